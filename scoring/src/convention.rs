@@ -1,0 +1,116 @@
+//! The eight sign and axis conventions that the original scoring tries on every submission.
+
+use ndarray::Array2;
+use rustfft::num_complex::Complex64;
+use serde::{Deserialize, Serialize};
+
+use crate::error::ScoringError;
+
+/// One of the eight conventions, numbered 1 to 8 as in the original.
+///
+/// A submission's cell value is s₁·e₁ + i·s₂·e₂ with (s₁, s₂) = (+,+), (+,−), (−,−), (−,+) for
+/// 1 to 4 and again for 5 to 8. Conventions 1 to 4 index the field `[iy, ix]`, 5 to 8 `[ix, iy]`.
+///
+/// Convention 5 is the standard one of this project: e₁ along +x, e₂ along x = y.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(try_from = "u8", into = "u8")]
+pub struct Convention(u8);
+
+/// The two kinds of E-mode spectrum that the eight conventions can give.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum ConventionClass {
+    /// Conventions 1, 3, 6, 8.
+    A,
+    /// Conventions 2, 4, 5, 7, among them the standard one.
+    B,
+}
+
+impl Convention {
+    /// All eight, in order.
+    pub const ALL: [Convention; 8] = [
+        Convention(1),
+        Convention(2),
+        Convention(3),
+        Convention(4),
+        Convention(5),
+        Convention(6),
+        Convention(7),
+        Convention(8),
+    ];
+    /// The standard convention: e₁ along +x, e₂ along x = y, neither flipped.
+    pub const STANDARD: Convention = Convention(5);
+
+    /// Number 1 to 8.
+    pub fn number(self) -> u8 {
+        self.0
+    }
+
+    /// Place 0 to 7 in [`Convention::ALL`].
+    pub fn index(self) -> usize {
+        usize::from(self.0) - 1
+    }
+
+    /// Signs (s₁, s₂) applied to (e₁, e₂).
+    pub fn signs(self) -> (f64, f64) {
+        match (self.0 - 1) % 4 {
+            0 => (1.0, 1.0),
+            1 => (1.0, -1.0),
+            2 => (-1.0, -1.0),
+            _ => (-1.0, 1.0),
+        }
+    }
+
+    /// Whether x and y are swapped: the field is indexed `[iy, ix]`.
+    pub fn transposes(self) -> bool {
+        self.0 <= 4
+    }
+
+    /// Which of the two spectra it gives.
+    pub fn class(self) -> ConventionClass {
+        match self.0 {
+            1 | 3 | 6 | 8 => ConventionClass::A,
+            _ => ConventionClass::B,
+        }
+    }
+
+    /// What it means in words.
+    pub fn describe(self) -> &'static str {
+        match self.0 {
+            1 => "x and y swapped",
+            2 => "x and y swapped, e2 flipped",
+            3 => "x and y swapped, e1 and e2 flipped",
+            4 => "x and y swapped, e1 flipped",
+            5 => "standard",
+            6 => "e2 flipped",
+            7 => "e1 and e2 flipped",
+            _ => "e1 flipped",
+        }
+    }
+
+    /// The complex field of this convention from means of e₁ and e₂ on `[ix, iy]`.
+    pub fn apply(self, e1: &Array2<f64>, e2: &Array2<f64>) -> Array2<Complex64> {
+        let (s1, s2) = self.signs();
+        Array2::from_shape_fn(e1.dim(), |(i, j)| {
+            let cell = if self.transposes() { (j, i) } else { (i, j) };
+            Complex64::new(s1 * e1[cell], s2 * e2[cell])
+        })
+    }
+}
+
+impl TryFrom<u8> for Convention {
+    type Error = ScoringError;
+
+    fn try_from(number: u8) -> Result<Self, ScoringError> {
+        if (1..=8).contains(&number) {
+            Ok(Convention(number))
+        } else {
+            Err(ScoringError::Convention(number))
+        }
+    }
+}
+
+impl From<Convention> for u8 {
+    fn from(convention: Convention) -> u8 {
+        convention.0
+    }
+}

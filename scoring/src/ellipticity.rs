@@ -1,0 +1,151 @@
+//! The two ellipticity definitions of the field, as two types that do not mix.
+//!
+//! For an ellipse with axis ratio `q = b/a` and position angle φ (from +x towards +y):
+//!
+//! * [`Shear`]: ε = (1 − q)/(1 + q) · e^{2iφ}. Shear, and the truth of GREAT10, are of this type;
+//!   the mean of ε over randomly oriented galaxies is the reduced shear.
+//! * [`Distortion`]: χ = (1 − q²)/(1 + q²) · e^{2iφ}. Moments `(Qxx − Qyy)/(Qxx + Qyy)` are of this
+//!   type; χ ≈ 2ε for small values.
+//!
+//! Component 1 is positive along +x, component 2 is positive along the diagonal x = y.
+
+use serde::{Deserialize, Serialize};
+
+/// Shear-type ellipticity ε = (1 − q)/(1 + q) · e^{2iφ}; also a reduced shear g.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Shear {
+    /// Positive for elongation along +x.
+    pub e1: f64,
+    /// Positive for elongation along x = y.
+    pub e2: f64,
+}
+
+/// Distortion χ = (1 − q²)/(1 + q²) · e^{2iφ}.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Distortion {
+    /// Positive for elongation along +x.
+    pub e1: f64,
+    /// Positive for elongation along x = y.
+    pub e2: f64,
+}
+
+impl Shear {
+    /// A round object, or no shear.
+    pub const ZERO: Shear = Shear { e1: 0.0, e2: 0.0 };
+
+    /// From the two components.
+    pub const fn new(e1: f64, e2: f64) -> Self {
+        Shear { e1, e2 }
+    }
+
+    /// |ε|.
+    pub fn modulus(self) -> f64 {
+        self.e1.hypot(self.e2)
+    }
+
+    /// χ = 2ε / (1 + |ε|²).
+    pub fn to_distortion(self) -> Distortion {
+        let scale = 2.0 / (1.0 + self.e1 * self.e1 + self.e2 * self.e2);
+        Distortion {
+            e1: self.e1 * scale,
+            e2: self.e2 * scale,
+        }
+    }
+
+    /// The ellipticity of a source of intrinsic ellipticity `self` seen through the reduced shear
+    /// `g`: (ε + g)/(1 + g* ε), for |g| < 1 (Seitz & Schneider 1997).
+    pub fn sheared_by(self, g: Shear) -> Shear {
+        let (nr, ni) = (self.e1 + g.e1, self.e2 + g.e2);
+        let dr = 1.0 + g.e1 * self.e1 + g.e2 * self.e2;
+        let di = g.e1 * self.e2 - g.e2 * self.e1;
+        let norm = dr * dr + di * di;
+        Shear {
+            e1: (nr * dr + ni * di) / norm,
+            e2: (ni * dr - nr * di) / norm,
+        }
+    }
+
+    /// The area-preserving linear map that turns a circle into an ellipse of this ellipticity:
+    /// `[[1 + e1, e2], [e2, 1 − e1]] / sqrt(1 − |ε|²)`, acting on (x, y).
+    pub fn matrix(self) -> [[f64; 2]; 2] {
+        let norm = 1.0 / (1.0 - self.e1 * self.e1 - self.e2 * self.e2).sqrt();
+        [
+            [(1.0 + self.e1) * norm, self.e2 * norm],
+            [self.e2 * norm, (1.0 - self.e1) * norm],
+        ]
+    }
+}
+
+impl Distortion {
+    /// From the two components.
+    pub const fn new(e1: f64, e2: f64) -> Self {
+        Distortion { e1, e2 }
+    }
+
+    /// |χ|.
+    pub fn modulus(self) -> f64 {
+        self.e1.hypot(self.e2)
+    }
+
+    /// ε = χ / (1 + sqrt(1 − |χ|²)); `None` where |χ| > 1, which no ellipse has.
+    pub fn to_shear(self) -> Option<Shear> {
+        let rest = 1.0 - self.e1 * self.e1 - self.e2 * self.e2;
+        if rest.is_nan() || rest < 0.0 {
+            return None;
+        }
+        let scale = 1.0 / (1.0 + rest.sqrt());
+        Some(Shear {
+            e1: self.e1 * scale,
+            e2: self.e2 * scale,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_definitions_follow_from_the_axis_ratio() {
+        let q: f64 = 0.5;
+        let shear = Shear::new((1.0 - q) / (1.0 + q), 0.0);
+        let distortion = Distortion::new((1.0 - q * q) / (1.0 + q * q), 0.0);
+        assert!((shear.to_distortion().e1 - distortion.e1).abs() < 1e-15);
+        assert!((distortion.to_shear().unwrap().e1 - shear.e1).abs() < 1e-15);
+    }
+
+    #[test]
+    fn impossible_distortion_has_no_shear() {
+        assert_eq!(Distortion::new(0.8, 0.7).to_shear(), None);
+        assert_eq!(Distortion::new(f64::NAN, 0.0).to_shear(), None);
+    }
+
+    #[test]
+    fn shearing_a_circle_gives_the_shear_and_the_matrix_agrees() {
+        let g = Shear::new(0.1, -0.2);
+        assert_eq!(Shear::ZERO.sheared_by(g), g);
+        // Second moments of a unit circle mapped by the matrix are A·Aᵀ; their distortion is χ(g).
+        let a = g.matrix();
+        let qxx = a[0][0] * a[0][0] + a[0][1] * a[0][1];
+        let qyy = a[1][0] * a[1][0] + a[1][1] * a[1][1];
+        let qxy = a[0][0] * a[1][0] + a[0][1] * a[1][1];
+        let chi = Distortion::new((qxx - qyy) / (qxx + qyy), 2.0 * qxy / (qxx + qyy));
+        let expected = g.to_distortion();
+        assert!((chi.e1 - expected.e1).abs() < 1e-15 && (chi.e2 - expected.e2).abs() < 1e-15);
+    }
+
+    #[test]
+    fn shear_of_an_ellipse_matches_composed_maps() {
+        // The moments of the composed map give the modulus and angle of the sheared ellipse.
+        let (s, g) = (Shear::new(0.3, 0.1), Shear::new(-0.05, 0.08));
+        let (a, b) = (g.matrix(), s.matrix());
+        let m = |i: usize, j: usize| a[i][0] * b[0][j] + a[i][1] * b[1][j];
+        let qxx = m(0, 0) * m(0, 0) + m(0, 1) * m(0, 1);
+        let qyy = m(1, 0) * m(1, 0) + m(1, 1) * m(1, 1);
+        let qxy = m(0, 0) * m(1, 0) + m(0, 1) * m(1, 1);
+        let chi = Distortion::new((qxx - qyy) / (qxx + qyy), 2.0 * qxy / (qxx + qyy));
+        let got = chi.to_shear().unwrap();
+        let expected = s.sheared_by(g);
+        assert!((got.e1 - expected.e1).abs() < 1e-14 && (got.e2 - expected.e2).abs() < 1e-14);
+    }
+}

@@ -1,0 +1,63 @@
+//! What can be wrong with input to the scoring.
+
+use thiserror::Error;
+
+/// An input that cannot be scored. The caller adds the file it came from.
+#[derive(Debug, Error, PartialEq)]
+pub enum ScoringError {
+    /// A grid side out of range.
+    #[error("the grid has {found} cells a side; expected {min} to {max}")]
+    GridSide {
+        /// Cells a side found.
+        found: usize,
+        /// Smallest accepted.
+        min: usize,
+        /// Largest accepted.
+        max: usize,
+    },
+    /// A length that is not positive and finite.
+    #[error("{what} is {found}; expected a positive number")]
+    Length {
+        /// Which length.
+        what: &'static str,
+        /// Its value.
+        found: f64,
+    },
+    /// The truth does not fill the grid.
+    #[error(
+        "the true shear covers {found} of the {expected} cells of the {side}×{side} grid; expected each exactly once"
+    )]
+    TruthIncomplete {
+        /// Cells found.
+        found: usize,
+        /// Cells of the grid.
+        expected: usize,
+        /// Cells a side.
+        side: usize,
+    },
+    /// A truth value that is not a number.
+    #[error("the true shear of cell ({ix}, {iy}) is not a finite number")]
+    TruthNotFinite {
+        /// Column, 1-based.
+        ix: usize,
+        /// Row, 1-based.
+        iy: usize,
+    },
+    /// No image was added.
+    #[error("no image to score")]
+    NoImages,
+    /// A negative or non-finite noise variance.
+    #[error("the noise variance is {0}; expected a finite number, zero or more")]
+    NoiseVariance(f64),
+    /// A convention number that does not exist.
+    #[error("there is no convention {0}; expected 1 to 8")]
+    Convention(u8),
+    /// A power-spectrum submission with the wrong bins.
+    #[error("a power-spectrum submission has {found} bins; expected the {expected} bins 2 to 9")]
+    SpectrumBins {
+        /// Bins found.
+        found: usize,
+        /// Bins expected.
+        expected: usize,
+    },
+}

@@ -1,0 +1,159 @@
+//! The square grid of postage stamps, and the Fourier modes that live on it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::ScoringError;
+use crate::units::{Degrees, Multipole, Pixels, Radians};
+
+/// Offset that the original scoring program adds to both components of every wave vector, so that
+/// the zero mode has a direction. It decides which of the modes at exactly ℓ_min are counted.
+pub(crate) const MODE_OFFSET: f64 = 1e-10;
+
+/// A square grid of galaxies: `n` × `n` stamps of `stamp` pixels over `field` degrees a side.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Grid {
+    /// Cells a side.
+    pub n: usize,
+    /// Pixels a side of one stamp, which is one cell.
+    pub stamp: Pixels,
+    /// Side of the whole field.
+    pub field: Degrees,
+}
+
+impl Grid {
+    /// Smallest grid whose bins 2 to 9 all hold modes.
+    pub const MIN_SIDE: usize = 8;
+    /// Largest grid accepted (16 million cells), against absurd sizes in damaged input.
+    pub const MAX_SIDE: usize = 4000;
+
+    /// The GREAT10 layout for `n` cells a side: 48 px stamps over 10°.
+    ///
+    /// # Errors
+    /// Where `n` is outside [`Grid::MIN_SIDE`]..=[`Grid::MAX_SIDE`].
+    pub fn great10(n: usize) -> Result<Self, ScoringError> {
+        Grid::new(n, Pixels(48.0), Degrees(10.0))
+    }
+
+    /// A grid of `n` cells a side.
+    ///
+    /// # Errors
+    /// Where `n` is out of range, or a length is not a positive finite number.
+    pub fn new(n: usize, stamp: Pixels, field: Degrees) -> Result<Self, ScoringError> {
+        if !(Self::MIN_SIDE..=Self::MAX_SIDE).contains(&n) {
+            return Err(ScoringError::GridSide {
+                found: n,
+                min: Self::MIN_SIDE,
+                max: Self::MAX_SIDE,
+            });
+        }
+        if !(stamp.0.is_finite() && stamp.0 > 0.0) {
+            return Err(ScoringError::Length {
+                what: "stamp size in pixels",
+                found: stamp.0,
+            });
+        }
+        if !(field.0.is_finite() && field.0 > 0.0) {
+            return Err(ScoringError::Length {
+                what: "field size in degrees",
+                found: field.0,
+            });
+        }
+        Ok(Grid { n, stamp, field })
+    }
+
+    /// Number of cells.
+    pub fn cells(&self) -> usize {
+        self.n * self.n
+    }
+
+    /// 0-based cell `(ix, iy)` of the FITS pixel position `(x, y)`, `None` outside the grid.
+    ///
+    /// The 1-based index is round(x/stamp + ½), halves away from zero, as the original takes it.
+    pub fn cell(&self, x: f64, y: f64) -> Option<(usize, usize)> {
+        let index = |v: f64| {
+            let i = (v / self.stamp.0 + 0.5).round();
+            (i >= 1.0 && i <= self.n as f64).then(|| i as usize - 1)
+        };
+        Some((index(x)?, index(y)?))
+    }
+
+    /// FITS pixel position (1-based) of the centre of cell `(ix, iy)`: the corner shared by the
+    /// four central pixels for an even stamp.
+    pub fn centre(&self, ix: usize, iy: usize) -> (f64, f64) {
+        let position = |i: usize| i as f64 * self.stamp.0 + (self.stamp.0 + 1.0) / 2.0;
+        (position(ix), position(iy))
+    }
+
+    /// Side of the field in radians.
+    pub fn side(&self) -> Radians {
+        self.field.into()
+    }
+
+    /// ℓ_min = 2π/L, the spacing of the modes.
+    pub fn l_min(&self) -> Multipole {
+        Multipole(2.0 * std::f64::consts::PI / self.side().0)
+    }
+
+    /// ℓ_max = 2πn/L, the upper end of the bins (twice the Nyquist multipole along an axis).
+    pub fn l_max(&self) -> Multipole {
+        Multipole(self.l_min().0 * self.n as f64)
+    }
+
+    /// Signed integer frequency of position `i` in centred order (0 is the most negative).
+    pub(crate) fn frequency(&self, i: usize) -> i64 {
+        i as i64 - (self.n / 2) as i64
+    }
+
+    /// Place in FFT order of position `i` in centred order.
+    pub(crate) fn fft_index(&self, i: usize) -> usize {
+        (i + self.n - self.n / 2) % self.n
+    }
+
+    /// Component of the wave vector at centred position `i`, with the original's offset.
+    pub(crate) fn wave(&self, i: usize) -> f64 {
+        self.l_min().0 * self.frequency(i) as f64 + MODE_OFFSET
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_and_centres_are_inverse_and_edges_round_away_from_zero() {
+        let grid = Grid::great10(100).unwrap();
+        for (ix, iy) in [(0, 0), (3, 99), (99, 50)] {
+            let (x, y) = grid.centre(ix, iy);
+            assert_eq!(grid.cell(x, y), Some((ix, iy)));
+        }
+        assert_eq!(grid.centre(0, 1), (24.5, 72.5));
+        // x/48 + 0.5 = 1.5 rounds up to the second cell.
+        assert_eq!(grid.cell(48.0, 24.5), Some((1, 0)));
+        assert_eq!(grid.cell(47.999, 24.5), Some((0, 0)));
+        assert_eq!(grid.cell(-0.1, 24.5), None);
+        assert_eq!(grid.cell(4800.0, 24.5), None);
+        assert_eq!(grid.cell(f64::NAN, 24.5), None);
+    }
+
+    #[test]
+    fn modes_of_ten_degrees_are_36_apart() {
+        let grid = Grid::great10(100).unwrap();
+        assert!((grid.l_min().0 - 36.0).abs() < 1e-12);
+        assert!((grid.l_max().0 - 3600.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn centred_order_maps_to_fft_order_for_even_and_odd_sides() {
+        for n in [8, 9] {
+            let grid = Grid::great10(n).unwrap();
+            for i in 0..n {
+                let f = grid.frequency(i);
+                assert_eq!(
+                    grid.fft_index(i) as i64,
+                    f.rem_euclid(n as i64),
+                    "n {n}, i {i}"
+                );
+            }
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! The figures of merit: Q, Q_dn, M and A.
+
+use serde::Serialize;
+
+use crate::bandpower::{BINS, Bins, SCORED};
+
+/// Numerator of the quality factor (Kitching et al. 2012, eq. 1; GREAT10 handbook eq. 21).
+const Q_SCALE: f64 = 5e-3;
+
+/// A quality factor and the systematic error it comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Quality {
+    /// Q = 5·10⁻³ / σ_sys. Infinite for a perfect submission.
+    pub q: f64,
+    /// σ_sys = Σ_b |P_b − P_b^true| Δln ℓ_b over bins 2 to 9.
+    pub sigma_sys: f64,
+}
+
+/// Q of measured bandpowers against true ones, both ≈ ℓ²C_ℓ/2π.
+pub fn quality(bins: &Bins, measured: &[f64; BINS], truth: &[f64; BINS]) -> Quality {
+    let sigma_sys = SCORED
+        .map(|b| (measured[b] - truth[b]).abs() * bins.dln_l[b])
+        .sum::<f64>();
+    Quality {
+        q: Q_SCALE / sigma_sys,
+        sigma_sys,
+    }
+}
+
+/// Multiplicative and additive bias of a power spectrum:
+/// C_b − C_b^true = A + M·C_b^true, by unweighted least squares over bins 2 to 9.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[allow(non_snake_case, reason = "the field's own symbols, also in the JSON output")]
+pub struct Bias {
+    /// Multiplicative bias M ≈ m² + 2m; the published figure is M/2.
+    pub M: f64,
+    /// Additive bias A = σ²(c), in the unit of the spectra fitted.
+    pub A: f64,
+    /// sign(A)·√|A|; tabulated in units of 10⁻⁴ when fitted to C_ℓ in steradian.
+    pub sqrtA: f64,
+    /// M/2.
+    pub m: f64,
+}
+
+/// Fits M and A to `measured` against `truth` after multiplying each bin by `scale`.
+pub fn bias(measured: &[f64; BINS], truth: &[f64; BINS], scale: impl Fn(usize) -> f64) -> Bias {
+    let points: Vec<(f64, f64)> = SCORED
+        .map(|b| {
+            let t = truth[b] * scale(b);
+            (t, measured[b] * scale(b) - t)
+        })
+        .collect();
+    let count = points.len() as f64;
+    let mean_x = points.iter().map(|p| p.0).sum::<f64>() / count;
+    let mean_y = points.iter().map(|p| p.1).sum::<f64>() / count;
+    let sxx: f64 = points.iter().map(|p| (p.0 - mean_x).powi(2)).sum();
+    let sxy: f64 = points
+        .iter()
+        .map(|p| (p.0 - mean_x) * (p.1 - mean_y))
+        .sum();
+    let slope = sxy / sxx;
+    let intercept = mean_y - slope * mean_x;
+    Bias {
+        M: slope,
+        A: intercept,
+        sqrtA: intercept.signum() * intercept.abs().sqrt(),
+        m: slope / 2.0,
+    }
+}
+
+/// The same fit in the units that have been in use. The published figures are `cl`; in ℓ²C_ℓ units
+/// M swallows the noise, whose bandpower rises like the modes' weight.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct BiasFits {
+    /// Bandpowers ℓ²C_ℓ/2π.
+    pub l2: Bias,
+    /// Mean |FFT|²/n⁴ of a bin's modes.
+    pub mode: Bias,
+    /// C_ℓ in steradian.
+    pub cl: Bias,
+    /// C_ℓ/2π in steradian.
+    pub cl_over_2pi: Bias,
+}
+
+/// Fits M and A in all units.
+pub fn bias_fits(bins: &Bins, side: f64, measured: &[f64; BINS], truth: &[f64; BINS]) -> BiasFits {
+    let cl = |b: usize| bins.to_c_l(b);
+    BiasFits {
+        l2: bias(measured, truth, |_| 1.0),
+        mode: bias(measured, truth, |b| cl(b) / (side * side)),
+        cl: bias(measured, truth, cl),
+        cl_over_2pi: bias(measured, truth, |b| cl(b) / (2.0 * std::f64::consts::PI)),
+    }
+}

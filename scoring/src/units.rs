@@ -1,0 +1,30 @@
+//! Angles, pixels and multipoles as types of their own, so that a number of one kind cannot stand
+//! where another is meant.
+
+use serde::{Deserialize, Serialize};
+
+/// An angle in degrees, as data files and settings give field sizes.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Degrees(pub f64);
+
+/// An angle in radians, as all formulae take it.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Radians(pub f64);
+
+/// A length in image pixels.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Pixels(pub f64);
+
+/// An angular multipole ℓ (flat sky: the modulus of the wave vector in rad⁻¹).
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Multipole(pub f64);
+
+impl From<Degrees> for Radians {
+    fn from(angle: Degrees) -> Self {
+        Radians(angle.0 * std::f64::consts::PI / 180.0)
+    }
+}

@@ -1,0 +1,324 @@
+//! The settings of a submission, section by section.
+//!
+//! Each section exists twice: complete, as the pipeline takes it, and partial, as one file of an
+//! inheritance chain gives it. One macro writes both, so that a field cannot be forgotten in one.
+
+use serde::{Deserialize, Serialize};
+
+/// Declares a section's complete and partial structs, and how one is made of the other.
+macro_rules! section {
+    ($(#[$doc:meta])* $name:ident, $partial:ident, $key:literal {
+        $($(#[$field_doc:meta])* $field:ident: $type:ty,)*
+    }) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+        pub struct $name {
+            $($(#[$field_doc])* pub $field: $type,)*
+        }
+
+        #[derive(Debug, Clone, Default, Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub(crate) struct $partial {
+            $($field: Option<$type>,)*
+        }
+
+        impl $partial {
+            /// `self` where it says something, `base` elsewhere.
+            pub(crate) fn over(self, base: Self) -> Self {
+                $partial { $($field: self.$field.or(base.$field),)* }
+            }
+
+            /// The complete section, or the key that nothing in the chain sets.
+            pub(crate) fn complete(self) -> Result<$name, &'static str> {
+                Ok($name {
+                    $($field: self.$field.ok_or(concat!($key, ".", stringify!($field)))?,)*
+                })
+            }
+        }
+    };
+}
+
+section! {
+    /// The piece of the postage stamp that is worked on.
+    Stamp, PartialStamp, "stamp" {
+        /// Pixels a side, cut around the stamp's centre; 5 to 64.
+        size: usize,
+    }
+}
+
+section! {
+    /// The PSF used to deconvolve.
+    Psf, PartialPsf, "psf" {
+        /// From star stamps or from the functional form.
+        form: PsfForm,
+        /// Pixels a side of the PSF stamp; 3 to 48.
+        size: usize,
+    }
+}
+
+section! {
+    /// Where the noise level σ of a stamp comes from.
+    Noise, PartialNoise, "noise" {
+        /// Its source.
+        source: NoiseSource,
+        /// Width in pixels of the frame at the edge of the full stamp that `border` measures.
+        border: usize,
+    }
+}
+
+section! {
+    /// Denoising of the full stamp before it is cut.
+    Denoise, PartialDenoise, "denoise" {
+        /// Which method, or none.
+        method: DenoiseMethod,
+        /// Wavelet scales, each twice as coarse as the one before; 1 to 4.
+        levels: usize,
+        /// Half width in pixels of the window over which a coefficient's signal power is estimated.
+        window: usize,
+        /// Multiple of the noise variance that is subtracted from that power; 1 is the Wiener filter.
+        strength: f64,
+    }
+}
+
+section! {
+    /// The Hopfield network.
+    Deconvolution, PartialDeconvolution, "deconvolution" {
+        /// How much a neuron changes when it is updated.
+        update: Update,
+        /// Step c of the adaptive rule (Eq. 10), as `step_scale` reads it.
+        step: f64,
+        /// What `step` is a multiple of.
+        step_scale: StepScale,
+        /// Change of a neuron under the constant rule, in units of brightness.
+        constant_step: f64,
+        /// Tikhonov parameter λ.
+        lambda: f64,
+        /// Most iterations M.
+        max_iterations: usize,
+        /// State of the neurons before the first iteration.
+        start: Start,
+        /// What one unit of brightness is, to which the thresholds (Eq. 9) refer.
+        brightness_unit: BrightnessUnit,
+        /// The unit is `brightness_unit` divided by this.
+        unit_divisor: f64,
+    }
+}
+
+section! {
+    /// Shape from the autocorrelation of the deconvolved stamp.
+    Shape, PartialShape, "shape" {
+        /// Share of the ACF's light inside the radius at which it is clipped; above 0, at most 1.
+        acf_share: f64,
+        /// Which ellipticity the catalogue reports as e1, e2.
+        ellipticity: EllipticityType,
+    }
+}
+
+/// Form of the PSF in the data.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PsfForm {
+    /// Star stamps, one per image or one per galaxy.
+    Star,
+    /// Moffat or Kolmogorov parameters, drawn with the pixel response.
+    Functional,
+}
+
+/// Source of the noise level.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NoiseSource {
+    /// Median absolute deviation of the frame at the edge of each stamp.
+    Border,
+    /// The image header's NOISESIG.
+    Header,
+}
+
+/// Denoising method.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DenoiseMethod {
+    /// Raw data.
+    None,
+    /// Wavelet decomposition and Wiener filtering of the coefficients.
+    WaveletWiener,
+}
+
+/// Neuron updating rule.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Update {
+    /// Proportional to the energy's gradient (Eq. 10).
+    Adaptive,
+    /// A constant (Eq. 6).
+    Constant,
+}
+
+/// What the adaptive step is a multiple of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum StepScale {
+    /// 1: c is `step` itself.
+    Fixed,
+    /// The stamp's brightest pixel in units of brightness: c = `step`·max(u₀).
+    Peak,
+}
+
+/// First state of the network. All are non-negative: with a negative start the first clipping at
+/// zero raises the energy and stops the network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Start {
+    /// The observed stamp, negative pixels set to zero.
+    ClippedData,
+    /// The mean of the observed stamp everywhere (zero if it is negative).
+    Flat,
+    /// Zero everywhere.
+    Zero,
+}
+
+/// What a unit of brightness is derived from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum BrightnessUnit {
+    /// The image's own unit.
+    Image,
+    /// The stamp's noise level.
+    Noise,
+    /// The stamp's brightest pixel.
+    Peak,
+}
+
+/// Ellipticity definition of a catalogue.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum EllipticityType {
+    /// χ = (1 − q²)/(1 + q²): the moments' own (Eq. 13).
+    Distortion,
+    /// ε = (1 − q)/(1 + q): that of shear.
+    Shear,
+}
+
+/// Every setting of a submission, resolved.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Submission {
+    /// Name, as tables print it.
+    pub name: String,
+    /// What it is, in a sentence.
+    pub description: String,
+    /// Stamp size.
+    pub stamp: Stamp,
+    /// PSF form and size.
+    pub psf: Psf,
+    /// Noise level.
+    pub noise: Noise,
+    /// Denoising.
+    pub denoise: Denoise,
+    /// Deconvolution.
+    pub deconvolution: Deconvolution,
+    /// Shape measurement.
+    pub shape: Shape,
+}
+
+/// The sections of one file, none of which must be complete.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct PartialSubmission {
+    pub(crate) stamp: PartialStamp,
+    pub(crate) psf: PartialPsf,
+    pub(crate) noise: PartialNoise,
+    pub(crate) denoise: PartialDenoise,
+    pub(crate) deconvolution: PartialDeconvolution,
+    pub(crate) shape: PartialShape,
+}
+
+impl PartialSubmission {
+    pub(crate) fn over(self, base: Self) -> Self {
+        PartialSubmission {
+            stamp: self.stamp.over(base.stamp),
+            psf: self.psf.over(base.psf),
+            noise: self.noise.over(base.noise),
+            denoise: self.denoise.over(base.denoise),
+            deconvolution: self.deconvolution.over(base.deconvolution),
+            shape: self.shape.over(base.shape),
+        }
+    }
+
+    pub(crate) fn complete(
+        self,
+        name: String,
+        description: String,
+    ) -> Result<Submission, &'static str> {
+        Ok(Submission {
+            name,
+            description,
+            stamp: self.stamp.complete()?,
+            psf: self.psf.complete()?,
+            noise: self.noise.complete()?,
+            denoise: self.denoise.complete()?,
+            deconvolution: self.deconvolution.complete()?,
+            shape: self.shape.complete()?,
+        })
+    }
+}
+
+/// A value that is out of range.
+pub(crate) struct OutOfRange {
+    pub(crate) key: &'static str,
+    pub(crate) found: String,
+    pub(crate) expected: &'static str,
+}
+
+impl Submission {
+    /// Checks every value against its range.
+    pub(crate) fn validate(&self) -> Result<(), OutOfRange> {
+        let Submission {
+            name: _,
+            description: _,
+            stamp,
+            psf,
+            noise,
+            denoise,
+            deconvolution: d,
+            shape,
+        } = self;
+        let whole = |key, found: usize, low, high, expected| {
+            if (low..=high).contains(&found) {
+                Ok(())
+            } else {
+                Err(OutOfRange {
+                    key,
+                    found: found.to_string(),
+                    expected,
+                })
+            }
+        };
+        let real = |key, found: f64, good: bool, expected| {
+            if good && found.is_finite() {
+                Ok(())
+            } else {
+                Err(OutOfRange {
+                    key,
+                    found: found.to_string(),
+                    expected,
+                })
+            }
+        };
+        whole("stamp.size", stamp.size, 5, 64, "5 to 64 pixels")?;
+        whole("psf.size", psf.size, 3, 48, "3 to 48 pixels")?;
+        whole("noise.border", noise.border, 1, 16, "1 to 16 pixels")?;
+        whole("denoise.levels", denoise.levels, 1, 4, "1 to 4")?;
+        whole("denoise.window", denoise.window, 0, 8, "0 to 8 pixels")?;
+        let s = denoise.strength;
+        real("denoise.strength", s, s > 0.0, "a positive number")?;
+        real("deconvolution.step", d.step, d.step > 0.0, "a positive number")?;
+        let c = d.constant_step;
+        real("deconvolution.constant_step", c, c > 0.0, "a positive number")?;
+        real("deconvolution.lambda", d.lambda, d.lambda >= 0.0, "zero or a positive number")?;
+        let most = d.max_iterations;
+        whole("deconvolution.max_iterations", most, 1, 100_000, "1 to 100000")?;
+        let u = d.unit_divisor;
+        real("deconvolution.unit_divisor", u, u > 0.0, "a positive number")?;
+        let a = shape.acf_share;
+        real("shape.acf_share", a, a > 0.0 && a <= 1.0, "above 0 and at most 1")
+    }
+}

@@ -1,0 +1,430 @@
+//! Parquet files: the one place that calls polars.
+//!
+//! Writing goes through polars' frame writer. Reading takes polars' footer parser and column
+//! decoder, but fetches the bytes itself: only the column chunks that are wanted are read, nothing
+//! is memory-mapped (a mapped file that shrinks kills the process), no second thread pool starts,
+//! and 8- and 16-bit integers decode into wider ones without polars' features for them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{Cursor, Read, Seek, SeekFrom, Write};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+
+use polars::prelude::{
+    ArrowDataType, ArrowField, ChunkedArray, DataFrame, DataType, FileMetadataRef,
+    KeyValueMetadata, NamedFrom, ParquetCompression, ParquetReader, ParquetWriter, PolarsError,
+    PolarsNumericType, PolarsResult, SerReader, Series, StatisticsOptions,
+};
+use polars_parquet::parquet::page::CompressedPage;
+use polars_parquet::read::{
+    BasicDecompressor, ColumnChunkMetadata, PageReader, column_iter_to_arrays,
+};
+
+use crate::table::SCHEMA_KEY;
+use crate::{Column, Table, TableError};
+
+/// Writes `table` as a Parquet file into `writer`.
+///
+/// Equal tables give equal bytes. The metadata becomes the file's key-value metadata, in the order
+/// of the keys. The data are not compressed: measured shears and sizes are noise in most of their
+/// bits, so that compression gains a few per cent of space and costs up to half of the reading
+/// speed. Repeated values still become small, by dictionaries.
+///
+/// The file must be opened (and, to be replaced at once or not at all, renamed) by the caller.
+///
+/// # Errors
+/// [`TableError::Write`] if the encoder or `writer` fails.
+pub fn write_parquet<W: Write>(writer: W, table: &Table) -> Result<(), TableError> {
+    let columns = table
+        .columns()
+        .iter()
+        .map(|(name, column)| to_series(name, column).into());
+    let metadata = table
+        .metadata()
+        .iter()
+        .map(|(key, value)| (key.clone(), value.clone()));
+    DataFrame::new(table.rows(), columns.collect())
+        .and_then(|mut frame| {
+            ParquetWriter::new(writer)
+                .with_compression(ParquetCompression::Uncompressed)
+                // Nothing selects rows by minima and maxima, which cost a pass over the values.
+                .with_statistics(StatisticsOptions {
+                    null_count: true,
+                    ..StatisticsOptions::empty()
+                })
+                .with_key_value_metadata(Some(KeyValueMetadata::from_static(metadata.collect())))
+                .set_parallel(false)
+                .finish(&mut frame)
+        })
+        .map(drop)
+        .map_err(|error| TableError::Write {
+            detail: error.to_string(),
+        })
+}
+
+/// Reads the Parquet file at `path`: all columns in file order, or those in `wanted`, in that order.
+///
+/// Signed integers become [`Column::I64`]; unsigned ones and booleans [`Column::U32`], 64-bit ones
+/// [`Column::I64`]; text with a dictionary becomes plain text. Missing values in float columns
+/// become NaN. Columns that are not wanted may be of any type. It runs on the calling thread alone,
+/// so that a caller with many files reads them in parallel.
+///
+/// # Errors
+/// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read;
+/// [`TableError::MissingColumn`], [`TableError::DuplicateColumn`],
+/// [`TableError::UnsupportedType`], [`TableError::MissingValues`] and [`TableError::TooLarge`] for a
+/// wanted column that is absent, named twice, or cannot be held in a [`Column`].
+pub fn read_parquet(path: impl AsRef<Path>, wanted: Option<&[&str]>) -> Result<Table, TableError> {
+    let path = path.as_ref();
+    let mut source = Source::open(path)?;
+    let fields = match wanted {
+        None => source.fields.clone(),
+        Some(names) => source.pick(names)?,
+    };
+    let columns = fields
+        .iter()
+        .map(|field| Ok((field.name.to_string(), source.read_column(field)?)))
+        .collect::<Result<_, TableError>>()?;
+    Table::new(columns, source.key_values())
+}
+
+/// The names of the columns of the Parquet file at `path`, in file order, from the footer alone.
+///
+/// # Errors
+/// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read.
+pub fn parquet_columns(path: impl AsRef<Path>) -> Result<Vec<String>, TableError> {
+    Ok(Source::open(path.as_ref())?.names())
+}
+
+/// The text metadata of the Parquet file at `path`, from the footer alone.
+///
+/// # Errors
+/// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read.
+pub fn parquet_metadata(path: impl AsRef<Path>) -> Result<BTreeMap<String, String>, TableError> {
+    Ok(Source::open(path.as_ref())?.key_values())
+}
+
+/// A column in the form polars writes.
+fn to_series(name: &str, column: &Column) -> Series {
+    match column {
+        Column::F64(values) => Series::new(name.into(), values),
+        Column::F32(values) => Series::new(name.into(), values),
+        Column::I64(values) => Series::new(name.into(), values),
+        Column::U32(values) => Series::new(name.into(), values),
+        Column::Text(values) => Series::new(name.into(), values),
+    }
+}
+
+/// An open file with its parsed footer.
+struct Source<'a> {
+    path: &'a Path,
+    file: File,
+    /// In bytes.
+    length: u64,
+    footer: FileMetadataRef,
+    /// The columns with the types the file declares.
+    fields: Vec<ArrowField>,
+}
+
+impl<'a> Source<'a> {
+    fn open(path: &'a Path) -> Result<Self, TableError> {
+        let io = |source| TableError::Io {
+            path: path.into(),
+            source,
+        };
+        let mut file = File::open(path).map_err(io)?;
+        let about = file.metadata().map_err(io)?;
+        if !about.is_file() {
+            return Err(TableError::Damaged {
+                path: path.into(),
+                detail: "found no regular file".into(),
+            });
+        }
+        let (footer, fields) = guarded(path, "footer", || {
+            let mut reader = ParquetReader::new(&mut file);
+            let fields = reader.schema()?.iter_values().cloned().collect();
+            Ok((reader.get_metadata()?.clone(), fields))
+        })?;
+        Ok(Self {
+            path,
+            file,
+            length: about.len(),
+            footer,
+            fields,
+        })
+    }
+
+    fn names(&self) -> Vec<String> {
+        self.fields
+            .iter()
+            .map(|field| field.name.to_string())
+            .collect()
+    }
+
+    /// The fields called `names`, in that order.
+    fn pick(&self, names: &[&str]) -> Result<Vec<ArrowField>, TableError> {
+        let mut seen = BTreeSet::new();
+        names
+            .iter()
+            .map(|&name| {
+                if !seen.insert(name) {
+                    return Err(TableError::DuplicateColumn { name: name.into() });
+                }
+                let field = self.fields.iter().find(|field| field.name == name);
+                field.cloned().ok_or_else(|| TableError::MissingColumn {
+                    path: self.path.into(),
+                    wanted: name.into(),
+                    present: self.names(),
+                })
+            })
+            .collect()
+    }
+
+    /// The file's own key-value metadata, without the schema that Arrow keeps there.
+    fn key_values(&self) -> BTreeMap<String, String> {
+        let pairs = self.footer.key_value_metadata().iter().flatten();
+        pairs
+            .filter(|pair| pair.key != SCHEMA_KEY)
+            .map(|pair| (pair.key.clone(), pair.value.clone().unwrap_or_default()))
+            .collect()
+    }
+
+    /// All rows of one column.
+    fn read_column(&mut self, field: &ArrowField) -> Result<Column, TableError> {
+        let (path, name) = (self.path, field.name.as_str());
+        let Some(decoded) = decoded_type(&field.dtype) else {
+            return Err(TableError::UnsupportedType {
+                path: path.into(),
+                column: name.into(),
+                found: format!("{:?}", field.dtype),
+            });
+        };
+        let field = ArrowField::new(field.name.clone(), decoded, field.is_nullable);
+        let footer = self.footer.clone();
+        // A false count in a damaged footer must not ask for more memory than the file suggests.
+        let room = footer
+            .num_rows
+            .min(usize::try_from(self.length).unwrap_or(usize::MAX));
+        let mut column = empty_column(&field.dtype, room);
+        for (number, group) in footer.row_groups.iter().enumerate() {
+            let place = format!("column `{name}`, row group {number}");
+            let damaged = |detail| TableError::Damaged {
+                path: path.into(),
+                detail: format!("{place}: {detail}"),
+            };
+            let chunk = match group
+                .columns_under_root_iter(name)
+                .map(|mut all| (all.len(), all.next()))
+            {
+                Some((1, Some(chunk))) => chunk,
+                _ => return Err(damaged("found no single column chunk".into())),
+            };
+            if usize::try_from(chunk.num_values()) != Ok(group.num_rows()) {
+                return Err(damaged(format!(
+                    "found {} values, expected {} as the row group has rows",
+                    chunk.num_values(),
+                    group.num_rows()
+                )));
+            }
+            let start = chunk
+                .dictionary_page_offset()
+                .unwrap_or(chunk.data_page_offset());
+            let bytes = self
+                .read_bytes(start, chunk.compressed_size())
+                .map_err(damaged)?;
+            let series = guarded(path, &place, || decode(chunk, bytes, &field))?;
+            if series.len() != group.num_rows() {
+                return Err(damaged(format!(
+                    "found {} rows, expected {}",
+                    series.len(),
+                    group.num_rows()
+                )));
+            }
+            append(&mut column, path, &series)?;
+        }
+        Ok(column)
+    }
+
+    /// The bytes from `start`, as many as `size`, after checking that the file has them.
+    fn read_bytes(&mut self, start: i64, size: i64) -> Result<Vec<u8>, String> {
+        let range = u64::try_from(start).ok().zip(u64::try_from(size).ok());
+        let Some((start, size)) = range.filter(|(start, size)| {
+            start
+                .checked_add(*size)
+                .is_some_and(|end| end <= self.length)
+        }) else {
+            return Err(format!(
+                "found bytes from {start}, {size} of them, expected a part of the file's {} bytes",
+                self.length
+            ));
+        };
+        let size = usize::try_from(size).map_err(|error| error.to_string())?;
+        let mut bytes = vec![0; size];
+        self.file
+            .seek(SeekFrom::Start(start))
+            .and_then(|_| self.file.read_exact(&mut bytes))
+            .map_err(|error| error.to_string())?;
+        Ok(bytes)
+    }
+}
+
+/// The values in one column chunk of a file, as the type in `field`.
+fn decode(chunk: &ColumnChunkMetadata, bytes: Vec<u8>, field: &ArrowField) -> PolarsResult<Series> {
+    let length = bytes.len();
+    // Cloning it shares the bytes.
+    let source = Cursor::new(bytes.into());
+    let pages = || PageReader::new(source.clone(), chunk, Vec::new(), length);
+    // The decoder makes room for as many values as a page claims, a negative count being taken for
+    // a huge one, and a failed allocation ends the process: add the claims up first.
+    let mut claimed = 0_usize;
+    for page in pages() {
+        if let CompressedPage::Data(page) = page? {
+            claimed = claimed.saturating_add(page.num_values());
+        }
+    }
+    if i64::try_from(claimed) != Ok(chunk.num_values()) {
+        let expected = chunk.num_values();
+        return Err(PolarsError::ComputeError(
+            format!("found pages with {claimed} values, expected {expected} as in the footer")
+                .into(),
+        ));
+    }
+    let (arrays, _) = column_iter_to_arrays(
+        vec![BasicDecompressor::new(pages(), Vec::new())],
+        vec![&chunk.descriptor().descriptor.primitive_type],
+        field.clone(),
+        None,
+    )?;
+    Series::try_from((field, arrays))
+}
+
+/// Runs a part of polars on what a file says.
+///
+/// Its decoders return errors for most damage, but index out of range or overflow on some; that
+/// must not take a long run down, so such a panic becomes an error too.
+fn guarded<T>(
+    path: &Path,
+    place: &str,
+    run: impl FnOnce() -> PolarsResult<T>,
+) -> Result<T, TableError> {
+    let detail = match catch_unwind(AssertUnwindSafe(run)) {
+        Ok(Ok(value)) => return Ok(value),
+        Ok(Err(error)) => error.to_string(),
+        Err(_) => "the contents contradict themselves".into(),
+    };
+    Err(TableError::Damaged {
+        path: path.into(),
+        detail: format!("{place}: {detail}"),
+    })
+}
+
+/// The type into which a column declared as `declared` is decoded, if a [`Column`] can hold it.
+fn decoded_type(declared: &ArrowDataType) -> Option<ArrowDataType> {
+    use ArrowDataType as Type;
+    match declared {
+        Type::Int8 | Type::Int16 | Type::Int32 => Some(Type::Int32),
+        Type::UInt8 | Type::UInt16 | Type::UInt32 => Some(Type::UInt32),
+        Type::Boolean
+        | Type::Int64
+        | Type::UInt64
+        | Type::Float32
+        | Type::Float64
+        | Type::Utf8View => Some(declared.clone()),
+        // Text with few different values, as data frames in Python like to write it.
+        Type::Dictionary(_, value, _) => {
+            matches!(**value, Type::Utf8 | Type::LargeUtf8 | Type::Utf8View)
+                .then_some(Type::Utf8View)
+        }
+        _ => None,
+    }
+}
+
+/// A column without rows for values of the type `decoded`, with room for `rows`.
+fn empty_column(decoded: &ArrowDataType, rows: usize) -> Column {
+    match decoded {
+        ArrowDataType::Float64 => Column::F64(Vec::with_capacity(rows)),
+        ArrowDataType::Float32 => Column::F32(Vec::with_capacity(rows)),
+        ArrowDataType::UInt32 | ArrowDataType::Boolean => Column::U32(Vec::with_capacity(rows)),
+        ArrowDataType::Utf8View => Column::Text(Vec::with_capacity(rows)),
+        _ => Column::I64(Vec::with_capacity(rows)),
+    }
+}
+
+/// Appends the decoded `series` to the column it belongs to.
+fn append(column: &mut Column, path: &Path, series: &Series) -> Result<(), TableError> {
+    let name = series.name().as_str();
+    if series.null_count() > 0 && !series.dtype().is_float() {
+        return Err(TableError::MissingValues {
+            path: path.into(),
+            column: name.into(),
+            count: series.null_count(),
+        });
+    }
+    let decoded = match column {
+        Column::F64(values) => series
+            .f64()
+            .map(|chunks| extend(values, chunks, f64::NAN, |v| v)),
+        Column::F32(values) => series
+            .f32()
+            .map(|chunks| extend(values, chunks, f32::NAN, |v| v)),
+        Column::U32(values) if *series.dtype() == DataType::Boolean => series
+            .bool()
+            .map(|flags| values.extend(flags.iter().flatten().map(u32::from))),
+        Column::U32(values) => series.u32().map(|chunks| extend(values, chunks, 0, |v| v)),
+        Column::I64(values) => match series.dtype() {
+            DataType::Int32 => series
+                .i32()
+                .map(|chunks| extend(values, chunks, 0, i64::from)),
+            DataType::UInt64 => {
+                let chunks = series
+                    .u64()
+                    .map_err(|error| unexpected(path, name, &error))?;
+                for value in chunks.iter().flatten() {
+                    values.push(i64::try_from(value).map_err(|_| TableError::TooLarge {
+                        path: path.into(),
+                        column: name.into(),
+                        row: values.len(),
+                        value,
+                    })?);
+                }
+                Ok(())
+            }
+            _ => series.i64().map(|chunks| extend(values, chunks, 0, |v| v)),
+        },
+        Column::Text(values) => series
+            .str()
+            .map(|texts| values.extend(texts.iter().flatten().map(str::to_owned))),
+    };
+    decoded.map_err(|error| unexpected(path, name, &error))
+}
+
+/// A decoder returned another type than the one asked for.
+fn unexpected(path: &Path, name: &str, error: &PolarsError) -> TableError {
+    TableError::Damaged {
+        path: path.into(),
+        detail: format!("column `{name}`: {error}"),
+    }
+}
+
+/// Appends numbers, converted by `convert`, with `missing` where there are none.
+fn extend<T, V: Copy>(
+    values: &mut Vec<V>,
+    chunks: &ChunkedArray<T>,
+    missing: V,
+    convert: impl Fn(T::Native) -> V,
+) where
+    T: PolarsNumericType,
+{
+    for chunk in chunks.downcast_iter() {
+        if chunk.validity().is_none() {
+            values.extend(chunk.values().iter().map(|&value| convert(value)));
+        } else {
+            values.extend(
+                chunk
+                    .iter()
+                    .map(|value| value.map_or(missing, |&value| convert(value))),
+            );
+        }
+    }
+}
