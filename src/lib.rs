@@ -1,1 +1,32 @@
-//! x
+//! shearq: challenge scoring and submissions for weak-lensing shape measurement, around a
+//! deconvolution by a Hopfield network (Nurbaeva et al., *Hopfield Neural Network deconvolution for
+//! weak lensing measurement*).
+//!
+//! # Where things are
+//!
+//! * [`deconvolve`], [`denoise`], [`shape`], [`psf`]: the method, one galaxy at a time.
+//! * [`simulate`]: GREAT10-like sets.
+//! * [`io`]: files; [`pipeline`]: the chain over many galaxies; [`report`]: tables and figures.
+//! * [`cli`]: the command line; nothing else knows it.
+//! * The crates `shearq-scoring` (spectra and figures of merit), `shearq-submissions` (settings) and
+//!   `shearq-tables` (Parquet) stand below this one.
+//!
+//! # Conventions
+//!
+//! Positions are FITS pixels, 1-based; stamps are row-major with rows along y; e₁ > 0 is elongation
+//! along +x, e₂ > 0 along x = y; noise levels are standard deviations per pixel in image units.
+//! Ellipticity types, FFT scaling and units of spectra are stated in `shearq-scoring`.
+
+pub mod cli;
+pub mod deconvolve;
+pub mod denoise;
+pub mod io;
+pub mod pipeline;
+pub mod psf;
+mod radial;
+pub mod report;
+pub mod shape;
+pub mod simulate;
+
+/// Version of this package, as outputs carry it.
+pub const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -1,1 +1,7 @@
-fn main(){}
+//! The `shearq` command.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    shearq::cli::main()
+}

@@ -1,0 +1,126 @@
+//! Arguments that several subcommands share.
+
+use std::collections::BTreeSet;
+use std::str::FromStr;
+
+use clap::{Args, ValueEnum};
+use shearq_scoring::{Choice, Convention, Definition};
+
+use crate::simulate::kinds::SETS;
+
+/// A list of sets such as `1,2,7-9` or `all`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct SetList(pub(super) Vec<u32>);
+
+impl FromStr for SetList {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "all" {
+            return Ok(SetList((1..=SETS).collect()));
+        }
+        let number = |part: &str| -> Result<u32, String> {
+            match part.trim().parse() {
+                Ok(set) if (1..=99).contains(&set) => Ok(set),
+                _ => Err(format!(
+                    "`{part}` is not a set; expected numbers from 1 as in `1,2,7-9`, or `all`"
+                )),
+            }
+        };
+        let mut sets = BTreeSet::new();
+        for part in text.split(',') {
+            match part.split_once('-') {
+                Some((first, last)) => {
+                    let (first, last) = (number(first)?, number(last)?);
+                    if first > last {
+                        return Err(format!("`{part}` runs backwards"));
+                    }
+                    sets.extend(first..=last);
+                }
+                None => {
+                    sets.insert(number(part)?);
+                }
+            }
+        }
+        Ok(SetList(sets.into_iter().collect()))
+    }
+}
+
+/// Number of worker threads.
+#[derive(Debug, Clone, Args)]
+pub(super) struct Threads {
+    /// Worker threads [default: one per core]. Results do not depend on it.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+}
+
+impl Threads {
+    pub(super) fn number(&self) -> usize {
+        self.threads.map_or_else(
+            || std::thread::available_parallelism().map_or(1, usize::from),
+            usize::from,
+        )
+    }
+}
+
+/// Bandpower definition on the command line.
+#[derive(Debug, Clone, Copy, Default, ValueEnum)]
+enum DefinitionArgument {
+    /// The challenge's own arithmetic.
+    #[default]
+    Leaderboard,
+    /// True azimuthal averages over fixed bins.
+    Corrected,
+}
+
+/// How to score.
+#[derive(Debug, Clone, Args)]
+pub(super) struct ScoreSettings {
+    /// How bandpowers and Q are defined.
+    #[arg(long, value_enum, default_value_t)]
+    definition: DefinitionArgument,
+    /// Convention of the figures: `matched` to the truth, `best` as the leaderboard took it, or 1 to 8.
+    #[arg(long, value_name = "WHICH", default_value = "matched", value_parser = parse_choice)]
+    convention: Choice,
+}
+
+impl ScoreSettings {
+    pub(super) fn definition(&self) -> Definition {
+        match self.definition {
+            DefinitionArgument::Leaderboard => Definition::Leaderboard,
+            DefinitionArgument::Corrected => Definition::Corrected,
+        }
+    }
+
+    pub(super) fn choice(&self) -> Choice {
+        self.convention
+    }
+}
+
+fn parse_choice(text: &str) -> Result<Choice, String> {
+    match text {
+        "matched" => Ok(Choice::Matched),
+        "best" => Ok(Choice::Best),
+        number => number
+            .parse()
+            .ok()
+            .and_then(|number: u8| Convention::try_from(number).ok())
+            .map(Choice::Insist)
+            .ok_or_else(|| "expected `matched`, `best` or a number from 1 to 8".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn set_lists_are_sorted_and_checked() {
+        let parse = |text: &str| text.parse::<SetList>().map(|list| list.0);
+        assert_eq!(parse("7-9,1,2,8"), Ok(vec![1, 2, 7, 8, 9]));
+        assert_eq!(parse("all").unwrap().len(), 24);
+        for wrong in ["", "0", "x", "3-1", "1,,2", "100"] {
+            assert!(parse(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! `shearq measure`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use shearq_submissions::Registry;
+
+use super::arguments::{SetList, Threads};
+use super::progress::Bar;
+use crate::io::layout::DataFolder;
+use crate::io::run::Run;
+use crate::io::table::Format;
+use crate::pipeline::measure::{galaxies_to_do, measure_folder};
+
+/// Measure the galaxies of a data folder by a submission: one catalogue per image.
+///
+/// Catalogues have x, y, e1, e2, flag, iterations, stop and what else tells whether to trust a row;
+/// docs/formats.md describes them. Catalogues already in the folder are kept if the same settings
+/// made them, so a stopped measurement goes on where it was.
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Name of a submission (see `shearq submissions list`) or a TOML file of your own.
+    #[arg(long, value_name = "NAME|FILE")]
+    submission: String,
+    /// Data folder.
+    #[arg(long, value_name = "DIR")]
+    data: PathBuf,
+    /// Folder to write to.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Sets to measure [default: all there are].
+    #[arg(long, value_name = "LIST")]
+    sets: Option<SetList>,
+    /// Format of the catalogues [default: parquet, or fits in a build without it].
+    #[arg(long, value_enum)]
+    catalogue_format: Option<Format>,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let Arguments {
+        submission,
+        data,
+        out,
+        sets,
+        catalogue_format,
+        threads,
+    } = arguments;
+    let submission = Registry::embedded()?.get(submission)?.submission;
+    let data = DataFolder::open(data)?;
+    let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
+    measure(
+        &Run {
+            version: crate::VERSION.into(),
+            data: data.root().to_owned(),
+            layout: data.layout().clone(),
+            submission,
+            format: catalogue_format.unwrap_or_default(),
+        },
+        &data,
+        out,
+        sets,
+        threads.number(),
+    )
+}
+
+/// Measures with a progress bar and says what was done.
+pub(super) fn measure(
+    run: &Run,
+    data: &DataFolder,
+    out: &std::path::Path,
+    sets: &[u32],
+    threads: usize,
+) -> anyhow::Result<()> {
+    let mut bar = Bar::new("measuring", galaxies_to_do(run, data, out, sets)?);
+    let start = std::time::Instant::now();
+    let summary = measure_folder(run, data, out, sets, threads, &mut bar)?;
+    drop(bar);
+    let seconds = start.elapsed().as_secs_f64();
+    eprintln!(
+        "{}: {} images ({} galaxies, {} flagged) measured in {seconds:.1} s, {:.0} µs a galaxy and thread; {} there already, in {}",
+        run.submission.name,
+        summary.images,
+        summary.galaxies,
+        summary.flagged,
+        1e6 * seconds * threads as f64 / (summary.galaxies.max(1)) as f64,
+        summary.already,
+        out.display()
+    );
+    Ok(())
+}

@@ -1,0 +1,68 @@
+//! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage.
+
+mod arguments;
+mod compare;
+mod measure;
+mod progress;
+mod quickstart;
+mod score;
+mod show;
+mod simulate;
+mod submissions;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Score and submit weak-lensing shape measurements, and measure them by Hopfield-network
+/// deconvolution.
+///
+/// Start with `shearq quickstart`. The chain in steps: `simulate` writes GREAT10-like sets (or bring
+/// your own), `measure` turns images into catalogues by a named submission, `score` turns catalogues
+/// into Q, M/2 and √A, `compare` puts variants side by side.
+#[derive(Debug, Parser)]
+#[command(name = "shearq", version, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Quickstart(quickstart::Arguments),
+    Simulate(simulate::Arguments),
+    Measure(measure::Arguments),
+    Score(score::Arguments),
+    Compare(compare::Arguments),
+    Show(show::Arguments),
+    Submissions(submissions::Arguments),
+}
+
+/// Parses the arguments, runs the command and reports its error, if any, in one place.
+pub fn main() -> ExitCode {
+    let result = match Cli::parse().command {
+        Command::Quickstart(arguments) => quickstart::run(&arguments),
+        Command::Simulate(arguments) => simulate::run(&arguments),
+        Command::Measure(arguments) => measure::run(&arguments),
+        Command::Score(arguments) => score::run(&arguments),
+        Command::Compare(arguments) => compare::run(&arguments),
+        Command::Show(arguments) => show::run(&arguments),
+        Command::Submissions(arguments) => submissions::run(&arguments),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Prints results to standard output; a reader that has gone away (`| head`) is no error.
+fn print(text: &str) -> anyhow::Result<()> {
+    use std::io::Write;
+    match std::io::stdout().write_all(text.as_bytes()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
+        _ => Ok(()),
+    }
+}

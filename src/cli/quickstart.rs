@@ -1,0 +1,94 @@
+//! `shearq quickstart`.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use shearq_scoring::Options;
+use shearq_submissions::Registry;
+
+use super::arguments::Threads;
+use super::progress::Bar;
+use super::{compare, measure, print};
+use crate::io::layout::DataFolder;
+use crate::io::run::Run;
+use crate::io::table::Format;
+use crate::pipeline::score::score_folder;
+use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
+use crate::report::scores::per_set;
+use crate::report::table::TableFormat;
+use crate::simulate::field::ShearSpectrum;
+use crate::simulate::set::SimulationSettings;
+
+/// The whole chain on a small simulated default: simulate, measure with two submissions, score,
+/// compare. Takes well under two minutes.
+///
+/// It runs what these commands would: `simulate --sets 2,8 --images 10 --grid 40 --seed 2013`, then
+/// `measure` and `score` with 23/raw/star and 23/den/star, then `compare`. The data are simulated,
+/// and few: the errors printed are what tells whether a difference is one.
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Folder to write to.
+    #[arg(long, value_name = "DIR", default_value = "shearq-quickstart")]
+    out: PathBuf,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+const SETS: [u32; 2] = [2, 8];
+const IMAGES: u32 = 10;
+const GRID: usize = 40;
+const SEED: u64 = 2013;
+const SUBMISSIONS: [&str; 2] = ["23/raw/star", "23/den/star"];
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let Arguments { out, threads } = arguments;
+    let threads = threads.number();
+    let data = DataFolder::new(out.join("data"));
+    let record = SimulationRecord {
+        version: crate::VERSION.into(),
+        settings: SimulationSettings {
+            seed: SEED,
+            grid: GRID,
+            spectrum: ShearSpectrum::default(),
+            intrinsic_sigma: super::simulate::INTRINSIC_SIGMA,
+        },
+    };
+    let galaxies = (SETS.len() * IMAGES as usize * GRID * GRID) as u64;
+    let mut bar = Bar::new("simulating", galaxies);
+    simulate_folder(&record, &SETS, IMAGES, &data, threads, &mut bar)?;
+    drop(bar);
+    eprintln!(
+        "simulated sets {SETS:?}, {IMAGES} images of {GRID} × {GRID} galaxies each, in {}",
+        data.root().display()
+    );
+    let registry = Registry::embedded()?;
+    let options = Options::default();
+    let mut folders = Vec::new();
+    for name in SUBMISSIONS {
+        let folder = out.join(name.replace('/', "-"));
+        let run = Run {
+            version: crate::VERSION.into(),
+            data: data.root().to_owned(),
+            layout: data.layout().clone(),
+            submission: registry.get(name)?.submission,
+            format: Format::default(),
+        };
+        measure::measure(&run, &data, &folder, &[], threads)?;
+        let scored = score_folder(&data, &folder, &run, &[], options, threads)?;
+        let title = format!("Scores of {name} (simulated data)");
+        let table = per_set(&scored, &title, options.definition, options.choice);
+        print(&format!("{}\n", table.render(TableFormat::Table)))?;
+        folders.push(folder);
+    }
+    let table = compare::table(&folders, None, options, threads)?;
+    print(&table.render(TableFormat::Table))?;
+    eprintln!("\nNext: {}", next_step(out));
+    Ok(())
+}
+
+fn next_step(out: &Path) -> String {
+    format!(
+        "shearq show --submission 23/den/star --data {} --galaxy 8/1/1 --out galaxy.png",
+        out.join("data").display()
+    )
+}

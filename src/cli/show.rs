@@ -1,0 +1,140 @@
+//! `shearq show`.
+
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use anyhow::Context;
+use clap::Args;
+use shearq_submissions::Registry;
+
+use crate::io::layout::DataFolder;
+use crate::pipeline::galaxy::{Measurement, Measurer};
+use crate::pipeline::measure::{ImageId, ImageSource, psf_of};
+use crate::report::figure::{
+    ColourMap, Figure, ImageGrid, ImagePanel, ImageRow, Scale, Stretch,
+};
+
+/// Draw the steps of galaxies like the paper's Fig. 3: stamp, PSF, deconvolved, residual, ACF,
+/// clipped ACF.
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Name of a submission or a TOML file of your own.
+    #[arg(long, value_name = "NAME|FILE")]
+    submission: String,
+    /// Data folder.
+    #[arg(long, value_name = "DIR")]
+    data: PathBuf,
+    /// Galaxies; INDEX counts from 1 along the rows of the grid. May be given several times.
+    #[arg(long, value_name = "SET/IMAGE/INDEX", required = true)]
+    galaxy: Vec<GalaxyId>,
+    /// Picture to write, .png or .svg.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+}
+
+/// A galaxy on the command line.
+#[derive(Debug, Clone, Copy)]
+struct GalaxyId {
+    image: ImageId,
+    index: usize,
+}
+
+impl FromStr for GalaxyId {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers: Option<Vec<u32>> = text
+            .split('/')
+            .map(|part| part.parse().ok().filter(|n| *n >= 1))
+            .collect();
+        match numbers.as_deref() {
+            Some(&[set, image, index]) => Ok(GalaxyId {
+                image: ImageId { set, image },
+                index: index as usize,
+            }),
+            _ => Err("expected SET/IMAGE/INDEX, three numbers from 1".into()),
+        }
+    }
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let Arguments {
+        submission,
+        data,
+        galaxy,
+        out,
+    } = arguments;
+    let submission = Registry::embedded()?.get(submission)?.submission;
+    let data = DataFolder::open(data)?;
+    let mut rows = Vec::new();
+    for &GalaxyId { image, index } in galaxy {
+        let mut source = ImageSource::open(&data, image, &submission)?;
+        let grid = source.grid();
+        anyhow::ensure!(
+            index <= grid.cells(),
+            "set {} image {} has {} galaxies; galaxy {index} was asked for",
+            image.set,
+            image.image,
+            grid.cells()
+        );
+        let (ix, iy) = ((index - 1) % grid.n, (index - 1) / grid.n);
+        let row = loop {
+            let row = source.next_row()?.context("the image ended before the galaxy")?;
+            if row.iy == iy {
+                break row;
+            }
+        };
+        let psf = psf_of(&row, ix, submission.psf.size)
+            .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
+        let measurer = Measurer::new(&submission, row.stamp)?;
+        let mut scratch = measurer.scratch();
+        measurer.set_psf(&mut scratch, Some(psf.view()));
+        let pixels = &row.pixels[ix * row.stamp..];
+        let stride = grid.n * row.stamp;
+        let measured = measurer.measure(pixels, stride, row.header_noise, &mut scratch);
+        anyhow::ensure!(
+            measured.outcome.is_some(),
+            "galaxy {index} could not be measured: flag {}",
+            measured.flag
+        );
+        let steps = measurer.steps(pixels, stride, psf.view(), &measured, &scratch);
+        let panel = |title: &str, image, map, stretch| ImagePanel {
+            title: title.into(),
+            image,
+            map,
+            stretch,
+            limits: None,
+        };
+        use ColourMap::{Diverging, Viridis};
+        rows.push(ImageRow {
+            label: format!("{}/{}/{index}", image.set, image.image),
+            panels: vec![
+                panel("Stamp", steps.raw, Viridis, Stretch::Linear),
+                panel("PSF", psf, Viridis, Stretch::Asinh),
+                panel("Deconvolved", steps.deconvolved, Viridis, Stretch::Linear),
+                panel("Residual", steps.residual, Diverging, Stretch::Linear),
+                panel("ACF", steps.acf, Viridis, Stretch::Linear),
+                panel("ACF clipped", steps.clipped, Viridis, Stretch::Linear),
+            ],
+        });
+        println!("{}", describe(image, index, &measured));
+    }
+    let figure = ImageGrid {
+        title: format!("{} (shearq {})", submission.name, crate::VERSION),
+        rows,
+        scale: Scale::Own,
+    };
+    figure.save(out)?;
+    eprintln!("wrote {}", out.display());
+    Ok(())
+}
+
+fn describe(id: ImageId, index: usize, m: &Measurement) -> String {
+    let stop = m
+        .outcome
+        .map_or_else(String::new, |o| format!("{} iterations, {:?}", o.iterations, o.stop));
+    format!(
+        "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4}, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",
+        id.set, id.image, m.e1, m.e2, m.flag, m.noise, m.radius
+    )
+}

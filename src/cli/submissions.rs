@@ -1,0 +1,121 @@
+//! `shearq submissions`.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+use shearq_submissions::{DenoiseMethod, PsfForm, Registry, TEMPLATE};
+
+use super::print;
+use crate::io::atomic;
+use crate::report::table::{Cell, Heading, Table, TableFormat};
+
+/// List, show and start submission configurations.
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// The embedded submissions with their published figures.
+    List {
+        /// How to print.
+        #[arg(long, value_enum, default_value_t)]
+        format: TableFormat,
+    },
+    /// All settings of a submission, resolved, as TOML.
+    Show {
+        /// Name or file.
+        #[arg(value_name = "NAME|FILE")]
+        name: String,
+    },
+    /// Write a commented configuration of your own to start from.
+    Init {
+        /// File to write; it must not exist.
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+    },
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    match &arguments.command {
+        Command::List { format } => print(&list()?.render(*format)),
+        Command::Show { name } => {
+            let entry = Registry::embedded()?.get(name)?;
+            let mut text = toml::to_string(&entry.submission)?;
+            if let Some(published) = entry.published {
+                text.push_str(&format!("\n[published]\n{}", toml::to_string(&published)?));
+            }
+            print(&text)
+        }
+        Command::Init { file } => {
+            anyhow::ensure!(
+                !file.exists(),
+                "{}: the file exists; expected a new one",
+                file.display()
+            );
+            atomic::write(file, template().as_bytes())?;
+            eprintln!("wrote {}", file.display());
+            Ok(())
+        }
+    }
+}
+
+/// The base's commented settings as a file of the user's, to be changed or thinned out.
+fn template() -> String {
+    let rest = TEMPLATE
+        .lines()
+        .filter(|line| !line.starts_with("name =") && !line.starts_with("description ="))
+        .collect::<Vec<_>>()
+        .join("\n");
+    let (comments, sections) = rest.split_once("\n\n").unwrap_or(("", &rest));
+    format!("{comments}\nextends = \"paper\"\ndescription = \"my own variant\"\n\n{sections}\n")
+}
+
+fn list() -> anyhow::Result<Table> {
+    let registry = Registry::embedded()?;
+    let mut rows = Vec::new();
+    for name in registry.names() {
+        let entry = registry.get(name)?;
+        let s = &entry.submission;
+        let published = |value: fn(&shearq_submissions::Published) -> f64| {
+            entry.published.as_ref().map_or(f64::NAN, value)
+        };
+        rows.push(vec![
+            Cell::text(name),
+            Cell::text(format!("{0}×{0}", s.stamp.size)),
+            Cell::text(match s.denoise.method {
+                DenoiseMethod::None => "raw",
+                DenoiseMethod::WaveletWiener => "denoised",
+            }),
+            Cell::text(match s.psf.form {
+                PsfForm::Star => "star",
+                PsfForm::Functional => "functional",
+            }),
+            Cell::number(published(|p| p.m_half), 4),
+            Cell::number(published(|p| p.sqrt_a), 4),
+            Cell::number(published(|p| p.q), 2),
+            Cell::text(&s.description),
+        ]);
+    }
+    let headings = [
+        ("name", "Name"),
+        ("stamp", "Stamp"),
+        ("data", "Data"),
+        ("psf", "PSF"),
+        ("m_half_published", "M/2 publ."),
+        ("sqrt_a_published", "√A×10⁴ publ."),
+        ("q_published", "Q publ."),
+        ("description", "Description"),
+    ];
+    Ok(Table {
+        title: "Submissions".into(),
+        headings: headings
+            .iter()
+            .map(|(key, label)| Heading::new(key, *label))
+            .collect(),
+        rows,
+        notes: vec!["Published: Table 1 of the paper.".into()],
+    })
+}

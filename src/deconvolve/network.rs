@@ -1,0 +1,298 @@
+//! The working network: planned once per stamp and PSF size, run per galaxy.
+
+use ndarray::ArrayView2;
+use shearq_submissions::Start;
+
+use super::kernel::{Buffers, Level, Real};
+use super::operator::{Operator, OperatorError};
+use super::{Outcome, Rule};
+
+/// A network for one stamp size, PSF size and λ, holding one PSF at a time.
+///
+/// Running it needs a [`NetworkScratch`] of the caller and allocates nothing. The network itself is
+/// not changed by a run, so one can serve many threads.
+#[derive(Debug, Clone)]
+pub struct Network<T> {
+    operator: Operator<T>,
+    level: Level,
+}
+
+/// Buffers for one thread's runs. Their content between runs does not matter.
+#[derive(Debug, Clone)]
+pub struct NetworkScratch<T> {
+    buffers: Buffers<T>,
+}
+
+impl<T: Real> Network<T> {
+    /// Plans for n×n stamps and p×p PSFs; the PSF is zero until [`Network::set_psf`].
+    ///
+    /// # Errors
+    /// Where a size is out of range.
+    pub fn plan(n: usize, p: usize, lambda: f64) -> Result<Self, OperatorError> {
+        Ok(Network {
+            operator: Operator::new(n, p, lambda)?,
+            level: Level::detect(),
+        })
+    }
+
+    /// Takes a PSF; it is used as it is, so it should sum to one.
+    ///
+    /// # Errors
+    /// Where its size is not the planned one or a pixel is not finite.
+    pub fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), OperatorError> {
+        self.operator.set_psf(psf)
+    }
+
+    /// Stamp side n.
+    pub fn stamp_size(&self) -> usize {
+        self.operator.n
+    }
+
+    /// PSF side p.
+    pub fn psf_size(&self) -> usize {
+        self.operator.p
+    }
+
+    /// Thresholds TH_i (Eq. 9) for a unit of brightness of one, row-major.
+    pub fn thresholds(&self) -> &[T] {
+        &self.operator.thresholds
+    }
+
+    /// Buffers that fit this network.
+    pub fn scratch(&self) -> NetworkScratch<T> {
+        NetworkScratch {
+            buffers: Buffers::new(self.operator.n, self.operator.p),
+        }
+    }
+
+    /// Deconvolves the row-major n×n stamp `u0` into `out`.
+    ///
+    /// # Panics
+    /// Where `u0` or `out` does not have n² pixels, or the scratch is of another network's sizes.
+    pub fn deconvolve(
+        &self,
+        rule: &Rule,
+        u0: &[T],
+        scratch: &mut NetworkScratch<T>,
+        out: &mut [T],
+    ) -> Outcome {
+        let n = self.operator.n;
+        let b = &mut scratch.buffers;
+        assert_eq!(u0.len(), n * n, "stamp of {n} × {n} pixels");
+        b.data.copy_from_slice(u0);
+        let flat = match rule.start {
+            Start::Flat => {
+                let mean = u0.iter().map(|u| u.to_f64()).sum::<f64>() / (n * n) as f64;
+                T::from_f64(mean.max(0.0))
+            }
+            Start::ClippedData | Start::Zero => T::ZERO,
+        };
+        for (y, row) in u0.chunks_exact(n).enumerate() {
+            let state = b.state.row_mut(y);
+            match rule.start {
+                Start::ClippedData => {
+                    for (v, &u) in state.iter_mut().zip(row) {
+                        *v = if u > T::ZERO { u } else { T::ZERO };
+                    }
+                }
+                Start::Flat | Start::Zero => state.fill(flat),
+            }
+        }
+        let outcome = self.level.run(&self.operator, rule, b);
+        for (y, row) in out.chunks_exact_mut(n).enumerate() {
+            row.copy_from_slice(b.state.row(y));
+        }
+        outcome
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::{Array2, ArrayView2};
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use shearq_submissions::Start;
+
+    use super::*;
+    use crate::deconvolve::reference::Matrices;
+    use crate::deconvolve::{Step, Stop};
+
+    fn random(rng: &mut ChaCha8Rng, n: usize) -> Array2<f64> {
+        Array2::from_shape_fn((n, n), |_| rng.random_range(-1.0..1.0))
+    }
+
+    /// A lopsided PSF of sum one: an asymmetric blob and noise, so that a turned or transposed
+    /// operator shows.
+    fn psf(rng: &mut ChaCha8Rng, p: usize) -> Array2<f64> {
+        let centre = p as f64 / 2.0;
+        let blob = Array2::from_shape_fn((p, p), |(y, x)| {
+            let (dy, dx) = (y as f64 - centre, x as f64 - centre + 0.7);
+            (-(dx * dx + 0.6 * dy * dy + 0.5 * dx * dy) / 4.0).exp()
+        });
+        let psf = blob + random(rng, p).mapv(|v| 0.01 * v.abs());
+        let sum = psf.sum();
+        psf / sum
+    }
+
+    /// A galaxy-like stamp with noise of σ = 1.
+    fn stamp(rng: &mut ChaCha8Rng, n: usize) -> Array2<f64> {
+        let centre = (n as f64 - 1.0) / 2.0 + 0.3;
+        random(rng, n) * 1.7
+            + Array2::from_shape_fn((n, n), |(y, x)| {
+                let (dy, dx) = (y as f64 - centre, x as f64 - centre);
+                6.0 * (-(dx * dx + dy * dy - 0.6 * dx * dy) / 12.0).exp()
+            })
+    }
+
+    struct Case {
+        n: usize,
+        p: usize,
+        lambda: f64,
+        rule: Rule,
+    }
+
+    fn run<T: Real>(case: &Case, psf: ArrayView2<'_, f64>, u0: &Array2<f64>) -> (Vec<f64>, Outcome) {
+        let mut network = Network::<T>::plan(case.n, case.p, case.lambda).unwrap();
+        network.set_psf(psf).unwrap();
+        let mut scratch = network.scratch();
+        let mut out = vec![T::ZERO; case.n * case.n];
+        let data: Vec<T> = u0.iter().map(|&v| T::from_f64(v)).collect();
+        // A first run on other data leaves its traces in the scratch.
+        let dirt: Vec<T> = data.iter().rev().map(|v| T::from_f64(9.0 * v.to_f64())).collect();
+        network.deconvolve(&case.rule, &dirt, &mut scratch, &mut out);
+        let outcome = network.deconvolve(&case.rule, &data, &mut scratch, &mut out);
+        (out.iter().map(|v| v.to_f64()).collect(), outcome)
+    }
+
+    fn largest(a: &[f64], b: &Array2<f64>) -> f64 {
+        a.iter().zip(b).map(|(x, y)| (x - y).abs()).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn matches_the_matrices_over_sizes_updates_and_regularisation() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let sizes = [
+            (5, 3), (5, 4), (5, 15), (7, 25), (11, 5), (16, 15), (17, 16), (19, 15), (23, 15),
+            (23, 25), (29, 15), (32, 8), (33, 21), (48, 15), (48, 25),
+        ];
+        for (k, (n, p)) in sizes.into_iter().enumerate() {
+            let psf = psf(&mut rng, p);
+            let u0 = stamp(&mut rng, n);
+            let lambdas = if n > 30 { vec![0.3] } else { vec![0.0, 1e-4, 1.0] };
+            for lambda in lambdas {
+                let matrices = Matrices::new(n, psf.view(), lambda);
+                for step in [Step::Adaptive(0.9), Step::Adaptive(0.05), Step::Constant(0.03)] {
+                    let start = [Start::ClippedData, Start::Flat, Start::Zero][k % 3];
+                    let rule = Rule { step, unit: 0.03, max_iterations: 12, start };
+                    let case = Case { n, p, lambda, rule };
+                    let (expected, reference) = matrices.deconvolve(&rule, u0.view());
+                    let (found, outcome) = run::<f64>(&case, psf.view(), &u0);
+                    let label = format!("n {n}, p {p}, λ {lambda}, {step:?}, {start:?}");
+                    assert_eq!(outcome.iterations, reference.iterations, "{label}");
+                    assert_eq!(outcome.stop, reference.stop, "{label}");
+                    assert_eq!(outcome.updated, reference.updated, "{label}");
+                    // Same operations in another order: f64 rounding of sums of 10³ terms of
+                    // order ten, carried through twelve steps.
+                    assert!(largest(&found, &expected) < 1e-11, "{label}");
+                    let scale = reference.energy.abs().max(1.0);
+                    assert!((outcome.energy - reference.energy).abs() < 1e-10 * scale, "{label}");
+                    assert!((outcome.first_energy - reference.first_energy).abs() < 1e-10 * scale);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn thresholds_are_half_the_diagonal_of_the_weights() {
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        for (n, p) in [(5, 9), (12, 4), (13, 7)] {
+            let psf = psf(&mut rng, p);
+            let matrices = Matrices::new(n, psf.view(), 0.7);
+            let mut network = Network::<f64>::plan(n, p, 0.7).unwrap();
+            network.set_psf(psf.view()).unwrap();
+            for (a, b) in network.thresholds().iter().zip(matrices.thresholds()) {
+                assert!((a - b).abs() < 1e-14);
+            }
+        }
+    }
+
+    #[test]
+    fn single_precision_stays_within_its_rounding() {
+        // Without thresholds (a vanishing unit) no decision can flip, and the difference is the
+        // rounding of f32 (6e-8) over sums of a few hundred terms of order ten, times the steps.
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        for (n, p) in [(19, 15), (23, 15), (29, 15), (48, 25)] {
+            let psf = psf(&mut rng, p);
+            let u0 = stamp(&mut rng, n);
+            let rule = Rule {
+                step: Step::Adaptive(0.9),
+                unit: 1e-30,
+                max_iterations: 20,
+                start: Start::ClippedData,
+            };
+            let case = Case { n, p, lambda: 1e-4, rule };
+            let (double, a) = run::<f64>(&case, psf.view(), &u0);
+            let (single, b) = run::<f32>(&case, psf.view(), &u0);
+            assert_eq!((a.iterations, a.stop), (b.iterations, b.stop));
+            let peak = double.iter().copied().fold(0.0, f64::max);
+            let worst = double.iter().zip(&single).map(|(x, y)| (x - y).abs()).fold(0.0, f64::max);
+            assert!(worst < 3e-6 * peak, "n {n}: {worst} of {peak}");
+        }
+    }
+
+    #[test]
+    fn every_stop_occurs_and_is_reported() {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let psf = psf(&mut rng, 7);
+        let u0 = stamp(&mut rng, 15);
+        let outcome = |step, unit, max_iterations| {
+            let rule = Rule { step, unit, max_iterations, start: Start::ClippedData };
+            run::<f32>(&Case { n: 15, p: 7, lambda: 0.0, rule }, psf.view(), &u0).1
+        };
+        let all = outcome(Step::Adaptive(0.5), 0.01, 5);
+        assert_eq!((all.stop, all.iterations), (Stop::MaxIterations, 5));
+        assert!(all.energy < all.first_energy);
+        // A unit so large that no gradient reaches its threshold.
+        let stable = outcome(Step::Adaptive(0.5), 1e6, 50);
+        assert_eq!((stable.stop, stable.iterations, stable.updated), (Stop::Stable, 0, 0));
+        // A step beyond the stability limit of 2 over the largest eigenvalue.
+        let rise = outcome(Step::Adaptive(50.0), 0.01, 50);
+        assert_eq!(rise.stop, Stop::EnergyRise);
+        assert!(rise.energy <= rise.first_energy);
+    }
+
+    #[test]
+    fn every_instruction_set_of_this_machine_agrees() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let psf = psf(&mut rng, 15);
+        let u0: Vec<f32> = stamp(&mut rng, 23).iter().map(|&v| v as f32).collect();
+        let rule = Rule {
+            step: Step::Adaptive(0.9),
+            unit: 1e-30,
+            max_iterations: 10,
+            start: Start::ClippedData,
+        };
+        let mut network = Network::<f32>::plan(23, 15, 1e-4).unwrap();
+        network.set_psf(psf.view()).unwrap();
+        let mut scratch = network.scratch();
+        let (mut best, mut plain) = (vec![0.0; 529], vec![0.0; 529]);
+        network.deconvolve(&rule, &u0, &mut scratch, &mut best);
+        network.level = Level::Baseline;
+        network.deconvolve(&rule, &u0, &mut scratch, &mut plain);
+        // Fused and unfused products differ by f32 rounding.
+        let worst = best.iter().zip(&plain).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(worst < 1e-4, "{worst}");
+    }
+
+    #[test]
+    fn unusable_psfs_are_refused() {
+        let mut network = Network::<f32>::plan(15, 5, 0.0).unwrap();
+        assert!(network.set_psf(Array2::zeros((5, 7)).view()).is_err());
+        let mut psf = Array2::from_elem((5, 5), 0.04);
+        psf[(1, 2)] = f64::NAN;
+        let message = network.set_psf(psf.view()).unwrap_err().to_string();
+        assert!(message.contains("(3, 2)"), "{message}");
+        assert!(Network::<f32>::plan(2, 5, 0.0).is_err());
+        assert!(Network::<f32>::plan(15, 49, 0.0).is_err());
+    }
+}

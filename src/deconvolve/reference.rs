@@ -1,0 +1,130 @@
+//! The network written as its equations: dense matrices, f64, no short cuts.
+//!
+//! It is the oracle of the working kernel, and far too slow for anything else: H alone has n⁴
+//! elements.
+
+use ndarray::{Array1, Array2, ArrayView2, arr2};
+use shearq_submissions::Start;
+
+use super::{Outcome, Rule, SUN_KERNEL, Step, Stop};
+
+/// The n²×n² matrix of the convolution of an n×n image with `kernel` under a zero boundary: a block
+/// Toeplitz matrix of Toeplitz blocks (Sect. 2.1, Fig. 1).
+pub fn toeplitz(n: usize, kernel: ArrayView2<'_, f64>) -> Array2<f64> {
+    let (cy, cx) = (kernel.nrows() / 2, kernel.ncols() / 2);
+    let mut matrix = Array2::zeros((n * n, n * n));
+    for y in 0..n {
+        for x in 0..n {
+            for ((j, i), &value) in kernel.indexed_iter() {
+                // (Hv)[y, x] takes v[y − (j − c), x − (i − c)].
+                let (sy, sx) = ((y + cy).wrapping_sub(j), (x + cx).wrapping_sub(i));
+                if sy < n && sx < n {
+                    matrix[(y * n + x, sy * n + sx)] = value;
+                }
+            }
+        }
+    }
+    matrix
+}
+
+/// D: the same matrix for Sun's 3×3 high-pass kernel (Sect. 3.1).
+pub fn high_pass(n: usize) -> Array2<f64> {
+    toeplitz(n, arr2(&SUN_KERNEL).view())
+}
+
+/// The matrices of one stamp size and PSF.
+#[derive(Debug, Clone)]
+pub struct Matrices {
+    n: usize,
+    h: Array2<f64>,
+    /// W + λG, with W = HᵀH and G = DᵀD (Eq. 8).
+    weights: Array2<f64>,
+    /// TH_i = ½|W_ii + λG_ii| (Eq. 9).
+    thresholds: Array1<f64>,
+}
+
+impl Matrices {
+    /// Builds H, W, G and the thresholds for n×n stamps.
+    pub fn new(n: usize, psf: ArrayView2<'_, f64>, lambda: f64) -> Self {
+        let h = toeplitz(n, psf);
+        let mut weights = h.t().dot(&h);
+        if lambda != 0.0 {
+            let d = high_pass(n);
+            weights.scaled_add(lambda, &d.t().dot(&d));
+        }
+        let thresholds = weights.diag().mapv(|w| 0.5 * w.abs());
+        Matrices {
+            n,
+            h,
+            weights,
+            thresholds,
+        }
+    }
+
+    /// Thresholds TH_i in row-major order, for a unit of brightness of one.
+    pub fn thresholds(&self) -> &Array1<f64> {
+        &self.thresholds
+    }
+
+    /// E(v) (Eq. 7).
+    pub fn energy(&self, q: &Array1<f64>, v: &Array1<f64>) -> f64 {
+        0.5 * v.dot(&self.weights.dot(v)) - q.dot(v)
+    }
+
+    /// Runs the network on the n×n stamp `u0` and returns its last state.
+    pub fn deconvolve(&self, rule: &Rule, u0: ArrayView2<'_, f64>) -> (Array2<f64>, Outcome) {
+        let n = self.n;
+        let u0: Array1<f64> = u0.iter().copied().collect();
+        let q = self.h.t().dot(&u0);
+        let mut v = match rule.start {
+            Start::ClippedData => u0.mapv(|u| u.max(0.0)),
+            Start::Flat => Array1::from_elem(n * n, (u0.sum() / (n * n) as f64).max(0.0)),
+            Start::Zero => Array1::zeros(n * n),
+        };
+        let first_energy = self.energy(&q, &v);
+        let mut outcome = Outcome {
+            iterations: 0,
+            stop: Stop::MaxIterations,
+            first_energy,
+            energy: first_energy,
+            updated: 0,
+        };
+        for _ in 0..rule.max_iterations {
+            // Eq. 11.
+            let f = &q - &self.weights.dot(&v);
+            let mut next = v.clone();
+            outcome.updated = 0;
+            for i in 0..n * n {
+                let threshold = self.thresholds[i] * rule.unit;
+                let change = match rule.step {
+                    Step::Adaptive(c) => c * f[i].abs(),
+                    Step::Constant(delta) => delta,
+                };
+                // Eq. 6.
+                if f[i] < -threshold {
+                    next[i] -= change;
+                    outcome.updated += 1;
+                } else if f[i] > threshold {
+                    next[i] += change;
+                    outcome.updated += 1;
+                }
+                // Eq. 12.
+                next[i] = next[i].max(0.0);
+            }
+            if outcome.updated == 0 {
+                outcome.stop = Stop::Stable;
+                break;
+            }
+            let energy = self.energy(&q, &next);
+            if energy.is_nan() || energy >= outcome.energy {
+                outcome.stop = Stop::EnergyRise;
+                break;
+            }
+            v = next;
+            outcome.energy = energy;
+            outcome.iterations += 1;
+        }
+        let stamp = Array2::from_shape_fn((n, n), |(y, x)| v[y * n + x]);
+        (stamp, outcome)
+    }
+}

@@ -1,0 +1,215 @@
+//! Where the files of a challenge lie, and which conventions they follow.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
+
+use super::error::FileError;
+use super::table;
+
+/// Highest set and image numbers looked for.
+const MAX_NUMBER: u32 = 999;
+
+/// Name of the layout file inside a data folder.
+pub const LAYOUT_FILE: &str = "layout.toml";
+
+/// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for the plain
+/// numbers, `{set:02}` and `{image:03}` for zero-padded ones.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Layout {
+    /// Galaxy images.
+    pub galaxies: String,
+    /// Star stamps.
+    pub psf_star: String,
+    /// Functional PSFs.
+    pub psf_functional: String,
+    /// True shear.
+    pub truth: String,
+    /// Intrinsic and observed ellipticities.
+    pub intrinsic: String,
+    /// Sign of g2 in the truth files.
+    pub truth_sign: TruthSign,
+    /// Side of the field in degrees.
+    pub field_degrees: f64,
+    /// Pixels a side of a stamp, where the image header has no STAMP.
+    pub stamp: usize,
+}
+
+impl Default for Layout {
+    fn default() -> Self {
+        Layout {
+            galaxies: "set{set:02}/galaxies-{image:03}.fits".into(),
+            psf_star: "set{set:02}/psf-{image:03}.fits".into(),
+            psf_functional: "set{set:02}/psf-{image:03}.csv".into(),
+            truth: "set{set:02}/truth.csv".into(),
+            intrinsic: "set{set:02}/intrinsic-{image:03}.csv".into(),
+            truth_sign: TruthSign::Standard,
+            field_degrees: 10.0,
+            stamp: 48,
+        }
+    }
+}
+
+/// A data folder with its layout.
+#[derive(Debug, Clone)]
+pub struct DataFolder {
+    root: PathBuf,
+    layout: Layout,
+}
+
+impl DataFolder {
+    /// Opens a folder, with the layout of its `layout.toml` or the default one.
+    ///
+    /// # Errors
+    /// Where the folder does not exist or its layout file is not valid.
+    pub fn open(root: impl AsRef<Path>) -> Result<Self, FileError> {
+        let root = root.as_ref().to_owned();
+        if !root.is_dir() {
+            return Err(FileError::new(&root, "there is no such folder; expected a data folder"));
+        }
+        let path = root.join(LAYOUT_FILE);
+        let layout = if path.is_file() {
+            let text = std::fs::read_to_string(&path)
+                .map_err(FileError::doing(&path, "cannot read the layout"))?;
+            toml::from_str(&text).map_err(|e| FileError::new(&path, e.to_string().trim_end()))?
+        } else {
+            Layout::default()
+        };
+        Ok(DataFolder { root, layout })
+    }
+
+    /// A folder to be written in the default layout.
+    pub fn new(root: impl AsRef<Path>) -> Self {
+        DataFolder {
+            root: root.as_ref().to_owned(),
+            layout: Layout::default(),
+        }
+    }
+
+    /// The folder.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The layout.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// The galaxy image of a set.
+    pub fn galaxies(&self, set: u32, image: u32) -> PathBuf {
+        self.root.join(fill(&self.layout.galaxies, set, image))
+    }
+
+    /// The star stamps of an image.
+    pub fn psf_star(&self, set: u32, image: u32) -> PathBuf {
+        self.root.join(fill(&self.layout.psf_star, set, image))
+    }
+
+    /// The PSF parameters of an image.
+    pub fn psf_functional(&self, set: u32, image: u32) -> PathBuf {
+        self.root.join(fill(&self.layout.psf_functional, set, image))
+    }
+
+    /// The true shear of a set.
+    pub fn truth(&self, set: u32) -> PathBuf {
+        self.root.join(fill(&self.layout.truth, set, 0))
+    }
+
+    /// The intrinsic ellipticities of an image.
+    pub fn intrinsic(&self, set: u32, image: u32) -> PathBuf {
+        self.root.join(fill(&self.layout.intrinsic, set, image))
+    }
+
+    /// Numbers of the images of a set that are there, in order.
+    pub fn images(&self, set: u32) -> Vec<u32> {
+        let any = self.galaxies(set, 1);
+        if !any.parent().is_some_and(Path::is_dir) {
+            return Vec::new();
+        }
+        (1..=MAX_NUMBER)
+            .filter(|&image| self.galaxies(set, image).is_file())
+            .collect()
+    }
+
+    /// Sets that have an image, in order.
+    pub fn sets(&self) -> Vec<u32> {
+        (1..=99)
+            .filter(|&set| !self.images(set).is_empty())
+            .collect()
+    }
+
+    /// True shear of a set on `grid`.
+    ///
+    /// # Errors
+    /// Where the file cannot be read or does not cover the grid.
+    pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
+        let path = self.truth(set);
+        let rows = read_truth_rows(&path)?;
+        TrueShear::from_rows(grid, self.layout.truth_sign, rows)
+            .map_err(|error| FileError::new(&path, error))
+    }
+}
+
+/// Rows (x, y, g1, g2) of a truth file: CSV with that header, or ASCII columns in that order.
+///
+/// # Errors
+/// Where the file cannot be read.
+pub fn read_truth_rows(path: &Path) -> Result<Vec<Row>, FileError> {
+    let has_header = std::fs::read(path)
+        .map_err(FileError::doing(path, "cannot read the true shear"))?
+        .iter()
+        .take(4096)
+        .any(|&b| b == b'g');
+    let names = if has_header {
+        ["x", "y", "g1", "g2"]
+    } else {
+        ["x", "y", "e1", "e2"]
+    };
+    read_rows(path, &names)
+}
+
+/// Rows of a catalogue from four named columns.
+///
+/// # Errors
+/// Where the file cannot be read or a column is absent.
+pub fn read_rows(path: &Path, names: &[&str; 4]) -> Result<Vec<Row>, FileError> {
+    let mut table = table::read(path, Some(names))?;
+    let mut column = |name: &str| table.take_real(name).unwrap_or_default();
+    let (x, y, e1, e2) = (
+        column(names[0]),
+        column(names[1]),
+        column(names[2]),
+        column(names[3]),
+    );
+    Ok((0..x.len())
+        .map(|k| Row {
+            x: x[k],
+            y: y[k],
+            e1: e1[k],
+            e2: e2[k],
+        })
+        .collect())
+}
+
+/// Replaces the numbers in a pattern.
+pub fn fill(pattern: &str, set: u32, image: u32) -> String {
+    pattern
+        .replace("{set:02}", &format!("{set:02}"))
+        .replace("{image:03}", &format!("{image:03}"))
+        .replace("{set}", &set.to_string())
+        .replace("{image}", &image.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn patterns_take_plain_and_padded_numbers() {
+        assert_eq!(fill("set{set:02}/galaxies-{image:03}.fits", 7, 12), "set07/galaxies-012.fits");
+        assert_eq!(fill("g10_v1_objs_{set}_{image}.me.dat", 7, 12), "g10_v1_objs_7_12.me.dat");
+    }
+}

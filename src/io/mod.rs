@@ -1,0 +1,17 @@
+//! Files: FITS, Parquet, ASCII and CSV, the layout of challenge data, and what made a result.
+//!
+//! [`fits`] is the only user of cfitsio and serialises its calls; `parquet` the only user of
+//! polars. Every file is written under a temporary name and renamed when whole ([`atomic`]).
+
+pub mod atomic;
+pub mod error;
+pub mod fits;
+pub mod layout;
+#[cfg(feature = "parquet")]
+mod parquet;
+pub mod psf_table;
+pub mod run;
+pub mod table;
+mod text;
+
+pub use error::FileError;

@@ -1,0 +1,52 @@
+//! Parquet tables, by way of the crate that holds polars.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use shearq_tables as tables;
+
+use super::atomic;
+use super::error::FileError;
+use super::table::{Column, Table};
+
+/// Reads columns as real numbers.
+pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
+    let table = tables::read_parquet(path, wanted).map_err(|error| bare(path, &error))?;
+    let columns = table
+        .columns()
+        .iter()
+        .filter_map(|(name, column)| Some((name.clone(), Column::Real(column.to_f64()?))))
+        .collect();
+    Table::new(columns).map_err(|message| FileError::new(path, message))
+}
+
+/// Writes the table with its metadata in the footer.
+pub(super) fn write(
+    path: &Path,
+    table: Table,
+    metadata: &BTreeMap<String, String>,
+) -> Result<(), FileError> {
+    let columns = table
+        .columns()
+        .iter()
+        .map(|(name, column)| {
+            let column = match column {
+                Column::Real(values) => tables::Column::F64(values.clone()),
+                Column::Whole(values) => tables::Column::I64(values.clone()),
+            };
+            (name.clone(), column)
+        })
+        .collect();
+    let table =
+        tables::Table::new(columns, metadata.clone()).map_err(|error| bare(path, &error))?;
+    let mut bytes = Vec::new();
+    tables::write_parquet(&mut bytes, &table).map_err(|error| bare(path, &error))?;
+    atomic::write(path, &bytes)
+}
+
+/// The crate's errors name the file already; keep the name once.
+fn bare(path: &Path, error: &tables::TableError) -> FileError {
+    let message = error.to_string();
+    let prefix = format!("{}: ", path.display());
+    FileError::new(path, message.strip_prefix(&prefix).unwrap_or(&message))
+}

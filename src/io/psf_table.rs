@@ -1,0 +1,96 @@
+//! The functional form of PSFs: CSV with x, y, profile, beta, fwhm, e1, e2.
+
+use std::path::Path;
+
+use shearq_scoring::{Grid, Shear};
+
+use super::atomic;
+use super::error::FileError;
+use crate::psf::functional::{FunctionalPsf, PsfProfile};
+
+/// Header of the table.
+const HEADER: &str = "x,y,profile,beta,fwhm,e1,e2";
+
+/// PSFs of an image: one, or one per galaxy in the order `iy·n + ix`.
+///
+/// # Errors
+/// Where the file cannot be read, a row is not valid, or the rows are neither one nor one per
+/// galaxy of the grid.
+pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
+    let text = std::fs::read_to_string(path)
+        .map_err(FileError::doing(path, "cannot read the PSF parameters"))?;
+    let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
+    let header = lines.next().map_or("", |(_, line)| line.trim());
+    if header != HEADER {
+        return Err(FileError::new(
+            path,
+            format!("the header is `{header}`; expected `{HEADER}`"),
+        ));
+    }
+    let mut rows = Vec::new();
+    for (number, line) in lines {
+        let wrong = |what: String| FileError::new(path, format!("line {}: {what}", number + 1));
+        let fields: Vec<&str> = line.split(',').map(str::trim).collect();
+        let &[x, y, profile, beta, fwhm, e1, e2] = fields.as_slice() else {
+            return Err(wrong(format!("{} fields; expected 7", fields.len())));
+        };
+        let parse = |name: &str, field: &str| {
+            field
+                .parse::<f64>()
+                .map_err(|_| wrong(format!("`{field}` in column `{name}` is not a number")))
+        };
+        let profile = match profile {
+            "moffat" => PsfProfile::Moffat {
+                beta: parse("beta", beta)?,
+            },
+            "kolmogorov" => PsfProfile::Kolmogorov,
+            other => {
+                return Err(wrong(format!(
+                    "the profile is `{other}`; expected `moffat` or `kolmogorov`"
+                )));
+            }
+        };
+        let shape = Shear::new(parse("e1", e1)?, parse("e2", e2)?);
+        let psf = FunctionalPsf::new(profile, parse("fwhm", fwhm)?, shape)
+            .map_err(|error| wrong(error.to_string()))?;
+        rows.push(((parse("x", x)?, parse("y", y)?), psf));
+    }
+    if let [(_, psf)] = rows.as_slice() {
+        return Ok(vec![*psf]);
+    }
+    let mut field = vec![None; grid.cells()];
+    for ((x, y), psf) in &rows {
+        let (ix, iy) = grid.cell(*x, *y).ok_or_else(|| {
+            FileError::new(path, format!("the position ({x}, {y}) is outside the grid"))
+        })?;
+        field[iy * grid.n + ix] = Some(*psf);
+    }
+    field.into_iter().collect::<Option<Vec<_>>>().ok_or_else(|| {
+        FileError::new(
+            path,
+            format!(
+                "{} rows; expected one, or one for each of the {} galaxies",
+                rows.len(),
+                grid.cells()
+            ),
+        )
+    })
+}
+
+/// Writes PSFs with their positions.
+///
+/// # Errors
+/// Where the file cannot be written.
+pub fn write(path: &Path, rows: &[((f64, f64), FunctionalPsf)]) -> Result<(), FileError> {
+    let mut text = format!("{HEADER}\n");
+    for ((x, y), psf) in rows {
+        // A Kolmogorov PSF has no β; the column keeps the place with that of a Moffat.
+        let (profile, beta) = match psf.profile {
+            PsfProfile::Moffat { beta } => ("moffat", beta),
+            PsfProfile::Kolmogorov => ("kolmogorov", 3.0),
+        };
+        let (fwhm, e1, e2) = (psf.fwhm, psf.shape.e1, psf.shape.e2);
+        text.push_str(&format!("{x},{y},{profile},{beta},{fwhm},{e1},{e2}\n"));
+    }
+    atomic::write(path, text.as_bytes())
+}

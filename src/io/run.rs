@@ -1,0 +1,105 @@
+//! What made a folder of results: `run.json`, written before the first result.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use shearq_submissions::Submission;
+
+use super::atomic;
+use super::error::FileError;
+use super::layout::Layout;
+use super::table::Format;
+
+/// Name of the record in a folder of results.
+pub const RUN_FILE: &str = "run.json";
+
+/// Settings of a measurement, as stored with its catalogues.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Run {
+    /// Version of shearq.
+    pub version: String,
+    /// Data folder as given.
+    pub data: PathBuf,
+    /// Its layout.
+    pub layout: Layout,
+    /// All settings of the submission.
+    pub submission: Submission,
+    /// Format of the catalogues.
+    pub format: Format,
+}
+
+impl Run {
+    /// Reads the record of a folder; `None` where there is none.
+    ///
+    /// # Errors
+    /// Where it exists and cannot be read.
+    pub fn read(folder: &Path) -> Result<Option<Self>, FileError> {
+        let path = folder.join(RUN_FILE);
+        let text = match std::fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(FileError::new(&path, error)),
+        };
+        serde_json::from_str(&text)
+            .map(Some)
+            .map_err(|error| FileError::new(&path, format!("not a record of a run: {error}")))
+    }
+
+    /// Writes the record.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<(), FileError> {
+        write_record(&folder.join(RUN_FILE), self)
+    }
+
+    /// The catalogue of an image.
+    pub fn catalogue(&self, folder: &Path, set: u32, image: u32) -> PathBuf {
+        let name = format!("set{set:02}/catalogue-{image:03}.{}", self.format.extension());
+        folder.join(name)
+    }
+}
+
+/// Writes any record as indented JSON.
+///
+/// # Errors
+/// Where it cannot be written.
+pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileError> {
+    let mut text = serde_json::to_string_pretty(record)
+        .map_err(FileError::doing(path, "cannot write the record"))?;
+    text.push('\n');
+    atomic::write(path, text.as_bytes())
+}
+
+/// Lines in which two records differ, as `key: first ≠ second`.
+///
+/// # Errors
+/// Where a record cannot be turned into JSON.
+pub fn differences(
+    first: &impl Serialize,
+    second: &impl Serialize,
+) -> Result<Vec<String>, serde_json::Error> {
+    let (first, second) = (serde_json::to_value(first)?, serde_json::to_value(second)?);
+    let mut found = Vec::new();
+    compare("", &first, &second, &mut found);
+    Ok(found)
+}
+
+fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut Vec<String>) {
+    match (a, b) {
+        (serde_json::Value::Object(a), serde_json::Value::Object(b)) => {
+            let keys: std::collections::BTreeSet<&String> = a.keys().chain(b.keys()).collect();
+            for name in keys {
+                let null = serde_json::Value::Null;
+                let path = if key.is_empty() {
+                    name.clone()
+                } else {
+                    format!("{key}.{name}")
+                };
+                compare(&path, a.get(name).unwrap_or(&null), b.get(name).unwrap_or(&null), found);
+            }
+        }
+        _ if a != b => found.push(format!("{key}: {a} ≠ {b}")),
+        _ => {}
+    }
+}

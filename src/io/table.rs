@@ -1,0 +1,180 @@
+//! Tables of named columns, read from and written to any supported format by the file's ending.
+//!
+//! | ending | format |
+//! |---|---|
+//! | `.fits`, `.fit`, `.fits.gz` | FITS binary table |
+//! | `.parquet` | Parquet |
+//! | `.csv` | comma-separated with a header of names |
+//! | anything else (`.dat`, `.txt`, `.cat`) | ASCII: numbers between blanks; columns `x y e1 e2` unless a `#` header names them |
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::error::FileError;
+use super::fits;
+use super::text;
+
+/// One column.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Column {
+    /// Real numbers; NaN is a missing value.
+    Real(Vec<f64>),
+    /// Whole numbers.
+    Whole(Vec<i64>),
+}
+
+impl Column {
+    /// Number of rows.
+    pub fn len(&self) -> usize {
+        match self {
+            Column::Real(values) => values.len(),
+            Column::Whole(values) => values.len(),
+        }
+    }
+
+    /// Whether there are no rows.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// Columns of equal length with unique names.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Table {
+    columns: Vec<(String, Column)>,
+}
+
+impl Table {
+    /// From columns.
+    ///
+    /// # Errors
+    /// A message where lengths differ or names repeat.
+    pub fn new(columns: Vec<(String, Column)>) -> Result<Self, String> {
+        for (k, (name, column)) in columns.iter().enumerate() {
+            let (first_name, first) = &columns[0];
+            if column.len() != first.len() {
+                return Err(format!(
+                    "column `{name}` has {} rows, but `{first_name}` has {}",
+                    column.len(),
+                    first.len()
+                ));
+            }
+            if columns[..k].iter().any(|(other, _)| other == name) {
+                return Err(format!("there are two columns named `{name}`"));
+            }
+        }
+        Ok(Table { columns })
+    }
+
+    /// Names and columns, in order.
+    pub fn columns(&self) -> &[(String, Column)] {
+        &self.columns
+    }
+
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.columns.first().map_or(0, |(_, column)| column.len())
+    }
+
+    /// Takes a column out as real numbers.
+    pub fn take_real(&mut self, name: &str) -> Option<Vec<f64>> {
+        let at = self.columns.iter().position(|(own, _)| own == name)?;
+        Some(match self.columns.swap_remove(at).1 {
+            Column::Real(values) => values,
+            Column::Whole(values) => values.into_iter().map(|v| v as f64).collect(),
+        })
+    }
+}
+
+/// File format of a table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    /// Parquet.
+    Parquet,
+    /// FITS binary table.
+    Fits,
+}
+
+impl Format {
+    /// Ending of file names.
+    pub fn extension(self) -> &'static str {
+        match self {
+            Format::Parquet => "parquet",
+            Format::Fits => "fits",
+        }
+    }
+}
+
+impl Default for Format {
+    /// Parquet where this build has it, FITS elsewhere.
+    fn default() -> Self {
+        if cfg!(feature = "parquet") {
+            Format::Parquet
+        } else {
+            Format::Fits
+        }
+    }
+}
+
+/// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending.
+///
+/// # Errors
+/// Where the file cannot be read, or lacks a column.
+pub fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
+    let name = path.to_string_lossy().to_ascii_lowercase();
+    if name.ends_with(".parquet") {
+        read_parquet(path, wanted)
+    } else if [".fits", ".fit", ".fits.gz"].iter().any(|end| name.ends_with(end)) {
+        fits::read_table(path, wanted)
+    } else {
+        text::read(path, wanted)
+    }
+}
+
+/// Writes `table` as `format`, with the key–value pairs that say what made it. FITS keeps of them
+/// those with keys of at most eight characters and values of at most 68.
+///
+/// # Errors
+/// Where the file cannot be written, or this build lacks the format.
+pub fn write(
+    path: &Path,
+    format: Format,
+    table: Table,
+    metadata: &BTreeMap<String, String>,
+) -> Result<(), FileError> {
+    match format {
+        Format::Parquet => write_parquet(path, table, metadata),
+        Format::Fits => {
+            let keys: Vec<(String, fits::Value)> = metadata
+                .iter()
+                .filter(|(key, value)| key.len() <= 8 && value.len() <= 68)
+                .map(|(key, value)| (key.to_ascii_uppercase(), fits::Value::Text(value.clone())))
+                .collect();
+            let header: Vec<(&str, fits::Value)> =
+                keys.iter().map(|(k, v)| (k.as_str(), v.clone())).collect();
+            fits::write_table(path, &table, &header)
+        }
+    }
+}
+
+#[cfg(feature = "parquet")]
+use super::parquet::{read as read_parquet, write as write_parquet};
+
+#[cfg(not(feature = "parquet"))]
+fn read_parquet(path: &Path, _wanted: Option<&[&str]>) -> Result<Table, FileError> {
+    Err(FileError::new(path, WITHOUT_PARQUET))
+}
+
+#[cfg(not(feature = "parquet"))]
+fn write_parquet(
+    path: &Path,
+    _table: Table,
+    _metadata: &BTreeMap<String, String>,
+) -> Result<(), FileError> {
+    Err(FileError::new(path, WITHOUT_PARQUET))
+}
+
+#[cfg(not(feature = "parquet"))]
+const WITHOUT_PARQUET: &str =
+    "this build of shearq has no Parquet support; rebuild with the feature `parquet` or use FITS";

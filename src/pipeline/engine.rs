@@ -1,0 +1,207 @@
+//! Ordered, bounded, parallel mapping: one thread reads, a pool works, the caller's thread writes.
+//!
+//! Results reach the writer in the order in which they were read, whatever the number of threads.
+//! At most [`IN_FLIGHT`] items per worker exist at a time, so memory does not grow with the length
+//! of the work.
+
+use std::collections::BTreeMap;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Mutex, PoisonError};
+
+use super::PipelineError;
+
+/// Items read, in work or waiting to be written, per worker.
+const IN_FLIGHT: usize = 4;
+
+/// Hears how far the work is. Called from the thread that writes.
+pub trait Progress {
+    /// `galaxies` more are done.
+    fn advance(&mut self, galaxies: u64);
+    /// A line worth showing.
+    fn note(&mut self, line: &str);
+}
+
+/// Hears nothing.
+pub struct Quiet;
+
+impl Progress for Quiet {
+    fn advance(&mut self, _galaxies: u64) {}
+    fn note(&mut self, _line: &str) {}
+}
+
+/// Hands items to the workers; false once the work has been given up.
+pub struct Feeder<'a, I> {
+    items: SyncSender<(u64, I)>,
+    permits: &'a Receiver<()>,
+    next: u64,
+}
+
+impl<I> Feeder<'_, I> {
+    /// Waits for a place and hands over `item`. False means that nobody wants more.
+    #[must_use]
+    pub fn push(&mut self, item: I) -> bool {
+        if self.permits.recv().is_err() {
+            return false;
+        }
+        self.next += 1;
+        self.items.send((self.next - 1, item)).is_ok()
+    }
+}
+
+/// Runs `read` on a thread of its own, `work` on `threads` workers, each with a scratch of its own,
+/// and `write` on the calling thread, in the order of reading.
+///
+/// # Errors
+/// The first error of any part; what was written before stays written.
+pub fn ordered<I, O, S>(
+    threads: usize,
+    read: impl FnOnce(&mut Feeder<'_, I>) -> Result<(), PipelineError> + Send,
+    scratch: impl Fn() -> S + Sync,
+    work: impl Fn(&mut S, I) -> Result<O, PipelineError> + Sync,
+    mut write: impl FnMut(O) -> Result<(), PipelineError>,
+) -> Result<(), PipelineError>
+where
+    I: Send,
+    O: Send,
+{
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
+    let capacity = IN_FLIGHT * threads;
+    let (item_sender, item_receiver) = sync_channel::<(u64, I)>(capacity);
+    let (result_sender, result_receiver) = sync_channel::<(u64, Result<O, PipelineError>)>(capacity);
+    let (permit_sender, permit_receiver) = sync_channel::<()>(capacity);
+    for _ in 0..capacity {
+        // The channel was just made with room for all of them.
+        let _ = permit_sender.try_send(());
+    }
+    let items = Mutex::new(item_receiver);
+    std::thread::scope(|threads_scope| {
+        let reader = threads_scope.spawn(move || {
+            let mut feeder = Feeder {
+                items: item_sender,
+                permits: &permit_receiver,
+                next: 0,
+            };
+            read(&mut feeder)
+        });
+        let mut outcome = Ok(());
+        let (work, scratch, items) = (&work, &scratch, &items);
+        pool.in_place_scope(|workers| {
+            for _ in 0..threads {
+                let results = result_sender.clone();
+                workers.spawn(move |_| {
+                    let mut own = scratch();
+                    loop {
+                        let next = items.lock().unwrap_or_else(PoisonError::into_inner).recv();
+                        let Ok((number, item)) = next else { break };
+                        let result = work(&mut own, item);
+                        if results.send((number, result)).is_err() {
+                            break;
+                        }
+                    }
+                });
+            }
+            drop(result_sender);
+            outcome = collect(&result_receiver, &permit_sender, &mut write);
+            // Whoever still waits finds nobody at the other end and stops.
+            drop(result_receiver);
+            drop(permit_sender);
+            if outcome.is_err() {
+                let waiting = items.lock().unwrap_or_else(PoisonError::into_inner);
+                while waiting.recv().is_ok() {}
+            }
+        });
+        match reader.join() {
+            Ok(read) => outcome.and(read),
+            Err(panic) => std::panic::resume_unwind(panic),
+        }
+    })
+}
+
+/// Writes results in order as they come.
+fn collect<O>(
+    results: &Receiver<(u64, Result<O, PipelineError>)>,
+    permits: &SyncSender<()>,
+    write: &mut impl FnMut(O) -> Result<(), PipelineError>,
+) -> Result<(), PipelineError> {
+    let mut early = BTreeMap::new();
+    let mut next = 0;
+    for (number, result) in results {
+        early.insert(number, result);
+        while let Some(result) = early.remove(&next) {
+            write(result?)?;
+            next += 1;
+            // The reader may have finished and gone.
+            let _ = permits.try_send(());
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn results_come_in_order_for_any_number_of_threads() {
+        for threads in [1, 2, 5] {
+            let mut found = Vec::new();
+            ordered(
+                threads,
+                |feeder| {
+                    for k in 0..200u64 {
+                        if !feeder.push(k) {
+                            break;
+                        }
+                    }
+                    Ok(())
+                },
+                || 0u64,
+                |count, k| {
+                    *count += 1;
+                    // Uneven work, so that later items finish earlier.
+                    std::thread::sleep(std::time::Duration::from_micros(50 * (k % 7)));
+                    Ok(k * k)
+                },
+                |square| {
+                    found.push(square);
+                    Ok(())
+                },
+            )
+            .unwrap();
+            assert_eq!(found, (0..200).map(|k| k * k).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn an_error_anywhere_ends_the_work() {
+        let fail = |at: &str| {
+            let error = || PipelineError::Request("stop".into());
+            let mut written = 0;
+            let result = ordered(
+                2,
+                |feeder| {
+                    for k in 0..1000 {
+                        if at == "read" && k == 20 {
+                            return Err(error());
+                        }
+                        if !feeder.push(k) {
+                            break;
+                        }
+                    }
+                    Ok(())
+                },
+                || (),
+                |(), k| if at == "work" && k == 20 { Err(error()) } else { Ok(k) },
+                |k| {
+                    written += 1;
+                    if at == "write" && k == 20 { Err(error()) } else { Ok(()) }
+                },
+            );
+            assert!(result.is_err(), "{at}");
+            assert!(written <= 21, "{at}: {written}");
+        };
+        fail("read");
+        fail("work");
+        fail("write");
+    }
+}

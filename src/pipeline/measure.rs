@@ -1,0 +1,515 @@
+//! Measuring a data folder: rows of stamps in, one catalogue per image out.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use ndarray::{Array2, ArrayView2};
+use shearq_scoring::Grid;
+use shearq_scoring::units::{Degrees, Pixels};
+use shearq_submissions::{EllipticityType, PsfForm, Submission};
+
+use super::engine::{self, Feeder, Progress};
+use super::galaxy::{Measurement, Measurer};
+use super::PipelineError;
+use crate::io::FileError;
+use crate::io::fits::ImageReader;
+use crate::io::layout::DataFolder;
+use crate::io::psf_table;
+use crate::io::run::{Run, differences};
+use crate::io::table::{self, Column, Table};
+use crate::psf::functional::FunctionalPsf;
+use crate::psf::star::star_psf;
+
+/// One image of a data folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageId {
+    /// Set number.
+    pub set: u32,
+    /// Image number.
+    pub image: u32,
+}
+
+/// PSFs of one row of stamps.
+pub enum RowPsf {
+    /// The same for all galaxies of the image, cut and normalised.
+    Shared(Arc<Array2<f64>>),
+    /// A strip of star stamps of `side` pixels, row-major, one per galaxy.
+    Stars {
+        /// Pixels of the strip.
+        pixels: Vec<f32>,
+        /// Side of one star stamp.
+        side: usize,
+    },
+    /// Parameters, one per galaxy.
+    Functional(Vec<FunctionalPsf>),
+}
+
+/// One row of stamps of an image.
+pub struct StampRow {
+    /// The image.
+    pub id: ImageId,
+    /// Row on the grid, from 0.
+    pub iy: usize,
+    /// The image's grid.
+    pub grid: Grid,
+    /// `stamp` rows of pixels of the image.
+    pub pixels: Vec<f32>,
+    /// Pixels a side of a stamp.
+    pub stamp: usize,
+    /// NOISESIG.
+    pub header_noise: Option<f64>,
+    /// PSFs.
+    pub psf: RowPsf,
+}
+
+/// Measurements of one row of stamps.
+pub struct MeasuredRow {
+    /// The image.
+    pub id: ImageId,
+    /// Row on the grid, from 0.
+    pub iy: usize,
+    /// The image's grid.
+    pub grid: Grid,
+    /// One per galaxy.
+    pub galaxies: Vec<Measurement>,
+}
+
+/// An open image with its PSFs.
+pub struct ImageSource {
+    id: ImageId,
+    image: ImageReader,
+    grid: Grid,
+    stamp: usize,
+    header_noise: Option<f64>,
+    psf: PsfSource,
+    next: usize,
+}
+
+enum PsfSource {
+    Shared(Arc<Array2<f64>>),
+    Stars { image: ImageReader, side: usize },
+    Functional(Vec<FunctionalPsf>),
+}
+
+impl ImageSource {
+    /// Opens an image and what the submission needs of its PSF.
+    ///
+    /// # Errors
+    /// Where a file is absent, damaged or does not fit the submission.
+    pub fn open(
+        data: &DataFolder,
+        id: ImageId,
+        submission: &Submission,
+    ) -> Result<Self, PipelineError> {
+        let path = data.galaxies(id.set, id.image);
+        let mut image = ImageReader::open(&path)?;
+        let whole = |image: &mut ImageReader, key: &str| {
+            image.number(key).filter(|v| *v >= 1.0 && *v <= 1e5).map(|v| v as usize)
+        };
+        let stamp = whole(&mut image, "STAMP").unwrap_or(data.layout().stamp);
+        let n = whole(&mut image, "NGRID").unwrap_or(image.width() / stamp);
+        if image.width() != n * stamp || image.height() != n * stamp {
+            return Err(FileError::new(
+                &path,
+                format!(
+                    "the image is {} × {} pixels; expected {n} × {n} stamps of {stamp} pixels a side",
+                    image.width(),
+                    image.height()
+                ),
+            )
+            .into());
+        }
+        if !Measurer::fits(submission, stamp) {
+            return Err(FileError::new(
+                &path,
+                format!(
+                    "the stamps have {stamp} pixels a side; submission {} needs {}",
+                    submission.name, submission.stamp.size
+                ),
+            )
+            .into());
+        }
+        let field = Degrees(data.layout().field_degrees);
+        let grid = Grid::new(n, Pixels(stamp as f64), field)
+            .map_err(|error| FileError::new(&path, error))?;
+        let header_noise = image.number("NOISESIG");
+        Ok(ImageSource {
+            psf: open_psf(data, id, submission, &grid)?,
+            id,
+            image,
+            grid,
+            stamp,
+            header_noise,
+            next: 0,
+        })
+    }
+
+    /// The image's grid.
+    pub fn grid(&self) -> Grid {
+        self.grid
+    }
+
+    /// The next row of stamps, `None` after the last.
+    ///
+    /// # Errors
+    /// Where it cannot be read.
+    pub fn next_row(&mut self) -> Result<Option<StampRow>, PipelineError> {
+        if self.next == self.grid.n {
+            return Ok(None);
+        }
+        let iy = self.next;
+        self.next += 1;
+        let n = self.grid.n;
+        Ok(Some(StampRow {
+            id: self.id,
+            iy,
+            grid: self.grid,
+            pixels: self.image.read_rows(self.stamp)?,
+            stamp: self.stamp,
+            header_noise: self.header_noise,
+            psf: match &mut self.psf {
+                PsfSource::Shared(psf) => RowPsf::Shared(Arc::clone(psf)),
+                PsfSource::Stars { image, side } => RowPsf::Stars {
+                    pixels: image.read_rows(*side)?,
+                    side: *side,
+                },
+                PsfSource::Functional(field) => {
+                    RowPsf::Functional(field[iy * n..(iy + 1) * n].to_vec())
+                }
+            },
+        }))
+    }
+}
+
+fn open_psf(
+    data: &DataFolder,
+    id: ImageId,
+    submission: &Submission,
+    grid: &Grid,
+) -> Result<PsfSource, PipelineError> {
+    let size = submission.psf.size;
+    match submission.psf.form {
+        PsfForm::Functional => {
+            let path = data.psf_functional(id.set, id.image);
+            let rows = psf_table::read(&path, grid)?;
+            Ok(match rows.as_slice() {
+                [psf] => PsfSource::Shared(Arc::new(functional_psf(psf, size))),
+                _ => PsfSource::Functional(rows),
+            })
+        }
+        PsfForm::Star => {
+            let path = data.psf_star(id.set, id.image);
+            let mut image = ImageReader::open(&path)?;
+            let (width, height) = (image.width(), image.height());
+            if width != height {
+                return Err(FileError::new(
+                    &path,
+                    format!("the star image is {width} × {height} pixels; expected a square"),
+                )
+                .into());
+            }
+            // One star is never as large as a grid of the smallest PSF stamps that could be cut.
+            let stars = grid.n * size;
+            if width >= stars && width % grid.n == 0 && width / grid.n >= size {
+                let side = width / grid.n;
+                return Ok(PsfSource::Stars { image, side });
+            }
+            let pixels = image.read_rows(height)?;
+            let stamp = ArrayView2::from_shape((height, width), &pixels)
+                .map_err(|error| FileError::new(&path, error))?;
+            let psf = star_psf(stamp, size).map_err(|error| FileError::new(&path, error))?;
+            Ok(PsfSource::Shared(Arc::new(psf)))
+        }
+    }
+}
+
+/// A functional PSF on its p×p stamp, centred on the pixel (odd p) or corner (even p) in the middle,
+/// normalised to a sum of one.
+pub fn functional_psf(psf: &FunctionalPsf, size: usize) -> Array2<f64> {
+    let mut stamp = Array2::zeros((size, size));
+    let centre = (size as f64 - 1.0) / 2.0;
+    psf.draw_into(centre, centre, stamp.view_mut());
+    let sum = stamp.sum();
+    stamp / sum
+}
+
+/// Measures every galaxy of a row with a thread's scratch.
+pub fn measure_row(
+    measurer: &Measurer,
+    scratch: &mut super::galaxy::MeasureScratch,
+    row: &StampRow,
+) -> MeasuredRow {
+    let n = row.grid.n;
+    let stride = n * row.stamp;
+    let size = measurer.submission().psf.size;
+    if let RowPsf::Shared(psf) = &row.psf {
+        measurer.set_psf(scratch, Some(psf.view()));
+    }
+    let galaxies = (0..n)
+        .map(|ix| {
+            match &row.psf {
+                RowPsf::Shared(_) => {}
+                RowPsf::Stars { pixels, side } => {
+                    let star = star_of(pixels, n, *side, ix);
+                    let psf = star.and_then(|star| star_psf(star, size).ok());
+                    measurer.set_psf(scratch, psf.as_ref().map(|psf| psf.view()));
+                }
+                RowPsf::Functional(field) => {
+                    let psf = functional_psf(&field[ix], size);
+                    measurer.set_psf(scratch, Some(psf.view()));
+                }
+            }
+            measurer.measure(&row.pixels[ix * row.stamp..], stride, row.header_noise, scratch)
+        })
+        .collect();
+    MeasuredRow {
+        id: row.id,
+        iy: row.iy,
+        grid: row.grid,
+        galaxies,
+    }
+}
+
+/// Star `ix` of a strip of `n` stars.
+fn star_of(pixels: &[f32], n: usize, side: usize, ix: usize) -> Option<ArrayView2<'_, f32>> {
+    let strip = ArrayView2::from_shape((side, n * side), pixels).ok()?;
+    Some(strip.slice_move(ndarray::s![.., ix * side..(ix + 1) * side]))
+}
+
+/// The PSF of galaxy `ix` of a row as the network takes it; `None` if it cannot be used.
+pub fn psf_of(row: &StampRow, ix: usize, size: usize) -> Option<Array2<f64>> {
+    match &row.psf {
+        RowPsf::Shared(psf) => Some(psf.as_ref().clone()),
+        RowPsf::Stars { pixels, side } => {
+            star_psf(star_of(pixels, row.grid.n, *side, ix)?, size).ok()
+        }
+        RowPsf::Functional(field) => Some(functional_psf(&field[ix], size)),
+    }
+}
+
+/// What a measurement did.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Summary {
+    /// Images measured now.
+    pub images: usize,
+    /// Images found already measured.
+    pub already: usize,
+    /// Galaxies measured now.
+    pub galaxies: u64,
+    /// Of these, flagged.
+    pub flagged: u64,
+}
+
+/// Measures `sets` of the run's data (all if empty) into catalogues in `out`.
+///
+/// Catalogues that are there already are kept if the folder's record says that the same settings
+/// made them.
+///
+/// # Errors
+/// Where the folder holds results of other settings, data are absent or damaged, or a catalogue
+/// cannot be written.
+pub fn measure_folder(
+    run: &Run,
+    data: &DataFolder,
+    out: &Path,
+    sets: &[u32],
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Summary, PipelineError> {
+    claim(run, out)?;
+    let (todo, already) = images_to_do(run, data, out, sets)?;
+    let mut summary = Summary {
+        already,
+        ..Summary::default()
+    };
+    let Some(&first) = todo.first() else {
+        return Ok(summary);
+    };
+    // All images of a folder have stamps of one size; each is checked when it is opened.
+    let stamp = ImageSource::open(data, first, &run.submission)?.stamp;
+    let measurer = Measurer::new(&run.submission, stamp)?;
+    let mut rows = Vec::new();
+    engine::ordered(
+        threads,
+        |feeder| read_images(data, &todo, &run.submission, stamp, feeder),
+        || measurer.scratch(),
+        |scratch, row: StampRow| Ok(measure_row(&measurer, scratch, &row)),
+        |row: MeasuredRow| {
+            progress.advance(row.galaxies.len() as u64);
+            let (id, grid) = (row.id, row.grid);
+            rows.push(row);
+            if rows.len() == grid.n {
+                write_catalogue(run, out, &rows)?;
+                summary.images += 1;
+                for row in rows.drain(..) {
+                    summary.galaxies += row.galaxies.len() as u64;
+                    summary.flagged += row.galaxies.iter().filter(|g| g.flag != 0).count() as u64;
+                }
+                progress.note(&format!("set {:02} image {:03}", id.set, id.image));
+            }
+            Ok(())
+        },
+    )?;
+    Ok(summary)
+}
+
+/// Number of galaxies that `measure_folder` will measure, for progress bars: an estimate from the
+/// first image.
+///
+/// # Errors
+/// As [`measure_folder`].
+pub fn galaxies_to_do(
+    run: &Run,
+    data: &DataFolder,
+    out: &Path,
+    sets: &[u32],
+) -> Result<u64, PipelineError> {
+    let (todo, _) = images_to_do(run, data, out, sets)?;
+    let Some(&first) = todo.first() else {
+        return Ok(0);
+    };
+    let grid = ImageSource::open(data, first, &run.submission)?.grid();
+    Ok((todo.len() * grid.cells()) as u64)
+}
+
+/// Makes `out` this run's folder, or finds that it is.
+fn claim(run: &Run, out: &Path) -> Result<(), PipelineError> {
+    match Run::read(out)? {
+        None => Ok(run.write(out)?),
+        Some(earlier) => {
+            let differences = differences(&earlier, run)
+                .map_err(|error| FileError::new(out, format!("cannot compare records: {error}")))?;
+            if differences.is_empty() {
+                return Ok(());
+            }
+            Err(FileError::new(
+                out,
+                format!(
+                    "this folder holds results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
+                    differences.join("\n  ")
+                ),
+            )
+            .into())
+        }
+    }
+}
+
+/// Images without a catalogue, and the number of those with one.
+fn images_to_do(
+    run: &Run,
+    data: &DataFolder,
+    out: &Path,
+    sets: &[u32],
+) -> Result<(Vec<ImageId>, usize), PipelineError> {
+    let sets = if sets.is_empty() {
+        data.sets()
+    } else {
+        sets.to_vec()
+    };
+    let mut todo = Vec::new();
+    let mut already = 0;
+    for set in sets {
+        let images = data.images(set);
+        if images.is_empty() {
+            let path = data.galaxies(set, 1);
+            let message = format!("there is no image of set {set}; expected this file");
+            return Err(FileError::new(path, message).into());
+        }
+        for image in images {
+            if run.catalogue(out, set, image).is_file() {
+                already += 1;
+            } else {
+                todo.push(ImageId { set, image });
+            }
+        }
+    }
+    if todo.is_empty() && already == 0 {
+        let message = "there are no galaxy images here in the layout expected";
+        return Err(FileError::new(data.root(), message).into());
+    }
+    Ok((todo, already))
+}
+
+fn read_images(
+    data: &DataFolder,
+    todo: &[ImageId],
+    submission: &Submission,
+    stamp: usize,
+    feeder: &mut Feeder<'_, StampRow>,
+) -> Result<(), PipelineError> {
+    for &id in todo {
+        let mut source = ImageSource::open(data, id, submission)?;
+        if source.stamp != stamp {
+            let path = data.galaxies(id.set, id.image);
+            let message = format!(
+                "the stamps have {} pixels a side; those of the images before have {stamp}",
+                source.stamp
+            );
+            return Err(FileError::new(path, message).into());
+        }
+        while let Some(row) = source.next_row()? {
+            if !feeder.push(row) {
+                return Ok(());
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Catalogue of one image from its rows of stamps, in grid order.
+pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
+    let galaxies = || {
+        rows.iter()
+            .flat_map(|row| row.galaxies.iter().enumerate().map(move |(ix, g)| (row, ix, g)))
+    };
+    let real = |value: &dyn Fn(&Measurement) -> f64| {
+        Column::Real(galaxies().map(|(_, _, g)| value(g)).collect())
+    };
+    let whole = |value: &dyn Fn(&Measurement) -> i64| {
+        Column::Whole(galaxies().map(|(_, _, g)| value(g)).collect())
+    };
+    let energy = |g: &Measurement| g.outcome.map_or(f64::NAN, |o| o.energy);
+    let first = |g: &Measurement| g.outcome.map_or(f64::NAN, |o| o.first_energy);
+    let positions: Vec<(f64, f64)> = galaxies()
+        .map(|(row, ix, _)| row.grid.centre(ix, row.iy))
+        .collect();
+    Table::new(vec![
+        ("x".into(), Column::Real(positions.iter().map(|p| p.0).collect())),
+        ("y".into(), Column::Real(positions.iter().map(|p| p.1).collect())),
+        ("e1".into(), real(&|g| g.e1)),
+        ("e2".into(), real(&|g| g.e2)),
+        ("flag".into(), whole(&|g| i64::from(g.flag))),
+        ("iterations".into(), whole(&|g| g.outcome.map_or(0, |o| i64::from(o.iterations)))),
+        ("stop".into(), whole(&|g| g.stop_code())),
+        ("updated".into(), whole(&|g| g.outcome.map_or(0, |o| i64::from(o.updated)))),
+        ("first_energy".into(), real(&first)),
+        ("energy".into(), real(&energy)),
+        ("noise".into(), real(&|g| g.noise)),
+        ("flux".into(), real(&|g| g.flux)),
+        ("radius".into(), real(&|g| g.radius)),
+        ("size".into(), real(&|g| g.size)),
+    ])
+}
+
+fn write_catalogue(run: &Run, out: &Path, rows: &[MeasuredRow]) -> Result<(), PipelineError> {
+    let id = rows[0].id;
+    let path = run.catalogue(out, id.set, id.image);
+    let table = catalogue(rows).map_err(|message| FileError::new(&path, message))?;
+    let ellipticity = match run.submission.shape.ellipticity {
+        EllipticityType::Distortion => "distortion",
+        EllipticityType::Shear => "shear",
+    };
+    let settings = toml::to_string(&run.submission)
+        .map_err(|error| FileError::new(&path, format!("cannot store the settings: {error}")))?;
+    let metadata = BTreeMap::from([
+        ("creator".to_owned(), format!("shearq {}", run.version)),
+        ("submiss".to_owned(), run.submission.name.clone()),
+        ("elltype".to_owned(), ellipticity.to_owned()),
+        ("set".to_owned(), id.set.to_string()),
+        ("image".to_owned(), id.image.to_string()),
+        ("settings".to_owned(), settings),
+    ]);
+    table::write(&path, run.format, table, &metadata)?;
+    Ok(())
+}

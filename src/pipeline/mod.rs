@@ -1,0 +1,43 @@
+//! The chain over many galaxies: read or simulate, measure, write, score.
+//!
+//! [`engine`] is the only place that starts threads. Everything below it is serial and takes its
+//! scratch from the caller; everything in it is in order, so that results do not depend on the
+//! number of threads.
+
+pub mod engine;
+pub mod galaxy;
+pub mod measure;
+pub mod score;
+pub mod simulate;
+
+pub use engine::{Progress, Quiet};
+
+use thiserror::Error;
+
+use crate::deconvolve::OperatorError;
+use crate::io::FileError;
+
+/// What can stop the pipeline.
+#[derive(Debug, Error)]
+pub enum PipelineError {
+    /// A file.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// Sizes that the network cannot work with.
+    #[error(transparent)]
+    Operator(#[from] OperatorError),
+    /// Scores.
+    #[error("set {set}: {source}")]
+    Scoring {
+        /// The set.
+        set: u32,
+        /// Why it cannot be scored.
+        source: shearq_scoring::ScoringError,
+    },
+    /// A setting or request that cannot be met.
+    #[error("{0}")]
+    Request(String),
+    /// Threads that cannot be started.
+    #[error("cannot start the worker threads: {0}")]
+    Threads(#[from] rayon::ThreadPoolBuildError),
+}

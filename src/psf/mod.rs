@@ -1,0 +1,3 @@
+//! Point-spread functions: star stamps and functional forms.
+pub mod functional;
+pub mod star;

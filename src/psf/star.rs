@@ -1,0 +1,134 @@
+//! Cutting stamps around their centre, and checking that a PSF stamp can be used.
+//!
+//! The centre of a side of N pixels is at (N − 1)/2 counted from 0: between pixels for even N. A cut
+//! of another parity starts half a pixel early, so that its central pixel (odd side) or corner (even
+//! side) is half a pixel before the stamp's centre on both axes. The autocorrelation does not see
+//! such shifts.
+
+use ndarray::{Array2, ArrayView2, s};
+use thiserror::Error;
+
+/// Farthest that the centroid of a PSF may lie from the centre of its stamp, in pixels.
+pub const MAX_CENTROID_OFFSET: f64 = 2.0;
+
+/// A PSF stamp that cannot be used.
+#[derive(Debug, Error, PartialEq)]
+pub enum StarError {
+    /// A stamp smaller than the PSF asked for.
+    #[error("the PSF stamp has {found} pixels a side; the submission needs {wanted}")]
+    TooSmall {
+        /// Side found.
+        found: usize,
+        /// Side asked for.
+        wanted: usize,
+    },
+    /// A pixel that is not finite.
+    #[error("pixel ({x}, {y}) of the PSF stamp, counted from 1, is not a finite number")]
+    NotFinite {
+        /// Column, 1-based.
+        x: usize,
+        /// Row, 1-based.
+        y: usize,
+    },
+    /// No light to normalise by.
+    #[error("the pixels of the PSF stamp sum to {0}; expected a positive sum")]
+    NoLight(f64),
+    /// A star that is not where it should be.
+    #[error(
+        "the PSF is centred ({dx:+.1}, {dy:+.1}) px off the centre of its stamp; expected at most {MAX_CENTROID_OFFSET} px"
+    )]
+    OffCentre {
+        /// Offset along x.
+        dx: f64,
+        /// Offset along y.
+        dy: f64,
+    },
+}
+
+/// First pixel of a centred cut of `size` from a side of `full`; `None` where it does not fit.
+pub fn cut_start(full: usize, size: usize) -> Option<usize> {
+    full.checked_sub(size).map(|rest| rest / 2)
+}
+
+/// The central p×p pixels of a star stamp, normalised to a sum of one.
+///
+/// # Errors
+/// Where the stamp is too small, has pixels that are not finite, no light, or its light is centred
+/// elsewhere.
+pub fn star_psf(stamp: ArrayView2<'_, f32>, size: usize) -> Result<Array2<f64>, StarError> {
+    let too_small = StarError::TooSmall {
+        found: stamp.nrows().min(stamp.ncols()),
+        wanted: size,
+    };
+    let Some(y0) = cut_start(stamp.nrows(), size) else {
+        return Err(too_small);
+    };
+    let Some(x0) = cut_start(stamp.ncols(), size) else {
+        return Err(too_small);
+    };
+    for ((y, x), value) in stamp.indexed_iter() {
+        if !value.is_finite() {
+            return Err(StarError::NotFinite { x: x + 1, y: y + 1 });
+        }
+    }
+    let cut = stamp
+        .slice(s![y0..y0 + size, x0..x0 + size])
+        .mapv(f64::from);
+    let sum = cut.sum();
+    if sum <= 0.0 {
+        return Err(StarError::NoLight(sum));
+    }
+    // The brightest pixel tells a misplaced star; the centroid of faint wings would not.
+    let brightest = stamp
+        .indexed_iter()
+        .fold(((0, 0), f32::NEG_INFINITY), |best, (at, &value)| {
+            if value > best.1 { (at, value) } else { best }
+        })
+        .0;
+    let offset = |at: usize, side: usize| at as f64 - (side as f64 - 1.0) / 2.0;
+    let dy = offset(brightest.0, stamp.nrows());
+    let dx = offset(brightest.1, stamp.ncols());
+    if dx.abs() > MAX_CENTROID_OFFSET || dy.abs() > MAX_CENTROID_OFFSET {
+        return Err(StarError::OffCentre { dx, dy });
+    }
+    Ok(cut / sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cuts_keep_the_centre_or_start_half_a_pixel_early() {
+        assert_eq!(cut_start(48, 24), Some(12));
+        assert_eq!(cut_start(48, 23), Some(12));
+        assert_eq!(cut_start(15, 15), Some(0));
+        assert_eq!(cut_start(15, 16), None);
+    }
+
+    #[test]
+    fn a_star_is_cut_and_normalised_without_turning_it() {
+        let mut stamp = Array2::<f32>::zeros((9, 9));
+        stamp[(4, 4)] = 6.0;
+        stamp[(4, 5)] = 2.0;
+        let psf = star_psf(stamp.view(), 5).unwrap();
+        assert_eq!(psf[(2, 2)], 0.75);
+        assert_eq!(psf[(2, 3)], 0.25);
+    }
+
+    #[test]
+    fn unusable_stars_are_refused_with_the_reason() {
+        let mut stamp = Array2::<f32>::zeros((9, 9));
+        assert_eq!(star_psf(stamp.view(), 5), Err(StarError::NoLight(0.0)));
+        stamp[(4, 4)] = -1.0;
+        assert_eq!(star_psf(stamp.view(), 5), Err(StarError::NoLight(-1.0)));
+        stamp[(4, 4)] = 1.0;
+        assert!(matches!(star_psf(stamp.view(), 15), Err(StarError::TooSmall { .. })));
+        stamp[(4, 8)] = 3.0;
+        let message = star_psf(stamp.view(), 5).unwrap_err().to_string();
+        assert!(message.contains("(+4.0, +0.0)"), "{message}");
+        stamp[(0, 1)] = f32::INFINITY;
+        let message = star_psf(stamp.view(), 5).unwrap_err().to_string();
+        assert!(message.contains("(2, 1)"), "{message}");
+    }
+}

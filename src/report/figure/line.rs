@@ -1,0 +1,515 @@
+//! Curves and points over a common axis, in one panel or in many.
+
+use super::colour::{GRID, INK, Rgb, series_colour};
+use super::legend::{Entry, Legend, Sample};
+use super::scene::{Anchor, Point, Scene};
+use super::ticks::{Axis, Direction, TINIEST, shown};
+use super::{Figure, FigureError, LABEL_SIZE, MARGIN, TICK_SIZE, TITLE_SIZE};
+
+/// How a series is drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Style {
+    /// A line through the points.
+    #[default]
+    Line,
+    /// A disc at each point, without a line.
+    Points,
+    /// A dashed line through the points.
+    Dashed,
+}
+
+/// One curve or set of points.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Series {
+    /// Its name in the legend; without one it does not appear there.
+    pub label: String,
+    /// Where the points are across.
+    pub x: Vec<f64>,
+    /// Where they are up, as many as in `x`.
+    pub y: Vec<f64>,
+    /// Half the length of an error bar at each point, as many as in `x`.
+    pub y_err: Option<Vec<f64>>,
+    /// Line or points.
+    pub style: Style,
+    /// Which colour of the palette of eight.
+    pub colour: usize,
+}
+
+impl Series {
+    /// A series without error bars.
+    pub fn new(label: &str, x: Vec<f64>, y: Vec<f64>, style: Style, colour: usize) -> Self {
+        Self {
+            label: label.into(),
+            x,
+            y,
+            y_err: None,
+            style,
+            colour,
+        }
+    }
+
+    /// The same series with error bars of half the length `y_err`.
+    pub fn with_errors(self, y_err: Vec<f64>) -> Self {
+        Self {
+            y_err: Some(y_err),
+            ..self
+        }
+    }
+
+    fn check(&self, figure: &str) -> Result<(), FigureError> {
+        let lengths = [
+            ("values of y", self.y.len()),
+            (
+                "error bars",
+                self.y_err.as_ref().map_or(self.x.len(), Vec::len),
+            ),
+        ];
+        for (what, found) in lengths {
+            if found != self.x.len() {
+                return Err(FigureError::Lengths {
+                    figure: figure.into(),
+                    place: format!("series `{}`", self.label),
+                    what,
+                    found,
+                    expected: self.x.len(),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// The ends of the error bar at a point, or the point itself where there is none.
+    fn bar(&self, point: usize) -> (f64, f64) {
+        let half = self
+            .y_err
+            .as_ref()
+            .map_or(0.0, |errors| errors[point].abs());
+        let half = if shown(half, false) { half } else { 0.0 };
+        (self.y[point] - half, self.y[point] + half)
+    }
+}
+
+/// Series over common axes.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct LinePlot {
+    /// Above the plot.
+    pub title: String,
+    /// Below the horizontal axis, with the unit.
+    pub x_label: String,
+    /// Beside the vertical axis, with the unit.
+    pub y_label: String,
+    /// Whether the horizontal axis is logarithmic.
+    pub x_log: bool,
+    /// Whether the vertical axis is logarithmic.
+    pub y_log: bool,
+    /// The ends of the horizontal axis; from the data if there are none.
+    pub x_range: Option<(f64, f64)>,
+    /// The ends of the vertical axis; from the data if there are none.
+    pub y_range: Option<(f64, f64)>,
+    /// What is drawn, the last on top.
+    pub series: Vec<Series>,
+}
+
+impl LinePlot {
+    fn check(&self) -> Result<(), FigureError> {
+        self.series
+            .iter()
+            .try_for_each(|series| series.check(&self.title))
+    }
+
+    /// The axes for a plot of this size inside its frame.
+    fn axes(&self, width: f64, height: f64) -> (Axis, Axis) {
+        let points = || {
+            self.series.iter().flat_map(|series| {
+                (0..series.x.len())
+                    .filter(|&i| shown(series.x[i], self.x_log) && shown(series.y[i], self.y_log))
+                    .map(move |i| (series, i))
+            })
+        };
+        let x = points().map(|(series, i)| series.x[i]);
+        // On a logarithmic axis a bar down to zero has no end: it must not stretch the axis.
+        let y = points().flat_map(|(series, i)| {
+            let (low, high) = series.bar(i);
+            let low = if self.y_log {
+                low.max(0.3 * series.y[i])
+            } else {
+                low
+            };
+            [low, high]
+        });
+        (
+            Axis::new(
+                x,
+                self.x_range,
+                self.x_log,
+                width,
+                TICK_SIZE,
+                Direction::Across,
+            ),
+            Axis::new(
+                y,
+                self.y_range,
+                self.y_log,
+                height,
+                TICK_SIZE,
+                Direction::Up,
+            ),
+        )
+    }
+
+    fn legend_entries(&self) -> impl Iterator<Item = Entry> {
+        self.series.iter().map(|series| Entry {
+            label: series.label.clone(),
+            colour: series_colour(series.colour),
+            sample: Sample::Curve(series.style),
+        })
+    }
+}
+
+/// The inside of the axes of one plot.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Frame {
+    pub left: f64,
+    pub top: f64,
+    pub right: f64,
+    pub bottom: f64,
+}
+
+impl Frame {
+    pub(super) fn width(&self) -> f64 {
+        self.right - self.left
+    }
+
+    pub(super) fn height(&self) -> f64 {
+        self.bottom - self.top
+    }
+
+    fn place(&self, x: &Axis, y: &Axis, (at, up): Point) -> Point {
+        (
+            self.left + x.fraction(at) * self.width(),
+            self.bottom - y.fraction(up) * self.height(),
+        )
+    }
+
+    fn contains(&self, (x, y): Point) -> bool {
+        (self.left - 0.5..=self.right + 0.5).contains(&x)
+            && (self.top - 0.5..=self.bottom + 0.5).contains(&y)
+    }
+
+    /// The part of a straight line inside, by the method of Liang and Barsky.
+    fn clip(&self, from: Point, to: Point) -> Option<(Point, Point)> {
+        let (dx, dy) = (to.0 - from.0, to.1 - from.1);
+        let (mut start, mut end) = (0.0_f64, 1.0_f64);
+        let sides = [
+            (-dx, from.0 - self.left),
+            (dx, self.right - from.0),
+            (-dy, from.1 - self.top),
+            (dy, self.bottom - from.1),
+        ];
+        for (direction, distance) in sides {
+            if direction == 0.0 {
+                if distance < 0.0 {
+                    return None;
+                }
+            } else if direction < 0.0 {
+                start = start.max(distance / direction);
+            } else {
+                end = end.min(distance / direction);
+            }
+        }
+        let at = |along: f64| (from.0 + along * dx, from.1 + along * dy);
+        (start <= end).then(|| (at(start), at(end)))
+    }
+
+    /// The vertical axis with its grid lines, numbers and factor.
+    pub(super) fn draw_vertical_axis(&self, scene: &mut Scene, axis: &Axis) {
+        let height = |value: f64| self.bottom - axis.fraction(value) * self.height();
+        for tick in &axis.ticks {
+            let y = height(tick.value);
+            scene.path(vec![(self.left, y), (self.right, y)], GRID, 0.75);
+            scene.path(vec![(self.left - 4.0, y), (self.left, y)], INK, 1.0);
+            let baseline = (self.left - 7.0, y + 0.36 * TICK_SIZE);
+            scene.text(&tick.label, baseline, TICK_SIZE, INK, Anchor::End);
+        }
+        for y in axis.minor.iter().map(|&value| height(value)) {
+            scene.path(vec![(self.left - 2.0, y), (self.left, y)], INK, 0.75);
+        }
+        if let Some(factor) = &axis.factor {
+            let baseline = (self.left, self.top - 4.0);
+            scene.text(factor, baseline, TICK_SIZE, INK, Anchor::Start);
+        }
+    }
+
+    fn draw_horizontal_axis(&self, scene: &mut Scene, axis: &Axis) {
+        let across = |value: f64| self.left + axis.fraction(value) * self.width();
+        for tick in &axis.ticks {
+            let x = across(tick.value);
+            scene.path(vec![(x, self.top), (x, self.bottom)], GRID, 0.75);
+            scene.path(vec![(x, self.bottom), (x, self.bottom + 4.0)], INK, 1.0);
+            let baseline = (x, self.bottom + 6.0 + TICK_SIZE);
+            scene.text(&tick.label, baseline, TICK_SIZE, INK, Anchor::Middle);
+        }
+        for x in axis.minor.iter().map(|&value| across(value)) {
+            scene.path(vec![(x, self.bottom), (x, self.bottom + 2.0)], INK, 0.75);
+        }
+        if let Some(factor) = &axis.factor {
+            let baseline = (self.right + 4.0, self.bottom + 3.0);
+            scene.text(factor, baseline, TICK_SIZE, INK, Anchor::Start);
+        }
+    }
+}
+
+/// Draws axes and series into the frame, without labels and title.
+fn draw_plot(scene: &mut Scene, plot: &LinePlot, frame: Frame) {
+    let (x_axis, y_axis) = plot.axes(frame.width(), frame.height());
+    frame.draw_horizontal_axis(scene, &x_axis);
+    frame.draw_vertical_axis(scene, &y_axis);
+    let mut empty = true;
+    for series in &plot.series {
+        let colour = series_colour(series.colour);
+        let place = |x, y| frame.place(&x_axis, &y_axis, (x, y));
+        let visible = |i: usize| shown(series.x[i], plot.x_log) && shown(series.y[i], plot.y_log);
+        let points: Vec<Option<Point>> = (0..series.x.len())
+            .map(|i| visible(i).then(|| place(series.x[i], series.y[i])))
+            .collect();
+        empty &= points.iter().all(Option::is_none);
+        if series.y_err.is_some() {
+            for i in (0..points.len()).filter(|&i| points[i].is_some()) {
+                let (low, high) = series.bar(i);
+                // A bar that reaches zero or below runs off a logarithmic axis.
+                let low = if plot.y_log { low.max(TINIEST) } else { low };
+                draw_error_bar(
+                    scene,
+                    frame,
+                    place(series.x[i], low),
+                    place(series.x[i], high),
+                    colour,
+                );
+            }
+        }
+        match series.style {
+            Style::Points => {
+                for point in points
+                    .into_iter()
+                    .flatten()
+                    .filter(|&point| frame.contains(point))
+                {
+                    scene.disc(point, 2.7, colour);
+                }
+            }
+            Style::Line | Style::Dashed => {
+                // A point between missing ones has no line to show it.
+                let at = |number: Option<usize>| number.and_then(|i| *points.get(i)?);
+                for (i, point) in points.iter().enumerate() {
+                    let alone = at(i.checked_sub(1)).is_none() && at(Some(i + 1)).is_none();
+                    if let Some(point) = point.filter(|&point| alone && frame.contains(point)) {
+                        scene.disc(point, 1.8, colour);
+                    }
+                }
+                for run in runs(&points, frame) {
+                    match series.style {
+                        Style::Dashed => scene.dashes(&run, colour, 1.8),
+                        _ => scene.path(run, colour, 1.8),
+                    }
+                }
+            }
+        }
+    }
+    if empty {
+        let middle = (
+            0.5 * (frame.left + frame.right),
+            0.5 * (frame.top + frame.bottom),
+        );
+        scene.text(
+            "no data",
+            middle,
+            LABEL_SIZE,
+            [120, 120, 120],
+            Anchor::Middle,
+        );
+    }
+    scene.frame(
+        (frame.left, frame.top),
+        (frame.right, frame.bottom),
+        INK,
+        1.0,
+    );
+}
+
+/// An error bar with caps where its ends are inside the frame.
+pub(super) fn draw_error_bar(
+    scene: &mut Scene,
+    frame: Frame,
+    low: Point,
+    high: Point,
+    colour: Rgb,
+) {
+    let Some((from, to)) = frame.clip(low, high) else {
+        return;
+    };
+    scene.path(vec![from, to], colour, 1.1);
+    for end in [low, high].into_iter().filter(|&end| frame.contains(end)) {
+        scene.path(
+            vec![(end.0 - 2.5, end.1), (end.0 + 2.5, end.1)],
+            colour,
+            1.1,
+        );
+    }
+}
+
+/// The connected parts of a line that are inside the frame; missing points break it.
+fn runs(points: &[Option<Point>], frame: Frame) -> Vec<Vec<Point>> {
+    let mut runs: Vec<Vec<Point>> = Vec::new();
+    for pair in points.windows(2) {
+        let (Some(from), Some(to)) = (pair[0], pair[1]) else {
+            continue;
+        };
+        let Some((from, to)) = frame.clip(from, to) else {
+            continue;
+        };
+        match runs.last_mut() {
+            Some(run) if run.last() == Some(&from) => run.push(to),
+            _ => runs.push(vec![from, to]),
+        }
+    }
+    runs
+}
+
+impl Figure for LinePlot {
+    fn scene(&self) -> Result<Scene, FigureError> {
+        PanelGrid {
+            title: String::new(),
+            columns: 1,
+            plots: vec![self.clone()],
+        }
+        .scene()
+    }
+}
+
+/// Several plots in rows, with one legend.
+///
+/// Where all plots have the same label at an axis, it is written at the left column and the bottom
+/// row only.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PanelGrid {
+    /// Above all plots.
+    pub title: String,
+    /// How many plots are in a row.
+    pub columns: usize,
+    /// The plots, by rows.
+    pub plots: Vec<LinePlot>,
+}
+
+impl Figure for PanelGrid {
+    fn scene(&self) -> Result<Scene, FigureError> {
+        self.plots.iter().try_for_each(LinePlot::check)?;
+        let columns = self.columns.clamp(1, self.plots.len().max(1));
+        let rows = self.plots.len().div_ceil(columns).max(1);
+        let (width, height) = match columns {
+            1 => (600.0, 370.0),
+            2 => (380.0, 250.0),
+            3 => (280.0, 190.0),
+            _ => (205.0, 150.0),
+        };
+
+        let common = |label: fn(&LinePlot) -> &str| {
+            self.plots
+                .windows(2)
+                .all(|pair| label(&pair[0]) == label(&pair[1]))
+        };
+        let common_x = common(|plot| &plot.x_label);
+        let common_y = common(|plot| &plot.y_label);
+        let has_x = self.plots.iter().any(|plot| !plot.x_label.is_empty());
+        let has_y = self.plots.iter().any(|plot| !plot.y_label.is_empty());
+        let label_room = |present: bool| if present { LABEL_SIZE + 6.0 } else { 0.0 };
+        let axes: Vec<(Axis, Axis)> = self
+            .plots
+            .iter()
+            .map(|plot| plot.axes(width, height))
+            .collect();
+        let tick_room = axes
+            .iter()
+            .map(|(_, y)| y.label_width(TICK_SIZE))
+            .fold(0.0, f64::max)
+            + 9.0;
+        let factor_across = axes.iter().any(|(x, _)| x.factor.is_some());
+        let factor_up = axes.iter().any(|(_, y)| y.factor.is_some());
+
+        // Space around each frame: left for numbers, above for titles, below for numbers.
+        let left = tick_room + if common_y { 0.0 } else { label_room(has_y) };
+        let right = if factor_across { 42.0 } else { 10.0 };
+        let single = self.plots.len() == 1;
+        let panel_title_size = if single { TITLE_SIZE } else { LABEL_SIZE };
+        let titled = self.plots.iter().any(|plot| !plot.title.is_empty());
+        let above = if titled && !single {
+            panel_title_size + 10.0
+        } else {
+            6.0
+        } + if factor_up { TICK_SIZE + 2.0 } else { 0.0 };
+        let below = TICK_SIZE + 10.0 + if common_x { 0.0 } else { label_room(has_x) };
+        let (cell_width, cell_height) = (left + width + right, above + height + below);
+
+        let origin_x = MARGIN + if common_y { label_room(has_y) } else { 0.0 };
+        let total_width = origin_x + columns as f64 * cell_width + 0.5 * MARGIN;
+        let title = match self.plots.as_slice() {
+            [only] if self.title.is_empty() => &only.title,
+            _ => &self.title,
+        };
+        let mut entries: Vec<Entry> = Vec::new();
+        for entry in self.plots.iter().flat_map(LinePlot::legend_entries) {
+            if !entries.contains(&entry) {
+                entries.push(entry);
+            }
+        }
+        let legend = Legend::new(&entries, total_width - 2.0 * MARGIN);
+        let title_height = if title.is_empty() {
+            0.0
+        } else {
+            TITLE_SIZE + 10.0
+        };
+        let origin_y = MARGIN + title_height + legend.height();
+        let bottom_room = if common_x { label_room(has_x) } else { 0.0 } + 0.5 * MARGIN;
+        let total_height = origin_y + rows as f64 * cell_height + bottom_room;
+
+        let mut scene = Scene::new(total_width, total_height);
+        let middle = origin_x + 0.5 * (columns as f64 * cell_width + left - right);
+        scene.text(
+            title,
+            (middle, MARGIN + TITLE_SIZE),
+            TITLE_SIZE,
+            INK,
+            Anchor::Middle,
+        );
+        legend.draw(&mut scene, middle, MARGIN + title_height);
+        for (number, plot) in self.plots.iter().enumerate() {
+            let (row, column) = (number / columns, number % columns);
+            let frame_left = origin_x + column as f64 * cell_width + left;
+            let frame_top = origin_y + row as f64 * cell_height + above;
+            let frame = Frame {
+                left: frame_left,
+                top: frame_top,
+                right: frame_left + width,
+                bottom: frame_top + height,
+            };
+            draw_plot(&mut scene, plot, frame);
+            let centre = (
+                0.5 * (frame.left + frame.right),
+                0.5 * (frame.top + frame.bottom),
+            );
+            if !single {
+                let baseline = (centre.0, frame.top - 6.0);
+                scene.text(&plot.title, baseline, panel_title_size, INK, Anchor::Middle);
+            }
+            // The last plot of each column carries the label, also above a gap in the last row.
+            if !common_x || number + columns >= self.plots.len() {
+                let baseline = (centre.0, frame.bottom + TICK_SIZE + 10.0 + LABEL_SIZE);
+                scene.text(&plot.x_label, baseline, LABEL_SIZE, INK, Anchor::Middle);
+            }
+            if !common_y || column == 0 {
+                let baseline = (frame.left - tick_room - 4.0, centre.1);
+                scene.text_upwards(&plot.y_label, baseline, LABEL_SIZE, INK, Anchor::Middle);
+            }
+        }
+        Ok(scene)
+    }
+}

@@ -1,0 +1,6 @@
+//! Tables and figures.
+
+pub mod figure;
+mod font;
+pub mod scores;
+pub mod table;

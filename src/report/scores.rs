@@ -1,0 +1,417 @@
+//! Scores as tables and as JSON.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Value, json};
+use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
+use shearq_scoring::{
+    BINS, Bias, BiasFits, Choice, ConventionClass, ConventionScore, Definition, Figures,
+    MAX_GROUPS, SetScore,
+};
+use shearq_submissions::Published;
+
+use super::table::{Cell, Heading, Table};
+use crate::pipeline::score::{ScoredSet, means};
+use crate::simulate::kinds::SetKind;
+
+/// Figures of a table: heading, decimals and place in [`Figures::values`].
+const COLUMNS: [(&str, &str, usize, usize); 8] = [
+    ("q", "Q", 2, 0),
+    ("q_dn", "Q_dn", 2, 1),
+    ("m_half", "M/2", 4, 2),
+    ("sqrt_a", "√A×10⁴", 4, 3),
+    ("m_cross", "m (cross)", 4, 4),
+    ("c1", "c1", 5, 7),
+    ("c2", "c2", 5, 8),
+    ("b_power", "B mode×10⁹", 3, 9),
+];
+
+fn figure_cells(figures: &Figures, errors: Option<&Figures>) -> Vec<Cell> {
+    let values = figures.values();
+    let errors = errors.map(Figures::values);
+    COLUMNS
+        .iter()
+        .map(|&(_, _, decimals, at)| {
+            Cell::with_error(values[at], errors.map(|e| e[at]), decimals)
+        })
+        .collect()
+}
+
+/// What a set is called in tables.
+fn kind_label(set: u32) -> String {
+    SetKind::of(set).map_or_else(String::new, |kind| kind.image.label().to_owned())
+}
+
+/// One line that says what the figures are.
+fn definition_note(definition: Definition, choice: Choice) -> String {
+    let definition = match definition {
+        Definition::Leaderboard => "leaderboard definition (the challenge's own arithmetic)",
+        Definition::Corrected => "corrected definition (azimuthal averages, fixed bins)",
+    };
+    let choice = match choice {
+        Choice::Matched => "the convention that correlates best with the truth".to_owned(),
+        Choice::Best => "the convention with the highest Q, as the leaderboard took it".to_owned(),
+        Choice::Insist(k) => format!("convention {} ({})", k.number(), k.describe()),
+    };
+    format!(
+        "Figures: {definition}; {choice}. Errors: delete-one jackknife over up to {MAX_GROUPS} groups of images. √A in 10⁻⁴ for C_ℓ in steradian."
+    )
+}
+
+/// Warnings about sets whose leaderboard Q comes from a wrong convention, or whose truth looks
+/// misread.
+pub fn warnings(scored: &[ScoredSet]) -> Vec<String> {
+    let mut lines = Vec::new();
+    for ScoredSet { set, score, rows } in scored {
+        let name = if *set == 0 {
+            "this set".to_owned()
+        } else {
+            format!("set {set}")
+        };
+        if score.wrong_convention_wins() {
+            let (best, matched) = (
+                &score.conventions[score.best.index()],
+                &score.conventions[score.matched.index()],
+            );
+            lines.push(format!(
+                "Warning: in {name} the leaderboard takes convention {} ({}) with Q = {:.2}, but convention {} ({}) matches the truth, with Q = {:.2}.",
+                best.convention.number(),
+                best.convention.describe(),
+                best.quality.q,
+                matched.convention.number(),
+                matched.convention.describe(),
+                matched.quality.q
+            ));
+        }
+        if score.true_b_share() > 0.2 {
+            lines.push(format!(
+                "Warning: {:.0} % of the true power of {name} is in B modes; its g2 may have the other sign (--truth-sign).",
+                100.0 * score.true_b_share()
+            ));
+        }
+        if rows.outside + rows.excess > 0 {
+            lines.push(format!(
+                "Warning: {name} has {} rows outside the grid and {} beyond the number of cells; they do not count.",
+                rows.outside, rows.excess
+            ));
+        }
+        if rows.not_finite > 0 {
+            lines.push(format!(
+                "Note: {} of {} galaxies of {name} have no ellipticity and count as missing.",
+                rows.not_finite,
+                rows.not_finite + rows.used
+            ));
+        }
+    }
+    lines
+}
+
+/// Figures per set, with a row of means where there are several sets.
+pub fn per_set(
+    scored: &[ScoredSet],
+    title: &str,
+    definition: Definition,
+    choice: Choice,
+) -> Table {
+    let mut headings = vec![
+        Heading::new("set", "Set"),
+        Heading::new("kind", "Kind"),
+        Heading::new("images", "Images"),
+    ];
+    headings.extend(COLUMNS.iter().map(|(key, label, _, _)| Heading::new(key, *label)));
+    headings.push(Heading::new("convention", "Conv."));
+    headings.push(Heading::new("q_leaderboard", "Q leaderboard"));
+    let mut rows = Vec::new();
+    for ScoredSet { set, score, .. } in scored {
+        let mut row = vec![
+            Cell::text(if *set == 0 { "–".into() } else { format!("{set:02}") }),
+            Cell::text(kind_label(*set)),
+            Cell::number(score.images as f64, 0),
+        ];
+        row.extend(figure_cells(&score.figures, score.errors().as_ref()));
+        row.push(Cell::text(score.chosen.number().to_string()));
+        row.push(Cell::number(score.conventions[score.best.index()].quality.q, 2));
+        rows.push(row);
+    }
+    if scored.len() > 1 {
+        let (mean, errors) = means(scored);
+        let mut row = vec![
+            Cell::text("mean"),
+            Cell::text(""),
+            Cell::number(scored.iter().map(|s| s.score.images as f64).sum(), 0),
+        ];
+        row.extend(figure_cells(&mean, errors.as_ref()));
+        row.push(Cell::text(""));
+        let best = scored
+            .iter()
+            .map(|s| s.score.conventions[s.score.best.index()].quality.q)
+            .sum::<f64>();
+        row.push(Cell::number(best / scored.len() as f64, 2));
+        rows.push(row);
+    }
+    let mut notes = vec![definition_note(definition, choice)];
+    notes.extend(warnings(scored));
+    Table {
+        title: title.to_owned(),
+        headings,
+        rows,
+        notes,
+    }
+}
+
+/// One variant in a comparison.
+pub struct Variant {
+    /// Name of the submission.
+    pub name: String,
+    /// Its scores.
+    pub scored: Vec<ScoredSet>,
+    /// Published figures.
+    pub published: Option<Published>,
+}
+
+/// Variants side by side over the sets that all of them have, with the significance of each one's
+/// difference in Q from the first, paired over the same images, and the published figures.
+pub fn compare(variants: &[Variant], definition: Definition, choice: Choice) -> Table {
+    let common: Vec<u32> = variants.first().map_or_else(Vec::new, |first| {
+        first
+            .scored
+            .iter()
+            .map(|s| s.set)
+            .filter(|set| {
+                variants
+                    .iter()
+                    .all(|v| v.scored.iter().any(|s| s.set == *set))
+            })
+            .collect()
+    });
+    let of = |variant: &Variant| -> BTreeMap<u32, usize> {
+        variant
+            .scored
+            .iter()
+            .enumerate()
+            .map(|(k, s)| (s.set, k))
+            .collect()
+    };
+    let headings = vec![
+        Heading::new("submission", "Submission"),
+        Heading::new("q", "Q"),
+        Heading::new("q_difference", "ΔQ to first"),
+        Heading::new("sigma", "in σ"),
+        Heading::new("q_published", "Q publ."),
+        Heading::new("q_dn", "Q_dn"),
+        Heading::new("m_half", "M/2"),
+        Heading::new("m_half_published", "M/2 publ."),
+        Heading::new("sqrt_a", "√A×10⁴"),
+        Heading::new("sqrt_a_published", "√A publ."),
+        Heading::new("m_cross", "m (cross)"),
+    ];
+    let mut rows = Vec::new();
+    for variant in variants {
+        let index = of(variant);
+        let sets: Vec<&SetScore> = common
+            .iter()
+            .map(|set| &variant.scored[index[set]].score)
+            .collect();
+        let mean = |at: usize, decimals: usize| {
+            let pairs: Vec<(f64, Option<f64>)> = sets
+                .iter()
+                .map(|s| (s.figures.values()[at], s.errors().map(|e| e.values()[at])))
+                .collect();
+            let (value, error) = mean_over_sets(&pairs);
+            Cell::with_error(value, error, decimals)
+        };
+        let published = |value: fn(&Published) -> f64, decimals: usize| {
+            Cell::number(variant.published.as_ref().map_or(f64::NAN, value), decimals)
+        };
+        let difference = difference_from(&variants[0], variant, &common);
+        rows.push(vec![
+            Cell::text(&variant.name),
+            mean(0, 2),
+            Cell::with_error(
+                difference.map_or(f64::NAN, |d| d.difference),
+                difference.map(|d| d.error),
+                2,
+            ),
+            Cell::number(difference.map_or(f64::NAN, |d| d.sigma()), 1),
+            published(|p| p.q, 2),
+            mean(1, 2),
+            mean(2, 4),
+            published(|p| p.m_half, 4),
+            mean(3, 4),
+            published(|p| p.sqrt_a, 4),
+            mean(4, 4),
+        ]);
+    }
+    let images: usize = variants.first().map_or(0, |v| {
+        v.scored
+            .iter()
+            .filter(|s| common.contains(&s.set))
+            .map(|s| s.score.images)
+            .sum()
+    });
+    let list: Vec<String> = common.iter().map(u32::to_string).collect();
+    let mut notes = vec![
+        format!("Means over set(s) {}, {images} images in all.", list.join(", ")),
+        definition_note(definition, choice),
+        "ΔQ: jackknife of the paired difference on the same images. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
+    ];
+    for variant in variants {
+        let kept: Vec<String> = warnings(&variant.scored)
+            .into_iter()
+            .filter(|line| line.starts_with("Warning"))
+            .map(|line| format!("{}: {line}", variant.name))
+            .collect();
+        notes.extend(kept);
+    }
+    Table {
+        title: "Comparison of submissions".into(),
+        headings,
+        rows,
+        notes,
+    }
+}
+
+/// Paired difference in Q of `second` from `first`; `None` for a variant with itself.
+fn difference_from(
+    first: &Variant,
+    second: &Variant,
+    sets: &[u32],
+) -> Option<shearq_scoring::resample::PairedDifference> {
+    if std::ptr::eq(first, second) {
+        return None;
+    }
+    let find = |v: &'_ Variant, set: u32| v.scored.iter().position(|s| s.set == set);
+    let q = |score: &SetScore| -> Vec<f64> { score.replicates.iter().map(|r| r.q).collect() };
+    let mut pairs = Vec::new();
+    for &set in sets {
+        let a = &first.scored[find(first, set)?].score;
+        let b = &second.scored[find(second, set)?].score;
+        // Groups pair up only where both have the same images.
+        if a.images != b.images {
+            return None;
+        }
+        pairs.push((a.figures.q, q(a), b.figures.q, q(b)));
+    }
+    let pairs: Vec<PairedSet<'_>> = pairs
+        .iter()
+        .map(|(first, first_replicates, second, second_replicates)| PairedSet {
+            first: *first,
+            first_replicates,
+            second: *second,
+            second_replicates,
+        })
+        .collect();
+    paired_difference(&pairs)
+}
+
+fn bias_json(bias: &Bias) -> Value {
+    json!({ "M": bias.M, "A": bias.A, "sqrtA": bias.sqrtA, "m": bias.m })
+}
+
+fn fits_json(fits: &BiasFits) -> Value {
+    json!({
+        "l2": bias_json(&fits.l2),
+        "mode": bias_json(&fits.mode),
+        "cl": bias_json(&fits.cl),
+        "cl_over_2pi": bias_json(&fits.cl_over_2pi),
+    })
+}
+
+fn class_json(score: &SetScore, representative: &ConventionScore, class: ConventionClass) -> Value {
+    let mut object = json!({
+        "EE": representative.ee,
+        "BB": representative.bb,
+        "EB": representative.eb,
+        "sigma_sys": representative.quality.sigma_sys,
+        "Q": representative.quality.q,
+        "corr": score.class_correlation(class),
+        "M": representative.fit.cl.M,
+        "A": representative.fit.cl.A,
+        "sqrtA": representative.fit.cl.sqrtA,
+        "fit": fits_json(&representative.fit),
+    });
+    if let (Some(quality), Some(fit)) = (&representative.quality_dn, &representative.fit_dn) {
+        object["sigma_sys_dn"] = json!(quality.sigma_sys);
+        object["Q_dn"] = json!(quality.q);
+        object["fit_dn"] = fits_json(fit);
+    }
+    object
+}
+
+/// What one set's JSON says about its input.
+pub struct SetInput {
+    /// Name of the case.
+    pub case: String,
+    /// Truth file as given.
+    pub truth: String,
+    /// Catalogues as given.
+    pub catalogues: Vec<String>,
+    /// Bandpower definition.
+    pub definition: Definition,
+}
+
+/// Everything about one set scored from plain files, under the names that the public scoring cases
+/// use, with errors and null tests added.
+pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
+    let score = &scored.score;
+    let best = &score.conventions[score.best.index()];
+    let matched = &score.conventions[score.matched.index()];
+    let bins = &score.bins;
+    let per_convention: BTreeMap<String, f64> = score
+        .conventions
+        .iter()
+        .map(|c| (c.convention.number().to_string(), c.quality.q))
+        .collect();
+    let weights: Vec<f64> = (0..BINS).map(|b| bins.mode_weight(b)).collect();
+    let errors = score.errors();
+    json!({
+        "case": input.case,
+        "description": format!(
+            "{} catalogue(s) scored by shearq {}",
+            input.catalogues.len(),
+            crate::VERSION
+        ),
+        "definition": input.definition,
+        "files": { "truth": input.truth, "catalogues": input.catalogues },
+        "n": score.grid.n,
+        "size_deg": score.grid.field.0,
+        "postage": score.grid.stamp.0,
+        "n_images": score.images,
+        "noise_var": score.noise_variance,
+        "l_min": score.grid.l_min().0,
+        "l_max": score.grid.l_max().0,
+        "dlogl": bins.width,
+        "n_modes": bins.modes,
+        "sum_l": bins.sum_l,
+        "W": weights,
+        "ll": bins.l,
+        "dll": bins.dln_l,
+        "P_noise": score.noise,
+        "truth": { "EE": score.true_ee, "BB": score.true_bb },
+        "submission": { "EE": best.ee, "BB": best.bb },
+        "Q": best.quality.q,
+        "sigma_sys": best.quality.sigma_sys,
+        "winner": score.best.number(),
+        "winner_class": score.best.class(),
+        "matched": score.matched.number(),
+        "matched_class": score.matched.class(),
+        "corr_matched": matched.correlation,
+        "Q_matched": matched.quality.q,
+        "M": best.fit.cl.M,
+        "A": best.fit.cl.A,
+        "sqrtA": best.fit.cl.sqrtA,
+        "Q_dn": best.quality_dn.map(|q| q.q),
+        "sigma_sys_dn": best.quality_dn.map(|q| q.sigma_sys),
+        "Q_per_convention": per_convention,
+        "classes": {
+            "A": class_json(score, &score.conventions[5], ConventionClass::A),
+            "B": class_json(score, &score.conventions[4], ConventionClass::B),
+        },
+        "chosen": score.chosen.number(),
+        "figures": score.figures,
+        "figure_errors": errors,
+        "error_method": format!("delete-one jackknife over up to {MAX_GROUPS} groups of images"),
+        "rows": scored.rows,
+        "warnings": warnings(std::slice::from_ref(scored)),
+    })
+}

@@ -1,0 +1,317 @@
+//! Tables for terminals, papers and programs.
+
+use clap::ValueEnum;
+use comfy_table::{CellAlignment, ContentArrangement, presets};
+use serde_json::{Map, Value, json};
+
+/// How to print a table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum TableFormat {
+    /// For reading on a terminal.
+    #[default]
+    Table,
+    /// Machine-readable, full precision.
+    Json,
+    /// Comma-separated, full precision, value and error in columns of their own.
+    Csv,
+    /// Markdown.
+    Markdown,
+    /// A LaTeX tabular.
+    Latex,
+}
+
+/// One cell.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Cell {
+    /// Words.
+    Text(String),
+    /// A number, perhaps with an error, to be printed with so many decimals.
+    Number {
+        /// The value; not a number is printed as a dash.
+        value: f64,
+        /// Its standard error.
+        error: Option<f64>,
+        /// Decimals printed for people.
+        decimals: usize,
+    },
+}
+
+impl Cell {
+    /// Words.
+    pub fn text(words: impl Into<String>) -> Self {
+        Cell::Text(words.into())
+    }
+
+    /// A number without error.
+    pub fn number(value: f64, decimals: usize) -> Self {
+        Cell::Number {
+            value,
+            error: None,
+            decimals,
+        }
+    }
+
+    /// A number with an error.
+    pub fn with_error(value: f64, error: Option<f64>, decimals: usize) -> Self {
+        Cell::Number {
+            value,
+            error,
+            decimals,
+        }
+    }
+
+    /// For people; `latex` wraps numbers in mathematics.
+    fn print(&self, latex: bool) -> String {
+        match self {
+            Cell::Text(words) if latex => escape_latex(words),
+            Cell::Text(words) => words.clone(),
+            Cell::Number { value, .. } if value.is_nan() => "–".into(),
+            Cell::Number {
+                value,
+                error,
+                decimals,
+            } => {
+                let number = format!("{value:.decimals$}");
+                match (error.filter(|e| e.is_finite()), latex) {
+                    (None, false) => number,
+                    (None, true) => format!("${number}$"),
+                    (Some(e), false) => format!("{number} ± {e:.decimals$}"),
+                    (Some(e), true) => format!("${number} \\pm {e:.decimals$}$"),
+                }
+            }
+        }
+    }
+}
+
+/// A column: its key for programs and its heading for people.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Heading {
+    /// Key in CSV and JSON.
+    pub key: &'static str,
+    /// Heading elsewhere.
+    pub label: String,
+}
+
+impl Heading {
+    /// A heading.
+    pub fn new(key: &'static str, label: impl Into<String>) -> Self {
+        Heading {
+            key,
+            label: label.into(),
+        }
+    }
+}
+
+/// A table with a title and notes.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Table {
+    /// One line above.
+    pub title: String,
+    /// Columns.
+    pub headings: Vec<Heading>,
+    /// Cells, row by row.
+    pub rows: Vec<Vec<Cell>>,
+    /// Lines below.
+    pub notes: Vec<String>,
+}
+
+impl Table {
+    /// The table in a format, ending in a line break.
+    pub fn render(&self, format: TableFormat) -> String {
+        match format {
+            TableFormat::Table => self.people(presets::UTF8_HORIZONTAL_ONLY, ""),
+            TableFormat::Markdown => self.people(presets::ASCII_MARKDOWN, "\n"),
+            TableFormat::Latex => self.latex(),
+            TableFormat::Csv => self.csv(),
+            TableFormat::Json => {
+                let mut text = serde_json::to_string_pretty(&self.json()).unwrap_or_default();
+                text.push('\n');
+                text
+            }
+        }
+    }
+
+    fn people(&self, preset: &str, gap: &str) -> String {
+        let mut table = comfy_table::Table::new();
+        table
+            .load_preset(preset)
+            .set_content_arrangement(ContentArrangement::Disabled)
+            .set_header(self.headings.iter().map(|h| h.label.as_str()));
+        for row in &self.rows {
+            table.add_row(row.iter().map(|cell| cell.print(false)));
+        }
+        for (k, column) in table.column_iter_mut().enumerate() {
+            let numbers = self
+                .rows
+                .iter()
+                .any(|row| matches!(row.get(k), Some(Cell::Number { .. })));
+            if numbers {
+                column.set_cell_alignment(CellAlignment::Right);
+            }
+        }
+        let mut text = String::new();
+        if !self.title.is_empty() {
+            text.push_str(&format!("{}\n{gap}", self.title));
+        }
+        text.push_str(&format!("{table}\n"));
+        for note in &self.notes {
+            text.push_str(&format!("{gap}{note}\n"));
+        }
+        text
+    }
+
+    fn latex(&self) -> String {
+        let columns: String = (0..self.headings.len())
+            .map(|k| {
+                let numbers = self
+                    .rows
+                    .iter()
+                    .any(|row| matches!(row.get(k), Some(Cell::Number { .. })));
+                if numbers { 'r' } else { 'l' }
+            })
+            .collect();
+        let line = |cells: Vec<String>| format!("{} \\\\\n", cells.join(" & "));
+        let mut text = format!("% {}\n\\begin{{tabular}}{{{columns}}}\n\\hline\n", self.title);
+        text.push_str(&line(self.headings.iter().map(|h| escape_latex(&h.label)).collect()));
+        text.push_str("\\hline\n");
+        for row in &self.rows {
+            text.push_str(&line(row.iter().map(|cell| cell.print(true)).collect()));
+        }
+        text.push_str("\\hline\n\\end{tabular}\n");
+        for note in &self.notes {
+            text.push_str(&format!("% {note}\n"));
+        }
+        text
+    }
+
+    /// Whether a column holds errors, and needs a second column in CSV.
+    fn has_errors(&self, k: usize) -> bool {
+        self.rows
+            .iter()
+            .any(|row| matches!(row.get(k), Some(Cell::Number { error: Some(_), .. })))
+    }
+
+    fn csv(&self) -> String {
+        let quote = |words: &str| {
+            if words.contains([',', '"', '\n']) {
+                format!("\"{}\"", words.replace('"', "\"\""))
+            } else {
+                words.to_owned()
+            }
+        };
+        let mut header = Vec::new();
+        for (k, heading) in self.headings.iter().enumerate() {
+            header.push(heading.key.to_owned());
+            if self.has_errors(k) {
+                header.push(format!("{}_error", heading.key));
+            }
+        }
+        let mut text = header.join(",") + "\n";
+        for row in &self.rows {
+            let mut fields = Vec::new();
+            for (k, cell) in row.iter().enumerate() {
+                match cell {
+                    Cell::Text(words) => fields.push(quote(words)),
+                    Cell::Number { value, error, .. } => {
+                        fields.push(number(*value));
+                        if self.has_errors(k) {
+                            fields.push(error.map_or(String::new(), number));
+                        }
+                    }
+                }
+            }
+            text.push_str(&(fields.join(",") + "\n"));
+        }
+        text
+    }
+
+    /// Title, rows as objects, and notes.
+    pub fn json(&self) -> Value {
+        let rows: Vec<Value> = self
+            .rows
+            .iter()
+            .map(|row| {
+                let mut object = Map::new();
+                for (heading, cell) in self.headings.iter().zip(row) {
+                    match cell {
+                        Cell::Text(words) => {
+                            object.insert(heading.key.into(), json!(words));
+                        }
+                        Cell::Number { value, error, .. } => {
+                            object.insert(heading.key.into(), json!(value));
+                            if let Some(error) = error {
+                                object.insert(format!("{}_error", heading.key), json!(error));
+                            }
+                        }
+                    }
+                }
+                Value::Object(object)
+            })
+            .collect();
+        json!({ "title": self.title, "rows": rows, "notes": self.notes })
+    }
+}
+
+fn number(value: f64) -> String {
+    if value.is_nan() {
+        String::new()
+    } else {
+        value.to_string()
+    }
+}
+
+fn escape_latex(words: &str) -> String {
+    let mut text = String::new();
+    for c in words.chars() {
+        match c {
+            '_' | '%' | '&' | '#' | '$' | '{' | '}' => {
+                text.push('\\');
+                text.push(c);
+            }
+            '√' => text.push_str("$\\sqrt{}$"),
+            'χ' => text.push_str("$\\chi$"),
+            'ε' => text.push_str("$\\varepsilon$"),
+            'σ' => text.push_str("$\\sigma$"),
+            '±' => text.push_str("$\\pm$"),
+            '×' => text.push_str("$\\times$"),
+            '−' => text.push_str("$-$"),
+            '⁻' => text.push_str("$^{-}$"),
+            '⁴' => text.push_str("$^{4}$"),
+            other => text.push(other),
+        }
+    }
+    text.replace("$$", "")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn table() -> Table {
+        Table {
+            title: "Scores".into(),
+            headings: vec![Heading::new("name", "Name"), Heading::new("q", "Q")],
+            rows: vec![
+                vec![Cell::text("a,b"), Cell::with_error(87.125, Some(1.5), 1)],
+                vec![Cell::text("c_d"), Cell::number(f64::NAN, 1)],
+            ],
+            notes: vec!["A note.".into()],
+        }
+    }
+
+    #[test]
+    fn every_format_holds_the_numbers() {
+        let people = table().render(TableFormat::Table);
+        assert!(people.contains("87.1 ± 1.5") && people.contains('–'));
+        assert!(table().render(TableFormat::Markdown).contains("| 87.1 ± 1.5 |"));
+        let latex = table().render(TableFormat::Latex);
+        assert!(latex.contains("a,b & $87.1 \\pm 1.5$ \\\\") && latex.contains("c\\_d"));
+        assert_eq!(
+            table().render(TableFormat::Csv),
+            "name,q,q_error\n\"a,b\",87.125,1.5\nc_d,,\n"
+        );
+        let json: Value = serde_json::from_str(&table().render(TableFormat::Json)).unwrap();
+        assert_eq!(json["rows"][0]["q_error"], 1.5);
+        assert!(json["rows"][1]["q"].is_null());
+    }
+}

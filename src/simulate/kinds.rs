@@ -1,0 +1,150 @@
+//! The 24 kinds of set of GREAT10 (Table 2 of the paper).
+
+use serde::Serialize;
+
+/// Highest set number.
+pub const SETS: u32 = 24;
+
+/// Whether a field is the same for all images of a set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Variability {
+    /// The same in every image.
+    Fixed,
+    /// Different from image to image.
+    Variable,
+}
+
+/// What the galaxies and the PSF of a set are like.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ImageType {
+    /// S/N 20, bulge and disc of fiducial size, Moffat PSF.
+    Fiducial,
+    /// S/N 10.
+    LowSnr,
+    /// S/N 40.
+    HighSnr,
+    /// A distribution of S/N.
+    SmoothSnr,
+    /// Small galaxies.
+    SmallGalaxy,
+    /// Large galaxies.
+    LargeGalaxy,
+    /// A distribution of sizes.
+    SmoothGalaxy,
+    /// Kolmogorov PSF with turbulence.
+    Kolmogorov,
+    /// Uniform distribution of bulge fractions.
+    UniformBulge,
+    /// Bulge offset from the disc.
+    OffsetBulge,
+}
+
+impl ImageType {
+    /// The name of the paper's Table 2.
+    pub fn label(self) -> &'static str {
+        match self {
+            ImageType::Fiducial => "Fiducial",
+            ImageType::LowSnr => "Low S/N",
+            ImageType::HighSnr => "High S/N",
+            ImageType::SmoothSnr => "Smooth S/N",
+            ImageType::SmallGalaxy => "Small galaxy",
+            ImageType::LargeGalaxy => "Large galaxy",
+            ImageType::SmoothGalaxy => "Smooth galaxy",
+            ImageType::Kolmogorov => "Kolmogorov PSF",
+            ImageType::UniformBulge => "Uniform bulge/disc ratios",
+            ImageType::OffsetBulge => "50/50 bulge/disc offset",
+        }
+    }
+}
+
+/// One row of Table 2.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct SetKind {
+    /// Set number, 1 to 24.
+    pub set: u32,
+    /// PSF field over the images.
+    pub psf: Variability,
+    /// Intrinsic ellipticity field over the images.
+    pub ellipticity: Variability,
+    /// Galaxies and PSF.
+    pub image: ImageType,
+}
+
+impl SetKind {
+    /// The kind of set `set`, `None` beyond 24.
+    pub fn of(set: u32) -> Option<Self> {
+        use ImageType as I;
+        use Variability::{Fixed, Variable};
+        // Sets 1 to 12 come in threes (variable, fixed PSF, fixed ellipticity), the rest in pairs.
+        let (image, place) = match set {
+            1..=12 => (
+                [I::Fiducial, I::LowSnr, I::HighSnr, I::SmoothSnr][(set as usize - 1) / 3],
+                (set - 1) % 3,
+            ),
+            13..=24 => (
+                [
+                    I::SmallGalaxy,
+                    I::LargeGalaxy,
+                    I::SmoothGalaxy,
+                    I::Kolmogorov,
+                    I::UniformBulge,
+                    I::OffsetBulge,
+                ][(set as usize - 13) / 2],
+                (set - 13) % 2,
+            ),
+            _ => return None,
+        };
+        let (psf, ellipticity) = match place {
+            0 => (Variable, Variable),
+            1 => (Fixed, Variable),
+            _ => (Variable, Fixed),
+        };
+        Some(SetKind {
+            set,
+            psf,
+            ellipticity,
+            image,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_is_the_papers() {
+        use ImageType as I;
+        use Variability::{Fixed, Variable};
+        let spots = [
+            (1, Variable, Variable, I::Fiducial),
+            (2, Fixed, Variable, I::Fiducial),
+            (3, Variable, Fixed, I::Fiducial),
+            (5, Fixed, Variable, I::LowSnr),
+            (9, Variable, Fixed, I::HighSnr),
+            (10, Variable, Variable, I::SmoothSnr),
+            (12, Variable, Fixed, I::SmoothSnr),
+            (13, Variable, Variable, I::SmallGalaxy),
+            (14, Fixed, Variable, I::SmallGalaxy),
+            (16, Fixed, Variable, I::LargeGalaxy),
+            (17, Variable, Variable, I::SmoothGalaxy),
+            (20, Fixed, Variable, I::Kolmogorov),
+            (22, Fixed, Variable, I::UniformBulge),
+            (23, Variable, Variable, I::OffsetBulge),
+            (24, Fixed, Variable, I::OffsetBulge),
+        ];
+        for (set, psf, ellipticity, image) in spots {
+            let kind = SetKind {
+                set,
+                psf,
+                ellipticity,
+                image,
+            };
+            assert_eq!(SetKind::of(set), Some(kind));
+        }
+        assert_eq!(SetKind::of(0), None);
+        assert_eq!(SetKind::of(25), None);
+    }
+}

@@ -1,0 +1,14 @@
+//! GREAT10-like sets, simulated.
+//!
+//! * [`kinds`]: what distinguishes the 24 sets (the paper's Table 2).
+//! * [`field`]: shear, intrinsic and PSF ellipticity fields as Gaussian random fields.
+//! * [`set`]: one set: its fields, and each galaxy from a random stream of its own.
+//! * [`galaxy`], [`render`]: profiles and their drawing.
+//!
+//! What GREAT10 did not publish is chosen here and documented at each choice.
+
+pub mod field;
+pub mod galaxy;
+pub mod kinds;
+pub mod render;
+pub mod set;
