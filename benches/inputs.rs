@@ -15,7 +15,9 @@ pub fn submission(name: &str) -> Submission {
 pub fn stamp(n: usize) -> Vec<f32> {
     let mut state = 1u64;
     let mut next = || {
-        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        state = state
+            .wrapping_mul(6364136223846793005)
+            .wrapping_add(1442695040888963407);
         (state >> 40) as f32 / (1u64 << 24) as f32 - 0.5
     };
     let centre = (n as f32 - 1.0) / 2.0;

@@ -205,10 +205,7 @@ mod tests {
             let turned = shear.mapv(|g| g * Complex64::new(0.0, 1.0));
             let power = |m: &Array2<Complex64>| m.iter().map(|v| v.norm_sqr()).sum::<f64>();
             let modes = decomposer.decompose(shear);
-            assert!(
-                power(&modes.b) < 1e-12 * power(&modes.e),
-                "wave {wave:?}"
-            );
+            assert!(power(&modes.b) < 1e-12 * power(&modes.e), "wave {wave:?}");
             // κ keeps the sign of the wave: E is +n²/2 at the wave vector.
             assert!((modes.e[wave].re - (n * n) as f64 / 2.0).abs() < 1e-6);
             let modes = decomposer.decompose(turned);

@@ -30,7 +30,10 @@ pub fn quality(bins: &Bins, measured: &[f64; BINS], truth: &[f64; BINS]) -> Qual
 /// Multiplicative and additive bias of a power spectrum:
 /// C_b − C_b^true = A + M·C_b^true, by unweighted least squares over bins 2 to 9.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-#[allow(non_snake_case, reason = "the field's own symbols, also in the JSON output")]
+#[allow(
+    non_snake_case,
+    reason = "the field's own symbols, also in the JSON output"
+)]
 pub struct Bias {
     /// Multiplicative bias M ≈ m² + 2m; the published figure is M/2.
     pub M: f64,
@@ -54,10 +57,7 @@ pub fn bias(measured: &[f64; BINS], truth: &[f64; BINS], scale: impl Fn(usize) -
     let mean_x = points.iter().map(|p| p.0).sum::<f64>() / count;
     let mean_y = points.iter().map(|p| p.1).sum::<f64>() / count;
     let sxx: f64 = points.iter().map(|p| (p.0 - mean_x).powi(2)).sum();
-    let sxy: f64 = points
-        .iter()
-        .map(|p| (p.0 - mean_x) * (p.1 - mean_y))
-        .sum();
+    let sxy: f64 = points.iter().map(|p| (p.0 - mean_x) * (p.1 - mean_y)).sum();
     let slope = sxy / sxx;
     let intercept = mean_y - slope * mean_x;
     Bias {

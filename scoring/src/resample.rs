@@ -89,9 +89,8 @@ mod tests {
         let n = data.len() as f64;
         let sum: f64 = data.iter().sum();
         let mean = sum / n;
-        let standard = (data.iter().map(|v| (v - mean).powi(2)).sum::<f64>()
-            / (n * (n - 1.0)))
-            .sqrt();
+        let standard =
+            (data.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))).sqrt();
         let error = jackknife_error(data.iter().map(|v| (sum - v) / (n - 1.0)));
         assert!((error / standard - 1.0).abs() < 1e-12);
         assert!(jackknife_error([1.0]).is_nan());

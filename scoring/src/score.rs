@@ -463,10 +463,9 @@ impl SetScorer {
     /// the standard one is used.
     fn noise_power(&self, images: &SetImages) -> Option<[f64; BINS]> {
         match self.options.noise {
-            Noise::Given(variance) => Some(
-                self.bins
-                    .white_noise(variance / images.total.images as f64),
-            ),
+            Noise::Given(variance) => {
+                Some(self.bins.white_noise(variance / images.total.images as f64))
+            }
             Noise::Measured => {
                 let count = images.groups.len() as f64;
                 if count < 2.0 {

@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 use shearq_scoring::{
-    Bias, BiasFits, ConventionClass, ConventionScore, FieldSum, Grid, Noise, Options, Row, SetImages, SetScore,
-    SetScorer, TrueShear, TruthSign,
+    Bias, BiasFits, ConventionClass, ConventionScore, FieldSum, Grid, Noise, Options, Row,
+    SetImages, SetScore, SetScorer, TrueShear, TruthSign,
 };
 
 fn cases() -> Vec<PathBuf> {
@@ -32,7 +32,10 @@ fn rows(path: &Path) -> Vec<Row> {
     text.lines()
         .skip(1)
         .map(|line| {
-            let v: Vec<f64> = line.split(',').map(|f| f.parse().expect("number")).collect();
+            let v: Vec<f64> = line
+                .split(',')
+                .map(|f| f.parse().expect("number"))
+                .collect();
             Row {
                 x: v[0],
                 y: v[1],
@@ -71,16 +74,22 @@ struct Check<'a> {
 
 impl Check<'_> {
     fn close(&mut self, what: &str, found: f64, expected: &Value, scale: f64) {
-        let wanted = expected.as_f64().unwrap_or_else(|| panic!("{what} in expected.json"));
+        let wanted = expected
+            .as_f64()
+            .unwrap_or_else(|| panic!("{what} in expected.json"));
         let size = wanted.abs().max(scale);
         if (found - wanted).abs() > self.tolerance * size {
-            self.failures
-                .push(format!("{}: {what}: found {found:e}, expected {wanted:e}", self.case));
+            self.failures.push(format!(
+                "{}: {what}: found {found:e}, expected {wanted:e}",
+                self.case
+            ));
         }
     }
 
     fn list(&mut self, what: &str, found: &[f64], expected: &Value, scale: f64) {
-        let wanted = expected.as_array().unwrap_or_else(|| panic!("{what} in expected.json"));
+        let wanted = expected
+            .as_array()
+            .unwrap_or_else(|| panic!("{what} in expected.json"));
         assert_eq!(found.len(), wanted.len(), "{what}");
         for (b, (f, w)) in found.iter().zip(wanted).enumerate() {
             if !w.is_null() {
@@ -92,7 +101,12 @@ impl Check<'_> {
     fn bias(&mut self, what: &str, found: &Bias, expected: &Value) {
         self.close(&format!("{what}.M"), found.M, &expected["M"], 1e-3);
         self.close(&format!("{what}.A"), found.A, &expected["A"], 0.0);
-        self.close(&format!("{what}.sqrtA"), found.sqrtA, &expected["sqrtA"], 0.0);
+        self.close(
+            &format!("{what}.sqrtA"),
+            found.sqrtA,
+            &expected["sqrtA"],
+            0.0,
+        );
         self.close(&format!("{what}.m"), found.m, &expected["m"], 1e-3);
     }
 
@@ -138,7 +152,11 @@ fn every_public_figure_is_reproduced() {
         let mut check = Check {
             case: name,
             // The cases' own README: 1e-9, and 1e-8 where nearly equal powers are subtracted.
-            tolerance: if name.contains("tiny_noise") { 1e-8 } else { 1e-9 },
+            tolerance: if name.contains("tiny_noise") {
+                1e-8
+            } else {
+                1e-9
+            },
             failures: Vec::new(),
         };
         let bins = &score.bins;
@@ -160,8 +178,16 @@ fn every_public_figure_is_reproduced() {
             let found = score.conventions[number - 1].quality.q;
             check.close(&format!("Q_per_convention.{name}"), found, q, 0.0);
         }
-        check.class("classes.A", &score.conventions[5], &expected["classes"]["A"]);
-        check.class("classes.B", &score.conventions[4], &expected["classes"]["B"]);
+        check.class(
+            "classes.A",
+            &score.conventions[5],
+            &expected["classes"]["A"],
+        );
+        check.class(
+            "classes.B",
+            &score.conventions[4],
+            &expected["classes"]["B"],
+        );
         for (name, class) in [("A", ConventionClass::A), ("B", ConventionClass::B)] {
             let corr = score.class_correlation(class);
             check.close("corr", corr, &expected["classes"][name]["corr"], 1e-3);
@@ -169,7 +195,10 @@ fn every_public_figure_is_reproduced() {
         failures.extend(check.failures);
         let class = |c: shearq_scoring::Convention| format!("{:?}", c.class());
         // Conventions of one class tie up to rounding: compare the winner by class.
-        assert_eq!(class(score.best), expected["winner_class"].as_str().unwrap());
+        assert_eq!(
+            class(score.best),
+            expected["winner_class"].as_str().unwrap()
+        );
         assert_eq!(
             u64::from(score.matched.number()),
             expected["matched"].as_u64().unwrap()

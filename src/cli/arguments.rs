@@ -6,6 +6,7 @@ use std::str::FromStr;
 use clap::{Args, ValueEnum};
 use shearq_scoring::{Choice, Convention, Definition};
 
+use crate::report::table::{Table, TableFormat};
 use crate::simulate::kinds::SETS;
 
 /// A list of sets such as `1,2,7-9` or `all`.
@@ -43,6 +44,28 @@ impl FromStr for SetList {
             }
         }
         Ok(SetList(sets.into_iter().collect()))
+    }
+}
+
+/// How to print a table.
+#[derive(Debug, Clone, Args)]
+pub(super) struct Printing {
+    /// How to print; `csv` and `json` have every column in full precision.
+    #[arg(long, value_enum, default_value_t)]
+    pub(super) format: TableFormat,
+    /// Print the columns of detail (c, m per component, null tests) in the other formats too.
+    #[arg(long)]
+    wide: bool,
+}
+
+impl Printing {
+    pub(super) fn render(&self, table: &Table) -> String {
+        let people = !matches!(self.format, TableFormat::Csv | TableFormat::Json);
+        if people && !self.wide {
+            table.narrow().render(self.format)
+        } else {
+            table.render(self.format)
+        }
     }
 }
 

@@ -7,13 +7,13 @@ use clap::Args;
 use shearq_scoring::{Noise, Options};
 use shearq_submissions::Registry;
 
-use super::arguments::{ScoreSettings, Threads};
+use super::arguments::{Printing, ScoreSettings, Threads};
 use super::print;
 use crate::io::layout::DataFolder;
 use crate::io::run::Run;
 use crate::pipeline::score::score_folder;
 use crate::report::scores::{Variant, compare};
-use crate::report::table::TableFormat;
+use crate::report::table::Table;
 
 /// Put measured submissions side by side, beside the published figures.
 ///
@@ -27,9 +27,8 @@ pub(super) struct Arguments {
     /// Data folder with the true shear [default: the one each OUT was measured from].
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// How to print.
-    #[arg(long, value_enum, default_value_t)]
-    format: TableFormat,
+    #[command(flatten)]
+    printing: Printing,
     #[command(flatten)]
     settings: ScoreSettings,
     #[command(flatten)]
@@ -42,14 +41,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         noise: Noise::Measured,
         choice: arguments.settings.choice(),
     };
-    let text = table(
+    let table = table(
         &arguments.measured,
         arguments.data.as_deref(),
         options,
         arguments.threads.number(),
-    )?
-    .render(arguments.format);
-    print(&text)
+    )?;
+    print(&arguments.printing.render(&table))
 }
 
 /// The comparison of several results folders.
@@ -58,7 +56,7 @@ pub(super) fn table(
     data: Option<&Path>,
     options: Options,
     threads: usize,
-) -> anyhow::Result<crate::report::table::Table> {
+) -> anyhow::Result<Table> {
     let registry = Registry::embedded()?;
     let mut variants = Vec::new();
     for folder in folders {

@@ -18,7 +18,8 @@ impl Bar {
             ProgressDrawTarget::hidden()
         };
         let bar = ProgressBar::with_draw_target(Some(galaxies), target);
-        let template = "{prefix} {bar:30} {human_pos}/{human_len} galaxies, {per_sec}, {eta} left  {msg}";
+        let template =
+            "{prefix} {bar:30} {human_pos}/{human_len} galaxies, {per_sec}, {eta} left  {msg}";
         if let Ok(style) = ProgressStyle::with_template(template) {
             bar.set_style(style);
         }

@@ -81,7 +81,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         folders.push(folder);
     }
     let table = compare::table(&folders, None, options, threads)?;
-    print(&table.render(TableFormat::Table))?;
+    print(&table.narrow().render(TableFormat::Table))?;
     eprintln!("\nNext: {}", next_step(out));
     Ok(())
 }

@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum};
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Noise, Options, TruthSign};
 
-use super::arguments::{ScoreSettings, SetList, Threads};
+use super::arguments::{Printing, ScoreSettings, SetList, Threads};
 use super::print;
 use crate::io::layout::DataFolder;
 use crate::io::run::Run;
@@ -24,7 +24,12 @@ use crate::report::table::TableFormat;
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Data folder with the true shear.
-    #[arg(long, value_name = "DIR", requires = "measured", conflicts_with = "truth")]
+    #[arg(
+        long,
+        value_name = "DIR",
+        requires = "measured",
+        conflicts_with = "truth"
+    )]
     data: Option<PathBuf>,
     /// Folder of catalogues that `measure` wrote.
     #[arg(long, value_name = "DIR", requires = "data")]
@@ -52,11 +57,16 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DEG", default_value_t = 10.0)]
     field: f64,
     /// Columns of the catalogues, for --truth.
-    #[arg(long, value_name = "X,Y,E1,E2", default_value = "x,y,e1,e2", value_delimiter = ',', num_args = 1)]
+    #[arg(
+        long,
+        value_name = "X,Y,E1,E2",
+        default_value = "x,y,e1,e2",
+        value_delimiter = ',',
+        num_args = 1
+    )]
     columns: Vec<String>,
-    /// How to print.
-    #[arg(long, value_enum, default_value_t)]
-    format: TableFormat,
+    #[command(flatten)]
+    printing: Printing,
     #[command(flatten)]
     settings: ScoreSettings,
     #[command(flatten)]
@@ -114,7 +124,7 @@ fn folder(
     let scored = score_folder(&data, measured, &run, sets, options, threads)?;
     let title = format!("Scores of {}", run.submission.name);
     let table = per_set(&scored, &title, options.definition, options.choice);
-    print(&table.render(arguments.format))
+    print(&arguments.printing.render(&table))
 }
 
 fn files(arguments: &Arguments, truth: &PathBuf, options: Options) -> anyhow::Result<()> {
@@ -128,7 +138,9 @@ fn files(arguments: &Arguments, truth: &PathBuf, options: Options) -> anyhow::Re
     let reading = Reading {
         field: Degrees(arguments.field),
         stamp: Pixels(arguments.stamp),
-        sign: arguments.truth_sign.map_or(TruthSign::Challenge, Into::into),
+        sign: arguments
+            .truth_sign
+            .map_or(TruthSign::Challenge, Into::into),
         columns,
     };
     let (score, rows) = score_files(
@@ -138,8 +150,12 @@ fn files(arguments: &Arguments, truth: &PathBuf, options: Options) -> anyhow::Re
         options,
         arguments.threads.number(),
     )?;
-    let scored = ScoredSet { set: 0, score, rows };
-    if arguments.format == TableFormat::Json {
+    let scored = ScoredSet {
+        set: 0,
+        score,
+        rows,
+    };
+    if arguments.printing.format == TableFormat::Json {
         let name = |path: &PathBuf| path.display().to_string();
         let input = SetInput {
             case: truth
@@ -156,5 +172,5 @@ fn files(arguments: &Arguments, truth: &PathBuf, options: Options) -> anyhow::Re
     }
     let title = format!("Scores against {}", truth.display());
     let table = per_set(&[scored], &title, options.definition, options.choice);
-    print(&table.render(arguments.format))
+    print(&arguments.printing.render(&table))
 }

@@ -10,9 +10,7 @@ use shearq_submissions::Registry;
 use crate::io::layout::DataFolder;
 use crate::pipeline::galaxy::{Measurement, Measurer};
 use crate::pipeline::measure::{ImageId, ImageSource, psf_of};
-use crate::report::figure::{
-    ColourMap, Figure, ImageGrid, ImagePanel, ImageRow, Scale, Stretch,
-};
+use crate::report::figure::{ColourMap, Figure, ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
 
 /// Draw the steps of galaxies like the paper's Fig. 3: stamp, PSF, deconvolved, residual, ACF,
 /// clipped ACF.
@@ -79,7 +77,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         );
         let (ix, iy) = ((index - 1) % grid.n, (index - 1) / grid.n);
         let row = loop {
-            let row = source.next_row()?.context("the image ended before the galaxy")?;
+            let row = source
+                .next_row()?
+                .context("the image ended before the galaxy")?;
             if row.iy == iy {
                 break row;
             }
@@ -109,7 +109,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         rows.push(ImageRow {
             label: format!("{}/{}/{index}", image.set, image.image),
             panels: vec![
-                panel("Stamp", steps.raw, Viridis, Stretch::Linear),
+                panel("Stamp", steps.stamp, Viridis, Stretch::Linear),
                 panel("PSF", psf, Viridis, Stretch::Asinh),
                 panel("Deconvolved", steps.deconvolved, Viridis, Stretch::Linear),
                 panel("Residual", steps.residual, Diverging, Stretch::Linear),
@@ -130,9 +130,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 }
 
 fn describe(id: ImageId, index: usize, m: &Measurement) -> String {
-    let stop = m
-        .outcome
-        .map_or_else(String::new, |o| format!("{} iterations, {:?}", o.iterations, o.stop));
+    let stop = m.outcome.map_or_else(String::new, |o| {
+        format!("{} iterations, {:?}", o.iterations, o.stop)
+    });
     format!(
         "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4}, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",
         id.set, id.image, m.e1, m.e2, m.flag, m.noise, m.radius

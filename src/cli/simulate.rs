@@ -36,7 +36,12 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "A", default_value_t = 1.0)]
     amplitude: f64,
     /// Extra slope of the shear power spectrum, about ℓ = 1000.
-    #[arg(long, value_name = "T", default_value_t = 0.0, allow_negative_numbers = true)]
+    #[arg(
+        long,
+        value_name = "T",
+        default_value_t = 0.0,
+        allow_negative_numbers = true
+    )]
     tilt: f64,
     #[command(flatten)]
     threads: Threads,
@@ -78,6 +83,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (made, already) =
         simulate_folder(&record, &sets.0, *images, &data, threads.number(), &mut bar)?;
     drop(bar);
-    eprintln!("{made} images simulated, {already} there already, in {}", out.display());
+    eprintln!(
+        "{made} images simulated, {already} there already, in {}",
+        out.display()
+    );
     Ok(())
 }

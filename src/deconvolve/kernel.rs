@@ -43,7 +43,11 @@ macro_rules! real {
             }
             #[inline(always)]
             fn add_product<const FMA: bool>(self, a: Self, b: Self) -> Self {
-                if FMA { a.mul_add(b, self) } else { self + a * b }
+                if FMA {
+                    a.mul_add(b, self)
+                } else {
+                    self + a * b
+                }
             }
             #[inline(always)]
             fn minus(self, other: Self) -> Self {
@@ -239,9 +243,17 @@ fn add_squares<T: Real>(sums: &mut [f64; LANES], row: &[T]) {
 fn gradient<T: Real, const FMA: bool>(operator: &Operator<T>, b: &mut Buffers<T>) {
     let (n, p) = (operator.n, operator.p);
     let gradient = &mut b.gradient;
-    for_each_row!(FMA, &b.residual, &operator.forward, p, p / 2, &mut b.rows, |y, row| {
-        gradient[y * n..y * n + n].copy_from_slice(row);
-    });
+    for_each_row!(
+        FMA,
+        &b.residual,
+        &operator.forward,
+        p,
+        p / 2,
+        &mut b.rows,
+        |y, row| {
+            gradient[y * n..y * n + n].copy_from_slice(row);
+        }
+    );
     if operator.lambda > T::ZERO {
         let minus_lambda = T::ZERO.minus(operator.lambda);
         let kernel: [T; 9] = std::array::from_fn(|k| T::from_f64(SUN_KERNEL[k / 3][k % 3]));
@@ -256,7 +268,11 @@ fn gradient<T: Real, const FMA: bool>(operator: &Operator<T>, b: &mut Buffers<T>
 /// Updates every neuron beyond its threshold (Eq. 6) and clips at zero (Eq. 12); returns how many
 /// were beyond.
 #[inline(always)]
-fn update<T: Real, const FMA: bool>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> u32 {
+fn update<T: Real, const FMA: bool>(
+    operator: &Operator<T>,
+    rule: &Rule,
+    b: &mut Buffers<T>,
+) -> u32 {
     let n = operator.n;
     let unit = T::from_f64(rule.unit);
     let (adaptive, c, delta) = match rule.step {
@@ -293,7 +309,11 @@ fn update<T: Real, const FMA: bool>(operator: &Operator<T>, rule: &Rule, b: &mut
 
 /// Runs the network from `b.state` on `b.data`; the result is left in `b.state`.
 #[inline(always)]
-fn run<T: Real, const FMA: bool>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Outcome {
+fn run<T: Real, const FMA: bool>(
+    operator: &Operator<T>,
+    rule: &Rule,
+    b: &mut Buffers<T>,
+) -> Outcome {
     let mut constant = [0.0f64; LANES];
     add_squares(&mut constant, &b.data);
     let constant = 0.5 * constant.iter().sum::<f64>();
@@ -368,7 +388,12 @@ impl Level {
     }
 
     /// Runs the kernel compiled for this level.
-    pub(super) fn run<T: Real>(self, operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Outcome {
+    pub(super) fn run<T: Real>(
+        self,
+        operator: &Operator<T>,
+        rule: &Rule,
+        b: &mut Buffers<T>,
+    ) -> Outcome {
         match self {
             // SAFETY: `detect` returns these only where the machine has the features.
             #[cfg(target_arch = "x86_64")]

@@ -151,39 +151,76 @@ mod tests {
         rule: Rule,
     }
 
-    fn run<T: Real>(case: &Case, psf: ArrayView2<'_, f64>, u0: &Array2<f64>) -> (Vec<f64>, Outcome) {
+    fn run<T: Real>(
+        case: &Case,
+        psf: ArrayView2<'_, f64>,
+        u0: &Array2<f64>,
+    ) -> (Vec<f64>, Outcome) {
         let mut network = Network::<T>::plan(case.n, case.p, case.lambda).unwrap();
         network.set_psf(psf).unwrap();
         let mut scratch = network.scratch();
         let mut out = vec![T::ZERO; case.n * case.n];
         let data: Vec<T> = u0.iter().map(|&v| T::from_f64(v)).collect();
         // A first run on other data leaves its traces in the scratch.
-        let dirt: Vec<T> = data.iter().rev().map(|v| T::from_f64(9.0 * v.to_f64())).collect();
+        let dirt: Vec<T> = data
+            .iter()
+            .rev()
+            .map(|v| T::from_f64(9.0 * v.to_f64()))
+            .collect();
         network.deconvolve(&case.rule, &dirt, &mut scratch, &mut out);
         let outcome = network.deconvolve(&case.rule, &data, &mut scratch, &mut out);
         (out.iter().map(|v| v.to_f64()).collect(), outcome)
     }
 
     fn largest(a: &[f64], b: &Array2<f64>) -> f64 {
-        a.iter().zip(b).map(|(x, y)| (x - y).abs()).fold(0.0, f64::max)
+        a.iter()
+            .zip(b)
+            .map(|(x, y)| (x - y).abs())
+            .fold(0.0, f64::max)
     }
 
     #[test]
     fn matches_the_matrices_over_sizes_updates_and_regularisation() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let sizes = [
-            (5, 3), (5, 4), (5, 15), (7, 25), (11, 5), (16, 15), (17, 16), (19, 15), (23, 15),
-            (23, 25), (29, 15), (32, 8), (33, 21), (48, 15), (48, 25),
+            (5, 3),
+            (5, 4),
+            (5, 15),
+            (7, 25),
+            (11, 5),
+            (16, 15),
+            (17, 16),
+            (19, 15),
+            (23, 15),
+            (23, 25),
+            (29, 15),
+            (32, 8),
+            (33, 21),
+            (48, 15),
+            (48, 25),
         ];
         for (k, (n, p)) in sizes.into_iter().enumerate() {
             let psf = psf(&mut rng, p);
             let u0 = stamp(&mut rng, n);
-            let lambdas = if n > 30 { vec![0.3] } else { vec![0.0, 1e-4, 1.0] };
+            let lambdas = if n > 30 {
+                vec![0.3]
+            } else {
+                vec![0.0, 1e-4, 1.0]
+            };
             for lambda in lambdas {
                 let matrices = Matrices::new(n, psf.view(), lambda);
-                for step in [Step::Adaptive(0.9), Step::Adaptive(0.05), Step::Constant(0.03)] {
+                for step in [
+                    Step::Adaptive(0.9),
+                    Step::Adaptive(0.05),
+                    Step::Constant(0.03),
+                ] {
                     let start = [Start::ClippedData, Start::Flat, Start::Zero][k % 3];
-                    let rule = Rule { step, unit: 0.03, max_iterations: 12, start };
+                    let rule = Rule {
+                        step,
+                        unit: 0.03,
+                        max_iterations: 12,
+                        start,
+                    };
                     let case = Case { n, p, lambda, rule };
                     let (expected, reference) = matrices.deconvolve(&rule, u0.view());
                     let (found, outcome) = run::<f64>(&case, psf.view(), &u0);
@@ -195,7 +232,10 @@ mod tests {
                     // order ten, carried through twelve steps.
                     assert!(largest(&found, &expected) < 1e-11, "{label}");
                     let scale = reference.energy.abs().max(1.0);
-                    assert!((outcome.energy - reference.energy).abs() < 1e-10 * scale, "{label}");
+                    assert!(
+                        (outcome.energy - reference.energy).abs() < 1e-10 * scale,
+                        "{label}"
+                    );
                     assert!((outcome.first_energy - reference.first_energy).abs() < 1e-10 * scale);
                 }
             }
@@ -230,12 +270,21 @@ mod tests {
                 max_iterations: 20,
                 start: Start::ClippedData,
             };
-            let case = Case { n, p, lambda: 1e-4, rule };
+            let case = Case {
+                n,
+                p,
+                lambda: 1e-4,
+                rule,
+            };
             let (double, a) = run::<f64>(&case, psf.view(), &u0);
             let (single, b) = run::<f32>(&case, psf.view(), &u0);
             assert_eq!((a.iterations, a.stop), (b.iterations, b.stop));
             let peak = double.iter().copied().fold(0.0, f64::max);
-            let worst = double.iter().zip(&single).map(|(x, y)| (x - y).abs()).fold(0.0, f64::max);
+            let worst = double
+                .iter()
+                .zip(&single)
+                .map(|(x, y)| (x - y).abs())
+                .fold(0.0, f64::max);
             assert!(worst < 3e-6 * peak, "n {n}: {worst} of {peak}");
         }
     }
@@ -246,15 +295,33 @@ mod tests {
         let psf = psf(&mut rng, 7);
         let u0 = stamp(&mut rng, 15);
         let outcome = |step, unit, max_iterations| {
-            let rule = Rule { step, unit, max_iterations, start: Start::ClippedData };
-            run::<f32>(&Case { n: 15, p: 7, lambda: 0.0, rule }, psf.view(), &u0).1
+            let rule = Rule {
+                step,
+                unit,
+                max_iterations,
+                start: Start::ClippedData,
+            };
+            run::<f32>(
+                &Case {
+                    n: 15,
+                    p: 7,
+                    lambda: 0.0,
+                    rule,
+                },
+                psf.view(),
+                &u0,
+            )
+            .1
         };
         let all = outcome(Step::Adaptive(0.5), 0.01, 5);
         assert_eq!((all.stop, all.iterations), (Stop::MaxIterations, 5));
         assert!(all.energy < all.first_energy);
         // A unit so large that no gradient reaches its threshold.
         let stable = outcome(Step::Adaptive(0.5), 1e6, 50);
-        assert_eq!((stable.stop, stable.iterations, stable.updated), (Stop::Stable, 0, 0));
+        assert_eq!(
+            (stable.stop, stable.iterations, stable.updated),
+            (Stop::Stable, 0, 0)
+        );
         // A step beyond the stability limit of 2 over the largest eigenvalue.
         let rise = outcome(Step::Adaptive(50.0), 0.01, 50);
         assert_eq!(rise.stop, Stop::EnergyRise);
@@ -280,7 +347,11 @@ mod tests {
         network.level = Level::Baseline;
         network.deconvolve(&rule, &u0, &mut scratch, &mut plain);
         // Fused and unfused products differ by f32 rounding.
-        let worst = best.iter().zip(&plain).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let worst = best
+            .iter()
+            .zip(&plain)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max);
         assert!(worst < 1e-4, "{worst}");
     }
 

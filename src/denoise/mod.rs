@@ -282,11 +282,18 @@ mod tests {
         for (level, expected) in filter.variances.iter().enumerate() {
             let DenoiseScratch { rows, line, .. } = &mut scratch;
             filter.convolve(&smooth, &mut next, rows, line, &SPLINE, 1 << level);
-            let measured = smooth.iter().zip(&next).map(|(a, b)| (a - b).powi(2)).sum::<f32>()
+            let measured = smooth
+                .iter()
+                .zip(&next)
+                .map(|(a, b)| (a - b).powi(2))
+                .sum::<f32>()
                 / (n * n) as f32;
             // About n²/(4·4^level) independent coefficients: 3, 6 and 12 % at three sigma.
             let tolerance = 0.06 * f32::from(1u8 << level);
-            assert!((measured / expected - 1.0).abs() < tolerance, "scale {level}");
+            assert!(
+                (measured / expected - 1.0).abs() < tolerance,
+                "scale {level}"
+            );
             std::mem::swap(&mut smooth, &mut next);
         }
     }

@@ -30,14 +30,18 @@ impl PartFile {
             .ok_or_else(|| FileError::new(&target, "this is not the name of a file"))?;
         let folder = target.parent().unwrap_or(Path::new(""));
         if !folder.as_os_str().is_empty() {
-            fs::create_dir_all(folder).map_err(FileError::doing(folder, "cannot make the folder"))?;
+            fs::create_dir_all(folder)
+                .map_err(FileError::doing(folder, "cannot make the folder"))?;
         }
         let part = folder.join(format!(".{}.part", name.to_string_lossy()));
         match fs::remove_file(&part) {
             Ok(()) => {}
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
             Err(error) => {
-                return Err(FileError::new(&part, format!("cannot remove the leftover: {error}")));
+                return Err(FileError::new(
+                    &part,
+                    format!("cannot remove the leftover: {error}"),
+                ));
             }
         }
         Ok(PartFile {

@@ -34,7 +34,11 @@ fn plain_name(path: &Path) -> Result<(), FileError> {
     let plus = name
         .rsplit_once('+')
         .is_some_and(|(_, end)| !end.is_empty() && end.bytes().all(|b| b.is_ascii_digit()));
-    if name.contains(['[', ']', '(', ')']) || name.starts_with(['!', '-']) || name.contains("://") || plus {
+    if name.contains(['[', ']', '(', ')'])
+        || name.starts_with(['!', '-'])
+        || name.contains("://")
+        || plus
+    {
         return Err(FileError::new(
             path,
             "FITS file names must not hold brackets or `://`, start with `!` or `-`, or end in `+` and a number",
@@ -85,7 +89,10 @@ impl ImageReader {
             .map_err(FileError::doing(path, "cannot open the image"))?
             .len();
         if size == 0 {
-            return Err(FileError::new(path, "the file is empty; expected a FITS image"));
+            return Err(FileError::new(
+                path,
+                "the file is empty; expected a FITS image",
+            ));
         }
         let _guard = lock();
         let cannot = |e| FileError::new(path, format!("cannot open the image: {}", describe(e)));
@@ -159,7 +166,6 @@ impl ImageReader {
         let _guard = lock();
         let pixels = self
             .hdu
-            
             .read_section::<Vec<f32>>(self.file.get(), first * self.width, last * self.width)
             .map_err(|e| {
                 FileError::new(
@@ -249,7 +255,10 @@ impl ImageWriter {
         if rows * self.width != pixels.len() || self.next_row + rows > self.height {
             return Err(FileError::new(
                 self.part.target(),
-                format!("{} pixels are not the next rows of this image", pixels.len()),
+                format!(
+                    "{} pixels are not the next rows of this image",
+                    pixels.len()
+                ),
             ));
         }
         let _guard = lock();
@@ -328,11 +337,7 @@ fn write_header(
 ///
 /// # Errors
 /// Where the file cannot be written.
-pub fn write_table(
-    path: &Path,
-    table: &Table,
-    header: &[(&str, Value)],
-) -> Result<(), FileError> {
+pub fn write_table(path: &Path, table: &Table, header: &[(&str, Value)]) -> Result<(), FileError> {
     plain_name(path)?;
     let part = PartFile::new(path)?;
     let file = {
@@ -391,7 +396,10 @@ pub fn read_table(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileErr
                 format!("the table says it has {num_rows} rows; expected at most {MAX_ROWS}"),
             ));
         }
-        let known: Vec<&str> = column_descriptions.iter().map(|c| c.name.as_str()).collect();
+        let known: Vec<&str> = column_descriptions
+            .iter()
+            .map(|c| c.name.as_str())
+            .collect();
         let mut columns = Vec::new();
         for description in column_descriptions {
             let name = description.name.as_str();

@@ -67,7 +67,10 @@ impl DataFolder {
     pub fn open(root: impl AsRef<Path>) -> Result<Self, FileError> {
         let root = root.as_ref().to_owned();
         if !root.is_dir() {
-            return Err(FileError::new(&root, "there is no such folder; expected a data folder"));
+            return Err(FileError::new(
+                &root,
+                "there is no such folder; expected a data folder",
+            ));
         }
         let path = root.join(LAYOUT_FILE);
         let layout = if path.is_file() {
@@ -110,7 +113,8 @@ impl DataFolder {
 
     /// The PSF parameters of an image.
     pub fn psf_functional(&self, set: u32, image: u32) -> PathBuf {
-        self.root.join(fill(&self.layout.psf_functional, set, image))
+        self.root
+            .join(fill(&self.layout.psf_functional, set, image))
     }
 
     /// The true shear of a set.
@@ -209,7 +213,13 @@ mod tests {
 
     #[test]
     fn patterns_take_plain_and_padded_numbers() {
-        assert_eq!(fill("set{set:02}/galaxies-{image:03}.fits", 7, 12), "set07/galaxies-012.fits");
-        assert_eq!(fill("g10_v1_objs_{set}_{image}.me.dat", 7, 12), "g10_v1_objs_7_12.me.dat");
+        assert_eq!(
+            fill("set{set:02}/galaxies-{image:03}.fits", 7, 12),
+            "set07/galaxies-012.fits"
+        );
+        assert_eq!(
+            fill("g10_v1_objs_{set}_{image}.me.dat", 7, 12),
+            "g10_v1_objs_7_12.me.dat"
+        );
     }
 }

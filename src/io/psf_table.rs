@@ -19,7 +19,10 @@ const HEADER: &str = "x,y,profile,beta,fwhm,e1,e2";
 pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
     let text = std::fs::read_to_string(path)
         .map_err(FileError::doing(path, "cannot read the PSF parameters"))?;
-    let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
+    let mut lines = text
+        .lines()
+        .enumerate()
+        .filter(|(_, l)| !l.trim().is_empty());
     let header = lines.next().map_or("", |(_, line)| line.trim());
     if header != HEADER {
         return Err(FileError::new(
@@ -65,16 +68,19 @@ pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
         })?;
         field[iy * grid.n + ix] = Some(*psf);
     }
-    field.into_iter().collect::<Option<Vec<_>>>().ok_or_else(|| {
-        FileError::new(
-            path,
-            format!(
-                "{} rows; expected one, or one for each of the {} galaxies",
-                rows.len(),
-                grid.cells()
-            ),
-        )
-    })
+    field
+        .into_iter()
+        .collect::<Option<Vec<_>>>()
+        .ok_or_else(|| {
+            FileError::new(
+                path,
+                format!(
+                    "{} rows; expected one, or one for each of the {} galaxies",
+                    rows.len(),
+                    grid.cells()
+                ),
+            )
+        })
 }
 
 /// Writes PSFs with their positions.

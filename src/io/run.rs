@@ -55,7 +55,10 @@ impl Run {
 
     /// The catalogue of an image.
     pub fn catalogue(&self, folder: &Path, set: u32, image: u32) -> PathBuf {
-        let name = format!("set{set:02}/catalogue-{image:03}.{}", self.format.extension());
+        let name = format!(
+            "set{set:02}/catalogue-{image:03}.{}",
+            self.format.extension()
+        );
         folder.join(name)
     }
 }
@@ -96,7 +99,12 @@ fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut 
                 } else {
                     format!("{key}.{name}")
                 };
-                compare(&path, a.get(name).unwrap_or(&null), b.get(name).unwrap_or(&null), found);
+                compare(
+                    &path,
+                    a.get(name).unwrap_or(&null),
+                    b.get(name).unwrap_or(&null),
+                    found,
+                );
             }
         }
         _ if a != b => found.push(format!("{key}: {a} ≠ {b}")),

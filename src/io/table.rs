@@ -87,7 +87,9 @@ impl Table {
 }
 
 /// File format of a table.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize, clap::ValueEnum,
+)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
     /// Parquet.
@@ -125,7 +127,10 @@ pub fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
     let name = path.to_string_lossy().to_ascii_lowercase();
     if name.ends_with(".parquet") {
         read_parquet(path, wanted)
-    } else if [".fits", ".fit", ".fits.gz"].iter().any(|end| name.ends_with(end)) {
+    } else if [".fits", ".fit", ".fits.gz"]
+        .iter()
+        .any(|end| name.ends_with(end))
+    {
         fits::read_table(path, wanted)
     } else {
         text::read(path, wanted)

@@ -16,7 +16,13 @@ const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
     let text = std::fs::read(path).map_err(FileError::doing(path, "cannot read the table"))?;
     let text = std::str::from_utf8(&text).map_err(|e| {
-        FileError::new(path, format!("this is not a text table: byte {} is not UTF-8", e.valid_up_to() + 1))
+        FileError::new(
+            path,
+            format!(
+                "this is not a text table: byte {} is not UTF-8",
+                e.valid_up_to() + 1
+            ),
+        )
     })?;
     let mut lines = text
         .lines()
@@ -25,7 +31,10 @@ pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileEr
         .filter(|(_, line)| !line.is_empty())
         .peekable();
     let Some(&(_, first)) = lines.peek() else {
-        return Err(FileError::new(path, "the file is empty; expected a table with a header or numbers"));
+        return Err(FileError::new(
+            path,
+            "the file is empty; expected a table with a header or numbers",
+        ));
     };
     let commas = first.contains(',');
     let is_header = first.starts_with('#')
@@ -34,18 +43,26 @@ pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileEr
             .is_some_and(|field| field.parse::<f64>().is_err());
     let mut names: Vec<String> = if is_header {
         let line = first.trim_start_matches('#').trim();
-        let names = fields(line, commas).map(|name| name.trim_matches('"').to_owned()).collect();
+        let names = fields(line, commas)
+            .map(|name| name.trim_matches('"').to_owned())
+            .collect();
         lines.next();
         names
     } else {
-        CHALLENGE_COLUMNS.iter().map(|&name| name.to_owned()).collect()
+        CHALLENGE_COLUMNS
+            .iter()
+            .map(|&name| name.to_owned())
+            .collect()
     };
     // A `#` line of prose is no header: the challenge's columns are meant then.
     if first.starts_with('#')
         && let Some((_, line)) = lines.peek()
         && fields(line, commas).count() != names.len()
     {
-        names = CHALLENGE_COLUMNS.iter().map(|&name| name.to_owned()).collect();
+        names = CHALLENGE_COLUMNS
+            .iter()
+            .map(|&name| name.to_owned())
+            .collect();
     }
     let places: Vec<usize> = match wanted {
         Some(wanted) => wanted
@@ -54,7 +71,10 @@ pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileEr
                 names.iter().position(|own| own == name).ok_or_else(|| {
                     FileError::new(
                         path,
-                        format!("there is no column `{name}`; columns found: {}", names.join(", ")),
+                        format!(
+                            "there is no column `{name}`; columns found: {}",
+                            names.join(", ")
+                        ),
                     )
                 })
             })
@@ -81,7 +101,10 @@ pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileEr
                 Err(_) => {
                     return Err(FileError::new(
                         path,
-                        format!("line {number}: `{field}` in column `{}` is not a number", names[column]),
+                        format!(
+                            "line {number}: `{field}` in column `{}` is not a number",
+                            names[column]
+                        ),
                     ));
                 }
             }
@@ -112,7 +135,10 @@ fn fields(line: &str, commas: bool) -> impl Iterator<Item = &str> {
     } else {
         (None, Some(line.split_ascii_whitespace()))
     };
-    by_comma.into_iter().flatten().chain(by_blank.into_iter().flatten())
+    by_comma
+        .into_iter()
+        .flatten()
+        .chain(by_blank.into_iter().flatten())
 }
 
 #[cfg(test)]
@@ -135,7 +161,10 @@ mod tests {
         let expected = (vec![2.0, 6.0], vec![3.0, -7e-3]);
         assert_eq!(columns("x,y,e1,e2\n1,2,3,4\n5,6,-7e-3,8\n"), expected);
         assert_eq!(columns("1 2 3 4\n 5  6 -7e-3 8\n"), expected);
-        assert_eq!(columns("# x y e1 e2\n1 2 3 4\n# note\n\n5\t6 -7e-3 8\n"), expected);
+        assert_eq!(
+            columns("# x y e1 e2\n1 2 3 4\n# note\n\n5\t6 -7e-3 8\n"),
+            expected
+        );
         assert_eq!(columns("# made by hand\n1 2 3 4\n5 6 -7e-3 8\n"), expected);
         assert_eq!(columns("e1,x,y\r\n3,1,2\r\n-7e-3,5,6\r\n"), expected);
         assert_eq!(table("x,y,e1,e2\n", None).unwrap().rows(), 0);
@@ -147,8 +176,13 @@ mod tests {
         let message = |text| table(text, Some(&["x", "e2"])).unwrap_err();
         assert!(message("").contains("empty"));
         assert!(message("x,y,e1,e2\n1,2,3\n").contains("line 2: 3 fields; expected 4"));
-        assert!(message("x,y,e1,e2\n1,2,3,4\n1,2,3,four\n").contains("line 3: `four` in column `e2`"));
+        assert!(
+            message("x,y,e1,e2\n1,2,3,4\n1,2,3,four\n").contains("line 3: `four` in column `e2`")
+        );
         let missing = message("x,y,g1,g2\n1,2,3,4\n");
-        assert!(missing.contains("no column `e2`") && missing.contains("g1, g2"), "{missing}");
+        assert!(
+            missing.contains("no column `e2`") && missing.contains("g1, g2"),
+            "{missing}"
+        );
     }
 }

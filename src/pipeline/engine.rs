@@ -64,10 +64,13 @@ where
     I: Send,
     O: Send,
 {
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()?;
     let capacity = IN_FLIGHT * threads;
     let (item_sender, item_receiver) = sync_channel::<(u64, I)>(capacity);
-    let (result_sender, result_receiver) = sync_channel::<(u64, Result<O, PipelineError>)>(capacity);
+    let (result_sender, result_receiver) =
+        sync_channel::<(u64, Result<O, PipelineError>)>(capacity);
     let (permit_sender, permit_receiver) = sync_channel::<()>(capacity);
     for _ in 0..capacity {
         // The channel was just made with room for all of them.
@@ -191,10 +194,20 @@ mod tests {
                     Ok(())
                 },
                 || (),
-                |(), k| if at == "work" && k == 20 { Err(error()) } else { Ok(k) },
+                |(), k| {
+                    if at == "work" && k == 20 {
+                        Err(error())
+                    } else {
+                        Ok(k)
+                    }
+                },
                 |k| {
                     written += 1;
-                    if at == "write" && k == 20 { Err(error()) } else { Ok(()) }
+                    if at == "write" && k == 20 {
+                        Err(error())
+                    } else {
+                        Ok(())
+                    }
                 },
             );
             assert!(result.is_err(), "{at}");

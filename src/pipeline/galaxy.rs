@@ -122,9 +122,7 @@ impl Measurer {
             full,
             denoise: match submission.denoise.method {
                 DenoiseMethod::None => None,
-                DenoiseMethod::WaveletWiener => {
-                    Some(WaveletWiener::new(full, &submission.denoise))
-                }
+                DenoiseMethod::WaveletWiener => Some(WaveletWiener::new(full, &submission.denoise)),
             },
             network: Network::plan(n, submission.psf.size, d.lambda)?,
             acf: Autocorrelation::new(n),
@@ -217,8 +215,11 @@ impl Measurer {
             &mut scratch.deconvolved,
         );
         let flux: f64 = scratch.deconvolved.iter().map(|&v| f64::from(v)).sum();
-        self.acf
-            .compute(&scratch.deconvolved, &mut scratch.acf_scratch, &mut scratch.acf);
+        self.acf.compute(
+            &scratch.deconvolved,
+            &mut scratch.acf_scratch,
+            &mut scratch.acf,
+        );
         let measured = self.moments.measure(&scratch.acf, flux);
         let (radius, size) = measured.map_or((f64::NAN, f64::NAN), |m| (m.radius, m.xx + m.yy));
         let shape = measured.and_then(|moments| moments.distortion());
@@ -253,10 +254,8 @@ impl Measurer {
 
 /// The steps of one measurement as images, for pictures.
 pub struct Steps {
-    /// The stamp as cut, denoised if the submission says so.
+    /// The stamp as cut from the data, before any denoising.
     pub stamp: Array2<f64>,
-    /// The stamp as cut from the data.
-    pub raw: Array2<f64>,
     /// The deconvolved stamp.
     pub deconvolved: Array2<f64>,
     /// Data minus the deconvolved stamp convolved with the PSF.
@@ -279,10 +278,11 @@ impl Measurer {
     ) -> Steps {
         let n = self.network.stamp_size();
         let start = cut_start(self.full, n).unwrap_or(0);
-        let image = |values: &[f32]| {
-            Array2::from_shape_fn((n, n), |(y, x)| f64::from(values[y * n + x]))
-        };
-        let stamp = image(&scratch.cut);
+        let image =
+            |values: &[f32]| Array2::from_shape_fn((n, n), |(y, x)| f64::from(values[y * n + x]));
+        let stamp = Array2::from_shape_fn((n, n), |(y, x)| {
+            f64::from(pixels[(start + y) * stride + start + x])
+        });
         let deconvolved = image(&scratch.deconvolved);
         let c = psf.nrows() / 2;
         let reconvolved = Array2::from_shape_fn((n, n), |(y, x)| {
@@ -298,11 +298,18 @@ impl Measurer {
         let side = 2 * n - 1;
         let acf = Array2::from_shape_fn((side, side), |(y, x)| {
             // The half with dy < 0 follows from A(−dx, −dy) = A(dx, dy).
-            let (y, x) = if y + 1 < n { (side - 1 - y, side - 1 - x) } else { (y, x) };
+            let (y, x) = if y + 1 < n {
+                (side - 1 - y, side - 1 - x)
+            } else {
+                (y, x)
+            };
             f64::from(scratch.acf[(y + 1 - n) * side + x])
         });
         let clipped = Array2::from_shape_fn((side, side), |at| {
-            let (dy, dx) = (at.0 as f64 - (n as f64 - 1.0), at.1 as f64 - (n as f64 - 1.0));
+            let (dy, dx) = (
+                at.0 as f64 - (n as f64 - 1.0),
+                at.1 as f64 - (n as f64 - 1.0),
+            );
             if dy.hypot(dx) <= measurement.radius {
                 acf[at]
             } else {
@@ -311,9 +318,6 @@ impl Measurer {
         });
         Steps {
             residual: &stamp - &reconvolved,
-            raw: Array2::from_shape_fn((n, n), |(y, x)| {
-                f64::from(pixels[(start + y) * stride + start + x])
-            }),
             stamp,
             deconvolved,
             acf,

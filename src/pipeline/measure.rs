@@ -9,9 +9,9 @@ use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_submissions::{EllipticityType, PsfForm, Submission};
 
+use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
 use super::galaxy::{Measurement, Measurer};
-use super::PipelineError;
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
 use crate::io::layout::DataFolder;
@@ -105,7 +105,10 @@ impl ImageSource {
         let path = data.galaxies(id.set, id.image);
         let mut image = ImageReader::open(&path)?;
         let whole = |image: &mut ImageReader, key: &str| {
-            image.number(key).filter(|v| *v >= 1.0 && *v <= 1e5).map(|v| v as usize)
+            image
+                .number(key)
+                .filter(|v| *v >= 1.0 && *v <= 1e5)
+                .map(|v| v as usize)
         };
         let stamp = whole(&mut image, "STAMP").unwrap_or(data.layout().stamp);
         let n = whole(&mut image, "NGRID").unwrap_or(image.width() / stamp);
@@ -260,7 +263,12 @@ pub fn measure_row(
                     measurer.set_psf(scratch, Some(psf.view()));
                 }
             }
-            measurer.measure(&row.pixels[ix * row.stamp..], stride, row.header_noise, scratch)
+            measurer.measure(
+                &row.pixels[ix * row.stamp..],
+                stride,
+                row.header_noise,
+                scratch,
+            )
         })
         .collect();
     MeasuredRow {
@@ -460,8 +468,12 @@ fn read_images(
 /// Catalogue of one image from its rows of stamps, in grid order.
 pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
     let galaxies = || {
-        rows.iter()
-            .flat_map(|row| row.galaxies.iter().enumerate().map(move |(ix, g)| (row, ix, g)))
+        rows.iter().flat_map(|row| {
+            row.galaxies
+                .iter()
+                .enumerate()
+                .map(move |(ix, g)| (row, ix, g))
+        })
     };
     let real = |value: &dyn Fn(&Measurement) -> f64| {
         Column::Real(galaxies().map(|(_, _, g)| value(g)).collect())
@@ -475,14 +487,26 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
         .map(|(row, ix, _)| row.grid.centre(ix, row.iy))
         .collect();
     Table::new(vec![
-        ("x".into(), Column::Real(positions.iter().map(|p| p.0).collect())),
-        ("y".into(), Column::Real(positions.iter().map(|p| p.1).collect())),
+        (
+            "x".into(),
+            Column::Real(positions.iter().map(|p| p.0).collect()),
+        ),
+        (
+            "y".into(),
+            Column::Real(positions.iter().map(|p| p.1).collect()),
+        ),
         ("e1".into(), real(&|g| g.e1)),
         ("e2".into(), real(&|g| g.e2)),
         ("flag".into(), whole(&|g| i64::from(g.flag))),
-        ("iterations".into(), whole(&|g| g.outcome.map_or(0, |o| i64::from(o.iterations)))),
+        (
+            "iterations".into(),
+            whole(&|g| g.outcome.map_or(0, |o| i64::from(o.iterations))),
+        ),
         ("stop".into(), whole(&|g| g.stop_code())),
-        ("updated".into(), whole(&|g| g.outcome.map_or(0, |o| i64::from(o.updated)))),
+        (
+            "updated".into(),
+            whole(&|g| g.outcome.map_or(0, |o| i64::from(o.updated))),
+        ),
         ("first_energy".into(), real(&first)),
         ("energy".into(), real(&energy)),
         ("noise".into(), real(&|g| g.noise)),

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::resample::mean_over_sets;
+use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{
     FieldSum, Figures, Grid, Options, Row, RowCounts, SetImages, SetScore, SetScorer, TrueShear,
     TruthSign,
@@ -57,7 +57,10 @@ pub fn score_files(
     let rows = read_truth_rows(truth)?;
     let side = (rows.len() as f64).sqrt().round() as usize;
     if side * side != rows.len() {
-        let message = format!("{} rows; expected the square of the grid's side", rows.len());
+        let message = format!(
+            "{} rows; expected the square of the grid's side",
+            rows.len()
+        );
         return Err(FileError::new(truth, message).into());
     }
     let bad = |error: shearq_scoring::ScoringError| FileError::new(truth, error);
@@ -153,10 +156,12 @@ pub fn score_folder(
             continue;
         }
         let truth = data.truth(set);
-        let (score, rows) = score_files(&truth, &catalogues, &reading, options, threads)
-            .map_err(|error| match error {
-                PipelineError::Scoring { source, .. } => PipelineError::Scoring { set, source },
-                other => other,
+        let (score, rows) =
+            score_files(&truth, &catalogues, &reading, options, threads).map_err(|error| {
+                match error {
+                    PipelineError::Scoring { source, .. } => PipelineError::Scoring { set, source },
+                    other => other,
+                }
             })?;
         scored.push(ScoredSet { set, score, rows });
     }
@@ -170,11 +175,18 @@ pub fn score_folder(
 pub fn means(scored: &[ScoredSet]) -> (Figures, Option<Figures>) {
     let values: Vec<([f64; 11], Option<[f64; 11]>)> = scored
         .iter()
-        .map(|s| (s.score.figures.values(), s.score.errors().map(|e| e.values())))
+        .map(|s| {
+            (
+                s.score.figures.values(),
+                s.score.errors().map(|e| e.values()),
+            )
+        })
         .collect();
     let column = |k: usize| {
-        let pairs: Vec<(f64, Option<f64>)> =
-            values.iter().map(|(v, e)| (v[k], e.map(|e| e[k]))).collect();
+        let pairs: Vec<(f64, Option<f64>)> = values
+            .iter()
+            .map(|(v, e)| (v[k], e.map(|e| e[k])))
+            .collect();
         mean_over_sets(&pairs)
     };
     let columns: [(f64, Option<f64>); 11] = std::array::from_fn(column);

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use shearq_scoring::Shear;
 
-use super::engine::{self, Feeder, Progress};
 use super::PipelineError;
+use super::engine::{self, Feeder, Progress};
 use crate::io::FileError;
 use crate::io::atomic;
 use crate::io::fits::{ImageWriter, Value};
@@ -255,15 +255,19 @@ impl OpenImage {
         };
         let stars = match &job.fields.psf {
             PsfField::One(psf) => {
-                let mut writer =
-                    ImageWriter::create(&psf_path, STAMP, STAMP, &psf_header(STAMP))?;
+                let mut writer = ImageWriter::create(&psf_path, STAMP, STAMP, &psf_header(STAMP))?;
                 writer.write_rows(&star(psf, STAMP))?;
                 writer.finish()?;
                 None
             }
             PsfField::PerGalaxy(_) => {
                 let side = n * STAR_STAMP;
-                Some(ImageWriter::create(&psf_path, side, side, &psf_header(STAR_STAMP))?)
+                Some(ImageWriter::create(
+                    &psf_path,
+                    side,
+                    side,
+                    &psf_header(STAR_STAMP),
+                )?)
             }
         };
         write_psf_table(data, job)?;

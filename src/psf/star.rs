@@ -123,7 +123,10 @@ mod tests {
         stamp[(4, 4)] = -1.0;
         assert_eq!(star_psf(stamp.view(), 5), Err(StarError::NoLight(-1.0)));
         stamp[(4, 4)] = 1.0;
-        assert!(matches!(star_psf(stamp.view(), 15), Err(StarError::TooSmall { .. })));
+        assert!(matches!(
+            star_psf(stamp.view(), 15),
+            Err(StarError::TooSmall { .. })
+        ));
         stamp[(4, 8)] = 3.0;
         let message = star_psf(stamp.view(), 5).unwrap_err().to_string();
         assert!(message.contains("(+4.0, +0.0)"), "{message}");

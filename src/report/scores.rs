@@ -14,16 +14,20 @@ use super::table::{Cell, Heading, Table};
 use crate::pipeline::score::{ScoredSet, means};
 use crate::simulate::kinds::SetKind;
 
-/// Figures of a table: heading, decimals and place in [`Figures::values`].
-const COLUMNS: [(&str, &str, usize, usize); 8] = [
-    ("q", "Q", 2, 0),
-    ("q_dn", "Q_dn", 2, 1),
-    ("m_half", "M/2", 4, 2),
-    ("sqrt_a", "√A×10⁴", 4, 3),
-    ("m_cross", "m (cross)", 4, 4),
-    ("c1", "c1", 5, 7),
-    ("c2", "c2", 5, 8),
-    ("b_power", "B mode×10⁹", 3, 9),
+/// Figures of a table: key, heading, decimals, place in [`Figures::values`], and whether it is one of
+/// the columns of detail.
+const COLUMNS: [(&str, &str, usize, usize, bool); 11] = [
+    ("q", "Q", 2, 0, false),
+    ("q_dn", "Q_dn", 2, 1, false),
+    ("m_half", "M/2", 4, 2, false),
+    ("sqrt_a", "√A×10⁴", 4, 3, false),
+    ("m_cross", "m (cross)", 4, 4, false),
+    ("m1", "m1", 4, 5, true),
+    ("m2", "m2", 4, 6, true),
+    ("c1", "c1", 5, 7, true),
+    ("c2", "c2", 5, 8, true),
+    ("b_power", "B mode×10⁹", 3, 9, true),
+    ("eb_power", "EB×10⁹", 3, 10, true),
 ];
 
 fn figure_cells(figures: &Figures, errors: Option<&Figures>) -> Vec<Cell> {
@@ -31,7 +35,7 @@ fn figure_cells(figures: &Figures, errors: Option<&Figures>) -> Vec<Cell> {
     let errors = errors.map(Figures::values);
     COLUMNS
         .iter()
-        .map(|&(_, _, decimals, at)| {
+        .map(|&(_, _, decimals, at, _)| {
             Cell::with_error(values[at], errors.map(|e| e[at]), decimals)
         })
         .collect()
@@ -107,30 +111,35 @@ pub fn warnings(scored: &[ScoredSet]) -> Vec<String> {
 }
 
 /// Figures per set, with a row of means where there are several sets.
-pub fn per_set(
-    scored: &[ScoredSet],
-    title: &str,
-    definition: Definition,
-    choice: Choice,
-) -> Table {
+pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition, choice: Choice) -> Table {
     let mut headings = vec![
         Heading::new("set", "Set"),
         Heading::new("kind", "Kind"),
         Heading::new("images", "Images"),
     ];
-    headings.extend(COLUMNS.iter().map(|(key, label, _, _)| Heading::new(key, *label)));
+    headings.extend(COLUMNS.iter().map(|&(key, label, _, _, detail)| Heading {
+        detail,
+        ..Heading::new(key, label)
+    }));
     headings.push(Heading::new("convention", "Conv."));
     headings.push(Heading::new("q_leaderboard", "Q leaderboard"));
     let mut rows = Vec::new();
     for ScoredSet { set, score, .. } in scored {
         let mut row = vec![
-            Cell::text(if *set == 0 { "–".into() } else { format!("{set:02}") }),
+            Cell::text(if *set == 0 {
+                "–".into()
+            } else {
+                format!("{set:02}")
+            }),
             Cell::text(kind_label(*set)),
             Cell::number(score.images as f64, 0),
         ];
         row.extend(figure_cells(&score.figures, score.errors().as_ref()));
         row.push(Cell::text(score.chosen.number().to_string()));
-        row.push(Cell::number(score.conventions[score.best.index()].quality.q, 2));
+        row.push(Cell::number(
+            score.conventions[score.best.index()].quality.q,
+            2,
+        ));
         rows.push(row);
     }
     if scored.len() > 1 {
@@ -294,12 +303,14 @@ fn difference_from(
     }
     let pairs: Vec<PairedSet<'_>> = pairs
         .iter()
-        .map(|(first, first_replicates, second, second_replicates)| PairedSet {
-            first: *first,
-            first_replicates,
-            second: *second,
-            second_replicates,
-        })
+        .map(
+            |(first, first_replicates, second, second_replicates)| PairedSet {
+                first: *first,
+                first_replicates,
+                second: *second,
+                second_replicates,
+            },
+        )
         .collect();
     paired_difference(&pairs)
 }

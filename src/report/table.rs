@@ -1,7 +1,7 @@
 //! Tables for terminals, papers and programs.
 
 use clap::ValueEnum;
-use comfy_table::{CellAlignment, ContentArrangement, presets};
+use comfy_table::{CellAlignment, ContentArrangement, TableComponent, presets};
 use serde_json::{Map, Value, json};
 
 /// How to print a table.
@@ -90,6 +90,8 @@ pub struct Heading {
     pub key: &'static str,
     /// Heading elsewhere.
     pub label: String,
+    /// Left out of tables for people unless they are to be wide; CSV and JSON have every column.
+    pub detail: bool,
 }
 
 impl Heading {
@@ -98,6 +100,15 @@ impl Heading {
         Heading {
             key,
             label: label.into(),
+            detail: false,
+        }
+    }
+
+    /// The same, left out of narrow tables.
+    pub fn detail(self) -> Self {
+        Heading {
+            detail: true,
+            ..self
         }
     }
 }
@@ -116,6 +127,19 @@ pub struct Table {
 }
 
 impl Table {
+    /// The table without its columns of detail.
+    pub fn narrow(&self) -> Self {
+        let keep: Vec<bool> = self.headings.iter().map(|h| !h.detail).collect();
+        let mut table = self.clone();
+        let mut kept = keep.iter().copied();
+        table.headings.retain(|_| kept.next().unwrap_or(true));
+        for row in &mut table.rows {
+            let mut kept = keep.iter().copied();
+            row.retain(|_| kept.next().unwrap_or(true));
+        }
+        table
+    }
+
     /// The table in a format, ending in a line break.
     pub fn render(&self, format: TableFormat) -> String {
         match format {
@@ -135,6 +159,10 @@ impl Table {
         let mut table = comfy_table::Table::new();
         table
             .load_preset(preset)
+            .remove_style(TableComponent::HorizontalLines)
+            .remove_style(TableComponent::MiddleIntersections)
+            .remove_style(TableComponent::LeftBorderIntersections)
+            .remove_style(TableComponent::RightBorderIntersections)
             .set_content_arrangement(ContentArrangement::Disabled)
             .set_header(self.headings.iter().map(|h| h.label.as_str()));
         for row in &self.rows {
@@ -171,8 +199,16 @@ impl Table {
             })
             .collect();
         let line = |cells: Vec<String>| format!("{} \\\\\n", cells.join(" & "));
-        let mut text = format!("% {}\n\\begin{{tabular}}{{{columns}}}\n\\hline\n", self.title);
-        text.push_str(&line(self.headings.iter().map(|h| escape_latex(&h.label)).collect()));
+        let mut text = format!(
+            "% {}\n\\begin{{tabular}}{{{columns}}}\n\\hline\n",
+            self.title
+        );
+        text.push_str(&line(
+            self.headings
+                .iter()
+                .map(|h| escape_latex(&h.label))
+                .collect(),
+        ));
         text.push_str("\\hline\n");
         for row in &self.rows {
             text.push_str(&line(row.iter().map(|cell| cell.print(true)).collect()));
@@ -303,7 +339,11 @@ mod tests {
     fn every_format_holds_the_numbers() {
         let people = table().render(TableFormat::Table);
         assert!(people.contains("87.1 ± 1.5") && people.contains('–'));
-        assert!(table().render(TableFormat::Markdown).contains("| 87.1 ± 1.5 |"));
+        assert!(
+            table()
+                .render(TableFormat::Markdown)
+                .contains("| 87.1 ± 1.5 |")
+        );
         let latex = table().render(TableFormat::Latex);
         assert!(latex.contains("a,b & $87.1 \\pm 1.5$ \\\\") && latex.contains("c\\_d"));
         assert_eq!(

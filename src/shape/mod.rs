@@ -7,5 +7,5 @@
 mod acf;
 mod moments;
 
-pub use acf::{Autocorrelation, AcfScratch, autocorrelation_naive};
+pub use acf::{AcfScratch, Autocorrelation, autocorrelation_naive};
 pub use moments::{ClippedMoments, Moments, Unmeasurable};

@@ -171,9 +171,13 @@ mod tests {
     #[test]
     fn signs_and_axes_are_those_of_the_stamp() {
         for share in [0.5, 0.9] {
-            let along_x = measure(23, share, &blob(23, 6.0, 3.0, 0.0)).distortion().unwrap();
+            let along_x = measure(23, share, &blob(23, 6.0, 3.0, 0.0))
+                .distortion()
+                .unwrap();
             assert!(along_x.e1 > 0.05 && along_x.e2.abs() < 1e-5);
-            let diagonal = measure(23, share, &blob(23, 4.0, 4.0, 1.5)).distortion().unwrap();
+            let diagonal = measure(23, share, &blob(23, 4.0, 4.0, 1.5))
+                .distortion()
+                .unwrap();
             assert!(diagonal.e2 > 0.05 && diagonal.e1.abs() < 1e-5);
         }
     }
@@ -184,14 +188,21 @@ mod tests {
         let sigma_square: f64 = 6.0;
         let moments = measure(32, 0.9, &blob(32, 3.0, 3.0, 0.0));
         let expected = (-2.0 * sigma_square * 0.1f64.ln()).sqrt();
-        assert!((moments.radius - expected).abs() < 0.5, "{}", moments.radius);
+        assert!(
+            (moments.radius - expected).abs() < 0.5,
+            "{}",
+            moments.radius
+        );
     }
 
     #[test]
     fn stamps_without_light_are_refused() {
         let moments = ClippedMoments::new(5, 0.9);
         assert_eq!(moments.measure(&[0.0; 45], 0.0), Err(Unmeasurable::NoLight));
-        assert_eq!(moments.measure(&[0.0; 45], f64::NAN), Err(Unmeasurable::NoLight));
+        assert_eq!(
+            moments.measure(&[0.0; 45], f64::NAN),
+            Err(Unmeasurable::NoLight)
+        );
         let mut acf = [0.0; 45];
         acf[4] = 1.0;
         let point = moments.measure(&acf, 1.0).unwrap();

@@ -141,7 +141,10 @@ mod tests {
             tilt: 0.5,
         };
         assert!((power(&tilted, 1000.0) / power(&fiducial, 1000.0) - 2.0).abs() < 1e-12);
-        assert!((power(&tilted, 2000.0) / power(&fiducial, 2000.0) / 2.0f64.powf(1.5) - 1.0).abs() < 1e-12);
+        assert!(
+            (power(&tilted, 2000.0) / power(&fiducial, 2000.0) / 2.0f64.powf(1.5) - 1.0).abs()
+                < 1e-12
+        );
     }
 
     #[test]

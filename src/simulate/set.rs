@@ -58,12 +58,7 @@ const WHOLE_SET: u32 = 0;
 impl SimulationSettings {
     fn stream(&self, set: u32, image: u32, purpose: Purpose) -> ChaCha8Rng {
         let mut key = [0; 32];
-        let words = [
-            self.seed,
-            u64::from(set),
-            u64::from(image),
-            purpose as u64,
-        ];
+        let words = [self.seed, u64::from(set), u64::from(image), purpose as u64];
         for (bytes, word) in key.chunks_exact_mut(8).zip(words) {
             bytes.copy_from_slice(&word.to_le_bytes());
         }
@@ -184,8 +179,9 @@ impl SetSimulator {
         // A white B-mode field: σ² per component and cell is half the power of both modes.
         let cell = (self.grid.side().0 / self.grid.n as f64).powi(2);
         let power = 2.0 * self.settings.intrinsic_sigma.powi(2) * cell;
-        let mut intrinsic =
-            random_field(&self.decomposer, &mut rng, Content::BOnly, |_| power / NYQUIST_SHARE);
+        let mut intrinsic = random_field(&self.decomposer, &mut rng, Content::BOnly, |_| {
+            power / NYQUIST_SHARE
+        });
         intrinsic.mapv_inplace(|e| {
             let modulus = e.norm();
             if modulus > MAX_INTRINSIC {
@@ -227,7 +223,9 @@ impl SetSimulator {
             phase + turns * tau * along
         };
         let turbulence = (self.kind.image == ImageType::Kolmogorov).then(|| {
-            let field = random_field(&self.decomposer, rng, Content::Both, |l| l.powf(-11.0 / 3.0));
+            let field = random_field(&self.decomposer, rng, Content::Both, |l| {
+                l.powf(-11.0 / 3.0)
+            });
             let mean_square = field.iter().map(|e| e.norm_sqr()).sum::<f64>() / field.len() as f64;
             // Scaled to an rms of 0.03, and no more than 0.2 anywhere.
             field.mapv(|e| {
@@ -359,10 +357,7 @@ mod tests {
         let same = |set: u32| {
             let simulator = simulator(set, 7, 16);
             let (a, b) = (simulator.image_fields(1), simulator.image_fields(2));
-            (
-                a.intrinsic == b.intrinsic,
-                a.psf.at(3, 4) == b.psf.at(3, 4),
-            )
+            (a.intrinsic == b.intrinsic, a.psf.at(3, 4) == b.psf.at(3, 4))
         };
         assert_eq!(same(1), (false, false));
         assert_eq!(same(2), (false, true));

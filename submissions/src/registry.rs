@@ -17,13 +17,34 @@ pub const TEMPLATE: &str = include_str!("../named/paper.toml");
 /// The embedded files, in the order of the paper's Table 1.
 const EMBEDDED: [(&str, &str); 8] = [
     ("paper.toml", TEMPLATE),
-    ("subm-19-den-star.toml", include_str!("../named/subm-19-den-star.toml")),
-    ("subm-23-den-func.toml", include_str!("../named/subm-23-den-func.toml")),
-    ("23-den-func.toml", include_str!("../named/23-den-func.toml")),
-    ("23-den-star.toml", include_str!("../named/23-den-star.toml")),
-    ("23-raw-func.toml", include_str!("../named/23-raw-func.toml")),
-    ("23-raw-star.toml", include_str!("../named/23-raw-star.toml")),
-    ("29-den-func.toml", include_str!("../named/29-den-func.toml")),
+    (
+        "subm-19-den-star.toml",
+        include_str!("../named/subm-19-den-star.toml"),
+    ),
+    (
+        "subm-23-den-func.toml",
+        include_str!("../named/subm-23-den-func.toml"),
+    ),
+    (
+        "23-den-func.toml",
+        include_str!("../named/23-den-func.toml"),
+    ),
+    (
+        "23-den-star.toml",
+        include_str!("../named/23-den-star.toml"),
+    ),
+    (
+        "23-raw-func.toml",
+        include_str!("../named/23-raw-func.toml"),
+    ),
+    (
+        "23-raw-star.toml",
+        include_str!("../named/23-raw-star.toml"),
+    ),
+    (
+        "29-den-func.toml",
+        include_str!("../named/29-den-func.toml"),
+    ),
 ];
 
 /// Longest chain of `extends` followed.
@@ -88,7 +109,9 @@ pub enum SubmissionError {
         chain: String,
     },
     /// A key that no file of the chain sets.
-    #[error("{path}: the key `{key}` is set neither here nor in what it extends; start from `extends = \"paper\"`")]
+    #[error(
+        "{path}: the key `{key}` is set neither here nor in what it extends; start from `extends = \"paper\"`"
+    )]
     Missing {
         /// The file asked for.
         path: PathBuf,
@@ -225,12 +248,13 @@ impl Registry {
             here = parent_path;
             settings = settings.over(parent_file.settings());
         }
-        let submission = settings
-            .complete(name, description)
-            .map_err(|key| SubmissionError::Missing {
-                path: path.clone(),
-                key,
-            })?;
+        let submission =
+            settings
+                .complete(name, description)
+                .map_err(|key| SubmissionError::Missing {
+                    path: path.clone(),
+                    key,
+                })?;
         submission.validate().map_err(|e| SubmissionError::Range {
             path,
             key: e.key,
@@ -333,7 +357,10 @@ mod tests {
         assert_eq!(entry.submission.name, "own");
         assert_eq!(entry.submission.stamp.size, 31);
         assert_eq!(entry.submission.deconvolution.lambda, 0.5);
-        assert_eq!(entry.submission.denoise.method, DenoiseMethod::WaveletWiener);
+        assert_eq!(
+            entry.submission.denoise.method,
+            DenoiseMethod::WaveletWiener
+        );
         assert_eq!(entry.published, None);
     }
 
@@ -346,12 +373,21 @@ mod tests {
             registry.get(&path).unwrap_err().to_string()
         };
         let unknown = message("a.toml", "extends = \"paper\"\n[stamp]\nsise = 23\n");
-        assert!(unknown.contains("a.toml") && unknown.contains("line 3"), "{unknown}");
-        assert!(unknown.contains("sise") && unknown.contains("size"), "{unknown}");
+        assert!(
+            unknown.contains("a.toml") && unknown.contains("line 3"),
+            "{unknown}"
+        );
+        assert!(
+            unknown.contains("sise") && unknown.contains("size"),
+            "{unknown}"
+        );
         let wrong_type = message("b.toml", "extends = \"paper\"\n[stamp]\nsize = \"big\"\n");
         assert!(wrong_type.contains("line 3"), "{wrong_type}");
         let range = message("c.toml", "extends = \"paper\"\n[shape]\nacf_share = 1.5\n");
-        assert!(range.contains("shape.acf_share") && range.contains("1.5"), "{range}");
+        assert!(
+            range.contains("shape.acf_share") && range.contains("1.5"),
+            "{range}"
+        );
         let missing = message("d.toml", "[stamp]\nsize = 23\n");
         assert!(missing.contains("psf.form"), "{missing}");
         let cycle = message("e.toml", "extends = \"e.toml\"\n");

@@ -310,15 +310,46 @@ impl Submission {
         whole("denoise.window", denoise.window, 0, 8, "0 to 8 pixels")?;
         let s = denoise.strength;
         real("denoise.strength", s, s > 0.0, "a positive number")?;
-        real("deconvolution.step", d.step, d.step > 0.0, "a positive number")?;
+        real(
+            "deconvolution.step",
+            d.step,
+            d.step > 0.0,
+            "a positive number",
+        )?;
         let c = d.constant_step;
-        real("deconvolution.constant_step", c, c > 0.0, "a positive number")?;
-        real("deconvolution.lambda", d.lambda, d.lambda >= 0.0, "zero or a positive number")?;
+        real(
+            "deconvolution.constant_step",
+            c,
+            c > 0.0,
+            "a positive number",
+        )?;
+        real(
+            "deconvolution.lambda",
+            d.lambda,
+            d.lambda >= 0.0,
+            "zero or a positive number",
+        )?;
         let most = d.max_iterations;
-        whole("deconvolution.max_iterations", most, 1, 100_000, "1 to 100000")?;
+        whole(
+            "deconvolution.max_iterations",
+            most,
+            1,
+            100_000,
+            "1 to 100000",
+        )?;
         let u = d.unit_divisor;
-        real("deconvolution.unit_divisor", u, u > 0.0, "a positive number")?;
+        real(
+            "deconvolution.unit_divisor",
+            u,
+            u > 0.0,
+            "a positive number",
+        )?;
         let a = shape.acf_share;
-        real("shape.acf_share", a, a > 0.0 && a <= 1.0, "above 0 and at most 1")
+        real(
+            "shape.acf_share",
+            a,
+            a > 0.0 && a <= 1.0,
+            "above 0 and at most 1",
+        )
     }
 }

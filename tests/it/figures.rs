@@ -1,0 +1,231 @@
+//! Every kind of figure with data that are empty, constant, not finite or extreme, and the errors.
+
+use ndarray::{Array2, array};
+use shearq::report::figure::{
+    BarGroup, BarPlot, ColourMap, Figure, FigureError, Format, HeatMap, ImageGrid, ImagePanel,
+    ImageRow, LinePlot, PanelGrid, Scale, Series, Stretch, Style,
+};
+
+const HARD: [&[f64]; 9] = [
+    &[],
+    &[0.0],
+    &[f64::NAN, f64::INFINITY, f64::NEG_INFINITY],
+    &[2.0, 2.0, 2.0],
+    &[f64::MAX, f64::MIN, 0.0],
+    &[1e-310, 1e-300, 1.0],
+    &[1.0, f64::NAN, 3.0],
+    &[-1.0, 0.0, 1e-5],
+    &[1.0, 1.0 + f64::EPSILON, 1.0],
+];
+
+/// Draws in both formats; the results must be what they claim to be.
+fn draw(figure: &impl Figure) {
+    let svg = String::from_utf8(figure.render(Format::Svg).expect("SVG")).expect("UTF-8");
+    assert!(svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"));
+    assert!(!svg.contains("NaN") && !svg.contains("inf"));
+    assert!(
+        figure
+            .render(Format::Png)
+            .expect("PNG")
+            .starts_with(b"\x89PNG")
+    );
+}
+
+fn lines(x: &[f64], y: &[f64], log: bool) -> LinePlot {
+    let series = [Style::Line, Style::Points, Style::Dashed].map(|style| {
+        Series::new("hard", x.to_vec(), y.to_vec(), style, 11)
+            .with_errors(y.iter().rev().copied().collect())
+    });
+    LinePlot {
+        x_log: log,
+        y_log: log,
+        series: series.into(),
+        ..LinePlot::default()
+    }
+}
+
+#[test]
+fn curves_of_any_data_are_drawn() {
+    let mut plots = Vec::new();
+    for y in HARD {
+        let x: Vec<f64> = (0..y.len()).map(|i| i as f64).collect();
+        for log in [false, true] {
+            plots.push(lines(&x, y, log));
+            plots.push(LinePlot {
+                y_range: Some((-1.0, 0.5)),
+                ..lines(y, y, log)
+            });
+        }
+    }
+    draw(&PanelGrid {
+        title: "Hard & <difficult>".into(),
+        columns: 0,
+        plots: vec![],
+    });
+    draw(&PanelGrid {
+        title: String::new(),
+        columns: 6,
+        plots,
+    });
+    draw(&LinePlot::default());
+}
+
+#[test]
+fn bars_of_any_data_are_drawn() {
+    draw(&BarPlot::default());
+    for values in HARD {
+        let group = |label: &str| BarGroup {
+            label: label.into(),
+            values: values.to_vec(),
+            errors: Some(values.iter().rev().copied().collect()),
+        };
+        draw(&BarPlot {
+            categories: (0..values.len())
+                .map(|number| format!("category {number}"))
+                .collect(),
+            groups: vec![group("a"), group("b")],
+            ..BarPlot::default()
+        });
+    }
+}
+
+#[test]
+fn tables_and_images_of_any_data_are_drawn() {
+    draw(&HeatMap::default());
+    draw(&ImageGrid::default());
+    for values in HARD {
+        let image = Array2::from_shape_vec((1, values.len()), values.to_vec()).expect("one row");
+        draw(&HeatMap {
+            rows: vec!["only".into()],
+            columns: (0..values.len()).map(|number| number.to_string()).collect(),
+            values: image.clone(),
+            decimals: 3,
+            ..HeatMap::default()
+        });
+        let maps = [ColourMap::Viridis, ColourMap::Grey, ColourMap::Diverging];
+        let panel = |map| ImagePanel {
+            image: image.clone(),
+            map,
+            stretch: Stretch::Asinh,
+            limits: Some((f64::NAN, 1.0)),
+            ..ImagePanel::default()
+        };
+        let row = ImageRow {
+            label: "hard".into(),
+            panels: maps.map(panel).into(),
+        };
+        for scale in [Scale::Own, Scale::Row, Scale::Column] {
+            let rows = vec![row.clone(), ImageRow::default()];
+            draw(&ImageGrid {
+                title: String::new(),
+                rows,
+                scale,
+            });
+        }
+    }
+}
+
+#[test]
+fn the_first_row_of_an_image_is_at_the_bottom() {
+    let panel = ImagePanel {
+        image: array![[0.0, 0.0], [1.0, 1.0]],
+        map: ColourMap::Grey,
+        ..ImagePanel::default()
+    };
+    let rows = vec![ImageRow {
+        label: String::new(),
+        panels: vec![panel],
+    }];
+    let grid = ImageGrid {
+        title: String::new(),
+        rows,
+        scale: Scale::Own,
+    };
+    let svg = String::from_utf8(grid.render(Format::Svg).expect("SVG")).expect("UTF-8");
+    // The two rows are the first rectangles after the background.
+    let top = |line: &str| -> i32 {
+        let after = line.split_once(" y=\"").expect("a y").1;
+        after
+            .split_once('"')
+            .expect("a number")
+            .0
+            .parse()
+            .expect("a number")
+    };
+    let rectangles: Vec<&str> = svg
+        .lines()
+        .filter(|line| line.starts_with("<rect "))
+        .skip(1)
+        .take(2)
+        .collect();
+    assert!(rectangles[0].contains("#000000") && rectangles[1].contains("#FFFFFF"));
+    assert!(top(rectangles[0]) > top(rectangles[1]), "{rectangles:?}");
+}
+
+#[test]
+fn equal_figures_give_equal_files() {
+    let plot = lines(&[1.0, 2.0, 4.0], &[3.0, 1.0, 2.0], true);
+    for format in [Format::Png, Format::Svg] {
+        assert_eq!(
+            plot.render(format).expect("drawn"),
+            plot.render(format).expect("drawn")
+        );
+    }
+}
+
+#[test]
+fn files_are_written_by_extension_and_replaced() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let plot = lines(&[1.0, 2.0], &[1.0, 2.0], false);
+    let png = folder.path().join("figure.PNG");
+    std::fs::write(&png, "old").expect("written");
+    plot.save(&png).expect("saved");
+    assert!(std::fs::read(&png).expect("there").starts_with(b"\x89PNG"));
+    plot.save(folder.path().join("figure.svg")).expect("saved");
+    // Nothing temporary is left.
+    assert_eq!(
+        std::fs::read_dir(folder.path()).expect("readable").count(),
+        2
+    );
+}
+
+#[test]
+fn errors_name_the_place_and_what_was_expected() {
+    let plot = lines(&[1.0], &[1.0], false);
+    let message = |path: &str| plot.save(path).expect_err("refused").to_string();
+    assert_eq!(
+        message("figure.pdf"),
+        "figure.pdf: found `.pdf` as the figure's format; expected the extension `.png` or `.svg`"
+    );
+    assert!(message("figure").contains("found no extension"));
+    assert!(
+        message("absent/folder/figure.svg").starts_with("absent/folder/figure.svg: cannot write")
+    );
+
+    let mut uneven = LinePlot {
+        title: "Bias".into(),
+        ..plot.clone()
+    };
+    uneven.series[1].y.push(2.0);
+    assert_eq!(
+        uneven.render(Format::Svg).expect_err("uneven").to_string(),
+        "figure `Bias`, series `hard`: found 2 values of y, expected 1"
+    );
+    let table = HeatMap {
+        values: array![[1.0]],
+        ..HeatMap::default()
+    };
+    assert!(matches!(
+        table.render(Format::Svg),
+        Err(FigureError::Lengths { expected: 1, .. })
+    ));
+    let many = PanelGrid {
+        title: String::new(),
+        columns: 2,
+        plots: vec![plot; 2000],
+    };
+    assert!(matches!(
+        many.render(Format::Svg),
+        Err(FigureError::TooLarge { .. })
+    ));
+}

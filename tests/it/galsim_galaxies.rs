@@ -1,0 +1,287 @@
+//! What this crate draws against what GalSim draws: stars exactly, galaxies through their noise.
+
+use std::path::Path;
+
+use shearq::psf::functional::{FunctionalPsf, PsfProfile, PsfTransform, TransformedPsf};
+use shearq::simulate::galaxy::Galaxy;
+use shearq::simulate::render::{RenderScratch, Renderer, render_reference};
+use shearq_scoring::Shear;
+
+use crate::support::shared;
+
+const STAMP: usize = 48;
+const PIXELS: usize = STAMP * STAMP;
+
+/// A FITS image of big-endian f32 with a header of one block: its width and pixels.
+fn read_fits(path: &Path) -> (usize, Vec<f64>) {
+    let bytes = std::fs::read(path).unwrap();
+    let card = bytes[..2880]
+        .chunks(80)
+        .find(|card| card.starts_with(b"NAXIS1"))
+        .unwrap();
+    let width = std::str::from_utf8(&card[10..30])
+        .unwrap()
+        .trim()
+        .parse()
+        .unwrap();
+    let pixels = bytes[2880..]
+        .chunks_exact(4)
+        .map(|b| f64::from(f32::from_be_bytes(b.try_into().unwrap())))
+        .take(width * width)
+        .collect();
+    (width, pixels)
+}
+
+fn rows(path: &Path) -> Vec<Vec<String>> {
+    let text = std::fs::read_to_string(path).unwrap();
+    text.lines()
+        .skip(1)
+        .map(|line| line.split(',').map(|f| f.trim().to_owned()).collect())
+        .collect()
+}
+
+struct Model<'a> {
+    renderer: &'a Renderer,
+    psf: TransformedPsf<'a>,
+    shape: Shear,
+    /// Factor on both half-light radii.
+    size: f64,
+    scratch: RenderScratch,
+    out: Vec<f32>,
+}
+
+impl Model<'_> {
+    /// The noise-free galaxy with S/N = sqrt(Σ I²) = 20 over the stamp.
+    fn draw(&mut self, centre: (f64, f64)) -> Vec<f64> {
+        let galaxy =
+            Galaxy::bulge_and_disc(1.0, 0.5, 2.3 * self.size, 4.8 * self.size, self.shape).unwrap();
+        self.renderer
+            .render(&galaxy, &self.psf, centre, &mut self.scratch, &mut self.out);
+        let norm: f64 = self.out.iter().map(|&v| f64::from(v).powi(2)).sum();
+        let scale = 20.0 / norm.sqrt();
+        self.out.iter().map(|&v| f64::from(v) * scale).collect()
+    }
+
+    /// The model at the centroid that fits `data` best, by Gauss–Newton from the stamp's middle.
+    fn fit(&mut self, data: &[f64]) -> (Vec<f64>, (f64, f64)) {
+        let (mut x, mut y) = (23.5, 23.5);
+        let h = 0.05;
+        for _ in 0..6 {
+            let model = self.draw((x, y));
+            let slope = |minus: Vec<f64>, plus: Vec<f64>| -> Vec<f64> {
+                minus
+                    .iter()
+                    .zip(plus)
+                    .map(|(a, b)| (b - a) / (2.0 * h))
+                    .collect()
+            };
+            let along_x = slope(self.draw((x - h, y)), self.draw((x + h, y)));
+            let along_y = slope(self.draw((x, y - h)), self.draw((x, y + h)));
+            let dot = |a: &[f64], b: &[f64]| -> f64 { a.iter().zip(b).map(|(a, b)| a * b).sum() };
+            let rest: Vec<f64> = data.iter().zip(&model).map(|(d, m)| d - m).collect();
+            let (xx, xy, yy) = (
+                dot(&along_x, &along_x),
+                dot(&along_x, &along_y),
+                dot(&along_y, &along_y),
+            );
+            let (bx, by) = (dot(&along_x, &rest), dot(&along_y, &rest));
+            let det = xx * yy - xy * xy;
+            let step = ((yy * bx - xy * by) / det, (xx * by - xy * bx) / det);
+            // Centroids lie within half a pixel, the noise moves the fit by some tenths more.
+            x = f64::clamp(x + step.0, 21.5, 25.5);
+            y = f64::clamp(y + step.1, 21.5, 25.5);
+            if step.0.hypot(step.1) < 1e-3 {
+                break;
+            }
+        }
+        (self.draw((x, y)), (x, y))
+    }
+}
+
+/// One way to be wrong about the galaxies: factors on e1, e2 and on both radii.
+#[derive(Clone, Copy)]
+struct Change {
+    e1: f64,
+    e2: f64,
+    size: f64,
+}
+
+const TRUE: Change = Change {
+    e1: 1.0,
+    e2: 1.0,
+    size: 1.0,
+};
+
+/// What the images of a set leave when the fitted models are subtracted.
+struct Residuals {
+    galaxies: f64,
+    chi2: f64,
+    /// The mean stamp, in units of its error.
+    mean: Vec<f64>,
+    /// Root mean square of the fitted centroids' offsets.
+    shift: [f64; 2],
+}
+
+fn residuals(folder: &Path, images: &[&str], change: Change) -> Residuals {
+    let number = |row: &[String], i: usize| -> f64 { row[i].parse().unwrap() };
+    let renderer = Renderer::new(STAMP);
+    let (mut galaxies, mut chi2, mut mean) = (0.0f64, 0.0, vec![0.0; PIXELS]);
+    let mut shift2 = [0.0f64; 2];
+    for image in images {
+        let (width, pixels) = read_fits(&folder.join(format!("galaxies-{image}.fits")));
+        let psfs = rows(&folder.join(format!("psf-{image}.csv")));
+        let profile = match psfs[0][2].as_str() {
+            "moffat" => PsfProfile::Moffat {
+                beta: number(&psfs[0], 3),
+            },
+            _ => PsfProfile::Kolmogorov,
+        };
+        let transform = PsfTransform::new(profile).unwrap();
+        let intrinsic = rows(&folder.join(format!("intrinsic-{image}.csv")));
+        for (index, row) in intrinsic.iter().enumerate() {
+            let psf = &psfs[index.min(psfs.len() - 1)];
+            let psf_shape = Shear::new(number(psf, 5), number(psf, 6));
+            let psf = FunctionalPsf::new(profile, number(psf, 4), psf_shape).unwrap();
+            let mut model = Model {
+                renderer: &renderer,
+                psf: transform.of(&psf).unwrap(),
+                shape: Shear::new(change.e1 * number(row, 4), change.e2 * number(row, 5)),
+                size: change.size,
+                scratch: RenderScratch::new(),
+                out: vec![0.0; PIXELS],
+            };
+            let x0 = (number(row, 0) - 24.5) as usize;
+            let y0 = (number(row, 1) - 24.5) as usize;
+            let data: Vec<f64> = (0..STAMP)
+                .flat_map(|y| &pixels[(y0 + y) * width + x0..][..STAMP])
+                .copied()
+                .collect();
+            let (best, centre) = model.fit(&data);
+            galaxies += 1.0;
+            shift2[0] += (centre.0 - 23.5).powi(2);
+            shift2[1] += (centre.1 - 23.5).powi(2);
+            for ((mean, d), m) in mean.iter_mut().zip(&data).zip(&best) {
+                *mean += d - m;
+                chi2 += (d - m).powi(2);
+            }
+        }
+    }
+    mean.iter_mut().for_each(|m| *m /= galaxies.sqrt());
+    Residuals {
+        galaxies,
+        chi2,
+        mean,
+        shift: shift2.map(|s| (s / galaxies).sqrt()),
+    }
+}
+
+/// GalSim's S/N 20 galaxies less the noise-free model leave white noise of σ = 1, galaxy by galaxy
+/// and averaged over 256 of them.
+#[test]
+fn galsim_galaxies_less_the_model_are_noise() {
+    let Some(folder) = shared("galsim-sets") else {
+        return;
+    };
+    for set in ["set02", "set01", "set20"] {
+        let found = residuals(&folder.join(set), &["001"], TRUE);
+        let mean = &found.mean;
+        let chi2 = found.chi2 / (found.galaxies * PIXELS as f64);
+        let worst = mean.iter().fold(0f64, |worst, m| worst.max(m.abs()));
+        let mean_chi2 = mean.iter().map(|m| m * m).sum::<f64>() / PIXELS as f64;
+        // The pixels of the galaxy itself, where a wrong profile would show.
+        let inner: Vec<f64> = (0..PIXELS)
+            .filter(|i| {
+                let (x, y) = ((i % STAMP) as f64 - 23.5, (i / STAMP) as f64 - 23.5);
+                x.hypot(y) < 8.0
+            })
+            .map(|i| mean[i])
+            .collect();
+        let count = inner.len() as f64;
+        let inner_chi2 = inner.iter().map(|m| m * m).sum::<f64>() / count;
+        let inner_sum = inner.iter().sum::<f64>() / count.sqrt();
+        println!(
+            "{set}: chi2 per pixel {chi2:.5}, mean residual chi2 per pixel {mean_chi2:.3}, \
+             largest {worst:.2} sigma, inner {count} pixels: chi2 {inner_chi2:.3}, \
+             sum {inner_sum:.2} sigma; rms shift {:.3?}",
+            found.shift
+        );
+        // χ² of 256 · 2304 pixels scatters by 0.0018, that of the mean stamp by 0.03, that of its
+        // some 200 inner pixels by 0.1; four of each are allowed.
+        assert!(
+            (chi2 - (1.0 - 2.0 / PIXELS as f64)).abs() < 0.008,
+            "{set}: {chi2}"
+        );
+        assert!((mean_chi2 - 1.0).abs() < 0.12, "{set}: {mean_chi2}");
+        assert!(worst < 5.0, "{set}: {worst}");
+        assert!((inner_chi2 - 1.0).abs() < 0.4, "{set}: {inner_chi2}");
+        assert!(inner_sum.abs() < 4.0, "{set}: {inner_sum}");
+    }
+}
+
+/// The size and the ellipticity that fit GalSim's galaxies best are those that GalSim was given.
+#[test]
+fn galsim_galaxies_have_the_size_and_ellipticity_that_fit_best() {
+    let Some(folder) = shared("galsim-sets") else {
+        return;
+    };
+    let folder = folder.join("set02");
+    let chi2 = |change: Change| residuals(&folder, &["001", "002"], change).chi2;
+    let truth = chi2(TRUE);
+    // The minimum of the parabola through three factors, and its error, from χ² = 1 above it.
+    let best = |low: f64, high: f64, h: f64| {
+        let curvature = (high - 2.0 * truth + low) / (h * h);
+        (
+            1.0 - (high - low) / (2.0 * h) / curvature,
+            (2.0 / curvature).sqrt(),
+        )
+    };
+    let sized = |size| chi2(Change { size, ..TRUE });
+    let (size, size_error) = best(sized(0.95), sized(1.05), 0.05);
+    let e1 = |e1| chi2(Change { e1, ..TRUE });
+    let (e1, e1_error) = best(e1(0.8), e1(1.2), 0.2);
+    let e2 = |e2| chi2(Change { e2, ..TRUE });
+    let (e2, e2_error) = best(e2(0.8), e2(1.2), 0.2);
+    println!(
+        "size {size:.4} ± {size_error:.4}, e1 {e1:.3} ± {e1_error:.3}, e2 {e2:.3} ± {e2_error:.3}"
+    );
+    for (name, value, error) in [
+        ("size", size, size_error),
+        ("e1", e1, e1_error),
+        ("e2", e2, e2_error),
+    ] {
+        assert!(error < 0.06, "{name} is hardly measured: {error}");
+        assert!(
+            (value - 1.0).abs() < 4.0 * error,
+            "{name}: {value} ± {error}"
+        );
+    }
+}
+
+/// GalSim draws stars by an FFT of 128 × 128 points and, for a Moffat profile, without wavenumbers
+/// beyond π. The reference renderer with the same limits draws the same star.
+#[test]
+fn galsim_stars_are_drawn_with_the_limits_of_galsims_transform() {
+    let Some(folder) = shared("galsim-sets") else {
+        return;
+    };
+    let point = Galaxy::bulge_and_disc(1.0, 0.0, 1.0, 1e-3, Shear::ZERO).unwrap();
+    let shape = Shear::new(0.02, -0.015);
+    let moffat = PsfProfile::Moffat { beta: 3.0 };
+    for (set, profile, orders) in [
+        ("set02", moffat, 0.99),
+        ("set20", PsfProfile::Kolmogorov, 1.2),
+    ] {
+        let (_, theirs) = read_fits(&folder.join(set).join("psf-001.fits"));
+        let psf = FunctionalPsf::new(profile, 3.4, shape).unwrap();
+        let ours = render_reference(STAMP, &point, &psf, (23.5, 23.5), 128, orders);
+        let sum = ours.sum();
+        let peak = theirs.iter().copied().fold(0.0, f64::max);
+        let worst = ours
+            .iter()
+            .zip(&theirs)
+            .map(|(a, b)| (a / sum - b).abs() / peak)
+            .fold(0.0, f64::max);
+        println!("{set}: {worst:.1e} of the peak");
+        assert!(worst < 2e-5, "{set}: {worst:e}");
+    }
+}

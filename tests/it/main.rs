@@ -1,0 +1,9 @@
+//! End to end, through the binary and the library's public face.
+
+mod chain;
+mod figures;
+mod galsim_galaxies;
+mod galsim_measured;
+mod orientation;
+mod scoring_cases;
+mod support;

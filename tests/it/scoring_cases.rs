@@ -1,0 +1,89 @@
+//! `score --truth ... --format json` gives the figures of the challenge's own program, under the
+//! same names.
+
+use serde_json::Value;
+
+use crate::support::{shared, succeed, text};
+
+/// Every key of `expected` is in `found`, with the same numbers.
+fn compare(place: &str, found: &Value, expected: &Value, tolerance: f64, wrong: &mut Vec<String>) {
+    match expected {
+        Value::Object(entries) => {
+            for (key, value) in entries {
+                // Words, and lists of B-mode powers that are pure rounding, are not figures.
+                if ["case", "description", "files", "BB"].contains(&key.as_str()) {
+                    continue;
+                }
+                match found.get(key) {
+                    Some(inner) => {
+                        compare(&format!("{place}.{key}"), inner, value, tolerance, wrong)
+                    }
+                    None => wrong.push(format!("{place}.{key} is missing")),
+                }
+            }
+        }
+        Value::Array(values) => {
+            for (k, value) in values.iter().enumerate() {
+                compare(&format!("{place}[{k}]"), &found[k], value, tolerance, wrong);
+            }
+        }
+        Value::Number(number) => {
+            // Conventions of one class tie up to rounding.
+            if place.ends_with(".winner") {
+                return;
+            }
+            let (f, e) = (found.as_f64(), number.as_f64().unwrap());
+            let close = f.is_some_and(|f| {
+                (f - e).abs() <= tolerance * e.abs().max(if place.contains("corr") { 1.0 } else { 0.0 })
+                    // M and A are differences of nearly equal powers.
+                    || (place.contains("fit") && (f - e).abs() <= tolerance)
+                    || (e == 0.0 && f.abs() < 1e-20)
+            });
+            if !close {
+                wrong.push(format!("{place}: found {f:?}, expected {e}"));
+            }
+        }
+        other => {
+            if found != other {
+                wrong.push(format!("{place}: found {found}, expected {other}"));
+            }
+        }
+    }
+}
+
+#[test]
+fn the_printed_object_holds_every_figure_of_the_public_cases() {
+    let Some(folder) = shared("scoring-cases") else {
+        return;
+    };
+    let mut wrong = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let case = entry.unwrap().path();
+        let Ok(expected) = std::fs::read_to_string(case.join("expected.json")) else {
+            continue;
+        };
+        let expected: Value = serde_json::from_str(&expected).unwrap();
+        let truth = case.join("truth.csv");
+        let noise = expected["noise_var"].to_string();
+        let mut arguments = vec!["score", "--truth", text(&truth)];
+        let catalogues: Vec<_> = expected["files"]["catalogues"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|name| case.join(name.as_str().unwrap()))
+            .collect();
+        arguments.extend(catalogues.iter().map(|path| text(path)));
+        arguments.extend(["--noise-var", &noise, "--format", "json"]);
+        let found: Value = serde_json::from_str(&succeed(&arguments)).unwrap();
+        let name = expected["case"].as_str().unwrap();
+        assert_eq!(found["case"], name);
+        assert!(found["description"].is_string() && found["files"]["truth"].is_string());
+        let tolerance = if name.contains("tiny_noise") {
+            1e-8
+        } else {
+            1e-9
+        };
+        compare(name, &found, &expected, tolerance, &mut wrong);
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
