@@ -7,6 +7,7 @@
 //! * [`deconvolve`], [`denoise`], [`shape`], [`psf`]: the method, one galaxy at a time.
 //! * [`simulate`]: GREAT10-like sets.
 //! * [`io`]: files; [`pipeline`]: the chain over many galaxies; [`report`]: tables and figures.
+//! * [`submit`]: challenge files, other programs' catalogues, checks.
 //! * [`cli`]: the command line; nothing else knows it.
 //! * The crates `shearq-scoring` (spectra and figures of merit), `shearq-submissions` (settings) and
 //!   `shearq-tables` (Parquet) stand below this one.
@@ -27,6 +28,7 @@ mod radial;
 pub mod report;
 pub mod shape;
 pub mod simulate;
+pub mod submit;
 
 /// Version of this package, as outputs carry it.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -98,7 +98,7 @@ impl Bins {
                         let zero_mode = grid.frequency(i) == 0 && grid.frequency(j) == 0;
                         // Nyquist rows of an even grid have no opposite: E and B cannot be told
                         // apart there.
-                        let nyquist = grid.n % 2 == 0 && (i == 0 || j == 0);
+                        let nyquist = grid.n.is_multiple_of(2) && (i == 0 || j == 0);
                         if zero_mode || nyquist {
                             continue;
                         }
@@ -130,14 +130,14 @@ impl Bins {
                 }
             }
             Definition::Corrected => {
-                for b in 0..BINS {
+                for (b, sum_l2) in sum_l2.iter().enumerate() {
                     let low = (l_min + (b as f64 - 0.5) * width).max(l_min);
                     let high = l_min + (b as f64 + 0.5) * width;
                     bins.dln_l[b] = (high / low).ln();
                     if bins.modes[b] > 0 {
                         let count = bins.modes[b] as f64;
                         bins.l[b] = bins.sum_l[b] / count;
-                        bins.to_c_l[b] = 2.0 * std::f64::consts::PI * count / sum_l2[b];
+                        bins.to_c_l[b] = 2.0 * std::f64::consts::PI * count / sum_l2;
                     }
                 }
             }

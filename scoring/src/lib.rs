@@ -55,5 +55,5 @@ pub use grid::Grid;
 pub use quality::{Bias, BiasFits, Quality};
 pub use score::{
     Choice, ConventionScore, Figures, MAX_GROUPS, Noise, Options, SetImages, SetScore, SetScorer,
-    published_bias,
+    measured_bandpowers,
 };

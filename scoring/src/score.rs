@@ -9,7 +9,7 @@ use crate::convention::{Convention, ConventionClass};
 use crate::error::ScoringError;
 use crate::grid::Grid;
 use crate::modes::{Decomposer, Modes};
-use crate::quality::{BiasFits, Quality, bias, bias_fits, quality};
+use crate::quality::{BiasFits, Quality, bias_fits, quality};
 use crate::resample::jackknife_error;
 
 /// Most groups of images that the jackknife leaves out in turn.
@@ -589,11 +589,23 @@ fn shear_bias(g: &Array2<f64>, sum: &Array2<f64>, count: &Array2<f64>) -> (f64, 
     (slope - 1.0, (s[3] - slope * s[1]) / s[0])
 }
 
-/// M and A of bandpowers in the published unit, for callers with spectra of their own.
-pub fn published_bias(
-    bins: &Bins,
-    measured: &[f64; BINS],
-    truth: &[f64; BINS],
-) -> crate::quality::Bias {
-    bias(measured, truth, |b| bins.to_c_l(b))
+/// E-mode bandpowers of a submission's averaged field and the bins they refer to: what a
+/// power-spectrum submission holds. No truth is needed.
+///
+/// # Errors
+/// Where no image was added.
+pub fn measured_bandpowers(
+    grid: &Grid,
+    sum: &FieldSum,
+    convention: Convention,
+) -> Result<(Bins, [f64; BINS]), ScoringError> {
+    if sum.images == 0 {
+        return Err(ScoringError::NoImages);
+    }
+    let scale = 1.0 / sum.images as f64;
+    let field = convention.apply(&(&sum.e1 * scale), &(&sum.e2 * scale));
+    let modes = Decomposer::new(*grid).decompose(field);
+    let bins = Bins::new(grid, Definition::Leaderboard);
+    let power = bins.power(&modes.e, &modes.e);
+    Ok((bins, power))
 }

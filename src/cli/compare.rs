@@ -4,16 +4,17 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
-use shearq_scoring::{Noise, Options};
+use shearq_scoring::{Grid, Noise, Options};
 use shearq_submissions::Registry;
 
 use super::arguments::{Printing, ScoreSettings, Threads};
 use super::print;
 use crate::io::layout::DataFolder;
 use crate::io::run::Run;
-use crate::pipeline::score::score_folder;
+use crate::pipeline::score::{score_folder, score_sets};
 use crate::report::scores::{Variant, compare};
 use crate::report::table::Table;
+use crate::submit::foreign::Foreign;
 
 /// Put measured submissions side by side, beside the published figures.
 ///
@@ -22,11 +23,15 @@ use crate::report::table::Table;
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Folders of catalogues.
-    #[arg(value_name = "OUT", required = true)]
+    #[arg(value_name = "OUT", required_unless_present = "foreign")]
     measured: Vec<PathBuf>,
-    /// Data folder with the true shear [default: the one each OUT was measured from].
+    /// Data folder with the true shear [default: the one the first OUT was measured from].
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
+    /// Catalogues of another program, described in a TOML file (docs/formats.md). May be given
+    /// several times.
+    #[arg(long, value_name = "FILE")]
+    foreign: Vec<PathBuf>,
     #[command(flatten)]
     printing: Printing,
     #[command(flatten)]
@@ -43,6 +48,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     };
     let table = table(
         &arguments.measured,
+        &arguments.foreign,
         arguments.data.as_deref(),
         options,
         arguments.threads.number(),
@@ -50,14 +56,16 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     print(&arguments.printing.render(&table))
 }
 
-/// The comparison of several results folders.
+/// The comparison of several results folders and of other programs' catalogues.
 pub(super) fn table(
     folders: &[PathBuf],
+    foreign: &[PathBuf],
     data: Option<&Path>,
     options: Options,
     threads: usize,
 ) -> anyhow::Result<Table> {
     let registry = Registry::embedded()?;
+    let mut data = data.map(Path::to_owned);
     let mut variants = Vec::new();
     for folder in folders {
         let run = Run::read(folder)?.with_context(|| {
@@ -66,7 +74,8 @@ pub(super) fn table(
                 folder.display()
             )
         })?;
-        let data = DataFolder::open(data.unwrap_or(&run.data))?;
+        let root = data.get_or_insert_with(|| run.data.clone());
+        let data = DataFolder::open(root)?;
         variants.push(Variant {
             scored: score_folder(&data, folder, &run, &[], options, threads)?,
             // Published figures belong to the embedded settings, not to a file of the same name.
@@ -78,5 +87,34 @@ pub(super) fn table(
             name: run.submission.name,
         });
     }
+    for path in foreign {
+        let root = data
+            .as_ref()
+            .context("--foreign alone needs --data DIR with the true shear")?;
+        variants.push(foreign_variant(
+            path,
+            &DataFolder::open(root)?,
+            options,
+            threads,
+        )?);
+    }
     Ok(compare(&variants, options.definition, options.choice))
+}
+
+fn foreign_variant(
+    path: &Path,
+    data: &DataFolder,
+    options: Options,
+    threads: usize,
+) -> anyhow::Result<Variant> {
+    let foreign = Foreign::read(path)?;
+    let read = |grid: &Grid, path: &Path| foreign.sum(grid, path);
+    let catalogues = |set| foreign.catalogues(set);
+    let scored = score_sets(data, &[], catalogues, &read, options, threads)
+        .with_context(|| path.display().to_string())?;
+    Ok(Variant {
+        name: foreign.name.clone(),
+        scored,
+        published: None,
+    })
 }

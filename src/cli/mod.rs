@@ -1,8 +1,10 @@
 //! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage.
 
 mod arguments;
+mod check;
 mod compare;
 mod measure;
+mod pack;
 mod progress;
 mod quickstart;
 mod score;
@@ -19,7 +21,7 @@ use clap::{Parser, Subcommand};
 ///
 /// Start with `shearq quickstart`. The chain in steps: `simulate` writes GREAT10-like sets (or bring
 /// your own), `measure` turns images into catalogues by a named submission, `score` turns catalogues
-/// into Q, M/2 and √A, `compare` puts variants side by side.
+/// into Q, M/2 and √A, `compare` puts variants side by side, `pack` and `check` prepare what is sent.
 #[derive(Debug, Parser)]
 #[command(name = "shearq", version, propagate_version = true)]
 struct Cli {
@@ -34,6 +36,8 @@ enum Command {
     Measure(measure::Arguments),
     Score(score::Arguments),
     Compare(compare::Arguments),
+    Check(check::Arguments),
+    Pack(pack::Arguments),
     Show(show::Arguments),
     Submissions(submissions::Arguments),
 }
@@ -46,6 +50,8 @@ pub fn main() -> ExitCode {
         Command::Measure(arguments) => measure::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
+        Command::Check(arguments) => check::run(&arguments),
+        Command::Pack(arguments) => pack::run(&arguments),
         Command::Show(arguments) => show::run(&arguments),
         Command::Submissions(arguments) => submissions::run(&arguments),
     };

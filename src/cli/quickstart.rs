@@ -80,7 +80,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         print(&format!("{}\n", table.render(TableFormat::Table)))?;
         folders.push(folder);
     }
-    let table = compare::table(&folders, None, options, threads)?;
+    let table = compare::table(&folders, &[], None, options, threads)?;
     print(&table.narrow().render(TableFormat::Table))?;
     eprintln!("\nNext: {}", next_step(out));
     Ok(())

@@ -1,25 +1,31 @@
 //! `shearq score`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use shearq_scoring::units::{Degrees, Pixels};
-use shearq_scoring::{Noise, Options, TruthSign};
+use shearq_scoring::{BiasFits, Grid, Noise, Options, Quality, SetScorer, TrueShear, TruthSign};
 
 use super::arguments::{Printing, ScoreSettings, SetList, Threads};
 use super::print;
 use crate::io::layout::DataFolder;
 use crate::io::run::Run;
-use crate::pipeline::score::{Reading, ScoredSet, score_files, score_folder};
-use crate::report::scores::{SetInput, one_set_json, per_set};
+use crate::pipeline::score::{
+    Reading, ScoredSet, plain_columns, read_truth, reading_of, score_files, score_folder,
+    score_sets,
+};
+use crate::report::scores::{SetInput, one_set_json, per_set, spectra};
 use crate::report::table::TableFormat;
+use crate::submit::challenge::{Kind, read_bandpowers};
+use crate::submit::foreign::Foreign;
 
 /// Score ellipticities against the true shear: Q, Q_dn, M/2, √A.
 ///
-/// Either a folder that `measure` wrote (`--data DATA --measured OUT`), or one set from plain files
-/// (`--truth truth.csv CATALOGUE...`, one catalogue per image; CSV with a header, ASCII `x y e1 e2`,
-/// FITS or Parquet by the file's ending). With `--format json` and plain files everything about the
+/// Either a folder that `measure` wrote (`--data DATA --measured OUT`), other programs' catalogues
+/// (`--data DATA --foreign FILE`), or one set from plain files (`--truth truth.csv CATALOGUE...`, one
+/// catalogue per image; CSV with a header, ASCII `x y e1 e2`, FITS or Parquet by the file's ending).
+/// Power-spectrum submissions are given by --spectra. With `--format json` and plain files everything about the
 /// set is printed, all eight conventions included.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -35,11 +41,24 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR", requires = "data")]
     measured: Option<PathBuf>,
     /// True shear of one set: x, y, g1, g2.
-    #[arg(long, value_name = "FILE", requires = "catalogues")]
+    #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// Catalogues of that set, one per image.
     #[arg(value_name = "CATALOGUE", requires = "truth")]
     catalogues: Vec<PathBuf>,
+    /// Catalogues of another program, described in a TOML file (docs/formats.md), instead of
+    /// --measured.
+    #[arg(
+        long,
+        value_name = "FILE",
+        requires = "data",
+        conflicts_with = "measured"
+    )]
+    foreign: Option<PathBuf>,
+    /// Power-spectrum submission (`index l power`): a file with --truth, a folder of
+    /// `{method}_set{set}.dat` with --data.
+    #[arg(long, value_name = "PATH", conflicts_with_all = ["measured", "foreign", "catalogues"])]
+    spectra: Option<PathBuf>,
     /// Sets to score [default: all that were measured].
     #[arg(long, value_name = "LIST", requires = "data")]
     sets: Option<SetList>,
@@ -97,37 +116,126 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         noise: arguments.noise_var.map_or(Noise::Measured, Noise::Given),
         choice: arguments.settings.choice(),
     };
-    match (&arguments.data, &arguments.measured, &arguments.truth) {
-        (Some(data), Some(measured), None) => folder(arguments, data, measured, options),
-        (None, None, Some(truth)) => files(arguments, truth, options),
+    match (&arguments.data, &arguments.truth, &arguments.spectra) {
+        (Some(data), None, Some(spectra)) => spectrum_folder(arguments, data, spectra, options),
+        (None, Some(truth), Some(spectrum)) => spectrum_file(arguments, truth, spectrum, options),
+        (Some(data), None, None) => folder(arguments, data, options),
+        (None, Some(truth), None) if !arguments.catalogues.is_empty() => {
+            files(arguments, truth, options)
+        }
         _ => bail!(
-            "nothing to score: give --data DIR --measured DIR, or --truth FILE and its catalogues"
+            "nothing to score: give --data DIR with --measured, --foreign or --spectra, or --truth FILE with catalogues or --spectra"
         ),
     }
 }
 
-fn folder(
-    arguments: &Arguments,
-    data: &PathBuf,
-    measured: &PathBuf,
-    options: Options,
-) -> anyhow::Result<()> {
+fn folder(arguments: &Arguments, data: &Path, options: Options) -> anyhow::Result<()> {
     let data = DataFolder::open(data)?;
-    let run = Run::read(measured)?.with_context(|| {
-        format!(
-            "{}: there is no run.json; expected a folder that `shearq measure` wrote",
-            measured.display()
-        )
-    })?;
     let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
     let threads = arguments.threads.number();
-    let scored = score_folder(&data, measured, &run, sets, options, threads)?;
-    let title = format!("Scores of {}", run.submission.name);
+    let (name, scored) = match (&arguments.measured, &arguments.foreign) {
+        (Some(measured), _) => {
+            let run = Run::read(measured)?.with_context(|| {
+                format!(
+                    "{}: there is no run.json; expected a folder that `shearq measure` wrote",
+                    measured.display()
+                )
+            })?;
+            let scored = score_folder(&data, measured, &run, sets, options, threads)?;
+            (run.submission.name, scored)
+        }
+        (None, Some(path)) => {
+            let foreign = Foreign::read(path)?;
+            let read = |grid: &Grid, path: &Path| foreign.sum(grid, path);
+            let catalogues = |set| foreign.catalogues(set);
+            let scored = score_sets(&data, sets, catalogues, &read, options, threads)
+                .with_context(|| path.display().to_string())?;
+            (foreign.name.clone(), scored)
+        }
+        (None, None) => bail!("--data needs --measured, --foreign or --spectra"),
+    };
+    let title = format!("Scores of {name}");
     let table = per_set(&scored, &title, options.definition, options.choice);
     print(&arguments.printing.render(&table))
 }
 
-fn files(arguments: &Arguments, truth: &PathBuf, options: Options) -> anyhow::Result<()> {
+/// Scores the power spectra of a folder, one file per set.
+fn spectrum_folder(
+    arguments: &Arguments,
+    data: &Path,
+    folder: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
+    let data = DataFolder::open(data)?;
+    let mut files: Vec<(u32, PathBuf)> = std::fs::read_dir(folder)
+        .with_context(|| format!("{}: cannot read the folder", folder.display()))?
+        .filter_map(|entry| {
+            let path = entry.ok()?.path();
+            match Kind::of(&path)? {
+                Kind::Spectrum { set, .. } => Some((set, path)),
+                Kind::Catalogue { .. } => None,
+            }
+        })
+        .collect();
+    files.sort();
+    anyhow::ensure!(
+        !files.is_empty(),
+        "{}: there is no file named {{method}}_set{{set}}.dat",
+        folder.display()
+    );
+    let reading = reading_of(&data);
+    let mut scored = Vec::new();
+    for (set, path) in &files {
+        let (grid, truth) = read_truth(&data.truth(*set), &reading)?;
+        scored.push((*set, score_spectrum(grid, truth, path, options)?));
+    }
+    print_spectra(arguments, &scored, folder, options)
+}
+
+fn spectrum_file(
+    arguments: &Arguments,
+    truth: &Path,
+    spectrum: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
+    let (grid, shear) = read_truth(truth, &plain_reading(arguments))?;
+    let scored = [(0, score_spectrum(grid, shear, spectrum, options)?)];
+    print_spectra(arguments, &scored, spectrum, options)
+}
+
+fn score_spectrum(
+    grid: Grid,
+    truth: TrueShear,
+    path: &Path,
+    options: Options,
+) -> anyhow::Result<(Quality, BiasFits)> {
+    let powers = read_bandpowers(path)?;
+    Ok(SetScorer::new(grid, truth, options)?.score_spectrum(&powers)?)
+}
+
+fn print_spectra(
+    arguments: &Arguments,
+    scored: &[(u32, (Quality, BiasFits))],
+    path: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
+    let title = format!("Scores of the power spectra of {}", path.display());
+    let table = spectra(scored, &title, options.definition);
+    print(&arguments.printing.render(&table))
+}
+
+/// How the truth given by `--truth` is to be read.
+fn plain_reading(arguments: &Arguments) -> Reading {
+    Reading {
+        field: Degrees(arguments.field),
+        stamp: Pixels(arguments.stamp),
+        sign: arguments
+            .truth_sign
+            .map_or(TruthSign::Challenge, Into::into),
+    }
+}
+
+fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Result<()> {
     let columns: Vec<&str> = arguments.columns.iter().map(String::as_str).collect();
     let columns: [&str; 4] = columns.as_slice().try_into().map_err(|_| {
         anyhow::anyhow!(
@@ -135,18 +243,11 @@ fn files(arguments: &Arguments, truth: &PathBuf, options: Options) -> anyhow::Re
             columns.len()
         )
     })?;
-    let reading = Reading {
-        field: Degrees(arguments.field),
-        stamp: Pixels(arguments.stamp),
-        sign: arguments
-            .truth_sign
-            .map_or(TruthSign::Challenge, Into::into),
-        columns,
-    };
     let (score, rows) = score_files(
         truth,
         &arguments.catalogues,
-        &reading,
+        &plain_reading(arguments),
+        &plain_columns(columns),
         options,
         arguments.threads.number(),
     )?;
@@ -156,14 +257,14 @@ fn files(arguments: &Arguments, truth: &PathBuf, options: Options) -> anyhow::Re
         rows,
     };
     if arguments.printing.format == TableFormat::Json {
-        let name = |path: &PathBuf| path.display().to_string();
+        let name = |path: &Path| path.display().to_string();
         let input = SetInput {
             case: truth
                 .parent()
                 .and_then(|folder| folder.file_name())
                 .map_or_else(|| name(truth), |n| n.to_string_lossy().into_owned()),
             truth: name(truth),
-            catalogues: arguments.catalogues.iter().map(name).collect(),
+            catalogues: arguments.catalogues.iter().map(|path| name(path)).collect(),
             definition: options.definition,
         };
         let mut text = serde_json::to_string_pretty(&one_set_json(&scored, &input))?;

@@ -63,6 +63,17 @@ impl Run {
     }
 }
 
+impl Run {
+    /// Catalogues of a set that are there, by image number.
+    pub fn catalogues(&self, folder: &Path, set: u32) -> Vec<(u32, PathBuf)> {
+        (1..=999)
+            .map(|image| (image, self.catalogue(folder, set, image)))
+            .take_while(|(_, path)| path.parent().is_some_and(Path::is_dir))
+            .filter(|(_, path)| path.is_file())
+            .collect()
+    }
+}
+
 /// Writes any record as indented JSON.
 ///
 /// # Errors

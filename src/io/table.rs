@@ -137,6 +137,14 @@ pub fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
     }
 }
 
+/// Reads an ASCII or CSV table whose columns, where it has no header, are `names`.
+///
+/// # Errors
+/// Where the file cannot be read.
+pub fn read_text(path: &Path, names: &[&str]) -> Result<Table, FileError> {
+    text::read_named(path, Some(names), names)
+}
+
 /// Writes `table` as `format`, with the key–value pairs that say what made it. FITS keeps of them
 /// those with keys of at most eight characters and values of at most 68.
 ///

@@ -14,6 +14,15 @@ const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 /// not a number. Fields are separated by commas if the first line has one, by blanks otherwise.
 /// Later lines starting with `#` are comments.
 pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
+    read_named(path, wanted, &CHALLENGE_COLUMNS)
+}
+
+/// The same, with other names for the columns of a table without a header.
+pub(super) fn read_named(
+    path: &Path,
+    wanted: Option<&[&str]>,
+    default_names: &[&str],
+) -> Result<Table, FileError> {
     let text = std::fs::read(path).map_err(FileError::doing(path, "cannot read the table"))?;
     let text = std::str::from_utf8(&text).map_err(|e| {
         FileError::new(
@@ -49,20 +58,14 @@ pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileEr
         lines.next();
         names
     } else {
-        CHALLENGE_COLUMNS
-            .iter()
-            .map(|&name| name.to_owned())
-            .collect()
+        owned(default_names)
     };
     // A `#` line of prose is no header: the challenge's columns are meant then.
     if first.starts_with('#')
         && let Some((_, line)) = lines.peek()
         && fields(line, commas).count() != names.len()
     {
-        names = CHALLENGE_COLUMNS
-            .iter()
-            .map(|&name| name.to_owned())
-            .collect();
+        names = owned(default_names);
     }
     let places: Vec<usize> = match wanted {
         Some(wanted) => wanted
@@ -126,6 +129,10 @@ pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileEr
         .map(|(&place, values)| (names[place].clone(), Column::Real(values)))
         .collect();
     Table::new(columns).map_err(|message| FileError::new(path, message))
+}
+
+fn owned(names: &[&str]) -> Vec<String> {
+    names.iter().map(|&name| name.to_owned()).collect()
 }
 
 /// Fields of a line, without surrounding blanks.

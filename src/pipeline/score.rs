@@ -28,32 +28,38 @@ pub struct ScoredSet {
     pub rows: RowCounts,
 }
 
-/// How the truth and the catalogues of a set are to be read.
+/// How a truth file is to be read.
 #[derive(Debug, Clone, Copy)]
-pub struct Reading<'a> {
+pub struct Reading {
     /// Side of the field in degrees.
     pub field: Degrees,
     /// Pixels a side of a cell.
     pub stamp: Pixels,
     /// Sign of g2 in the truth.
     pub sign: TruthSign,
-    /// Columns of the catalogues: x, y and the two components.
-    pub columns: [&'a str; 4],
 }
 
-/// Scores one set from a truth file and one catalogue per image.
-///
-/// The grid's side is the square root of the truth's number of rows.
+/// Reads one catalogue onto the grid.
+pub type ReadImage<'a> =
+    &'a (dyn Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync);
+
+/// A [`ReadImage`] for catalogues with the given columns in standard signs.
+pub fn plain_columns<'a>(
+    columns: [&'a str; 4],
+) -> impl Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync + 'a {
+    move |grid, path| {
+        let rows: Vec<Row> = read_rows(path, &columns)?;
+        let mut sum = FieldSum::new(grid);
+        let counts = sum.add_image(grid, rows);
+        Ok((sum, counts))
+    }
+}
+
+/// The true shear of a file on its grid, whose side is the square root of the number of rows.
 ///
 /// # Errors
-/// Where a file cannot be read or the truth does not fill a square grid.
-pub fn score_files(
-    truth: &Path,
-    catalogues: &[PathBuf],
-    reading: &Reading<'_>,
-    options: Options,
-    threads: usize,
-) -> Result<(SetScore, RowCounts), PipelineError> {
+/// Where the file cannot be read or does not fill a square grid.
+pub fn read_truth(truth: &Path, reading: &Reading) -> Result<(Grid, TrueShear), FileError> {
     let rows = read_truth_rows(truth)?;
     let side = (rows.len() as f64).sqrt().round() as usize;
     if side * side != rows.len() {
@@ -61,36 +67,28 @@ pub fn score_files(
             "{} rows; expected the square of the grid's side",
             rows.len()
         );
-        return Err(FileError::new(truth, message).into());
+        return Err(FileError::new(truth, message));
     }
     let bad = |error: shearq_scoring::ScoringError| FileError::new(truth, error);
     let grid = Grid::new(side, reading.stamp, reading.field).map_err(bad)?;
     let shear = TrueShear::from_rows(&grid, reading.sign, rows).map_err(bad)?;
-    let (images, counts) = add_up(&grid, catalogues, reading.columns, threads)?;
-    if counts.used == 0 {
-        if let Some(first) = catalogues.first() {
-            let message = format!(
-                "no row of the {} catalogue(s) falls on the {side} × {side} grid of {} px stamps",
-                catalogues.len(),
-                reading.stamp.0
-            );
-            return Err(FileError::new(first, message).into());
-        }
-    }
-    let score = SetScorer::new(grid, shear, options)
-        .and_then(|scorer| scorer.score(&images))
-        .map_err(|source| PipelineError::Scoring { set: 0, source })?;
-    Ok((score, counts))
+    Ok((grid, shear))
 }
 
-/// Adds up the catalogues of a set's images.
-fn add_up(
-    grid: &Grid,
+/// Scores one set from a truth file and one catalogue per image.
+///
+/// # Errors
+/// Where a file cannot be read, the truth does not fill a square grid, or no row falls on it.
+pub fn score_files(
+    truth: &Path,
     catalogues: &[PathBuf],
-    columns: [&str; 4],
+    reading: &Reading,
+    read: ReadImage<'_>,
+    options: Options,
     threads: usize,
-) -> Result<(SetImages, RowCounts), PipelineError> {
-    let mut images = SetImages::new(grid);
+) -> Result<(SetScore, RowCounts), PipelineError> {
+    let (grid, shear) = read_truth(truth, reading)?;
+    let mut images = SetImages::new(&grid);
     let mut counts = RowCounts::default();
     engine::ordered(
         threads,
@@ -103,25 +101,86 @@ fn add_up(
             Ok(())
         },
         || (),
-        |(), path: PathBuf| {
-            let rows: Vec<Row> = read_rows(&path, &columns)?;
-            let mut sum = FieldSum::new(grid);
-            let counts = sum.add_image(grid, rows);
-            Ok((sum, counts))
-        },
+        |(), path: PathBuf| Ok(read(&grid, &path)?),
         |(sum, more)| {
             images.add(&sum);
             counts += more;
             Ok(())
         },
     )?;
-    Ok((images, counts))
+    if counts.used == 0
+        && counts.outside > 0
+        && let Some(first) = catalogues.first()
+    {
+        let message = format!(
+            "no row of the {} catalogue(s) falls on the {1} × {1} grid of {2} px stamps",
+            catalogues.len(),
+            grid.n,
+            reading.stamp.0
+        );
+        return Err(FileError::new(first, message).into());
+    }
+    let score = SetScorer::new(grid, shear, options)
+        .and_then(|scorer| scorer.score(&images))
+        .map_err(|source| PipelineError::Scoring { set: 0, source })?;
+    Ok((score, counts))
+}
+
+/// How the truth of a data folder is to be read.
+pub fn reading_of(data: &DataFolder) -> Reading {
+    let layout = data.layout();
+    Reading {
+        field: Degrees(layout.field_degrees),
+        stamp: Pixels(layout.stamp as f64),
+        sign: layout.truth_sign,
+    }
+}
+
+/// Scores sets of a data folder from catalogues found by `catalogues`: all sets that have some, or
+/// those of `sets`, which then must have some.
+///
+/// # Errors
+/// Where files are absent or damaged, or there is nothing to score.
+pub fn score_sets(
+    data: &DataFolder,
+    sets: &[u32],
+    catalogues: impl Fn(u32) -> Vec<PathBuf>,
+    read: ReadImage<'_>,
+    options: Options,
+    threads: usize,
+) -> Result<Vec<ScoredSet>, PipelineError> {
+    let reading = reading_of(data);
+    let mut scored = Vec::new();
+    for set in 1..=99 {
+        if !sets.is_empty() && !sets.contains(&set) {
+            continue;
+        }
+        let files = catalogues(set);
+        if files.is_empty() {
+            if sets.contains(&set) {
+                let message = format!("there is no catalogue of set {set} to score");
+                return Err(PipelineError::Request(message));
+            }
+            continue;
+        }
+        let (score, rows) = score_files(&data.truth(set), &files, &reading, read, options, threads)
+            .map_err(|error| match error {
+                PipelineError::Scoring { source, .. } => PipelineError::Scoring { set, source },
+                other => other,
+            })?;
+        scored.push(ScoredSet { set, score, rows });
+    }
+    if scored.is_empty() {
+        let message = "there is no catalogue to score".into();
+        return Err(PipelineError::Request(message));
+    }
+    Ok(scored)
 }
 
 /// Scores every measured set of a results folder (or those of `sets`) against the truth of `data`.
 ///
 /// # Errors
-/// Where files are absent or damaged, or nothing was measured.
+/// As [`score_sets`].
 pub fn score_folder(
     data: &DataFolder,
     out: &Path,
@@ -130,45 +189,17 @@ pub fn score_folder(
     options: Options,
     threads: usize,
 ) -> Result<Vec<ScoredSet>, PipelineError> {
-    let layout = data.layout();
-    let reading = Reading {
-        field: Degrees(layout.field_degrees),
-        stamp: Pixels(layout.stamp as f64),
-        sign: layout.truth_sign,
-        columns: COLUMNS,
+    let read = plain_columns(COLUMNS);
+    let catalogues = |set| {
+        run.catalogues(out, set)
+            .into_iter()
+            .map(|(_, path)| path)
+            .collect()
     };
-    let mut scored = Vec::new();
-    for set in 1..=99 {
-        if !sets.is_empty() && !sets.contains(&set) {
-            continue;
-        }
-        let catalogues: Vec<PathBuf> = (1..=999)
-            .map(|image| run.catalogue(out, set, image))
-            .take_while(|path| path.parent().is_some_and(Path::is_dir))
-            .filter(|path| path.is_file())
-            .collect();
-        if catalogues.is_empty() {
-            if sets.contains(&set) {
-                let path = run.catalogue(out, set, 1);
-                let message = format!("set {set} was not measured; expected this catalogue");
-                return Err(FileError::new(path, message).into());
-            }
-            continue;
-        }
-        let truth = data.truth(set);
-        let (score, rows) =
-            score_files(&truth, &catalogues, &reading, options, threads).map_err(|error| {
-                match error {
-                    PipelineError::Scoring { source, .. } => PipelineError::Scoring { set, source },
-                    other => other,
-                }
-            })?;
-        scored.push(ScoredSet { set, score, rows });
-    }
-    if scored.is_empty() {
-        return Err(FileError::new(out, "there is no catalogue here to score").into());
-    }
-    Ok(scored)
+    score_sets(data, sets, catalogues, &read, options, threads).map_err(|error| match error {
+        PipelineError::Request(message) => FileError::new(out, message).into(),
+        other => other,
+    })
 }
 
 /// Means over sets of the headline figures and their errors, `None` for errors that are unknown.

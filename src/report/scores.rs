@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
 use shearq_scoring::{
     BINS, Bias, BiasFits, Choice, ConventionClass, ConventionScore, Definition, Figures,
-    MAX_GROUPS, SetScore,
+    MAX_GROUPS, Quality, SetScore,
 };
 use shearq_submissions::Published;
 
@@ -165,6 +165,66 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition, choice
         headings,
         rows,
         notes,
+    }
+}
+
+/// Figures of power-spectrum submissions, one row per set and one of means. There are no errors: a
+/// spectrum does not say how its images scatter.
+pub fn spectra(
+    scored: &[(u32, (Quality, BiasFits))],
+    title: &str,
+    definition: Definition,
+) -> Table {
+    let headings = vec![
+        Heading::new("set", "Set"),
+        Heading::new("kind", "Kind"),
+        Heading::new("q", "Q"),
+        Heading::new("sigma_sys", "σ_sys×10⁴"),
+        Heading::new("m_half", "M/2"),
+        Heading::new("sqrt_a", "√A×10⁴"),
+    ];
+    let mut rows: Vec<Vec<Cell>> = scored
+        .iter()
+        .map(|(set, (quality, fit))| {
+            let label = if *set == 0 {
+                "–".into()
+            } else {
+                format!("{set:02}")
+            };
+            vec![
+                Cell::text(label),
+                Cell::text(kind_label(*set)),
+                Cell::number(quality.q, 2),
+                Cell::number(quality.sigma_sys * 1e4, 4),
+                Cell::number(fit.cl.m, 4),
+                Cell::number(fit.cl.sqrtA * 1e4, 4),
+            ]
+        })
+        .collect();
+    if scored.len() > 1 {
+        let mean = |value: fn(&(Quality, BiasFits)) -> f64| {
+            scored.iter().map(|(_, s)| value(s)).sum::<f64>() / scored.len() as f64
+        };
+        rows.push(vec![
+            Cell::text("mean"),
+            Cell::text(""),
+            Cell::number(mean(|s| s.0.q), 2),
+            Cell::number(mean(|s| s.0.sigma_sys * 1e4), 4),
+            Cell::number(mean(|s| s.1.cl.m), 4),
+            Cell::number(mean(|s| s.1.cl.sqrtA * 1e4), 4),
+        ]);
+    }
+    let definition = match definition {
+        Definition::Leaderboard => "leaderboard",
+        Definition::Corrected => "corrected",
+    };
+    Table {
+        title: title.to_owned(),
+        headings,
+        rows,
+        notes: vec![format!(
+            "Figures: {definition} definition. √A in 10⁻⁴ for C_ℓ in steradian."
+        )],
     }
 }
 

@@ -97,7 +97,7 @@ pub fn random_field(
     for i in 0..n {
         for j in 0..n {
             let l = multipole(&grid, i, j);
-            let edge = n % 2 == 0 && (i == n / 2 || j == n / 2);
+            let edge = n.is_multiple_of(2) && (i == n / 2 || j == n / 2);
             // |mode|² = C_ℓ n⁴/L² (see `shearq_scoring::modes`).
             let scale = if l == 0.0 || edge || l > nyquist {
                 0.0

@@ -6,4 +6,5 @@ mod galsim_galaxies;
 mod galsim_measured;
 mod orientation;
 mod scoring_cases;
+mod submitted;
 mod support;

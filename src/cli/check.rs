@@ -1,0 +1,105 @@
+//! `shearq check`.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use clap::Args;
+use shearq_scoring::Grid;
+use shearq_scoring::units::{Degrees, Pixels};
+
+use super::print;
+use crate::io::layout::{DataFolder, read_truth_rows};
+use crate::submit::check::{Expected, Severity, check};
+
+/// Validate a submission before it is sent: one line per finding.
+///
+/// PATH is a catalogue, a power-spectrum file, or a folder of either, in the challenge's formats
+/// (catalogues may also be CSV, FITS or Parquet with columns x, y, e1, e2). Checked: readability,
+/// names, completeness against the grid, duplicates, rows outside or in excess, positions off the
+/// cells' centres, NaN, |e| > 1, constant values, missing images, bins, multipoles; and, with --data,
+/// sign and axis conventions, type of ellipticity and unit of power against the true shear.
+///
+/// Exit code 0: no errors (perhaps warnings); 1: errors were found.
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// File or folder.
+    path: PathBuf,
+    /// Data folder whose true shear to check against.
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+    /// Galaxies a side [default: that of the data's truth, or 100].
+    #[arg(long, value_name = "N")]
+    grid: Option<usize>,
+    /// Pixels a side of a grid cell.
+    #[arg(long, value_name = "PX", default_value_t = 48.0)]
+    stamp: f64,
+    /// Images that every set must have.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    images: u32,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let Arguments {
+        path,
+        data,
+        grid,
+        stamp,
+        images,
+        json,
+    } = arguments;
+    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let mut side = *grid;
+    if let (None, Some(data)) = (side, &data)
+        && let Some(&set) = data.sets().first()
+    {
+        let rows = read_truth_rows(&data.truth(set))?.len();
+        side = Some((rows as f64).sqrt().round() as usize);
+    }
+    let field = Degrees(data.as_ref().map_or(10.0, |d| d.layout().field_degrees));
+    let grid = Grid::new(side.unwrap_or(100), Pixels(*stamp), field)?;
+    let mut truth = BTreeMap::new();
+    if let Some(data) = &data {
+        for set in data.sets() {
+            truth.insert(set, data.read_truth(set, &grid)?);
+        }
+    }
+    let expected = Expected {
+        grid,
+        truth,
+        images: *images,
+    };
+    let findings = check(path, &expected);
+    let errors = findings
+        .iter()
+        .filter(|f| f.severity == Severity::Error)
+        .count();
+    if *json {
+        print(&(serde_json::to_string_pretty(&findings)? + "\n"))?;
+    } else {
+        for finding in &findings {
+            let severity = match finding.severity {
+                Severity::Error => "error",
+                Severity::Warning => "warning",
+            };
+            print(&format!(
+                "{}: {severity} [{}]: {}\n",
+                finding.path.display(),
+                finding.check,
+                finding.message
+            ))?;
+        }
+        if findings.is_empty() {
+            print(&format!("{}: no findings\n", path.display()))?;
+        }
+    }
+    anyhow::ensure!(
+        errors == 0,
+        "{}: {errors} errors and {} warnings found",
+        path.display(),
+        findings.len() - errors
+    );
+    Ok(())
+}

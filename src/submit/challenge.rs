@@ -1,0 +1,199 @@
+//! The two kinds of file that the challenge takes: ellipticity catalogues and power spectra.
+//!
+//! * Catalogue: ASCII `x y e1 e2`, one line a galaxy, one file an image,
+//!   `g10_v1_objs_{set}_{image}.{method}.dat`.
+//! * Power spectrum: ASCII `index l power`, the eight bins 2 to 9, one file a set,
+//!   `{method}_set{set}.dat`; power is ℓ²C_ℓ/2π.
+
+use std::path::{Path, PathBuf};
+
+use shearq_scoring::{
+    BINS, Bins, Convention, FieldSum, Grid, Row, SCORED, SetImages, measured_bandpowers,
+};
+
+use crate::io::FileError;
+use crate::io::atomic;
+use crate::io::layout::read_rows;
+use crate::io::table;
+use crate::pipeline::score::COLUMNS;
+
+/// One line of a power-spectrum file.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SpectrumLine {
+    /// Bin, 1-based: 2 to 9.
+    pub index: u32,
+    /// Multipole of the bin.
+    pub l: f64,
+    /// ℓ²C_ℓ/2π.
+    pub power: f64,
+}
+
+/// What a file's name says it is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Kind {
+    /// Catalogue of an image.
+    Catalogue {
+        /// Set number.
+        set: u32,
+        /// Image number.
+        image: u32,
+        /// Method's name.
+        method: String,
+    },
+    /// Power spectrum of a set.
+    Spectrum {
+        /// Set number.
+        set: u32,
+        /// Method's name.
+        method: String,
+    },
+}
+
+impl Kind {
+    /// Recognises the challenge's file names.
+    pub fn of(path: &Path) -> Option<Self> {
+        let name = path.file_name()?.to_str()?.strip_suffix(".dat")?;
+        if let Some(rest) = name.strip_prefix("g10_v1_objs_") {
+            let (numbers, method) = rest.split_once('.')?;
+            let (set, image) = numbers.split_once('_')?;
+            return Some(Kind::Catalogue {
+                set: number(set)?,
+                image: number(image)?,
+                method: method.to_owned(),
+            });
+        }
+        let (method, set) = name.rsplit_once("_set")?;
+        Some(Kind::Spectrum {
+            set: number(set)?,
+            method: method.to_owned(),
+        })
+    }
+
+    /// The file name.
+    pub fn file_name(&self) -> String {
+        match self {
+            Kind::Catalogue { set, image, method } => {
+                format!("g10_v1_objs_{set}_{image}.{method}.dat")
+            }
+            Kind::Spectrum { set, method } => format!("{method}_set{set}.dat"),
+        }
+    }
+
+    /// Set number.
+    pub fn set(&self) -> u32 {
+        match self {
+            Kind::Catalogue { set, .. } | Kind::Spectrum { set, .. } => *set,
+        }
+    }
+}
+
+/// A number without signs or leading zeros, from 1.
+fn number(text: &str) -> Option<u32> {
+    if text.starts_with('0') || !text.bytes().all(|b| b.is_ascii_digit()) {
+        return None;
+    }
+    text.parse().ok()
+}
+
+/// Writes the measured galaxies of a catalogue of ours in the challenge's format. Flagged galaxies
+/// have no ellipticity and are left out, which the original scoring counts as zero.
+///
+/// # Errors
+/// Where the catalogue cannot be read or the file cannot be written.
+pub fn write_catalogue(from: &Path, to: &Path) -> Result<usize, FileError> {
+    let rows = read_rows(from, &COLUMNS)?;
+    let mut text = String::new();
+    let mut count = 0;
+    for Row { x, y, e1, e2 } in rows {
+        if e1.is_finite() && e2.is_finite() {
+            text.push_str(&format!("{x} {y} {e1:.9} {e2:.9}\n"));
+            count += 1;
+        }
+    }
+    atomic::write(to, text.as_bytes())?;
+    Ok(count)
+}
+
+/// Writes the power spectrum of a set's catalogues in the challenge's format.
+///
+/// # Errors
+/// Where a catalogue cannot be read or the file cannot be written.
+pub fn write_spectrum(grid: &Grid, catalogues: &[PathBuf], to: &Path) -> Result<(), FileError> {
+    let mut images = SetImages::new(grid);
+    for path in catalogues {
+        let mut sum = FieldSum::new(grid);
+        sum.add_image(grid, read_rows(path, &COLUMNS)?);
+        images.add(&sum);
+    }
+    let (bins, power) = measured_bandpowers(grid, images.total(), Convention::STANDARD)
+        .map_err(|error| FileError::new(to, error))?;
+    atomic::write(to, spectrum_text(&bins, &power).as_bytes())
+}
+
+fn spectrum_text(bins: &Bins, power: &[f64; BINS]) -> String {
+    SCORED
+        .map(|b| format!("{} {:.6} {:.12e}\n", b + 1, bins.l[b], power[b]))
+        .collect()
+}
+
+/// Reads a power-spectrum file as it is; [`super::check`] says whether it is complete.
+///
+/// # Errors
+/// Where it cannot be read.
+pub fn read_spectrum(path: &Path) -> Result<Vec<SpectrumLine>, FileError> {
+    let mut table = table::read_text(path, &["index", "l", "power"])?;
+    let mut column = |name: &str| table.take_real(name).unwrap_or_default();
+    let (index, l, power) = (column("index"), column("l"), column("power"));
+    Ok((0..index.len())
+        .map(|k| SpectrumLine {
+            index: index[k] as u32,
+            l: l[k],
+            power: power[k],
+        })
+        .collect())
+}
+
+/// The eight bandpowers of a power-spectrum file, in order.
+///
+/// # Errors
+/// Where the file cannot be read, or its bins are not 2 to 9.
+pub fn read_bandpowers(path: &Path) -> Result<Vec<f64>, FileError> {
+    let lines = read_spectrum(path)?;
+    let found: Vec<u32> = lines.iter().map(|line| line.index).collect();
+    let expected: Vec<u32> = SCORED.map(|b| b as u32 + 1).collect();
+    if found != expected {
+        return Err(FileError::new(
+            path,
+            format!("the bins are {found:?}; expected {expected:?}"),
+        ));
+    }
+    if let Some(bad) = lines.iter().find(|line| !line.power.is_finite()) {
+        return Err(FileError::new(
+            path,
+            format!("the power of bin {} is not a finite number", bad.index),
+        ));
+    }
+    Ok(lines.iter().map(|line| line.power).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_recognised_and_made() {
+        for name in ["g10_v1_objs_7_12.NN23.dat", "NN_23_set24.dat"] {
+            let kind = Kind::of(Path::new(name)).unwrap();
+            assert_eq!(kind.file_name(), name);
+        }
+        for wrong in [
+            "g10_v1_objs_7.NN.dat",
+            "NN_set1.txt",
+            "NN_set01.dat",
+            "set.dat",
+            "x",
+        ] {
+            assert_eq!(Kind::of(Path::new(wrong)), None, "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,447 @@
+//! Checks of a submission before it is sent.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use shearq_scoring::{
+    Bins, Convention, Definition, FieldSum, Grid, Options, Row, SCORED, SetImages, SetScorer,
+    TrueShear,
+};
+
+use super::challenge::{Kind, SpectrumLine, read_spectrum};
+use crate::io::layout::read_rows;
+use crate::pipeline::score::COLUMNS;
+
+/// How bad a finding is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Severity {
+    /// Worth a look.
+    Warning,
+    /// The submission would not be scored as meant.
+    Error,
+}
+
+/// One thing found.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct Finding {
+    /// File or folder.
+    pub path: PathBuf,
+    /// How bad.
+    pub severity: Severity,
+    /// Short name of the check.
+    pub check: &'static str,
+    /// What was found and what was expected.
+    pub message: String,
+}
+
+/// What the files are checked against.
+pub struct Expected {
+    /// The grid.
+    pub grid: Grid,
+    /// True shear by set, where known: then conventions and the type of ellipticity are checked.
+    pub truth: BTreeMap<u32, TrueShear>,
+    /// Images that every set must have; 0 if not known.
+    pub images: u32,
+}
+
+/// Largest share of a cell by which positions may be off its centre.
+const POSITION_TOLERANCE: f64 = 0.01;
+
+/// Checks a file, or all files of a folder.
+pub fn check(path: &Path, expected: &Expected) -> Vec<Finding> {
+    let mut report = Report::default();
+    let files = match files_of(path) {
+        Ok(files) => files,
+        Err(error) => {
+            report.error(path, "readable", error.to_string());
+            return report.findings;
+        }
+    };
+    if files.is_empty() {
+        report.error(path, "empty", "there is no file here".into());
+    }
+    let mut sets: BTreeMap<u32, SetFiles> = BTreeMap::new();
+    let mut methods: BTreeMap<String, PathBuf> = BTreeMap::new();
+    for file in &files {
+        let kind = Kind::of(file);
+        match &kind {
+            None => {
+                let single = files.len() == 1 && path.is_file();
+                let message = "the name is neither g10_v1_objs_{set}_{image}.{method}.dat nor {method}_set{set}.dat".to_owned();
+                if single {
+                    report.warn(file, "name", message);
+                } else {
+                    report.error(file, "name", message);
+                }
+            }
+            Some(Kind::Catalogue { method, .. } | Kind::Spectrum { method, .. }) => {
+                methods
+                    .entry(method.clone())
+                    .or_insert_with(|| file.clone());
+            }
+        }
+        let spectrum = match &kind {
+            Some(kind) => matches!(kind, Kind::Spectrum { .. }),
+            None => looks_like_spectrum(file),
+        };
+        if spectrum {
+            check_spectrum(file, kind.as_ref(), expected, &mut report);
+            continue;
+        }
+        let Some(sum) = check_catalogue(file, expected, &mut report) else {
+            continue;
+        };
+        match &kind {
+            Some(Kind::Catalogue { set, image, .. }) => {
+                let entry = sets.entry(*set).or_insert_with(|| SetFiles {
+                    images: SetImages::new(&expected.grid),
+                    numbers: Vec::new(),
+                    first: file.clone(),
+                });
+                entry.images.add(&sum);
+                entry.numbers.push(*image);
+            }
+            // A lone file of another name can only belong to the only set there is.
+            _ if files.len() == 1 && expected.truth.len() == 1 => {
+                let mut images = SetImages::new(&expected.grid);
+                images.add(&sum);
+                for set in expected.truth.keys() {
+                    check_against_truth(*set, &images, file, expected, &mut report);
+                }
+            }
+            _ => {}
+        }
+    }
+    if methods.len() > 1 {
+        let names: Vec<&str> = methods.keys().map(String::as_str).collect();
+        report.error(
+            path,
+            "method",
+            format!("files of several methods: {}", names.join(", ")),
+        );
+    }
+    for (set, files) in &mut sets {
+        check_images(*set, files, path, expected, &mut report);
+        check_against_truth(*set, &files.images, &files.first, expected, &mut report);
+    }
+    report.findings
+}
+
+struct SetFiles {
+    images: SetImages,
+    numbers: Vec<u32>,
+    first: PathBuf,
+}
+
+#[derive(Default)]
+struct Report {
+    findings: Vec<Finding>,
+}
+
+impl Report {
+    fn error(&mut self, path: &Path, check: &'static str, message: String) {
+        self.add(path, Severity::Error, check, message);
+    }
+
+    fn warn(&mut self, path: &Path, check: &'static str, message: String) {
+        self.add(path, Severity::Warning, check, message);
+    }
+
+    fn add(&mut self, path: &Path, severity: Severity, check: &'static str, message: String) {
+        self.findings.push(Finding {
+            path: path.to_owned(),
+            severity,
+            check,
+            message,
+        });
+    }
+}
+
+fn files_of(path: &Path) -> std::io::Result<Vec<PathBuf>> {
+    if !path.is_dir() {
+        std::fs::metadata(path)?;
+        return Ok(vec![path.to_owned()]);
+    }
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(path)? {
+        let file = entry?.path();
+        let hidden = file
+            .file_name()
+            .is_some_and(|name| name.to_string_lossy().starts_with('.'));
+        if file.is_file() && !hidden {
+            files.push(file);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// A file of an unknown name is a spectrum if its lines have three numbers.
+fn looks_like_spectrum(path: &Path) -> bool {
+    read_spectrum(path).is_ok_and(|lines| !lines.is_empty() && lines.len() <= 20)
+}
+
+fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Option<FieldSum> {
+    let rows = match read_rows(path, &COLUMNS) {
+        Ok(rows) => rows,
+        Err(error) => {
+            report.error(path, "readable", error.message);
+            return None;
+        }
+    };
+    let grid = &expected.grid;
+    let cells = grid.cells();
+    if rows.len() > cells {
+        let message = format!(
+            "{} rows; the {cells} cells take no more, the rest is ignored",
+            rows.len()
+        );
+        report.error(path, "excess", message);
+    }
+    let mut count = vec![0u32; cells];
+    let (mut outside, mut off_centre, mut offset) = (0, 0, (0.0, 0.0));
+    let (mut not_finite, mut too_large, mut square) = (0, 0, 0.0);
+    for Row { x, y, e1, e2 } in &rows {
+        let Some((ix, iy)) = grid.cell(*x, *y) else {
+            outside += 1;
+            continue;
+        };
+        count[iy * grid.n + ix] += 1;
+        let centre = grid.centre(ix, iy);
+        let (dx, dy) = (x - centre.0, y - centre.1);
+        if dx.abs().max(dy.abs()) > POSITION_TOLERANCE * grid.stamp.0 {
+            off_centre += 1;
+            offset = (offset.0 + dx, offset.1 + dy);
+        }
+        let modulus = e1.hypot(*e2);
+        if !modulus.is_finite() {
+            not_finite += 1;
+        } else {
+            square += modulus * modulus;
+            if modulus > 1.0 {
+                too_large += 1;
+            }
+        }
+    }
+    let missing = count.iter().filter(|c| **c == 0).count();
+    let repeated = count.iter().filter(|c| **c > 1).count();
+    if outside > 0 {
+        report.error(
+            path,
+            "outside",
+            format!("{outside} rows lie outside the {0} × {0} grid", grid.n),
+        );
+    }
+    if missing == cells {
+        report.error(path, "missing", "no galaxy of the grid is there".into());
+    } else if missing > 0 {
+        let message = format!("{missing} of {cells} galaxies are missing; each counts as zero");
+        if missing * 10 > cells {
+            report.error(path, "missing", message);
+        } else {
+            report.warn(path, "missing", message);
+        }
+    }
+    if repeated > 0 {
+        let message =
+            format!("{repeated} galaxies are given more than once; their ellipticities add up");
+        report.error(path, "duplicates", message);
+    }
+    if off_centre > 0 {
+        let (dx, dy) = (
+            offset.0 / f64::from(off_centre),
+            offset.1 / f64::from(off_centre),
+        );
+        let message = format!(
+            "{off_centre} positions are off the centres of their cells, on average by ({dx:+.2}, {dy:+.2}) px; positions are 1-based FITS pixels of the stamp centre"
+        );
+        report.warn(path, "positions", message);
+    }
+    if not_finite > 0 {
+        report.error(
+            path,
+            "not-finite",
+            format!("{not_finite} ellipticities are not finite numbers"),
+        );
+    }
+    if too_large > 0 {
+        let message = format!("{too_large} galaxies have |e| > 1");
+        if too_large * 20 > rows.len() {
+            report.error(path, "range", message);
+        } else {
+            report.warn(path, "range", message);
+        }
+    }
+    let used = rows.len() - outside - not_finite;
+    if used > 0 && square == 0.0 {
+        report.error(path, "constant", "all ellipticities are zero".into());
+    } else if used > 1 {
+        let first = rows.iter().find(|r| r.e1.is_finite());
+        if first.is_some_and(|f| rows.iter().all(|r| r.e1 == f.e1 && r.e2 == f.e2)) {
+            report.error(
+                path,
+                "constant",
+                "all galaxies have the same ellipticity".into(),
+            );
+        }
+    }
+    let mut sum = FieldSum::new(grid);
+    sum.add_image(grid, rows);
+    Some(sum)
+}
+
+fn check_images(
+    set: u32,
+    files: &mut SetFiles,
+    path: &Path,
+    expected: &Expected,
+    report: &mut Report,
+) {
+    files.numbers.sort_unstable();
+    let last = files
+        .numbers
+        .last()
+        .copied()
+        .unwrap_or(0)
+        .max(expected.images);
+    let missing: Vec<String> = (1..=last)
+        .filter(|image| files.numbers.binary_search(image).is_err())
+        .map(|image| image.to_string())
+        .collect();
+    if !missing.is_empty() {
+        let shown = missing
+            .iter()
+            .take(10)
+            .cloned()
+            .collect::<Vec<_>>()
+            .join(", ");
+        let more = if missing.len() > 10 { ", …" } else { "" };
+        let message = format!(
+            "set {set} lacks {} of {last} images: {shown}{more}",
+            missing.len()
+        );
+        report.error(path, "images", message);
+    }
+    if expected.images > 0 && last > expected.images {
+        let message = format!(
+            "set {set} has an image {last}; expected {} images",
+            expected.images
+        );
+        report.error(path, "images", message);
+    }
+}
+
+/// Conventions and type of ellipticity, where the truth is known.
+fn check_against_truth(
+    set: u32,
+    images: &SetImages,
+    path: &Path,
+    expected: &Expected,
+    report: &mut Report,
+) {
+    let Some(truth) = expected.truth.get(&set) else {
+        return;
+    };
+    let scorer = SetScorer::new(expected.grid, truth.clone(), Options::default());
+    let Ok(score) = scorer.and_then(|scorer| scorer.score(images)) else {
+        return;
+    };
+    let standard = &score.conventions[Convention::STANDARD.index()];
+    let matched = &score.conventions[score.matched.index()];
+    // Two uncorrelated sets of N modes correlate by 1/√N; ask for a clear excess over that.
+    let modes: usize = SCORED.map(|b| score.bins.modes[b]).sum();
+    let noise = (2.0 / modes as f64).sqrt();
+    if matched.correlation < 4.0 * noise {
+        let message = format!(
+            "set {set}: no convention correlates with the true shear (best {:.2})",
+            matched.correlation
+        );
+        report.warn(path, "correlation", message);
+        return;
+    }
+    if score.matched != Convention::STANDARD
+        && matched.correlation - standard.correlation > 4.0 * noise
+    {
+        let message = format!(
+            "set {set}: wrong convention suspected: {} (convention {}) correlates with the true shear by {:.2}, as given only by {:.2}",
+            matched.convention.describe(),
+            matched.convention.number(),
+            matched.correlation,
+            standard.correlation
+        );
+        report.error(path, "convention", message);
+        return;
+    }
+    let errors = score.errors().map_or(0.1, |e| e.m_cross);
+    if standard.m_cross - 0.5 > 3.0 * errors {
+        let message = format!(
+            "set {set}: ellipticities respond to shear by a factor {:.2}; a distortion (about 2) may have been given for a shear-type ellipticity",
+            1.0 + standard.m_cross
+        );
+        report.warn(path, "type", message);
+    }
+}
+
+fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report: &mut Report) {
+    let lines = match read_spectrum(path) {
+        Ok(lines) => lines,
+        Err(error) => {
+            report.error(path, "readable", error.message);
+            return;
+        }
+    };
+    let found: Vec<u32> = lines.iter().map(|line| line.index).collect();
+    let wanted: Vec<u32> = SCORED.map(|b| b as u32 + 1).collect();
+    if found != wanted {
+        report.error(
+            path,
+            "bins",
+            format!("the bins are {found:?}; expected {wanted:?}"),
+        );
+    }
+    let bins = Bins::new(&expected.grid, Definition::Leaderboard);
+    for SpectrumLine { index, l, power } in &lines {
+        let bin = *index as usize;
+        if !power.is_finite() {
+            report.error(
+                path,
+                "not-finite",
+                format!("the power of bin {index} is not a finite number"),
+            );
+        } else if *power < 0.0 {
+            report.warn(
+                path,
+                "negative",
+                format!("the power of bin {index} is negative: {power:e}"),
+            );
+        }
+        if (1..=bins.l.len()).contains(&bin) {
+            let centre = bins.l[bin - 1];
+            if !(l - centre).abs().le(&(0.5 * bins.width)) {
+                let message = format!("bin {index} has l = {l}; expected {centre:.1}");
+                report.error(path, "multipole", message);
+            }
+        }
+    }
+    let truth = kind.and_then(|kind| expected.truth.get(&kind.set()));
+    if let Some(truth) = truth
+        && found == wanted
+        && let Ok(scorer) = SetScorer::new(expected.grid, truth.clone(), Options::default())
+    {
+        let true_power = scorer.true_bandpowers();
+        let (sum, true_sum) = lines.iter().fold((0.0, 0.0), |sums, line| {
+            (
+                sums.0 + line.power,
+                sums.1 + true_power[line.index as usize - 1],
+            )
+        });
+        let ratio = sum / true_sum;
+        if !(0.01..100.0).contains(&ratio) {
+            let message = format!(
+                "the power is {ratio:.1e} times the true one; the unit is l(l+1)C/2π, not C or its root"
+            );
+            report.error(path, "unit", message);
+        }
+    }
+}

@@ -1,0 +1,163 @@
+//! Catalogues of other programs, described by a small TOML file.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use shearq_scoring::{Distortion, FieldSum, Grid, Row, RowCounts, Shear};
+use shearq_submissions::EllipticityType;
+
+use crate::io::FileError;
+use crate::io::layout::fill;
+use crate::io::table;
+
+/// How to read another program's catalogues.
+///
+/// ```toml
+/// name = "REGAUSS"
+/// catalogues = "set{set:02}/hsm-regauss-{image:03}.csv"   # beside this file, or absolute
+/// ellipticity = "distortion"      # what the columns hold: "distortion" or "shear"
+/// report = "shear"                # what is scored [default: shear]
+/// x = "x"                         # names of the columns [defaults: x, y, e1, e2, no flag]
+/// y = "y"
+/// e1 = "e1"
+/// e2 = "e2"
+/// flag = "flag"                   # rows with another value than 0 have no ellipticity
+/// max_modulus = 1.0               # rows with a larger |e| (as reported) have none [default: no limit]
+/// position_offset = 0.0           # added to x and y to make them FITS pixels (1 for 0-based ones)
+/// e2_sign = 1                     # -1 where e2 is positive along x = -y
+/// ```
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Foreign {
+    /// Name in tables.
+    pub name: String,
+    catalogues: String,
+    ellipticity: EllipticityType,
+    #[serde(default = "shear")]
+    report: EllipticityType,
+    #[serde(default = "x")]
+    x: String,
+    #[serde(default = "y")]
+    y: String,
+    #[serde(default = "e1")]
+    e1: String,
+    #[serde(default = "e2")]
+    e2: String,
+    flag: Option<String>,
+    max_modulus: Option<f64>,
+    #[serde(default)]
+    position_offset: f64,
+    #[serde(default = "one")]
+    e2_sign: i8,
+    #[serde(skip)]
+    folder: PathBuf,
+}
+
+fn shear() -> EllipticityType {
+    EllipticityType::Shear
+}
+fn x() -> String {
+    "x".into()
+}
+fn y() -> String {
+    "y".into()
+}
+fn e1() -> String {
+    "e1".into()
+}
+fn e2() -> String {
+    "e2".into()
+}
+fn one() -> i8 {
+    1
+}
+
+impl Foreign {
+    /// Reads a description.
+    ///
+    /// # Errors
+    /// Where it cannot be read or is not valid.
+    pub fn read(path: &Path) -> Result<Self, FileError> {
+        let text = std::fs::read_to_string(path).map_err(FileError::doing(
+            path,
+            "cannot read the description of catalogues",
+        ))?;
+        let mut foreign: Foreign =
+            toml::from_str(&text).map_err(|e| FileError::new(path, e.to_string().trim_end()))?;
+        if foreign.e2_sign.abs() != 1 {
+            let message = format!("`e2_sign` is {}; expected 1 or -1", foreign.e2_sign);
+            return Err(FileError::new(path, message));
+        }
+        if !foreign.catalogues.contains("{image") {
+            let message = format!(
+                "`catalogues` is \"{}\"; expected a pattern with {{set}} and {{image}}",
+                foreign.catalogues
+            );
+            return Err(FileError::new(path, message));
+        }
+        foreign.folder = path.parent().unwrap_or(Path::new("")).to_owned();
+        Ok(foreign)
+    }
+
+    /// The catalogues of a set that are there, in order of images.
+    pub fn catalogues(&self, set: u32) -> Vec<PathBuf> {
+        (1..=999)
+            .map(|image| self.folder.join(fill(&self.catalogues, set, image)))
+            .filter(|path| path.is_file())
+            .collect()
+    }
+
+    /// One image's catalogue on the grid, converted to standard signs and the reported type.
+    /// Flagged rows and distortions above 1 count as missing.
+    ///
+    /// # Errors
+    /// Where it cannot be read or a column is absent.
+    pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
+        let mut names = vec![
+            self.x.as_str(),
+            self.y.as_str(),
+            self.e1.as_str(),
+            self.e2.as_str(),
+        ];
+        names.extend(self.flag.as_deref());
+        let mut table = table::read(path, Some(&names))?;
+        let mut column = |name: &str| table.take_real(name).unwrap_or_default();
+        let flags = self.flag.as_deref().map(&mut column);
+        let (x, y) = (column(&self.x), column(&self.y));
+        let (e1, e2) = (column(&self.e1), column(&self.e2));
+        let rows = (0..x.len()).map(|k| {
+            let good = flags.as_ref().is_none_or(|flags| flags[k] == 0.0);
+            let shape = if good {
+                self.convert(e1[k], f64::from(self.e2_sign) * e2[k])
+            } else {
+                None
+            };
+            let shape =
+                shape.filter(|(e1, e2)| self.max_modulus.is_none_or(|most| e1.hypot(*e2) <= most));
+            let (e1, e2) = shape.unwrap_or((f64::NAN, f64::NAN));
+            Row {
+                x: x[k] + self.position_offset,
+                y: y[k] + self.position_offset,
+                e1,
+                e2,
+            }
+        });
+        let mut sum = FieldSum::new(grid);
+        let counts = sum.add_image(grid, rows);
+        Ok((sum, counts))
+    }
+
+    fn convert(&self, e1: f64, e2: f64) -> Option<(f64, f64)> {
+        match (self.ellipticity, self.report) {
+            (EllipticityType::Distortion, EllipticityType::Shear) => {
+                let shear = Distortion::new(e1, e2).to_shear()?;
+                Some((shear.e1, shear.e2))
+            }
+            (EllipticityType::Shear, EllipticityType::Distortion) => {
+                let distortion = Shear::new(e1, e2).to_distortion();
+                Some((distortion.e1, distortion.e2))
+            }
+            _ => Some((e1, e2)),
+        }
+    }
+}

@@ -1,0 +1,5 @@
+//! What is handed in: challenge files, catalogues of other programs, and checks before sending.
+
+pub mod challenge;
+pub mod check;
+pub mod foreign;

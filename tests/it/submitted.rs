@@ -1,0 +1,379 @@
+//! Challenge files: packed, checked and scored; other programs' catalogues in the same table.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::support::{shared, shearq, succeed, text};
+
+/// A measured small set and its packed catalogues.
+struct Packed {
+    root: tempfile::TempDir,
+}
+
+impl Packed {
+    fn new() -> Self {
+        let root = tempfile::tempdir().unwrap();
+        let at = |name: &str| root.path().join(name);
+        succeed(&[
+            "simulate",
+            "--sets",
+            "8",
+            "--images",
+            "3",
+            "--grid",
+            "16",
+            "--seed",
+            "5",
+            "--amplitude",
+            "100",
+            "--out",
+            text(&at("data")),
+        ]);
+        succeed(&[
+            "measure",
+            "--submission",
+            "23/den/star",
+            "--data",
+            text(&at("data")),
+            "--out",
+            text(&at("out")),
+        ]);
+        succeed(&[
+            "pack",
+            "--measured",
+            text(&at("out")),
+            "--method",
+            "NN",
+            "--out",
+            text(&at("sent")),
+        ]);
+        Packed { root }
+    }
+
+    fn at(&self, name: &str) -> std::path::PathBuf {
+        self.root.path().join(name)
+    }
+
+    fn file(&self, image: u32) -> std::path::PathBuf {
+        self.at("sent")
+            .join(format!("g10_v1_objs_8_{image}.NN.dat"))
+    }
+
+    /// Names of the checks that found something on `path`, and the exit code.
+    fn check(&self, path: &Path) -> (Vec<String>, i32) {
+        let output = shearq(&[
+            "check",
+            text(path),
+            "--data",
+            text(&self.at("data")),
+            "--images",
+            "3",
+            "--json",
+        ]);
+        let findings: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let names = findings
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|f| f["check"].as_str().unwrap().to_owned())
+            .collect();
+        (names, output.status.code().unwrap())
+    }
+}
+
+#[test]
+fn a_sound_submission_passes_and_scores_like_its_catalogues() {
+    let packed = Packed::new();
+    assert_eq!(packed.check(&packed.at("sent")), (vec![], 0));
+    let plain = succeed(&["check", text(&packed.at("sent")), "--grid", "16"]);
+    assert!(plain.ends_with("no findings\n"), "{plain}");
+    let truth = packed.at("data").join("set08/truth.csv");
+    let files: Vec<_> = (1..=3).map(|image| packed.file(image)).collect();
+    let mut arguments = vec!["score", "--truth", text(&truth), "--truth-sign", "standard"];
+    arguments.extend(files.iter().map(|f| text(f)));
+    arguments.extend(["--format", "csv"]);
+    let from_ascii = succeed(&arguments);
+    let (data, out) = (packed.at("data"), packed.at("out"));
+    let from_catalogues = succeed(&[
+        "score",
+        "--data",
+        text(&data),
+        "--measured",
+        text(&out),
+        "--format",
+        "csv",
+    ]);
+    let q = |csv: &str| -> f64 {
+        csv.lines()
+            .nth(1)
+            .unwrap()
+            .split(',')
+            .nth(3)
+            .unwrap()
+            .parse()
+            .unwrap()
+    };
+    // ASCII keeps nine decimals.
+    assert!((q(&from_ascii) / q(&from_catalogues) - 1.0).abs() < 1e-6);
+    succeed(&[
+        "pack",
+        "--measured",
+        text(&out),
+        "--method",
+        "NN",
+        "--kind",
+        "spectra",
+        "--out",
+        text(&packed.at("spectra")),
+    ]);
+    let spectra = succeed(&[
+        "score",
+        "--data",
+        text(&data),
+        "--spectra",
+        text(&packed.at("spectra")),
+        "--format",
+        "csv",
+    ]);
+    let q_spectrum: f64 = spectra
+        .lines()
+        .nth(1)
+        .unwrap()
+        .split(',')
+        .nth(2)
+        .unwrap()
+        .parse()
+        .unwrap();
+    assert!((q_spectrum / q(&from_catalogues) - 1.0).abs() < 1e-6);
+    assert_eq!(packed.check(&packed.at("spectra")), (vec![], 0));
+}
+
+#[test]
+fn each_planted_fault_in_a_catalogue_is_found() {
+    let packed = Packed::new();
+    let file = packed.file(2);
+    let sound = fs::read_to_string(&file).unwrap();
+    let lines: Vec<&str> = sound.lines().collect();
+    let edit = |change: &dyn Fn(&str) -> String| -> String {
+        lines.iter().map(|line| change(line) + "\n").collect()
+    };
+    let fields = |line: &str| -> Vec<f64> { line.split(' ').map(|f| f.parse().unwrap()).collect() };
+    let first = |replacement: &str| {
+        std::iter::once(replacement)
+            .chain(lines[1..].iter().copied())
+            .map(|l| format!("{l}\n"))
+            .collect::<String>()
+    };
+    let faults: Vec<(&str, String, &str)> = vec![
+        ("few rows", lines[..100].join("\n"), "missing"),
+        ("one row missing", lines[1..].join("\n"), "missing"),
+        ("a row twice", first(lines[1]), "duplicates"),
+        (
+            "more rows than cells",
+            format!("{sound}{}\n", lines[5]),
+            "excess",
+        ),
+        ("outside the grid", first("99999 24.5 0.1 0.1"), "outside"),
+        ("NaN", first("24.5 24.5 NaN 0.1"), "not-finite"),
+        ("infinite", first("24.5 24.5 0.1 inf"), "not-finite"),
+        ("large |e|", first("24.5 24.5 0.9 0.9"), "range"),
+        ("words", first("24.5 24.5 none 0.1"), "readable"),
+        (
+            "a column too few",
+            edit(&|l| l.rsplit_once(' ').unwrap().0.to_owned()),
+            "readable",
+        ),
+        (
+            "all zero",
+            edit(&|l| {
+                let f = fields(l);
+                format!("{} {} 0 0", f[0], f[1])
+            }),
+            "constant",
+        ),
+        (
+            "all the same",
+            edit(&|l| {
+                let f = fields(l);
+                format!("{} {} 0.1 -0.2", f[0], f[1])
+            }),
+            "constant",
+        ),
+        (
+            "positions counted from 0",
+            edit(&|l| {
+                let f = fields(l);
+                format!("{} {} {} {}", f[0] - 1.0, f[1] - 1.0, f[2], f[3])
+            }),
+            "positions",
+        ),
+        ("empty", String::new(), "readable"),
+    ];
+    for (fault, content, expected) in faults {
+        fs::write(&file, content).unwrap();
+        let (found, code) = packed.check(&packed.at("sent"));
+        assert!(found.iter().any(|f| f == expected), "{fault}: {found:?}");
+        let only_warning = ["one row missing", "large |e|", "positions counted from 0"];
+        assert_eq!(
+            code,
+            i32::from(!only_warning.contains(&fault)),
+            "{fault}: {found:?}"
+        );
+    }
+    fs::write(&file, &sound).unwrap();
+    fs::rename(&file, packed.at("sent").join("catalogue_2.txt")).unwrap();
+    let (found, _) = packed.check(&packed.at("sent"));
+    assert!(
+        found.contains(&"name".into()) && found.contains(&"images".into()),
+        "{found:?}"
+    );
+    fs::rename(
+        packed.at("sent").join("catalogue_2.txt"),
+        packed.at("sent").join("g10_v1_objs_8_2.other.dat"),
+    )
+    .unwrap();
+    assert!(
+        packed
+            .check(&packed.at("sent"))
+            .0
+            .contains(&"method".into())
+    );
+}
+
+#[test]
+fn wrong_conventions_and_types_are_suspected() {
+    let packed = Packed::new();
+    let change = |e1: f64, e2: f64| {
+        for image in 1..=3 {
+            let text = fs::read_to_string(packed.file(image)).unwrap();
+            let changed: String = text
+                .lines()
+                .map(|line| {
+                    let f: Vec<f64> = line.split(' ').map(|f| f.parse().unwrap()).collect();
+                    format!("{} {} {} {}\n", f[0], f[1], e1 * f[2], e2 * f[3])
+                })
+                .collect();
+            fs::write(packed.file(image), changed).unwrap();
+        }
+    };
+    change(1.0, -1.0);
+    let (found, code) = packed.check(&packed.at("sent"));
+    assert_eq!((found, code), (vec!["convention".to_owned()], 1));
+    change(5.0, -5.0);
+    let (found, _) = packed.check(&packed.at("sent"));
+    assert!(found.contains(&"type".to_owned()), "{found:?}");
+}
+
+#[test]
+fn each_planted_fault_in_a_spectrum_is_found() {
+    let packed = Packed::new();
+    let (out, folder) = (packed.at("out"), packed.at("spectra"));
+    succeed(&[
+        "pack",
+        "--measured",
+        text(&out),
+        "--method",
+        "NN",
+        "--kind",
+        "spectra",
+        "--out",
+        text(&folder),
+    ]);
+    let file = folder.join("NN_set8.dat");
+    let sound = fs::read_to_string(&file).unwrap();
+    let lines: Vec<&str> = sound.lines().collect();
+    let scaled: String = lines
+        .iter()
+        .map(|line| {
+            let f: Vec<f64> = line.split(' ').map(|f| f.parse().unwrap()).collect();
+            format!("{} {} {:e}\n", f[0], f[1], f[2] * 1e-4)
+        })
+        .collect();
+    let replaced = |line: &str| {
+        std::iter::once(line)
+            .chain(lines[1..].iter().copied())
+            .map(|l| format!("{l}\n"))
+            .collect::<String>()
+    };
+    let second = lines[0].split(' ').nth(1).unwrap();
+    for (content, expected) in [
+        (lines[1..].join("\n"), "bins"),
+        (replaced("2 9999 1e-5"), "multipole"),
+        (replaced(&format!("2 {second} nan")), "not-finite"),
+        (replaced(&format!("2 {second} -1e-5")), "negative"),
+        (scaled, "unit"),
+        ("nothing here\n1 2\n".to_owned(), "readable"),
+    ] {
+        fs::write(&file, content).unwrap();
+        let (found, _) = packed.check(&folder);
+        assert!(found.iter().any(|f| f == expected), "{expected}: {found:?}");
+    }
+}
+
+#[test]
+fn other_programs_catalogues_stand_in_the_same_table() {
+    let Some(folder) = shared("galsim-sets") else {
+        return;
+    };
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    succeed(&[
+        "measure",
+        "--submission",
+        "23/raw/star",
+        "--data",
+        text(&folder),
+        "--out",
+        text(&at("out")),
+    ]);
+    let describe = |name: &str, ellipticity: &str, report: &str| {
+        let path = at(&format!("{name}-{report}.toml"));
+        let pattern = folder.join(format!("set{{set:02}}/hsm-{name}-{{image:03}}.csv"));
+        let content = format!(
+            "name = \"{name}\"\ncatalogues = \"{}\"\nellipticity = \"{ellipticity}\"\nreport = \"{report}\"\nflag = \"flag\"\n",
+            pattern.display()
+        );
+        fs::write(&path, content).unwrap();
+        path
+    };
+    let regauss = describe("regauss", "distortion", "shear");
+    let ksb = describe("ksb", "shear", "shear");
+    let distortion = describe("regauss", "distortion", "distortion");
+    let table = succeed(&[
+        "compare",
+        text(&at("out")),
+        "--foreign",
+        text(&regauss),
+        "--foreign",
+        text(&ksb),
+        "--foreign",
+        text(&distortion),
+        "--format",
+        "json",
+    ]);
+    let table: Value = serde_json::from_str(&table).unwrap();
+    let value = |row: usize, key: &str| table["rows"][row][key].as_f64().unwrap();
+    assert_eq!(table["rows"][1]["submission"], "regauss");
+    // Shape noise of 2,048 galaxies: by its own jackknife error, from two images a set.
+    for row in [1, 2] {
+        let (m, error) = (value(row, "m_cross"), value(row, "m_cross_error"));
+        assert!(m.abs() < 4.0 * error, "{table:#}");
+    }
+    // The same galaxies as distortions respond nearly twice, and the noise is common to both.
+    let ratio = (1.0 + value(3, "m_cross")) / (1.0 + value(1, "m_cross"));
+    assert!((1.5..2.0).contains(&ratio), "{ratio}");
+    let broken = at("broken.toml");
+    fs::write(
+        &broken,
+        "name = \"x\"\ncatalogues = \"{set}-{image}\"\nellipticity = \"shear\"\ncolumn = 1\n",
+    )
+    .unwrap();
+    let output = shearq(&["score", "--data", text(&folder), "--foreign", text(&broken)]);
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        message.contains("broken.toml") && message.contains("column"),
+        "{message}"
+    );
+}
