@@ -289,7 +289,7 @@ fn every_convention_is_recognised_by_its_correlation() {
             };
             Complex64::new(s1 * g.re, s2 * g.im)
         });
-        let images = images(&grid, &given, 2, 0.01, 5, |_, _| true);
+        let images = images(&grid, &given, 2, 0.001, 5, |_, _| true);
         let score = score(grid, &shear, &images, Options::default());
         assert!(score.conventions[k.index()].correlation > 0.8, "{k:?}");
         assert_eq!(score.matched.class(), k.class(), "{k:?}");
@@ -305,7 +305,8 @@ fn every_convention_is_recognised_by_its_correlation() {
 fn noise_makes_the_wrong_convention_win_and_that_is_seen() {
     let grid = Grid::great10(50).unwrap();
     let shear = field(&grid, Content::E, 30);
-    let images = images(&grid, &shear, 20, 0.4, 6, |_, _| true);
+    // Noise in the mean field of about the signal's own power in the scored bins.
+    let images = images(&grid, &shear, 20, 0.02, 6, |_, _| true);
     let score = score(grid, &shear, &images, Options::default());
     assert!(score.wrong_convention_wins());
     assert_eq!(score.matched.class(), Convention::STANDARD.class());
