@@ -7,6 +7,7 @@
 //! * [`deconvolve`], [`denoise`], [`shape`], [`psf`]: the method, one galaxy at a time.
 //! * [`simulate`]: GREAT10-like sets.
 //! * [`io`]: files; [`pipeline`]: the chain over many galaxies; [`report`]: tables and figures.
+//! * [`study`]: the paper's calibration of λ and its results on 24 sets.
 //! * [`submit`]: challenge files, other programs' catalogues, checks.
 //! * [`cli`]: the command line; nothing else knows it.
 //! * The crates `shearq-scoring` (spectra and figures of merit), `shearq-submissions` (settings) and
@@ -28,6 +29,7 @@ mod radial;
 pub mod report;
 pub mod shape;
 pub mod simulate;
+pub mod study;
 pub mod submit;
 
 /// Version of this package, as outputs carry it.

@@ -1,6 +1,7 @@
 //! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage.
 
 mod arguments;
+mod calibrate;
 mod check;
 mod compare;
 mod measure;
@@ -39,6 +40,7 @@ enum Command {
     Check(check::Arguments),
     Pack(pack::Arguments),
     Show(show::Arguments),
+    Calibrate(calibrate::Arguments),
     Submissions(submissions::Arguments),
 }
 
@@ -53,6 +55,7 @@ pub fn main() -> ExitCode {
         Command::Check(arguments) => check::run(&arguments),
         Command::Pack(arguments) => pack::run(&arguments),
         Command::Show(arguments) => show::run(&arguments),
+        Command::Calibrate(arguments) => calibrate::run(&arguments),
         Command::Submissions(arguments) => submissions::run(&arguments),
     };
     match result {

@@ -5,7 +5,7 @@ use shearq_submissions::Start;
 
 use super::kernel::{Buffers, Level, Real};
 use super::operator::{Operator, OperatorError};
-use super::{Outcome, Rule};
+use super::{Outcome, Rule, Stop};
 
 /// A network for one stamp size, PSF size and λ, holding one PSF at a time.
 ///
@@ -78,6 +78,68 @@ impl<T: Real> Network<T> {
     ) -> Outcome {
         let n = self.operator.n;
         let b = &mut scratch.buffers;
+        Self::start(n, rule, u0, b);
+        let outcome = self.level.run(&self.operator, rule, b);
+        for (y, row) in out.chunks_exact_mut(n).enumerate() {
+            row.copy_from_slice(b.state.row(y));
+        }
+        outcome
+    }
+
+    /// Like [`Network::deconvolve`], one iteration at a time, showing `observe` the state before and
+    /// after each, row-major. The last one shown may be an update that raised the energy and is not
+    /// kept. For studies: it allocates, and repeats part of the work.
+    ///
+    /// # Panics
+    /// As [`Network::deconvolve`].
+    pub fn trace(
+        &self,
+        rule: &Rule,
+        u0: &[T],
+        scratch: &mut NetworkScratch<T>,
+        out: &mut [T],
+        mut observe: impl FnMut(&[T], &[T]),
+    ) -> Outcome {
+        let n = self.operator.n;
+        let b = &mut scratch.buffers;
+        Self::start(n, rule, u0, b);
+        let one = Rule {
+            max_iterations: 1,
+            ..*rule
+        };
+        let image = |padded: &super::kernel::Padded<T>| -> Vec<T> {
+            (0..n).flat_map(|y| padded.row(y).iter().copied()).collect()
+        };
+        let mut total: Option<Outcome> = None;
+        for _ in 0..rule.max_iterations {
+            let before = image(&b.state);
+            let outcome = self.level.run(&self.operator, &one, b);
+            match outcome.stop {
+                Stop::Stable => {}
+                Stop::EnergyRise => observe(&before, &image(&b.next)),
+                Stop::MaxIterations => observe(&before, &image(&b.state)),
+            }
+            let so_far = total.get_or_insert(Outcome {
+                iterations: 0,
+                ..outcome
+            });
+            *so_far = Outcome {
+                iterations: so_far.iterations + outcome.iterations,
+                first_energy: so_far.first_energy,
+                ..outcome
+            };
+            if outcome.stop != Stop::MaxIterations {
+                break;
+            }
+        }
+        for (y, row) in out.chunks_exact_mut(n).enumerate() {
+            row.copy_from_slice(b.state.row(y));
+        }
+        total.unwrap_or_else(|| self.level.run(&self.operator, rule, b))
+    }
+
+    /// Takes the stamp and sets the first state.
+    fn start(n: usize, rule: &Rule, u0: &[T], b: &mut Buffers<T>) {
         assert_eq!(u0.len(), n * n, "stamp of {n} × {n} pixels");
         b.data.copy_from_slice(u0);
         let flat = match rule.start {
@@ -98,11 +160,6 @@ impl<T: Real> Network<T> {
                 Start::Flat | Start::Zero => state.fill(flat),
             }
         }
-        let outcome = self.level.run(&self.operator, rule, b);
-        for (y, row) in out.chunks_exact_mut(n).enumerate() {
-            row.copy_from_slice(b.state.row(y));
-        }
-        outcome
     }
 }
 
@@ -353,6 +410,35 @@ mod tests {
             .map(|(a, b)| (a - b).abs())
             .fold(0.0, f32::max);
         assert!(worst < 1e-4, "{worst}");
+    }
+
+    #[test]
+    fn a_trace_shows_every_iteration_of_the_same_run() {
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        let psf = psf(&mut rng, 7);
+        let u0: Vec<f64> = stamp(&mut rng, 15).iter().copied().collect();
+        let mut network = Network::<f64>::plan(15, 7, 0.0).unwrap();
+        network.set_psf(psf.view()).unwrap();
+        let mut scratch = network.scratch();
+        for (step, unit) in [(0.5, 0.01), (0.5, 1.0), (50.0, 0.01)] {
+            let rule = Rule {
+                step: Step::Adaptive(step),
+                unit,
+                max_iterations: 30,
+                start: Start::ClippedData,
+            };
+            let (mut whole, mut traced) = (vec![0.0; 225], vec![0.0; 225]);
+            let expected = network.deconvolve(&rule, &u0, &mut scratch, &mut whole);
+            let mut shown = 0;
+            let found = network.trace(&rule, &u0, &mut scratch, &mut traced, |before, after| {
+                shown += 1;
+                assert_ne!(before, after);
+            });
+            assert_eq!(found, expected);
+            assert_eq!(whole, traced);
+            let attempted = u32::from(expected.stop == Stop::EnergyRise);
+            assert_eq!(shown, expected.iterations + attempted);
+        }
     }
 
     #[test]

@@ -45,14 +45,6 @@ impl Run {
             .map_err(|error| FileError::new(&path, format!("not a record of a run: {error}")))
     }
 
-    /// Writes the record.
-    ///
-    /// # Errors
-    /// Where it cannot be written.
-    pub fn write(&self, folder: &Path) -> Result<(), FileError> {
-        write_record(&folder.join(RUN_FILE), self)
-    }
-
     /// The catalogue of an image.
     pub fn catalogue(&self, folder: &Path, set: u32, image: u32) -> PathBuf {
         let name = format!(
@@ -85,11 +77,40 @@ pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileErro
     atomic::write(path, text.as_bytes())
 }
 
-/// Lines in which two records differ, as `key: first ≠ second`.
+/// Makes the folder of `path` that of `record`: writes it where there is none, and refuses a folder
+/// with a different one, showing the differences.
 ///
 /// # Errors
-/// Where a record cannot be turned into JSON.
-pub fn differences(
+/// Where the folder belongs to other settings, or the record cannot be read or written.
+pub fn claim<R: Serialize + serde::de::DeserializeOwned>(
+    path: &Path,
+    record: &R,
+) -> Result<(), FileError> {
+    let text = match std::fs::read_to_string(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+            return write_record(path, record);
+        }
+        Err(error) => return Err(FileError::new(path, error)),
+        Ok(text) => text,
+    };
+    let earlier: R = serde_json::from_str(&text)
+        .map_err(|error| FileError::new(path, format!("not a record of this kind: {error}")))?;
+    let differences = differences(&earlier, record)
+        .map_err(|error| FileError::new(path, format!("cannot compare records: {error}")))?;
+    if differences.is_empty() {
+        return Ok(());
+    }
+    Err(FileError::new(
+        path.parent().unwrap_or(path),
+        format!(
+            "this folder holds results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
+            differences.join("\n  ")
+        ),
+    ))
+}
+
+/// Lines in which two records differ, as `key: first ≠ second`.
+fn differences(
     first: &impl Serialize,
     second: &impl Serialize,
 ) -> Result<Vec<String>, serde_json::Error> {

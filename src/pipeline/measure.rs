@@ -16,7 +16,7 @@ use crate::io::FileError;
 use crate::io::fits::ImageReader;
 use crate::io::layout::DataFolder;
 use crate::io::psf_table;
-use crate::io::run::{Run, differences};
+use crate::io::run::{RUN_FILE, Run, claim};
 use crate::io::table::{self, Column, Table};
 use crate::psf::functional::FunctionalPsf;
 use crate::psf::star::star_psf;
@@ -325,7 +325,7 @@ pub fn measure_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    claim(run, out)?;
+    claim(&out.join(RUN_FILE), run)?;
     let (todo, already) = images_to_do(run, data, out, sets)?;
     let mut summary = Summary {
         already,
@@ -379,28 +379,6 @@ pub fn galaxies_to_do(
     };
     let grid = ImageSource::open(data, first, &run.submission)?.grid();
     Ok((todo.len() * grid.cells()) as u64)
-}
-
-/// Makes `out` this run's folder, or finds that it is.
-fn claim(run: &Run, out: &Path) -> Result<(), PipelineError> {
-    match Run::read(out)? {
-        None => Ok(run.write(out)?),
-        Some(earlier) => {
-            let differences = differences(&earlier, run)
-                .map_err(|error| FileError::new(out, format!("cannot compare records: {error}")))?;
-            if differences.is_empty() {
-                return Ok(());
-            }
-            Err(FileError::new(
-                out,
-                format!(
-                    "this folder holds results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
-                    differences.join("\n  ")
-                ),
-            )
-            .into())
-        }
-    }
 }
 
 /// Images without a catalogue, and the number of those with one.

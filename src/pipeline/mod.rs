@@ -7,6 +7,7 @@
 pub mod engine;
 pub mod galaxy;
 pub mod measure;
+pub mod run;
 pub mod score;
 pub mod simulate;
 

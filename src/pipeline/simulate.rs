@@ -1,6 +1,5 @@
 //! Simulating sets into a data folder.
 
-use std::path::Path;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -8,12 +7,11 @@ use shearq_scoring::Shear;
 
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
-use crate::io::FileError;
 use crate::io::atomic;
 use crate::io::fits::{ImageWriter, Value};
 use crate::io::layout::DataFolder;
 use crate::io::psf_table;
-use crate::io::run::{differences, write_record};
+use crate::io::run::claim;
 use crate::psf::functional::FunctionalPsf;
 use crate::simulate::kinds::{SETS, SetKind};
 use crate::simulate::render::RenderScratch;
@@ -24,7 +22,7 @@ use crate::simulate::set::{
 /// Name of the record in a simulated data folder.
 pub const SIMULATION_FILE: &str = "simulation.json";
 /// Pixels a side of each star stamp where there is one per galaxy.
-const STAR_STAMP: usize = 32;
+pub(super) const STAR_STAMP: usize = 32;
 
 /// Settings of a simulation, as stored with its data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -64,7 +62,7 @@ pub fn simulate_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
-    claim(record, data.root())?;
+    claim(&data.root().join(SIMULATION_FILE), record)?;
     let mut simulators = Vec::new();
     let mut already = 0;
     for &set in sets {
@@ -131,28 +129,44 @@ fn feed(simulators: &[(Arc<SetSimulator>, Vec<u32>)], feeder: &mut Feeder<'_, Ro
 }
 
 fn draw_row(scratch: &mut RenderScratch, job: RowJob) -> DrawnRow {
-    let n = job.set.grid().n;
-    let mut pixels = vec![0.0; n * STAMP * STAMP];
-    let mut stamp = vec![0.0; STAMP * STAMP];
-    let mut observed = Vec::with_capacity(n);
-    for ix in 0..n {
-        observed.push(job.set.draw(&job.fields, ix, job.iy, scratch, &mut stamp));
-        place(&stamp, STAMP, ix, n, &mut pixels);
-    }
-    let stars = matches!(job.fields.psf, PsfField::PerGalaxy(_)).then(|| {
-        let mut strip = vec![0.0; n * STAR_STAMP * STAR_STAMP];
-        for ix in 0..n {
-            let star = star(job.fields.psf.at(ix, job.iy), STAR_STAMP);
-            place(&star, STAR_STAMP, ix, n, &mut strip);
-        }
-        strip
-    });
+    let (pixels, observed) = draw_stamps(&job.set, &job.fields, job.iy, scratch);
+    let stars = matches!(job.fields.psf, PsfField::PerGalaxy(_))
+        .then(|| draw_stars(&job.set, &job.fields, job.iy));
     DrawnRow {
         job,
         pixels,
         stars,
         observed,
     }
+}
+
+/// A strip of noisy stamps, and the galaxies' ellipticities after lensing.
+pub(super) fn draw_stamps(
+    set: &SetSimulator,
+    fields: &ImageFields,
+    iy: usize,
+    scratch: &mut RenderScratch,
+) -> (Vec<f32>, Vec<Shear>) {
+    let n = set.grid().n;
+    let mut pixels = vec![0.0; n * STAMP * STAMP];
+    let mut stamp = vec![0.0; STAMP * STAMP];
+    let mut observed = Vec::with_capacity(n);
+    for ix in 0..n {
+        observed.push(set.draw(fields, ix, iy, scratch, &mut stamp));
+        place(&stamp, STAMP, ix, n, &mut pixels);
+    }
+    (pixels, observed)
+}
+
+/// A strip of star stamps of [`STAR_STAMP`] pixels, one per galaxy.
+pub(super) fn draw_stars(set: &SetSimulator, fields: &ImageFields, iy: usize) -> Vec<f32> {
+    let n = set.grid().n;
+    let mut strip = vec![0.0; n * STAR_STAMP * STAR_STAMP];
+    for ix in 0..n {
+        let star = star(fields.psf.at(ix, iy), STAR_STAMP);
+        place(&star, STAR_STAMP, ix, n, &mut strip);
+    }
+    strip
 }
 
 /// Copies a stamp to its place in a strip of `n`.
@@ -164,38 +178,9 @@ fn place(stamp: &[f32], side: usize, ix: usize, n: usize, strip: &mut [f32]) {
 }
 
 /// A noise-free star stamp with a sum of one.
-fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
+pub(super) fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
     let stamp = super::measure::functional_psf(psf, side);
     stamp.iter().map(|&v| v as f32).collect()
-}
-
-fn claim(record: &SimulationRecord, folder: &Path) -> Result<(), PipelineError> {
-    let path = folder.join(SIMULATION_FILE);
-    match std::fs::read_to_string(&path) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-            Ok(write_record(&path, record)?)
-        }
-        Err(error) => Err(FileError::new(&path, error).into()),
-        Ok(text) => {
-            let earlier: SimulationRecord = serde_json::from_str(&text).map_err(|error| {
-                FileError::new(&path, format!("not a record of a simulation: {error}"))
-            })?;
-            let differences = differences(&earlier, record).map_err(|error| {
-                FileError::new(&path, format!("cannot compare records: {error}"))
-            })?;
-            if differences.is_empty() {
-                return Ok(());
-            }
-            Err(FileError::new(
-                folder,
-                format!(
-                    "this folder holds data of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
-                    differences.join("\n  ")
-                ),
-            )
-            .into())
-        }
-    }
 }
 
 fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {

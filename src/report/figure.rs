@@ -30,9 +30,9 @@ mod scene;
 mod ticks;
 
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use crate::io::{FileError, atomic};
 use plotters::backend::{BitMapBackend, DrawingBackend};
 
 pub use bar::{BarGroup, BarPlot};
@@ -64,6 +64,9 @@ pub enum FigureError {
         found: String,
     },
     /// The file could not be written.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// The temporary file through which pixels pass could not be used.
     #[error("{}: cannot write the figure: {source}", path.display())]
     Io {
         /// The file.
@@ -159,17 +162,14 @@ pub trait Figure {
     /// at once or, on failure, not at all.
     ///
     /// # Errors
-    /// Those of [`Format::of`] and [`Figure::render`], and [`FigureError::Io`].
+    /// Those of [`Format::of`] and [`Figure::render`], and [`FigureError::File`].
     fn save(&self, path: impl AsRef<Path>) -> Result<(), FigureError>
     where
         Self: Sized,
     {
         let path = path.as_ref();
         let bytes = self.render(Format::of(path)?)?;
-        replace(path, &bytes).map_err(|source| FigureError::Io {
-            path: path.into(),
-            source,
-        })
+        Ok(atomic::write(path, &bytes)?)
     }
 }
 
@@ -193,22 +193,3 @@ fn encode_png(scene: &Scene) -> Result<Vec<u8>, FigureError> {
     fs::read(&path).map_err(|source| FigureError::Io { path, source })
 }
 
-/// Writes a file beside `path` and then renames it to that.
-fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let folder = path
-        .parent()
-        .filter(|folder| !folder.as_os_str().is_empty());
-    let mut builder = tempfile::Builder::new();
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        // As for any new file, what the user's mask allows; temporary files are private otherwise.
-        builder.permissions(fs::Permissions::from_mode(0o666));
-    }
-    let mut file = builder
-        .prefix(".figure")
-        .tempfile_in(folder.unwrap_or(Path::new(".")))?;
-    file.write_all(bytes)?;
-    file.persist(path)?;
-    Ok(())
-}

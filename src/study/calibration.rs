@@ -1,0 +1,436 @@
+//! Calibration of the regularisation parameter λ on synthetic galaxies (Sect. 4).
+//!
+//! A galaxy is an exponential (Sérsic n = 1) profile u on a stamp; the observed stamp is
+//! u₀ = Hu + n with a Moffat PSF (β = 3) of the galaxy's own and white noise of
+//! SNR = 10 log₁₀(σ_S²/σ²) dB, σ_S² being the variance of Hu over the stamp. Half-light radii are
+//! uniform in 1.5–4 px, FWHM in 2.8–4 px, ellipticities of galaxies Gaussian of 0.2 per component
+//! (at most 0.6), of PSFs uniform to 0.05. The paper gives none of these numbers.
+//!
+//! * CTR = K_c/K_t (Eq. 15): of all changes of a neuron's state, the share that brings it nearer to
+//!   u. The update that raises the energy and ends the run counts as attempted.
+//! * dSNR = 10 log₁₀(‖u₀ − u‖²/‖u* − u‖²) (Eq. 16), mean over galaxies.
+//! * 1/RMSD = √(2N/Σ|e − e*|²) (Eq. 17), distortions, over the galaxies that could be measured.
+
+use ndarray::Array2;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use shearq_scoring::{Distortion, Shear};
+use shearq_submissions::{Submission, Update};
+
+use crate::deconvolve::{Network, NetworkScratch, Rule};
+use crate::pipeline::PipelineError;
+use crate::pipeline::engine::{self, Progress};
+use crate::pipeline::measure::functional_psf;
+use crate::psf::functional::{FunctionalPsf, PsfProfile};
+use crate::shape::{AcfScratch, Autocorrelation, ClippedMoments};
+use crate::simulate::galaxy::{Component, Sersic};
+
+/// S/N in dB of the curves.
+pub const SNR_DB: [f64; 3] = [10.0, 20.0, 40.0];
+/// log₁₀ λ of the curves: −6 to 6 in halves.
+pub const LOG_LAMBDA: [f64; 25] = log_lambda();
+/// S/N in dB of the CTR curve at the λ of the paper's Fig. 4.
+pub const CTR_SNR_DB: [f64; 7] = [10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0];
+/// log₁₀ of that λ.
+pub const CTR_LOG_LAMBDA: f64 = -3.5;
+/// Both rules, in the order of [`Curves`].
+pub const UPDATES: [Update; 2] = [Update::Adaptive, Update::Constant];
+
+const fn log_lambda() -> [f64; 25] {
+    let mut values = [0.0; 25];
+    let mut k = 0;
+    while k < 25 {
+        values[k] = -6.0 + 0.5 * k as f64;
+        k += 1;
+    }
+    values
+}
+
+/// Sums over galaxies at one S/N, rule and λ.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Sums {
+    /// Transitions that brought a neuron nearer to the truth.
+    pub correct: u64,
+    /// All transitions.
+    pub transitions: u64,
+    /// Σ dSNR in dB.
+    pub dsnr: f64,
+    /// Galaxies.
+    pub galaxies: u64,
+    /// Σ |e − e*|².
+    pub deviation: f64,
+    /// Σ |e − e*|⁴, for the error of the RMSD.
+    pub deviation_square: f64,
+    /// Galaxies with a shape.
+    pub measured: u64,
+    /// Accepted iterations.
+    pub iterations: u64,
+}
+
+impl Sums {
+    fn add(&mut self, other: &Sums) {
+        self.correct += other.correct;
+        self.transitions += other.transitions;
+        self.dsnr += other.dsnr;
+        self.galaxies += other.galaxies;
+        self.deviation += other.deviation;
+        self.deviation_square += other.deviation_square;
+        self.measured += other.measured;
+        self.iterations += other.iterations;
+    }
+
+    /// CTR; not a number without transitions.
+    pub fn ctr(&self) -> f64 {
+        self.correct as f64 / self.transitions as f64
+    }
+
+    /// Mean dSNR in dB.
+    pub fn mean_dsnr(&self) -> f64 {
+        self.dsnr / self.galaxies as f64
+    }
+
+    /// 1/RMSD.
+    pub fn inverse_rmsd(&self) -> f64 {
+        (2.0 * self.measured as f64 / self.deviation).sqrt()
+    }
+
+    /// Standard error of 1/RMSD, from the scatter of |e − e*|².
+    pub fn inverse_rmsd_error(&self) -> f64 {
+        let n = self.measured as f64;
+        let mean = self.deviation / n;
+        let variance = (self.deviation_square / n - mean * mean) / n;
+        0.5 * self.inverse_rmsd() * variance.sqrt() / mean
+    }
+}
+
+/// The curves of Sect. 4.
+#[derive(Debug, Clone)]
+pub struct Curves {
+    /// `[rule][S/N of SNR_DB][λ of LOG_LAMBDA]`.
+    pub over_lambda: Vec<Vec<Vec<Sums>>>,
+    /// `[rule][S/N of CTR_SNR_DB]` at [`CTR_LOG_LAMBDA`].
+    pub over_snr: Vec<Vec<Sums>>,
+    /// Galaxies.
+    pub galaxies: u64,
+}
+
+impl Curves {
+    fn new() -> Self {
+        Curves {
+            over_lambda: vec![vec![vec![Sums::default(); LOG_LAMBDA.len()]; SNR_DB.len()]; 2],
+            over_snr: vec![vec![Sums::default(); CTR_SNR_DB.len()]; 2],
+            galaxies: 0,
+        }
+    }
+
+    fn add(&mut self, other: &Curves) {
+        let mine = self.over_lambda.iter_mut().flatten().flatten();
+        for (sum, more) in mine.zip(other.over_lambda.iter().flatten().flatten()) {
+            sum.add(more);
+        }
+        let mine = self.over_snr.iter_mut().flatten();
+        for (sum, more) in mine.zip(other.over_snr.iter().flatten()) {
+            sum.add(more);
+        }
+        self.galaxies += other.galaxies;
+    }
+
+    /// The λ this study would choose for a rule: among the λ whose 1/RMSD, averaged over the three
+    /// S/N relative to the best at each, is within two standard errors of the highest, the largest,
+    /// which regularises most at no cost.
+    pub fn best_log_lambda(&self, rule: usize) -> f64 {
+        let relative = |k: usize| -> (f64, f64) {
+            let (mut value, mut variance) = (0.0, 0.0);
+            for curve in &self.over_lambda[rule] {
+                let best = curve.iter().map(Sums::inverse_rmsd).fold(0.0, f64::max);
+                value += curve[k].inverse_rmsd() / best / SNR_DB.len() as f64;
+                variance += (curve[k].inverse_rmsd_error() / best / SNR_DB.len() as f64).powi(2);
+            }
+            (value, variance.sqrt())
+        };
+        let all: Vec<(f64, f64)> = (0..LOG_LAMBDA.len()).map(relative).collect();
+        let best = all.iter().map(|v| v.0).fold(0.0, f64::max);
+        (0..LOG_LAMBDA.len())
+            .rev()
+            .find(|&k| all[k].0 + 2.0 * all[k].1 >= best)
+            .map_or(f64::NAN, |k| LOG_LAMBDA[k])
+    }
+}
+
+/// Galaxies worked on together.
+const CHUNK: u64 = 8;
+
+/// Runs the study with the settings of `submission` (stamp and PSF size, step, start, M, unit, ACF
+/// share), both rules in turn, on `galaxies` galaxies.
+///
+/// # Errors
+/// Where the submission's sizes cannot be worked with.
+pub fn calibrate(
+    submission: &Submission,
+    galaxies: u64,
+    seed: u64,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Curves, PipelineError> {
+    let planned = Study::new(submission)?;
+    let mut curves = Curves::new();
+    engine::ordered(
+        threads,
+        |feeder| {
+            for first in (0..galaxies).step_by(CHUNK as usize) {
+                if !feeder.push(first..(first + CHUNK).min(galaxies)) {
+                    break;
+                }
+            }
+            Ok(())
+        },
+        || planned.scratch(),
+        |scratch, range: std::ops::Range<u64>| {
+            let mut curves = Curves::new();
+            for galaxy in range {
+                planned.galaxy(seed, galaxy, scratch, &mut curves)?;
+            }
+            Ok(curves)
+        },
+        |more| {
+            progress.advance(more.galaxies);
+            curves.add(&more);
+            Ok(())
+        },
+    )?;
+    Ok(curves)
+}
+
+/// Everything planned for one submission.
+struct Study {
+    submission: Submission,
+    networks: Vec<Network<f32>>,
+    ctr_network: Network<f32>,
+    acf: Autocorrelation,
+    moments: ClippedMoments,
+}
+
+struct StudyScratch {
+    networks: Vec<Network<f32>>,
+    ctr_network: Network<f32>,
+    buffers: NetworkScratch<f32>,
+    acf_scratch: AcfScratch,
+    acf: Vec<f32>,
+    out: Vec<f32>,
+}
+
+/// One synthetic galaxy.
+struct Synthetic {
+    original: Vec<f32>,
+    convolved: Vec<f64>,
+    psf: Array2<f64>,
+    shape: Distortion,
+    /// White noise of unit variance.
+    noise: Vec<f64>,
+}
+
+impl Study {
+    fn new(submission: &Submission) -> Result<Self, PipelineError> {
+        let (n, p) = (submission.stamp.size, submission.psf.size);
+        let networks = LOG_LAMBDA
+            .iter()
+            .map(|log| Network::plan(n, p, 10f64.powf(*log)))
+            .collect::<Result<_, _>>()?;
+        Ok(Study {
+            networks,
+            ctr_network: Network::plan(n, p, 10f64.powf(CTR_LOG_LAMBDA))?,
+            acf: Autocorrelation::new(n),
+            moments: ClippedMoments::new(n, submission.shape.acf_share),
+            submission: submission.clone(),
+        })
+    }
+
+    fn scratch(&self) -> StudyScratch {
+        let n = self.submission.stamp.size;
+        StudyScratch {
+            networks: self.networks.clone(),
+            ctr_network: self.ctr_network.clone(),
+            buffers: self.ctr_network.scratch(),
+            acf_scratch: self.acf.scratch(),
+            acf: vec![0.0; self.acf.len()],
+            out: vec![0.0; n * n],
+        }
+    }
+
+    /// Adds one galaxy to all curves.
+    fn galaxy(
+        &self,
+        seed: u64,
+        number: u64,
+        scratch: &mut StudyScratch,
+        curves: &mut Curves,
+    ) -> Result<(), PipelineError> {
+        let galaxy = self.draw(seed, number);
+        for network in scratch
+            .networks
+            .iter_mut()
+            .chain([&mut scratch.ctr_network])
+        {
+            network.set_psf(galaxy.psf.view())?;
+        }
+        for (rule, update) in UPDATES.into_iter().enumerate() {
+            for (s, snr) in SNR_DB.into_iter().enumerate() {
+                let (stamp, sigma) = observe(&galaxy, snr);
+                for k in 0..LOG_LAMBDA.len() {
+                    let networks = std::mem::take(&mut scratch.networks);
+                    let sums = self.run(&networks[k], update, &galaxy, &stamp, sigma, scratch);
+                    scratch.networks = networks;
+                    curves.over_lambda[rule][s][k].add(&sums);
+                }
+            }
+            for (s, snr) in CTR_SNR_DB.into_iter().enumerate() {
+                let (stamp, sigma) = observe(&galaxy, snr);
+                let network = scratch.ctr_network.clone();
+                let sums = self.run(&network, update, &galaxy, &stamp, sigma, scratch);
+                curves.over_snr[rule][s].add(&sums);
+            }
+        }
+        curves.galaxies += 1;
+        Ok(())
+    }
+
+    fn draw(&self, seed: u64, number: u64) -> Synthetic {
+        let n = self.submission.stamp.size;
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(number);
+        let mut normal = |scale: f64| -> f64 {
+            let draw: f64 = StandardNormal.sample(&mut rng);
+            scale * draw
+        };
+        let (e1, e2) = (normal(0.2), normal(0.2));
+        let modulus = e1.hypot(e2);
+        let cap = (0.6 / modulus).min(1.0);
+        let shape = Shear::new(e1 * cap, e2 * cap);
+        let noise = (0..n * n).map(|_| normal(1.0)).collect();
+        let galaxy = Component {
+            profile: Sersic::Exponential,
+            half_light_radius: rng.random_range(1.5..4.0),
+            flux: 1.0,
+            dx: rng.random_range(-0.5..0.5),
+            dy: rng.random_range(-0.5..0.5),
+            shape,
+        };
+        let fwhm = rng.random_range(2.8..4.0);
+        let psf_shape = Shear::new(rng.random_range(-0.05..0.05), rng.random_range(-0.05..0.05));
+        let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, fwhm, psf_shape)
+            .expect("the PSFs drawn here are within range");
+        let psf = functional_psf(&psf, self.submission.psf.size);
+        // Mean over 4 × 4 points of each pixel.
+        let centre = (n as f64 - 1.0) / 2.0;
+        let original: Vec<f64> = (0..n * n)
+            .map(|k| {
+                let (y, x) = ((k / n) as f64 - centre, (k % n) as f64 - centre);
+                (0..16)
+                    .map(|s| {
+                        let at = |s: usize| (s as f64 + 0.5) / 4.0 - 0.5;
+                        galaxy.value(x + at(s % 4), y + at(s / 4))
+                    })
+                    .sum::<f64>()
+                    / 16.0
+            })
+            .collect();
+        let c = psf.nrows() / 2;
+        let convolved = (0..n * n)
+            .map(|k| {
+                let (y, x) = (k / n, k % n);
+                let mut sum = 0.0;
+                for ((j, i), h) in psf.indexed_iter() {
+                    let (sy, sx) = ((y + c).wrapping_sub(j), (x + c).wrapping_sub(i));
+                    if sy < n && sx < n {
+                        sum += h * original[sy * n + sx];
+                    }
+                }
+                sum
+            })
+            .collect();
+        Synthetic {
+            original: original.iter().map(|&v| v as f32).collect(),
+            convolved,
+            psf,
+            shape: shape.to_distortion(),
+            noise,
+        }
+    }
+
+    fn run(
+        &self,
+        network: &Network<f32>,
+        update: Update,
+        galaxy: &Synthetic,
+        stamp: &[f32],
+        sigma: f64,
+        scratch: &mut StudyScratch,
+    ) -> Sums {
+        let mut settings = self.submission.deconvolution.clone();
+        settings.update = update;
+        let mut sums = Sums {
+            galaxies: 1,
+            ..Sums::default()
+        };
+        let peak = stamp.iter().copied().fold(0.0f32, f32::max);
+        let Some(rule) = Rule::new(&settings, f64::from(peak), sigma) else {
+            return sums;
+        };
+        let original = &galaxy.original;
+        let (mut correct, mut transitions) = (0, 0);
+        let outcome = network.trace(
+            &rule,
+            stamp,
+            &mut scratch.buffers,
+            &mut scratch.out,
+            |before, after| {
+                for ((b, a), u) in before.iter().zip(after).zip(original) {
+                    if a != b {
+                        transitions += 1;
+                        correct += u64::from((a - u).abs() < (b - u).abs());
+                    }
+                }
+            },
+        );
+        (sums.correct, sums.transitions) = (correct, transitions);
+        sums.iterations = u64::from(outcome.iterations);
+        let distance = |image: &[f32]| -> f64 {
+            image
+                .iter()
+                .zip(original)
+                .map(|(v, u)| f64::from(v - u).powi(2))
+                .sum()
+        };
+        sums.dsnr = 10.0 * (distance(stamp) / distance(&scratch.out)).log10();
+        let light = scratch.out.iter().map(|&v| f64::from(v)).sum();
+        self.acf
+            .compute(&scratch.out, &mut scratch.acf_scratch, &mut scratch.acf);
+        let shape = self
+            .moments
+            .measure(&scratch.acf, light)
+            .and_then(|moments| moments.distortion());
+        if let Ok(Distortion { e1, e2 }) = shape {
+            let deviation = (e1 - galaxy.shape.e1).powi(2) + (e2 - galaxy.shape.e2).powi(2);
+            sums.deviation = deviation;
+            sums.deviation_square = deviation * deviation;
+            sums.measured = 1;
+        }
+        sums
+    }
+}
+
+/// The observed stamp at a S/N in dB, and its noise level.
+fn observe(galaxy: &Synthetic, snr_db: f64) -> (Vec<f32>, f64) {
+    let image = &galaxy.convolved;
+    let count = image.len() as f64;
+    let mean = image.iter().sum::<f64>() / count;
+    let variance = image.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / count;
+    let sigma = (variance / 10f64.powf(snr_db / 10.0)).sqrt();
+    let stamp = image
+        .iter()
+        .zip(&galaxy.noise)
+        .map(|(v, n)| (v + sigma * n) as f32)
+        .collect();
+    (stamp, sigma)
+}

@@ -1,0 +1,5 @@
+//! Studies: the paper's Sect. 4 (calibration of λ) and Sect. 5 (seven submissions on 24 sets).
+
+pub mod calibration;
+pub mod exhibits;
+pub mod reproduce;

@@ -1,0 +1,215 @@
+//! The paper's Sect. 5: submissions on simulated sets, set by set, resumable.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use shearq_scoring::{
+    BINS, Choice, Convention, FieldSum, Figures, Noise, Options, Row, SetImages, SetScore,
+    SetScorer,
+};
+use shearq_submissions::Submission;
+
+use crate::io::FileError;
+use crate::io::run::write_record;
+use crate::pipeline::PipelineError;
+use crate::pipeline::engine::Progress;
+use crate::pipeline::measure::MeasuredRow;
+use crate::pipeline::run::{measurers, run_set};
+use crate::simulate::kinds::SetKind;
+use crate::simulate::set::{SetSimulator, SimulationSettings};
+
+/// What a run is made from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Plan {
+    /// Version of shearq.
+    pub version: String,
+    /// Simulated data.
+    pub simulation: SimulationSettings,
+    /// Images per set.
+    pub images: u32,
+    /// Submissions, resolved.
+    pub submissions: Vec<Submission>,
+}
+
+/// One submission on one set.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Result {
+    /// Submission's name.
+    pub submission: String,
+    /// Headline figures, matched convention, leaderboard definition.
+    pub figures: Figures,
+    /// Their jackknife errors.
+    pub errors: Option<Figures>,
+    /// Q of the delete-one replicates, for paired differences.
+    pub q_replicates: Vec<f64>,
+    /// The leaderboard's Q.
+    pub q_leaderboard: f64,
+    /// The leaderboard's convention.
+    pub best: Convention,
+    /// The matched convention.
+    pub matched: Convention,
+    /// E-mode bandpowers.
+    pub ee: [f64; BINS],
+    /// Galaxies flagged.
+    pub flagged: u64,
+    /// Galaxies.
+    pub galaxies: u64,
+}
+
+/// All submissions on one set.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SetResult {
+    /// Set number.
+    pub set: u32,
+    /// Images.
+    pub images: u32,
+    /// Multipole of each bin.
+    pub l: [f64; BINS],
+    /// Bandpowers of the true shear.
+    pub true_ee: [f64; BINS],
+    /// One per submission, in the plan's order.
+    pub results: Vec<Result>,
+}
+
+/// Where a set's result is kept.
+fn result_path(folder: &Path, set: u32) -> PathBuf {
+    folder.join(format!("sets/set{set:02}.json"))
+}
+
+/// Runs `plan` on `sets`, keeping each set's result in `folder` as soon as it is there; results that
+/// are there already, of the same plan, are read.
+///
+/// # Errors
+/// Where the folder holds results of another plan, or a file cannot be written.
+pub fn run_sets(
+    plan: &Plan,
+    sets: &[u32],
+    folder: &Path,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> std::result::Result<Vec<SetResult>, PipelineError> {
+    crate::io::run::claim(&folder.join("plan.json"), plan)?;
+    // Submissions that differ in name alone are measured once.
+    let (distinct, place) = distinct(&plan.submissions);
+    let measurers = measurers(&distinct)?;
+    let mut results = Vec::new();
+    for &set in sets {
+        let path = result_path(folder, set);
+        if path.is_file() {
+            let text = std::fs::read_to_string(&path)
+                .map_err(FileError::doing(&path, "cannot read the result"))?;
+            let result: SetResult = serde_json::from_str(&text)
+                .map_err(FileError::doing(&path, "not a result of a set"))?;
+            progress.advance(u64::from(plan.images) * (plan.simulation.grid as u64).pow(2));
+            results.push(result);
+            continue;
+        }
+        let kind = SetKind::of(set)
+            .ok_or_else(|| PipelineError::Request(format!("there is no set {set}")))?;
+        let scoring = |source| PipelineError::Scoring { set, source };
+        let simulator = SetSimulator::new(kind, plan.simulation).map_err(scoring)?;
+        let grid = simulator.grid();
+        let images: Vec<u32> = (1..=plan.images).collect();
+        let mut sums: Vec<SetImages> = distinct.iter().map(|_| SetImages::new(&grid)).collect();
+        let mut flagged = vec![0u64; distinct.len()];
+        run_set(
+            &simulator,
+            &images,
+            &measurers,
+            threads,
+            progress,
+            |_, rows| {
+                for ((sum, flagged), rows) in sums.iter_mut().zip(&mut flagged).zip(rows) {
+                    sum.add(&field_sum(rows));
+                    let bad = rows
+                        .iter()
+                        .flat_map(|r| &r.galaxies)
+                        .filter(|g| g.flag != 0);
+                    *flagged += bad.count() as u64;
+                }
+                Ok(())
+            },
+        )?;
+        progress.note(&format!("set {set:02}"));
+        let options = Options {
+            noise: Noise::Measured,
+            choice: Choice::Matched,
+            ..Options::default()
+        };
+        let scorer = SetScorer::new(grid, simulator.truth(), options).map_err(scoring)?;
+        let scores: Vec<SetScore> = sums
+            .iter()
+            .map(|images| scorer.score(images))
+            .collect::<std::result::Result<_, _>>()
+            .map_err(scoring)?;
+        let galaxies = u64::from(plan.images) * grid.cells() as u64;
+        let result = SetResult {
+            set,
+            images: plan.images,
+            l: scores[0].bins.l,
+            true_ee: scores[0].true_ee,
+            results: plan
+                .submissions
+                .iter()
+                .zip(&place)
+                .map(|(submission, &at)| {
+                    let score = &scores[at];
+                    Result {
+                        submission: submission.name.clone(),
+                        figures: score.figures,
+                        errors: score.errors(),
+                        q_replicates: score.replicates.iter().map(|r| r.q).collect(),
+                        q_leaderboard: score.conventions[score.best.index()].quality.q,
+                        best: score.best,
+                        matched: score.matched,
+                        ee: score.spectra().ee,
+                        flagged: flagged[at],
+                        galaxies,
+                    }
+                })
+                .collect(),
+        };
+        write_record(&path, &result)?;
+        results.push(result);
+    }
+    Ok(results)
+}
+
+/// Submissions without repetition, and the place of each one given among them.
+fn distinct(submissions: &[Submission]) -> (Vec<Submission>, Vec<usize>) {
+    let mut kept: Vec<Submission> = Vec::new();
+    let mut place = Vec::new();
+    for submission in submissions {
+        let same = |other: &Submission| {
+            Submission {
+                name: other.name.clone(),
+                description: other.description.clone(),
+                ..submission.clone()
+            } == *other
+        };
+        place.push(kept.iter().position(same).unwrap_or_else(|| {
+            kept.push(submission.clone());
+            kept.len() - 1
+        }));
+    }
+    (kept, place)
+}
+
+/// One image's measurements on the grid; flagged galaxies count as missing.
+pub fn field_sum(rows: &[MeasuredRow]) -> FieldSum {
+    let grid = rows[0].grid;
+    let mut sum = FieldSum::new(&grid);
+    let galaxies = rows.iter().flat_map(|row| {
+        row.galaxies.iter().enumerate().map(|(ix, galaxy)| {
+            let (x, y) = row.grid.centre(ix, row.iy);
+            Row {
+                x,
+                y,
+                e1: galaxy.e1,
+                e2: galaxy.e2,
+            }
+        })
+    });
+    sum.add_image(&grid, galaxies);
+    sum
+}
