@@ -8,6 +8,7 @@ mod measure;
 mod pack;
 mod progress;
 mod quickstart;
+mod reproduce;
 mod score;
 mod show;
 mod simulate;
@@ -41,6 +42,7 @@ enum Command {
     Pack(pack::Arguments),
     Show(show::Arguments),
     Calibrate(calibrate::Arguments),
+    Reproduce(reproduce::Arguments),
     Submissions(submissions::Arguments),
 }
 
@@ -56,6 +58,7 @@ pub fn main() -> ExitCode {
         Command::Pack(arguments) => pack::run(&arguments),
         Command::Show(arguments) => show::run(&arguments),
         Command::Calibrate(arguments) => calibrate::run(&arguments),
+        Command::Reproduce(arguments) => reproduce::run(&arguments),
         Command::Submissions(arguments) => submissions::run(&arguments),
     };
     match result {

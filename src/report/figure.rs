@@ -192,4 +192,3 @@ fn encode_png(scene: &Scene) -> Result<Vec<u8>, FigureError> {
     drop(backend);
     fs::read(&path).map_err(|source| FigureError::Io { path, source })
 }
-
