@@ -258,7 +258,7 @@ fn missing_galaxies_bias_the_leaderboard_but_not_the_corrected_definition() {
     let keep = |image: usize, k: usize| {
         let mut normal = Normal((image as u64) << 32 | k as u64);
         normal.uniform();
-        normal.uniform() > 0.2 && k % 97 != 0
+        normal.uniform() > 0.2 && !k.is_multiple_of(97)
     };
     let images = images(&grid, &shear, 20, 0.0, 1, keep);
     let m = |definition| {

@@ -1,6 +1,7 @@
 //! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage.
 
 mod arguments;
+mod bench;
 mod calibrate;
 mod check;
 mod compare;
@@ -43,6 +44,7 @@ enum Command {
     Show(show::Arguments),
     Calibrate(calibrate::Arguments),
     Reproduce(reproduce::Arguments),
+    Bench(bench::Arguments),
     Submissions(submissions::Arguments),
 }
 
@@ -59,6 +61,7 @@ pub fn main() -> ExitCode {
         Command::Show(arguments) => show::run(&arguments),
         Command::Calibrate(arguments) => calibrate::run(&arguments),
         Command::Reproduce(arguments) => reproduce::run(&arguments),
+        Command::Bench(arguments) => bench::run(&arguments),
         Command::Submissions(arguments) => submissions::run(&arguments),
     };
     match result {

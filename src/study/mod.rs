@@ -3,3 +3,4 @@
 pub mod calibration;
 pub mod exhibits;
 pub mod reproduce;
+pub mod speed;

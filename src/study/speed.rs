@@ -1,0 +1,415 @@
+//! Speed on the user's machine: stages of a measurement, stamp sizes, threads, scoring.
+
+use std::hint::black_box;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use ndarray::ArrayView2;
+use shearq_scoring::units::{Degrees, Pixels};
+use shearq_scoring::{Options, TruthSign};
+use shearq_submissions::{Submission, Update};
+
+use crate::deconvolve::reference::Matrices;
+use crate::deconvolve::{Network, Rule};
+use crate::denoise::{WaveletWiener, border_noise};
+use crate::io::FileError;
+use crate::io::table::{self, Column, Format, Table as Columns};
+use crate::pipeline::PipelineError;
+use crate::pipeline::engine::Quiet;
+use crate::pipeline::galaxy::Measurer;
+use crate::pipeline::measure::functional_psf;
+use crate::pipeline::run::{measurers, run_set};
+use crate::pipeline::score::{COLUMNS, Reading, plain_columns, score_files};
+use crate::report::table::{Cell, Heading, Table};
+use crate::shape::{Autocorrelation, ClippedMoments};
+use crate::simulate::kinds::SetKind;
+use crate::simulate::render::RenderScratch;
+use crate::simulate::set::{STAMP, SetSimulator, SimulationSettings};
+
+/// Different noisy galaxies that a timing runs through, so that no branch is learnt by heart.
+const SAMPLE: usize = 64;
+/// Longest time spent on one figure.
+const BUDGET: Duration = Duration::from_millis(400);
+/// Stamp sizes of the table of costs.
+pub const SIZES: [usize; 8] = [11, 15, 19, 23, 29, 33, 39, 48];
+
+/// Microseconds a call: the fastest of several passes over `SAMPLE` galaxies, after a warm-up.
+fn time(mut call: impl FnMut(usize)) -> f64 {
+    for k in 0..SAMPLE {
+        call(k);
+    }
+    let begin = Instant::now();
+    let mut best = f64::INFINITY;
+    while begin.elapsed() < BUDGET {
+        let start = Instant::now();
+        for k in 0..SAMPLE {
+            call(k);
+        }
+        best = best.min(start.elapsed().as_secs_f64() * 1e6 / SAMPLE as f64);
+    }
+    best
+}
+
+/// Stamps of the fiducial set, and its PSF at a size.
+struct Inputs {
+    set: SetSimulator,
+    stamps: Vec<Vec<f32>>,
+}
+
+impl Inputs {
+    fn new(settings: SimulationSettings) -> Result<Self, PipelineError> {
+        let kind = SetKind::of(2).ok_or_else(|| PipelineError::Request("no set 2".into()))?;
+        let set = SetSimulator::new(kind, settings)
+            .map_err(|source| PipelineError::Scoring { set: 2, source })?;
+        let fields = set.image_fields(1);
+        let mut scratch = RenderScratch::new();
+        let n = set.grid().n;
+        let stamps = (0..SAMPLE)
+            .map(|k| {
+                let mut stamp = vec![0.0; STAMP * STAMP];
+                set.draw(&fields, k % n, k / n, &mut scratch, &mut stamp);
+                stamp
+            })
+            .collect();
+        Ok(Inputs { set, stamps })
+    }
+
+    fn psf(&self, size: usize) -> ndarray::Array2<f64> {
+        functional_psf(self.set.image_fields(1).psf.at(0, 0), size)
+    }
+}
+
+/// Cost of each stage of a measurement by `submission`, and of simulating the galaxy.
+///
+/// # Errors
+/// Where the submission's sizes cannot be worked with.
+pub fn stages(
+    submission: &Submission,
+    settings: SimulationSettings,
+) -> Result<Table, PipelineError> {
+    let inputs = Inputs::new(settings)?;
+    let (n, p) = (submission.stamp.size, submission.psf.size);
+    let psf = inputs.psf(p);
+    let fields = inputs.set.image_fields(1);
+    let grid = inputs.set.grid().n;
+    let mut render = RenderScratch::new();
+    let mut stamp = vec![0.0; STAMP * STAMP];
+    let mut rows: Vec<(&str, f64)> = Vec::new();
+    rows.push((
+        "simulate",
+        time(|k| {
+            black_box(
+                inputs
+                    .set
+                    .draw(&fields, k % grid, k / grid, &mut render, &mut stamp),
+            );
+        }),
+    ));
+    let mut border = Vec::new();
+    rows.push((
+        "noise level",
+        time(|k| {
+            let level = border_noise(
+                &inputs.stamps[k],
+                STAMP,
+                submission.noise.border,
+                &mut border,
+            );
+            black_box(level);
+        }),
+    ));
+    let filter = WaveletWiener::new(STAMP, &submission.denoise);
+    let mut filter_scratch = filter.scratch();
+    rows.push((
+        "denoise (den variants)",
+        time(|k| {
+            stamp.copy_from_slice(&inputs.stamps[k]);
+            filter.apply(black_box(&mut stamp), 1.0, &mut filter_scratch);
+        }),
+    ));
+    let cut: Vec<Vec<f32>> = inputs.stamps.iter().map(|stamp| centre(stamp, n)).collect();
+    let mut network = Network::<f32>::plan(n, p, submission.deconvolution.lambda)?;
+    network.set_psf(psf.view())?;
+    let mut scratch = network.scratch();
+    let mut out = vec![0.0; n * n];
+    let rules: Vec<Option<Rule>> = cut
+        .iter()
+        .map(|stamp| {
+            let peak = stamp.iter().copied().fold(0.0, f32::max);
+            Rule::new(&submission.deconvolution, f64::from(peak), 1.0)
+        })
+        .collect();
+    let mut iterations = 0;
+    let network_time = time(|k| {
+        if let Some(rule) = &rules[k] {
+            iterations = network
+                .deconvolve(rule, black_box(&cut[k]), &mut scratch, &mut out)
+                .iterations;
+        }
+    });
+    rows.push(("deconvolve", network_time));
+    let acf = Autocorrelation::new(n);
+    let mut acf_scratch = acf.scratch();
+    let mut lags = vec![0.0; acf.len()];
+    rows.push((
+        "autocorrelation",
+        time(|k| acf.compute(black_box(&cut[k]), &mut acf_scratch, &mut lags)),
+    ));
+    acf.compute(&out, &mut acf_scratch, &mut lags);
+    let light = out.iter().map(|&v| f64::from(v)).sum();
+    let moments = ClippedMoments::new(n, submission.shape.acf_share);
+    rows.push((
+        "moments",
+        time(|_| {
+            let _ = black_box(moments.measure(black_box(&lags), light));
+        }),
+    ));
+    let measurer = Measurer::new(submission, STAMP)?;
+    let mut measure_scratch = measurer.scratch();
+    measurer.set_psf(&mut measure_scratch, Some(psf.view()));
+    let whole = time(|k| {
+        black_box(measurer.measure(&inputs.stamps[k], STAMP, None, &mut measure_scratch));
+    });
+    rows.push(("whole measurement", whole));
+    let mut notes = vec![format!(
+        "One thread; fastest of several passes over {SAMPLE} galaxies. The network made {iterations} iterations of the last one."
+    )];
+    if n <= 32 && submission.deconvolution.update == Update::Adaptive {
+        let matrices = Matrices::new(n, psf.view(), submission.deconvolution.lambda);
+        let data: Vec<f64> = cut[0].iter().map(|&v| f64::from(v)).collect();
+        if let (Some(rule), Ok(view)) = (&rules[0], ArrayView2::from_shape((n, n), &data)) {
+            let start = Instant::now();
+            black_box(matrices.deconvolve(rule, view));
+            let plain = start.elapsed().as_secs_f64() * 1e6;
+            notes.push(format!(
+                "The plain reference (dense matrices, f64) takes {plain:.0} µs for the deconvolution, {:.0} times as long.",
+                plain / network_time
+            ));
+        }
+    }
+    Ok(Table {
+        title: format!("Stages of {}", submission.name),
+        headings: vec![
+            Heading::new("stage", "Stage"),
+            Heading::new("microseconds", "µs a galaxy"),
+            Heading::new("per_second", "galaxies a second"),
+        ],
+        rows: rows
+            .into_iter()
+            .map(|(stage, time)| {
+                vec![
+                    Cell::text(stage),
+                    Cell::number(time, 1),
+                    Cell::number(1e6 / time, 0),
+                ]
+            })
+            .collect(),
+        notes,
+    })
+}
+
+fn centre(stamp: &[f32], n: usize) -> Vec<f32> {
+    let start = (STAMP - n) / 2;
+    (0..n)
+        .flat_map(|y| &stamp[(start + y) * STAMP + start..][..n])
+        .copied()
+        .collect()
+}
+
+/// Cost of a whole measurement against stamp size.
+///
+/// # Errors
+/// Where the submission's sizes cannot be worked with.
+pub fn sizes(
+    submission: &Submission,
+    settings: SimulationSettings,
+) -> Result<Table, PipelineError> {
+    let inputs = Inputs::new(settings)?;
+    let psf = inputs.psf(submission.psf.size);
+    let mut rows = Vec::new();
+    for n in SIZES {
+        let mut sized = submission.clone();
+        sized.stamp.size = n;
+        let measurer = Measurer::new(&sized, STAMP)?;
+        let mut scratch = measurer.scratch();
+        measurer.set_psf(&mut scratch, Some(psf.view()));
+        let cost = time(|k| {
+            black_box(measurer.measure(&inputs.stamps[k], STAMP, None, &mut scratch));
+        });
+        rows.push(vec![
+            Cell::number(n as f64, 0),
+            Cell::number(cost, 1),
+            Cell::number(cost * 1e3 / (n * n) as f64, 1),
+        ]);
+    }
+    Ok(Table {
+        title: format!("Cost of {} against stamp size", submission.name),
+        headings: vec![
+            Heading::new("stamp", "Stamp [px]"),
+            Heading::new("microseconds", "µs a galaxy"),
+            Heading::new("nanoseconds_per_pixel", "ns a pixel"),
+        ],
+        rows,
+        notes: Vec::new(),
+    })
+}
+
+/// Rate of simulating and measuring in memory against the number of threads.
+///
+/// # Errors
+/// Where the submission's sizes cannot be worked with or threads cannot be started.
+pub fn scaling(
+    submission: &Submission,
+    settings: SimulationSettings,
+    threads: usize,
+) -> Result<Table, PipelineError> {
+    let inputs = Inputs::new(settings)?;
+    let measurers = measurers(std::slice::from_ref(submission))?;
+    let galaxies = inputs.set.grid().cells() as f64;
+    let rate = |threads: usize| -> Result<f64, PipelineError> {
+        let mut best = 0.0f64;
+        for _ in 0..3 {
+            let start = Instant::now();
+            run_set(
+                &inputs.set,
+                &[1],
+                &measurers,
+                threads,
+                &mut Quiet,
+                |_, _| Ok(()),
+            )?;
+            best = best.max(galaxies / start.elapsed().as_secs_f64());
+        }
+        Ok(best)
+    };
+    let one = rate(1)?;
+    let mut rows = vec![vec![
+        Cell::number(1.0, 0),
+        Cell::number(one, 0),
+        Cell::number(1.0, 2),
+    ]];
+    for count in 2..=threads {
+        let many = rate(count)?;
+        rows.push(vec![
+            Cell::number(count as f64, 0),
+            Cell::number(many, 0),
+            Cell::number(many / one, 2),
+        ]);
+    }
+    Ok(Table {
+        title: format!("Simulating and measuring {} in memory", submission.name),
+        headings: vec![
+            Heading::new("threads", "Threads"),
+            Heading::new("per_second", "galaxies a second"),
+            Heading::new("speed_up", "speed-up"),
+        ],
+        rows,
+        notes: Vec::new(),
+    })
+}
+
+/// Rate of scoring a set of 10,000-row catalogues from each format, in a temporary folder.
+///
+/// # Errors
+/// Where the files cannot be written or read.
+pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
+    let folder =
+        tempfile::tempdir().map_err(|error| FileError::new(std::env::temp_dir(), error))?;
+    let side = 100;
+    let position = |k: usize| (k as f64).mul_add(48.0, 24.5);
+    let x: Vec<f64> = (0..side * side).map(|k| position(k % side)).collect();
+    let y: Vec<f64> = (0..side * side).map(|k| position(k / side)).collect();
+    // Any ellipticities do; these differ in every digit.
+    let e1: Vec<f64> = (0..side * side)
+        .map(|k| 0.1 * (k as f64 * 0.7).sin())
+        .collect();
+    let e2: Vec<f64> = (0..side * side)
+        .map(|k| 0.1 * (k as f64 * 1.3).cos())
+        .collect();
+    let ascii = |header: &str, separator: &str| -> String {
+        let mut text = header.to_owned();
+        for k in 0..side * side {
+            let fields = [x[k], y[k], e1[k], e2[k]].map(|v| format!("{v:.9}"));
+            text.push_str(&(fields.join(separator) + "\n"));
+        }
+        text
+    };
+    let truth = folder.path().join("truth.csv");
+    crate::io::atomic::write(&truth, ascii("x,y,g1,g2\n", ",").as_bytes())?;
+    let dat = ascii("", " ");
+    let columns = || {
+        let column = |name: &str, v: &[f64]| (name.to_owned(), Column::Real(v.to_vec()));
+        Columns::new(vec![
+            column("x", &x),
+            column("y", &y),
+            column("e1", &e1),
+            column("e2", &e2),
+        ])
+    };
+    let mut rows = Vec::new();
+    for (format, ending) in [("Parquet", "parquet"), ("FITS", "fits"), ("ASCII", "dat")] {
+        if ending == "parquet" && !cfg!(feature = "parquet") {
+            continue;
+        }
+        let mut paths = Vec::new();
+        for k in 0..images {
+            let path = folder.path().join(format!("{k}.{ending}"));
+            match ending {
+                "dat" => crate::io::atomic::write(&path, dat.as_bytes())?,
+                _ => {
+                    let kind = if ending == "fits" {
+                        Format::Fits
+                    } else {
+                        Format::Parquet
+                    };
+                    let table = columns().map_err(|m| FileError::new(&path, m))?;
+                    table::write(&path, kind, table, &Default::default())?;
+                }
+            }
+            paths.push(path);
+        }
+        let seconds = best_score(&truth, &paths, threads)?;
+        rows.push(vec![
+            Cell::text(format),
+            Cell::number(seconds, 3),
+            Cell::number((images * side * side) as f64 / seconds / 1e6, 1),
+        ]);
+    }
+    Ok(Table {
+        title: format!("Scoring {images} catalogues of 10,000 rows, {threads} thread(s)"),
+        headings: vec![
+            Heading::new("format", "Format"),
+            Heading::new("seconds", "seconds"),
+            Heading::new("million_rows_per_second", "million rows a second"),
+        ],
+        rows,
+        notes: vec!["Reading, adding up, spectra of eight conventions, jackknife.".into()],
+    })
+}
+
+fn best_score(
+    truth: &Path,
+    paths: &[std::path::PathBuf],
+    threads: usize,
+) -> Result<f64, PipelineError> {
+    let reading = Reading {
+        field: Degrees(10.0),
+        stamp: Pixels(48.0),
+        sign: TruthSign::Standard,
+    };
+    let mut best = f64::INFINITY;
+    for _ in 0..3 {
+        let start = Instant::now();
+        let read = plain_columns(COLUMNS);
+        black_box(score_files(
+            truth,
+            paths,
+            &reading,
+            &read,
+            Options::default(),
+            threads,
+        )?);
+        best = best.min(start.elapsed().as_secs_f64());
+    }
+    Ok(best)
+}
