@@ -77,7 +77,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let scored = score_folder(&data, &folder, &run, &[], options, threads)?;
         let title = format!("Scores of {name} (simulated data)");
         let table = per_set(&scored, &title, options.definition, options.choice);
-        print(&format!("{}\n", table.render(TableFormat::Table)))?;
+        print(&format!("{}\n", table.narrow().render(TableFormat::Table)))?;
         folders.push(folder);
     }
     let table = compare::table(&folders, &[], None, options, threads)?;
