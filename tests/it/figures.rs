@@ -198,8 +198,11 @@ fn errors_name_the_place_and_what_was_expected() {
         "figure.pdf: found `.pdf` as the figure's format; expected the extension `.png` or `.svg`"
     );
     assert!(message("figure").contains("found no extension"));
+    // Below a file there can be no folder.
+    let refused = message("Cargo.toml/figures/figure.svg");
     assert!(
-        message("absent/folder/figure.svg").starts_with("absent/folder/figure.svg: cannot write")
+        refused.starts_with("Cargo.toml/figures: cannot make the folder"),
+        "{refused}"
     );
 
     let mut uneven = LinePlot {
