@@ -52,6 +52,14 @@ pub enum ScoringError {
     /// A convention number that does not exist.
     #[error("there is no convention {0}; expected 1 to 8")]
     Convention(u8),
+    /// A simulated shear that is not weak.
+    #[error("the largest shear is {found:.2}; expected at most {most}: lower the amplitude")]
+    StrongShear {
+        /// Its modulus.
+        found: f64,
+        /// Largest accepted.
+        most: f64,
+    },
     /// A power-spectrum submission with the wrong bins.
     #[error("a power-spectrum submission has {found} bins; expected the {expected} bins 2 to 9")]
     SpectrumBins {

@@ -21,7 +21,7 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// Smallest grid whose bins 2 to 9 all hold modes.
+    /// Smallest grid accepted. Below 12 cells a side some of the bins 2 to 9 hold no modes.
     pub const MIN_SIDE: usize = 8;
     /// Largest grid accepted (16 million cells), against absurd sizes in damaged input.
     pub const MAX_SIDE: usize = 4000;

@@ -1,16 +1,45 @@
 //! Errors by the jackknife over groups of images, alone and for differences on the same images.
 
-/// Standard error of a figure from its delete-one replicates:
-/// √((G−1)/G · Σ(θ_g − θ̄)²) (Tukey's jackknife). Not a number with fewer than two replicates.
-pub fn jackknife_error(replicates: impl IntoIterator<Item = f64>) -> f64 {
+use crate::score::MAX_GROUPS;
+
+/// Images in each jackknife group when `images` are dealt out in turn.
+pub fn group_sizes(images: usize) -> Vec<usize> {
+    let groups = images.min(MAX_GROUPS);
+    (0..groups)
+        .map(|g| (images - g).div_ceil(MAX_GROUPS))
+        .collect()
+}
+
+/// Standard error of a figure by the delete-a-group jackknife for groups of unequal size (Busing,
+/// Meijer & van der Leeden 1999, Stat. Comput. 9, 3): `full` is the figure from all `images`,
+/// `replicates` those with each group left out. For equal groups it is Tukey's
+/// √((G−1)/G · Σ(θ_g − θ̄)²). Not a number with fewer than two groups.
+pub fn jackknife_error(full: f64, replicates: impl IntoIterator<Item = f64>, images: usize) -> f64 {
+    let sizes = group_sizes(images);
     let values: Vec<f64> = replicates.into_iter().collect();
-    let count = values.len() as f64;
-    if count < 2.0 {
+    if values.len() < 2 || values.len() != sizes.len() {
         return f64::NAN;
     }
-    let mean = values.iter().sum::<f64>() / count;
-    let square: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
-    ((count - 1.0) / count * square).sqrt()
+    let groups = values.len() as f64;
+    let total = images as f64;
+    let pairs = || {
+        values
+            .iter()
+            .zip(&sizes)
+            .map(|(&value, &size)| (value, total / size as f64))
+    };
+    let mean = groups * full
+        - pairs()
+            .map(|(value, h)| (1.0 - 1.0 / h) * value)
+            .sum::<f64>();
+    let variance = pairs()
+        .map(|(value, h)| {
+            let pseudo = h * full - (h - 1.0) * value;
+            (pseudo - mean).powi(2) / (h - 1.0)
+        })
+        .sum::<f64>()
+        / groups;
+    variance.sqrt()
 }
 
 /// Mean over sets of a figure and its standard error. Sets have noise of their own, so their
@@ -51,14 +80,14 @@ pub fn paired_difference(sets: &[PairedSet<'_>]) -> Option<PairedDifference> {
     let mut difference = 0.0;
     let mut variance = 0.0;
     for set in sets {
-        if set.first_replicates.len() != set.second_replicates.len()
-            || set.first_replicates.len() < 2
-        {
+        let pairs = set.first_replicates.iter().zip(set.second_replicates);
+        let full = set.second - set.first;
+        let error = jackknife_error(full, pairs.map(|(a, b)| b - a), set.images);
+        if set.first_replicates.len() != set.second_replicates.len() || error.is_nan() {
             return None;
         }
-        difference += (set.second - set.first) / count;
-        let pairs = set.first_replicates.iter().zip(set.second_replicates);
-        variance += jackknife_error(pairs.map(|(a, b)| b - a)).powi(2);
+        difference += full / count;
+        variance += error.powi(2);
     }
     Some(PairedDifference {
         difference,
@@ -69,6 +98,8 @@ pub fn paired_difference(sets: &[PairedSet<'_>]) -> Option<PairedDifference> {
 /// One figure of one set under two variants.
 #[derive(Debug, Clone, Copy)]
 pub struct PairedSet<'a> {
+    /// Images of the set.
+    pub images: usize,
     /// The first variant's figure.
     pub first: f64,
     /// Its delete-one replicates.
@@ -91,9 +122,26 @@ mod tests {
         let mean = sum / n;
         let standard =
             (data.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))).sqrt();
-        let error = jackknife_error(data.iter().map(|v| (sum - v) / (n - 1.0)));
+        let error = jackknife_error(mean, data.iter().map(|v| (sum - v) / (n - 1.0)), 5);
         assert!((error / standard - 1.0).abs() < 1e-12);
-        assert!(jackknife_error([1.0]).is_nan());
+        assert!(jackknife_error(1.0, [1.0], 1).is_nan());
+    }
+
+    #[test]
+    fn images_are_dealt_to_groups_in_turn() {
+        assert_eq!(group_sizes(3), vec![1, 1, 1]);
+        assert_eq!(group_sizes(20), vec![1; 20]);
+        let sizes = group_sizes(30);
+        assert_eq!((sizes.len(), sizes[9], sizes[10]), (20, 2, 1));
+        assert_eq!(group_sizes(200), vec![10; 20]);
+    }
+
+    #[test]
+    fn a_bias_that_falls_with_the_number_of_images_is_no_scatter() {
+        // θ = S + N/K without any noise: groups of one and of two images shift it differently.
+        let theta = |images: f64| 3.0 + 7.0 / images;
+        let replicates = group_sizes(30).into_iter().map(|m| theta(30.0 - m as f64));
+        assert!(jackknife_error(theta(30.0), replicates, 30) < 1e-12);
     }
 
     #[test]
@@ -101,6 +149,7 @@ mod tests {
         let first = [1.0, 2.0, 3.0];
         let second = first.map(|v| v + 0.5);
         let paired = paired_difference(&[PairedSet {
+            images: 3,
             first: 2.0,
             first_replicates: &first,
             second: 2.5,

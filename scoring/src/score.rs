@@ -239,9 +239,10 @@ impl SetScore {
         if self.replicates.len() < 2 {
             return None;
         }
+        let full = self.figures.values();
         let rows: Vec<[f64; 11]> = self.replicates.iter().map(Figures::values).collect();
         Some(Figures::from_values(std::array::from_fn(|i| {
-            jackknife_error(rows.iter().map(|row| row[i]))
+            jackknife_error(full[i], rows.iter().map(|row| row[i]), self.images)
         })))
     }
 
@@ -265,6 +266,24 @@ impl SetScore {
         let sum = |p: &[f64; BINS]| SCORED.map(|b| p[b]).sum::<f64>();
         let (e, b) = (sum(&self.true_ee), sum(&self.true_bb));
         b / (e + b)
+    }
+}
+
+/// What the noise of a group of images is measured from.
+#[derive(Debug, Clone, Copy)]
+struct GroupPower {
+    /// E-mode bandpowers of the group's mean field.
+    power: [f64; BINS],
+    /// Variance of its noise per unit variance of a galaxy's.
+    gain: f64,
+}
+
+impl Default for GroupPower {
+    fn default() -> Self {
+        GroupPower {
+            power: [0.0; BINS],
+            gain: 0.0,
+        }
     }
 }
 
@@ -306,7 +325,8 @@ impl SetScorer {
         if total.images == 0 {
             return Err(ScoringError::NoImages);
         }
-        let noise = self.noise_power(images);
+        let groups = self.group_powers(images);
+        let noise = self.noise_power(total, &groups);
         let modes: Vec<Modes> = Convention::ALL.map(|k| self.modes(total, k)).into();
         let true_modes = self.true_modes(total, Convention::STANDARD);
         let conventions: Vec<ConventionScore> = Convention::ALL
@@ -331,7 +351,12 @@ impl SetScorer {
                 .map_or(Convention::STANDARD, |c| c.convention)
         };
         let best = argmax(|c| c.quality.q);
-        let matched = argmax(|c| c.correlation);
+        // A blank submission correlates with nothing: then no convention is better than the standard.
+        let matched = if conventions.iter().all(|c| c.correlation.is_nan()) {
+            Convention::STANDARD
+        } else {
+            argmax(|c| c.correlation)
+        };
         let chosen = match self.options.choice {
             Choice::Matched => matched,
             Choice::Best => best,
@@ -344,13 +369,18 @@ impl SetScorer {
             images
                 .groups
                 .iter()
-                .map(|group| self.replicate(total, group, chosen, noise.as_ref()))
+                .enumerate()
+                .map(|(k, group)| {
+                    let mut rest = groups.clone();
+                    rest.remove(k);
+                    self.replicate(total, group, chosen, &rest, noise.as_ref())
+                })
                 .collect()
         };
         let noise_variance = noise.as_ref().map(|power| match self.options.noise {
             Noise::Given(variance) => variance,
             Noise::Measured => {
-                let unit = self.bins.white_noise(1.0 / total.images as f64);
+                let unit = self.bins.white_noise(self.noise_gain(total));
                 SCORED.map(|b| power[b]).sum::<f64>() / SCORED.map(|b| unit[b]).sum::<f64>()
             }
         });
@@ -455,37 +485,63 @@ impl SetScorer {
         }
     }
 
-    /// Noise bandpowers of the averaged E modes, `None` where they cannot be known.
-    ///
-    /// Measured: with groups g of K_g images, ⟨P(E_g)⟩ = S + σ²⟨1/K_g⟩ and P(Ē) = S + σ²/K, so
-    /// σ²/K = (⟨P(E_g)⟩ − P(Ē)) / (K⟨1/K_g⟩ − 1). It counts whatever changes from image to image
-    /// in the E modes, and nothing else. The sign and axis convention does not matter to its mean;
-    /// the standard one is used.
-    fn noise_power(&self, images: &SetImages) -> Option<[f64; BINS]> {
-        match self.options.noise {
-            Noise::Given(variance) => {
-                Some(self.bins.white_noise(variance / images.total.images as f64))
+    /// Variance of the field's noise per unit variance of a galaxy's: 1/K on the leaderboard, and
+    /// ⟨w⟩/⟨w²⟩/K in the corrected definition, where gaps are made up for by rescaling.
+    fn noise_gain(&self, sum: &FieldSum) -> f64 {
+        let images = sum.images as f64;
+        match self.options.definition {
+            Definition::Leaderboard => 1.0 / images,
+            Definition::Corrected => {
+                let mean = sum.count.mean().unwrap_or(0.0) / images;
+                self.rescaling(sum).powi(2) * mean / images
             }
+        }
+    }
+
+    /// E-mode bandpowers of each group's mean field, with its noise gain. The sign and axis
+    /// convention does not matter to the mean of the noise; the standard one is used.
+    fn group_powers(&self, images: &SetImages) -> Vec<GroupPower> {
+        match self.options.noise {
+            Noise::Given(_) => images
+                .groups
+                .iter()
+                .map(|_| GroupPower::default())
+                .collect(),
+            Noise::Measured => images
+                .groups
+                .iter()
+                .map(|group| GroupPower {
+                    power: self.standard_power(group),
+                    gain: self.noise_gain(group),
+                })
+                .collect(),
+        }
+    }
+
+    fn standard_power(&self, sum: &FieldSum) -> [f64; BINS] {
+        let modes = self.modes(sum, Convention::STANDARD);
+        self.bins.power(&modes.e, &modes.e)
+    }
+
+    /// Noise bandpowers of the E modes averaged in `sum`, which is made of `groups`; `None` where
+    /// they cannot be known.
+    ///
+    /// Measured: with noise gains r_g of the groups and r of all, ⟨P(E_g)⟩ = S + σ²⟨r_g⟩ and
+    /// P(Ē) = S + σ²r, so σ²r = r(⟨P(E_g)⟩ − P(Ē)) / (⟨r_g⟩ − r). It counts whatever changes from
+    /// image to image in the E modes, and nothing else.
+    fn noise_power(&self, sum: &FieldSum, groups: &[GroupPower]) -> Option<[f64; BINS]> {
+        let gain = self.noise_gain(sum);
+        match self.options.noise {
+            Noise::Given(variance) => Some(self.bins.white_noise(variance * gain)),
+            Noise::Measured if groups.len() < 2 => None,
             Noise::Measured => {
-                let count = images.groups.len() as f64;
-                if count < 2.0 {
-                    return None;
-                }
-                let auto = |sum: &FieldSum| {
-                    let modes = self.modes(sum, Convention::STANDARD);
-                    self.bins.power(&modes.e, &modes.e)
-                };
-                let mut groups = [0.0; BINS];
-                let mut inverse_images = 0.0;
-                for group in &images.groups {
-                    for (sum, power) in groups.iter_mut().zip(auto(group)) {
-                        *sum += power / count;
-                    }
-                    inverse_images += 1.0 / (group.images as f64 * count);
-                }
-                let total = auto(&images.total);
-                let scale = images.total.images as f64 * inverse_images - 1.0;
-                Some(std::array::from_fn(|b| (groups[b] - total[b]) / scale))
+                let count = groups.len() as f64;
+                let mean_gain = groups.iter().map(|g| g.gain).sum::<f64>() / count;
+                let total = self.standard_power(sum);
+                Some(std::array::from_fn(|b| {
+                    let mean = groups.iter().map(|g| g.power[b]).sum::<f64>() / count;
+                    gain * (mean - total[b]) / (mean_gain - gain)
+                }))
             }
         }
     }
@@ -522,22 +578,26 @@ impl SetScorer {
         }
     }
 
-    /// Headline figures with one group of images left out.
+    /// Headline figures with one group of images left out; `others` are the rest. Where too few are
+    /// left to measure the noise, that of all images is scaled.
     fn replicate(
         &self,
         total: &FieldSum,
         group: &FieldSum,
         chosen: Convention,
+        others: &[GroupPower],
         noise: Option<&[f64; BINS]>,
     ) -> Figures {
         let rest = total.without(group);
-        let more_noise = total.images as f64 / rest.images as f64;
-        let noise = noise.map(|n| n.map(|power| power * more_noise));
+        let own = self.noise_power(&rest, others).or_else(|| {
+            let more = self.noise_gain(&rest) / self.noise_gain(total);
+            noise.map(|n| n.map(|power| power * more))
+        });
         let score = self.convention_score(
             chosen,
             &self.modes(&rest, chosen),
             &self.true_modes(&rest, chosen),
-            noise.as_ref(),
+            own.as_ref(),
         );
         self.figures(&rest, &score)
     }

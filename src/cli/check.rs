@@ -8,7 +8,7 @@ use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
 
 use super::print;
-use crate::io::layout::{DataFolder, read_truth_rows};
+use crate::io::layout::{DataFolder, Layout, read_truth_rows};
 use crate::submit::check::{Expected, Severity, check};
 
 /// Validate a submission before it is sent: one line per finding.
@@ -30,11 +30,11 @@ pub(super) struct Arguments {
     /// Galaxies a side [default: that of the data's truth, or 100].
     #[arg(long, value_name = "N")]
     grid: Option<usize>,
-    /// Pixels a side of a grid cell.
-    #[arg(long, value_name = "PX", default_value_t = 48.0)]
-    stamp: f64,
+    /// Pixels a side of a grid cell [default: that of the data's layout, or 48].
+    #[arg(long, value_name = "PX", allow_negative_numbers = true)]
+    stamp: Option<f64>,
     /// Images that every set must have.
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=999))]
     images: u32,
     /// Print JSON.
     #[arg(long)]
@@ -51,18 +51,25 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         json,
     } = arguments;
     let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let sets: Vec<u32> = data.as_ref().map_or_else(Vec::new, |data| {
+        (1..=99).filter(|set| data.truth(*set).is_file()).collect()
+    });
     let mut side = *grid;
-    if let (None, Some(data)) = (side, &data)
-        && let Some(&set) = data.sets().first()
-    {
+    if let (None, Some(data), Some(&set)) = (side, &data, sets.first()) {
         let rows = read_truth_rows(&data.truth(set))?.len();
         side = Some((rows as f64).sqrt().round() as usize);
     }
-    let field = Degrees(data.as_ref().map_or(10.0, |d| d.layout().field_degrees));
-    let grid = Grid::new(side.unwrap_or(100), Pixels(*stamp), field)?;
+    let layout = data
+        .as_ref()
+        .map_or_else(Layout::default, |data| data.layout().clone());
+    let grid = Grid::new(
+        side.unwrap_or(100),
+        Pixels(stamp.unwrap_or(layout.stamp as f64)),
+        Degrees(layout.field_degrees),
+    )?;
     let mut truth = BTreeMap::new();
     if let Some(data) = &data {
-        for set in data.sets() {
+        for set in sets {
             truth.insert(set, data.read_truth(set, &grid)?);
         }
     }

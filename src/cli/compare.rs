@@ -65,6 +65,7 @@ pub(super) fn table(
     threads: usize,
 ) -> anyhow::Result<Table> {
     let registry = Registry::embedded()?;
+    let given = data.is_some();
     let mut data = data.map(Path::to_owned);
     let mut variants = Vec::new();
     for folder in folders {
@@ -75,7 +76,19 @@ pub(super) fn table(
             )
         })?;
         let root = data.get_or_insert_with(|| run.data.clone());
-        let data = DataFolder::open(root)?;
+        anyhow::ensure!(
+            given || *root == run.data,
+            "{}: it was measured from {}, the first from {}; give --data DIR to score both against one truth",
+            folder.display(),
+            run.data.display(),
+            root.display()
+        );
+        let data = DataFolder::open(root).with_context(|| {
+            format!(
+                "the data folder of {} (--data gives another)",
+                folder.display()
+            )
+        })?;
         variants.push(Variant {
             scored: score_folder(&data, folder, &run, &[], options, threads)?,
             // Published figures belong to the embedded settings, not to a file of the same name.
@@ -98,6 +111,15 @@ pub(super) fn table(
             threads,
         )?);
     }
+    let common = |set: u32| {
+        variants
+            .iter()
+            .all(|v| v.scored.iter().any(|s| s.set == set))
+    };
+    anyhow::ensure!(
+        (1..=99).any(common),
+        "the variants have no set in common; there is nothing to compare"
+    );
     Ok(compare(&variants, options.definition, options.choice))
 }
 

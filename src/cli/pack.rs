@@ -57,7 +57,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .clone()
         .unwrap_or_else(|| run.submission.name.replace('/', "-"));
     anyhow::ensure!(
-        !method.is_empty() && !method.contains(['/', '\\', ' ']),
+        !method.is_empty()
+            && !method.contains(|c: char| "/\\".contains(c) || c.is_whitespace() || c.is_control()),
         "the method's name is `{method}`; expected one without `/`, `\\` and blanks"
     );
     let mut files = 0;

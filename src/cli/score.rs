@@ -57,20 +57,25 @@ pub(super) struct Arguments {
     foreign: Option<PathBuf>,
     /// Power-spectrum submission (`index l power`): a file with --truth, a folder of
     /// `{method}_set{set}.dat` with --data.
-    #[arg(long, value_name = "PATH", conflicts_with_all = ["measured", "foreign", "catalogues"])]
+    #[arg(long, value_name = "PATH", conflicts_with_all = ["measured", "foreign", "catalogues", "noise_var"])]
     spectra: Option<PathBuf>,
     /// Sets to score [default: all that were measured].
     #[arg(long, value_name = "LIST", requires = "data")]
     sets: Option<SetList>,
     /// Noise variance per component, galaxy and image, for Q_dn [default: measured from the scatter
     /// between images].
-    #[arg(long, value_name = "V")]
+    #[arg(long, value_name = "V", allow_negative_numbers = true)]
     noise_var: Option<f64>,
     /// Sign of g2 in the truth file [default: challenge for --truth, the layout's for --data].
     #[arg(long, value_enum)]
     truth_sign: Option<SignArgument>,
     /// Pixels a side of a grid cell, for --truth.
-    #[arg(long, value_name = "PX", default_value_t = 48.0)]
+    #[arg(
+        long,
+        value_name = "PX",
+        default_value_t = 48.0,
+        allow_negative_numbers = true
+    )]
     stamp: f64,
     /// Side of the field in degrees, for --truth.
     #[arg(long, value_name = "DEG", default_value_t = 10.0)]
@@ -152,7 +157,7 @@ fn folder(arguments: &Arguments, data: &Path, options: Options) -> anyhow::Resul
                 .with_context(|| path.display().to_string())?;
             (foreign.name.clone(), scored)
         }
-        (None, None) => bail!("--data needs --measured, --foreign or --spectra"),
+        (None, None) => bail!("--data needs --measured DIR, --foreign FILE or --spectra DIR"),
     };
     let title = format!("Scores of {name}");
     let table = per_set(&scored, &title, options.definition, options.choice);
@@ -171,8 +176,11 @@ fn spectrum_folder(
         .with_context(|| format!("{}: cannot read the folder", folder.display()))?
         .filter_map(|entry| {
             let path = entry.ok()?.path();
+            let wanted = arguments.sets.as_ref();
             match Kind::of(&path)? {
-                Kind::Spectrum { set, .. } => Some((set, path)),
+                Kind::Spectrum { set, .. } => wanted
+                    .is_none_or(|list| list.0.contains(&set))
+                    .then_some((set, path)),
                 Kind::Catalogue { .. } => None,
             }
         })
@@ -253,6 +261,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     )?;
     let scored = ScoredSet {
         set: 0,
+        images: (1..=score.images as u32).collect(),
         score,
         rows,
     };

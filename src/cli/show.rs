@@ -10,7 +10,9 @@ use shearq_submissions::Registry;
 use crate::io::layout::DataFolder;
 use crate::pipeline::galaxy::{Measurement, Measurer};
 use crate::pipeline::measure::{ImageId, ImageSource, psf_of};
-use crate::report::figure::{ColourMap, Figure, ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
+use crate::report::figure::{
+    ColourMap, Figure, Format, ImageGrid, ImagePanel, ImageRow, Scale, Stretch,
+};
 
 /// Draw the steps of galaxies like the paper's Fig. 3: stamp, PSF, deconvolved, residual, ACF,
 /// clipped ACF.
@@ -62,6 +64,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         galaxy,
         out,
     } = arguments;
+    Format::of(out)?;
     let submission = Registry::embedded()?.get(submission)?.submission;
     let data = DataFolder::open(data)?;
     let mut rows = Vec::new();

@@ -30,7 +30,9 @@ fn lock() -> MutexGuard<'static, ()> {
 
 /// cfitsio reads `[...]`, `(...)`, a leading `!` or `-` and a trailing `+n` of a name as commands.
 fn plain_name(path: &Path) -> Result<(), FileError> {
-    let name = path.to_string_lossy();
+    let Some(name) = path.to_str() else {
+        return Err(FileError::new(path, "FITS file names must be UTF-8"));
+    };
     let plus = name
         .rsplit_once('+')
         .is_some_and(|(_, end)| !end.is_empty() && end.bytes().all(|b| b.is_ascii_digit()));

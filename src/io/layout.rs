@@ -162,17 +162,7 @@ impl DataFolder {
 /// # Errors
 /// Where the file cannot be read.
 pub fn read_truth_rows(path: &Path) -> Result<Vec<Row>, FileError> {
-    let has_header = std::fs::read(path)
-        .map_err(FileError::doing(path, "cannot read the true shear"))?
-        .iter()
-        .take(4096)
-        .any(|&b| b == b'g');
-    let names = if has_header {
-        ["x", "y", "g1", "g2"]
-    } else {
-        ["x", "y", "e1", "e2"]
-    };
-    read_rows(path, &names)
+    rows_of(path, table::read_truth(path)?, &["x", "y", "g1", "g2"])
 }
 
 /// Rows of a catalogue from four named columns.
@@ -180,14 +170,13 @@ pub fn read_truth_rows(path: &Path) -> Result<Vec<Row>, FileError> {
 /// # Errors
 /// Where the file cannot be read or a column is absent.
 pub fn read_rows(path: &Path, names: &[&str; 4]) -> Result<Vec<Row>, FileError> {
-    let mut table = table::read(path, Some(names))?;
-    let mut column = |name: &str| table.take_real(name).unwrap_or_default();
-    let (x, y, e1, e2) = (
-        column(names[0]),
-        column(names[1]),
-        column(names[2]),
-        column(names[3]),
-    );
+    rows_of(path, table::read(path, Some(names))?, names)
+}
+
+fn rows_of(path: &Path, mut table: table::Table, names: &[&str; 4]) -> Result<Vec<Row>, FileError> {
+    let mut column = |name: &str| table.require(name, path);
+    let (x, y) = (column(names[0])?, column(names[1])?);
+    let (e1, e2) = (column(names[2])?, column(names[3])?);
     Ok((0..x.len())
         .map(|k| Row {
             x: x[k],

@@ -12,11 +12,17 @@ use super::table::{Column, Table};
 /// Reads columns as real numbers.
 pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
     let table = tables::read_parquet(path, wanted).map_err(|error| bare(path, &error))?;
-    let columns = table
-        .columns()
-        .iter()
-        .filter_map(|(name, column)| Some((name.clone(), Column::Real(column.to_f64()?))))
-        .collect();
+    let mut columns = Vec::new();
+    for (name, column) in table.columns() {
+        match column.to_f64() {
+            Some(values) => columns.push((name.clone(), Column::Real(values))),
+            None if wanted.is_none() => {}
+            None => {
+                let message = format!("column `{name}` holds text; expected numbers");
+                return Err(FileError::new(path, message));
+            }
+        }
+    }
     Table::new(columns).map_err(|message| FileError::new(path, message))
 }
 

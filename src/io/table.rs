@@ -1,11 +1,10 @@
-//! Tables of named columns, read from and written to any supported format by the file's ending.
+//! Tables of named columns, read and written by the file's ending.
 //!
 //! | ending | format |
 //! |---|---|
 //! | `.fits`, `.fit`, `.fits.gz` | FITS binary table |
 //! | `.parquet` | Parquet |
-//! | `.csv` | comma-separated with a header of names |
-//! | anything else (`.dat`, `.txt`, `.cat`) | ASCII: numbers between blanks; columns `x y e1 e2` unless a `#` header names them |
+//! | anything else (`.csv`, `.dat`, `.txt`, `.cat`) | text: numbers between commas or blanks, as the content has them; columns `x y e1 e2` unless a header names them |
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -76,6 +75,19 @@ impl Table {
         self.columns.first().map_or(0, |(_, column)| column.len())
     }
 
+    /// Takes a column of `path` out as real numbers.
+    ///
+    /// # Errors
+    /// Where it is not there.
+    pub fn require(&mut self, name: &str, path: &Path) -> Result<Vec<f64>, FileError> {
+        self.take_real(name).ok_or_else(|| {
+            FileError::new(
+                path,
+                format!("there is no column `{name}` that holds numbers, or it is asked for twice"),
+            )
+        })
+    }
+
     /// Takes a column out as real numbers.
     pub fn take_real(&mut self, name: &str) -> Option<Vec<f64>> {
         let at = self.columns.iter().position(|(own, _)| own == name)?;
@@ -124,6 +136,14 @@ impl Default for Format {
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
 pub fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
+    if let Some(wanted) = wanted {
+        for (k, column) in wanted.iter().enumerate() {
+            if wanted[..k].contains(column) {
+                let message = format!("the column `{column}` is asked for twice");
+                return Err(FileError::new(path, message));
+            }
+        }
+    }
     let name = path.to_string_lossy().to_ascii_lowercase();
     if name.ends_with(".parquet") {
         read_parquet(path, wanted)
@@ -134,6 +154,23 @@ pub fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
         fits::read_table(path, wanted)
     } else {
         text::read(path, wanted)
+    }
+}
+
+/// Reads a truth file's x, y, g1, g2: a text table, which needs no header, or another format.
+///
+/// # Errors
+/// Where the file cannot be read, or lacks a column.
+pub fn read_truth(path: &Path) -> Result<Table, FileError> {
+    const NAMES: [&str; 4] = ["x", "y", "g1", "g2"];
+    let name = path.to_string_lossy().to_ascii_lowercase();
+    if [".parquet", ".fits", ".fit", ".fits.gz"]
+        .iter()
+        .any(|end| name.ends_with(end))
+    {
+        read(path, Some(&NAMES))
+    } else {
+        read_text(path, &NAMES)
     }
 }
 

@@ -10,9 +10,10 @@ const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 
 /// Reads the columns `wanted` (all that are numbers, if `None`).
 ///
-/// The first line that is not empty names the columns if it starts with `#` or its first field is
-/// not a number. Fields are separated by commas if the first line has one, by blanks otherwise.
-/// Later lines starting with `#` are comments.
+/// The first line that is neither empty nor a `#` comment names the columns if its first field is not
+/// a number; otherwise a comment that holds all the names wanted does; otherwise the columns are the
+/// challenge's, and further ones are left alone. Fields are separated by commas if the first line of
+/// numbers has one, by blanks otherwise. A file without a line of numbers is a table without rows.
 pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
     read_named(path, wanted, &CHALLENGE_COLUMNS)
 }
@@ -33,40 +34,45 @@ pub(super) fn read_named(
             ),
         )
     })?;
+    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+    let mut comments = Vec::new();
     let mut lines = text
         .lines()
         .enumerate()
         .map(|(k, line)| (k + 1, line.trim()))
         .filter(|(_, line)| !line.is_empty())
         .peekable();
-    let Some(&(_, first)) = lines.peek() else {
-        return Err(FileError::new(
-            path,
-            "the file is empty; expected a table with a header or numbers",
-        ));
-    };
-    let commas = first.contains(',');
-    let is_header = first.starts_with('#')
-        || fields(first, commas)
-            .next()
-            .is_some_and(|field| field.parse::<f64>().is_err());
-    let mut names: Vec<String> = if is_header {
-        let line = first.trim_start_matches('#').trim();
-        let names = fields(line, commas)
-            .map(|name| name.trim_matches('"').to_owned())
-            .collect();
-        lines.next();
-        names
-    } else {
-        owned(default_names)
-    };
-    // A `#` line of prose is no header: the challenge's columns are meant then.
-    if first.starts_with('#')
-        && let Some((_, line)) = lines.peek()
-        && fields(line, commas).count() != names.len()
-    {
-        names = owned(default_names);
+    while let Some((_, line)) = lines.next_if(|(_, line)| line.starts_with('#')) {
+        comments.push(line.trim_start_matches('#').trim());
     }
+    let header = lines
+        .next_if(|(_, line)| {
+            let first = fields(line, line.contains(',')).next();
+            first.is_some_and(|field| field.parse::<f64>().is_err())
+        })
+        .map(|(_, line)| line);
+    let data = lines.peek().map(|(_, line)| *line);
+    // Where there is no line of numbers, the header tells the separator.
+    let commas = data.or(header).is_some_and(|line| line.contains(','));
+    let (names, named) = match header {
+        Some(line) => (split_names(line), true),
+        None => {
+            let fits = |names: &Vec<String>| match wanted {
+                Some(wanted) => wanted.iter().all(|w| names.iter().any(|n| n == w)),
+                None => data.is_some_and(|line| fields(line, commas).count() == names.len()),
+            };
+            // The last comment that can be a header is one.
+            match comments
+                .iter()
+                .rev()
+                .map(|line| split_names(line))
+                .find(fits)
+            {
+                Some(names) => (names, true),
+                None => (owned(default_names), false),
+            }
+        }
+    };
     let places: Vec<usize> = match wanted {
         Some(wanted) => wanted
             .iter()
@@ -112,7 +118,13 @@ pub(super) fn read_named(
                 }
             }
         }
-        if count != names.len() {
+        // Without a header, the columns after the known ones are nobody's.
+        let right = if named {
+            count == names.len()
+        } else {
+            count >= names.len()
+        };
+        if !right {
             return Err(FileError::new(
                 path,
                 format!(
@@ -129,6 +141,15 @@ pub(super) fn read_named(
         .map(|(&place, values)| (names[place].clone(), Column::Real(values)))
         .collect();
     Table::new(columns).map_err(|message| FileError::new(path, message))
+}
+
+/// Names in a header line, between commas or blanks, quoted or not.
+fn split_names(line: &str) -> Vec<String> {
+    line.split([',', ' ', '\t'])
+        .map(|name| name.trim().trim_matches('"'))
+        .filter(|name| !name.is_empty())
+        .map(str::to_owned)
+        .collect()
 }
 
 fn owned(names: &[&str]) -> Vec<String> {
@@ -174,6 +195,26 @@ mod tests {
         );
         assert_eq!(columns("# made by hand\n1 2 3 4\n5 6 -7e-3 8\n"), expected);
         assert_eq!(columns("e1,x,y\r\n3,1,2\r\n-7e-3,5,6\r\n"), expected);
+        assert_eq!(
+            columns("# my method version one\n1 2 3 4\n5 6 -7e-3 8\n"),
+            expected
+        );
+        assert_eq!(
+            columns("# made by hand, by me\n# x, y, e1, e2\n1 2 3 4\n5 6 -7e-3 8\n"),
+            expected
+        );
+        assert_eq!(
+            columns("# note\nx,y,e1,e2\n1,2,3,4\n5,6,-7e-3,8\n"),
+            expected
+        );
+        assert_eq!(
+            columns("\u{feff}x,y,e1,e2\n1,2,3,4\n5,6,-7e-3,8\n"),
+            expected
+        );
+        assert_eq!(columns("1 2 3 4 0\n5 6 -7e-3 8 0\n"), expected);
+        for blank in ["", "# no galaxies\n", "x,y,e1,e2\n"] {
+            assert_eq!(columns(blank), (vec![], vec![]), "{blank:?}");
+        }
         assert_eq!(table("x,y,e1,e2\n", None).unwrap().rows(), 0);
         assert!(table("x,y,e1,e2\n1,2,NaN,nan\n", None).is_ok());
     }
@@ -181,7 +222,6 @@ mod tests {
     #[test]
     fn mistakes_are_named_with_their_line() {
         let message = |text| table(text, Some(&["x", "e2"])).unwrap_err();
-        assert!(message("").contains("empty"));
         assert!(message("x,y,e1,e2\n1,2,3\n").contains("line 2: 3 fields; expected 4"));
         assert!(
             message("x,y,e1,e2\n1,2,3,4\n1,2,3,four\n").contains("line 3: `four` in column `e2`")

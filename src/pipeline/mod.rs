@@ -28,7 +28,7 @@ pub enum PipelineError {
     #[error(transparent)]
     Operator(#[from] OperatorError),
     /// Scores.
-    #[error("set {set}: {source}")]
+    #[error("{}", if *set == 0 { "this set cannot be scored".to_owned() } else { format!("set {set}") })]
     Scoring {
         /// The set.
         set: u32,

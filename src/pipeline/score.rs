@@ -22,6 +22,8 @@ pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 pub struct ScoredSet {
     /// Set number; 0 for a set given as plain files.
     pub set: u32,
+    /// Numbers of the images scored.
+    pub images: Vec<u32>,
     /// The score.
     pub score: SetScore,
     /// How the catalogues' rows were used.
@@ -144,7 +146,7 @@ pub fn reading_of(data: &DataFolder) -> Reading {
 pub fn score_sets(
     data: &DataFolder,
     sets: &[u32],
-    catalogues: impl Fn(u32) -> Vec<PathBuf>,
+    catalogues: impl Fn(u32) -> Vec<(u32, PathBuf)>,
     read: ReadImage<'_>,
     options: Options,
     threads: usize,
@@ -155,7 +157,7 @@ pub fn score_sets(
         if !sets.is_empty() && !sets.contains(&set) {
             continue;
         }
-        let files = catalogues(set);
+        let (numbers, files): (Vec<u32>, Vec<PathBuf>) = catalogues(set).into_iter().unzip();
         if files.is_empty() {
             if sets.contains(&set) {
                 let message = format!("there is no catalogue of set {set} to score");
@@ -168,7 +170,12 @@ pub fn score_sets(
                 PipelineError::Scoring { source, .. } => PipelineError::Scoring { set, source },
                 other => other,
             })?;
-        scored.push(ScoredSet { set, score, rows });
+        scored.push(ScoredSet {
+            set,
+            images: numbers,
+            score,
+            rows,
+        });
     }
     if scored.is_empty() {
         let message = "there is no catalogue to score".into();
@@ -190,12 +197,7 @@ pub fn score_folder(
     threads: usize,
 ) -> Result<Vec<ScoredSet>, PipelineError> {
     let read = plain_columns(COLUMNS);
-    let catalogues = |set| {
-        run.catalogues(out, set)
-            .into_iter()
-            .map(|(_, path)| path)
-            .collect()
-    };
+    let catalogues = |set| run.catalogues(out, set);
     score_sets(data, sets, catalogues, &read, options, threads).map_err(|error| match error {
         PipelineError::Request(message) => FileError::new(out, message).into(),
         other => other,

@@ -66,7 +66,10 @@ fn definition_note(definition: Definition, choice: Choice) -> String {
 /// misread.
 pub fn warnings(scored: &[ScoredSet]) -> Vec<String> {
     let mut lines = Vec::new();
-    for ScoredSet { set, score, rows } in scored {
+    for ScoredSet {
+        set, score, rows, ..
+    } in scored
+    {
         let name = if *set == 0 {
             "this set".to_owned()
         } else {
@@ -324,6 +327,18 @@ pub fn compare(variants: &[Variant], definition: Definition, choice: Choice) -> 
         definition_note(definition, choice),
         "ΔQ: jackknife of the paired difference on the same images. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
     ];
+    let unpaired: Vec<&str> = variants
+        .iter()
+        .skip(1)
+        .filter(|v| difference_from(&variants[0], v, &common).is_none())
+        .map(|v| v.name.as_str())
+        .collect();
+    if !unpaired.is_empty() {
+        notes.push(format!(
+            "No difference is given for {}: it needs at least two images, the same ones as the first.",
+            unpaired.join(", ")
+        ));
+    }
     for variant in variants {
         let kept: Vec<String> = warnings(&variant.scored)
             .into_iter()
@@ -353,18 +368,22 @@ fn difference_from(
     let q = |score: &SetScore| -> Vec<f64> { score.replicates.iter().map(|r| r.q).collect() };
     let mut pairs = Vec::new();
     for &set in sets {
-        let a = &first.scored[find(first, set)?].score;
-        let b = &second.scored[find(second, set)?].score;
+        let (a, b) = (
+            &first.scored[find(first, set)?],
+            &second.scored[find(second, set)?],
+        );
         // Groups pair up only where both have the same images.
         if a.images != b.images {
             return None;
         }
-        pairs.push((a.figures.q, q(a), b.figures.q, q(b)));
+        let (a, b) = (&a.score, &b.score);
+        pairs.push((a.images, a.figures.q, q(a), b.figures.q, q(b)));
     }
     let pairs: Vec<PairedSet<'_>> = pairs
         .iter()
         .map(
-            |(first, first_replicates, second, second_replicates)| PairedSet {
+            |(images, first, first_replicates, second, second_replicates)| PairedSet {
+                images: *images,
                 first: *first,
                 first_replicates,
                 second: *second,

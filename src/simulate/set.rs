@@ -25,6 +25,8 @@ pub const STAMP: usize = 48;
 pub const NOISE_SIGMA: f64 = 1.0;
 /// Intrinsic ellipticities are scaled back to this modulus.
 const MAX_INTRINSIC: f64 = 0.7;
+/// Shears beyond this are not weak, and with intrinsic shapes could exceed 1.
+const MAX_SHEAR: f64 = 0.5;
 /// FWHM of every PSF in pixels.
 const FWHM: f64 = 3.4;
 /// Range of S/N in the "smooth" sets, around which the distribution is cut.
@@ -110,7 +112,7 @@ impl SetSimulator {
     /// Draws the fields that the whole set shares.
     ///
     /// # Errors
-    /// Where the grid is out of range.
+    /// Where the grid is out of range or the spectrum so high that the shear is not weak.
     pub fn new(
         kind: SetKind,
         settings: SimulationSettings,
@@ -121,6 +123,13 @@ impl SetSimulator {
         let shear = random_field(&decomposer, &mut rng, Content::EOnly, |l| {
             settings.spectrum.c_l(l)
         });
+        let strongest = shear.iter().map(|g| g.norm()).fold(0.0, f64::max);
+        if strongest > MAX_SHEAR {
+            return Err(shearq_scoring::ScoringError::StrongShear {
+                found: strongest,
+                most: MAX_SHEAR,
+            });
+        }
         let profile = psf_profile(kind);
         Ok(SetSimulator {
             kind,

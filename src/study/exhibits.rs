@@ -464,6 +464,7 @@ fn q_difference(results: &[SetResult], first: usize, second: usize) -> Option<(f
     let sets: Vec<PairedSet<'_>> = results
         .iter()
         .map(|set| PairedSet {
+            images: set.images as usize,
             first: set.results[first].figures.q,
             first_replicates: &set.results[first].q_replicates,
             second: set.results[second].figures.q,

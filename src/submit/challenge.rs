@@ -87,12 +87,12 @@ impl Kind {
     }
 }
 
-/// A number without signs or leading zeros, from 1.
+/// A number without signs or leading zeros, 1 to 999.
 fn number(text: &str) -> Option<u32> {
     if text.starts_with('0') || !text.bytes().all(|b| b.is_ascii_digit()) {
         return None;
     }
-    text.parse().ok()
+    text.parse().ok().filter(|number| *number <= 999)
 }
 
 /// Writes the measured galaxies of a catalogue of ours in the challenge's format. Flagged galaxies
@@ -142,8 +142,17 @@ fn spectrum_text(bins: &Bins, power: &[f64; BINS]) -> String {
 /// Where it cannot be read.
 pub fn read_spectrum(path: &Path) -> Result<Vec<SpectrumLine>, FileError> {
     let mut table = table::read_text(path, &["index", "l", "power"])?;
-    let mut column = |name: &str| table.take_real(name).unwrap_or_default();
-    let (index, l, power) = (column("index"), column("l"), column("power"));
+    let mut column = |name: &str| table.require(name, path);
+    let (index, l, power) = (column("index")?, column("l")?, column("power")?);
+    if let Some(odd) = index
+        .iter()
+        .find(|i| i.fract() != 0.0 || !(0.0..=99.0).contains(*i))
+    {
+        return Err(FileError::new(
+            path,
+            format!("`{odd}` is not the index of a bin"),
+        ));
+    }
     Ok((0..index.len())
         .map(|k| SpectrumLine {
             index: index[k] as u32,

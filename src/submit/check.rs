@@ -439,9 +439,9 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
         let ratio = sum / true_sum;
         if !(0.01..100.0).contains(&ratio) {
             let message = format!(
-                "the power is {ratio:.1e} times the true one; the unit is l(l+1)C/2π, not C or its root"
+                "the power is {ratio:.1e} times the true one; the unit is ℓ²C_ℓ/2π (noise raises it, too)"
             );
-            report.error(path, "unit", message);
+            report.warn(path, "unit", message);
         }
     }
 }

@@ -99,11 +99,11 @@ impl Foreign {
         Ok(foreign)
     }
 
-    /// The catalogues of a set that are there, in order of images.
-    pub fn catalogues(&self, set: u32) -> Vec<PathBuf> {
+    /// The catalogues of a set that are there, by image number.
+    pub fn catalogues(&self, set: u32) -> Vec<(u32, PathBuf)> {
         (1..=999)
-            .map(|image| self.folder.join(fill(&self.catalogues, set, image)))
-            .filter(|path| path.is_file())
+            .map(|image| (image, self.folder.join(fill(&self.catalogues, set, image))))
+            .filter(|(_, path)| path.is_file())
             .collect()
     }
 
@@ -121,10 +121,10 @@ impl Foreign {
         ];
         names.extend(self.flag.as_deref());
         let mut table = table::read(path, Some(&names))?;
-        let mut column = |name: &str| table.take_real(name).unwrap_or_default();
-        let flags = self.flag.as_deref().map(&mut column);
-        let (x, y) = (column(&self.x), column(&self.y));
-        let (e1, e2) = (column(&self.e1), column(&self.e2));
+        let mut column = |name: &str| table.require(name, path);
+        let flags = self.flag.as_deref().map(&mut column).transpose()?;
+        let (x, y) = (column(&self.x)?, column(&self.y)?);
+        let (e1, e2) = (column(&self.e1)?, column(&self.e2)?);
         let rows = (0..x.len()).map(|k| {
             let good = flags.as_ref().is_none_or(|flags| flags[k] == 0.0);
             let shape = if good {

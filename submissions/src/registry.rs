@@ -85,7 +85,7 @@ pub enum SubmissionError {
         known: String,
     },
     /// A file that cannot be read.
-    #[error("cannot read the submission file {path}: {source}")]
+    #[error("cannot read the submission file {path}")]
     Read {
         /// The file.
         path: PathBuf,
@@ -236,8 +236,9 @@ impl Registry {
         let mut next = file.extends.clone();
         let mut settings = file.settings();
         while let Some(parent) = next {
+            let again = chain.contains(&parent);
             chain.push(parent.clone());
-            if chain.len() > MAX_DEPTH {
+            if again || chain.len() > MAX_DEPTH {
                 return Err(SubmissionError::Cycle {
                     path,
                     chain: chain.join(" → "),

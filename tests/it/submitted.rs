@@ -209,7 +209,7 @@ fn each_planted_fault_in_a_catalogue_is_found() {
             }),
             "positions",
         ),
-        ("empty", String::new(), "readable"),
+        ("empty", String::new(), "missing"),
     ];
     for (fault, content, expected) in faults {
         fs::write(&file, content).unwrap();
@@ -240,6 +240,66 @@ fn each_planted_fault_in_a_catalogue_is_found() {
             .0
             .contains(&"method".into())
     );
+}
+
+#[test]
+fn blank_catalogues_count_as_images_and_odd_tables_get_errors() {
+    let packed = Packed::new();
+    let truth = packed.at("data").join("set08/truth.csv");
+    let blank = packed.at("blank.dat");
+    fs::write(&blank, "").unwrap();
+    let score = |files: &[&Path], columns: &str| {
+        let mut arguments = vec!["score", "--truth", text(&truth), "--truth-sign", "standard"];
+        arguments.extend(files.iter().map(|f| text(f)));
+        arguments.extend(["--columns", columns, "--format", "json"]);
+        shearq(&arguments)
+    };
+    let first = packed.file(1);
+    let figures = |output: std::process::Output| -> Value {
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    let alone = figures(score(&[&first], "x,y,e1,e2"));
+    let diluted = figures(score(&[&first, &blank], "x,y,e1,e2"));
+    assert_eq!(diluted["n_images"], 2);
+    // Half the field, a quarter of the power.
+    let power = |found: &Value| found["classes"]["B"]["EE"][3].as_f64().unwrap();
+    assert!((power(&diluted) / power(&alone) - 0.25).abs() < 1e-9);
+    let nothing = figures(score(&[&blank], "x,y,e1,e2"));
+    assert_eq!(nothing["matched"], 5);
+    // The same column twice, from every format.
+    for file in [
+        first.clone(),
+        packed.at("out").join("set08/catalogue-001.parquet"),
+    ] {
+        let output = score(&[&file], "x,y,e1,e1");
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{message}");
+        assert!(message.contains("`e1` is asked for twice"), "{message}");
+    }
+    // An absurd image number is no name of a catalogue.
+    let absurd = packed.at("sent").join("g10_v1_objs_8_4294967295.NN.dat");
+    fs::copy(&first, &absurd).unwrap();
+    assert!(packed.check(&packed.at("sent")).0.contains(&"name".into()));
+}
+
+#[test]
+fn differences_are_given_only_for_the_same_images() {
+    let packed = Packed::new();
+    let (data, other) = (packed.at("data"), packed.at("other"));
+    succeed(&[
+        "measure", "--submission", "23/raw/star", "--data", text(&data), "--out", text(&other),
+    ]);
+    let compare = || -> Value {
+        let out = succeed(&["compare", text(&packed.at("out")), text(&other), "--format", "json"]);
+        serde_json::from_str(&out).unwrap()
+    };
+    assert!(compare()["rows"][1]["sigma"].is_number());
+    fs::remove_file(other.join("set08/catalogue-001.parquet")).unwrap();
+    fs::remove_file(packed.at("out").join("set08/catalogue-003.parquet")).unwrap();
+    let table = compare();
+    assert!(table["rows"][1]["sigma"].is_null(), "{table}");
+    assert!(table["notes"].to_string().contains("the same ones as the first"));
 }
 
 #[test]
