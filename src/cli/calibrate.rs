@@ -22,7 +22,7 @@ use crate::study::exhibits;
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Name of a submission or a TOML file of your own.
-    #[arg(long, value_name = "NAME|FILE", default_value = "23/raw/star")]
+    #[arg(long, value_name = "NAME|FILE", default_value = "paper")]
     submission: String,
     /// Galaxies; the paper has 10000.
     #[arg(long, value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u64).range(10..=1_000_000))]

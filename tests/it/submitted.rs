@@ -256,7 +256,11 @@ fn blank_catalogues_count_as_images_and_odd_tables_get_errors() {
     };
     let first = packed.file(1);
     let figures = |output: std::process::Output| -> Value {
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        assert!(
+            output.status.success(),
+            "{}",
+            String::from_utf8_lossy(&output.stderr)
+        );
         serde_json::from_slice(&output.stdout).unwrap()
     };
     let alone = figures(score(&[&first], "x,y,e1,e2"));
@@ -288,10 +292,22 @@ fn differences_are_given_only_for_the_same_images() {
     let packed = Packed::new();
     let (data, other) = (packed.at("data"), packed.at("other"));
     succeed(&[
-        "measure", "--submission", "23/raw/star", "--data", text(&data), "--out", text(&other),
+        "measure",
+        "--submission",
+        "23/raw/star",
+        "--data",
+        text(&data),
+        "--out",
+        text(&other),
     ]);
     let compare = || -> Value {
-        let out = succeed(&["compare", text(&packed.at("out")), text(&other), "--format", "json"]);
+        let out = succeed(&[
+            "compare",
+            text(&packed.at("out")),
+            text(&other),
+            "--format",
+            "json",
+        ]);
         serde_json::from_str(&out).unwrap()
     };
     assert!(compare()["rows"][1]["sigma"].is_number());
@@ -299,7 +315,11 @@ fn differences_are_given_only_for_the_same_images() {
     fs::remove_file(packed.at("out").join("set08/catalogue-003.parquet")).unwrap();
     let table = compare();
     assert!(table["rows"][1]["sigma"].is_null(), "{table}");
-    assert!(table["notes"].to_string().contains("the same ones as the first"));
+    assert!(
+        table["notes"]
+            .to_string()
+            .contains("the same ones as the first")
+    );
 }
 
 #[test]
