@@ -1,17 +1,22 @@
 //! The arithmetic of one iteration, serial and vectorised, without allocation.
 //!
 //! Called from many threads at once, so nothing here is parallel. The functions are written once,
-//! generically, and compiled for each instruction set at the end of the file; which one runs is
+//! over [`Vector`], and compiled for each instruction set at the end of the file; which one runs is
 //! found out when a network is planned. Instruction sets with fused multiply-add round differently
 //! from those without, so last digits differ between machines, never between threads.
+//!
+//! Nearly all the time goes into two convolutions. Eight output rows are summed in registers while
+//! the source rows pass once: a vector of pixels, most often across two cache lines, is loaded once
+//! for all the rows it contributes to, and source rows outside the stamp are never looked at.
 
-use super::operator::{Operator, SUN_KERNEL};
+use super::operator::Operator;
+use super::vector::{self, Portable, Vector};
 use super::{Outcome, Rule, Step, Stop};
 
-/// Pixels worked on together along a row. Rows are padded to a multiple of it.
+/// Rows are padded to a multiple of this, the longest vector.
 pub(super) const LANES: usize = 16;
-/// Rows worked on together.
-const BLOCK: usize = 4;
+/// Output rows summed together.
+pub(super) const BLOCK: usize = 8;
 
 /// `f32` or `f64`.
 pub trait Real: Copy + Default + PartialOrd + Send + Sync + std::fmt::Debug + 'static {
@@ -27,11 +32,23 @@ pub trait Real: Copy + Default + PartialOrd + Send + Sync + std::fmt::Debug + 's
     fn minus(self, other: Self) -> Self;
     /// |self|.
     fn modulus(self) -> Self;
+    /// Vectors of AVX-512.
+    #[cfg(target_arch = "x86_64")]
+    #[doc(hidden)]
+    type Avx512: Vector<Self>;
+    /// Vectors of AVX2 with fused multiply-add.
+    #[cfg(target_arch = "x86_64")]
+    #[doc(hidden)]
+    type Avx2: Vector<Self>;
 }
 
 macro_rules! real {
-    ($type:ty) => {
+    ($type:ty, $avx512:ty, $avx2:ty) => {
         impl Real for $type {
+            #[cfg(target_arch = "x86_64")]
+            type Avx512 = $avx512;
+            #[cfg(target_arch = "x86_64")]
+            type Avx2 = $avx2;
             const ZERO: Self = 0.0;
             #[inline(always)]
             fn from_f64(value: f64) -> Self {
@@ -60,271 +77,335 @@ macro_rules! real {
         }
     };
 }
-real!(f32);
-real!(f64);
+real!(f32, vector::Sixteen, vector::Eight);
+// Only tests run in f64: nothing is won by intrinsics.
+real!(f64, Portable<f64, 4, true>, Portable<f64, 4, true>);
 
-/// An n×n image inside a frame of zeros, rows padded so that whole vectors can be read anywhere.
+/// An n×n image with zeros left and right of it, so that whole vectors can be read anywhere.
 #[derive(Debug, Clone)]
 pub(super) struct Padded<T> {
     data: Vec<T>,
+    /// Elements before the first row, which put every row on a cache line.
+    skip: usize,
     stride: usize,
-    /// Zeros before the image on both axes.
+    /// Zeros before the image.
     before: usize,
     n: usize,
 }
 
 impl<T: Real> Padded<T> {
+    /// Room for kernels that reach up to `before` and `after` pixels beyond the image.
     pub(super) fn new(n: usize, before: usize, after: usize) -> Self {
-        let stride = before + n.next_multiple_of(LANES) + after;
+        let before = before.next_multiple_of(LANES);
+        let stride = (before + n.next_multiple_of(LANES) + after).next_multiple_of(LANES);
+        let data = vec![T::ZERO; stride * n + LANES];
+        let skip = data.as_ptr().align_offset(64).min(LANES);
         Padded {
-            // The last vectors of the last row reach past its end.
-            data: vec![T::ZERO; stride * (n + before + after) + LANES],
+            data,
+            skip,
             stride,
             before,
             n,
         }
     }
 
+    /// Row `y` with its zeros.
+    #[inline(always)]
+    fn line(&self, y: usize) -> &[T] {
+        &self.data[self.skip + y * self.stride..][..self.stride]
+    }
+
+    /// Row `y` and the zeros after it.
+    #[inline(always)]
+    fn wide(&self, y: usize) -> &[T] {
+        &self.line(y)[self.before..]
+    }
+
+    #[inline(always)]
+    fn wide_mut(&mut self, y: usize) -> &mut [T] {
+        &mut self.data[self.skip + y * self.stride..][self.before..self.stride]
+    }
+
     #[inline(always)]
     pub(super) fn row(&self, y: usize) -> &[T] {
-        let start = (y + self.before) * self.stride + self.before;
-        &self.data[start..start + self.n]
+        &self.wide(y)[..self.n]
     }
 
     #[inline(always)]
     pub(super) fn row_mut(&mut self, y: usize) -> &mut [T] {
-        let start = (y + self.before) * self.stride + self.before;
-        &mut self.data[start..start + self.n]
+        let n = self.n;
+        &mut self.wide_mut(y)[..n]
     }
 }
 
 /// Buffers of one network; the frames of the padded ones stay zero, the rest may hold anything.
 #[derive(Debug, Clone)]
 pub(super) struct Buffers<T> {
-    /// Accepted state, in the frame that H needs.
+    /// Accepted state.
     pub(super) state: Padded<T>,
-    /// Candidate state, likewise.
+    /// Candidate state.
     pub(super) next: Padded<T>,
-    /// u₀ − Hv, in the frame that Hᵀ needs.
+    /// u₀ − Hv.
     residual: Padded<T>,
-    /// Dv, in the frame that D needs.
+    /// Dv.
     rough: Padded<T>,
-    /// f = Hᵀ(u₀ − Hv) − λDDv, n×n.
-    gradient: Vec<T>,
-    /// u₀, n×n.
-    pub(super) data: Vec<T>,
-    /// Rows of a product on their way.
+    /// u₀.
+    pub(super) data: Padded<T>,
+    /// Rows of H's or Hᵀ's product on their way.
     rows: Vec<T>,
+    /// Rows of D's product.
+    rough_rows: Vec<T>,
 }
 
 impl<T: Real> Buffers<T> {
     pub(super) fn new(n: usize, p: usize) -> Self {
-        let c = p / 2;
-        // H looks p − 1 − c pixels back and c ahead; Hᵀ the other way round; D one each way.
-        let state = || Padded::new(n, (p - 1 - c).max(1), c.max(1));
+        let rows = vec![T::ZERO; BLOCK * n.next_multiple_of(LANES)];
         Buffers {
-            state: state(),
-            next: state(),
-            residual: Padded::new(n, c, p - 1 - c),
+            state: Padded::new(n, p, p),
+            next: Padded::new(n, p, p),
+            residual: Padded::new(n, p, p),
             rough: Padded::new(n, 1, 1),
-            gradient: vec![T::ZERO; n * n],
-            data: vec![T::ZERO; n * n],
-            rows: vec![T::ZERO; BLOCK * n.next_multiple_of(LANES)],
+            data: Padded::new(n, 0, 0),
+            rows: rows.clone(),
+            rough_rows: rows,
         }
     }
 }
 
-/// Slides the p×p `kernel` over `ROWS` rows of `source` from output row `y` on; `back` is how far
-/// the kernel reaches before the output pixel. Writes whole vectors to `out`, `stride` apart.
-#[inline(always)]
-fn slide<T: Real, const FMA: bool, const ROWS: usize>(
-    source: &Padded<T>,
-    kernel: &[T],
+/// A small kernel as [`slide`] wants it: column by column, each between zeros, upside down, so that
+/// the weights with which one pixel enters the rows of a block lie side by side.
+#[derive(Debug, Clone)]
+pub(super) struct Kernel<T> {
     p: usize,
+    /// How far the kernel reaches before the output pixel.
     back: usize,
+    weights: Vec<T>,
+}
+
+impl<T: Real> Kernel<T> {
+    pub(super) fn new(p: usize, back: usize) -> Self {
+        Kernel {
+            p,
+            back,
+            weights: vec![T::ZERO; p * Self::height(p)],
+        }
+    }
+
+    fn height(p: usize) -> usize {
+        p + 2 * (BLOCK - 1)
+    }
+
+    /// Sets the weight of row `j`, column `i`.
+    pub(super) fn set(&mut self, j: usize, i: usize, weight: T) {
+        let (p, height) = (self.p, Self::height(self.p));
+        self.weights[i * height + BLOCK - 1 + p - 1 - j] = weight;
+    }
+}
+
+/// Adds what the source row `line` contributes to the output rows `LOW..HIGH` of a block. `age` is
+/// the kernel row with which it enters the first of them.
+#[inline(always)]
+fn add_row<
+    T: Real,
+    V: Vector<T>,
+    const ROWS: usize,
+    const COLUMNS: usize,
+    const LOW: usize,
+    const HIGH: usize,
+>(
+    sums: &mut [[V; COLUMNS]; ROWS],
+    line: &[T],
+    kernel: &Kernel<T>,
+    age: usize,
+) {
+    let height = Kernel::<T>::height(kernel.p);
+    // Output row k takes kernel row age − k.
+    let first = BLOCK - 1 + kernel.p - 1 - age;
+    for i in 0..kernel.p {
+        let weights = &kernel.weights[i * height + first..][..ROWS];
+        let mut pixels = [V::splat(T::ZERO); COLUMNS];
+        for (c, pixel) in pixels.iter_mut().enumerate() {
+            *pixel = V::load(&line[i + c * V::LANES..]);
+        }
+        for k in LOW..HIGH {
+            let weight = V::splat(weights[k]);
+            for c in 0..COLUMNS {
+                sums[k][c] = sums[k][c].add_product(weight, pixels[c]);
+            }
+        }
+    }
+}
+
+/// Slides `kernel` over `source` for `ROWS` output rows from `y` on and `COLUMNS` vectors from `x`
+/// on, and writes them to `out`, rows `stride` apart.
+#[inline(always)]
+fn slide<T: Real, V: Vector<T>, const ROWS: usize, const COLUMNS: usize>(
+    source: &Padded<T>,
+    kernel: &Kernel<T>,
+    y: usize,
+    x: usize,
+    out: &mut [T],
+    stride: usize,
+) {
+    let (p, back) = (kernel.p, kernel.back);
+    let mut sums = [[V::splat(T::ZERO); COLUMNS]; ROWS];
+    // Source row y + age − back enters output row y + k with kernel row age − k. The rows inside
+    // the stamp:
+    let from = back.saturating_sub(y);
+    let to = (ROWS + p - 1).min(source.n + back - y);
+    let at = source.before + x - back;
+    // While the kernel's first row has not reached the block's last row yet, the later rows take
+    // nothing; neither do the earlier ones once its last row has left them behind.
+    macro_rules! add {
+        ($low:literal, $high:literal, $age:expr) => {{
+            let age = $age;
+            if $low < $high && $high <= ROWS && from <= age && age < to {
+                let line = &source.line(y + age - back)[at..];
+                add_row::<T, V, ROWS, COLUMNS, $low, $high>(&mut sums, line, kernel, age);
+            }
+        }};
+    }
+    macro_rules! add_all {
+        ($rows:literal, [$($young:literal)*], [$($old:literal)*]) => {{
+            $( add!(0, $young, $young - 1); )*
+            for age in from.max($rows - 1)..to.min(p) {
+                add!(0, $rows, age);
+            }
+            $( if p + $old > $rows - 1 { add!($old, $rows, p + $old - 1); } )*
+        }};
+    }
+    if ROWS == 8 {
+        add_all!(8, [1 2 3 4 5 6 7], [1 2 3 4 5 6 7]);
+    } else {
+        add_all!(4, [1 2 3], [1 2 3]);
+    }
+    for (k, sum) in sums.iter().enumerate() {
+        for (c, sum) in sum.iter().enumerate() {
+            sum.store(&mut out[k * stride + x + c * V::LANES..]);
+        }
+    }
+}
+
+/// Slides `kernel` over `source` for the output rows from `y` on, as many as make a block, and
+/// writes them to `out`, whole vectors, `stride` apart.
+#[inline(always)]
+fn slide_block<T: Real, V: Vector<T>>(
+    source: &Padded<T>,
+    kernel: &Kernel<T>,
     y: usize,
     out: &mut [T],
+    stride: usize,
 ) {
-    let wide = source.n.next_multiple_of(LANES);
-    let shift = source.before - back;
-    for x in (0..wide).step_by(LANES) {
-        let mut sums = [[T::ZERO; LANES]; ROWS];
-        for j in 0..p {
-            let weights = &kernel[j * p..j * p + p];
-            let start = (y + j + shift) * source.stride + x + shift;
-            // One bounds check for all that is read below.
-            let rows = &source.data[start..start + (ROWS - 1) * source.stride + p - 1 + LANES];
-            for (i, &weight) in weights.iter().enumerate() {
-                for (k, sum) in sums.iter_mut().enumerate() {
-                    let at = k * source.stride + i;
-                    let pixels = &rows[at..at + LANES];
-                    for l in 0..LANES {
-                        sum[l] = sum[l].add_product::<FMA>(weight, pixels[l]);
-                    }
-                }
-            }
+    let half = source.n - y <= BLOCK / 2;
+    let mut x = 0;
+    while x < source.n {
+        let vectors = (source.n - x).div_ceil(V::LANES).min(V::COLUMNS);
+        match (vectors, half) {
+            (1, false) => slide::<T, V, 8, 1>(source, kernel, y, x, out, stride),
+            (1, true) => slide::<T, V, 4, 1>(source, kernel, y, x, out, stride),
+            (_, false) => slide::<T, V, 8, 2>(source, kernel, y, x, out, stride),
+            (_, true) => slide::<T, V, 4, 2>(source, kernel, y, x, out, stride),
         }
-        for (k, sum) in sums.iter().enumerate() {
-            out[k * wide + x..k * wide + x + LANES].copy_from_slice(sum);
-        }
+        x += vectors * V::LANES;
     }
-}
-
-/// Calls [`slide`] over all rows and hands each finished row to `$use`.
-macro_rules! for_each_row {
-    ($fma:expr, $source:expr, $kernel:expr, $p:expr, $back:expr, $rows:expr, |$y:ident, $row:ident| $use:block) => {{
-        let n = $source.n;
-        let wide = n.next_multiple_of(LANES);
-        let mut first = 0;
-        while first < n {
-            let count = if n - first >= BLOCK {
-                slide::<T, $fma, BLOCK>($source, $kernel, $p, $back, first, $rows);
-                BLOCK
-            } else {
-                slide::<T, $fma, 1>($source, $kernel, $p, $back, first, $rows);
-                1
-            };
-            for k in 0..count {
-                let $y = first + k;
-                let $row = &$rows[k * wide..k * wide + n];
-                $use
-            }
-            first += count;
-        }
-    }};
 }
 
 /// Residual and roughness of `state`; returns J(v) = ½‖u₀ − Hv‖² + ½λ‖Dv‖² (Eq. 4), which is the
 /// energy E plus the constant ½‖u₀‖² (Eq. 9 of the paper's J) but has no cancellation in it.
 #[inline(always)]
-fn residual<T: Real, const FMA: bool>(
-    operator: &Operator<T>,
-    state: &Padded<T>,
-    data: &[T],
-    residual: &mut Padded<T>,
-    rough: &mut Padded<T>,
-    rows: &mut [T],
-) -> f64 {
-    let (n, p) = (operator.n, operator.p);
-    let back = p - 1 - p / 2;
-    let mut misfit = [0.0f64; LANES];
-    for_each_row!(FMA, state, &operator.turned, p, back, rows, |y, row| {
-        let out = residual.row_mut(y);
-        for x in 0..n {
-            out[x] = data[y * n + x].minus(row[x]);
-        }
-        add_squares(&mut misfit, out);
-    });
-    let mut roughness = [0.0f64; LANES];
-    if operator.lambda > T::ZERO {
-        let kernel: [T; 9] = std::array::from_fn(|k| T::from_f64(SUN_KERNEL[k / 3][k % 3]));
-        for_each_row!(FMA, state, &kernel, 3, 1, rows, |y, row| {
-            rough.row_mut(y).copy_from_slice(row);
-            add_squares(&mut roughness, row);
-        });
-    }
-    0.5 * misfit.iter().sum::<f64>()
-        + 0.5 * operator.lambda.to_f64() * roughness.iter().sum::<f64>()
-}
-
-/// Σ x² of a row in f64, in lanes of its own so that it vectorises.
-#[inline(always)]
-fn add_squares<T: Real>(sums: &mut [f64; LANES], row: &[T]) {
-    for chunk in row.chunks(LANES) {
-        for (sum, value) in sums.iter_mut().zip(chunk) {
-            let value = value.to_f64();
-            *sum += value * value;
-        }
-    }
-}
-
-/// f = Hᵀ(u₀ − Hv) − λD(Dv) (Eq. 11; D is symmetric).
-#[inline(always)]
-fn gradient<T: Real, const FMA: bool>(operator: &Operator<T>, b: &mut Buffers<T>) {
-    let (n, p) = (operator.n, operator.p);
-    let gradient = &mut b.gradient;
-    for_each_row!(
-        FMA,
-        &b.residual,
-        &operator.forward,
-        p,
-        p / 2,
-        &mut b.rows,
-        |y, row| {
-            gradient[y * n..y * n + n].copy_from_slice(row);
-        }
-    );
-    if operator.lambda > T::ZERO {
-        let minus_lambda = T::ZERO.minus(operator.lambda);
-        let kernel: [T; 9] = std::array::from_fn(|k| T::from_f64(SUN_KERNEL[k / 3][k % 3]));
-        for_each_row!(FMA, &b.rough, &kernel, 3, 1, &mut b.rows, |y, row| {
-            for (f, &g) in gradient[y * n..y * n + n].iter_mut().zip(row) {
-                *f = f.add_product::<FMA>(minus_lambda, g);
-            }
-        });
-    }
-}
-
-/// Updates every neuron beyond its threshold (Eq. 6) and clips at zero (Eq. 12); returns how many
-/// were beyond.
-#[inline(always)]
-fn update<T: Real, const FMA: bool>(
-    operator: &Operator<T>,
-    rule: &Rule,
-    b: &mut Buffers<T>,
-) -> u32 {
+fn residual<T: Real, V: Vector<T>>(operator: &Operator<T>, b: &mut Buffers<T>) -> f64 {
     let n = operator.n;
-    let unit = T::from_f64(rule.unit);
-    let (adaptive, c, delta) = match rule.step {
-        Step::Adaptive(c) => (true, T::from_f64(c), T::ZERO),
-        Step::Constant(delta) => (false, T::ZERO, T::from_f64(delta)),
+    let stride = n.next_multiple_of(LANES);
+    let regularised = operator.lambda > T::ZERO;
+    let (mut misfit, mut roughness) = (V::no_squares(), V::no_squares());
+    for first in (0..n).step_by(BLOCK) {
+        slide_block::<T, V>(&b.next, &operator.turned, first, &mut b.rows, stride);
+        if regularised {
+            slide_block::<T, V>(&b.next, &operator.sun, first, &mut b.rough_rows, stride);
+        }
+        for y in first..n.min(first + BLOCK) {
+            let (data, out) = (b.data.wide(y), b.residual.wide_mut(y));
+            let rough = b.rough.wide_mut(y);
+            let row = (y - first) * stride;
+            for x in (0..n).step_by(V::LANES) {
+                let inside = V::load(&operator.inside[x..]);
+                let left = V::load(&data[x..]).minus(V::load(&b.rows[row + x..]));
+                let left = left.times(inside);
+                left.store(&mut out[x..]);
+                misfit = left.add_squares(misfit);
+                if regularised {
+                    let left = V::load(&b.rough_rows[row + x..]).times(inside);
+                    left.store(&mut rough[x..]);
+                    roughness = left.add_squares(roughness);
+                }
+            }
+        }
+    }
+    0.5 * V::sum(misfit) + 0.5 * operator.lambda.to_f64() * V::sum(roughness)
+}
+
+/// Takes f = Hᵀ(u₀ − Hv) − λD(Dv) (Eq. 11; D is symmetric), updates every neuron beyond its
+/// threshold (Eq. 6) and clips at zero (Eq. 12); returns how many were beyond.
+#[inline(always)]
+fn update<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> u32 {
+    let n = operator.n;
+    let stride = n.next_multiple_of(LANES);
+    let regularised = operator.lambda > T::ZERO;
+    let zero = V::splat(T::ZERO);
+    let minus_lambda = V::splat(T::ZERO.minus(operator.lambda));
+    let unit = V::splat(T::from_f64(rule.unit));
+    let (adaptive, step) = match rule.step {
+        Step::Adaptive(c) => (true, V::splat(T::from_f64(c))),
+        Step::Constant(delta) => (false, V::splat(T::from_f64(delta))),
     };
     let mut updated = 0;
-    for y in 0..n {
-        let (from, to) = (b.state.row(y), b.next.row_mut(y));
-        let f = &b.gradient[y * n..y * n + n];
-        let thresholds = &operator.thresholds[y * n..y * n + n];
-        let mut count = 0u32;
-        for x in 0..n {
-            let threshold = T::ZERO.add_product::<FMA>(thresholds[x], unit);
-            let beyond = f[x].modulus() > threshold;
-            let signed_delta = if f[x] > T::ZERO {
-                delta
-            } else {
-                T::ZERO.minus(delta)
-            };
-            let moved = if adaptive {
-                from[x].add_product::<FMA>(c, f[x])
-            } else {
-                from[x].minus(T::ZERO.minus(signed_delta))
-            };
-            let value = if beyond { moved } else { from[x] };
-            to[x] = if value > T::ZERO { value } else { T::ZERO };
-            count += u32::from(beyond);
+    for first in (0..n).step_by(BLOCK) {
+        slide_block::<T, V>(&b.residual, &operator.forward, first, &mut b.rows, stride);
+        if regularised {
+            slide_block::<T, V>(&b.rough, &operator.sun, first, &mut b.rough_rows, stride);
         }
-        updated += count;
+        for y in first..n.min(first + BLOCK) {
+            let (from, to) = (b.state.wide(y), b.next.wide_mut(y));
+            let thresholds = &operator.wide_thresholds[y * stride..][..stride];
+            let row = (y - first) * stride;
+            for x in (0..n).step_by(V::LANES) {
+                let mut f = V::load(&b.rows[row + x..]);
+                if regularised {
+                    f = f.add_product(minus_lambda, V::load(&b.rough_rows[row + x..]));
+                }
+                let from = V::load(&from[x..]);
+                // Infinite behind the end of the row, where the state has to stay zero.
+                let threshold = V::load(&thresholds[x..]).times(unit);
+                let moved = if adaptive {
+                    from.add_product(step, f)
+                } else {
+                    V::where_greater(f, zero, from.plus(step), from.minus(step))
+                };
+                let size = f.modulus();
+                let value = V::where_greater(size, threshold, moved, from);
+                V::where_greater(value, zero, value, zero).store(&mut to[x..]);
+                updated += V::count_greater(size, threshold);
+            }
+        }
     }
     updated
 }
 
 /// Runs the network from `b.state` on `b.data`; the result is left in `b.state`.
 #[inline(always)]
-fn run<T: Real, const FMA: bool>(
-    operator: &Operator<T>,
-    rule: &Rule,
-    b: &mut Buffers<T>,
-) -> Outcome {
-    let mut constant = [0.0f64; LANES];
-    add_squares(&mut constant, &b.data);
-    let constant = 0.5 * constant.iter().sum::<f64>();
-    let mut cost = residual::<T, FMA>(
-        operator,
-        &b.state,
-        &b.data,
-        &mut b.residual,
-        &mut b.rough,
-        &mut b.rows,
-    );
+fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Outcome {
+    let mut constant = V::no_squares();
+    for y in 0..operator.n {
+        let row = b.data.wide(y);
+        for x in (0..operator.n).step_by(V::LANES) {
+            constant = V::load(&row[x..]).add_squares(constant);
+        }
+    }
+    let constant = 0.5 * V::sum(constant);
+    // `residual` looks at the candidate, which the first state is too.
+    std::mem::swap(&mut b.state, &mut b.next);
+    let mut cost = residual::<T, V>(operator, b);
+    std::mem::swap(&mut b.state, &mut b.next);
     let mut outcome = Outcome {
         iterations: 0,
         stop: Stop::MaxIterations,
@@ -333,20 +414,12 @@ fn run<T: Real, const FMA: bool>(
         updated: 0,
     };
     for _ in 0..rule.max_iterations {
-        gradient::<T, FMA>(operator, b);
-        outcome.updated = update::<T, FMA>(operator, rule, b);
+        outcome.updated = update::<T, V>(operator, rule, b);
         if outcome.updated == 0 {
             outcome.stop = Stop::Stable;
             break;
         }
-        let next = residual::<T, FMA>(
-            operator,
-            &b.next,
-            &b.data,
-            &mut b.residual,
-            &mut b.rough,
-            &mut b.rows,
-        );
+        let next = residual::<T, V>(operator, b);
         if next.is_nan() || next >= cost {
             outcome.stop = Stop::EnergyRise;
             break;
@@ -377,7 +450,10 @@ impl Level {
     pub(super) fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
         {
-            if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vl") {
+            if is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx2")
+                && is_x86_feature_detected!("fma")
+            {
                 return Level::Avx512;
             }
             if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
@@ -400,19 +476,21 @@ impl Level {
             Level::Avx512 => unsafe { run_avx512(operator, rule, b) },
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => unsafe { run_avx2(operator, rule, b) },
-            Level::Baseline => run::<T, { cfg!(target_arch = "aarch64") }>(operator, rule, b),
+            Level::Baseline => {
+                run::<T, Portable<T, 4, { cfg!(target_arch = "aarch64") }>>(operator, rule, b)
+            }
         }
     }
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx512vl,avx2,fma")]
+#[target_feature(enable = "avx512f,avx2,fma")]
 fn run_avx512<T: Real>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Outcome {
-    run::<T, true>(operator, rule, b)
+    run::<T, T::Avx512>(operator, rule, b)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 fn run_avx2<T: Real>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Outcome {
-    run::<T, true>(operator, rule, b)
+    run::<T, T::Avx2>(operator, rule, b)
 }

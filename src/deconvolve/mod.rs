@@ -26,6 +26,7 @@ mod network;
 mod operator;
 pub mod reference;
 mod rule;
+mod vector;
 
 pub use network::{Network, NetworkScratch};
 pub use operator::{MAX_PSF, MAX_STAMP, OperatorError, SUN_KERNEL};

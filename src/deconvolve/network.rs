@@ -141,7 +141,6 @@ impl<T: Real> Network<T> {
     /// Takes the stamp and sets the first state.
     fn start(n: usize, rule: &Rule, u0: &[T], b: &mut Buffers<T>) {
         assert_eq!(u0.len(), n * n, "stamp of {n} × {n} pixels");
-        b.data.copy_from_slice(u0);
         let flat = match rule.start {
             Start::Flat => {
                 let mean = u0.iter().map(|u| u.to_f64()).sum::<f64>() / (n * n) as f64;
@@ -150,6 +149,7 @@ impl<T: Real> Network<T> {
             Start::ClippedData | Start::Zero => T::ZERO,
         };
         for (y, row) in u0.chunks_exact(n).enumerate() {
+            b.data.row_mut(y).copy_from_slice(row);
             let state = b.state.row_mut(y);
             match rule.start {
                 Start::ClippedData => {

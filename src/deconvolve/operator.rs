@@ -3,7 +3,7 @@
 use ndarray::ArrayView2;
 use thiserror::Error;
 
-use super::kernel::Real;
+use super::kernel::{Kernel, LANES, Real};
 
 /// Sun's high-pass kernel d (Sect. 3.1); its elements sum to zero.
 pub const SUN_KERNEL: [[f64; 3]; 3] = [
@@ -51,12 +51,18 @@ pub(super) struct Operator<T> {
     pub(super) p: usize,
     /// λ.
     pub(super) lambda: T,
-    /// h, row-major: what Hᵀ slides over the residual.
-    pub(super) forward: Vec<T>,
+    /// h: what Hᵀ slides over the residual.
+    pub(super) forward: Kernel<T>,
     /// h turned by 180°: what H slides over the state.
-    pub(super) turned: Vec<T>,
+    pub(super) turned: Kernel<T>,
+    /// d.
+    pub(super) sun: Kernel<T>,
     /// TH_i for a unit of brightness of one, row-major n×n (Eq. 9).
     pub(super) thresholds: Vec<T>,
+    /// The same in rows of whole vectors, infinite behind their ends.
+    pub(super) wide_thresholds: Vec<T>,
+    /// One for each pixel of a row, zero behind its end.
+    pub(super) inside: Vec<T>,
 }
 
 impl<T: Real> Operator<T> {
@@ -70,13 +76,26 @@ impl<T: Real> Operator<T> {
                 columns: p,
             });
         }
+        let wide = n.next_multiple_of(LANES);
+        let mut inside = vec![T::ZERO; wide];
+        inside[..n].fill(T::from_f64(1.0));
+        let mut sun = Kernel::new(3, 1);
+        for (j, row) in SUN_KERNEL.iter().enumerate() {
+            for (i, &value) in row.iter().enumerate() {
+                sun.set(j, i, T::from_f64(value));
+            }
+        }
         Ok(Operator {
             n,
             p,
             lambda: T::from_f64(lambda),
-            forward: vec![T::ZERO; p * p],
-            turned: vec![T::ZERO; p * p],
+            // A PSF's centre is its pixel p/2; turned, p − 1 − p/2.
+            forward: Kernel::new(p, p / 2),
+            turned: Kernel::new(p, p - 1 - p / 2),
+            sun,
             thresholds: vec![T::ZERO; n * n],
+            wide_thresholds: vec![T::from_f64(f64::INFINITY); n * wide],
+            inside,
         })
     }
 
@@ -93,8 +112,9 @@ impl<T: Real> Operator<T> {
             if !value.is_finite() {
                 return Err(OperatorError::PsfNotFinite { x: x + 1, y: y + 1 });
             }
-            self.forward[y * p + x] = T::from_f64(*value);
-            self.turned[p * p - 1 - (y * p + x)] = T::from_f64(*value);
+            let value = T::from_f64(*value);
+            self.forward.set(y, x, value);
+            self.turned.set(p - 1 - y, p - 1 - x, value);
         }
         self.set_thresholds(psf);
         Ok(())
@@ -134,7 +154,9 @@ impl<T: Real> Operator<T> {
                         g += value * value;
                     }
                 }
-                self.thresholds[y * n + x] = T::from_f64(0.5 * (w + lambda * g).abs());
+                let threshold = T::from_f64(0.5 * (w + lambda * g).abs());
+                self.thresholds[y * n + x] = threshold;
+                self.wide_thresholds[y * n.next_multiple_of(LANES) + x] = threshold;
             }
         }
     }
