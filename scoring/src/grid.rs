@@ -61,6 +61,12 @@ impl Grid {
         Ok(Grid { n, stamp, field })
     }
 
+    /// Side of the square grid with this many cells, `None` where they make no square.
+    pub fn side_of(cells: usize) -> Option<usize> {
+        let side = cells.isqrt();
+        (side * side == cells).then_some(side)
+    }
+
     /// Number of cells.
     pub fn cells(&self) -> usize {
         self.n * self.n

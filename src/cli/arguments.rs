@@ -6,8 +6,11 @@ use std::str::FromStr;
 use clap::{Args, ValueEnum};
 use shearq_scoring::{Choice, Convention, Definition};
 
+use crate::io::layout::MAX_SET;
 use crate::report::table::{Table, TableFormat};
+use crate::simulate::field::ShearSpectrum;
 use crate::simulate::kinds::SETS;
+use crate::simulate::set::SimulationSettings;
 
 /// A list of sets such as `1,2,7-9` or `all`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -22,7 +25,7 @@ impl FromStr for SetList {
         }
         let number = |part: &str| -> Result<u32, String> {
             match part.trim().parse() {
-                Ok(set) if (1..=99).contains(&set) => Ok(set),
+                Ok(set) if (1..=MAX_SET).contains(&set) => Ok(set),
                 _ => Err(format!(
                     "`{part}` is not a set; expected numbers from 1 as in `1,2,7-9`, or `all`"
                 )),
@@ -66,6 +69,52 @@ impl Printing {
         } else {
             table.render(self.format)
         }
+    }
+}
+
+/// What simulated data are made from.
+#[derive(Debug, Clone, Args)]
+pub(super) struct SimulationArguments {
+    /// Galaxies a side of a simulated image.
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u16).range(8..=400))]
+    grid: u16,
+    /// Seed of all random numbers of a simulation.
+    #[arg(long, value_name = "SEED", default_value_t = 1)]
+    seed: u64,
+    /// Factor on the simulated shear power spectrum.
+    #[arg(
+        long,
+        value_name = "A",
+        default_value_t = 1.0,
+        allow_negative_numbers = true
+    )]
+    amplitude: f64,
+    /// Extra slope of the simulated shear power spectrum, about ℓ = 1000.
+    #[arg(
+        long,
+        value_name = "T",
+        default_value_t = 0.0,
+        allow_negative_numbers = true
+    )]
+    tilt: f64,
+}
+
+impl SimulationArguments {
+    pub(super) fn settings(&self) -> anyhow::Result<SimulationSettings> {
+        let &SimulationArguments {
+            grid,
+            seed,
+            amplitude,
+            tilt,
+        } = self;
+        anyhow::ensure!(
+            amplitude.is_finite() && amplitude >= 0.0 && tilt.is_finite(),
+            "--amplitude is {amplitude} and --tilt {tilt}; expected finite numbers, the amplitude not negative"
+        );
+        Ok(SimulationSettings {
+            spectrum: ShearSpectrum { amplitude, tilt },
+            ..SimulationSettings::new(seed, usize::from(grid))
+        })
     }
 }
 

@@ -5,7 +5,6 @@ use shearq_submissions::Registry;
 
 use super::arguments::{Printing, Threads};
 use super::print;
-use crate::simulate::field::ShearSpectrum;
 use crate::simulate::set::SimulationSettings;
 use crate::study::speed;
 
@@ -30,12 +29,7 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let submission = Registry::embedded()?.get(&arguments.submission)?.submission;
     let threads = arguments.threads.number();
-    let settings = SimulationSettings {
-        seed: 1,
-        grid: 50,
-        spectrum: ShearSpectrum::default(),
-        intrinsic_sigma: super::simulate::INTRINSIC_SIGMA,
-    };
+    let settings = SimulationSettings::new(1, 50);
     let show = |table| print(&(arguments.printing.render(&table) + "\n"));
     show(speed::stages(&submission, settings)?)?;
     show(speed::sizes(&submission, settings)?)?;

@@ -8,7 +8,8 @@ use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
 
 use super::print;
-use crate::io::layout::{DataFolder, Layout, read_truth_rows};
+use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, MAX_SET, read_truth_rows};
+use crate::pipeline::score::grid_side;
 use crate::submit::check::{Expected, Severity, check};
 
 /// Validate a submission before it is sent: one line per finding.
@@ -34,7 +35,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "PX", allow_negative_numbers = true)]
     stamp: Option<f64>,
     /// Images that every set must have.
-    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=999))]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=i64::from(MAX_IMAGE)))]
     images: u32,
     /// Print JSON.
     #[arg(long)]
@@ -52,12 +53,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     } = arguments;
     let data = data.as_ref().map(DataFolder::open).transpose()?;
     let sets: Vec<u32> = data.as_ref().map_or_else(Vec::new, |data| {
-        (1..=99).filter(|set| data.truth(*set).is_file()).collect()
+        (1..=MAX_SET)
+            .filter(|set| data.truth(*set).is_file())
+            .collect()
     });
     let mut side = *grid;
     if let (None, Some(data), Some(&set)) = (side, &data, sets.first()) {
         let rows = read_truth_rows(&data.truth(set))?.len();
-        side = Some((rows as f64).sqrt().round() as usize);
+        side = Some(grid_side(&data.truth(set), rows)?);
     }
     let layout = data
         .as_ref()

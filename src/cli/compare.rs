@@ -9,8 +9,8 @@ use shearq_submissions::Registry;
 
 use super::arguments::{Printing, ScoreSettings, Threads};
 use super::print;
-use crate::io::layout::DataFolder;
-use crate::io::run::Run;
+use crate::io::layout::{DataFolder, MAX_SET};
+use crate::io::run::{Run, Source};
 use crate::pipeline::score::{score_folder, score_sets};
 use crate::report::scores::{Variant, compare};
 use crate::report::table::Table;
@@ -65,32 +65,34 @@ pub(super) fn table(
     threads: usize,
 ) -> anyhow::Result<Table> {
     let registry = Registry::embedded()?;
-    let given = data.is_some();
-    let mut data = data.map(Path::to_owned);
+    let given = data.map(DataFolder::open).transpose()?;
+    let mut first: Option<(Source, DataFolder)> = None;
     let mut variants = Vec::new();
     for folder in folders {
-        let run = Run::read(folder)?.with_context(|| {
-            format!(
-                "{}: there is no run.json; expected a folder that `shearq measure` wrote",
-                folder.display()
-            )
-        })?;
-        let root = data.get_or_insert_with(|| run.data.clone());
-        anyhow::ensure!(
-            given || *root == run.data,
-            "{}: it was measured from {}, the first from {}; give --data DIR to score both against one truth",
-            folder.display(),
-            run.data.display(),
-            root.display()
-        );
-        let data = DataFolder::open(root).with_context(|| {
-            format!(
-                "the data folder of {} (--data gives another)",
-                folder.display()
-            )
-        })?;
+        let run = Run::require(folder)?;
+        let data = match (&given, &first) {
+            (Some(data), _) => data,
+            (None, Some((source, data))) => {
+                anyhow::ensure!(
+                    *source == run.source,
+                    "{}: it was measured from {}, the first from {source}; give --data DIR to score both against one truth",
+                    folder.display(),
+                    run.source,
+                );
+                data
+            }
+            (None, None) => {
+                let data = run.source.data(folder).with_context(|| {
+                    format!(
+                        "the data folder of {} (--data gives another)",
+                        folder.display()
+                    )
+                })?;
+                &first.insert((run.source.clone(), data)).1
+            }
+        };
         variants.push(Variant {
-            scored: score_folder(&data, folder, &run, &[], options, threads)?,
+            scored: score_folder(data, folder, &run, &[], options, threads)?,
             // Published figures belong to the embedded settings, not to a file of the same name.
             published: registry
                 .get(&run.submission.name)
@@ -101,15 +103,11 @@ pub(super) fn table(
         });
     }
     for path in foreign {
-        let root = data
+        let data = given
             .as_ref()
+            .or(first.as_ref().map(|(_, data)| data))
             .context("--foreign alone needs --data DIR with the true shear")?;
-        variants.push(foreign_variant(
-            path,
-            &DataFolder::open(root)?,
-            options,
-            threads,
-        )?);
+        variants.push(foreign_variant(path, data, options, threads)?);
     }
     let common = |set: u32| {
         variants
@@ -117,7 +115,7 @@ pub(super) fn table(
             .all(|v| v.scored.iter().any(|s| s.set == set))
     };
     anyhow::ensure!(
-        (1..=99).any(common),
+        (1..=MAX_SET).any(common),
         "the variants have no set in common; there is nothing to compare"
     );
     Ok(compare(&variants, options.definition, options.choice))

@@ -1,6 +1,7 @@
 //! `shearq measure`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use clap::Args;
 use shearq_submissions::Registry;
@@ -8,9 +9,9 @@ use shearq_submissions::Registry;
 use super::arguments::{SetList, Threads};
 use super::progress::Bar;
 use crate::io::layout::DataFolder;
-use crate::io::run::Run;
+use crate::io::run::{Run, Source};
 use crate::io::table::Format;
-use crate::pipeline::measure::{galaxies_to_do, measure_folder};
+use crate::pipeline::measure::{Summary, galaxies_to_do, measure_folder};
 
 /// Measure the galaxies of a data folder by a submission: one catalogue per image.
 ///
@@ -53,8 +54,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     measure(
         &Run {
             version: crate::VERSION.into(),
-            data: data.root().to_owned(),
-            layout: data.layout().clone(),
+            source: Source::folder(&data),
             submission,
             format: catalogue_format.unwrap_or_default(),
         },
@@ -69,7 +69,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 pub(super) fn measure(
     run: &Run,
     data: &DataFolder,
-    out: &std::path::Path,
+    out: &Path,
     sets: &[u32],
     threads: usize,
 ) -> anyhow::Result<()> {
@@ -77,9 +77,15 @@ pub(super) fn measure(
     let start = std::time::Instant::now();
     let summary = measure_folder(run, data, out, sets, threads, &mut bar)?;
     drop(bar);
-    let seconds = start.elapsed().as_secs_f64();
+    report(run, &summary, start.elapsed(), threads, out);
+    Ok(())
+}
+
+/// Says on standard error what was done and how fast.
+pub(super) fn report(run: &Run, summary: &Summary, elapsed: Duration, threads: usize, out: &Path) {
+    let seconds = elapsed.as_secs_f64();
     eprintln!(
-        "{}: {} images ({} galaxies, {} flagged) measured in {seconds:.1} s, {:.0} µs a galaxy and thread; {} there already, in {}",
+        "{}: {} images ({} galaxies, {} flagged) in {seconds:.1} s, {:.0} µs a galaxy and thread; {} there already, in {}",
         run.submission.name,
         summary.images,
         summary.galaxies,
@@ -88,5 +94,4 @@ pub(super) fn measure(
         summary.already,
         out.display()
     );
-    Ok(())
 }

@@ -10,6 +10,7 @@ mod pack;
 mod progress;
 mod quickstart;
 mod reproduce;
+mod run;
 mod score;
 mod show;
 mod simulate;
@@ -37,6 +38,7 @@ enum Command {
     Quickstart(quickstart::Arguments),
     Simulate(simulate::Arguments),
     Measure(measure::Arguments),
+    Run(run::Arguments),
     Score(score::Arguments),
     Compare(compare::Arguments),
     Check(check::Arguments),
@@ -54,6 +56,7 @@ pub fn main() -> ExitCode {
         Command::Quickstart(arguments) => quickstart::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Measure(arguments) => measure::run(&arguments),
+        Command::Run(arguments) => run::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),

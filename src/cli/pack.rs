@@ -2,13 +2,14 @@
 
 use std::path::PathBuf;
 
-use anyhow::Context;
 use clap::{Args, ValueEnum};
 use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
 
+use crate::io::layout::MAX_SET;
 use crate::io::run::Run;
 use crate::io::table;
+use crate::pipeline::score::grid_side;
 use crate::submit::challenge::{Kind, write_catalogue, write_spectrum};
 
 /// Write measured catalogues as the files that the challenge takes.
@@ -47,12 +48,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         method,
         kind,
     } = arguments;
-    let run = Run::read(measured)?.with_context(|| {
-        format!(
-            "{}: there is no run.json; expected a folder that `shearq measure` wrote",
-            measured.display()
-        )
-    })?;
+    let run = Run::require(measured)?;
+    let layout = run.source.layout();
     let method = method
         .clone()
         .unwrap_or_else(|| run.submission.name.replace('/', "-"));
@@ -62,7 +59,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "the method's name is `{method}`; expected one without `/`, `\\` and blanks"
     );
     let mut files = 0;
-    for set in 1..=99 {
+    for set in 1..=MAX_SET {
         let catalogues = run.catalogues(measured, set);
         if catalogues.is_empty() {
             continue;
@@ -83,9 +80,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 // A catalogue has a row for every cell, measured or not.
                 let cells = table::read(&catalogues[0].1, Some(&["x"]))?.rows();
                 let grid = Grid::new(
-                    (cells as f64).sqrt().round() as usize,
-                    Pixels(run.layout.stamp as f64),
-                    Degrees(run.layout.field_degrees),
+                    grid_side(&catalogues[0].1, cells)?,
+                    Pixels(layout.stamp as f64),
+                    Degrees(layout.field_degrees),
                 )?;
                 let paths: Vec<PathBuf> = catalogues.into_iter().map(|(_, path)| path).collect();
                 let kind = Kind::Spectrum {

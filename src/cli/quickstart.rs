@@ -10,13 +10,12 @@ use super::arguments::Threads;
 use super::progress::Bar;
 use super::{compare, measure, print};
 use crate::io::layout::DataFolder;
-use crate::io::run::Run;
+use crate::io::run::{Run, Source};
 use crate::io::table::Format;
 use crate::pipeline::score::score_folder;
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
 use crate::report::scores::per_set;
 use crate::report::table::TableFormat;
-use crate::simulate::field::ShearSpectrum;
 use crate::simulate::set::SimulationSettings;
 
 /// The whole chain on a small simulated default: simulate, measure with two submissions, score,
@@ -46,12 +45,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let data = DataFolder::new(out.join("data"));
     let record = SimulationRecord {
         version: crate::VERSION.into(),
-        settings: SimulationSettings {
-            seed: SEED,
-            grid: GRID,
-            spectrum: ShearSpectrum::default(),
-            intrinsic_sigma: super::simulate::INTRINSIC_SIGMA,
-        },
+        settings: SimulationSettings::new(SEED, GRID),
     };
     let galaxies = (SETS.len() * IMAGES as usize * GRID * GRID) as u64;
     let mut bar = Bar::new("simulating", galaxies);
@@ -68,8 +62,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let folder = out.join(name.replace('/', "-"));
         let run = Run {
             version: crate::VERSION.into(),
-            data: data.root().to_owned(),
-            layout: data.layout().clone(),
+            source: Source::folder(&data),
             submission: registry.get(name)?.submission,
             format: Format::default(),
         };

@@ -9,10 +9,10 @@ use super::arguments::{SetList, Threads};
 use super::print;
 use super::progress::Bar;
 use crate::io::atomic;
+use crate::io::layout::MAX_IMAGE;
 use crate::report::figure::{Figure, Format};
 use crate::report::html::{Block, Picture, Report, Section};
 use crate::report::table::{Table, TableFormat};
-use crate::simulate::field::ShearSpectrum;
 use crate::simulate::set::SimulationSettings;
 use crate::study::calibration::calibrate;
 use crate::study::exhibits;
@@ -31,7 +31,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR", default_value = "shearq-reproduce")]
     out: PathBuf,
     /// Images per set.
-    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=999))]
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     images: u32,
     /// Galaxies a side of an image.
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u16).range(8..=400))]
@@ -68,12 +68,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let plan = Plan {
         version: crate::VERSION.into(),
-        simulation: SimulationSettings {
-            seed: *seed,
-            grid: usize::from(*grid),
-            spectrum: ShearSpectrum::default(),
-            intrinsic_sigma: super::simulate::INTRINSIC_SIGMA,
-        },
+        simulation: SimulationSettings::new(*seed, usize::from(*grid)),
         images: *images,
         submissions: submissions.iter().map(|(s, _)| s.clone()).collect(),
     };

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use clap::{Args, ValueEnum};
+use clap::{ArgGroup, Args, ValueEnum};
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{BiasFits, Grid, Noise, Options, Quality, SetScorer, TrueShear, TruthSign};
 
@@ -28,17 +28,13 @@ use crate::submit::foreign::Foreign;
 /// Power-spectrum submissions are given by --spectra. With `--format json` and plain files everything about the
 /// set is printed, all eight conventions included.
 #[derive(Debug, Args)]
+#[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "spectra", "catalogues"]))]
 pub(super) struct Arguments {
-    /// Data folder with the true shear.
-    #[arg(
-        long,
-        value_name = "DIR",
-        requires = "measured",
-        conflicts_with = "truth"
-    )]
+    /// Data folder with the true shear [default with --measured: the one measured].
+    #[arg(long, value_name = "DIR", conflicts_with = "truth")]
     data: Option<PathBuf>,
     /// Folder of catalogues that `measure` wrote.
-    #[arg(long, value_name = "DIR", requires = "data")]
+    #[arg(long, value_name = "DIR", conflicts_with = "truth")]
     measured: Option<PathBuf>,
     /// True shear of one set: x, y, g1, g2.
     #[arg(long, value_name = "FILE")]
@@ -48,19 +44,14 @@ pub(super) struct Arguments {
     catalogues: Vec<PathBuf>,
     /// Catalogues of another program, described in a TOML file (docs/formats.md), instead of
     /// --measured.
-    #[arg(
-        long,
-        value_name = "FILE",
-        requires = "data",
-        conflicts_with = "measured"
-    )]
+    #[arg(long, value_name = "FILE", requires = "data")]
     foreign: Option<PathBuf>,
     /// Power-spectrum submission (`index l power`): a file with --truth, a folder of
     /// `{method}_set{set}.dat` with --data.
-    #[arg(long, value_name = "PATH", conflicts_with_all = ["measured", "foreign", "catalogues", "noise_var"])]
+    #[arg(long, value_name = "PATH", conflicts_with = "noise_var")]
     spectra: Option<PathBuf>,
     /// Sets to score [default: all that were measured].
-    #[arg(long, value_name = "LIST", requires = "data")]
+    #[arg(long, value_name = "LIST", conflicts_with = "truth")]
     sets: Option<SetList>,
     /// Noise variance per component, galaxy and image, for Q_dn [default: measured from the scatter
     /// between images].
@@ -121,35 +112,29 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         noise: arguments.noise_var.map_or(Noise::Measured, Noise::Given),
         choice: arguments.settings.choice(),
     };
-    match (&arguments.data, &arguments.truth, &arguments.spectra) {
-        (Some(data), None, Some(spectra)) => spectrum_folder(arguments, data, spectra, options),
-        (None, Some(truth), Some(spectrum)) => spectrum_file(arguments, truth, spectrum, options),
-        (Some(data), None, None) => folder(arguments, data, options),
-        (None, Some(truth), None) if !arguments.catalogues.is_empty() => {
-            files(arguments, truth, options)
+    let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
+    match (&arguments.truth, &arguments.spectra, data) {
+        (Some(truth), Some(spectrum), _) => spectrum_file(arguments, truth, spectrum, options),
+        (Some(truth), None, _) => files(arguments, truth, options),
+        (None, Some(spectra), Some(data)) => spectrum_folder(arguments, &data, spectra, options),
+        (None, Some(_), None) => {
+            bail!("--spectra needs the true shear: --data DIR or --truth FILE")
         }
-        _ => bail!(
-            "nothing to score: give --data DIR with --measured, --foreign or --spectra, or --truth FILE with catalogues or --spectra"
-        ),
+        (None, None, data) => folder(arguments, data, options),
     }
 }
 
-fn folder(arguments: &Arguments, data: &Path, options: Options) -> anyhow::Result<()> {
-    let data = DataFolder::open(data)?;
+fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> anyhow::Result<()> {
     let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
     let threads = arguments.threads.number();
-    let (name, scored) = match (&arguments.measured, &arguments.foreign) {
-        (Some(measured), _) => {
-            let run = Run::read(measured)?.with_context(|| {
-                format!(
-                    "{}: there is no run.json; expected a folder that `shearq measure` wrote",
-                    measured.display()
-                )
-            })?;
+    let (name, scored) = match (&arguments.measured, &arguments.foreign, data) {
+        (Some(measured), _, data) => {
+            let run = Run::require(measured)?;
+            let data = data.map_or_else(|| run.source.data(measured), Ok)?;
             let scored = score_folder(&data, measured, &run, sets, options, threads)?;
             (run.submission.name, scored)
         }
-        (None, Some(path)) => {
+        (None, Some(path), Some(data)) => {
             let foreign = Foreign::read(path)?;
             let read = |grid: &Grid, path: &Path| foreign.sum(grid, path);
             let catalogues = |set| foreign.catalogues(set);
@@ -157,7 +142,7 @@ fn folder(arguments: &Arguments, data: &Path, options: Options) -> anyhow::Resul
                 .with_context(|| path.display().to_string())?;
             (foreign.name.clone(), scored)
         }
-        (None, None) => bail!("--data needs --measured DIR, --foreign FILE or --spectra DIR"),
+        (None, _, _) => bail!("--foreign needs the true shear: --data DIR"),
     };
     let title = format!("Scores of {name}");
     let table = per_set(&scored, &title, options.definition, options.choice);
@@ -167,11 +152,10 @@ fn folder(arguments: &Arguments, data: &Path, options: Options) -> anyhow::Resul
 /// Scores the power spectra of a folder, one file per set.
 fn spectrum_folder(
     arguments: &Arguments,
-    data: &Path,
+    data: &DataFolder,
     folder: &Path,
     options: Options,
 ) -> anyhow::Result<()> {
-    let data = DataFolder::open(data)?;
     let mut files: Vec<(u32, PathBuf)> = std::fs::read_dir(folder)
         .with_context(|| format!("{}: cannot read the folder", folder.display()))?
         .filter_map(|entry| {
@@ -191,7 +175,7 @@ fn spectrum_folder(
         "{}: there is no file named {{method}}_set{{set}}.dat",
         folder.display()
     );
-    let reading = reading_of(&data);
+    let reading = reading_of(data);
     let mut scored = Vec::new();
     for (set, path) in &files {
         let (grid, truth) = read_truth(&data.truth(*set), &reading)?;

@@ -448,19 +448,22 @@ pub(super) enum Level {
 impl Level {
     /// The best that this machine has.
     pub(super) fn detect() -> Self {
+        Self::available().next().unwrap_or(Level::Baseline)
+    }
+
+    /// All that this machine has, the best first.
+    pub(super) fn available() -> impl Iterator<Item = Self> {
         #[cfg(target_arch = "x86_64")]
-        {
-            if is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx2")
-                && is_x86_feature_detected!("fma")
-            {
-                return Level::Avx512;
-            }
-            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                return Level::Avx2;
-            }
-        }
-        Level::Baseline
+        let wide = {
+            let fused = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            let avx512 = fused && is_x86_feature_detected!("avx512f");
+            [(avx512, Level::Avx512), (fused, Level::Avx2)]
+        };
+        #[cfg(not(target_arch = "x86_64"))]
+        let wide: [(bool, Level); 0] = [];
+        let wide = wide.into_iter().filter(|(here, _)| *here);
+        wide.map(|(_, level)| level)
+            .chain(std::iter::once(Level::Baseline))
     }
 
     /// Runs the kernel compiled for this level.
@@ -471,7 +474,7 @@ impl Level {
         b: &mut Buffers<T>,
     ) -> Outcome {
         match self {
-            // SAFETY: `detect` returns these only where the machine has the features.
+            // SAFETY: `available` yields these only where the machine has the features.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { run_avx512(operator, rule, b) },
             #[cfg(target_arch = "x86_64")]

@@ -27,6 +27,19 @@ pub fn toeplitz(n: usize, kernel: ArrayView2<'_, f64>) -> Array2<f64> {
     matrix
 }
 
+/// The same convolution without the matrix: Hv of a square image, zero outside it.
+pub fn convolve(image: ArrayView2<'_, f64>, kernel: ArrayView2<'_, f64>) -> Array2<f64> {
+    let (cy, cx) = (kernel.nrows() / 2, kernel.ncols() / 2);
+    Array2::from_shape_fn(image.dim(), |(y, x)| {
+        let mut sum = 0.0;
+        for ((j, i), &value) in kernel.indexed_iter() {
+            let at = ((y + cy).wrapping_sub(j), (x + cx).wrapping_sub(i));
+            sum += value * image.get(at).copied().unwrap_or(0.0);
+        }
+        sum
+    })
+}
+
 /// D: the same matrix for Sun's 3×3 high-pass kernel (Sect. 3.1).
 pub fn high_pass(n: usize) -> Array2<f64> {
     toeplitz(n, arr2(&SUN_KERNEL).view())

@@ -8,8 +8,10 @@ use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
 use super::error::FileError;
 use super::table;
 
-/// Highest set and image numbers looked for.
-const MAX_NUMBER: u32 = 999;
+/// Highest set number.
+pub const MAX_SET: u32 = 99;
+/// Highest image number.
+pub const MAX_IMAGE: u32 = 999;
 
 /// Name of the layout file inside a data folder.
 pub const LAYOUT_FILE: &str = "layout.toml";
@@ -133,14 +135,14 @@ impl DataFolder {
         if !any.parent().is_some_and(Path::is_dir) {
             return Vec::new();
         }
-        (1..=MAX_NUMBER)
+        (1..=MAX_IMAGE)
             .filter(|&image| self.galaxies(set, image).is_file())
             .collect()
     }
 
     /// Sets that have an image, in order.
     pub fn sets(&self) -> Vec<u32> {
-        (1..=99)
+        (1..=MAX_SET)
             .filter(|&set| !self.images(set).is_empty())
             .collect()
     }

@@ -7,21 +7,73 @@ use shearq_submissions::Submission;
 
 use super::atomic;
 use super::error::FileError;
-use super::layout::Layout;
+use super::layout::{DataFolder, Layout, MAX_IMAGE};
 use super::table::Format;
+use crate::simulate::set::SimulationSettings;
 
 /// Name of the record in a folder of results.
 pub const RUN_FILE: &str = "run.json";
+
+/// Where the galaxies of a run come from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Source {
+    /// Images of a data folder.
+    Folder {
+        /// The folder as given.
+        path: PathBuf,
+        /// Its layout.
+        layout: Layout,
+    },
+    /// Simulated and measured in memory. The true shear lies beside the catalogues.
+    Simulated(SimulationSettings),
+}
+
+impl Source {
+    /// A data folder as it is.
+    pub fn folder(data: &DataFolder) -> Self {
+        Source::Folder {
+            path: data.root().to_owned(),
+            layout: data.layout().clone(),
+        }
+    }
+
+    /// Layout of the data, that of simulated ones included.
+    pub fn layout(&self) -> Layout {
+        match self {
+            Source::Folder { layout, .. } => layout.clone(),
+            Source::Simulated(_) => Layout::default(),
+        }
+    }
+
+    /// The data folder with the true shear of a run whose catalogues lie in `measured`.
+    ///
+    /// # Errors
+    /// Where it is not there any more.
+    pub fn data(&self, measured: &Path) -> Result<DataFolder, FileError> {
+        match self {
+            Source::Folder { path, .. } => DataFolder::open(path),
+            Source::Simulated(_) => DataFolder::open(measured),
+        }
+    }
+}
+
+impl std::fmt::Display for Source {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Source::Folder { path, .. } => path.display().fmt(f),
+            Source::Simulated(settings) => write!(f, "a simulation with seed {}", settings.seed),
+        }
+    }
+}
 
 /// Settings of a measurement, as stored with its catalogues.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Run {
     /// Version of shearq.
     pub version: String,
-    /// Data folder as given.
-    pub data: PathBuf,
-    /// Its layout.
-    pub layout: Layout,
+    /// Where the galaxies come from.
+    pub source: Source,
     /// All settings of the submission.
     pub submission: Submission,
     /// Format of the catalogues.
@@ -45,6 +97,19 @@ impl Run {
             .map_err(|error| FileError::new(&path, format!("not a record of a run: {error}")))
     }
 
+    /// Reads the record of a folder that must be one of catalogues.
+    ///
+    /// # Errors
+    /// Where there is none, or it cannot be read.
+    pub fn require(folder: &Path) -> Result<Self, FileError> {
+        Run::read(folder)?.ok_or_else(|| {
+            let message = format!(
+                "there is no {RUN_FILE}; expected a folder that `shearq measure` or `shearq run` wrote"
+            );
+            FileError::new(folder, message)
+        })
+    }
+
     /// The catalogue of an image.
     pub fn catalogue(&self, folder: &Path, set: u32, image: u32) -> PathBuf {
         let name = format!(
@@ -53,12 +118,10 @@ impl Run {
         );
         folder.join(name)
     }
-}
 
-impl Run {
     /// Catalogues of a set that are there, by image number.
     pub fn catalogues(&self, folder: &Path, set: u32) -> Vec<(u32, PathBuf)> {
-        (1..=999)
+        (1..=MAX_IMAGE)
             .map(|image| (image, self.catalogue(folder, set, image)))
             .take_while(|(_, path)| path.parent().is_some_and(Path::is_dir))
             .filter(|(_, path)| path.is_file())

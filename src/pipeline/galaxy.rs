@@ -4,6 +4,7 @@ use ndarray::{Array2, ArrayView2};
 use shearq_scoring::{Distortion, Shear};
 use shearq_submissions::{DenoiseMethod, EllipticityType, NoiseSource, Submission};
 
+use crate::deconvolve::reference::convolve;
 use crate::deconvolve::{Network, NetworkScratch, OperatorError, Outcome, Rule, Stop};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::psf::star::cut_start;
@@ -284,17 +285,7 @@ impl Measurer {
             f64::from(pixels[(start + y) * stride + start + x])
         });
         let deconvolved = image(&scratch.deconvolved);
-        let c = psf.nrows() / 2;
-        let reconvolved = Array2::from_shape_fn((n, n), |(y, x)| {
-            let mut sum = 0.0;
-            for ((j, i), &h) in psf.indexed_iter() {
-                let (sy, sx) = ((y + c).wrapping_sub(j), (x + c).wrapping_sub(i));
-                if sy < n && sx < n {
-                    sum += h * deconvolved[(sy, sx)];
-                }
-            }
-            sum
-        });
+        let reconvolved = convolve(deconvolved.view(), psf);
         let side = 2 * n - 1;
         let acf = Array2::from_shape_fn((side, side), |(y, x)| {
             // The half with dy < 0 follows from A(−dx, −dy) = A(dx, dy).

@@ -309,6 +309,17 @@ pub struct Summary {
     pub flagged: u64,
 }
 
+impl Summary {
+    /// Counts one image.
+    pub(super) fn count(&mut self, rows: &[MeasuredRow]) {
+        self.images += 1;
+        for galaxy in rows.iter().flat_map(|row| &row.galaxies) {
+            self.galaxies += 1;
+            self.flagged += u64::from(galaxy.flag != 0);
+        }
+    }
+}
+
 /// Measures `sets` of the run's data (all if empty) into catalogues in `out`.
 ///
 /// Catalogues that are there already are kept if the folder's record says that the same settings
@@ -349,11 +360,8 @@ pub fn measure_folder(
             rows.push(row);
             if rows.len() == grid.n {
                 write_catalogue(run, out, &rows)?;
-                summary.images += 1;
-                for row in rows.drain(..) {
-                    summary.galaxies += row.galaxies.len() as u64;
-                    summary.flagged += row.galaxies.iter().filter(|g| g.flag != 0).count() as u64;
-                }
+                summary.count(&rows);
+                rows.clear();
                 progress.note(&format!("set {:02} image {:03}", id.set, id.image));
             }
             Ok(())
@@ -494,7 +502,12 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
     ])
 }
 
-fn write_catalogue(run: &Run, out: &Path, rows: &[MeasuredRow]) -> Result<(), PipelineError> {
+/// Writes the catalogue of one image from its rows of stamps, in grid order.
+pub(super) fn write_catalogue(
+    run: &Run,
+    out: &Path,
+    rows: &[MeasuredRow],
+) -> Result<(), PipelineError> {
     let id = rows[0].id;
     let path = run.catalogue(out, id.set, id.image);
     let table = catalogue(rows).map_err(|message| FileError::new(&path, message))?;

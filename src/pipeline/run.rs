@@ -1,5 +1,6 @@
 //! Simulating and measuring in memory: no image is stored.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2};
@@ -7,11 +8,17 @@ use shearq_submissions::{PsfForm, Submission};
 
 use super::engine::{self, Progress};
 use super::galaxy::{MeasureScratch, Measurer};
-use super::measure::{ImageId, MeasuredRow, RowPsf, StampRow, functional_psf, measure_row};
+use super::measure::{
+    ImageId, MeasuredRow, RowPsf, StampRow, Summary, functional_psf, measure_row, write_catalogue,
+};
 use super::{PipelineError, simulate};
+use crate::io::layout::DataFolder;
+use crate::io::run::{RUN_FILE, Run, claim};
 use crate::psf::star::star_psf;
 use crate::simulate::render::RenderScratch;
-use crate::simulate::set::{ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator};
+use crate::simulate::set::{
+    ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
+};
 
 /// One row of stamps to draw and measure.
 struct RowJob {
@@ -42,6 +49,55 @@ pub fn measurers(submissions: &[Submission]) -> Result<Vec<Measurer>, PipelineEr
             )))
         })
         .collect()
+}
+
+/// Simulates images 1 to `images` of `sets` and measures them by the run's submission, into
+/// catalogues in `out` with the true shear beside them. No image is stored; catalogues that are
+/// there already, of the same settings, are kept.
+///
+/// # Errors
+/// Where a set does not exist, the folder holds results of other settings, or a file cannot be
+/// written.
+pub fn run_folder(
+    run: &Run,
+    settings: SimulationSettings,
+    sets: &[u32],
+    images: u32,
+    out: &Path,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Summary, PipelineError> {
+    claim(&out.join(RUN_FILE), run)?;
+    let measurers = measurers(std::slice::from_ref(&run.submission))?;
+    let truth = DataFolder::new(out);
+    let mut summary = Summary::default();
+    for &set in sets {
+        let todo: Vec<u32> = (1..=images)
+            .filter(|&image| !run.catalogue(out, set, image).is_file())
+            .collect();
+        let already = images as usize - todo.len();
+        summary.already += already;
+        progress.advance((already * settings.grid * settings.grid) as u64);
+        if todo.is_empty() {
+            continue;
+        }
+        let simulator = simulate::simulator(set, settings)?;
+        simulate::write_truth(&truth, &simulator)?;
+        progress.note(&format!("set {set:02}"));
+        run_set(
+            &simulator,
+            &todo,
+            &measurers,
+            threads,
+            progress,
+            |_, rows| {
+                write_catalogue(run, out, &rows[0])?;
+                summary.count(&rows[0]);
+                Ok(())
+            },
+        )?;
+    }
+    Ok(summary)
 }
 
 /// Simulates images of a set and measures each galaxy by all `measurers`; `done` gets, image by

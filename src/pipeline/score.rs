@@ -12,7 +12,7 @@ use shearq_scoring::{
 use super::PipelineError;
 use super::engine;
 use crate::io::FileError;
-use crate::io::layout::{DataFolder, read_rows, read_truth_rows};
+use crate::io::layout::{DataFolder, MAX_SET, read_rows, read_truth_rows};
 use crate::io::run::Run;
 
 /// Columns of our catalogues that are scored.
@@ -63,18 +63,22 @@ pub fn plain_columns<'a>(
 /// Where the file cannot be read or does not fill a square grid.
 pub fn read_truth(truth: &Path, reading: &Reading) -> Result<(Grid, TrueShear), FileError> {
     let rows = read_truth_rows(truth)?;
-    let side = (rows.len() as f64).sqrt().round() as usize;
-    if side * side != rows.len() {
-        let message = format!(
-            "{} rows; expected the square of the grid's side",
-            rows.len()
-        );
-        return Err(FileError::new(truth, message));
-    }
+    let side = grid_side(truth, rows.len())?;
     let bad = |error: shearq_scoring::ScoringError| FileError::new(truth, error);
     let grid = Grid::new(side, reading.stamp, reading.field).map_err(bad)?;
     let shear = TrueShear::from_rows(&grid, reading.sign, rows).map_err(bad)?;
     Ok((grid, shear))
+}
+
+/// Side of the grid that a file with one row per cell fills.
+///
+/// # Errors
+/// Where the number of rows is no square.
+pub fn grid_side(path: &Path, rows: usize) -> Result<usize, FileError> {
+    Grid::side_of(rows).ok_or_else(|| {
+        let message = format!("{rows} rows; expected the square of the grid's side");
+        FileError::new(path, message)
+    })
 }
 
 /// Scores one set from a truth file and one catalogue per image.
@@ -153,7 +157,7 @@ pub fn score_sets(
 ) -> Result<Vec<ScoredSet>, PipelineError> {
     let reading = reading_of(data);
     let mut scored = Vec::new();
-    for set in 1..=99 {
+    for set in 1..=MAX_SET {
         if !sets.is_empty() && !sets.contains(&set) {
             continue;
         }

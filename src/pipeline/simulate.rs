@@ -49,6 +49,17 @@ struct DrawnRow {
     observed: Vec<Shear>,
 }
 
+/// Draws what all images of a set share.
+///
+/// # Errors
+/// Where there is no such set, or its shear would not be weak.
+pub fn simulator(set: u32, settings: SimulationSettings) -> Result<SetSimulator, PipelineError> {
+    let kind = SetKind::of(set).ok_or_else(|| {
+        PipelineError::Request(format!("there is no set {set}; expected 1 to {SETS}"))
+    })?;
+    SetSimulator::new(kind, settings).map_err(|source| PipelineError::Scoring { set, source })
+}
+
 /// Simulates images 1 to `images` of `sets` into `data`; returns how many images were made and how
 /// many were there already.
 ///
@@ -66,16 +77,12 @@ pub fn simulate_folder(
     let mut simulators = Vec::new();
     let mut already = 0;
     for &set in sets {
-        let kind = SetKind::of(set).ok_or_else(|| {
-            PipelineError::Request(format!("there is no set {set}; expected 1 to {SETS}"))
-        })?;
         let todo: Vec<u32> = (1..=images)
             .filter(|&image| !data.galaxies(set, image).is_file())
             .collect();
         already += images as usize - todo.len();
         if !todo.is_empty() {
-            let simulator = SetSimulator::new(kind, record.settings)
-                .map_err(|source| PipelineError::Scoring { set, source })?;
+            let simulator = simulator(set, record.settings)?;
             write_truth(data, &simulator)?;
             simulators.push((Arc::new(simulator), todo));
         }
@@ -183,7 +190,8 @@ pub(super) fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
     stamp.iter().map(|&v| v as f32).collect()
 }
 
-fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {
+/// Writes the true shear of a set.
+pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {
     let grid = set.grid();
     let mut text = String::from("x,y,g1,g2\n");
     for iy in 0..grid.n {

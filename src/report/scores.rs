@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
 use shearq_scoring::{
     BINS, Bias, BiasFits, Choice, ConventionClass, ConventionScore, Definition, Figures,
-    MAX_GROUPS, Quality, SetScore,
+    MAX_GROUPS, Quality, SCORED, SetScore,
 };
 use shearq_submissions::Published;
 
@@ -228,6 +228,41 @@ pub fn spectra(
         notes: vec![format!(
             "Figures: {definition} definition. √A in 10⁻⁴ for C_ℓ in steradian."
         )],
+    }
+}
+
+/// True and measured bandpowers of every set.
+pub fn bandpowers(scored: &[ScoredSet]) -> Table {
+    let power = |value: f64| Cell::number(value * 1e6, 4);
+    let mut rows = Vec::new();
+    for ScoredSet { set, score, .. } in scored {
+        let measured = score.spectra();
+        for b in SCORED {
+            rows.push(vec![
+                Cell::number(f64::from(*set), 0),
+                Cell::number(b as f64 + 1.0, 0),
+                Cell::number(score.bins.l[b], 1),
+                power(score.true_ee[b]),
+                power(measured.ee[b]),
+                power(measured.bb[b]),
+                power(measured.eb[b]),
+            ]);
+        }
+    }
+    let headings = [
+        ("set", "Set"),
+        ("bin", "Bin"),
+        ("l", "ℓ"),
+        ("true_ee", "true EE×10⁶"),
+        ("ee", "EE×10⁶"),
+        ("bb", "BB×10⁶"),
+        ("eb", "EB×10⁶"),
+    ];
+    Table {
+        title: "Shear bandpowers ℓ²C_ℓ/2π of the scored bins".into(),
+        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
+        rows,
+        notes: Vec::new(),
     }
 }
 

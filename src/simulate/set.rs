@@ -23,6 +23,8 @@ use crate::psf::functional::{FunctionalPsf, PsfProfile, PsfTransform};
 pub const STAMP: usize = 48;
 /// Noise per pixel; images are scaled so that it is one.
 pub const NOISE_SIGMA: f64 = 1.0;
+/// Standard deviation of the intrinsic ellipticities per component, by default.
+const INTRINSIC_SIGMA: f64 = 0.14;
 /// Intrinsic ellipticities are scaled back to this modulus.
 const MAX_INTRINSIC: f64 = 0.7;
 /// Shears beyond this are not weak, and with intrinsic shapes could exceed 1.
@@ -58,6 +60,16 @@ enum Purpose {
 const WHOLE_SET: u32 = 0;
 
 impl SimulationSettings {
+    /// The defaults with a seed and a number of galaxies a side.
+    pub fn new(seed: u64, grid: usize) -> Self {
+        SimulationSettings {
+            seed,
+            grid,
+            spectrum: ShearSpectrum::default(),
+            intrinsic_sigma: INTRINSIC_SIGMA,
+        }
+    }
+
     fn stream(&self, set: u32, image: u32, purpose: Purpose) -> ChaCha8Rng {
         let mut key = [0; 32];
         let words = [self.seed, u64::from(set), u64::from(image), purpose as u64];
@@ -349,12 +361,7 @@ mod tests {
     use super::*;
 
     fn settings(seed: u64, grid: usize) -> SimulationSettings {
-        SimulationSettings {
-            seed,
-            grid,
-            spectrum: ShearSpectrum::default(),
-            intrinsic_sigma: 0.14,
-        }
+        SimulationSettings::new(seed, grid)
     }
 
     fn simulator(set: u32, seed: u64, grid: usize) -> SetSimulator {

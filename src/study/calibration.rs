@@ -18,6 +18,7 @@ use rand_distr::{Distribution, StandardNormal};
 use shearq_scoring::{Distortion, Shear};
 use shearq_submissions::{Submission, Update};
 
+use crate::deconvolve::reference::convolve;
 use crate::deconvolve::{Network, NetworkScratch, Rule};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::{self, Progress};
@@ -323,35 +324,18 @@ impl Study {
         let psf = functional_psf(&psf, self.submission.psf.size);
         // Mean over 4 × 4 points of each pixel.
         let centre = (n as f64 - 1.0) / 2.0;
-        let original: Vec<f64> = (0..n * n)
-            .map(|k| {
-                let (y, x) = ((k / n) as f64 - centre, (k % n) as f64 - centre);
-                (0..16)
-                    .map(|s| {
-                        let at = |s: usize| (s as f64 + 0.5) / 4.0 - 0.5;
-                        galaxy.value(x + at(s % 4), y + at(s / 4))
-                    })
-                    .sum::<f64>()
-                    / 16.0
-            })
-            .collect();
-        let c = psf.nrows() / 2;
-        let convolved = (0..n * n)
-            .map(|k| {
-                let (y, x) = (k / n, k % n);
-                let mut sum = 0.0;
-                for ((j, i), h) in psf.indexed_iter() {
-                    let (sy, sx) = ((y + c).wrapping_sub(j), (x + c).wrapping_sub(i));
-                    if sy < n && sx < n {
-                        sum += h * original[sy * n + sx];
-                    }
-                }
-                sum
-            })
-            .collect();
+        let original = Array2::from_shape_fn((n, n), |(y, x)| {
+            let (y, x) = (y as f64 - centre, x as f64 - centre);
+            let points = (0..16).map(|s| {
+                let at = |s: usize| (s as f64 + 0.5) / 4.0 - 0.5;
+                galaxy.value(x + at(s % 4), y + at(s / 4))
+            });
+            points.sum::<f64>() / 16.0
+        });
+        let convolved = convolve(original.view(), psf.view());
         Synthetic {
             original: original.iter().map(|&v| v as f32).collect(),
-            convolved,
+            convolved: convolved.into_iter().collect(),
             psf,
             shape: shape.to_distortion(),
             noise,

@@ -15,8 +15,8 @@ use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Progress;
 use crate::pipeline::measure::MeasuredRow;
 use crate::pipeline::run::{measurers, run_set};
-use crate::simulate::kinds::SetKind;
-use crate::simulate::set::{SetSimulator, SimulationSettings};
+use crate::pipeline::simulate::simulator;
+use crate::simulate::set::SimulationSettings;
 
 /// What a run is made from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -104,10 +104,8 @@ pub fn run_sets(
             results.push(result);
             continue;
         }
-        let kind = SetKind::of(set)
-            .ok_or_else(|| PipelineError::Request(format!("there is no set {set}")))?;
         let scoring = |source| PipelineError::Scoring { set, source };
-        let simulator = SetSimulator::new(kind, plan.simulation).map_err(scoring)?;
+        let simulator = simulator(set, plan.simulation)?;
         let grid = simulator.grid();
         let images: Vec<u32> = (1..=plan.images).collect();
         let mut sums: Vec<SetImages> = distinct.iter().map(|_| SetImages::new(&grid)).collect();

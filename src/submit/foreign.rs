@@ -7,7 +7,7 @@ use shearq_scoring::{Distortion, FieldSum, Grid, Row, RowCounts, Shear};
 use shearq_submissions::EllipticityType;
 
 use crate::io::FileError;
-use crate::io::layout::fill;
+use crate::io::layout::{MAX_IMAGE, fill};
 use crate::io::table;
 
 /// How to read another program's catalogues.
@@ -101,7 +101,7 @@ impl Foreign {
 
     /// The catalogues of a set that are there, by image number.
     pub fn catalogues(&self, set: u32) -> Vec<(u32, PathBuf)> {
-        (1..=999)
+        (1..=MAX_IMAGE)
             .map(|image| (image, self.folder.join(fill(&self.catalogues, set, image))))
             .filter(|(_, path)| path.is_file())
             .collect()

@@ -1,7 +1,7 @@
 //! Every submission on images that GalSim rendered: measured ellipticities follow the truth.
 
 use shearq::io::layout::DataFolder;
-use shearq::io::run::Run;
+use shearq::io::run::{Run, Source};
 use shearq::io::table::{self, Format};
 use shearq::pipeline::Quiet;
 use shearq::pipeline::measure::measure_folder;
@@ -44,8 +44,7 @@ fn measured_ellipticities_follow_the_truth() {
     for name in registry.names() {
         let run = Run {
             version: "test".into(),
-            data: folder.clone(),
-            layout: data.layout().clone(),
+            source: Source::folder(&data),
             submission: registry.get(name).unwrap().submission,
             format: Format::Fits,
         };

@@ -1,0 +1,104 @@
+//! `shearq run`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use shearq_scoring::Options;
+use shearq_submissions::Registry;
+
+use super::arguments::{SetList, SimulationArguments, Threads};
+use super::progress::Bar;
+use super::{measure, print};
+use crate::io::atomic;
+use crate::io::layout::{DataFolder, MAX_IMAGE};
+use crate::io::run::{Run, Source};
+use crate::io::table::Format;
+use crate::pipeline::run::run_folder;
+use crate::pipeline::score::score_folder;
+use crate::report::scores::{bandpowers, per_set};
+use crate::report::table::TableFormat;
+
+/// Measure and score in one go, on a data folder or on sets that are simulated on the way.
+///
+/// With --simulate no image is ever stored: stamps are drawn, measured and forgotten, so that a whole
+/// challenge (`--sets all --images 200`, 48 million galaxies) needs the room of its catalogues alone.
+/// They are those that `simulate` and `measure` would make of the same settings. Scores and
+/// bandpowers are printed and kept beside the catalogues as scores.csv and bandpowers.csv. A stopped
+/// run goes on where it was, image by image.
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Name of a submission (see `shearq submissions list`) or a TOML file of your own.
+    #[arg(long, value_name = "NAME|FILE")]
+    submission: String,
+    /// Data folder to measure.
+    #[arg(long, value_name = "DIR", required_unless_present = "simulate")]
+    data: Option<PathBuf>,
+    /// Simulate the data in memory.
+    #[arg(long, conflicts_with = "data", requires_all = ["sets", "images"])]
+    simulate: bool,
+    /// Sets, as `1,2,7-9` or `all` [default with --data: all there are].
+    #[arg(long, value_name = "LIST")]
+    sets: Option<SetList>,
+    /// Images per set, with --simulate.
+    #[arg(long, value_name = "N", conflicts_with = "data", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    images: Option<u32>,
+    #[command(flatten)]
+    simulation: SimulationArguments,
+    /// Folder to write to.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Format of the catalogues [default: parquet, or fits in a build without it].
+    #[arg(long, value_enum)]
+    catalogue_format: Option<Format>,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let Arguments {
+        submission,
+        data,
+        simulate: _,
+        sets,
+        images,
+        simulation,
+        out,
+        catalogue_format,
+        threads,
+    } = arguments;
+    let threads = threads.number();
+    let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
+    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let run = Run {
+        version: crate::VERSION.into(),
+        source: match &data {
+            Some(data) => Source::folder(data),
+            None => Source::Simulated(simulation.settings()?),
+        },
+        submission: Registry::embedded()?.get(submission)?.submission,
+        format: catalogue_format.unwrap_or_default(),
+    };
+    match (&run.source, &data) {
+        (Source::Simulated(settings), _) => {
+            let images = images.unwrap_or(1);
+            let galaxies = sets.len() as u64 * u64::from(images) * (settings.grid as u64).pow(2);
+            let mut bar = Bar::new("simulating and measuring", galaxies);
+            let start = std::time::Instant::now();
+            let summary = run_folder(&run, *settings, sets, images, out, threads, &mut bar)?;
+            drop(bar);
+            measure::report(&run, &summary, start.elapsed(), threads, out);
+        }
+        (Source::Folder { .. }, Some(data)) => measure::measure(&run, data, out, sets, threads)?,
+        (Source::Folder { .. }, None) => {}
+    }
+    let options = Options::default();
+    let truth = run.source.data(out)?;
+    let scored = score_folder(&truth, out, &run, sets, options, threads)?;
+    let title = format!("Scores of {}", run.submission.name);
+    let table = per_set(&scored, &title, options.definition, options.choice);
+    for (name, table) in [("scores", &table), ("bandpowers", &bandpowers(&scored))] {
+        let text = table.render(TableFormat::Csv);
+        atomic::write(out.join(format!("{name}.csv")), text.as_bytes())?;
+    }
+    print(&table.narrow().render(TableFormat::Table))
+}
