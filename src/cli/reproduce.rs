@@ -1,6 +1,6 @@
 //! `shearq reproduce`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
 use shearq_submissions::{Published, Registry, Submission};
@@ -8,11 +8,12 @@ use shearq_submissions::{Published, Registry, Submission};
 use super::arguments::{SetList, Threads};
 use super::print;
 use super::progress::Bar;
-use crate::io::atomic;
 use crate::io::layout::MAX_IMAGE;
-use crate::report::figure::{Figure, Format};
-use crate::report::html::{Block, Picture, Report, Section};
-use crate::report::table::{Table, TableFormat};
+use crate::pipeline::run::{measurers, simulated_steps};
+use crate::pipeline::simulate::simulator;
+use crate::report::page::Page;
+use crate::report::steps::{steps_figure, steps_row};
+use crate::report::table::TableFormat;
 use crate::simulate::set::SimulationSettings;
 use crate::study::calibration::calibrate;
 use crate::study::exhibits;
@@ -23,8 +24,8 @@ use crate::study::reproduce::{Plan, SetResult, run_sets};
 /// Sect. 4: calibration of λ on synthetic galaxies (Figs 4 to 7). Sect. 5: the seven submissions of
 /// Table 1 on the 24 sets (Table 1, Figs 8 to 11), simulated and measured in memory, set by set;
 /// each finished set is kept, so a stopped run goes on where it was. The result is one HTML report,
-/// with every figure beside it as PNG and SVG and its data as CSV. The default takes minutes; --images 200 is the challenge's size and
-/// takes hours.
+/// with every figure beside it as PNG and SVG and its data as CSV and Parquet. The default takes
+/// minutes; --images 200 is the challenge's size and takes hours.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Folder to write to.
@@ -61,11 +62,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     } = arguments;
     let threads = threads.number();
     let registry = Registry::embedded()?;
-    let mut submissions = Vec::new();
-    for name in registry.names() {
-        let entry = registry.get(name)?;
-        submissions.push((entry.submission, entry.published));
-    }
+    let submissions = registry.published()?;
     let plan = Plan {
         version: crate::VERSION.into(),
         simulation: SimulationSettings::new(*seed, usize::from(*grid)),
@@ -81,7 +78,32 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let curves = calibrate(&base, *galaxies, *seed, threads, &mut bar)?;
     drop(bar);
 
-    let mut page = Page::new(out);
+    let settings = vec![
+        ("Version".into(), format!("shearq {}", crate::VERSION)),
+        ("Seed".into(), seed.to_string()),
+        (
+            "Data".into(),
+            format!(
+                "simulated: {} sets, {images} images of {grid} × {grid} galaxies",
+                sets.0.len()
+            ),
+        ),
+        (
+            "Calibration".into(),
+            format!("{galaxies} synthetic galaxies"),
+        ),
+        (
+            "Settings of the calibration".into(),
+            toml::to_string(&base)?,
+        ),
+    ];
+    let mut page = Page::new(
+        out,
+        "Hopfield Neural Network deconvolution, reproduced",
+        "Figures and tables of Nurbaeva et al. from simulated data",
+        settings,
+    );
+    method(&mut page, &plan)?;
     page.section("Calibration of λ (Sect. 4)", SECT_FOUR);
     page.figure(
         "fig4-ctr-snr",
@@ -104,25 +126,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "Fig. 7: 1/RMSD of the ellipticities against λ for both updates.",
     )?;
     page.table("calibration", &exhibits::calibration_table(&curves, &base))?;
+    page.table(
+        "findings-lambda",
+        &exhibits::findings_table(&exhibits::lambda_findings(&curves)),
+    )?;
     page.data("fig5-7-lambda", &exhibits::curves_table(&curves))?;
     sect_five(&mut page, &results, &submissions)?;
-    let settings = toml::to_string(&base)?;
-    page.save(vec![
-        ("Version".into(), format!("shearq {}", crate::VERSION)),
-        ("Seed".into(), seed.to_string()),
-        (
-            "Data".into(),
-            format!(
-                "simulated: {} sets, {images} images of {grid} × {grid} galaxies",
-                sets.0.len()
-            ),
-        ),
-        (
-            "Calibration".into(),
-            format!("{galaxies} synthetic galaxies"),
-        ),
-        ("Settings of the calibration".into(), settings),
-    ])?;
+    page.save()?;
     print(&format!(
         "{}\n{}\n{}",
         exhibits::table_one(&results, &submissions).render(TableFormat::Table),
@@ -134,17 +144,40 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
+const SECT_THREE: &str = "A stamp is deconvolved by the network; the ellipticity is measured on the autocorrelation (ACF) of the result, clipped at the radius that holds 90 % of its light.";
 const SECT_FOUR: &str = "Exponential galaxies on stamps, convolved with a Moffat PSF each, with white noise of 10, 20 and 40 dB, deconvolved for λ from 10⁻⁶ to 10⁶ by both updating rules. Everything here is simulated.";
 const SECT_FIVE: &str = "The seven submissions of Table 1 on the 24 kinds of set of Table 2. The images are simulated, not the challenge's own: distributions of S/N and size, PSF fields and shear spectra that were not published are chosen here. Figures are for the convention that matches the truth, by the leaderboard's definition, with jackknife errors.";
 
-fn names(submissions: &[(Submission, Option<Published>)]) -> Vec<String> {
+/// Fig. 3: the steps of one galaxy at S/N 10, 20 and 40.
+fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {
+    page.section("The method (Sect. 3)", SECT_THREE);
+    let name = "23/raw/star";
+    let Some(submission) = plan.submissions.iter().find(|s| s.name == name) else {
+        return Ok(());
+    };
+    let mut rows = Vec::new();
+    for (set, snr) in [(5, 10), (2, 20), (8, 40)] {
+        let simulator = simulator(set, plan.simulation)?;
+        let measurer = &measurers(std::slice::from_ref(submission))?[0];
+        if let Some((psf, steps)) = simulated_steps(&simulator, measurer, 1, (1, 1)) {
+            rows.push(steps_row(&format!("S/N {snr}"), psf, steps));
+        }
+    }
+    page.figure(
+        "fig3-steps",
+        &steps_figure(name, rows),
+        "Fig. 3: from a stamp to its clipped autocorrelation, for a galaxy at S/N 10, 20 and 40.",
+    )
+}
+
+fn names(submissions: &[(Submission, Published)]) -> Vec<String> {
     submissions.iter().map(|(s, _)| s.name.clone()).collect()
 }
 
 fn sect_five(
     page: &mut Page<'_>,
     results: &[SetResult],
-    submissions: &[(Submission, Option<Published>)],
+    submissions: &[(Submission, Published)],
 ) -> anyhow::Result<()> {
     let names = names(submissions);
     page.section("Submissions on 24 sets (Sect. 5)", SECT_FIVE);
@@ -159,6 +192,10 @@ fn sect_five(
         "Fig. 8: quality factor per set and submission.",
     )?;
     let place = |name: &str| names.iter().position(|n| n == name);
+    if let (Some(raw), Some(den)) = (place("23/raw/star"), place("23/den/star")) {
+        let both = [(raw, "23/raw/star"), (den, "23/den/star")];
+        page.table("denoising", &exhibits::denoising_table(results, &both))?;
+    }
     if let (Some(raw), Some(den)) = (place("23/raw/star"), place("23/den/star")) {
         page.figure(
             "fig9-power-spectra",
@@ -183,69 +220,4 @@ fn sect_five(
     }
     page.section("Every set", "The data of Figs 8, 10 and 11.");
     page.table("fig8-11-per-set", &exhibits::per_set_table(results))
-}
-
-/// The report on its way, and the files beside it.
-struct Page<'a> {
-    out: &'a Path,
-    report: Report,
-}
-
-impl<'a> Page<'a> {
-    fn new(out: &'a Path) -> Self {
-        Page {
-            out,
-            report: Report {
-                title: "Hopfield Neural Network deconvolution, reproduced".into(),
-                subtitle: "Figures and tables of Nurbaeva et al. from simulated data".into(),
-                ..Report::default()
-            },
-        }
-    }
-
-    fn section(&mut self, heading: &str, text: &str) {
-        let id = heading.split(" (").next().unwrap_or(heading).to_owned();
-        let blocks = vec![Block::Text(text.to_owned())];
-        self.report
-            .sections
-            .push(Section::new(&id, heading, blocks));
-    }
-
-    fn add(&mut self, block: Block) {
-        if let Some(section) = self.report.sections.last_mut() {
-            section.blocks.push(block);
-        }
-    }
-
-    /// Draws a figure as PNG and SVG and shows it.
-    fn figure(&mut self, name: &str, figure: &impl Figure, caption: &str) -> anyhow::Result<()> {
-        let mut picture = Picture::draw(figure, Format::Svg, name, caption)?;
-        for ending in ["png", "svg"] {
-            let path = format!("figures/{name}.{ending}");
-            figure.save(self.out.join(&path))?;
-            picture = picture.link(ending.to_uppercase(), &path);
-        }
-        self.add(Block::Figure(picture));
-        Ok(())
-    }
-
-    /// Writes a table's data and shows it.
-    fn table(&mut self, name: &str, table: &Table) -> anyhow::Result<()> {
-        self.data(name, table)?;
-        self.add(Block::Table(table.clone()));
-        Ok(())
-    }
-
-    /// Writes a table's data beside the report.
-    fn data(&self, name: &str, table: &Table) -> anyhow::Result<()> {
-        let text = table.render(TableFormat::Csv);
-        atomic::write(self.out.join(format!("data/{name}.csv")), text.as_bytes())?;
-        Ok(())
-    }
-
-    fn save(mut self, settings: Vec<(String, String)>) -> anyhow::Result<()> {
-        self.report.settings = settings;
-        self.report.save(self.out.join("report.html"))?;
-        Ok(())
-    }
 }

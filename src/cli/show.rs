@@ -10,9 +10,8 @@ use shearq_submissions::Registry;
 use crate::io::layout::DataFolder;
 use crate::pipeline::galaxy::{Measurement, Measurer};
 use crate::pipeline::measure::{ImageId, ImageSource, psf_of};
-use crate::report::figure::{
-    ColourMap, Figure, Format, ImageGrid, ImagePanel, ImageRow, Scale, Stretch,
-};
+use crate::report::figure::{Figure, Format};
+use crate::report::steps::{steps_figure, steps_row};
 
 /// Draw the steps of galaxies like the paper's Fig. 3: stamp, PSF, deconvolved, residual, ACF,
 /// clipped ACF.
@@ -101,33 +100,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             measured.flag
         );
         let steps = measurer.steps(pixels, stride, psf.view(), &measured, &scratch);
-        let panel = |title: &str, image, map, stretch| ImagePanel {
-            title: title.into(),
-            image,
-            map,
-            stretch,
-            limits: None,
-        };
-        use ColourMap::{Diverging, Viridis};
-        rows.push(ImageRow {
-            label: format!("{}/{}/{index}", image.set, image.image),
-            panels: vec![
-                panel("Stamp", steps.stamp, Viridis, Stretch::Linear),
-                panel("PSF", psf, Viridis, Stretch::Asinh),
-                panel("Deconvolved", steps.deconvolved, Viridis, Stretch::Linear),
-                panel("Residual", steps.residual, Diverging, Stretch::Linear),
-                panel("ACF", steps.acf, Viridis, Stretch::Linear),
-                panel("ACF clipped", steps.clipped, Viridis, Stretch::Linear),
-            ],
-        });
+        let label = format!("{}/{}/{index}", image.set, image.image);
+        rows.push(steps_row(&label, psf, steps));
         println!("{}", describe(image, index, &measured));
     }
-    let figure = ImageGrid {
-        title: format!("{} (shearq {})", submission.name, crate::VERSION),
-        rows,
-        scale: Scale::Own,
-    };
-    figure.save(out)?;
+    steps_figure(&submission.name, rows).save(out)?;
     eprintln!("wrote {}", out.display());
     Ok(())
 }

@@ -351,8 +351,13 @@ pub fn write_table(path: &Path, table: &Table, header: &[(&str, Value)]) -> Resu
             let kind = match column {
                 Column::Real(_) => ColumnDataType::Double,
                 Column::Whole(_) => ColumnDataType::LongLong,
+                Column::Text(_) => ColumnDataType::String,
             };
             let mut description = ColumnDescription::new(name.as_str());
+            if let Column::Text(words) = column {
+                let longest = words.iter().map(String::len).max().unwrap_or(0);
+                description.that_repeats(longest.max(1));
+            }
             descriptions.push(description.with_type(kind).create().map_err(cannot)?);
         }
         let hdu = file
@@ -362,6 +367,7 @@ pub fn write_table(path: &Path, table: &Table, header: &[(&str, Value)]) -> Resu
             match column {
                 Column::Real(values) => hdu.write_col(&mut file, name.as_str(), values),
                 Column::Whole(values) => hdu.write_col(&mut file, name.as_str(), values),
+                Column::Text(values) => hdu.write_col(&mut file, name.as_str(), values),
             }
             .map_err(cannot)?;
         }

@@ -39,6 +39,7 @@ pub(super) fn write(
             let column = match column {
                 Column::Real(values) => tables::Column::F64(values.clone()),
                 Column::Whole(values) => tables::Column::I64(values.clone()),
+                Column::Text(values) => tables::Column::Text(values.clone()),
             };
             (name.clone(), column)
         })

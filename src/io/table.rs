@@ -20,6 +20,8 @@ pub enum Column {
     Real(Vec<f64>),
     /// Whole numbers.
     Whole(Vec<i64>),
+    /// Words.
+    Text(Vec<String>),
 }
 
 impl Column {
@@ -28,6 +30,7 @@ impl Column {
         match self {
             Column::Real(values) => values.len(),
             Column::Whole(values) => values.len(),
+            Column::Text(values) => values.len(),
         }
     }
 
@@ -91,10 +94,11 @@ impl Table {
     /// Takes a column out as real numbers.
     pub fn take_real(&mut self, name: &str) -> Option<Vec<f64>> {
         let at = self.columns.iter().position(|(own, _)| own == name)?;
-        Some(match self.columns.swap_remove(at).1 {
-            Column::Real(values) => values,
-            Column::Whole(values) => values.into_iter().map(|v| v as f64).collect(),
-        })
+        match self.columns.swap_remove(at).1 {
+            Column::Real(values) => Some(values),
+            Column::Whole(values) => Some(values.into_iter().map(|v| v as f64).collect()),
+            Column::Text(_) => None,
+        }
     }
 }
 

@@ -59,7 +59,8 @@ pub struct Measurement {
 }
 
 impl Measurement {
-    fn flagged(flag: u32) -> Self {
+    /// A galaxy with nothing measured.
+    pub(crate) fn flagged(flag: u32) -> Self {
         Measurement {
             e1: f64::NAN,
             e2: f64::NAN,

@@ -4,10 +4,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2};
+use shearq_scoring::Shear;
 use shearq_submissions::{PsfForm, Submission};
 
 use super::engine::{self, Progress};
-use super::galaxy::{MeasureScratch, Measurer};
+use super::galaxy::{MeasureScratch, Measurer, Steps};
 use super::measure::{
     ImageId, MeasuredRow, RowPsf, StampRow, Summary, functional_psf, measure_row, write_catalogue,
 };
@@ -24,6 +25,23 @@ use crate::simulate::set::{
 struct RowJob {
     fields: Arc<ImageFields>,
     iy: usize,
+}
+
+/// A row of stamps, measured by each measurer.
+struct MeasuredJob {
+    /// Ellipticities after lensing.
+    observed: Vec<Shear>,
+    rows: Vec<MeasuredRow>,
+}
+
+/// A simulated image, measured.
+pub struct SimulatedImage<'a> {
+    /// Its number.
+    pub image: u32,
+    /// True ellipticities of the galaxies as lensed, row by row.
+    pub observed: &'a [Shear],
+    /// Rows of each measurer.
+    pub rows: &'a [Vec<MeasuredRow>],
 }
 
 /// One thread's buffers.
@@ -84,24 +102,17 @@ pub fn run_folder(
         let simulator = simulate::simulator(set, settings)?;
         simulate::write_truth(&truth, &simulator)?;
         progress.note(&format!("set {set:02}"));
-        run_set(
-            &simulator,
-            &todo,
-            &measurers,
-            threads,
-            progress,
-            |_, rows| {
-                write_catalogue(run, out, &rows[0])?;
-                summary.count(&rows[0]);
-                Ok(())
-            },
-        )?;
+        run_set(&simulator, &todo, &measurers, threads, progress, |image| {
+            write_catalogue(run, out, &image.rows[0])?;
+            summary.count(&image.rows[0]);
+            Ok(())
+        })?;
     }
     Ok(summary)
 }
 
-/// Simulates images of a set and measures each galaxy by all `measurers`; `done` gets, image by
-/// image in order, the rows of each measurer.
+/// Simulates images of a set and measures each galaxy by all `measurers`; `done` gets the
+/// images in order.
 ///
 /// The galaxies are those that `simulate` would write with the same settings, and the measurements
 /// those that `measure` would make of them.
@@ -114,10 +125,11 @@ pub fn run_set(
     measurers: &[Measurer],
     threads: usize,
     progress: &mut dyn Progress,
-    mut done: impl FnMut(u32, &[Vec<MeasuredRow>]) -> Result<(), PipelineError>,
+    mut done: impl FnMut(&SimulatedImage<'_>) -> Result<(), PipelineError>,
 ) -> Result<(), PipelineError> {
     let n = set.grid().n;
     let mut rows: Vec<Vec<MeasuredRow>> = measurers.iter().map(|_| Vec::new()).collect();
+    let mut observed = Vec::with_capacity(n * n);
     engine::ordered(
         threads,
         |feeder| {
@@ -137,15 +149,21 @@ pub fn run_set(
             measure: measurers.iter().map(Measurer::scratch).collect(),
         },
         |scratch, job| Ok(draw_and_measure(set, measurers, scratch, &job)),
-        |measured: Vec<MeasuredRow>| {
+        |measured: MeasuredJob| {
             progress.advance(n as u64);
-            let (image, iy) = (measured[0].id.image, measured[0].iy);
-            for (rows, row) in rows.iter_mut().zip(measured) {
+            let (image, iy) = (measured.rows[0].id.image, measured.rows[0].iy);
+            observed.extend(measured.observed);
+            for (rows, row) in rows.iter_mut().zip(measured.rows) {
                 rows.push(row);
             }
             if iy + 1 == n {
-                done(image, &rows)?;
+                done(&SimulatedImage {
+                    image,
+                    observed: &observed,
+                    rows: &rows,
+                })?;
                 rows.iter_mut().for_each(Vec::clear);
+                observed.clear();
             }
             Ok(())
         },
@@ -157,8 +175,8 @@ fn draw_and_measure(
     measurers: &[Measurer],
     scratch: &mut Scratch,
     job: &RowJob,
-) -> Vec<MeasuredRow> {
-    let (pixels, _) = simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render);
+) -> MeasuredJob {
+    let (pixels, observed) = simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render);
     let mut row = StampRow {
         id: ImageId {
             set: set.kind().set,
@@ -171,12 +189,33 @@ fn draw_and_measure(
         header_noise: Some(NOISE_SIGMA),
         psf: RowPsf::Functional(Vec::new()),
     };
-    let mut measured = Vec::with_capacity(measurers.len());
+    let mut rows = Vec::with_capacity(measurers.len());
     for (measurer, own) in measurers.iter().zip(&mut scratch.measure) {
         row.psf = row_psf(set, job, measurer.submission());
-        measured.push(measure_row(measurer, own, &row));
+        rows.push(measure_row(measurer, own, &row));
     }
-    measured
+    MeasuredJob { observed, rows }
+}
+
+/// Simulates galaxy `(ix, iy)` of an image and measures it, keeping the steps; `None` where it could
+/// not be measured. Returns the PSF with them.
+pub fn simulated_steps(
+    set: &SetSimulator,
+    measurer: &Measurer,
+    image: u32,
+    (ix, iy): (usize, usize),
+) -> Option<(Array2<f64>, Steps)> {
+    let fields = Arc::new(set.image_fields(image));
+    let mut pixels = vec![0.0; STAMP * STAMP];
+    set.draw(&fields, ix, iy, &mut RenderScratch::new(), &mut pixels);
+    let size = measurer.submission().psf.size;
+    let psf = functional_psf(fields.psf.at(ix, iy), size);
+    let mut scratch = measurer.scratch();
+    measurer.set_psf(&mut scratch, Some(psf.view()));
+    let measured = measurer.measure(&pixels, STAMP, Some(NOISE_SIGMA), &mut scratch);
+    measured.outcome?;
+    let steps = measurer.steps(&pixels, STAMP, psf.view(), &measured, &scratch);
+    Some((psf, steps))
 }
 
 /// The PSFs of a row in the form that a submission uses.

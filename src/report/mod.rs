@@ -3,5 +3,7 @@
 pub mod figure;
 mod font;
 pub mod html;
+pub mod page;
 pub mod scores;
+pub mod steps;
 pub mod table;

@@ -4,6 +4,8 @@ use clap::ValueEnum;
 use comfy_table::{CellAlignment, ContentArrangement, TableComponent, presets};
 use serde_json::{Map, Value, json};
 
+use crate::io::table::{Column, Table as Columns};
+
 /// How to print a table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum TableFormat {
@@ -227,6 +229,34 @@ impl Table {
             .any(|row| matches!(row.get(k), Some(Cell::Number { error: Some(_), .. })))
     }
 
+    /// The table as columns of numbers or words, those of errors beside their values: what CSV has,
+    /// for other formats.
+    ///
+    /// # Errors
+    /// A message where two headings share a key.
+    pub fn columns(&self) -> Result<Columns, String> {
+        let mut columns = Vec::new();
+        for (k, heading) in self.headings.iter().enumerate() {
+            let cells = || self.rows.iter().filter_map(|row| row.get(k));
+            let numbers: Option<Vec<(f64, f64)>> = cells()
+                .map(|cell| match cell {
+                    Cell::Text(_) => None,
+                    Cell::Number { value, error, .. } => Some((*value, error.unwrap_or(f64::NAN))),
+                })
+                .collect();
+            let Some((values, errors)) = numbers.map(|pairs| pairs.into_iter().unzip()) else {
+                let words = cells().map(|cell| cell.print(false)).collect();
+                columns.push((heading.key.to_owned(), Column::Text(words)));
+                continue;
+            };
+            columns.push((heading.key.to_owned(), Column::Real(values)));
+            if self.has_errors(k) {
+                columns.push((format!("{}_error", heading.key), Column::Real(errors)));
+            }
+        }
+        Columns::new(columns)
+    }
+
     fn csv(&self) -> String {
         let quote = |words: &str| {
             if words.contains([',', '"', '\n']) {
@@ -350,6 +380,13 @@ mod tests {
             table().render(TableFormat::Csv),
             "name,q,q_error\n\"a,b\",87.125,1.5\nc_d,,\n"
         );
+        let columns = table().columns().unwrap();
+        let names: Vec<&str> = columns.columns().iter().map(|(n, _)| n.as_str()).collect();
+        assert_eq!(names, ["name", "q", "q_error"]);
+        let Column::Text(words) = &columns.columns()[0].1 else {
+            panic!("words")
+        };
+        assert_eq!(words, &["a,b", "c_d"]);
         let json: Value = serde_json::from_str(&table().render(TableFormat::Json)).unwrap();
         assert_eq!(json["rows"][0]["q_error"], 1.5);
         assert!(json["rows"][1]["q"].is_null());

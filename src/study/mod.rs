@@ -3,4 +3,5 @@
 pub mod calibration;
 pub mod exhibits;
 pub mod reproduce;
+pub mod response;
 pub mod speed;

@@ -3,12 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use shearq_scoring::quality::quality;
 use shearq_scoring::{
     BINS, Choice, Convention, FieldSum, Figures, Noise, Options, Row, SetImages, SetScore,
     SetScorer,
 };
 use shearq_submissions::Submission;
 
+use super::response::{Regression, Response};
 use crate::io::FileError;
 use crate::io::run::write_record;
 use crate::pipeline::PipelineError;
@@ -50,10 +52,10 @@ pub struct Result {
     pub matched: Convention,
     /// E-mode bandpowers.
     pub ee: [f64; BINS],
-    /// Galaxies flagged.
-    pub flagged: u64,
-    /// Galaxies.
-    pub galaxies: u64,
+    /// Q of those bandpowers over the square of the response's mean slope.
+    pub q_calibrated: f64,
+    /// How ellipticities follow the true ones.
+    pub response: Response,
 }
 
 /// All submissions on one set.
@@ -109,21 +111,19 @@ pub fn run_sets(
         let grid = simulator.grid();
         let images: Vec<u32> = (1..=plan.images).collect();
         let mut sums: Vec<SetImages> = distinct.iter().map(|_| SetImages::new(&grid)).collect();
-        let mut flagged = vec![0u64; distinct.len()];
+        let mut regressions = vec![Regression::default(); distinct.len()];
         run_set(
             &simulator,
             &images,
             &measurers,
             threads,
             progress,
-            |_, rows| {
-                for ((sum, flagged), rows) in sums.iter_mut().zip(&mut flagged).zip(rows) {
+            |image| {
+                let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
+                for ((sum, regression), rows) in each {
                     sum.add(&field_sum(rows));
-                    let bad = rows
-                        .iter()
-                        .flat_map(|r| &r.galaxies)
-                        .filter(|g| g.flag != 0);
-                    *flagged += bad.count() as u64;
+                    let measured = rows.iter().flat_map(|row| &row.galaxies);
+                    regression.add(image.observed.iter().copied().zip(measured));
                 }
                 Ok(())
             },
@@ -140,7 +140,7 @@ pub fn run_sets(
             .map(|images| scorer.score(images))
             .collect::<std::result::Result<_, _>>()
             .map_err(scoring)?;
-        let galaxies = u64::from(plan.images) * grid.cells() as u64;
+        let responses: Vec<Response> = regressions.iter().map(Regression::response).collect();
         let result = SetResult {
             set,
             images: plan.images,
@@ -161,8 +161,8 @@ pub fn run_sets(
                         best: score.best,
                         matched: score.matched,
                         ee: score.spectra().ee,
-                        flagged: flagged[at],
-                        galaxies,
+                        q_calibrated: calibrated_q(score, &responses[at]),
+                        response: responses[at],
                     }
                 })
                 .collect(),
@@ -171,6 +171,14 @@ pub fn run_sets(
         results.push(result);
     }
     Ok(results)
+}
+
+/// Q that the spectrum of `score` would have, had the ellipticities been divided by the slope at
+/// which they follow the true ones.
+fn calibrated_q(score: &SetScore, response: &Response) -> f64 {
+    let slope = response.slope.iter().sum::<f64>() / 2.0;
+    let calibrated = score.spectra().ee.map(|power| power / (slope * slope));
+    quality(&score.bins, &calibrated, &score.true_ee).q
 }
 
 /// Submissions without repetition, and the place of each one given among them.

@@ -270,14 +270,9 @@ pub fn scaling(
         let mut best = 0.0f64;
         for _ in 0..3 {
             let start = Instant::now();
-            run_set(
-                &inputs.set,
-                &[1],
-                &measurers,
-                threads,
-                &mut Quiet,
-                |_, _| Ok(()),
-            )?;
+            run_set(&inputs.set, &[1], &measurers, threads, &mut Quiet, |_| {
+                Ok(())
+            })?;
             best = best.max(galaxies / start.elapsed().as_secs_f64());
         }
         Ok(best)

@@ -220,6 +220,19 @@ impl Registry {
         &self.names
     }
 
+    /// The submissions of the paper's Table 1 with their published figures, in its order.
+    ///
+    /// # Errors
+    /// As [`Registry::get`].
+    pub fn published(&self) -> Result<Vec<(Submission, Published)>, SubmissionError> {
+        let mut found = Vec::new();
+        for name in &self.names {
+            let entry = self.get(name)?;
+            found.extend(entry.published.map(|figures| (entry.submission, figures)));
+        }
+        Ok(found)
+    }
+
     /// The submission of this name, or in this file.
     ///
     /// A name wins over a file; a path with `./` in front is always a file.

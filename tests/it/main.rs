@@ -5,6 +5,7 @@ mod figures;
 mod galsim_galaxies;
 mod galsim_measured;
 mod orientation;
+mod reproduced;
 mod scoring_cases;
 mod submitted;
 mod support;

@@ -1,0 +1,99 @@
+//! A report with the pictures and data of its exhibits beside it.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::figure::{Figure, Format};
+use super::html::{Block, Picture, Report, Section};
+use super::table::{Table, TableFormat};
+use crate::io::{atomic, table};
+
+/// The report on its way, and the files beside it.
+pub struct Page<'a> {
+    out: &'a Path,
+    made_by: BTreeMap<String, String>,
+    report: Report,
+}
+
+impl<'a> Page<'a> {
+    /// An empty report to be written to `out`. `settings` are what made it: shown at its end, and
+    /// stored with the data.
+    pub fn new(
+        out: &'a Path,
+        title: &str,
+        subtitle: &str,
+        settings: Vec<(String, String)>,
+    ) -> Self {
+        Page {
+            out,
+            made_by: settings.iter().cloned().collect(),
+            report: Report {
+                title: title.into(),
+                subtitle: subtitle.into(),
+                settings,
+                ..Report::default()
+            },
+        }
+    }
+
+    /// Begins a section with a paragraph; a bracket at the end of the heading stays out of its link.
+    pub fn section(&mut self, heading: &str, text: &str) {
+        let id = heading.split(" (").next().unwrap_or(heading).to_owned();
+        let blocks = vec![Block::Text(text.to_owned())];
+        self.report
+            .sections
+            .push(Section::new(&id, heading, blocks));
+    }
+
+    fn add(&mut self, block: Block) {
+        if let Some(section) = self.report.sections.last_mut() {
+            section.blocks.push(block);
+        }
+    }
+
+    /// Draws a figure as PNG and SVG and shows it.
+    pub fn figure(
+        &mut self,
+        name: &str,
+        figure: &impl Figure,
+        caption: &str,
+    ) -> anyhow::Result<()> {
+        let mut picture = Picture::draw(figure, Format::Svg, name, caption)?;
+        for ending in ["png", "svg"] {
+            let path = format!("figures/{name}.{ending}");
+            figure.save(self.out.join(&path))?;
+            picture = picture.link(ending.to_uppercase(), &path);
+        }
+        self.add(Block::Figure(picture));
+        Ok(())
+    }
+
+    /// Writes a table's data and shows it.
+    pub fn table(&mut self, name: &str, exhibit: &Table) -> anyhow::Result<()> {
+        self.data(name, exhibit)?;
+        self.add(Block::Table(exhibit.clone()));
+        Ok(())
+    }
+
+    /// Writes a table's data beside the report.
+    pub fn data(&self, name: &str, exhibit: &Table) -> anyhow::Result<()> {
+        let text = exhibit.render(TableFormat::Csv);
+        atomic::write(self.out.join(format!("data/{name}.csv")), text.as_bytes())?;
+        #[cfg(feature = "parquet")]
+        {
+            let path = self.out.join(format!("data/{name}.parquet"));
+            let columns = exhibit.columns().map_err(anyhow::Error::msg)?;
+            table::write(&path, table::Format::Parquet, columns, &self.made_by)?;
+        }
+        Ok(())
+    }
+
+    /// Writes the report.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn save(self) -> anyhow::Result<()> {
+        self.report.save(self.out.join("report.html"))?;
+        Ok(())
+    }
+}

@@ -1,0 +1,38 @@
+//! The steps of a measurement as pictures, after the paper's Fig. 3.
+
+use ndarray::Array2;
+
+use super::figure::{ColourMap, ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
+use crate::pipeline::galaxy::Steps;
+
+/// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, clipped ACF.
+pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
+    use ColourMap::{Diverging, Viridis};
+    let panel = |title: &str, image, map, stretch| ImagePanel {
+        title: title.into(),
+        image,
+        map,
+        stretch,
+        limits: None,
+    };
+    ImageRow {
+        label: label.into(),
+        panels: vec![
+            panel("Stamp", steps.stamp, Viridis, Stretch::Linear),
+            panel("PSF", psf, Viridis, Stretch::Asinh),
+            panel("Deconvolved", steps.deconvolved, Viridis, Stretch::Linear),
+            panel("Residual", steps.residual, Diverging, Stretch::Linear),
+            panel("ACF", steps.acf, Viridis, Stretch::Linear),
+            panel("ACF clipped", steps.clipped, Viridis, Stretch::Linear),
+        ],
+    }
+}
+
+/// Several galaxies measured by a submission.
+pub fn steps_figure(submission: &str, rows: Vec<ImageRow>) -> ImageGrid {
+    ImageGrid {
+        title: format!("{submission} (shearq {})", crate::VERSION),
+        rows,
+        scale: Scale::Own,
+    }
+}

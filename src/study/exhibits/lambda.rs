@@ -1,0 +1,211 @@
+//! Sect. 4: Figs 4 to 7.
+
+use shearq_submissions::Submission;
+
+use crate::report::figure::{LinePlot, PanelGrid, Series, Style};
+use crate::report::table::{Cell, Heading, Table};
+use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, SNR_DB, Sums};
+
+/// Names of the two rules in legends, in the order of [`crate::study::calibration::UPDATES`].
+const RULES: [&str; 2] = ["adaptive", "constant"];
+
+fn lambdas() -> Vec<f64> {
+    LOG_LAMBDA.iter().map(|log| 10f64.powf(*log)).collect()
+}
+
+fn over_lambda(curve: &[Sums], value: fn(&Sums) -> f64) -> Vec<f64> {
+    curve.iter().map(value).collect()
+}
+
+/// Fig. 4: CTR against S/N at λ = 10^−3.5 for both rules.
+pub fn ctr_over_snr(curves: &Curves) -> LinePlot {
+    let series = curves
+        .over_snr
+        .iter()
+        .zip(RULES)
+        .enumerate()
+        .map(|(k, (sums, rule))| {
+            let y = over_lambda(sums, Sums::ctr);
+            let style = if k == 0 { Style::Dashed } else { Style::Line };
+            Series::new(rule, CTR_SNR_DB.to_vec(), y, style, k)
+        })
+        .collect();
+    LinePlot {
+        title: "Correct transition rate, λ = 10⁻³·⁵".into(),
+        x_label: "SNR [dB]".into(),
+        y_label: "CTR".into(),
+        series,
+        ..LinePlot::default()
+    }
+}
+
+/// Figs 5 and 6: a figure of the adaptive rule against λ at the three S/N.
+fn adaptive_over_lambda(
+    curves: &Curves,
+    title: &str,
+    y_label: &str,
+    value: fn(&Sums) -> f64,
+) -> LinePlot {
+    let series = SNR_DB
+        .iter()
+        .enumerate()
+        .map(|(s, snr)| {
+            let y = over_lambda(&curves.over_lambda[0][s], value);
+            Series::new(&format!("SNR {snr} dB"), lambdas(), y, Style::Line, s)
+        })
+        .collect();
+    LinePlot {
+        title: title.into(),
+        x_label: "λ".into(),
+        y_label: y_label.into(),
+        x_log: true,
+        series,
+        ..LinePlot::default()
+    }
+}
+
+/// Fig. 5: CTR against λ.
+pub fn ctr_over_lambda(curves: &Curves) -> LinePlot {
+    adaptive_over_lambda(curves, "Correct transition rate", "CTR", Sums::ctr)
+}
+
+/// Fig. 6: dSNR against λ.
+pub fn dsnr_over_lambda(curves: &Curves) -> LinePlot {
+    let title = "Discriminative signal-to-noise ratio";
+    adaptive_over_lambda(curves, title, "dSNR [dB]", Sums::mean_dsnr)
+}
+
+/// Fig. 7: 1/RMSD against λ for both rules at the three S/N.
+pub fn inverse_rmsd(curves: &Curves) -> PanelGrid {
+    let plots = SNR_DB
+        .iter()
+        .enumerate()
+        .map(|(s, snr)| LinePlot {
+            title: format!("SNR {snr} dB"),
+            x_label: "λ".into(),
+            y_label: "1/RMSD".into(),
+            x_log: true,
+            series: RULES
+                .iter()
+                .enumerate()
+                .map(|(rule, name)| {
+                    let sums = &curves.over_lambda[rule][s];
+                    let style = if rule == 0 {
+                        Style::Dashed
+                    } else {
+                        Style::Line
+                    };
+                    Series::new(
+                        name,
+                        lambdas(),
+                        over_lambda(sums, Sums::inverse_rmsd),
+                        style,
+                        rule,
+                    )
+                    .with_errors(over_lambda(sums, Sums::inverse_rmsd_error))
+                })
+                .collect(),
+            ..LinePlot::default()
+        })
+        .collect();
+    PanelGrid {
+        title: "Accuracy of the ellipticities".into(),
+        columns: 3,
+        plots,
+    }
+}
+
+/// All curves over λ as one table: the data of Figs 5 to 7.
+pub fn curves_table(curves: &Curves) -> Table {
+    let mut rows = Vec::new();
+    for (rule, name) in RULES.iter().enumerate() {
+        for (s, snr) in SNR_DB.iter().enumerate() {
+            for (k, sums) in curves.over_lambda[rule][s].iter().enumerate() {
+                rows.push(vec![
+                    Cell::text(*name),
+                    Cell::number(*snr, 0),
+                    Cell::number(LOG_LAMBDA[k], 1),
+                    Cell::number(sums.ctr(), 4),
+                    Cell::number(sums.mean_dsnr(), 3),
+                    Cell::with_error(sums.inverse_rmsd(), Some(sums.inverse_rmsd_error()), 3),
+                    Cell::number(sums.iterations as f64 / sums.galaxies as f64, 1),
+                ]);
+            }
+        }
+    }
+    Table {
+        title: format!("Calibration of λ on {} synthetic galaxies", curves.galaxies),
+        headings: vec![
+            Heading::new("update", "Update"),
+            Heading::new("snr_db", "SNR [dB]"),
+            Heading::new("log10_lambda", "log λ"),
+            Heading::new("ctr", "CTR"),
+            Heading::new("dsnr_db", "dSNR [dB]"),
+            Heading::new("inverse_rmsd", "1/RMSD"),
+            Heading::new("iterations", "Iterations"),
+        ],
+        rows,
+        notes: Vec::new(),
+    }
+}
+
+/// A short table for terminals: per rule and S/N, the best λ and the figures at 10⁻⁴.
+pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
+    let at = |log: f64| LOG_LAMBDA.iter().position(|l| *l == log).unwrap_or(0);
+    let mut rows = Vec::new();
+    for (rule, name) in RULES.iter().enumerate() {
+        for (s, snr) in SNR_DB.iter().enumerate() {
+            let curve = &curves.over_lambda[rule][s];
+            let best = (0..curve.len())
+                .max_by(|a, b| {
+                    curve[*a]
+                        .inverse_rmsd()
+                        .total_cmp(&curve[*b].inverse_rmsd())
+                })
+                .unwrap_or(0);
+            let paper = &curve[at(-4.0)];
+            let value = |sums: &Sums| {
+                Cell::with_error(sums.inverse_rmsd(), Some(sums.inverse_rmsd_error()), 3)
+            };
+            rows.push(vec![
+                Cell::text(*name),
+                Cell::number(*snr, 0),
+                Cell::number(LOG_LAMBDA[best], 1),
+                value(&curve[best]),
+                value(paper),
+                Cell::number(paper.ctr(), 4),
+                Cell::number(paper.mean_dsnr(), 2),
+            ]);
+        }
+    }
+    let chosen: Vec<String> = RULES
+        .iter()
+        .enumerate()
+        .map(|(rule, name)| {
+            format!(
+                "10^{:.1} for the {name} update",
+                curves.best_log_lambda(rule)
+            )
+        })
+        .collect();
+    Table {
+        title: format!(
+            "Calibration of λ for {} on {} synthetic galaxies",
+            submission.name, curves.galaxies
+        ),
+        headings: vec![
+            Heading::new("update", "Update"),
+            Heading::new("snr_db", "SNR [dB]"),
+            Heading::new("best_log10_lambda", "best log λ"),
+            Heading::new("inverse_rmsd_best", "1/RMSD there"),
+            Heading::new("inverse_rmsd", "1/RMSD at 10⁻⁴"),
+            Heading::new("ctr", "CTR at 10⁻⁴"),
+            Heading::new("dsnr_db", "dSNR at 10⁻⁴ [dB]"),
+        ],
+        rows,
+        notes: vec![format!(
+            "λ chosen (the largest within two standard errors of the best 1/RMSD over all S/N): {}. The paper suggests 10^-4.",
+            chosen.join(", ")
+        )],
+    }
+}

@@ -1,0 +1,355 @@
+//! Sect. 5: Table 1, Figs 8 to 11, and what denoising does to ellipticities.
+
+use shearq_scoring::SCORED;
+use shearq_scoring::resample::mean_over_sets;
+use shearq_submissions::{DenoiseMethod, PsfForm, Published, Submission};
+
+use crate::report::figure::{
+    BarGroup, BarPlot, ColourMap, HeatMap, LinePlot, PanelGrid, Series, Style,
+};
+use crate::report::table::{Cell, Heading, Table};
+use crate::simulate::kinds::{ImageType, SetKind};
+use crate::study::reproduce::SetResult;
+
+/// Figures of one submission over sets, from its place in each set's results.
+pub(super) fn over_sets(
+    results: &[SetResult],
+    place: usize,
+    figure: usize,
+) -> Vec<(f64, Option<f64>)> {
+    results
+        .iter()
+        .map(|set| {
+            let result = &set.results[place];
+            let error = result.errors.map(|e| e.values()[figure]);
+            (result.figures.values()[figure], error)
+        })
+        .collect()
+}
+
+/// Table 1: our figures beside the published ones.
+pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)]) -> Table {
+    let mut rows = Vec::new();
+    for (place, (submission, published)) in submissions.iter().enumerate() {
+        let mean = |figure: usize, decimals: usize| {
+            let (value, error) = mean_over_sets(&over_sets(results, place, figure));
+            Cell::with_error(value, error, decimals)
+        };
+        let given = |value: fn(&Published) -> f64, decimals: usize| {
+            Cell::number(value(published), decimals)
+        };
+        let yes = |yes: bool| Cell::text(if yes { "Y" } else { "N" });
+        rows.push(vec![
+            Cell::text(&submission.name),
+            Cell::text(format!("{0}×{0}", submission.stamp.size)),
+            yes(submission.denoise.method != DenoiseMethod::None),
+            Cell::text(match submission.psf.form {
+                PsfForm::Star => "Star",
+                PsfForm::Functional => "Func",
+            }),
+            mean(2, 4),
+            given(|p| p.m_half, 4),
+            mean(3, 4),
+            given(|p| p.sqrt_a, 4),
+            mean(0, 2),
+            given(|p| p.q, 2),
+            Cell::number(
+                results
+                    .iter()
+                    .map(|set| set.results[place].q_calibrated)
+                    .sum::<f64>()
+                    / results.len() as f64,
+                2,
+            ),
+            mean(1, 1),
+            mean(4, 4),
+        ]);
+    }
+    Table {
+        title: "Table 1: submissions over all sets (simulated data)".into(),
+        headings: vec![
+            Heading::new("method", "Method"),
+            Heading::new("size", "Size"),
+            Heading::new("denoised", "Den"),
+            Heading::new("psf", "PSF"),
+            Heading::new("m_half", "M/2"),
+            Heading::new("m_half_published", "M/2 publ."),
+            Heading::new("sqrt_a", "√A×10⁴"),
+            Heading::new("sqrt_a_published", "√A publ."),
+            Heading::new("q", "Q"),
+            Heading::new("q_published", "Q publ."),
+            Heading::new("q_calibrated", "Q calibrated"),
+            Heading::new("q_dn", "Q_dn"),
+            Heading::new("m_cross", "m (cross)"),
+        ],
+        rows,
+        notes: vec![
+            "Q calibrated: after dividing the ellipticities by the mean slope at which they follow the true ones.".into(),
+            "Matched convention, leaderboard definition, jackknife errors. Published figures are of the challenge's own images, 200 per set.".into(),
+        ],
+    }
+}
+
+fn set_labels(results: &[SetResult]) -> Vec<String> {
+    results.iter().map(|set| set.set.to_string()).collect()
+}
+
+/// Fig. 8: Q per set and variant.
+pub fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
+    let mut columns = set_labels(results);
+    columns.push("mean".into());
+    let values = ndarray::Array2::from_shape_fn((names.len(), columns.len()), |(place, k)| {
+        let over = over_sets(results, place, 0);
+        over.get(k)
+            .map_or_else(|| mean_over_sets(&over).0, |value| value.0)
+    });
+    HeatMap {
+        title: "Quality factor per set".into(),
+        row_label: "submission".into(),
+        column_label: "set".into(),
+        rows: names.to_vec(),
+        columns,
+        values,
+        decimals: 1,
+        value_label: "Q".into(),
+        map: ColourMap::Viridis,
+    }
+}
+
+/// Figures of every set and submission: the data of Figs 8, 10 and 11.
+pub fn per_set_table(results: &[SetResult]) -> Table {
+    let mut rows = Vec::new();
+    for set in results {
+        for result in &set.results {
+            let values = result.figures.values();
+            let errors = result.errors.map(|e| e.values());
+            let cell = |at: usize, decimals: usize| {
+                Cell::with_error(values[at], errors.map(|e| e[at]), decimals)
+            };
+            rows.push(vec![
+                Cell::number(f64::from(set.set), 0),
+                Cell::text(SetKind::of(set.set).map_or("", |kind| kind.image.label())),
+                Cell::text(&result.submission),
+                cell(0, 2),
+                Cell::number(result.q_leaderboard, 2),
+                cell(1, 1),
+                cell(2, 4),
+                cell(3, 4),
+                cell(4, 4),
+                Cell::text(format!(
+                    "{}/{}",
+                    result.matched.number(),
+                    result.best.number()
+                )),
+                Cell::number(result.q_calibrated, 2),
+                Cell::with_error(
+                    result.response.slope[0],
+                    Some(result.response.slope_error[0]),
+                    3,
+                ),
+                Cell::with_error(
+                    result.response.slope[1],
+                    Some(result.response.slope_error[1]),
+                    3,
+                ),
+                Cell::with_error(
+                    result.response.rms_scatter(),
+                    Some(result.response.rms_scatter_error()),
+                    4,
+                ),
+                Cell::number(result.response.flagged as f64, 0),
+            ]);
+        }
+    }
+    Table {
+        title: "Every set and submission".into(),
+        headings: vec![
+            Heading::new("set", "Set"),
+            Heading::new("kind", "Kind"),
+            Heading::new("submission", "Submission"),
+            Heading::new("q", "Q"),
+            Heading::new("q_leaderboard", "Q leaderboard"),
+            Heading::new("q_dn", "Q_dn"),
+            Heading::new("m_half", "M/2"),
+            Heading::new("sqrt_a", "√A×10⁴"),
+            Heading::new("m_cross", "m (cross)"),
+            Heading::new("conventions", "Conv. matched/best"),
+            Heading::new("q_calibrated", "Q calibrated"),
+            Heading::new("slope1", "slope e1"),
+            Heading::new("slope2", "slope e2"),
+            Heading::new("scatter", "scatter / slope"),
+            Heading::new("flagged", "Flagged"),
+        ],
+        rows,
+        notes: Vec::new(),
+    }
+}
+
+/// Fig. 9: true and measured shear power spectra, a panel per set.
+pub fn power_spectra(results: &[SetResult], place: usize, name: &str) -> PanelGrid {
+    let plots = results
+        .iter()
+        .map(|set| {
+            let scored = |values: &[f64]| SCORED.map(|b| values[b]).collect::<Vec<f64>>();
+            LinePlot {
+                title: format!(
+                    "Set {} {}",
+                    set.set,
+                    SetKind::of(set.set).map_or("", |kind| kind.image.label())
+                ),
+                x_label: "ℓ".into(),
+                y_label: "ℓ²C_ℓ/2π".into(),
+                x_log: true,
+                y_log: true,
+                series: vec![
+                    Series::new("true", scored(&set.l), scored(&set.true_ee), Style::Line, 2),
+                    Series::new(
+                        "measured",
+                        scored(&set.l),
+                        scored(&set.results[place].ee),
+                        Style::Line,
+                        5,
+                    ),
+                ],
+                ..LinePlot::default()
+            }
+        })
+        .collect();
+    PanelGrid {
+        title: format!("Shear power spectra of {name}"),
+        columns: 4,
+        plots,
+    }
+}
+
+/// The data of Fig. 9.
+pub fn power_spectra_table(results: &[SetResult], place: usize) -> Table {
+    let mut rows = Vec::new();
+    for set in results {
+        for b in SCORED {
+            rows.push(vec![
+                Cell::number(f64::from(set.set), 0),
+                Cell::number(b as f64 + 1.0, 0),
+                Cell::number(set.l[b], 1),
+                Cell::number(set.true_ee[b], 9),
+                Cell::number(set.results[place].ee[b], 9),
+            ]);
+        }
+    }
+    Table {
+        title: "Shear power spectra".into(),
+        headings: vec![
+            Heading::new("set", "Set"),
+            Heading::new("bin", "Bin"),
+            Heading::new("l", "ℓ"),
+            Heading::new("true", "true"),
+            Heading::new("measured", "measured"),
+        ],
+        rows,
+        notes: Vec::new(),
+    }
+}
+
+/// Figs 10 and 11: M/2 or √A per set for two submissions.
+pub fn bias_per_set(
+    results: &[SetResult],
+    places: &[(usize, &str)],
+    figure: usize,
+    title: &str,
+    y_label: &str,
+) -> BarPlot {
+    let groups = places
+        .iter()
+        .map(|&(place, name)| {
+            let over = over_sets(results, place, figure);
+            BarGroup {
+                label: name.into(),
+                values: over.iter().map(|v| v.0).collect(),
+                errors: over.iter().map(|v| v.1).collect(),
+            }
+        })
+        .collect();
+    BarPlot {
+        title: title.into(),
+        y_label: y_label.into(),
+        categories: set_labels(results),
+        groups,
+    }
+}
+
+/// Slope, scatter and offset of ellipticities at S/N 10, 20 and 40 with and without denoising: the
+/// means over the sets of those kinds for the submissions at `places`.
+pub fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table {
+    let kinds = [
+        (10.0, ImageType::LowSnr),
+        (20.0, ImageType::Fiducial),
+        (40.0, ImageType::HighSnr),
+    ];
+    let mut rows = Vec::new();
+    for (snr, kind) in kinds {
+        for &(place, name) in places {
+            let responses: Vec<_> = results
+                .iter()
+                .filter(|set| SetKind::of(set.set).is_some_and(|own| own.image == kind))
+                .map(|set| set.results[place].response)
+                .collect();
+            if responses.is_empty() {
+                continue;
+            }
+            // Sets of a kind have equally many galaxies.
+            let count = responses.len() as f64;
+            let mean = |values: Vec<(f64, f64)>, decimals| {
+                let value = values.iter().map(|v| v.0).sum::<f64>() / count;
+                let error = values.iter().map(|v| v.1 * v.1).sum::<f64>().sqrt() / count;
+                Cell::with_error(value, Some(error), decimals)
+            };
+            let component = |k: usize, decimals| {
+                mean(
+                    responses
+                        .iter()
+                        .map(|r| (r.slope[k], r.slope_error[k]))
+                        .collect(),
+                    decimals,
+                )
+            };
+            let offset = |k: usize| {
+                mean(
+                    responses
+                        .iter()
+                        .map(|r| (r.offset[k], r.offset_error[k]))
+                        .collect(),
+                    4,
+                )
+            };
+            let scatter = responses
+                .iter()
+                .map(|r| (r.rms_scatter(), r.rms_scatter_error()))
+                .collect();
+            rows.push(vec![
+                Cell::number(snr, 0),
+                Cell::text(name),
+                component(0, 3),
+                component(1, 3),
+                mean(scatter, 4),
+                offset(0),
+                offset(1),
+            ]);
+        }
+    }
+    Table {
+        title: "Ellipticities with and without denoising (simulated data)".into(),
+        headings: vec![
+            Heading::new("snr", "S/N"),
+            Heading::new("submission", "Submission"),
+            Heading::new("slope1", "slope e1"),
+            Heading::new("slope2", "slope e2"),
+            Heading::new("scatter", "scatter / slope"),
+            Heading::new("offset1", "offset e1"),
+            Heading::new("offset2", "offset e2"),
+        ],
+        rows,
+        notes: vec![
+            "Reported ellipticity against the true shear-type one of each galaxy; scatter per component about the line, divided by the slope.".into(),
+        ],
+    }
+}
