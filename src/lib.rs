@@ -22,6 +22,7 @@
 pub mod cli;
 pub mod deconvolve;
 pub mod denoise;
+mod fft;
 pub mod io;
 pub mod pipeline;
 pub mod psf;

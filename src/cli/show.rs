@@ -99,7 +99,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             "galaxy {index} could not be measured: flag {}",
             measured.flag
         );
-        let steps = measurer.steps(pixels, stride, psf.view(), &measured, &scratch);
+        let steps = measurer.steps(pixels, stride, psf.view(), &measured, &mut scratch);
         let label = format!("{}/{}/{index}", image.set, image.image);
         rows.push(steps_row(&label, psf, steps));
         println!("{}", describe(image, index, &measured));

@@ -26,11 +26,13 @@ mod network;
 mod operator;
 pub mod reference;
 mod rule;
+mod spectral;
 mod vector;
 
 pub use network::{Network, NetworkScratch};
 pub use operator::{MAX_PSF, MAX_STAMP, OperatorError, SUN_KERNEL};
 pub use rule::{Rule, Step};
+pub use spectral::{Lags, Spectral, SpectralPsf, SpectralScratch};
 
 /// Number types the network runs in: `f32` in the pipeline, `f64` to tell rounding from mistakes.
 pub use kernel::Real;

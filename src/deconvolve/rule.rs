@@ -38,7 +38,7 @@ impl Rule {
             return None;
         }
         let step = match settings.update {
-            Update::Adaptive => Step::Adaptive(match settings.step_scale {
+            Update::Adaptive | Update::Linear => Step::Adaptive(match settings.step_scale {
                 StepScale::Fixed => settings.step,
                 StepScale::Peak => settings.step * peak / unit,
             }),

@@ -1,14 +1,14 @@
 //! One galaxy: from its postage stamp and PSF to an ellipticity. Serial; allocates nothing.
 
 use ndarray::{Array2, ArrayView2};
-use shearq_scoring::{Distortion, Shear};
+use shearq_scoring::Shear;
 use shearq_submissions::{DenoiseMethod, EllipticityType, NoiseSource, Submission};
 
+use super::method::{Found, Method, MethodScratch};
 use crate::deconvolve::reference::convolve;
-use crate::deconvolve::{Network, NetworkScratch, OperatorError, Outcome, Rule, Stop};
+use crate::deconvolve::{OperatorError, Outcome, Stop};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::psf::star::cut_start;
-use crate::shape::{AcfScratch, Autocorrelation, ClippedMoments, Unmeasurable};
 
 /// Why a galaxy could not be measured, as bits of the catalogue's `flag`. Zero is a good galaxy;
 /// with any bit set, e1 and e2 are NaN.
@@ -25,15 +25,18 @@ pub mod flag {
     pub const NO_EXTENT: u32 = 16;
     /// The distortion exceeds 1 and has no shear-type ellipticity.
     pub const NO_SHEAR: u32 = 32;
+    /// The response by which the image's ellipticities were to be divided is not positive.
+    pub const NO_RESPONSE: u32 = 64;
 
     /// Meaning of each bit, for tables and documentation.
-    pub const MEANINGS: [(u32, &str); 6] = [
+    pub const MEANINGS: [(u32, &str); 7] = [
         (NOT_FINITE, "a pixel is not a finite number"),
         (BAD_PSF, "the PSF cannot be used"),
         (NO_SCALE, "no positive pixel or no noise to scale by"),
         (NO_LIGHT, "nothing left after deconvolution"),
         (NO_EXTENT, "moments without extent"),
         (NO_SHEAR, "distortion above 1"),
+        (NO_RESPONSE, "no response to shear to divide by"),
     ];
 }
 
@@ -46,6 +49,8 @@ pub struct Measurement {
     pub e2: f64,
     /// Bits of [`flag`].
     pub flag: u32,
+    /// Response of e1 to γ1 and of e2 to γ2, before any calibration; NaN where it is not measured.
+    pub response: [f64; 2],
     /// How the network ran; `None` if it did not.
     pub outcome: Option<Outcome>,
     /// Noise level used, in image units; NaN if unknown.
@@ -65,6 +70,7 @@ impl Measurement {
             e1: f64::NAN,
             e2: f64::NAN,
             flag,
+            response: [f64::NAN; 2],
             outcome: None,
             noise: f64::NAN,
             flux: f64::NAN,
@@ -90,23 +96,17 @@ pub struct Measurer {
     submission: Submission,
     full: usize,
     denoise: Option<WaveletWiener>,
-    network: Network<f32>,
-    acf: Autocorrelation,
-    moments: ClippedMoments,
+    method: Method,
 }
 
 /// One thread's buffers, its PSF among them.
 pub struct MeasureScratch {
-    network: Network<f32>,
-    network_scratch: NetworkScratch<f32>,
+    method: MethodScratch,
     denoise: Option<DenoiseScratch>,
-    acf_scratch: AcfScratch,
     /// Full stamp, denoised in place.
     full: Vec<f32>,
     /// Cut stamp.
     cut: Vec<f32>,
-    deconvolved: Vec<f32>,
-    acf: Vec<f32>,
     border: Vec<f32>,
     usable_psf: bool,
 }
@@ -119,16 +119,13 @@ impl Measurer {
     /// [`Measurer::fits`].
     pub fn new(submission: &Submission, full: usize) -> Result<Self, OperatorError> {
         let n = submission.stamp.size.min(full);
-        let d = &submission.deconvolution;
         Ok(Measurer {
             full,
             denoise: match submission.denoise.method {
                 DenoiseMethod::None => None,
                 DenoiseMethod::WaveletWiener => Some(WaveletWiener::new(full, &submission.denoise)),
             },
-            network: Network::plan(n, submission.psf.size, d.lambda)?,
-            acf: Autocorrelation::new(n),
-            moments: ClippedMoments::new(n, submission.shape.acf_share),
+            method: Method::new(submission, n)?,
             submission: submission.clone(),
         })
     }
@@ -145,16 +142,12 @@ impl Measurer {
 
     /// Buffers for one thread.
     pub fn scratch(&self) -> MeasureScratch {
-        let n = self.network.stamp_size();
+        let n = self.method.stamp_size();
         MeasureScratch {
-            network: self.network.clone(),
-            network_scratch: self.network.scratch(),
+            method: self.method.scratch(),
             denoise: self.denoise.as_ref().map(WaveletWiener::scratch),
-            acf_scratch: self.acf.scratch(),
             full: vec![0.0; self.full * self.full],
             cut: vec![0.0; n * n],
-            deconvolved: vec![0.0; n * n],
-            acf: vec![0.0; self.acf.len()],
             border: Vec::with_capacity(self.full * self.full),
             usable_psf: false,
         }
@@ -162,7 +155,8 @@ impl Measurer {
 
     /// Takes the PSF for the galaxies that follow; `None`, or one the network refuses, flags them.
     pub fn set_psf(&self, scratch: &mut MeasureScratch, psf: Option<ArrayView2<'_, f64>>) {
-        scratch.usable_psf = psf.is_some_and(|psf| scratch.network.set_psf(psf).is_ok());
+        scratch.usable_psf =
+            psf.is_some_and(|psf| self.method.set_psf(&mut scratch.method, psf).is_ok());
     }
 
     /// Measures the galaxy whose full stamp's row `y` is `pixels[y·stride..]`. `header_noise` is the
@@ -197,58 +191,58 @@ impl Measurer {
         if let (Some(filter), Some(buffers)) = (&self.denoise, &mut scratch.denoise) {
             filter.apply(&mut scratch.full, noise as f32, buffers);
         }
-        let n = self.network.stamp_size();
+        let n = self.method.stamp_size();
         let start = cut_start(full, n).unwrap_or(0);
         for (y, row) in scratch.cut.chunks_exact_mut(n).enumerate() {
             let from = (start + y) * full + start;
             row.copy_from_slice(&scratch.full[from..from + n]);
         }
-        let peak = scratch.cut.iter().copied().fold(0.0f32, f32::max);
-        let Some(rule) = Rule::new(&self.submission.deconvolution, f64::from(peak), noise) else {
+        let found = self
+            .method
+            .measure(&self.submission, &scratch.cut, noise, &mut scratch.method);
+        let Some(found) = found else {
             return Measurement {
                 noise,
                 ..Measurement::flagged(flag::NO_SCALE)
             };
         };
-        let outcome = scratch.network.deconvolve(
-            &rule,
-            &scratch.cut,
-            &mut scratch.network_scratch,
-            &mut scratch.deconvolved,
-        );
-        let flux: f64 = scratch.deconvolved.iter().map(|&v| f64::from(v)).sum();
-        self.acf.compute(
-            &scratch.deconvolved,
-            &mut scratch.acf_scratch,
-            &mut scratch.acf,
-        );
-        let measured = self.moments.measure(&scratch.acf, flux);
-        let (radius, size) = measured.map_or((f64::NAN, f64::NAN), |m| (m.radius, m.xx + m.yy));
-        let shape = measured.and_then(|moments| moments.distortion());
-        let (e1, e2, flag) = match shape {
-            Ok(distortion) => self.report(distortion),
-            Err(Unmeasurable::NoLight) => (f64::NAN, f64::NAN, flag::NO_LIGHT),
-            Err(Unmeasurable::NoExtent) => (f64::NAN, f64::NAN, flag::NO_EXTENT),
-        };
+        let (e1, e2, response, flag) = self.report(&found);
         Measurement {
             e1,
             e2,
             flag,
-            outcome: Some(outcome),
+            response,
+            outcome: Some(found.outcome),
             noise,
-            flux,
-            radius,
-            size,
+            flux: found.flux,
+            radius: found.radius,
+            size: found.size,
         }
     }
 
-    /// The ellipticity of the submission's type.
-    fn report(&self, distortion: Distortion) -> (f64, f64, u32) {
+    /// The ellipticity of the submission's type with its response, and the flag.
+    fn report(&self, found: &Found) -> (f64, f64, [f64; 2], u32) {
+        let none = |flag| (f64::NAN, f64::NAN, [f64::NAN; 2], flag);
+        let chi = match found.distortion {
+            Ok(chi) => chi,
+            Err(flag) => return none(flag),
+        };
+        let r = found.response;
         match self.submission.shape.ellipticity {
-            EllipticityType::Distortion => (distortion.e1, distortion.e2, 0),
-            EllipticityType::Shear => match distortion.to_shear() {
-                Some(Shear { e1, e2 }) => (e1, e2, 0),
-                None => (f64::NAN, f64::NAN, flag::NO_SHEAR),
+            EllipticityType::Distortion => (chi.e1, chi.e2, [r[0][0], r[1][1]], 0),
+            EllipticityType::Shear => match chi.to_shear() {
+                Some(Shear { e1, e2 }) => {
+                    // ε = χ f, f = 1/(1 + s), s = √(1 − |χ|²): ∂ε_i/∂χ_j = f δ_ij + χ_i χ_j f²/s.
+                    let s = (1.0 - chi.e1 * chi.e1 - chi.e2 * chi.e2).sqrt();
+                    let f = 1.0 / (1.0 + s);
+                    let cross = |a: f64, b: f64| a * b * f * f / s;
+                    let response = [
+                        (f + cross(chi.e1, chi.e1)) * r[0][0] + cross(chi.e1, chi.e2) * r[1][0],
+                        (f + cross(chi.e2, chi.e2)) * r[1][1] + cross(chi.e1, chi.e2) * r[0][1],
+                    ];
+                    (e1, e2, response, 0)
+                }
+                None => none(flag::NO_SHEAR),
             },
         }
     }
@@ -262,7 +256,8 @@ pub struct Steps {
     pub deconvolved: Array2<f64>,
     /// Data minus the deconvolved stamp convolved with the PSF.
     pub residual: Array2<f64>,
-    /// Full autocorrelation, (2n−1)×(2n−1), zero lag in the middle.
+    /// Autocorrelation, zero lag in the middle: all lags for the network, those that the weight
+    /// reaches for the linear one.
     pub acf: Array2<f64>,
     /// The same, NaN beyond the clipping radius.
     pub clipped: Array2<f64>,
@@ -276,32 +271,18 @@ impl Measurer {
         stride: usize,
         psf: ArrayView2<'_, f64>,
         measurement: &Measurement,
-        scratch: &MeasureScratch,
+        scratch: &mut MeasureScratch,
     ) -> Steps {
-        let n = self.network.stamp_size();
+        let n = self.method.stamp_size();
         let start = cut_start(self.full, n).unwrap_or(0);
-        let image =
-            |values: &[f32]| Array2::from_shape_fn((n, n), |(y, x)| f64::from(values[y * n + x]));
         let stamp = Array2::from_shape_fn((n, n), |(y, x)| {
             f64::from(pixels[(start + y) * stride + start + x])
         });
-        let deconvolved = image(&scratch.deconvolved);
+        let (deconvolved, acf) = self.method.images(&scratch.cut, psf, &mut scratch.method);
         let reconvolved = convolve(deconvolved.view(), psf);
-        let side = 2 * n - 1;
-        let acf = Array2::from_shape_fn((side, side), |(y, x)| {
-            // The half with dy < 0 follows from A(−dx, −dy) = A(dx, dy).
-            let (y, x) = if y + 1 < n {
-                (side - 1 - y, side - 1 - x)
-            } else {
-                (y, x)
-            };
-            f64::from(scratch.acf[(y + 1 - n) * side + x])
-        });
-        let clipped = Array2::from_shape_fn((side, side), |at| {
-            let (dy, dx) = (
-                at.0 as f64 - (n as f64 - 1.0),
-                at.1 as f64 - (n as f64 - 1.0),
-            );
+        let middle = (acf.nrows() / 2) as f64;
+        let clipped = Array2::from_shape_fn(acf.dim(), |at| {
+            let (dy, dx) = (at.0 as f64 - middle, at.1 as f64 - middle);
             if dy.hypot(dx) <= measurement.radius {
                 acf[at]
             } else {

@@ -10,6 +10,7 @@ use shearq_scoring::units::{Degrees, Pixels};
 use shearq_submissions::{EllipticityType, PsfForm, Submission};
 
 use super::PipelineError;
+use super::calibrate::calibrate;
 use super::engine::{self, Feeder, Progress};
 use super::galaxy::{Measurement, Measurer};
 use crate::io::FileError;
@@ -359,6 +360,7 @@ pub fn measure_folder(
             let (id, grid) = (row.id, row.grid);
             rows.push(row);
             if rows.len() == grid.n {
+                calibrate(&run.submission, &mut rows);
                 write_catalogue(run, out, &rows)?;
                 summary.count(&rows);
                 rows.clear();
@@ -499,6 +501,8 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
         ("flux".into(), real(&|g| g.flux)),
         ("radius".into(), real(&|g| g.radius)),
         ("size".into(), real(&|g| g.size)),
+        ("response1".into(), real(&|g| g.response[0])),
+        ("response2".into(), real(&|g| g.response[1])),
     ])
 }
 

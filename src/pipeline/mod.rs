@@ -4,9 +4,11 @@
 //! scratch from the caller; everything in it is in order, so that results do not depend on the
 //! number of threads.
 
+mod calibrate;
 pub mod engine;
 pub mod galaxy;
 pub mod measure;
+mod method;
 pub mod run;
 pub mod score;
 pub mod simulate;

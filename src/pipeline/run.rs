@@ -7,6 +7,7 @@ use ndarray::{Array2, ArrayView2};
 use shearq_scoring::Shear;
 use shearq_submissions::{PsfForm, Submission};
 
+use super::calibrate::calibrate;
 use super::engine::{self, Progress};
 use super::galaxy::{MeasureScratch, Measurer, Steps};
 use super::measure::{
@@ -157,6 +158,9 @@ pub fn run_set(
                 rows.push(row);
             }
             if iy + 1 == n {
+                for (rows, measurer) in rows.iter_mut().zip(measurers) {
+                    calibrate(measurer.submission(), rows);
+                }
                 done(&SimulatedImage {
                     image,
                     observed: &observed,
@@ -214,7 +218,7 @@ pub fn simulated_steps(
     measurer.set_psf(&mut scratch, Some(psf.view()));
     let measured = measurer.measure(&pixels, STAMP, Some(NOISE_SIGMA), &mut scratch);
     measured.outcome?;
-    let steps = measurer.steps(&pixels, STAMP, psf.view(), &measured, &scratch);
+    let steps = measurer.steps(&pixels, STAMP, psf.view(), &measured, &mut scratch);
     Some((psf, steps))
 }
 

@@ -1,11 +1,9 @@
 //! Autocorrelation of a stamp by zero-padded FFT.
 
-use std::sync::Arc;
-
 use ndarray::Array2;
-use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 use rustfft::num_complex::Complex32;
-use rustfft::{Fft, FftPlanner};
+
+use crate::fft::{FftScratch, StampFft};
 
 /// Autocorrelation of n×n stamps: A(dx, dy) = Σ v(x, y)·v(x + dx, y + dy), zero outside the stamp.
 ///
@@ -13,55 +11,31 @@ use rustfft::{Fft, FftPlanner};
 /// A(−dx, −dy) = A(dx, dy).
 pub struct Autocorrelation {
     n: usize,
-    /// FFT side, at least 2n − 1 so that no lag wraps onto another.
-    size: usize,
-    forward: Arc<dyn RealToComplex<f32>>,
-    backward: Arc<dyn ComplexToReal<f32>>,
-    column: Arc<dyn Fft<f32>>,
-    column_back: Arc<dyn Fft<f32>>,
+    /// At least 2n − 1 a side, so that no lag wraps onto another.
+    fft: StampFft,
 }
 
 /// Buffers for one thread. Their content between calls does not matter.
 #[derive(Debug, Clone)]
 pub struct AcfScratch {
-    line: Vec<f32>,
-    half: Vec<Complex32>,
-    /// Half spectrum, column by column: `size` values along y for each of `size/2 + 1` frequencies.
-    columns: Vec<Complex32>,
-    fft: Vec<Complex32>,
+    spectrum: Vec<Complex32>,
+    fft: FftScratch,
 }
 
 impl Autocorrelation {
     /// Plans for n×n stamps.
     pub fn new(n: usize) -> Self {
-        let size = transform_size(2 * n - 1);
-        let mut real = RealFftPlanner::new();
-        let mut complex = FftPlanner::new();
         Autocorrelation {
             n,
-            size,
-            forward: real.plan_fft_forward(size),
-            backward: real.plan_fft_inverse(size),
-            column: complex.plan_fft_forward(size),
-            column_back: complex.plan_fft_inverse(size),
+            fft: StampFft::new(2 * n - 1),
         }
     }
 
     /// Buffers that fit this plan.
     pub fn scratch(&self) -> AcfScratch {
-        let zero = Complex32::ZERO;
-        let half = self.size / 2 + 1;
-        let fft = [
-            self.forward.get_scratch_len(),
-            self.backward.get_scratch_len(),
-            self.column.get_inplace_scratch_len(),
-            self.column_back.get_inplace_scratch_len(),
-        ];
         AcfScratch {
-            line: vec![0.0; self.size],
-            half: vec![zero; half],
-            columns: vec![zero; half * self.size],
-            fft: vec![zero; fft.into_iter().max().unwrap_or(0)],
+            spectrum: self.fft.spectrum(),
+            fft: self.fft.scratch(),
         }
     }
 
@@ -80,67 +54,26 @@ impl Autocorrelation {
     /// # Panics
     /// Where a length is not that of the plan.
     pub fn compute(&self, stamp: &[f32], scratch: &mut AcfScratch, out: &mut [f32]) {
-        let (n, size) = (self.n, self.size);
-        let half = size / 2 + 1;
+        let (n, size) = (self.n, self.fft.size);
         assert_eq!(out.len(), self.len(), "lags of a stamp of {n} × {n} pixels");
-        let AcfScratch {
-            line,
-            half: spectrum,
-            columns,
-            fft,
-        } = scratch;
-        for (y, row) in stamp.chunks_exact(n).enumerate() {
-            line[..n].copy_from_slice(row);
-            line[n..].fill(0.0);
-            // Lengths are the plan's own, which is all that these calls can object to.
-            let done = self.forward.process_with_scratch(line, spectrum, fft);
-            debug_assert!(done.is_ok());
-            for (k, value) in spectrum.iter().enumerate() {
-                columns[k * size + y] = *value;
-            }
+        let AcfScratch { spectrum, fft } = scratch;
+        let rows = stamp.chunks_exact(n).map(|row| row.iter().copied());
+        self.fft.rows(rows, fft, spectrum);
+        self.fft.columns(fft, spectrum);
+        for value in spectrum.iter_mut() {
+            *value = Complex32::new(value.norm_sqr(), 0.0);
         }
-        // Power spectrum of each column, back along y; only lags dy < n are needed after that.
-        for column in columns.chunks_exact_mut(size) {
-            column[n..].fill(Complex32::ZERO);
-            self.column.process_with_scratch(column, fft);
-            for value in column.iter_mut() {
-                *value = Complex32::new(value.norm_sqr(), 0.0);
-            }
-            self.column_back.process_with_scratch(column, fft);
-        }
+        self.fft.columns_back(fft, spectrum);
         let scale = 1.0 / (size * size) as f32;
         for (dy, lags) in out.chunks_exact_mut(2 * n - 1).enumerate() {
-            for (k, value) in spectrum.iter_mut().enumerate() {
-                *value = columns[k * size + dy];
-            }
-            // The first and, for even sizes, the last value are real but for rounding.
-            spectrum[0].im = 0.0;
-            if size % 2 == 0 {
-                spectrum[half - 1].im = 0.0;
-            }
-            let done = self.backward.process_with_scratch(spectrum, line, fft);
-            debug_assert!(done.is_ok());
-            for (lag, value) in lags.iter_mut().enumerate() {
-                // lag = dx + n − 1; negative dx lie at the end of the line.
-                *value = line[(lag + size + 1 - n) % size] * scale;
+            let line = self.fft.row_back(spectrum, dy, fft);
+            // lag = dx + n − 1; negative dx lie at the end of the line.
+            let negative = line[size + 1 - n..].iter().chain(&line[..n]);
+            for (value, lag) in lags.iter_mut().zip(negative) {
+                *value = lag * scale;
             }
         }
     }
-}
-
-/// The smallest even length of at least `least` with no prime factor above 5.
-fn transform_size(least: usize) -> usize {
-    (least..)
-        .find(|&size| {
-            let mut rest = size;
-            for prime in [2, 3, 5] {
-                while rest % prime == 0 {
-                    rest /= prime;
-                }
-            }
-            rest == 1 && size % 2 == 0
-        })
-        .unwrap_or(least)
 }
 
 /// The same lags by the plain definition in f64.
@@ -170,7 +103,7 @@ mod tests {
         for n in [3, 5, 8, 11, 19, 23, 29, 32, 48] {
             let plan = Autocorrelation::new(n);
             let mut scratch = plan.scratch();
-            scratch.columns.fill(Complex32::new(1e9, -1e9));
+            scratch.spectrum.fill(Complex32::new(1e9, -1e9));
             let stamp = Array2::from_shape_fn((n, n), |_| rng.random_range(0.0..1.0));
             let single: Vec<f32> = stamp.iter().map(|&v: &f64| v as f32).collect();
             let mut found = vec![f32::NAN; plan.len()];

@@ -5,7 +5,9 @@
 //! share of its light, and its quadrupole moments give the distortion.
 
 mod acf;
+mod adaptive;
 mod moments;
 
 pub use acf::{AcfScratch, Autocorrelation, autocorrelation_naive};
+pub use adaptive::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
 pub use moments::{ClippedMoments, Moments, Unmeasurable};

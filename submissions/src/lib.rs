@@ -11,6 +11,6 @@ mod settings;
 
 pub use registry::{Entry, Published, Registry, SubmissionError, TEMPLATE};
 pub use settings::{
-    BrightnessUnit, Deconvolution, Denoise, DenoiseMethod, EllipticityType, Noise, NoiseSource,
-    Psf, PsfForm, Shape, Stamp, Start, StepScale, Submission, Update,
+    AcfWeight, BrightnessUnit, Calibration, Deconvolution, Denoise, DenoiseMethod, EllipticityType,
+    Noise, NoiseSource, Psf, PsfForm, Shape, Stamp, Start, StepScale, Submission, Update,
 };

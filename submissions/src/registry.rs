@@ -15,7 +15,7 @@ use crate::settings::{
 pub const TEMPLATE: &str = include_str!("../named/paper.toml");
 
 /// The embedded files, in the order of the paper's Table 1.
-const EMBEDDED: [(&str, &str); 8] = [
+const EMBEDDED: [(&str, &str); 10] = [
     ("paper.toml", TEMPLATE),
     (
         "subm-19-den-star.toml",
@@ -44,6 +44,14 @@ const EMBEDDED: [(&str, &str); 8] = [
     (
         "29-den-func.toml",
         include_str!("../named/29-den-func.toml"),
+    ),
+    (
+        "32-linear-star.toml",
+        include_str!("../named/32-linear-star.toml"),
+    ),
+    (
+        "32-linear-func.toml",
+        include_str!("../named/32-linear-func.toml"),
     ),
 ];
 

@@ -101,16 +101,25 @@ section! {
         brightness_unit: BrightnessUnit,
         /// The unit is `brightness_unit` divided by this.
         unit_divisor: f64,
+        /// σ in pixels of the round Gaussian with which the linear update's result is convolved
+        /// before its shape is measured.
+        target_sigma: f64,
     }
 }
 
 section! {
     /// Shape from the autocorrelation of the deconvolved stamp.
     Shape, PartialShape, "shape" {
+        /// How lags of the ACF enter its moments.
+        weight: AcfWeight,
         /// Share of the ACF's light inside the radius at which it is clipped; above 0, at most 1.
         acf_share: f64,
+        /// σ in pixels of the Gaussian weight.
+        weight_sigma: f64,
         /// Which ellipticity the catalogue reports as e1, e2.
         ellipticity: EllipticityType,
+        /// What ellipticities are divided by.
+        calibration: Calibration,
     }
 }
 
@@ -152,6 +161,9 @@ pub enum Update {
     Adaptive,
     /// A constant (Eq. 6).
     Constant,
+    /// The adaptive one without thresholds (Eq. 9) and clipping (Eq. 12), from zero and on a plane
+    /// without boundary: all M iterations in closed form.
+    Linear,
 }
 
 /// What the adaptive step is a multiple of.
@@ -187,6 +199,26 @@ pub enum BrightnessUnit {
     Noise,
     /// The stamp's brightest pixel.
     Peak,
+}
+
+/// Weight of the ACF's lags.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AcfWeight {
+    /// One inside the radius that holds `acf_share` of the light, zero outside (Sect. 3.2).
+    Clipped,
+    /// A Gaussian of size `weight_sigma` and of the galaxy's own ellipticity.
+    Gaussian,
+}
+
+/// Calibration of reported ellipticities.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Calibration {
+    /// None.
+    None,
+    /// The image's mean response to shear, measured on its own galaxies (metacalibration).
+    Response,
 }
 
 /// Ellipticity definition of a catalogue.
@@ -350,6 +382,70 @@ impl Submission {
             a,
             a > 0.0 && a <= 1.0,
             "above 0 and at most 1",
+        )?;
+        let w = shape.weight_sigma;
+        let fits = (1.0..=6.0).contains(&w);
+        real("shape.weight_sigma", w, fits, "1 to 6 pixels")?;
+        let t = d.target_sigma;
+        let fits = (0.0..=6.0).contains(&t);
+        real("deconvolution.target_sigma", t, fits, "0 to 6 pixels")?;
+        self.validate_linear()
+    }
+
+    /// What the linear update and the Gaussian weight, which come together, allow.
+    fn validate_linear(&self) -> Result<(), OutOfRange> {
+        let Submission {
+            denoise,
+            deconvolution: d,
+            shape,
+            ..
+        } = self;
+        let linear = d.update == Update::Linear;
+        let need = |good: bool, key, found: &dyn std::fmt::Debug, expected| {
+            if good {
+                return Ok(());
+            }
+            let found = format!("{found:?}").to_lowercase();
+            Err(OutOfRange {
+                key,
+                found,
+                expected,
+            })
+        };
+        let weighted = shape.weight == AcfWeight::Gaussian;
+        need(
+            linear == weighted,
+            "shape.weight",
+            &shape.weight,
+            "\"gaussian\" with the linear update, \"clipped\" with the others",
+        )?;
+        need(
+            linear || shape.calibration == Calibration::None,
+            "shape.calibration",
+            &shape.calibration,
+            "\"none\": the response is known for the linear update alone",
+        )?;
+        if !linear {
+            return Ok(());
+        }
+        need(
+            denoise.method == DenoiseMethod::None,
+            "denoise.method",
+            &denoise.method,
+            "\"none\" with the linear update, which has to know the noise",
+        )?;
+        need(
+            d.step_scale == StepScale::Fixed,
+            "deconvolution.step_scale",
+            &d.step_scale,
+            "\"fixed\" with the linear update",
+        )?;
+        // The largest eigenvalue of W is 1 for a PSF of sum one.
+        need(
+            d.step < 2.0,
+            "deconvolution.step",
+            &d.step,
+            "below 2 with the linear update, which diverges beyond",
         )
     }
 }
