@@ -126,6 +126,15 @@ impl<T: Real> Padded<T> {
         &mut self.data[self.skip + y * self.stride..][self.before..self.stride]
     }
 
+    /// Takes the image of another of the same side.
+    #[inline(always)]
+    fn copy_from(&mut self, other: &Self) {
+        let width = self.n.next_multiple_of(LANES);
+        for y in 0..self.n {
+            self.wide_mut(y)[..width].copy_from_slice(&other.wide(y)[..width]);
+        }
+    }
+
     #[inline(always)]
     pub(super) fn row(&self, y: usize) -> &[T] {
         &self.wide(y)[..self.n]
@@ -145,6 +154,10 @@ pub(super) struct Buffers<T> {
     pub(super) state: Padded<T>,
     /// Candidate state.
     pub(super) next: Padded<T>,
+    /// State after an accelerated update, before its momentum.
+    moved: Padded<T>,
+    /// The same one iteration before.
+    last: Padded<T>,
     /// u₀ − Hv.
     residual: Padded<T>,
     /// Dv.
@@ -163,6 +176,8 @@ impl<T: Real> Buffers<T> {
         Buffers {
             state: Padded::new(n, p, p),
             next: Padded::new(n, p, p),
+            moved: Padded::new(n, 0, 0),
+            last: Padded::new(n, 0, 0),
             residual: Padded::new(n, p, p),
             rough: Padded::new(n, 1, 1),
             data: Padded::new(n, 0, 0),
@@ -355,7 +370,7 @@ fn update<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Bu
     let minus_lambda = V::splat(T::ZERO.minus(operator.lambda));
     let unit = V::splat(T::from_f64(rule.unit));
     let (adaptive, step) = match rule.step {
-        Step::Adaptive(c) => (true, V::splat(T::from_f64(c))),
+        Step::Adaptive(c) | Step::Accelerated(c) => (true, V::splat(T::from_f64(c))),
         Step::Constant(delta) => (false, V::splat(T::from_f64(delta))),
     };
     let mut updated = 0;
@@ -391,6 +406,52 @@ fn update<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Bu
     updated
 }
 
+/// Adds momentum to an update from `b.state` to `b.next`: `b.moved` takes the update and `b.next` goes
+/// on beyond it, in the direction from the update before. `momentum` is Nesterov's t; it starts anew
+/// where the direction points uphill (O'Donoghue & Candès 2015, gradient scheme). Returns whether
+/// there was any momentum.
+#[inline(always)]
+fn extrapolate<T: Real, V: Vector<T>>(
+    operator: &Operator<T>,
+    b: &mut Buffers<T>,
+    momentum: &mut f64,
+) -> bool {
+    let n = operator.n;
+    let zero = V::splat(T::ZERO);
+    // (from − moved)·(moved − last) > 0 by the squares of sum and difference.
+    let (mut sum, mut difference) = (V::no_squares(), V::no_squares());
+    b.moved.copy_from(&b.next);
+    for y in 0..n {
+        let (from, moved, last) = (b.state.wide(y), b.moved.wide(y), b.last.wide(y));
+        for x in (0..n).step_by(V::LANES) {
+            let moved = V::load(&moved[x..]);
+            let back = V::load(&from[x..]).minus(moved);
+            let on = moved.minus(V::load(&last[x..]));
+            sum = back.plus(on).add_squares(sum);
+            difference = back.minus(on).add_squares(difference);
+        }
+    }
+    if V::sum(sum) > V::sum(difference) {
+        *momentum = 1.0;
+    }
+    let next = 0.5 * (1.0 + (1.0 + 4.0 * *momentum * *momentum).sqrt());
+    let beta = (*momentum - 1.0) / next;
+    *momentum = next;
+    if beta == 0.0 {
+        return false;
+    }
+    let beta = V::splat(T::from_f64(beta));
+    for y in 0..n {
+        let (moved, last, to) = (b.moved.wide(y), b.last.wide(y), b.next.wide_mut(y));
+        for x in (0..n).step_by(V::LANES) {
+            let moved = V::load(&moved[x..]);
+            let value = moved.add_product(beta, moved.minus(V::load(&last[x..])));
+            V::where_greater(value, zero, value, zero).store(&mut to[x..]);
+        }
+    }
+    true
+}
+
 /// Runs the network from `b.state` on `b.data`; the result is left in `b.state`.
 #[inline(always)]
 fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Outcome {
@@ -413,18 +474,31 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
         energy: cost - constant,
         updated: 0,
     };
+    let accelerated = matches!(rule.step, Step::Accelerated(_));
+    let mut momentum = 1.0;
+    if accelerated {
+        b.last.copy_from(&b.state);
+    }
     for _ in 0..rule.max_iterations {
         outcome.updated = update::<T, V>(operator, rule, b);
         if outcome.updated == 0 {
             outcome.stop = Stop::Stable;
             break;
         }
-        let next = residual::<T, V>(operator, b);
+        let extrapolated = accelerated && extrapolate::<T, V>(operator, b, &mut momentum);
+        let mut next = residual::<T, V>(operator, b);
+        if extrapolated && (next.is_nan() || next >= cost) {
+            // Too far: the update itself is left.
+            momentum = 1.0;
+            b.next.copy_from(&b.moved);
+            next = residual::<T, V>(operator, b);
+        }
         if next.is_nan() || next >= cost {
             outcome.stop = Stop::EnergyRise;
             break;
         }
         std::mem::swap(&mut b.state, &mut b.next);
+        std::mem::swap(&mut b.last, &mut b.moved);
         cost = next;
         outcome.energy = cost - constant;
         outcome.iterations += 1;

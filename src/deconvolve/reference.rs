@@ -102,38 +102,59 @@ impl Matrices {
             energy: first_energy,
             updated: 0,
         };
+        // With momentum: the update of the iteration before, and Nesterov's t.
+        let mut last = v.clone();
+        let mut momentum = 1.0;
         for _ in 0..rule.max_iterations {
             // Eq. 11.
             let f = &q - &self.weights.dot(&v);
-            let mut next = v.clone();
+            let mut moved = v.clone();
             outcome.updated = 0;
             for i in 0..n * n {
                 let threshold = self.thresholds[i] * rule.unit;
                 let change = match rule.step {
-                    Step::Adaptive(c) => c * f[i].abs(),
+                    Step::Adaptive(c) | Step::Accelerated(c) => c * f[i].abs(),
                     Step::Constant(delta) => delta,
                 };
                 // Eq. 6.
                 if f[i] < -threshold {
-                    next[i] -= change;
+                    moved[i] -= change;
                     outcome.updated += 1;
                 } else if f[i] > threshold {
-                    next[i] += change;
+                    moved[i] += change;
                     outcome.updated += 1;
                 }
                 // Eq. 12.
-                next[i] = next[i].max(0.0);
+                moved[i] = moved[i].max(0.0);
             }
             if outcome.updated == 0 {
                 outcome.stop = Stop::Stable;
                 break;
             }
-            let energy = self.energy(&q, &next);
+            let mut next = moved.clone();
+            let mut beta: f64 = 0.0;
+            if let Step::Accelerated(_) = rule.step {
+                let on = &moved - &last;
+                if (&v - &moved).dot(&on) > 0.0 {
+                    momentum = 1.0;
+                }
+                let grown = 0.5 * (1.0 + (1.0 + 4.0 * momentum * momentum as f64).sqrt());
+                beta = (momentum - 1.0) / grown;
+                momentum = grown;
+                next = (&moved + &(on * beta)).mapv(|v| v.max(0.0));
+            }
+            let mut energy = self.energy(&q, &next);
+            if beta > 0.0 && (energy.is_nan() || energy >= outcome.energy) {
+                momentum = 1.0;
+                next = moved.clone();
+                energy = self.energy(&q, &next);
+            }
             if energy.is_nan() || energy >= outcome.energy {
                 outcome.stop = Stop::EnergyRise;
                 break;
             }
             v = next;
+            last = moved;
             outcome.energy = energy;
             outcome.iterations += 1;
         }

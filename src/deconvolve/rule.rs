@@ -7,6 +7,8 @@ use shearq_submissions::{BrightnessUnit, Deconvolution, Start, StepScale, Update
 pub enum Step {
     /// Δv_i = c·|f_i| (Eq. 10), c without unit.
     Adaptive(f64),
+    /// The same with momentum.
+    Accelerated(f64),
     /// Δv_i in image units (Eq. 6).
     Constant(f64),
 }
@@ -37,11 +39,13 @@ impl Rule {
         if !(unit.is_finite() && unit > 0.0) {
             return None;
         }
+        let c = match settings.step_scale {
+            StepScale::Fixed => settings.step,
+            StepScale::Peak => settings.step * peak / unit,
+        };
         let step = match settings.update {
-            Update::Adaptive | Update::Linear => Step::Adaptive(match settings.step_scale {
-                StepScale::Fixed => settings.step,
-                StepScale::Peak => settings.step * peak / unit,
-            }),
+            Update::Adaptive | Update::Linear => Step::Adaptive(c),
+            Update::Accelerated => Step::Accelerated(c),
             Update::Constant => Step::Constant(settings.constant_step * unit),
         };
         Some(Rule {

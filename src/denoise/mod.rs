@@ -13,6 +13,7 @@
 //! with ⟨w²⟩ the mean square over a small window, σ_j the noise of that scale for white noise of
 //! level σ, and k = 1 for the Wiener filter. The smooth remainder is kept as it is.
 
+use multiversion::multiversion;
 use shearq_submissions::Denoise;
 
 /// Filter for one stamp size; serial, allocates nothing per stamp.
@@ -71,39 +72,11 @@ impl WaveletWiener {
 
     /// Denoises the row-major n×n `stamp` in place, for white noise of level `sigma`.
     pub fn apply(&self, stamp: &mut [f32], sigma: f32, scratch: &mut DenoiseScratch) {
-        let DenoiseScratch {
-            smooth,
-            next,
-            rows,
-            power,
-            line,
-        } = scratch;
-        smooth.copy_from_slice(stamp);
-        stamp.fill(0.0);
-        for (level, &variance) in self.variances.iter().enumerate() {
-            self.convolve(smooth, next, rows, line, &SPLINE, 1 << level);
-            // Detail of this scale, in place of the finer smooth image.
-            for (fine, &coarse) in smooth.iter_mut().zip(next.iter()) {
-                *fine -= coarse;
-            }
-            for (p, &w) in power.iter_mut().zip(smooth.iter()) {
-                *p = w * w;
-            }
-            self.box_mean(power, rows, line);
-            let noise = self.strength * variance * sigma * sigma;
-            for ((out, &w), &p) in stamp.iter_mut().zip(smooth.iter()).zip(power.iter()) {
-                if p > noise {
-                    *out += w * (1.0 - noise / p);
-                }
-            }
-            std::mem::swap(smooth, next);
-        }
-        for (out, &s) in stamp.iter_mut().zip(smooth.iter()) {
-            *out += s;
-        }
+        filter(self, stamp, sigma, scratch);
     }
 
     /// Separable convolution with five taps `hole` pixels apart.
+    #[inline(always)]
     fn convolve(
         &self,
         from: &[f32],
@@ -115,30 +88,22 @@ impl WaveletWiener {
     ) {
         let (n, reach) = (self.n, self.reach);
         for (row, out) in from.chunks_exact(n).zip(rows.chunks_exact_mut(n)) {
-            for (value, &at) in line.iter_mut().zip(&self.mirror) {
-                *value = row[at];
-            }
-            let start = reach - 2 * hole;
-            for (x, out) in out.iter_mut().enumerate() {
-                let mut sum = 0.0;
-                for (k, tap) in taps.iter().enumerate() {
-                    sum += tap * line[start + x + k * hole];
-                }
-                *out = sum;
-            }
+            self.mirror_row(row, line);
+            let shifted: [&[f32]; 5] =
+                std::array::from_fn(|k| &line[reach + k * hole - 2 * hole..][..n]);
+            weigh(shifted, taps, out);
         }
         for (y, out) in to.chunks_exact_mut(n).enumerate() {
-            out.fill(0.0);
-            for (k, tap) in taps.iter().enumerate() {
+            let shifted: [&[f32]; 5] = std::array::from_fn(|k| {
                 let source = self.mirror[reach + y + k * hole - 2 * hole];
-                for (o, &v) in out.iter_mut().zip(&rows[source * n..source * n + n]) {
-                    *o += tap * v;
-                }
-            }
+                &rows[source * n..][..n]
+            });
+            weigh(shifted, taps, out);
         }
     }
 
     /// Mean over the (2·window + 1)² neighbours, in place.
+    #[inline(always)]
     fn box_mean(&self, image: &mut [f32], rows: &mut [f32], line: &mut [f32]) {
         let (n, reach, window) = (self.n, self.reach, self.window);
         if window == 0 {
@@ -146,23 +111,78 @@ impl WaveletWiener {
         }
         let scale = 1.0 / (2 * window + 1) as f32;
         for (row, out) in image.chunks_exact(n).zip(rows.chunks_exact_mut(n)) {
-            for (value, &at) in line.iter_mut().zip(&self.mirror) {
-                *value = row[at];
-            }
-            for (x, out) in out.iter_mut().enumerate() {
-                let from = reach + x - window;
-                *out = line[from..=from + 2 * window].iter().sum::<f32>() * scale;
+            self.mirror_row(row, line);
+            out.fill(0.0);
+            for k in 0..=2 * window {
+                for (o, &v) in out.iter_mut().zip(&line[reach + k - window..][..n]) {
+                    *o += scale * v;
+                }
             }
         }
         for (y, out) in image.chunks_exact_mut(n).enumerate() {
             out.fill(0.0);
             for k in 0..=2 * window {
                 let source = self.mirror[reach + y + k - window];
-                for (o, &v) in out.iter_mut().zip(&rows[source * n..source * n + n]) {
+                for (o, &v) in out.iter_mut().zip(&rows[source * n..][..n]) {
                     *o += scale * v;
                 }
             }
         }
+    }
+
+    /// A row with its mirrored continuation on both sides.
+    #[inline(always)]
+    fn mirror_row(&self, row: &[f32], line: &mut [f32]) {
+        let (n, reach) = (self.n, self.reach);
+        line[reach..reach + n].copy_from_slice(row);
+        for (value, &at) in line[..reach].iter_mut().zip(&self.mirror) {
+            *value = row[at];
+        }
+        for (value, &at) in line[reach + n..].iter_mut().zip(&self.mirror[reach + n..]) {
+            *value = row[at];
+        }
+    }
+}
+
+/// Sum of five rows with weights.
+#[inline(always)]
+fn weigh(rows: [&[f32]; 5], taps: &[f32; 5], out: &mut [f32]) {
+    let [a, b, c, d, e] = rows;
+    let rows = a.iter().zip(b).zip(c).zip(d).zip(e);
+    for (out, ((((a, b), c), d), e)) in out.iter_mut().zip(rows) {
+        *out = taps[0] * a + taps[1] * b + taps[2] * c + taps[3] * d + taps[4] * e;
+    }
+}
+
+/// [`WaveletWiener::apply`], compiled for each instruction set.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn filter(plan: &WaveletWiener, stamp: &mut [f32], sigma: f32, scratch: &mut DenoiseScratch) {
+    let DenoiseScratch {
+        smooth,
+        next,
+        rows,
+        power,
+        line,
+    } = scratch;
+    smooth.copy_from_slice(stamp);
+    stamp.fill(0.0);
+    for (level, &variance) in plan.variances.iter().enumerate() {
+        plan.convolve(smooth, next, rows, line, &SPLINE, 1 << level);
+        // Detail of this scale, in place of the finer smooth image.
+        for ((fine, &coarse), p) in smooth.iter_mut().zip(next.iter()).zip(power.iter_mut()) {
+            *fine -= coarse;
+            *p = *fine * *fine;
+        }
+        plan.box_mean(power, rows, line);
+        let noise = plan.strength * variance * sigma * sigma;
+        for ((out, &w), &p) in stamp.iter_mut().zip(smooth.iter()).zip(power.iter()) {
+            // A power at or below the noise leaves nothing.
+            *out += w * (1.0 - noise / p.max(noise).max(f32::MIN_POSITIVE));
+        }
+        std::mem::swap(smooth, next);
+    }
+    for (out, &s) in stamp.iter_mut().zip(smooth.iter()) {
+        *out += s;
     }
 }
 

@@ -71,11 +71,13 @@ impl Method {
                     iterations: u32::try_from(d.max_iterations).unwrap_or(u32::MAX),
                 }
             }
-            (Update::Adaptive | Update::Constant, AcfWeight::Clipped) => Method::Network {
-                network: Box::new(Network::plan(n, p, d.lambda)?),
-                acf: Autocorrelation::new(n),
-                moments: ClippedMoments::new(n, submission.shape.acf_share),
-            },
+            (Update::Adaptive | Update::Accelerated | Update::Constant, AcfWeight::Clipped) => {
+                Method::Network {
+                    network: Box::new(Network::plan(n, p, d.lambda)?),
+                    acf: Autocorrelation::new(n),
+                    moments: ClippedMoments::new(n, submission.shape.acf_share),
+                }
+            }
         })
     }
 

@@ -1,6 +1,7 @@
 //! Studies: the paper's Sect. 4 (calibration of λ) and Sect. 5 (seven submissions on 24 sets).
 
 pub mod calibration;
+pub mod convergence;
 pub mod exhibits;
 pub mod reproduce;
 pub mod response;

@@ -7,11 +7,12 @@ use std::time::{Duration, Instant};
 use ndarray::ArrayView2;
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
-use shearq_submissions::{Submission, Update};
+use shearq_submissions::{Start, Submission, Update};
 
 use crate::deconvolve::reference::Matrices;
-use crate::deconvolve::{Network, Rule};
+use crate::deconvolve::{Network, Rule, Spectral, Step};
 use crate::denoise::{WaveletWiener, border_noise};
+use crate::fft::StampFft;
 use crate::io::FileError;
 use crate::io::table::{self, Column, Format, Table as Columns};
 use crate::pipeline::PipelineError;
@@ -20,9 +21,10 @@ use crate::pipeline::galaxy::Measurer;
 use crate::pipeline::measure::functional_psf;
 use crate::pipeline::run::{measurers, run_set};
 use crate::pipeline::score::{COLUMNS, Reading, plain_columns, score_files};
+use crate::pipeline::simulate::simulator;
+use crate::report::figure::{LinePlot, Series, Style};
 use crate::report::table::{Cell, Heading, Table};
-use crate::shape::{Autocorrelation, ClippedMoments};
-use crate::simulate::kinds::SetKind;
+use crate::shape::{AdaptiveMoments, Autocorrelation, ClippedMoments};
 use crate::simulate::render::RenderScratch;
 use crate::simulate::set::{STAMP, SetSimulator, SimulationSettings};
 
@@ -34,7 +36,7 @@ const BUDGET: Duration = Duration::from_millis(400);
 pub const SIZES: [usize; 8] = [11, 15, 19, 23, 29, 33, 39, 48];
 
 /// Microseconds a call: the fastest of several passes over `SAMPLE` galaxies, after a warm-up.
-fn time(mut call: impl FnMut(usize)) -> f64 {
+pub(super) fn time(mut call: impl FnMut(usize)) -> f64 {
     for k in 0..SAMPLE {
         call(k);
     }
@@ -51,16 +53,14 @@ fn time(mut call: impl FnMut(usize)) -> f64 {
 }
 
 /// Stamps of the fiducial set, and its PSF at a size.
-struct Inputs {
+pub(super) struct Inputs {
     set: SetSimulator,
     stamps: Vec<Vec<f32>>,
 }
 
 impl Inputs {
-    fn new(settings: SimulationSettings) -> Result<Self, PipelineError> {
-        let kind = SetKind::of(2).ok_or_else(|| PipelineError::Request("no set 2".into()))?;
-        let set = SetSimulator::new(kind, settings)
-            .map_err(|source| PipelineError::Scoring { set: 2, source })?;
+    pub(super) fn new(settings: SimulationSettings) -> Result<Self, PipelineError> {
+        let set = simulator(2, settings)?;
         let fields = set.image_fields(1);
         let mut scratch = RenderScratch::new();
         let n = set.grid().n;
@@ -74,8 +74,13 @@ impl Inputs {
         Ok(Inputs { set, stamps })
     }
 
-    fn psf(&self, size: usize) -> ndarray::Array2<f64> {
+    pub(super) fn psf(&self, size: usize) -> ndarray::Array2<f64> {
         functional_psf(self.set.image_fields(1).psf.at(0, 0), size)
+    }
+
+    /// The stamps, cut to n×n.
+    pub(super) fn cuts(&self, n: usize) -> Vec<Vec<f32>> {
+        self.stamps.iter().map(|stamp| centre(stamp, n)).collect()
     }
 }
 
@@ -127,9 +132,53 @@ pub fn stages(
             filter.apply(black_box(&mut stamp), 1.0, &mut filter_scratch);
         }),
     ));
-    let cut: Vec<Vec<f32>> = inputs.stamps.iter().map(|stamp| centre(stamp, n)).collect();
+    let cut = inputs.cuts(n);
+    let mut notes = vec![format!(
+        "One thread; fastest of several passes over {SAMPLE} galaxies."
+    )];
+    if submission.deconvolution.update == Update::Linear {
+        linear_stages(submission, psf.view(), &cut, &mut rows)?;
+    } else {
+        notes.extend(network_stages(submission, psf.view(), &cut, &mut rows)?);
+    }
+    let measurer = Measurer::new(submission, STAMP)?;
+    let mut measure_scratch = measurer.scratch();
+    measurer.set_psf(&mut measure_scratch, Some(psf.view()));
+    let whole = time(|k| {
+        black_box(measurer.measure(&inputs.stamps[k], STAMP, None, &mut measure_scratch));
+    });
+    rows.push(("whole measurement", whole));
+    Ok(Table {
+        title: format!("Stages of {}", submission.name),
+        headings: vec![
+            Heading::new("stage", "Stage"),
+            Heading::new("microseconds", "µs a galaxy"),
+            Heading::new("per_second", "galaxies a second"),
+        ],
+        rows: rows
+            .into_iter()
+            .map(|(stage, time)| {
+                vec![
+                    Cell::text(stage),
+                    Cell::number(time, 1),
+                    Cell::number(1e6 / time, 0),
+                ]
+            })
+            .collect(),
+        notes,
+    })
+}
+
+/// Stages of the network; returns notes.
+fn network_stages(
+    submission: &Submission,
+    psf: ArrayView2<'_, f64>,
+    cut: &[Vec<f32>],
+    rows: &mut Vec<(&'static str, f64)>,
+) -> Result<Vec<String>, PipelineError> {
+    let (n, p) = (submission.stamp.size, submission.psf.size);
     let mut network = Network::<f32>::plan(n, p, submission.deconvolution.lambda)?;
-    network.set_psf(psf.view())?;
+    network.set_psf(psf)?;
     let mut scratch = network.scratch();
     let mut out = vec![0.0; n * n];
     let rules: Vec<Option<Rule>> = cut
@@ -164,18 +213,12 @@ pub fn stages(
             let _ = black_box(moments.measure(black_box(&lags), light));
         }),
     ));
-    let measurer = Measurer::new(submission, STAMP)?;
-    let mut measure_scratch = measurer.scratch();
-    measurer.set_psf(&mut measure_scratch, Some(psf.view()));
-    let whole = time(|k| {
-        black_box(measurer.measure(&inputs.stamps[k], STAMP, None, &mut measure_scratch));
-    });
-    rows.push(("whole measurement", whole));
     let mut notes = vec![format!(
-        "One thread; fastest of several passes over {SAMPLE} galaxies. The network made {iterations} iterations of the last one."
+        "The network made {iterations} iterations of the last galaxy."
     )];
-    if n <= 32 && submission.deconvolution.update == Update::Adaptive {
-        let matrices = Matrices::new(n, psf.view(), submission.deconvolution.lambda);
+    // The reference's matrices take n⁴ numbers.
+    if n <= 32 && submission.deconvolution.update != Update::Constant {
+        let matrices = Matrices::new(n, psf, submission.deconvolution.lambda);
         let data: Vec<f64> = cut[0].iter().map(|&v| f64::from(v)).collect();
         if let (Some(rule), Ok(view)) = (&rules[0], ArrayView2::from_shape((n, n), &data)) {
             let start = Instant::now();
@@ -187,24 +230,129 @@ pub fn stages(
             ));
         }
     }
-    Ok(Table {
-        title: format!("Stages of {}", submission.name),
-        headings: vec![
-            Heading::new("stage", "Stage"),
-            Heading::new("microseconds", "µs a galaxy"),
-            Heading::new("per_second", "galaxies a second"),
-        ],
-        rows: rows
-            .into_iter()
-            .map(|(stage, time)| {
-                vec![
-                    Cell::text(stage),
-                    Cell::number(time, 1),
-                    Cell::number(1e6 / time, 0),
-                ]
+    Ok(notes)
+}
+
+/// Stages of the linear network.
+fn linear_stages(
+    submission: &Submission,
+    psf: ArrayView2<'_, f64>,
+    cut: &[Vec<f32>],
+    rows: &mut Vec<(&'static str, f64)>,
+) -> Result<(), PipelineError> {
+    let (n, p) = (submission.stamp.size, submission.psf.size);
+    let sigma = submission.shape.weight_sigma;
+    let reach = AdaptiveMoments::reach(sigma);
+    let spectral = Spectral::new(n, p, reach, &submission.deconvolution)?;
+    let (mut own, mut scratch) = (spectral.psf(), spectral.scratch());
+    let mut lags = spectral.lags();
+    rows.push((
+        "take a PSF",
+        time(|_| {
+            let _ = black_box(spectral.set_psf(psf, &mut scratch, &mut own));
+        }),
+    ));
+    for (name, response) in [
+        ("deconvolve and autocorrelate", false),
+        ("the same with response", true),
+    ] {
+        let cost = time(|k| {
+            spectral.autocorrelate(
+                &own,
+                black_box(&cut[k]),
+                1.0,
+                response,
+                &mut scratch,
+                &mut lags,
+            );
+        });
+        rows.push((name, cost));
+    }
+    let moments = AdaptiveMoments::new(sigma);
+    let mut values = moments.scratch();
+    rows.push((
+        "adaptive moments and response",
+        time(|_| {
+            if let Ok(shape) = black_box(moments.measure(black_box(&lags.acf), &mut values)) {
+                black_box(moments.response(&shape, &lags.shear1, &mut values));
+                black_box(moments.response(&shape, &lags.shear2, &mut values));
+            }
+        }),
+    ));
+    Ok(())
+}
+
+/// Cost of one application of H by direct sums, as the network does it, and by transforms, against
+/// the sizes of stamp and PSF.
+///
+/// # Errors
+/// Where a size cannot be worked with.
+pub fn operator_forms(settings: SimulationSettings) -> Result<Table, PipelineError> {
+    let inputs = Inputs::new(settings)?;
+    let mut rows = Vec::new();
+    for (n, p) in [
+        (19, 15),
+        (23, 15),
+        (29, 15),
+        (29, 21),
+        (48, 15),
+        (48, 25),
+        (48, 48),
+    ] {
+        let psf = inputs.psf(p);
+        let cut = inputs.cuts(n);
+        let mut network = Network::<f32>::plan(n, p, 0.0)?;
+        network.set_psf(psf.view())?;
+        let mut scratch = network.scratch();
+        let mut out = vec![0.0; n * n];
+        let mut of = |max_iterations: usize| {
+            let rule = Rule {
+                step: Step::Adaptive(1.0),
+                unit: 1e-6,
+                max_iterations,
+                start: Start::ClippedData,
+            };
+            time(|k| {
+                black_box(network.deconvolve(&rule, &cut[k], &mut scratch, &mut out));
             })
-            .collect(),
-        notes,
+        };
+        // An iteration applies H and its transpose.
+        let direct = (of(11) - of(1)) / 20.0;
+        let fft = StampFft::new(n + p - 1);
+        let (mut spectrum, mut buffers) = (fft.spectrum(), fft.scratch());
+        let kernel = spectrum.clone();
+        let transforms = time(|k| {
+            let rows = cut[k].chunks_exact(n).map(|row| row.iter().copied());
+            fft.rows(rows, &mut buffers, &mut spectrum);
+            fft.columns(&mut buffers, &mut spectrum);
+            for (value, factor) in spectrum.iter_mut().zip(&kernel) {
+                *value *= factor;
+            }
+            fft.columns_back(&mut buffers, &mut spectrum);
+            for y in 0..n {
+                black_box(fft.row_back(&spectrum, y, &mut buffers));
+            }
+        });
+        let rate = (n * n * p * p) as f64 / direct * 1e-3;
+        rows.push(vec![
+            Cell::number(n as f64, 0),
+            Cell::number(p as f64, 0),
+            Cell::number(direct, 2),
+            Cell::number(rate, 1),
+            Cell::number(transforms, 2),
+        ]);
+    }
+    Ok(Table {
+        title: "One application of the convolution H".into(),
+        headings: vec![
+            Heading::new("stamp", "Stamp [px]"),
+            Heading::new("psf", "PSF [px]"),
+            Heading::new("direct_microseconds", "direct [µs]"),
+            Heading::new("multiply_adds", "10⁹ multiply-adds/s"),
+            Heading::new("fft_microseconds", "by FFT [µs]"),
+        ],
+        rows,
+        notes: vec!["Direct sums count all p²n² products, of which the kernel skips those beyond the stamp. The FFT form has no room for the rest of an iteration.".into()],
     })
 }
 
@@ -216,42 +364,73 @@ fn centre(stamp: &[f32], n: usize) -> Vec<f32> {
         .collect()
 }
 
-/// Cost of a whole measurement against stamp size.
+/// Cost of a whole measurement against stamp size, in µs over [`SIZES`].
 ///
 /// # Errors
 /// Where the submission's sizes cannot be worked with.
-pub fn sizes(
+pub fn size_costs(
     submission: &Submission,
     settings: SimulationSettings,
-) -> Result<Table, PipelineError> {
+) -> Result<Vec<f64>, PipelineError> {
     let inputs = Inputs::new(settings)?;
     let psf = inputs.psf(submission.psf.size);
+    SIZES
+        .iter()
+        .map(|&n| {
+            let mut sized = submission.clone();
+            sized.stamp.size = n;
+            let measurer = Measurer::new(&sized, STAMP)?;
+            let mut scratch = measurer.scratch();
+            measurer.set_psf(&mut scratch, Some(psf.view()));
+            Ok(time(|k| {
+                black_box(measurer.measure(&inputs.stamps[k], STAMP, None, &mut scratch));
+            }))
+        })
+        .collect()
+}
+
+/// Costs against stamp size of several submissions as a table.
+pub fn sizes_table(costs: &[(&str, Vec<f64>)]) -> Table {
     let mut rows = Vec::new();
-    for n in SIZES {
-        let mut sized = submission.clone();
-        sized.stamp.size = n;
-        let measurer = Measurer::new(&sized, STAMP)?;
-        let mut scratch = measurer.scratch();
-        measurer.set_psf(&mut scratch, Some(psf.view()));
-        let cost = time(|k| {
-            black_box(measurer.measure(&inputs.stamps[k], STAMP, None, &mut scratch));
-        });
-        rows.push(vec![
-            Cell::number(n as f64, 0),
-            Cell::number(cost, 1),
-            Cell::number(cost * 1e3 / (n * n) as f64, 1),
-        ]);
+    for (name, costs) in costs {
+        for (n, cost) in SIZES.iter().zip(costs) {
+            rows.push(vec![
+                Cell::text(*name),
+                Cell::number(*n as f64, 0),
+                Cell::number(*cost, 1),
+                Cell::number(cost * 1e3 / (n * n) as f64, 1),
+            ]);
+        }
     }
-    Ok(Table {
-        title: format!("Cost of {} against stamp size", submission.name),
+    Table {
+        title: "Cost against stamp size".into(),
         headings: vec![
+            Heading::new("submission", "Submission"),
             Heading::new("stamp", "Stamp [px]"),
             Heading::new("microseconds", "µs a galaxy"),
             Heading::new("nanoseconds_per_pixel", "ns a pixel"),
         ],
         rows,
         notes: Vec::new(),
-    })
+    }
+}
+
+/// The same as a plot.
+pub fn sizes_figure(costs: &[(&str, Vec<f64>)]) -> LinePlot {
+    let sizes: Vec<f64> = SIZES.iter().map(|n| *n as f64).collect();
+    LinePlot {
+        title: "Cost against stamp size".into(),
+        x_label: "stamp [px]".into(),
+        y_label: "µs a galaxy".into(),
+        series: costs
+            .iter()
+            .enumerate()
+            .map(|(k, (name, costs))| {
+                Series::new(name, sizes.clone(), costs.clone(), Style::Line, k)
+            })
+            .collect(),
+        ..LinePlot::default()
+    }
 }
 
 /// Rate of simulating and measuring in memory against the number of threads.

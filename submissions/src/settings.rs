@@ -161,6 +161,8 @@ pub enum Update {
     Adaptive,
     /// A constant (Eq. 6).
     Constant,
+    /// The adaptive one with Nesterov's momentum: the same energy in fewer iterations.
+    Accelerated,
     /// The adaptive one without thresholds (Eq. 9) and clipping (Eq. 12), from zero and on a plane
     /// without boundary: all M iterations in closed form.
     Linear,
