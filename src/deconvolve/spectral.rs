@@ -29,8 +29,8 @@ use crate::fft::{FftScratch, StampFft};
 
 /// Pixels by which the deconvolved stamp may spread beyond the stamp before it wraps around.
 const SPREAD: usize = 8;
-/// Modes with w below this are left out: they are noise alone.
-const LEAST_WEIGHT: f64 = 1e-7;
+/// Modes with |p|² below this are left out: they are noise alone.
+const LEAST_POWER: f32 = 1e-7;
 
 /// The linear network for one stamp size.
 #[derive(Clone)]
@@ -38,10 +38,12 @@ pub struct Spectral {
     n: usize,
     p: usize,
     reach: usize,
-    step: f64,
+    step: f32,
     iterations: i32,
-    lambda: f64,
-    target: f64,
+    /// λ d² of each mode.
+    rough: Vec<f32>,
+    /// Γ of each mode.
+    target: Vec<f32>,
     fft: StampFft,
     /// k_x of each column and k_y of each place in it, in radians per pixel.
     k: Vec<f32>,
@@ -100,22 +102,33 @@ impl Spectral {
         }
         let fft = StampFft::new((n + reach + SPREAD).max(p).max(2 * reach + 1));
         let size = fft.size as i32;
-        let k = (0..size)
+        let k: Vec<f64> = (0..size)
             .map(|i| {
                 let signed = if 2 * i > size { i - size } else { i };
-                (std::f64::consts::TAU * f64::from(signed) / f64::from(size)) as f32
+                std::f64::consts::TAU * f64::from(signed) / f64::from(size)
             })
             .collect();
+        let modes = || {
+            let columns = k[..fft.half()].iter();
+            columns.flat_map(|&kx| k.iter().map(move |&ky| (kx, ky)))
+        };
         Ok(Spectral {
             n,
             p,
             reach,
-            step: settings.step,
+            step: settings.step as f32,
             iterations: i32::try_from(settings.max_iterations).unwrap_or(i32::MAX),
-            lambda: settings.lambda,
-            target: settings.target_sigma,
+            rough: modes()
+                .map(|(kx, ky)| (settings.lambda * high_pass(kx, ky).powi(2)) as f32)
+                .collect(),
+            target: modes()
+                .map(|(kx, ky)| {
+                    let exponent = settings.target_sigma.powi(2) * (kx * kx + ky * ky);
+                    (-0.5 * exponent).exp() as f32
+                })
+                .collect(),
+            k: k.iter().map(|&k| k as f32).collect(),
             fft,
-            k,
         })
     }
 
@@ -183,38 +196,41 @@ impl Spectral {
         let rows = rows.map(|row| row.into_iter().map(|&v| v as f32));
         self.transforms(rows, self.p, scratch);
         let size = self.fft.size;
-        let scale = 1.0 / (size * size) as f64;
+        let scale = 1.0 / (size * size) as f32;
         for at in 0..out.gain.len() {
             let (kx, ky) = (self.k[at / size], self.k[at % size]);
             let p = scratch.u[at];
-            let power = f64::from(p.norm_sqr());
-            let d = self.high_pass(kx, ky);
-            let w = power + self.lambda * d * d;
-            if w < LEAST_WEIGHT {
+            let power = p.norm_sqr();
+            let amplitude = self.amplitude(at, power);
+            if amplitude == 0.0 {
                 (out.gain[at], out.tilt1[at], out.tilt2[at]) = (0.0, 0.0, 0.0);
                 continue;
             }
-            let reached = 1.0 - (1.0 - self.step * w).powi(self.iterations);
-            let square = f64::from(kx * kx + ky * ky);
-            let gamma = (-0.5 * self.target * self.target * square).exp();
-            let amplitude = gamma * reached / w;
-            out.gain[at] = (amplitude * amplitude * power * scale) as f32;
+            out.gain[at] = amplitude * amplitude * power * scale;
             // Re(∂p/p) = Im(conj(p)·x̂)/|p|², for ∂p = −i·x̂.
-            let gx = (p.conj() * scratch.x[at]).im / p.norm_sqr();
-            let gy = (p.conj() * scratch.y[at]).im / p.norm_sqr();
+            let gx = (p.conj() * scratch.x[at]).im / power;
+            let gy = (p.conj() * scratch.y[at]).im / power;
             out.tilt1[at] = kx * gx - ky * gy;
             out.tilt2[at] = ky * gx + kx * gy;
         }
         Ok(())
     }
 
-    /// Transform of Sun's kernel, which is real.
-    fn high_pass(&self, kx: f32, ky: f32) -> f64 {
-        let (cx, cy) = (f64::from(kx).cos(), f64::from(ky).cos());
-        SUN_KERNEL[1][1]
-            + 2.0 * SUN_KERNEL[1][0] * cx
-            + 2.0 * SUN_KERNEL[0][1] * cy
-            + 4.0 * SUN_KERNEL[0][0] * cx * cy
+    /// Γ[1 − (1 − c w)^M]/w of a mode with |p|² = `power`; zero where the PSF leaves nothing.
+    fn amplitude(&self, at: usize, power: f32) -> f32 {
+        let w = power + self.rough[at];
+        // Without signal a mode is noise alone, whatever λ makes of it.
+        if power < LEAST_POWER {
+            return 0.0;
+        }
+        let left = f64::from(1.0 - self.step * w);
+        // A positive one below exp(−40) is nothing in single precision.
+        let left = if left > 0.0 && (1.0 - left) * f64::from(self.iterations) > 40.0 {
+            0.0
+        } else {
+            left.powi(self.iterations)
+        };
+        self.target[at] * (1.0 - left) as f32 / w
     }
 
     /// Transforms of an image of side `side`, and of it times x and y from its middle.
@@ -330,20 +346,176 @@ impl Spectral {
             let (kx, ky) = (self.k[at / size], self.k[at % size]);
             // The PSF's transform about its central pixel.
             let p = scratch.x[at] * Complex32::from_polar(1.0, centre * (kx + ky));
-            let d = self.high_pass(kx, ky);
-            let w = f64::from(p.norm_sqr()) + self.lambda * d * d;
-            let square = f64::from(kx * kx + ky * ky);
-            let gamma = (-0.5 * self.target * self.target * square).exp();
-            let factor = if w < LEAST_WEIGHT {
-                0.0
-            } else {
-                gamma * (1.0 - (1.0 - self.step * w).powi(self.iterations)) / w
-            };
-            *u *= p.conj() * (factor / (size * size) as f64) as f32;
+            *u *= p.conj() * (self.amplitude(at, p.norm_sqr()) / (size * size) as f32);
         }
         self.fft.columns_back(&mut scratch.fft, &mut scratch.u);
         (0..self.n)
             .flat_map(|y| self.fft.row_back(&scratch.u, y, &mut scratch.fft)[..self.n].to_vec())
             .collect()
+    }
+}
+
+/// Transform of Sun's kernel, which is real.
+fn high_pass(kx: f64, ky: f64) -> f64 {
+    let (cx, cy) = (kx.cos(), ky.cos());
+    SUN_KERNEL[1][1]
+        + 2.0 * SUN_KERNEL[1][0] * cx
+        + 2.0 * SUN_KERNEL[0][1] * cy
+        + 4.0 * SUN_KERNEL[0][0] * cx * cy
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array2;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use shearq_submissions::Registry;
+
+    use super::super::reference::convolve;
+    use super::*;
+    use crate::shape::autocorrelation_naive;
+
+    fn settings(iterations: usize, target: f64, lambda: f64) -> Deconvolution {
+        let registry = Registry::embedded().unwrap();
+        let named = registry.get("32/linear/star").unwrap().submission;
+        Deconvolution {
+            max_iterations: iterations,
+            target_sigma: target,
+            lambda,
+            ..named.deconvolution
+        }
+    }
+
+    /// A lopsided PSF of sum one.
+    fn psf(p: usize) -> Array2<f64> {
+        let centre = (p / 2) as f64;
+        let psf = Array2::from_shape_fn((p, p), |(y, x)| {
+            let (dy, dx) = (y as f64 - centre, x as f64 - centre);
+            (-(dx * dx + 0.7 * dy * dy + 0.5 * dx * dy) / 3.0).exp()
+        });
+        let sum = psf.sum();
+        psf / sum
+    }
+
+    /// An elliptical Gaussian galaxy under a shear, before the PSF, on a stamp large enough for all of
+    /// its light.
+    fn galaxy(n: usize, g1: f64, g2: f64) -> Array2<f64> {
+        let centre = (n as f64 - 1.0) / 2.0 + 0.2;
+        Array2::from_shape_fn((n, n), |(y, x)| {
+            let (y, x) = (y as f64 - centre, x as f64 - centre + 0.5);
+            // Position before the shear, whose matrix is (1 + γ₁, γ₂; γ₂, 1 − γ₁), of determinant
+            // one to first order.
+            let (u, v) = ((1.0 - g1) * x - g2 * y, (1.0 + g1) * y - g2 * x);
+            (-(u * u / 7.0 + v * v / 4.0 + 0.3 * u * v / 5.0)).exp()
+        })
+    }
+
+    fn single(image: &Array2<f64>) -> Vec<f32> {
+        image.iter().map(|&v| v as f32).collect()
+    }
+
+    #[test]
+    fn few_iterations_are_those_of_the_plain_linear_network() {
+        // Stamp and PSF so small against the plane that its missing boundary makes no difference.
+        let (n, p, reach) = (33, 7, 6);
+        let (h, u0) = (psf(p), galaxy(33, 0.0, 0.0));
+        let u0 = convolve(u0.view(), h.view());
+        let turned = h.slice(ndarray::s![..;-1, ..;-1]).to_owned();
+        let mut v = Array2::zeros((n, n));
+        for _ in 0..3 {
+            let residual = &u0 - &convolve(v.view(), h.view());
+            v += &convolve(residual.view(), turned.view());
+        }
+        let plan = Spectral::new(n, p, reach, &settings(3, 0.0, 0.0)).unwrap();
+        let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+        scratch.u.fill(Complex32::new(1e9, -1e9));
+        plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+        plan.autocorrelate(&own, &single(&u0), 0.0, false, &mut scratch, &mut lags);
+        let expected = autocorrelation_naive(&v);
+        let peak = expected[(0, n - 1)];
+        for dy in 0..=reach {
+            for dx in 0..=2 * reach {
+                let found = f64::from(lags.acf[dy * (2 * reach + 1) + dx]);
+                let expected = expected[(dy, dx + n - 1 - reach)];
+                // f32 transforms, and the modes below `LEAST_POWER` that are left out.
+                assert!((found - expected).abs() < 2e-5 * peak, "{dx} {dy}");
+            }
+        }
+        // The picture is the same stamp.
+        let picture = plan.deconvolved(h.view(), &single(&u0), &mut scratch);
+        let largest = v.iter().copied().fold(0.0, f64::max);
+        for (found, expected) in picture.iter().zip(&v) {
+            assert!((f64::from(*found) - expected).abs() < 2e-4 * largest);
+        }
+    }
+
+    #[test]
+    fn the_response_is_that_of_a_sheared_galaxy() {
+        let (n, p, reach) = (40, 11, 8);
+        let h = psf(p);
+        let plan = Spectral::new(n, p, reach, &settings(1000, 2.0, 0.0)).unwrap();
+        let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+        plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+        let mut lags_of = |g1: f64, g2: f64| {
+            let mut lags = plan.lags();
+            let stamp = convolve(galaxy(n, g1, g2).view(), h.view());
+            plan.autocorrelate(&own, &single(&stamp), 0.0, true, &mut scratch, &mut lags);
+            lags
+        };
+        let here = lags_of(0.0, 0.0);
+        let peak = here.acf[reach];
+        let step = 0.01;
+        for (derivative, plus, minus) in [
+            (&here.shear1, lags_of(step, 0.0), lags_of(-step, 0.0)),
+            (&here.shear2, lags_of(0.0, step), lags_of(0.0, -step)),
+        ] {
+            for (found, (a, b)) in derivative.iter().zip(plus.acf.iter().zip(&minus.acf)) {
+                let expected = (a - b) / (2.0 * step as f32);
+                // f32 rounding over the step (1e-5), second order in the step (1e-4 of the size).
+                assert!((found - expected).abs() < 1e-3 * peak, "{found} {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn noise_is_subtracted_in_the_mean() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let (n, p, reach) = (24, 9, 5);
+        let plan = Spectral::new(n, p, reach, &settings(1000, 2.0, 1e-4)).unwrap();
+        let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+        plan.set_psf(psf(p).view(), &mut scratch, &mut own).unwrap();
+        let mut with = vec![0.0f64; lags.acf.len()];
+        let mut without = with.clone();
+        // Uniform noise of variance 1/12 · 12 = 1.
+        let half = 3f32.sqrt();
+        let count = 400;
+        for _ in 0..count {
+            let noise: Vec<f32> = (0..n * n).map(|_| rng.random_range(-half..half)).collect();
+            for (level, sum) in [(1.0, &mut with), (0.0, &mut without)] {
+                plan.autocorrelate(&own, &noise, level, false, &mut scratch, &mut lags);
+                for (s, v) in sum.iter_mut().zip(&lags.acf) {
+                    *s += f64::from(*v) / f64::from(count);
+                }
+            }
+        }
+        // A few dozen independent modes in each of 400 stamps: 1 % of the noise's own.
+        let left = with.iter().map(|v| v.abs()).fold(0.0, f64::max);
+        assert!(left < 0.05 * without[reach], "{left} of {}", without[reach]);
+    }
+
+    #[test]
+    fn unusable_sizes_and_psfs_are_refused() {
+        let settings = settings(10, 1.0, 0.0);
+        assert!(Spectral::new(65, 15, 8, &settings).is_err());
+        assert!(Spectral::new(32, 49, 8, &settings).is_err());
+        let plan = Spectral::new(32, 7, 8, &settings).unwrap();
+        let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+        let mut bad = psf(7);
+        assert!(plan.set_psf(psf(9).view(), &mut scratch, &mut own).is_err());
+        bad[(2, 3)] = f64::NAN;
+        assert_eq!(
+            plan.set_psf(bad.view(), &mut scratch, &mut own),
+            Err(OperatorError::PsfNotFinite { x: 4, y: 3 })
+        );
     }
 }

@@ -181,23 +181,14 @@ fn draw_and_measure(
     job: &RowJob,
 ) -> MeasuredJob {
     let (pixels, observed) = simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render);
-    let mut row = StampRow {
-        id: ImageId {
-            set: set.kind().set,
-            image: job.fields.image,
-        },
-        iy: job.iy,
-        grid: set.grid(),
+    let rows = measure_strip(
+        set,
+        &job.fields,
+        job.iy,
         pixels,
-        stamp: STAMP,
-        header_noise: Some(NOISE_SIGMA),
-        psf: RowPsf::Functional(Vec::new()),
-    };
-    let mut rows = Vec::with_capacity(measurers.len());
-    for (measurer, own) in measurers.iter().zip(&mut scratch.measure) {
-        row.psf = row_psf(set, job, measurer.submission());
-        rows.push(measure_row(measurer, own, &row));
-    }
+        measurers,
+        &mut scratch.measure,
+    );
     MeasuredJob { observed, rows }
 }
 
@@ -222,11 +213,40 @@ pub fn simulated_steps(
     Some((psf, steps))
 }
 
+/// Measures a strip of simulated stamps by each measurer.
+pub(crate) fn measure_strip(
+    set: &SetSimulator,
+    fields: &ImageFields,
+    iy: usize,
+    pixels: Vec<f32>,
+    measurers: &[Measurer],
+    scratch: &mut [MeasureScratch],
+) -> Vec<MeasuredRow> {
+    let mut row = StampRow {
+        id: ImageId {
+            set: set.kind().set,
+            image: fields.image,
+        },
+        iy,
+        grid: set.grid(),
+        pixels,
+        stamp: STAMP,
+        header_noise: Some(NOISE_SIGMA),
+        psf: RowPsf::Functional(Vec::new()),
+    };
+    let mut measured = Vec::with_capacity(measurers.len());
+    for (measurer, own) in measurers.iter().zip(scratch) {
+        row.psf = row_psf(set, fields, iy, measurer.submission());
+        measured.push(measure_row(measurer, own, &row));
+    }
+    measured
+}
+
 /// The PSFs of a row in the form that a submission uses.
-fn row_psf(set: &SetSimulator, job: &RowJob, submission: &Submission) -> RowPsf {
+fn row_psf(set: &SetSimulator, fields: &ImageFields, iy: usize, submission: &Submission) -> RowPsf {
     let n = set.grid().n;
     let size = submission.psf.size;
-    match (&job.fields.psf, submission.psf.form) {
+    match (&fields.psf, submission.psf.form) {
         (PsfField::One(psf), PsfForm::Functional) => {
             RowPsf::Shared(Arc::new(functional_psf(psf, size)))
         }
@@ -239,10 +259,10 @@ fn row_psf(set: &SetSimulator, job: &RowJob, submission: &Submission) -> RowPsf 
             RowPsf::Shared(Arc::new(cut.unwrap_or_else(|| Array2::zeros((size, size)))))
         }
         (PsfField::PerGalaxy(_), PsfForm::Functional) => {
-            RowPsf::Functional((0..n).map(|ix| *job.fields.psf.at(ix, job.iy)).collect())
+            RowPsf::Functional((0..n).map(|ix| *fields.psf.at(ix, iy)).collect())
         }
         (PsfField::PerGalaxy(_), PsfForm::Star) => RowPsf::Stars {
-            pixels: simulate::draw_stars(set, &job.fields, job.iy),
+            pixels: simulate::draw_stars(set, fields, iy),
             side: simulate::STAR_STAMP,
         },
     }

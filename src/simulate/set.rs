@@ -274,11 +274,25 @@ impl SetSimulator {
         scratch: &mut RenderScratch,
         out: &mut [f32],
     ) -> Shear {
+        let shape = self.observed(fields, ix, iy);
+        self.draw_as(fields, (ix, iy), shape, scratch, out);
+        shape
+    }
+
+    /// Draws galaxy `(ix, iy)` like [`SetSimulator::draw`], with all of its random numbers the same,
+    /// but of ellipticity `shape`.
+    pub fn draw_as(
+        &self,
+        fields: &ImageFields,
+        (ix, iy): (usize, usize),
+        shape: Shear,
+        scratch: &mut RenderScratch,
+        out: &mut [f32],
+    ) {
         let mut rng = self
             .settings
             .stream(self.kind.set, fields.image, Purpose::Galaxy);
         rng.set_stream((iy * self.grid.n + ix) as u64);
-        let shape = self.observed(fields, ix, iy);
         let centre = (STAMP as f64 - 1.0) / 2.0;
         let x = centre + rng.random_range(-0.5..0.5);
         let y = centre + rng.random_range(-0.5..0.5);
@@ -295,7 +309,6 @@ impl SetSimulator {
             let noise: f32 = StandardNormal.sample(&mut rng);
             *value = *value * scale + noise * NOISE_SIGMA as f32;
         }
-        shape
     }
 
     /// Ellipticity of galaxy `(ix, iy)` after lensing.

@@ -1,5 +1,6 @@
 //! Studies: the paper's Sect. 4 (calibration of λ) and Sect. 5 (seven submissions on 24 sets).
 
+pub mod bias;
 pub mod calibration;
 pub mod convergence;
 pub mod exhibits;
