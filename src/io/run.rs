@@ -243,3 +243,29 @@ fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut 
         _ => {}
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn leftovers_are_removed_by_whoever_is_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("record.json");
+        let left = folder
+            .path()
+            .join("set01/.catalogue-001.fits.0123456789abcdef.part");
+        std::fs::create_dir(folder.path().join("set01")).unwrap();
+        std::fs::write(&left, "half").unwrap();
+        let first = claim(&path, &1).unwrap();
+        assert!(!left.exists());
+        std::fs::write(&left, "being written").unwrap();
+        let second = claim(&path, &1).unwrap();
+        assert!(left.exists());
+        drop((first, second));
+        let _third = claim(&path, &1).unwrap();
+        assert!(!left.exists());
+        let message = claim(&path, &2).unwrap_err().to_string();
+        assert!(message.contains(": 1 ≠ 2"), "{message}");
+    }
+}
