@@ -9,6 +9,9 @@ use crate::io::run::Run;
 use crate::submit::manifest::Contents;
 use crate::submit::pack::Packing;
 
+/// Longest name of a method, in bytes: a tar header has 100 for the file names made with it.
+const MAX_METHOD: usize = 64;
+
 /// Write measured catalogues as the files that the challenge takes, with a manifest.
 ///
 /// Either one ASCII catalogue per image (`g10_v1_objs_{set}_{image}.{method}.dat`), or one power
@@ -43,11 +46,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .clone()
         .unwrap_or_else(|| run.submission.name.replace('/', "-"));
     anyhow::ensure!(
-        !method.is_empty()
+        (1..=MAX_METHOD).contains(&method.len())
             && !method.starts_with('.')
             && !method
                 .contains(|c: char| "/\\:".contains(c) || c.is_whitespace() || c.is_control()),
-        "the method's name is `{method}`; expected one without `/`, `\\`, `:`, blanks and a first `.`"
+        "the method's name is `{method}`; expected 1 to {MAX_METHOD} bytes without `/`, `\\`, `:`, blanks and a first `.`"
     );
     let packing = Packing {
         measured,

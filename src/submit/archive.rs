@@ -14,9 +14,8 @@ use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
 use crate::io::FileError;
 use crate::io::atomic::{PartFile, PartFolder};
 
-/// Largest manifest accepted, in bytes: that of a submission with every image of every set has a
-/// hundredth.
-const MAX_MANIFEST: u64 = 1 << 30;
+/// Largest manifest accepted, in bytes: some four times that of 999 images of 99 sets.
+const MAX_MANIFEST: u64 = 1 << 26;
 
 /// Whether a path's ending is that of an archive.
 pub fn is_archive(path: &Path) -> bool {
@@ -147,7 +146,8 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
         manifest: None,
         files: BTreeMap::new(),
     };
-    for entry in archive.entries().map_err(cannot_read())? {
+    // Raw: extensions of tar, such as names of any length, are entries that are not plain files.
+    for entry in archive.entries().map_err(cannot_read())?.raw(true) {
         let mut entry = entry.map_err(cannot_read())?;
         let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
         if !entry.header().entry_type().is_file() || !is_plain_name(&name) {

@@ -1,7 +1,6 @@
 //! Packed submissions: the same bytes each time, verified by their manifest, unpacked whole or not at all.
 
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use flate2::Compression;
@@ -179,14 +178,19 @@ fn archives_that_are_not_what_was_packed_are_refused_and_leave_nothing() {
     builder
         .append_link(&mut header, "link.dat", "/tmp")
         .unwrap();
-    builder
-        .into_inner()
-        .unwrap()
-        .finish()
-        .unwrap()
-        .flush()
-        .unwrap();
+    builder.into_inner().unwrap().finish().unwrap();
     refused("expected plain files without folders");
+    // An extension of tar, whose content a reader would have to keep in memory.
+    let long = "long/".repeat(50);
+    let mut builder = tar::Builder::new(GzEncoder::new(
+        fs::File::create(&path).unwrap(),
+        Compression::fast(),
+    ));
+    let mut header = tar::Header::new_gnu();
+    header.set_size(0);
+    builder.append_data(&mut header, &long, &b""[..]).unwrap();
+    builder.into_inner().unwrap().finish().unwrap();
+    refused("`././@LongLink`; expected plain files");
     // Without a manifest there is nothing to verify by.
     let bare: Vec<(&str, &[u8])> = files
         .into_iter()
