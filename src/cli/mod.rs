@@ -28,6 +28,7 @@ use clap::{Parser, Subcommand};
 /// Start with `shearq quickstart`. The chain in steps: `simulate` writes GREAT10-like sets (or bring
 /// your own), `measure` turns images into catalogues by a named submission, `score` turns catalogues
 /// into Q, M/2 and √A, `compare` puts variants side by side, `pack` and `check` prepare what is sent.
+/// `run` measures and scores in one go; `merge` completes what parts of it on a cluster left.
 #[derive(Debug, Parser)]
 #[command(name = "shearq", version, propagate_version = true)]
 struct Cli {
