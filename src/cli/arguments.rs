@@ -7,6 +7,7 @@ use clap::{Args, ValueEnum};
 use shearq_scoring::{Choice, Convention, Definition};
 
 use crate::io::layout::MAX_SET;
+use crate::pipeline::images::{ImageId, Shard};
 use crate::report::table::{Table, TableFormat};
 use crate::simulate::field::ShearSpectrum;
 use crate::simulate::kinds::SETS;
@@ -115,6 +116,22 @@ impl SimulationArguments {
             spectrum: ShearSpectrum { amplitude, tilt },
             ..SimulationSettings::new(seed, usize::from(grid))
         })
+    }
+}
+
+/// Which part of the work to do.
+#[derive(Debug, Clone, Args)]
+pub(super) struct Sharding {
+    /// Do only the K-th of N parts of equal numbers of images, as one of N processes that may write to
+    /// the same folder at the same time; `merge` then checks that all is there (docs/clusters.md).
+    #[arg(long, value_name = "K/N")]
+    pub(super) shard: Option<Shard>,
+}
+
+impl Sharding {
+    /// The images to work on, out of all.
+    pub(super) fn part(&self, all: &[ImageId]) -> Vec<ImageId> {
+        self.shard.unwrap_or(Shard::WHOLE).part(all)
     }
 }
 

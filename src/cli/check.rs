@@ -7,15 +7,16 @@ use clap::Args;
 use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
 
-use super::print;
+use super::{Findings, print};
 use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, MAX_SET, read_truth_rows};
 use crate::pipeline::score::grid_side;
 use crate::submit::check::{Expected, Severity, check};
 
 /// Validate a submission before it is sent: one line per finding.
 ///
-/// PATH is a catalogue, a power-spectrum file, or a folder of either, in the challenge's formats
-/// (catalogues may also be CSV, FITS or Parquet with columns x, y, e1, e2). Checked: readability,
+/// PATH is a catalogue, a power-spectrum file, or a folder or archive (.tar.gz) of either, in the
+/// challenge's formats (catalogues may also be CSV, FITS or Parquet with columns x, y, e1, e2). Checked:
+/// the manifest's checksums, if there is one; readability,
 /// names, completeness against the grid, duplicates, rows outside or in excess, positions off the
 /// cells' centres, NaN, |e| > 1, constant values, missing images, bins, multipoles; and, with --data,
 /// sign and axis conventions, type of ellipticity and unit of power against the true shear.
@@ -23,7 +24,7 @@ use crate::submit::check::{Expected, Severity, check};
 /// Exit code 0: no errors (perhaps warnings); 1: errors were found.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// File or folder.
+    /// File, folder or archive.
     path: PathBuf,
     /// Data folder whose true shear to check against.
     #[arg(long, value_name = "DIR")]
@@ -101,15 +102,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 finding.message
             ))?;
         }
-        if findings.is_empty() {
-            print(&format!("{}: no findings\n", path.display()))?;
-        }
+        let summary = match findings.len() {
+            0 => "no findings".to_owned(),
+            all => format!("{errors} errors and {} warnings found", all - errors),
+        };
+        print(&format!("{}: {summary}\n", path.display()))?;
     }
-    anyhow::ensure!(
-        errors == 0,
-        "{}: {errors} errors and {} warnings found",
-        path.display(),
-        findings.len() - errors
-    );
+    if errors > 0 {
+        return Err(Findings.into());
+    }
     Ok(())
 }

@@ -6,11 +6,12 @@ use std::time::Duration;
 use clap::Args;
 use shearq_submissions::Registry;
 
-use super::arguments::{SetList, Threads};
+use super::arguments::{SetList, Sharding, Threads};
 use super::progress::Bar;
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
+use crate::pipeline::images::{self, ImageId};
 use crate::pipeline::measure::{Summary, galaxies_to_do, measure_folder};
 
 /// Measure the galaxies of a data folder by a submission: one catalogue per image.
@@ -36,6 +37,8 @@ pub(super) struct Arguments {
     #[arg(long, value_enum)]
     catalogue_format: Option<Format>,
     #[command(flatten)]
+    sharding: Sharding,
+    #[command(flatten)]
     threads: Threads,
 }
 
@@ -46,6 +49,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         out,
         sets,
         catalogue_format,
+        sharding,
         threads,
     } = arguments;
     let submission = Registry::embedded()?.get(submission)?.submission;
@@ -60,7 +64,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         },
         &data,
         out,
-        sets,
+        &sharding.part(&images::of_folder(&data, sets)?),
         threads.number(),
     )
 }
@@ -70,12 +74,12 @@ pub(super) fn measure(
     run: &Run,
     data: &DataFolder,
     out: &Path,
-    sets: &[u32],
+    images: &[ImageId],
     threads: usize,
 ) -> anyhow::Result<()> {
-    let mut bar = Bar::new("measuring", galaxies_to_do(run, data, out, sets)?);
+    let mut bar = Bar::new("measuring", galaxies_to_do(run, data, out, images)?);
     let start = std::time::Instant::now();
-    let summary = measure_folder(run, data, out, sets, threads, &mut bar)?;
+    let summary = measure_folder(run, data, out, images, threads, &mut bar)?;
     drop(bar);
     report(run, &summary, start.elapsed(), threads, out);
     Ok(())

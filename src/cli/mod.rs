@@ -6,6 +6,7 @@ mod calibrate;
 mod check;
 mod compare;
 mod measure;
+mod merge;
 mod pack;
 mod progress;
 mod quickstart;
@@ -15,6 +16,7 @@ mod score;
 mod show;
 mod simulate;
 mod submissions;
+mod unpack;
 
 use std::process::ExitCode;
 
@@ -26,6 +28,7 @@ use clap::{Parser, Subcommand};
 /// Start with `shearq quickstart`. The chain in steps: `simulate` writes GREAT10-like sets (or bring
 /// your own), `measure` turns images into catalogues by a named submission, `score` turns catalogues
 /// into Q, M/2 and √A, `compare` puts variants side by side, `pack` and `check` prepare what is sent.
+/// `run` measures and scores in one go; `merge` completes what parts of it on a cluster left.
 #[derive(Debug, Parser)]
 #[command(name = "shearq", version, propagate_version = true)]
 struct Cli {
@@ -39,10 +42,12 @@ enum Command {
     Simulate(simulate::Arguments),
     Measure(measure::Arguments),
     Run(run::Arguments),
+    Merge(merge::Arguments),
     Score(score::Arguments),
     Compare(compare::Arguments),
     Check(check::Arguments),
     Pack(pack::Arguments),
+    Unpack(unpack::Arguments),
     Show(show::Arguments),
     Calibrate(calibrate::Arguments),
     Reproduce(reproduce::Arguments),
@@ -57,10 +62,12 @@ pub fn main() -> ExitCode {
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Measure(arguments) => measure::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
+        Command::Merge(arguments) => merge::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Pack(arguments) => pack::run(&arguments),
+        Command::Unpack(arguments) => unpack::run(&arguments),
         Command::Show(arguments) => show::run(&arguments),
         Command::Calibrate(arguments) => calibrate::run(&arguments),
         Command::Reproduce(arguments) => reproduce::run(&arguments),
@@ -69,12 +76,18 @@ pub fn main() -> ExitCode {
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
+        Err(error) if error.is::<Findings>() => ExitCode::FAILURE,
         Err(error) => {
             eprintln!("error: {error:#}");
             ExitCode::FAILURE
         }
     }
 }
+
+/// Failure of a command whose printed results say already what was found.
+#[derive(Debug, thiserror::Error)]
+#[error("there are findings")]
+struct Findings;
 
 /// Prints results to standard output; a reader that has gone away (`| head`) is no error.
 fn print(text: &str) -> anyhow::Result<()> {

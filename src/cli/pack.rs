@@ -2,43 +2,36 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, ValueEnum};
-use shearq_scoring::Grid;
-use shearq_scoring::units::{Degrees, Pixels};
+use clap::Args;
 
-use crate::io::layout::MAX_SET;
+use super::progress::Bar;
 use crate::io::run::Run;
-use crate::io::table;
-use crate::pipeline::score::grid_side;
-use crate::submit::challenge::{Kind, write_catalogue, write_spectrum};
+use crate::submit::manifest::Contents;
+use crate::submit::pack::Packing;
 
-/// Write measured catalogues as the files that the challenge takes.
+/// Longest name of a method, in bytes: a tar header has 100 for the file names made with it.
+const MAX_METHOD: usize = 64;
+
+/// Write measured catalogues as the files that the challenge takes, with a manifest.
 ///
 /// Either one ASCII catalogue per image (`g10_v1_objs_{set}_{image}.{method}.dat`), or one power
-/// spectrum per set (`{method}_set{set}.dat`). `shearq check` validates the result.
+/// spectrum per set (`{method}_set{set}.dat`). manifest.json lists them with their SHA-256 checksums
+/// and says what made them. The same catalogues give the same bytes, archives included. `shearq check`
+/// validates the result, `shearq unpack` unpacks an archive.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Folder that `measure` wrote.
+    /// Folder that `measure` or `run` wrote.
     #[arg(long, value_name = "DIR")]
     measured: PathBuf,
-    /// Folder to write to.
-    #[arg(long, value_name = "DIR")]
+    /// New folder to write to, or an archive ending in .tar.gz.
+    #[arg(long, value_name = "PATH")]
     out: PathBuf,
     /// Method's name in file names [default: the submission's, with `-` for `/`].
     #[arg(long, value_name = "NAME")]
     method: Option<String>,
     /// Which kind of submission.
     #[arg(long, value_enum, default_value_t)]
-    kind: KindArgument,
-}
-
-#[derive(Debug, Clone, Copy, Default, ValueEnum)]
-enum KindArgument {
-    /// Ellipticity catalogues.
-    #[default]
-    Catalogues,
-    /// Shear power spectra.
-    Spectra,
+    kind: Contents,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -49,56 +42,28 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         kind,
     } = arguments;
     let run = Run::require(measured)?;
-    let layout = run.source.layout();
     let method = method
         .clone()
         .unwrap_or_else(|| run.submission.name.replace('/', "-"));
     anyhow::ensure!(
-        !method.is_empty()
-            && !method.contains(|c: char| "/\\".contains(c) || c.is_whitespace() || c.is_control()),
-        "the method's name is `{method}`; expected one without `/`, `\\` and blanks"
+        (1..=MAX_METHOD).contains(&method.len())
+            && !method.starts_with('.')
+            && !method
+                .contains(|c: char| "/\\:".contains(c) || c.is_whitespace() || c.is_control()),
+        "the method's name is `{method}`; expected 1 to {MAX_METHOD} bytes without `/`, `\\`, `:`, blanks and a first `.`"
     );
-    let mut files = 0;
-    for set in 1..=MAX_SET {
-        let catalogues = run.catalogues(measured, set);
-        if catalogues.is_empty() {
-            continue;
-        }
-        match kind {
-            KindArgument::Catalogues => {
-                for (image, path) in catalogues {
-                    let kind = Kind::Catalogue {
-                        set,
-                        image,
-                        method: method.clone(),
-                    };
-                    write_catalogue(&path, &out.join(kind.file_name()))?;
-                    files += 1;
-                }
-            }
-            KindArgument::Spectra => {
-                // A catalogue has a row for every cell, measured or not.
-                let cells = table::read(&catalogues[0].1, Some(&["x"]))?.rows();
-                let grid = Grid::new(
-                    grid_side(&catalogues[0].1, cells)?,
-                    Pixels(layout.stamp as f64),
-                    Degrees(layout.field_degrees),
-                )?;
-                let paths: Vec<PathBuf> = catalogues.into_iter().map(|(_, path)| path).collect();
-                let kind = Kind::Spectrum {
-                    set,
-                    method: method.clone(),
-                };
-                write_spectrum(&grid, &paths, &out.join(kind.file_name()))?;
-                files += 1;
-            }
-        }
-    }
-    anyhow::ensure!(
-        files > 0,
-        "{}: there is no catalogue here to pack",
-        measured.display()
+    let packing = Packing {
+        measured,
+        run: &run,
+        method,
+        contents: *kind,
+    };
+    let mut bar = Bar::new("packing", packing.galaxies()?);
+    let files = packing.write(out, &mut bar)?;
+    drop(bar);
+    eprintln!(
+        "{files} files and their manifest written to {}",
+        out.display()
     );
-    eprintln!("{files} files written to {}", out.display());
     Ok(())
 }

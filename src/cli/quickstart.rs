@@ -12,6 +12,7 @@ use super::{compare, measure, print};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
+use crate::pipeline::images;
 use crate::pipeline::score::score_folder;
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
 use crate::report::scores::per_set;
@@ -49,7 +50,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     };
     let galaxies = (SETS.len() * IMAGES as usize * GRID * GRID) as u64;
     let mut bar = Bar::new("simulating", galaxies);
-    simulate_folder(&record, &SETS, IMAGES, &data, threads, &mut bar)?;
+    let images = images::of_simulation(&SETS, IMAGES);
+    simulate_folder(&record, &images, &data, threads, &mut bar)?;
     drop(bar);
     eprintln!(
         "simulated sets {SETS:?}, {IMAGES} images of {GRID} × {GRID} galaxies each, in {}",
@@ -66,7 +68,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             submission: registry.get(name)?.submission,
             format: Format::default(),
         };
-        measure::measure(&run, &data, &folder, &[], threads)?;
+        measure::measure(&run, &data, &folder, &images, threads)?;
         let scored = score_folder(&data, &folder, &run, &[], options, threads)?;
         let title = format!("Scores of {name} (simulated data)");
         let table = per_set(&scored, &title, options.definition, options.choice);

@@ -1,18 +1,19 @@
 //! `shearq run`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
-use super::arguments::{SetList, SimulationArguments, Threads};
+use super::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use super::progress::Bar;
 use super::{measure, print};
 use crate::io::atomic;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
+use crate::pipeline::images;
 use crate::pipeline::run::run_folder;
 use crate::pipeline::score::score_folder;
 use crate::report::scores::{bandpowers, per_set};
@@ -24,7 +25,7 @@ use crate::report::table::TableFormat;
 /// challenge (`--sets all --images 200`, 48 million galaxies) needs the room of its catalogues alone.
 /// They are those that `simulate` and `measure` would make of the same settings. Scores and
 /// bandpowers are printed and kept beside the catalogues as scores.csv and bandpowers.csv. A stopped
-/// run goes on where it was, image by image.
+/// run goes on where it was, image by image. With --shard nothing is scored until `merge`.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Name of a submission (see `shearq submissions list`) or a TOML file of your own.
@@ -51,6 +52,8 @@ pub(super) struct Arguments {
     #[arg(long, value_enum)]
     catalogue_format: Option<Format>,
     #[command(flatten)]
+    sharding: Sharding,
+    #[command(flatten)]
     threads: Threads,
 }
 
@@ -64,6 +67,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         simulation,
         out,
         catalogue_format,
+        sharding,
         threads,
     } = arguments;
     let threads = threads.number();
@@ -80,20 +84,36 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     };
     match (&run.source, &data) {
         (Source::Simulated(settings), _) => {
-            let images = images.unwrap_or(1);
-            let galaxies = sets.len() as u64 * u64::from(images) * (settings.grid as u64).pow(2);
+            let images = sharding.part(&images::of_simulation(sets, images.unwrap_or(1)));
+            let galaxies = images.len() as u64 * (settings.grid as u64).pow(2);
             let mut bar = Bar::new("simulating and measuring", galaxies);
             let start = std::time::Instant::now();
-            let summary = run_folder(&run, *settings, sets, images, out, threads, &mut bar)?;
+            let summary = run_folder(&run, *settings, &images, out, threads, &mut bar)?;
             drop(bar);
             measure::report(&run, &summary, start.elapsed(), threads, out);
         }
-        (Source::Folder { .. }, Some(data)) => measure::measure(&run, data, out, sets, threads)?,
+        (Source::Folder { .. }, Some(data)) => {
+            let images = sharding.part(&images::of_folder(data, sets)?);
+            measure::measure(&run, data, out, &images, threads)?;
+        }
         (Source::Folder { .. }, None) => {}
     }
+    if let Some(shard) = sharding.shard {
+        eprintln!(
+            "shard {shard} is done; `shearq merge {}` scores when all are",
+            out.display()
+        );
+        return Ok(());
+    }
+    score(&run, out, sets, threads)
+}
+
+/// Scores a folder of catalogues (those of `sets`, or all), prints the scores and keeps them and the
+/// bandpowers beside the catalogues.
+pub(super) fn score(run: &Run, out: &Path, sets: &[u32], threads: usize) -> anyhow::Result<()> {
     let options = Options::default();
     let truth = run.source.data(out)?;
-    let scored = score_folder(&truth, out, &run, sets, options, threads)?;
+    let scored = score_folder(&truth, out, run, sets, options, threads)?;
     let title = format!("Scores of {}", run.submission.name);
     let table = per_set(&scored, &title, options.definition, options.choice);
     for (name, table) in [("scores", &table), ("bandpowers", &bandpowers(&scored))] {

@@ -9,7 +9,8 @@ use shearq_submissions::Registry;
 
 use crate::io::layout::DataFolder;
 use crate::pipeline::galaxy::{Measurement, Measurer};
-use crate::pipeline::measure::{ImageId, ImageSource, psf_of};
+use crate::pipeline::images::ImageId;
+use crate::pipeline::measure::{ImageSource, psf_of};
 use crate::report::figure::{Figure, Format};
 use crate::report::steps::{steps_figure, steps_row};
 

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::{SetList, SimulationArguments, Threads};
+use super::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use super::progress::Bar;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
+use crate::pipeline::images;
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
 
 /// Write simulated GREAT10-like sets: images, PSFs, true shear, intrinsic shapes.
@@ -27,6 +28,8 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     #[command(flatten)]
+    sharding: Sharding,
+    #[command(flatten)]
     threads: Threads,
 }
 
@@ -36,17 +39,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         images,
         simulation,
         out,
+        sharding,
         threads,
     } = arguments;
     let record = SimulationRecord {
         version: crate::VERSION.into(),
         settings: simulation.settings()?,
     };
-    let galaxies = sets.0.len() as u64 * u64::from(*images) * (record.settings.grid as u64).pow(2);
+    let images = sharding.part(&images::of_simulation(&sets.0, *images));
+    let galaxies = images.len() as u64 * (record.settings.grid as u64).pow(2);
     let mut bar = Bar::new("simulating", galaxies);
     let data = DataFolder::new(out);
-    let (made, already) =
-        simulate_folder(&record, &sets.0, *images, &data, threads.number(), &mut bar)?;
+    let (made, already) = simulate_folder(&record, &images, &data, threads.number(), &mut bar)?;
     drop(bar);
     eprintln!(
         "{made} images simulated, {already} there already, in {}",

@@ -26,6 +26,11 @@ pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileEr
     Table::new(columns).map_err(|message| FileError::new(path, message))
 }
 
+/// The metadata in the footer.
+pub(super) fn metadata(path: &Path) -> Result<BTreeMap<String, String>, FileError> {
+    tables::parquet_metadata(path).map_err(|error| bare(path, &error))
+}
+
 /// Writes the table with its metadata in the footer.
 pub(super) fn write(
     path: &Path,

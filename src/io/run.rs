@@ -1,7 +1,9 @@
 //! What made a folder of results: `run.json`, written before the first result.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use shearq_submissions::Submission;
 
@@ -86,15 +88,7 @@ impl Run {
     /// # Errors
     /// Where it exists and cannot be read.
     pub fn read(folder: &Path) -> Result<Option<Self>, FileError> {
-        let path = folder.join(RUN_FILE);
-        let text = match std::fs::read_to_string(&path) {
-            Ok(text) => text,
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            Err(error) => return Err(FileError::new(&path, error)),
-        };
-        serde_json::from_str(&text)
-            .map(Some)
-            .map_err(|error| FileError::new(&path, format!("not a record of a run: {error}")))
+        read_record(&folder.join(RUN_FILE))
     }
 
     /// Reads the record of a folder that must be one of catalogues.
@@ -129,47 +123,90 @@ impl Run {
     }
 }
 
+/// Reads any record; `None` where there is none.
+///
+/// # Errors
+/// Where it exists and cannot be read.
+pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileError> {
+    let text = match std::fs::read_to_string(path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(FileError::new(path, error)),
+    };
+    serde_json::from_str(&text)
+        .map(Some)
+        .map_err(|error| FileError::new(path, format!("not a record of this kind: {error}")))
+}
+
 /// Writes any record as indented JSON.
 ///
 /// # Errors
 /// Where it cannot be written.
 pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileError> {
+    atomic::write(path, record_text(path, record)?.as_bytes())
+}
+
+/// Any record as indented JSON, for a file at `path`.
+///
+/// # Errors
+/// Where it cannot be written as JSON.
+pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileError> {
     let mut text = serde_json::to_string_pretty(record)
         .map_err(FileError::doing(path, "cannot write the record"))?;
     text.push('\n');
-    atomic::write(path, text.as_bytes())
+    Ok(text)
+}
+
+/// A folder of results that this process writes to, alone or with others of the same settings, until
+/// it drops this.
+#[derive(Debug)]
+#[must_use]
+pub struct Claim {
+    /// The record, with a shared lock on it.
+    _record: File,
 }
 
 /// Makes the folder of `path` that of `record`: writes it where there is none, and refuses a folder
-/// with a different one, showing the differences.
+/// with a different one, showing the differences. What killed processes left there is removed if no
+/// other process is at work.
 ///
 /// # Errors
 /// Where the folder belongs to other settings, or the record cannot be read or written.
-pub fn claim<R: Serialize + serde::de::DeserializeOwned>(
-    path: &Path,
-    record: &R,
-) -> Result<(), FileError> {
-    let text = match std::fs::read_to_string(path) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-            return write_record(path, record);
-        }
-        Err(error) => return Err(FileError::new(path, error)),
-        Ok(text) => text,
-    };
-    let earlier: R = serde_json::from_str(&text)
-        .map_err(|error| FileError::new(path, format!("not a record of this kind: {error}")))?;
-    let differences = differences(&earlier, record)
-        .map_err(|error| FileError::new(path, format!("cannot compare records: {error}")))?;
-    if differences.is_empty() {
-        return Ok(());
+pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result<Claim, FileError> {
+    let mut earlier: Option<R> = read_record(path)?;
+    if earlier.is_none() {
+        // Another process may be first; then its record is compared like any earlier one.
+        atomic::write_if_absent(path, record_text(path, record)?.as_bytes())?;
+        earlier = read_record(path)?;
     }
-    Err(FileError::new(
-        path.parent().unwrap_or(path),
-        format!(
-            "this folder holds results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
-            differences.join("\n  ")
-        ),
-    ))
+    let differences = differences(&earlier, &Some(record))
+        .map_err(|error| FileError::new(path, format!("cannot compare records: {error}")))?;
+    let folder = path.parent().unwrap_or(path);
+    if !differences.is_empty() {
+        return Err(FileError::new(
+            folder,
+            format!(
+                "this folder holds results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
+                differences.join("\n  ")
+            ),
+        ));
+    }
+    let file = open_to_lock(path).map_err(FileError::doing(path, "cannot open the record"))?;
+    // Whoever has the file for itself is the only process at work here.
+    if file.try_lock().is_ok() {
+        atomic::remove_leftovers(folder)?;
+    }
+    // Turns the lock into one that others may hold, too. File systems without locks have none to
+    // wait for: there leftovers stay, and do no harm.
+    let _ = file.unlock();
+    let _ = file.lock_shared();
+    Ok(Claim { _record: file })
+}
+
+/// Opens a record so that it can be locked: over NFS an exclusive lock needs the right to write.
+fn open_to_lock(path: &Path) -> std::io::Result<File> {
+    let writable = File::options().read(true).write(true).open(path);
+    writable.or_else(|_| File::open(path))
 }
 
 /// Lines in which two records differ, as `key: first ≠ second`.
@@ -204,5 +241,31 @@ fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut 
         }
         _ if a != b => found.push(format!("{key}: {a} ≠ {b}")),
         _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn leftovers_are_removed_by_whoever_is_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("record.json");
+        let left = folder
+            .path()
+            .join("set01/.catalogue-001.fits.0123456789abcdef.part");
+        std::fs::create_dir(folder.path().join("set01")).unwrap();
+        std::fs::write(&left, "half").unwrap();
+        let first = claim(&path, &1).unwrap();
+        assert!(!left.exists());
+        std::fs::write(&left, "being written").unwrap();
+        let second = claim(&path, &1).unwrap();
+        assert!(left.exists());
+        drop((first, second));
+        let _third = claim(&path, &1).unwrap();
+        assert!(!left.exists());
+        let message = claim(&path, &2).unwrap_err().to_string();
+        assert!(message.contains(": 1 ≠ 2"), "{message}");
     }
 }

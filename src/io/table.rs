@@ -186,8 +186,37 @@ pub fn read_text(path: &Path, names: &[&str]) -> Result<Table, FileError> {
     text::read_named(path, Some(names), names)
 }
 
-/// Writes `table` as `format`, with the key–value pairs that say what made it. FITS keeps of them
-/// those with keys of at most eight characters and values of at most 68.
+/// What is left of `metadata` in a table written as `format`: all in Parquet; in FITS what fits into a
+/// header, which is keys of at most eight characters with values of at most 68.
+pub fn kept(metadata: &BTreeMap<String, String>, format: Format) -> BTreeMap<String, String> {
+    let fits = |key: &str, value: &str| key.len() <= 8 && value.len() <= 68;
+    metadata
+        .iter()
+        .filter(|(key, value)| format == Format::Parquet || fits(key, value))
+        .map(|(key, value)| (key.clone(), value.clone()))
+        .collect()
+}
+
+/// The values of `keys` that a table written by [`write`] carries, those that it has.
+///
+/// # Errors
+/// Where the file cannot be read, or this build lacks its format.
+pub fn read_metadata<'a>(
+    path: &Path,
+    format: Format,
+    keys: impl Iterator<Item = &'a String>,
+) -> Result<BTreeMap<String, String>, FileError> {
+    match format {
+        Format::Parquet => {
+            let mut all = parquet_metadata(path)?;
+            Ok(keys.filter_map(|key| all.remove_entry(key)).collect())
+        }
+        Format::Fits => fits::read_table_keys(path, keys),
+    }
+}
+
+/// Writes `table` as `format`, with the key–value pairs that say what made it, as far as
+/// they are [`kept`].
 ///
 /// # Errors
 /// Where the file cannot be written, or this build lacks the format.
@@ -200,10 +229,9 @@ pub fn write(
     match format {
         Format::Parquet => write_parquet(path, table, metadata),
         Format::Fits => {
-            let keys: Vec<(String, fits::Value)> = metadata
-                .iter()
-                .filter(|(key, value)| key.len() <= 8 && value.len() <= 68)
-                .map(|(key, value)| (key.to_ascii_uppercase(), fits::Value::Text(value.clone())))
+            let keys: Vec<(String, fits::Value)> = kept(metadata, format)
+                .into_iter()
+                .map(|(key, value)| (key.to_ascii_uppercase(), fits::Value::Text(value)))
                 .collect();
             let header: Vec<(&str, fits::Value)> =
                 keys.iter().map(|(k, v)| (k.as_str(), v.clone())).collect();
@@ -213,10 +241,15 @@ pub fn write(
 }
 
 #[cfg(feature = "parquet")]
-use super::parquet::{read as read_parquet, write as write_parquet};
+use super::parquet::{metadata as parquet_metadata, read as read_parquet, write as write_parquet};
 
 #[cfg(not(feature = "parquet"))]
 fn read_parquet(path: &Path, _wanted: Option<&[&str]>) -> Result<Table, FileError> {
+    Err(FileError::new(path, WITHOUT_PARQUET))
+}
+
+#[cfg(not(feature = "parquet"))]
+fn parquet_metadata(path: &Path) -> Result<BTreeMap<String, String>, FileError> {
     Err(FileError::new(path, WITHOUT_PARQUET))
 }
 

@@ -39,7 +39,7 @@ mod tests {
     use shearq_submissions::Registry;
 
     use super::super::galaxy::Measurement;
-    use super::super::measure::ImageId;
+    use super::super::images::ImageId;
     use super::*;
 
     fn row(responses: &[f64]) -> MeasuredRow {

@@ -13,6 +13,7 @@ use super::PipelineError;
 use super::calibrate::calibrate;
 use super::engine::{self, Feeder, Progress};
 use super::galaxy::{Measurement, Measurer};
+use super::images::ImageId;
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
 use crate::io::layout::DataFolder;
@@ -21,15 +22,6 @@ use crate::io::run::{RUN_FILE, Run, claim};
 use crate::io::table::{self, Column, Table};
 use crate::psf::functional::FunctionalPsf;
 use crate::psf::star::star_psf;
-
-/// One image of a data folder.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ImageId {
-    /// Set number.
-    pub set: u32,
-    /// Image number.
-    pub image: u32,
-}
 
 /// PSFs of one row of stamps.
 pub enum RowPsf {
@@ -103,30 +95,10 @@ impl ImageSource {
         id: ImageId,
         submission: &Submission,
     ) -> Result<Self, PipelineError> {
-        let path = data.galaxies(id.set, id.image);
-        let mut image = ImageReader::open(&path)?;
-        let whole = |image: &mut ImageReader, key: &str| {
-            image
-                .number(key)
-                .filter(|v| *v >= 1.0 && *v <= 1e5)
-                .map(|v| v as usize)
-        };
-        let stamp = whole(&mut image, "STAMP").unwrap_or(data.layout().stamp);
-        let n = whole(&mut image, "NGRID").unwrap_or(image.width() / stamp);
-        if image.width() != n * stamp || image.height() != n * stamp {
-            return Err(FileError::new(
-                &path,
-                format!(
-                    "the image is {} × {} pixels; expected {n} × {n} stamps of {stamp} pixels a side",
-                    image.width(),
-                    image.height()
-                ),
-            )
-            .into());
-        }
+        let (mut image, grid, stamp) = open_galaxies(data, id)?;
         if !Measurer::fits(submission, stamp) {
             return Err(FileError::new(
-                &path,
+                data.galaxies(id.set, id.image),
                 format!(
                     "the stamps have {stamp} pixels a side; submission {} needs {}",
                     submission.name, submission.stamp.size
@@ -134,9 +106,6 @@ impl ImageSource {
             )
             .into());
         }
-        let field = Degrees(data.layout().field_degrees);
-        let grid = Grid::new(n, Pixels(stamp as f64), field)
-            .map_err(|error| FileError::new(&path, error))?;
         let header_noise = image.number("NOISESIG");
         Ok(ImageSource {
             psf: open_psf(data, id, submission, &grid)?,
@@ -184,6 +153,39 @@ impl ImageSource {
             },
         }))
     }
+}
+
+/// Opens the galaxies of an image; their grid and the side of a stamp are those of its header, or of
+/// the data's layout.
+pub(super) fn open_galaxies(
+    data: &DataFolder,
+    id: ImageId,
+) -> Result<(ImageReader, Grid, usize), PipelineError> {
+    let path = data.galaxies(id.set, id.image);
+    let mut image = ImageReader::open(&path)?;
+    let whole = |image: &mut ImageReader, key: &str| {
+        image
+            .number(key)
+            .filter(|v| *v >= 1.0 && *v <= 1e5)
+            .map(|v| v as usize)
+    };
+    let stamp = whole(&mut image, "STAMP").unwrap_or(data.layout().stamp);
+    let n = whole(&mut image, "NGRID").unwrap_or(image.width() / stamp);
+    if image.width() != n * stamp || image.height() != n * stamp {
+        return Err(FileError::new(
+            &path,
+            format!(
+                "the image is {} × {} pixels; expected {n} × {n} stamps of {stamp} pixels a side",
+                image.width(),
+                image.height()
+            ),
+        )
+        .into());
+    }
+    let field = Degrees(data.layout().field_degrees);
+    let grid =
+        Grid::new(n, Pixels(stamp as f64), field).map_err(|error| FileError::new(&path, error))?;
+    Ok((image, grid, stamp))
 }
 
 fn open_psf(
@@ -321,7 +323,7 @@ impl Summary {
     }
 }
 
-/// Measures `sets` of the run's data (all if empty) into catalogues in `out`.
+/// Measures `images` of the run's data into catalogues in `out`.
 ///
 /// Catalogues that are there already are kept if the folder's record says that the same settings
 /// made them.
@@ -333,14 +335,14 @@ pub fn measure_folder(
     run: &Run,
     data: &DataFolder,
     out: &Path,
-    sets: &[u32],
+    images: &[ImageId],
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    claim(&out.join(RUN_FILE), run)?;
-    let (todo, already) = images_to_do(run, data, out, sets)?;
+    let _claim = claim(&out.join(RUN_FILE), run)?;
+    let todo = to_do(run, out, images);
     let mut summary = Summary {
-        already,
+        already: images.len() - todo.len(),
         ..Summary::default()
     };
     let Some(&first) = todo.first() else {
@@ -381,9 +383,9 @@ pub fn galaxies_to_do(
     run: &Run,
     data: &DataFolder,
     out: &Path,
-    sets: &[u32],
+    images: &[ImageId],
 ) -> Result<u64, PipelineError> {
-    let (todo, _) = images_to_do(run, data, out, sets)?;
+    let todo = to_do(run, out, images);
     let Some(&first) = todo.first() else {
         return Ok(0);
     };
@@ -391,40 +393,13 @@ pub fn galaxies_to_do(
     Ok((todo.len() * grid.cells()) as u64)
 }
 
-/// Images without a catalogue, and the number of those with one.
-fn images_to_do(
-    run: &Run,
-    data: &DataFolder,
-    out: &Path,
-    sets: &[u32],
-) -> Result<(Vec<ImageId>, usize), PipelineError> {
-    let sets = if sets.is_empty() {
-        data.sets()
-    } else {
-        sets.to_vec()
-    };
-    let mut todo = Vec::new();
-    let mut already = 0;
-    for set in sets {
-        let images = data.images(set);
-        if images.is_empty() {
-            let path = data.galaxies(set, 1);
-            let message = format!("there is no image of set {set}; expected this file");
-            return Err(FileError::new(path, message).into());
-        }
-        for image in images {
-            if run.catalogue(out, set, image).is_file() {
-                already += 1;
-            } else {
-                todo.push(ImageId { set, image });
-            }
-        }
-    }
-    if todo.is_empty() && already == 0 {
-        let message = "there are no galaxy images here in the layout expected";
-        return Err(FileError::new(data.root(), message).into());
-    }
-    Ok((todo, already))
+/// Those of `images` that have no catalogue yet.
+pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> Vec<ImageId> {
+    images
+        .iter()
+        .filter(|id| !run.catalogue(out, id.set, id.image).is_file())
+        .copied()
+        .collect()
 }
 
 fn read_images(
@@ -515,20 +490,25 @@ pub(super) fn write_catalogue(
     let id = rows[0].id;
     let path = run.catalogue(out, id.set, id.image);
     let table = catalogue(rows).map_err(|message| FileError::new(&path, message))?;
+    table::write(&path, run.format, table, &metadata(run, id)?)?;
+    Ok(())
+}
+
+/// What made the catalogue of an image, as the catalogue carries it.
+pub(super) fn metadata(run: &Run, id: ImageId) -> Result<BTreeMap<String, String>, PipelineError> {
     let ellipticity = match run.submission.shape.ellipticity {
         EllipticityType::Distortion => "distortion",
         EllipticityType::Shear => "shear",
     };
-    let settings = toml::to_string(&run.submission)
-        .map_err(|error| FileError::new(&path, format!("cannot store the settings: {error}")))?;
-    let metadata = BTreeMap::from([
+    let settings = toml::to_string(&run.submission).map_err(|error| {
+        PipelineError::Request(format!("the settings cannot be stored: {error}"))
+    })?;
+    Ok(BTreeMap::from([
         ("creator".to_owned(), format!("shearq {}", run.version)),
         ("submiss".to_owned(), run.submission.name.clone()),
         ("elltype".to_owned(), ellipticity.to_owned()),
         ("set".to_owned(), id.set.to_string()),
         ("image".to_owned(), id.image.to_string()),
         ("settings".to_owned(), settings),
-    ]);
-    table::write(&path, run.format, table, &metadata)?;
-    Ok(())
+    ]))
 }

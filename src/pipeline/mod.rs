@@ -5,8 +5,10 @@
 //! number of threads.
 
 mod calibrate;
+pub mod complete;
 pub mod engine;
 pub mod galaxy;
+pub mod images;
 pub mod measure;
 mod method;
 pub mod run;

@@ -10,8 +10,9 @@ use shearq_submissions::{PsfForm, Submission};
 use super::calibrate::calibrate;
 use super::engine::{self, Progress};
 use super::galaxy::{MeasureScratch, Measurer, Steps};
+use super::images::ImageId;
 use super::measure::{
-    ImageId, MeasuredRow, RowPsf, StampRow, Summary, functional_psf, measure_row, write_catalogue,
+    MeasuredRow, RowPsf, StampRow, Summary, functional_psf, measure_row, to_do, write_catalogue,
 };
 use super::{PipelineError, simulate};
 use crate::io::layout::DataFolder;
@@ -70,9 +71,9 @@ pub fn measurers(submissions: &[Submission]) -> Result<Vec<Measurer>, PipelineEr
         .collect()
 }
 
-/// Simulates images 1 to `images` of `sets` and measures them by the run's submission, into
-/// catalogues in `out` with the true shear beside them. No image is stored; catalogues that are
-/// there already, of the same settings, are kept.
+/// Simulates `images`, which are in the order of their sets, and measures them by the run's
+/// submission, into catalogues in `out` with the true shear beside them. No image is stored;
+/// catalogues that are there already, of the same settings, are kept.
 ///
 /// # Errors
 /// Where a set does not exist, the folder holds results of other settings, or a file cannot be
@@ -80,26 +81,23 @@ pub fn measurers(submissions: &[Submission]) -> Result<Vec<Measurer>, PipelineEr
 pub fn run_folder(
     run: &Run,
     settings: SimulationSettings,
-    sets: &[u32],
-    images: u32,
+    images: &[ImageId],
     out: &Path,
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    claim(&out.join(RUN_FILE), run)?;
+    let _claim = claim(&out.join(RUN_FILE), run)?;
     let measurers = measurers(std::slice::from_ref(&run.submission))?;
     let truth = DataFolder::new(out);
-    let mut summary = Summary::default();
-    for &set in sets {
-        let todo: Vec<u32> = (1..=images)
-            .filter(|&image| !run.catalogue(out, set, image).is_file())
-            .collect();
-        let already = images as usize - todo.len();
-        summary.already += already;
-        progress.advance((already * settings.grid * settings.grid) as u64);
-        if todo.is_empty() {
-            continue;
-        }
+    let todo = to_do(run, out, images);
+    let mut summary = Summary {
+        already: images.len() - todo.len(),
+        ..Summary::default()
+    };
+    progress.advance((summary.already * settings.grid * settings.grid) as u64);
+    for of_set in todo.chunk_by(|a, b| a.set == b.set) {
+        let set = of_set[0].set;
+        let todo: Vec<u32> = of_set.iter().map(|id| id.image).collect();
         let simulator = simulate::simulator(set, settings)?;
         simulate::write_truth(&truth, &simulator)?;
         progress.note(&format!("set {set:02}"));

@@ -7,6 +7,7 @@ use shearq_scoring::Shear;
 
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
+use super::images::ImageId;
 use crate::io::atomic;
 use crate::io::fits::{ImageWriter, Value};
 use crate::io::layout::DataFolder;
@@ -60,32 +61,30 @@ pub fn simulator(set: u32, settings: SimulationSettings) -> Result<SetSimulator,
     SetSimulator::new(kind, settings).map_err(|source| PipelineError::Scoring { set, source })
 }
 
-/// Simulates images 1 to `images` of `sets` into `data`; returns how many images were made and how
-/// many were there already.
+/// Simulates `images`, which are in the order of their sets, into `data`; returns how many were made
+/// and how many were there already.
 ///
 /// # Errors
 /// Where a set does not exist, the folder holds data of other settings, or a file cannot be written.
 pub fn simulate_folder(
     record: &SimulationRecord,
-    sets: &[u32],
-    images: u32,
+    images: &[ImageId],
     data: &DataFolder,
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
-    claim(&data.root().join(SIMULATION_FILE), record)?;
+    let _claim = claim(&data.root().join(SIMULATION_FILE), record)?;
+    let todo: Vec<ImageId> = images
+        .iter()
+        .filter(|id| !data.galaxies(id.set, id.image).is_file())
+        .copied()
+        .collect();
+    let already = images.len() - todo.len();
     let mut simulators = Vec::new();
-    let mut already = 0;
-    for &set in sets {
-        let todo: Vec<u32> = (1..=images)
-            .filter(|&image| !data.galaxies(set, image).is_file())
-            .collect();
-        already += images as usize - todo.len();
-        if !todo.is_empty() {
-            let simulator = simulator(set, record.settings)?;
-            write_truth(data, &simulator)?;
-            simulators.push((Arc::new(simulator), todo));
-        }
+    for of_set in todo.chunk_by(|a, b| a.set == b.set) {
+        let simulator = simulator(of_set[0].set, record.settings)?;
+        write_truth(data, &simulator)?;
+        simulators.push((Arc::new(simulator), of_set));
     }
     let mut made = 0;
     let mut open: Option<OpenImage> = None;
@@ -117,10 +116,10 @@ pub fn simulate_folder(
     Ok((made, already))
 }
 
-fn feed(simulators: &[(Arc<SetSimulator>, Vec<u32>)], feeder: &mut Feeder<'_, RowJob>) {
+fn feed(simulators: &[(Arc<SetSimulator>, &[ImageId])], feeder: &mut Feeder<'_, RowJob>) {
     for (set, images) in simulators {
-        for &image in images {
-            let fields = Arc::new(set.image_fields(image));
+        for id in *images {
+            let fields = Arc::new(set.image_fields(id.image));
             for iy in 0..set.grid().n {
                 let job = RowJob {
                     set: Arc::clone(set),

@@ -90,7 +90,7 @@ pub fn run_sets(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> std::result::Result<Vec<SetResult>, PipelineError> {
-    crate::io::run::claim(&folder.join("plan.json"), plan)?;
+    let _claim = crate::io::run::claim(&folder.join("plan.json"), plan)?;
     // Submissions that differ in name alone are measured once.
     let (distinct, place) = distinct(&plan.submissions);
     let measurers = measurers(&distinct)?;

@@ -7,12 +7,9 @@
 
 use std::path::{Path, PathBuf};
 
-use shearq_scoring::{
-    BINS, Bins, Convention, FieldSum, Grid, Row, SCORED, SetImages, measured_bandpowers,
-};
+use shearq_scoring::{Convention, FieldSum, Grid, Row, SCORED, SetImages, measured_bandpowers};
 
 use crate::io::FileError;
-use crate::io::atomic;
 use crate::io::layout::read_rows;
 use crate::io::table;
 use crate::pipeline::score::COLUMNS;
@@ -95,30 +92,27 @@ fn number(text: &str) -> Option<u32> {
     text.parse().ok().filter(|number| *number <= 999)
 }
 
-/// Writes the measured galaxies of a catalogue of ours in the challenge's format. Flagged galaxies
-/// have no ellipticity and are left out, which the original scoring counts as zero.
+/// The measured galaxies of a catalogue of ours in the challenge's format, and the number of its rows.
+/// Flagged galaxies have no ellipticity and are left out, which the original scoring counts as zero.
 ///
 /// # Errors
-/// Where the catalogue cannot be read or the file cannot be written.
-pub fn write_catalogue(from: &Path, to: &Path) -> Result<usize, FileError> {
-    let rows = read_rows(from, &COLUMNS)?;
+/// Where the catalogue cannot be read.
+pub fn catalogue_text(catalogue: &Path) -> Result<(String, usize), FileError> {
+    let rows = read_rows(catalogue, &COLUMNS)?;
     let mut text = String::new();
-    let mut count = 0;
-    for Row { x, y, e1, e2 } in rows {
+    for Row { x, y, e1, e2 } in &rows {
         if e1.is_finite() && e2.is_finite() {
             text.push_str(&format!("{x} {y} {e1:.9} {e2:.9}\n"));
-            count += 1;
         }
     }
-    atomic::write(to, text.as_bytes())?;
-    Ok(count)
+    Ok((text, rows.len()))
 }
 
-/// Writes the power spectrum of a set's catalogues in the challenge's format.
+/// The power spectrum of a set's catalogues in the challenge's format.
 ///
 /// # Errors
-/// Where a catalogue cannot be read or the file cannot be written.
-pub fn write_spectrum(grid: &Grid, catalogues: &[PathBuf], to: &Path) -> Result<(), FileError> {
+/// Where a catalogue cannot be read, or nothing of it falls on the grid.
+pub fn spectrum_text(grid: &Grid, catalogues: &[PathBuf]) -> Result<String, FileError> {
     let mut images = SetImages::new(grid);
     for path in catalogues {
         let mut sum = FieldSum::new(grid);
@@ -126,14 +120,10 @@ pub fn write_spectrum(grid: &Grid, catalogues: &[PathBuf], to: &Path) -> Result<
         images.add(&sum);
     }
     let (bins, power) = measured_bandpowers(grid, images.total(), Convention::STANDARD)
-        .map_err(|error| FileError::new(to, error))?;
-    atomic::write(to, spectrum_text(&bins, &power).as_bytes())
-}
-
-fn spectrum_text(bins: &Bins, power: &[f64; BINS]) -> String {
-    SCORED
+        .map_err(|error| FileError::new(&catalogues[0], error))?;
+    Ok(SCORED
         .map(|b| format!("{} {:.6} {:.12e}\n", b + 1, bins.l[b], power[b]))
-        .collect()
+        .collect())
 }
 
 /// Reads a power-spectrum file as it is; [`super::check`] says whether it is complete.

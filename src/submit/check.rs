@@ -8,7 +8,10 @@ use shearq_scoring::{
     TrueShear,
 };
 
+use super::archive::{self, is_archive};
 use super::challenge::{Kind, SpectrumLine, read_spectrum};
+use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
+use crate::io::FileError;
 use crate::io::layout::read_rows;
 use crate::pipeline::score::COLUMNS;
 
@@ -48,8 +51,34 @@ pub struct Expected {
 /// Largest share of a cell by which positions may be off its centre.
 const POSITION_TOLERANCE: f64 = 0.01;
 
-/// Checks a file, or all files of a folder.
+/// Checks a file, or all files of a folder or an archive.
 pub fn check(path: &Path, expected: &Expected) -> Vec<Finding> {
+    if !is_archive(path) {
+        return check_files(path, expected);
+    }
+    let mut report = Report::default();
+    let unpacked = tempfile::tempdir()
+        .map_err(|error| FileError::new(std::env::temp_dir(), error))
+        .and_then(|folder| archive::read(path, Some(folder.path())).map(|_| folder));
+    match unpacked {
+        Err(error) => report.error(&error.path, "readable", error.message),
+        Ok(folder) => {
+            report.findings = check_files(folder.path(), expected);
+            // Files are named as members of the archive.
+            for finding in &mut report.findings {
+                if let Ok(name) = finding.path.strip_prefix(folder.path()) {
+                    finding.path = match name.as_os_str().is_empty() {
+                        true => path.to_owned(),
+                        false => path.join(name),
+                    };
+                }
+            }
+        }
+    }
+    report.findings
+}
+
+fn check_files(path: &Path, expected: &Expected) -> Vec<Finding> {
     let mut report = Report::default();
     let files = match files_of(path) {
         Ok(files) => files,
@@ -60,6 +89,9 @@ pub fn check(path: &Path, expected: &Expected) -> Vec<Finding> {
     };
     if files.is_empty() {
         report.error(path, "empty", "there is no file here".into());
+    }
+    if path.is_dir() {
+        check_manifest(path, &files, &mut report);
     }
     let mut sets: BTreeMap<u32, SetFiles> = BTreeMap::new();
     let mut methods: BTreeMap<String, PathBuf> = BTreeMap::new();
@@ -166,15 +198,35 @@ fn files_of(path: &Path) -> std::io::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(path)? {
         let file = entry?.path();
-        let hidden = file
+        let own = file
             .file_name()
-            .is_some_and(|name| name.to_string_lossy().starts_with('.'));
-        if file.is_file() && !hidden {
+            .is_some_and(|name| name == MANIFEST_FILE || name.to_string_lossy().starts_with('.'));
+        if file.is_file() && !own {
             files.push(file);
         }
     }
     files.sort();
     Ok(files)
+}
+
+/// Compares the files of a folder with its manifest, if it has one.
+fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
+    let manifest = match Manifest::read(folder) {
+        Ok(Some(manifest)) => manifest,
+        Ok(None) => return,
+        Err(error) => return report.error(&error.path, "manifest", error.message),
+    };
+    let mut found = BTreeMap::new();
+    for file in files {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        match FileSum::of(file) {
+            Ok(sum) => _ = found.insert(name.into_owned(), sum),
+            Err(error) => report.error(file, "readable", error.message),
+        }
+    }
+    for (name, message) in manifest.faults(&found) {
+        report.error(&folder.join(name), "manifest", message);
+    }
 }
 
 /// A file of an unknown name is a spectrum if its lines have three numbers.

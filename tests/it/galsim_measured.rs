@@ -4,6 +4,7 @@ use shearq::io::layout::DataFolder;
 use shearq::io::run::{Run, Source};
 use shearq::io::table::{self, Format};
 use shearq::pipeline::Quiet;
+use shearq::pipeline::images;
 use shearq::pipeline::measure::measure_folder;
 use shearq_submissions::Registry;
 
@@ -49,7 +50,8 @@ fn measured_ellipticities_follow_the_truth() {
             format: Format::Fits,
         };
         let results = out.path().join(name.replace('/', "-"));
-        measure_folder(&run, &data, &results, &[], 2, &mut Quiet).unwrap();
+        let images = images::of_folder(&data, &[]).unwrap();
+        measure_folder(&run, &data, &results, &images, 2, &mut Quiet).unwrap();
         let mut line = format!("{name:18}");
         for &set in &sets {
             let (mut truth, mut measured) = ([Vec::new(), Vec::new()], [Vec::new(), Vec::new()]);

@@ -44,6 +44,26 @@ pub fn fail(arguments: &[&str]) -> String {
     message
 }
 
+/// Every file below a folder with its content.
+pub fn contents(folder: &Path) -> Vec<(String, Vec<u8>)> {
+    let mut found = Vec::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(next) = folders.pop() {
+        for entry in std::fs::read_dir(next).expect("readable folder") {
+            let path = entry.expect("readable folder").path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                let name = path.strip_prefix(folder).expect("below the folder");
+                let content = std::fs::read(&path).expect("readable file");
+                found.push((name.display().to_string(), content));
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
 /// A path as an argument.
 pub fn text(path: &Path) -> &str {
     path.to_str().expect("UTF-8 path")

@@ -1,0 +1,224 @@
+//! Submissions as one compressed archive (`.tar.gz`), the same bytes for the same files.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufReader, BufWriter, Read, Write};
+use std::path::Path;
+
+use flate2::bufread::GzDecoder;
+use flate2::write::GzEncoder;
+use flate2::{Compression, GzBuilder};
+use tar::{Archive, Builder, Header};
+
+use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
+use crate::io::FileError;
+use crate::io::atomic::{PartFile, PartFolder};
+
+/// Largest manifest accepted, in bytes: some four times that of 999 images of 99 sets.
+const MAX_MANIFEST: u64 = 1 << 26;
+
+/// Whether a path's ending is that of an archive.
+pub fn is_archive(path: &Path) -> bool {
+    let name = path.to_string_lossy();
+    name.ends_with(".tar.gz") || name.ends_with(".tgz")
+}
+
+/// An archive being written.
+pub struct ArchiveWriter {
+    builder: Builder<GzEncoder<BufWriter<File>>>,
+    part: PartFile,
+}
+
+impl ArchiveWriter {
+    /// Starts an archive.
+    ///
+    /// # Errors
+    /// Where the file cannot be made.
+    pub fn create(path: &Path) -> Result<Self, FileError> {
+        let part = PartFile::new(path)?;
+        let file = File::create(part.path()).map_err(cannot_write(path))?;
+        // Neither the time nor the system of its making.
+        let encoder = GzBuilder::new()
+            .mtime(0)
+            .operating_system(UNKNOWN_SYSTEM)
+            .write(BufWriter::new(file), Compression::default());
+        Ok(ArchiveWriter {
+            builder: Builder::new(encoder),
+            part,
+        })
+    }
+
+    /// Adds a file.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), FileError> {
+        let mut header = Header::new_gnu();
+        header.set_size(bytes.len() as u64);
+        header.set_mode(0o644);
+        header.set_mtime(0);
+        header.set_uid(0);
+        header.set_gid(0);
+        self.builder
+            .append_data(&mut header, name, bytes)
+            .map_err(cannot_write(self.part.target()))
+    }
+
+    /// Closes the archive and gives it its name.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn finish(self) -> Result<(), FileError> {
+        let ArchiveWriter { builder, part } = self;
+        builder
+            .into_inner()
+            .and_then(GzEncoder::finish)
+            .and_then(|mut file| file.flush())
+            .map_err(cannot_write(part.target()))?;
+        part.finish()
+    }
+}
+
+/// gzip's number for it.
+const UNKNOWN_SYSTEM: u8 = 255;
+
+fn cannot_write(path: &Path) -> impl FnOnce(std::io::Error) -> FileError {
+    FileError::doing(path, "cannot write the archive")
+}
+
+/// What an archive holds.
+pub struct Unpacked {
+    /// Its manifest, if it has one.
+    pub manifest: Option<Manifest>,
+    /// Its other files.
+    pub files: BTreeMap<String, FileSum>,
+}
+
+impl Unpacked {
+    /// Checks that the files are those of the manifest, which there must be if it is `required`.
+    ///
+    /// # Errors
+    /// Where they are not, or it is not there.
+    pub fn verify(&self, archive: &Path, required: bool) -> Result<(), FileError> {
+        let faults = match &self.manifest {
+            Some(manifest) => manifest.faults(&self.files),
+            None if required => {
+                let message = format!("there is no {MANIFEST_FILE} in it to verify the files by");
+                return Err(FileError::new(archive, message));
+            }
+            None => Vec::new(),
+        };
+        if faults.is_empty() {
+            return Ok(());
+        }
+        let lines: Vec<String> = faults
+            .iter()
+            .map(|(name, message)| format!("\n  {name}: {message}"))
+            .collect();
+        let message = format!("this is not what was packed:{}", lines.concat());
+        Err(FileError::new(archive, message))
+    }
+}
+
+/// Unpacks the archive at `path` into the new folder `out`, which appears whole and as its manifest
+/// says or not at all. Unless the manifest is `required`, there may be none.
+///
+/// # Errors
+/// As [`read`] and [`Unpacked::verify`], and where `out` exists or cannot be written.
+pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
+    let part = PartFolder::new(out)?;
+    let unpacked = read(path, Some(part.path()))?;
+    unpacked.verify(path, required)?;
+    part.finish()?;
+    Ok(unpacked)
+}
+
+/// Reads an archive from end to end; with `into`, its files are written to that folder.
+///
+/// # Errors
+/// Where it cannot be read to its end, holds anything but plain files without folders, or holds two
+/// of one name.
+pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
+    let cannot_read = || FileError::doing::<std::io::Error>(path, "cannot read the archive");
+    let file = File::open(path).map_err(cannot_read())?;
+    let mut archive = Archive::new(GzDecoder::new(BufReader::new(file)));
+    let mut unpacked = Unpacked {
+        manifest: None,
+        files: BTreeMap::new(),
+    };
+    // Raw: extensions of tar, such as names of any length, are entries that are not plain files.
+    for entry in archive.entries().map_err(cannot_read())?.raw(true) {
+        let mut entry = entry.map_err(cannot_read())?;
+        let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
+        if !entry.header().entry_type().is_file() || !is_plain_name(&name) {
+            let message = format!("it holds `{name}`; expected plain files without folders");
+            return Err(FileError::new(path, message));
+        }
+        if unpacked.files.contains_key(&name)
+            || (name == MANIFEST_FILE && unpacked.manifest.is_some())
+        {
+            let message = format!("it holds `{name}` twice");
+            return Err(FileError::new(path, message));
+        }
+        let mut bytes = Vec::new();
+        let mut target: Box<dyn Write> = match into {
+            _ if name == MANIFEST_FILE => Box::new(&mut bytes),
+            None => Box::new(std::io::sink()),
+            Some(folder) => {
+                let target = folder.join(&name);
+                Box::new(
+                    File::create_new(&target).map_err(FileError::doing(&target, "cannot write"))?,
+                )
+            }
+        };
+        if name == MANIFEST_FILE && entry.size() > MAX_MANIFEST {
+            let message = format!("its {MANIFEST_FILE} has {} bytes", entry.size());
+            return Err(FileError::new(path, message));
+        }
+        let sum = FileSum::copying(&mut entry, &mut target)
+            .map_err(|error| FileError::new(path, format!("cannot unpack `{name}`: {error}")))?;
+        drop(target);
+        if name != MANIFEST_FILE {
+            unpacked.files.insert(name, sum);
+            continue;
+        }
+        unpacked.manifest = serde_json::from_slice(&bytes).map_err(|error| {
+            FileError::new(
+                path,
+                format!("its {MANIFEST_FILE} is not one of a submission: {error}"),
+            )
+        })?;
+        if let Some(folder) = into {
+            std::fs::write(folder.join(MANIFEST_FILE), &bytes)
+                .map_err(FileError::doing(folder, "cannot write the manifest"))?;
+        }
+    }
+    check_end(archive.into_inner()).map_err(cannot_read())?;
+    Ok(unpacked)
+}
+
+/// Reads what follows the last file: blank blocks, gzip's own checksum and nothing else.
+fn check_end(mut decoder: GzDecoder<BufReader<File>>) -> std::io::Result<()> {
+    let wrong = |what| Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
+    let mut buffer = [0; 4096];
+    loop {
+        let read = decoder.read(&mut buffer)?;
+        if read == 0 {
+            break;
+        }
+        if buffer[..read].iter().any(|byte| *byte != 0) {
+            return wrong("there are data after its end");
+        }
+    }
+    if decoder.into_inner().read(&mut buffer)? > 0 {
+        return wrong("there are data after its end");
+    }
+    Ok(())
+}
+
+/// Whether a name is that of a file in the folder itself, on any system.
+fn is_plain_name(name: &str) -> bool {
+    !name.is_empty()
+        && !name.starts_with('.')
+        && !name.contains(|c: char| "/\\:".contains(c) || c.is_control())
+}
