@@ -15,6 +15,7 @@ mod run;
 mod score;
 mod show;
 mod simulate;
+mod study;
 mod submissions;
 mod unpack;
 
@@ -51,6 +52,7 @@ enum Command {
     Show(show::Arguments),
     Calibrate(calibrate::Arguments),
     Reproduce(reproduce::Arguments),
+    Study(study::Arguments),
     Bench(bench::Arguments),
     Submissions(submissions::Arguments),
 }
@@ -71,6 +73,7 @@ pub fn main() -> ExitCode {
         Command::Show(arguments) => show::run(&arguments),
         Command::Calibrate(arguments) => calibrate::run(&arguments),
         Command::Reproduce(arguments) => reproduce::run(&arguments),
+        Command::Study(arguments) => study::run(&arguments),
         Command::Bench(arguments) => bench::run(&arguments),
         Command::Submissions(arguments) => submissions::run(&arguments),
     };

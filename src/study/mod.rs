@@ -1,7 +1,9 @@
 //! Studies: the paper's Sect. 4 (calibration of λ) and Sect. 5 (seven submissions on 24 sets).
 
 pub mod bias;
+pub mod bound;
 pub mod calibration;
+pub mod contest;
 pub mod convergence;
 pub mod exhibits;
 pub mod reproduce;

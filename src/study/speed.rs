@@ -78,10 +78,29 @@ impl Inputs {
         functional_psf(self.set.image_fields(1).psf.at(0, 0), size)
     }
 
+    /// Microseconds of a whole measurement, the PSF being taken already.
+    fn whole(&self, submission: &Submission) -> Result<f64, PipelineError> {
+        let psf = self.psf(submission.psf.size);
+        let measurer = Measurer::new(submission, STAMP)?;
+        let mut scratch = measurer.scratch();
+        measurer.set_psf(&mut scratch, Some(psf.view()));
+        Ok(time(|k| {
+            black_box(measurer.measure(&self.stamps[k], STAMP, None, &mut scratch));
+        }))
+    }
+
     /// The stamps, cut to n×n.
     pub(super) fn cuts(&self, n: usize) -> Vec<Vec<f32>> {
         self.stamps.iter().map(|stamp| centre(stamp, n)).collect()
     }
+}
+
+/// Microseconds of a whole measurement by `submission`, the PSF being taken already.
+///
+/// # Errors
+/// Where the submission's sizes cannot be worked with.
+pub fn whole(submission: &Submission, settings: SimulationSettings) -> Result<f64, PipelineError> {
+    Inputs::new(settings)?.whole(submission)
 }
 
 /// Cost of each stage of a measurement by `submission`, and of simulating the galaxy.
@@ -141,13 +160,7 @@ pub fn stages(
     } else {
         notes.extend(network_stages(submission, psf.view(), &cut, &mut rows)?);
     }
-    let measurer = Measurer::new(submission, STAMP)?;
-    let mut measure_scratch = measurer.scratch();
-    measurer.set_psf(&mut measure_scratch, Some(psf.view()));
-    let whole = time(|k| {
-        black_box(measurer.measure(&inputs.stamps[k], STAMP, None, &mut measure_scratch));
-    });
-    rows.push(("whole measurement", whole));
+    rows.push(("whole measurement", inputs.whole(submission)?));
     Ok(Table {
         title: format!("Stages of {}", submission.name),
         headings: vec![
@@ -373,18 +386,12 @@ pub fn size_costs(
     settings: SimulationSettings,
 ) -> Result<Vec<f64>, PipelineError> {
     let inputs = Inputs::new(settings)?;
-    let psf = inputs.psf(submission.psf.size);
     SIZES
         .iter()
         .map(|&n| {
             let mut sized = submission.clone();
             sized.stamp.size = n;
-            let measurer = Measurer::new(&sized, STAMP)?;
-            let mut scratch = measurer.scratch();
-            measurer.set_psf(&mut scratch, Some(psf.view()));
-            Ok(time(|k| {
-                black_box(measurer.measure(&inputs.stamps[k], STAMP, None, &mut scratch));
-            }))
+            inputs.whole(&sized)
         })
         .collect()
 }

@@ -1,0 +1,101 @@
+//! `shearq study`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use shearq_submissions::{Registry, Submission};
+
+use super::arguments::{Printing, SetList, SimulationArguments, Threads};
+use super::print;
+use super::progress::Bar;
+use crate::io::layout::MAX_IMAGE;
+use crate::report::page::Page;
+use crate::study::contest::{bias_sets, contest_table};
+use crate::study::reproduce::{Plan, run_sets};
+
+/// Hold submissions against each other and against what can be reached.
+///
+/// For every kind of set and submission: scatter of calibrated ellipticities and its ratio to the
+/// Cramér–Rao bound, multiplicative and additive bias, leakage of the PSF, Q of catalogues and of
+/// cross-spectra, and time per galaxy. Everything is simulated in memory; finished sets are kept, so a
+/// stopped study goes on where it was. Use a seed that no setting was chosen with.
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Names of submissions, or TOML files of your own. May be given several times.
+    #[arg(long, value_name = "NAME|FILE", default_values = ["23/raw/star", "23/den/star", "32/linear/star"])]
+    submission: Vec<String>,
+    /// Sets; by default one of each kind, with a fixed PSF.
+    #[arg(
+        long,
+        value_name = "LIST",
+        default_value = "2,5,8,11,14,16,18,20,22,24"
+    )]
+    sets: SetList,
+    /// Images per set for Q and scatter; the challenge has 200.
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=i64::from(MAX_IMAGE)))]
+    images: u32,
+    /// Images per set whose galaxies are drawn four times for the biases.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    pairs: u32,
+    #[command(flatten)]
+    simulation: SimulationArguments,
+    /// Folder for results and report.
+    #[arg(long, value_name = "DIR", default_value = "shearq-study")]
+    out: PathBuf,
+    #[command(flatten)]
+    printing: Printing,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let Arguments {
+        submission,
+        sets,
+        images,
+        pairs,
+        simulation,
+        out,
+        printing,
+        threads,
+    } = arguments;
+    let registry = Registry::embedded()?;
+    let submissions = submission
+        .iter()
+        .map(|name| Ok(registry.get(name)?.submission))
+        .collect::<anyhow::Result<Vec<Submission>>>()?;
+    let plan = Plan {
+        version: crate::VERSION.into(),
+        simulation: simulation.settings()?,
+        images: *images,
+        submissions,
+    };
+    let threads = threads.number();
+    let image = (plan.simulation.grid as u64).pow(2) * sets.0.len() as u64;
+    let mut bar = Bar::new("simulating and measuring", image * u64::from(*images));
+    let results = run_sets(&plan, &sets.0, out, threads, &mut bar)?;
+    drop(bar);
+    let mut bar = Bar::new("measuring biases", image * u64::from(*pairs));
+    let biases = bias_sets(&plan, &sets.0, *pairs, out, threads, &mut bar)?;
+    drop(bar);
+    let table = contest_table(&plan, &results, &biases)?;
+    let mut made_by = vec![
+        ("Version".into(), format!("shearq {}", crate::VERSION)),
+        ("Seed".into(), plan.simulation.seed.to_string()),
+        (
+            "Data".into(),
+            format!(
+                "simulated: {images} images of {0} × {0} galaxies per set, {pairs} for biases",
+                plan.simulation.grid
+            ),
+        ),
+    ];
+    for submission in &plan.submissions {
+        made_by.push((submission.name.clone(), toml::to_string(submission)?));
+    }
+    let mut page = Page::new(out, "Submissions compared", "Simulated data", made_by);
+    page.section("Every kind of set", "Scatter, bias, quality and cost.");
+    page.table("study", &table)?;
+    page.save()?;
+    print(&printing.render(&table))
+}
