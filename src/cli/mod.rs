@@ -1,6 +1,7 @@
 //! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage.
 
 mod arguments;
+mod baseline;
 mod bench;
 mod calibrate;
 mod check;
@@ -19,6 +20,8 @@ mod submissions;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+
+use crate::report::figure::HeatMap;
 
 /// Score and submit weak-lensing shape measurements, and measure them by Hopfield-network
 /// deconvolution.
@@ -41,6 +44,7 @@ enum Command {
     Run(run::Arguments),
     Score(score::Arguments),
     Compare(compare::Arguments),
+    Baseline(baseline::Arguments),
     Check(check::Arguments),
     Pack(pack::Arguments),
     Show(show::Arguments),
@@ -59,6 +63,7 @@ pub fn main() -> ExitCode {
         Command::Run(arguments) => run::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
+        Command::Baseline(arguments) => baseline::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Pack(arguments) => pack::run(&arguments),
         Command::Show(arguments) => show::run(&arguments),
@@ -74,6 +79,18 @@ pub fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// Prints a heat map below a table that is read on a terminal; where output goes to a file or
+/// another program, nothing. `NO_COLOR` and a terminal without colours are respected.
+fn print_heat_map(map: &HeatMap) -> anyhow::Result<()> {
+    use std::io::IsTerminal;
+    if !std::io::stdout().is_terminal() {
+        return Ok(());
+    }
+    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
+    let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
+    print(&format!("\n{}", map.terminal(coloured)))
 }
 
 /// Prints results to standard output; a reader that has gone away (`| head`) is no error.

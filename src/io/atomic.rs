@@ -25,15 +25,8 @@ impl PartFile {
     /// Where the folder cannot be made or the leftover cannot be removed.
     pub fn new(target: impl AsRef<Path>) -> Result<Self, FileError> {
         let target = target.as_ref().to_owned();
-        let name = target
-            .file_name()
-            .ok_or_else(|| FileError::new(&target, "this is not the name of a file"))?;
-        let folder = target.parent().unwrap_or(Path::new(""));
-        if !folder.as_os_str().is_empty() {
-            fs::create_dir_all(folder)
-                .map_err(FileError::doing(folder, "cannot make the folder"))?;
-        }
-        let part = folder.join(format!(".{}.part", name.to_string_lossy()));
+        let (name, folder) = place(&target)?;
+        let part = folder.join(format!(".{name}.part"));
         match fs::remove_file(&part) {
             Ok(()) => {}
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
@@ -98,6 +91,44 @@ pub fn write(target: impl AsRef<Path>, bytes: &[u8]) -> Result<(), FileError> {
     part.finish()
 }
 
+/// As [`write`], for a file that several processes may write at once with the same content: each
+/// under a temporary name of its own.
+///
+/// # Errors
+/// Where the file cannot be written.
+pub fn write_shared(target: impl AsRef<Path>, bytes: &[u8]) -> Result<(), FileError> {
+    let target = target.as_ref();
+    let (name, folder) = place(target)?;
+    let mut builder = tempfile::Builder::new();
+    let (prefix, suffix) = (format!(".{name}."), ".part");
+    builder.prefix(&prefix).suffix(suffix);
+    // Temporary files are their owner's alone unless told otherwise; the user's mask still counts.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    builder
+        .tempfile_in(folder)
+        .and_then(|mut file| {
+            file.write_all(bytes)?;
+            file.as_file().sync_data()?;
+            file.persist(target).map_err(|error| error.error)
+        })
+        .map(drop)
+        .map_err(FileError::doing(target, "cannot write the file"))
+}
+
+/// Name and folder of a file to be written; the folder is made.
+fn place(target: &Path) -> Result<(String, &Path), FileError> {
+    let name = target
+        .file_name()
+        .ok_or_else(|| FileError::new(target, "this is not the name of a file"))?;
+    let folder = match target.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    fs::create_dir_all(folder).map_err(FileError::doing(folder, "cannot make the folder"))?;
+    Ok((name.to_string_lossy().into_owned(), folder))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -114,5 +145,28 @@ mod tests {
         write(&target, b"whole").unwrap();
         assert_eq!(fs::read(&target).unwrap(), b"whole");
         assert_eq!(count(), 1);
+    }
+
+    #[test]
+    fn a_file_that_many_write_at_once_is_whole_whenever_it_is_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let target = folder.path().join("new/shared");
+        let bytes = vec![7; 1 << 16];
+        std::thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| {
+                    for _ in 0..10 {
+                        write_shared(&target, &bytes).unwrap();
+                        assert_eq!(fs::read(&target).unwrap(), bytes);
+                    }
+                });
+            }
+        });
+        let folder = target.parent().unwrap();
+        assert_eq!(fs::read_dir(folder).unwrap().count(), 1);
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions();
+        let plain = folder.join("plain");
+        fs::write(&plain, b"").unwrap();
+        assert_eq!(mode(&target), mode(&plain));
     }
 }

@@ -172,8 +172,11 @@ pub fn claim<R: Serialize + serde::de::DeserializeOwned>(
     ))
 }
 
-/// Lines in which two records differ, as `key: first ≠ second`.
-fn differences(
+/// Lines in which two records differ, as `key: first ≠ second`; what one does not have is null.
+///
+/// # Errors
+/// Where a record cannot be put in JSON.
+pub fn differences(
     first: &impl Serialize,
     second: &impl Serialize,
 ) -> Result<Vec<String>, serde_json::Error> {

@@ -4,11 +4,13 @@
 //! scratch from the caller; everything in it is in order, so that results do not depend on the
 //! number of threads.
 
+pub mod baseline;
 mod calibrate;
 pub mod engine;
 pub mod galaxy;
 pub mod measure;
 mod method;
+pub mod record;
 pub mod run;
 pub mod score;
 pub mod simulate;

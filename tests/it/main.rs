@@ -1,5 +1,6 @@
 //! End to end, through the binary and the library's public face.
 
+mod baselines;
 mod chain;
 mod figures;
 mod galsim_galaxies;
@@ -7,5 +8,6 @@ mod galsim_measured;
 mod orientation;
 mod reproduced;
 mod scoring_cases;
+mod stored;
 mod submitted;
 mod support;
