@@ -93,8 +93,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     print(&arguments.printing.render(&table))?;
     if arguments.printing.format == TableFormat::Table {
-        // Whole numbers leave room for 24 sets.
-        print_heat_map(&HeatMap { decimals: 0, ..map })?;
+        print_heat_map(map)?;
     }
     Ok(())
 }

@@ -83,11 +83,14 @@ pub fn main() -> ExitCode {
 
 /// Prints a heat map below a table that is read on a terminal; where output goes to a file or
 /// another program, nothing. `NO_COLOR` and a terminal without colours are respected.
-fn print_heat_map(map: &HeatMap) -> anyhow::Result<()> {
+fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
     use std::io::IsTerminal;
     if !std::io::stdout().is_terminal() {
         return Ok(());
     }
+    // Two digits a cell leave room for 24 sets.
+    let decimals = usize::from(map.values.iter().all(|value| !(*value >= 10.0)));
+    let map = HeatMap { decimals, ..map };
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
     let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
     print(&format!("\n{}", map.terminal(coloured)))

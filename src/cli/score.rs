@@ -130,6 +130,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 }
 
 fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> anyhow::Result<()> {
+    if let Some(store) = &arguments.store {
+        store::prepare(store)?;
+    }
     let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
     let threads = arguments.threads.number();
     let (name, scored) = match (&arguments.measured, &arguments.foreign, data) {

@@ -218,11 +218,11 @@ pub fn compare_runs(runs: &[RunRecord], group: Option<Grouping>, order: Option<&
         title: "Recorded runs".into(),
         headings,
         rows,
-        notes: notes(runs, &unpaired),
+        notes: notes(runs, group, &unpaired),
     }
 }
 
-fn notes(runs: &[RunRecord], unpaired: &[&str]) -> Vec<String> {
+fn notes(runs: &[RunRecord], group: Option<Grouping>, unpaired: &[&str]) -> Vec<String> {
     let mut ways: Vec<String> = runs
         .iter()
         .map(|run| {
@@ -238,6 +238,9 @@ fn notes(runs: &[RunRecord], unpaired: &[&str]) -> Vec<String> {
         "Means over the sets of each row. Figures: {}. √A in 10⁻⁴ for C_ℓ in steradian.",
         ways.join("; ")
     )];
+    if group.is_some() {
+        notes.push("ΔQ: from the first row of the same group.".into());
+    }
     if ways.len() > 1 {
         notes.push("Warning: these runs were scored in different ways; choose one with --where definition=... or choice=...".into());
     }
