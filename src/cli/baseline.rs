@@ -17,6 +17,9 @@ use crate::pipeline::baseline::{Wanted, figures_of, measure, settings_moved, shi
 use crate::report::baseline::{Checked, junit, shift_table};
 use crate::report::table::TableFormat;
 
+/// The submission that all others rest on.
+const BASE: &str = "paper";
+
 /// Keep figures as baselines, and see later whether they moved.
 ///
 /// A baseline is a TOML file that holds the scores with errors per set, the scatter of the
@@ -270,6 +273,22 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The stored settings; those that the baseline does not know are the base's.
+fn with_defaults(stored: &toml::Table, base: &Submission) -> anyhow::Result<Submission> {
+    let mut all = toml::Table::try_from(base)?;
+    for (key, value) in stored {
+        match (all.get_mut(key), value) {
+            (Some(toml::Value::Table(section)), toml::Value::Table(own)) => {
+                section.extend(own.clone());
+            }
+            _ => {
+                all.insert(key.clone(), value.clone());
+            }
+        }
+    }
+    Ok(all.try_into()?)
+}
+
 /// Measures one baseline again, and updates it where that is asked for.
 fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Result<Vec<Checked>> {
     let baseline = Baseline::read(path)?;
@@ -284,8 +303,9 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
         let submission = if registry.names().contains(&before.name) {
             registry.get(&before.name)?.submission
         } else {
-            let stored = before.settings.clone().try_into();
-            stored.with_context(|| format!("{}: settings of {}", path.display(), before.name))?
+            let base = registry.get(BASE)?.submission;
+            with_defaults(&before.settings, &base)
+                .with_context(|| format!("{}: settings of {}", path.display(), before.name))?
         };
         let mut check = Checked {
             baseline: name.to_owned(),
