@@ -89,7 +89,7 @@ fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
         return Ok(());
     }
     // Two digits a cell leave room for 24 sets.
-    let decimals = usize::from(map.values.iter().all(|value| !(*value >= 10.0)));
+    let decimals = usize::from(!map.values.iter().any(|value| *value >= 10.0));
     let map = HeatMap { decimals, ..map };
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
     let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");

@@ -220,6 +220,8 @@ pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift
             } else {
                 sigmas * error
             };
+            // A figure that is lost or an error that is unknown is a change too.
+            let within = difference.abs() <= allowed;
             let neither = old[0].is_nan() && new[0].is_nan();
             Shift {
                 set: before.set,
@@ -227,8 +229,7 @@ pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift
                 before: old,
                 now: new,
                 sigma: difference / error,
-                // A figure that is lost or an error that is unknown is a change too.
-                moved: !neither && !(difference.abs() <= allowed),
+                moved: !neither && !within,
             }
         })
         .collect()
