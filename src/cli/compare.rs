@@ -5,25 +5,33 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use clap::Args;
 use shearq_scoring::{Grid, Noise, Options};
-use shearq_submissions::Registry;
+use shearq_submissions::{Published, Registry};
 
 use super::arguments::{Printing, ScoreSettings, Threads};
-use super::print;
+use super::{print, print_heat_map};
 use crate::io::layout::{DataFolder, MAX_SET};
 use crate::io::run::{Run, Source};
-use crate::pipeline::score::{score_folder, score_sets};
-use crate::report::scores::{Variant, compare};
-use crate::report::table::Table;
+use crate::io::store::{self, Conditions};
+use crate::pipeline::record::set_record;
+use crate::pipeline::score::{COLUMNS, Catalogues, ScoredSet, plain_columns, score_variants};
+use crate::report::comparison::{Variant, compare, q_heat_map};
+use crate::report::figure::{Figure, HeatMap};
+use crate::report::runs::{Grouping, Order, compare_runs, runs_heat_map};
+use crate::report::scores::warnings;
+use crate::report::table::{Table, TableFormat};
 use crate::submit::foreign::Foreign;
 
-/// Put measured submissions side by side, beside the published figures.
+/// Put measured submissions side by side, beside the published figures, or past runs of a store.
 ///
-/// Each OUT is a folder that `measure` wrote. Differences in Q are taken from the first and paired
-/// over the same images, so that noise common to both cancels.
+/// Each OUT is a folder that `measure` or `run` wrote. Differences in Q are taken from the first and
+/// paired over the same images, so that noise common to both cancels.
+///
+/// With --store the runs are those that `score --store` and `run --store` recorded. On a terminal Q
+/// per set follows as a heat map, in colours unless NO_COLOR is set.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Folders of catalogues.
-    #[arg(value_name = "OUT", required_unless_present = "foreign")]
+    #[arg(value_name = "OUT", required_unless_present_any = ["foreign", "store"])]
     measured: Vec<PathBuf>,
     /// Data folder with the true shear [default: the one the first OUT was measured from].
     #[arg(long, value_name = "DIR")]
@@ -32,6 +40,22 @@ pub(super) struct Arguments {
     /// several times.
     #[arg(long, value_name = "FILE")]
     foreign: Vec<PathBuf>,
+    /// Results store whose runs to compare, instead of folders.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["measured", "data", "foreign", "definition", "convention", "threads"])]
+    store: Option<PathBuf>,
+    /// Rows of the store to look at: conditions on its columns that all must hold, as in
+    /// `snr=low,submission=23/*,q>50`, with = != < <= > >= and `*` for any characters.
+    #[arg(long = "where", value_name = "CONDITIONS", requires = "store")]
+    conditions: Option<Conditions>,
+    /// Figure or column to sort by, as in `q:desc`.
+    #[arg(long, value_name = "FIELD[:desc]", requires = "store")]
+    sort: Option<Order>,
+    /// Means over groups of sets instead of all sets of a run.
+    #[arg(long, value_enum, requires = "store")]
+    group_by: Option<Grouping>,
+    /// Draw Q per run and set as PNG or SVG, by the file's ending.
+    #[arg(long, value_name = "FILE")]
+    heat_map: Option<PathBuf>,
     #[command(flatten)]
     printing: Printing,
     #[command(flatten)]
@@ -41,100 +65,177 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let options = Options {
-        definition: arguments.settings.definition(),
-        noise: Noise::Measured,
-        choice: arguments.settings.choice(),
+    let (table, map) = match &arguments.store {
+        Some(store) => stored(arguments, store)?,
+        None => {
+            let options = Options {
+                definition: arguments.settings.definition(),
+                noise: Noise::Measured,
+                choice: arguments.settings.choice(),
+            };
+            let variants = variants(
+                &arguments.measured,
+                &arguments.foreign,
+                arguments.data.as_deref(),
+                options,
+                arguments.threads.number(),
+            )?;
+            let rows: Vec<_> = variants
+                .iter()
+                .map(|v| (v.name.clone(), v.sets.iter().collect()))
+                .collect();
+            let table = compare(&variants, options.definition, options.choice);
+            (table, q_heat_map(&rows))
+        }
     };
-    let table = table(
-        &arguments.measured,
-        &arguments.foreign,
-        arguments.data.as_deref(),
-        options,
-        arguments.threads.number(),
-    )?;
-    print(&arguments.printing.render(&table))
+    if let Some(path) = &arguments.heat_map {
+        map.save(path)?;
+    }
+    print(&arguments.printing.render(&table))?;
+    if arguments.printing.format == TableFormat::Table {
+        print_heat_map(map)?;
+    }
+    Ok(())
 }
 
-/// The comparison of several results folders and of other programs' catalogues.
-pub(super) fn table(
+/// The comparison of a store's runs.
+fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)> {
+    let (mut runs, notes) = store::read(path)?;
+    if let Some(conditions) = &arguments.conditions {
+        runs = conditions
+            .choose(runs)
+            .map_err(|message| anyhow::anyhow!("--where: {message}"))?;
+    }
+    anyhow::ensure!(
+        !runs.is_empty(),
+        "{}: there is no recorded run{}",
+        path.display(),
+        match &arguments.conditions {
+            Some(_) => " for which the conditions hold",
+            None => "; `score --store` and `run --store` record them",
+        }
+    );
+    let mut table = compare_runs(&runs, arguments.group_by, arguments.sort.as_ref());
+    table.notes.extend(notes);
+    Ok((table, runs_heat_map(&runs, arguments.sort.as_ref())))
+}
+
+/// What one variant is before it is scored.
+struct Entrant<'a> {
+    name: String,
+    published: Option<Published>,
+    of_set: Box<dyn Fn(u32) -> Vec<(u32, PathBuf)> + 'a>,
+    foreign: Option<&'a Foreign>,
+}
+
+/// Scores of several results folders and of other programs' catalogues on the sets that all have.
+pub(super) fn variants(
     folders: &[PathBuf],
     foreign: &[PathBuf],
     data: Option<&Path>,
     options: Options,
     threads: usize,
-) -> anyhow::Result<Table> {
+) -> anyhow::Result<Vec<Variant>> {
+    let foreign: Vec<Foreign> = foreign
+        .iter()
+        .map(|path| Foreign::read(path))
+        .collect::<Result<_, _>>()?;
     let registry = Registry::embedded()?;
-    let given = data.map(DataFolder::open).transpose()?;
-    let mut first: Option<(Source, DataFolder)> = None;
-    let mut variants = Vec::new();
+    let mut data = data.map(DataFolder::open).transpose()?;
+    let given = data.is_some();
+    let mut first: Option<Source> = None;
+    let mut entrants = Vec::new();
     for folder in folders {
         let run = Run::require(folder)?;
-        let data = match (&given, &first) {
-            (Some(data), _) => data,
-            (None, Some((source, data))) => {
-                anyhow::ensure!(
-                    *source == run.source,
-                    "{}: it was measured from {}, the first from {source}; give --data DIR to score both against one truth",
-                    folder.display(),
-                    run.source,
-                );
-                data
-            }
-            (None, None) => {
-                let data = run.source.data(folder).with_context(|| {
-                    format!(
-                        "the data folder of {} (--data gives another)",
-                        folder.display()
-                    )
-                })?;
-                &first.insert((run.source.clone(), data)).1
-            }
-        };
-        variants.push(Variant {
-            scored: score_folder(data, folder, &run, &[], options, threads)?,
+        if !given {
+            let source = first.get_or_insert_with(|| run.source.clone());
+            anyhow::ensure!(
+                *source == run.source,
+                "{}: it was measured from {}, the first from {source}; give --data DIR to score both against one truth",
+                folder.display(),
+                run.source,
+            );
+        }
+        if data.is_none() {
+            data = Some(run.source.data(folder).with_context(|| {
+                format!(
+                    "the data folder of {} (--data gives another)",
+                    folder.display()
+                )
+            })?);
+        }
+        entrants.push(Entrant {
             // Published figures belong to the embedded settings, not to a file of the same name.
             published: registry
                 .get(&run.submission.name)
                 .ok()
                 .filter(|entry| entry.submission == run.submission)
                 .and_then(|entry| entry.published),
-            name: run.submission.name,
+            name: run.submission.name.clone(),
+            of_set: Box::new(move |set| run.catalogues(folder, set)),
+            foreign: None,
         });
     }
-    for path in foreign {
-        let data = given
-            .as_ref()
-            .or(first.as_ref().map(|(_, data)| data))
-            .context("--foreign alone needs --data DIR with the true shear")?;
-        variants.push(foreign_variant(path, data, options, threads)?);
+    let data = data.context("--foreign alone needs --data DIR with the true shear")?;
+    entrants.extend(foreign.iter().map(|foreign| Entrant {
+        name: foreign.name.clone(),
+        published: None,
+        of_set: Box::new(|set| foreign.catalogues(set)),
+        foreign: Some(foreign),
+    }));
+    for entrant in &entrants {
+        anyhow::ensure!(
+            (1..=MAX_SET).any(|set| !(entrant.of_set)(set).is_empty()),
+            "{}: there is no catalogue to score",
+            entrant.name
+        );
     }
-    let common = |set: u32| {
-        variants
-            .iter()
-            .all(|v| v.scored.iter().any(|s| s.set == set))
-    };
+    let common = |set: u32| entrants.iter().all(|e| !(e.of_set)(set).is_empty());
     anyhow::ensure!(
         (1..=MAX_SET).any(common),
         "the variants have no set in common; there is nothing to compare"
     );
-    Ok(compare(&variants, options.definition, options.choice))
+    let own = plain_columns(COLUMNS);
+    let readers: Vec<_> = entrants
+        .iter()
+        .map(|entrant| {
+            let (own, foreign) = (&own, entrant.foreign);
+            move |grid: &Grid, path: &Path| match foreign {
+                Some(foreign) => foreign.sum(grid, path),
+                None => own(grid, path),
+            }
+        })
+        .collect();
+    let catalogues: Vec<Catalogues<'_>> = entrants
+        .iter()
+        .zip(&readers)
+        .map(|(entrant, read)| Catalogues {
+            of_set: &entrant.of_set,
+            read,
+        })
+        .collect();
+    let scored = score_variants(&data, &catalogues, &[], options, threads)?;
+    drop(catalogues);
+    drop(readers);
+    Ok(entrants
+        .into_iter()
+        .zip(scored)
+        .map(|(entrant, scored)| variant(entrant.name, entrant.published, &scored))
+        .collect())
 }
 
-fn foreign_variant(
-    path: &Path,
-    data: &DataFolder,
-    options: Options,
-    threads: usize,
-) -> anyhow::Result<Variant> {
-    let foreign = Foreign::read(path)?;
-    let read = |grid: &Grid, path: &Path| foreign.sum(grid, path);
-    let catalogues = |set| foreign.catalogues(set);
-    let scored = score_sets(data, &[], catalogues, &read, options, threads)
-        .with_context(|| path.display().to_string())?;
-    Ok(Variant {
-        name: foreign.name.clone(),
-        scored,
-        published: None,
-    })
+fn variant(name: String, published: Option<Published>, scored: &[ScoredSet]) -> Variant {
+    Variant {
+        name,
+        published,
+        // All are scored against one truth, so their data need no fingerprint to be told apart.
+        sets: scored
+            .iter()
+            .map(|set| set_record(set, String::new()))
+            .collect(),
+        warnings: warnings(scored)
+            .into_iter()
+            .filter(|line| line.starts_with("Warning"))
+            .collect(),
+    }
 }

@@ -90,7 +90,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
     };
     require_complete(arguments, &results, &images)?;
     if images.iter().any(|id| data.truth(id.set).is_file()) {
-        return run::score(run, out, sets, arguments.threads.number());
+        return run::score(run, out, sets, None, arguments.threads.number());
     }
     eprintln!("not scored: {} has no true shear", data.root().display());
     Ok(())

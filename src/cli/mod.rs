@@ -1,6 +1,7 @@
 //! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage.
 
 mod arguments;
+mod baseline;
 mod bench;
 mod calibrate;
 mod check;
@@ -22,6 +23,8 @@ mod unpack;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+
+use crate::report::figure::HeatMap;
 
 /// Score and submit weak-lensing shape measurements, and measure them by Hopfield-network
 /// deconvolution.
@@ -46,6 +49,7 @@ enum Command {
     Merge(merge::Arguments),
     Score(score::Arguments),
     Compare(compare::Arguments),
+    Baseline(baseline::Arguments),
     Check(check::Arguments),
     Pack(pack::Arguments),
     Unpack(unpack::Arguments),
@@ -67,6 +71,7 @@ pub fn main() -> ExitCode {
         Command::Merge(arguments) => merge::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
+        Command::Baseline(arguments) => baseline::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Pack(arguments) => pack::run(&arguments),
         Command::Unpack(arguments) => unpack::run(&arguments),
@@ -91,6 +96,21 @@ pub fn main() -> ExitCode {
 #[derive(Debug, thiserror::Error)]
 #[error("there are findings")]
 struct Findings;
+
+/// Prints a heat map below a table that is read on a terminal; where output goes to a file or
+/// another program, nothing. `NO_COLOR` and a terminal without colours are respected.
+fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
+    use std::io::IsTerminal;
+    if !std::io::stdout().is_terminal() {
+        return Ok(());
+    }
+    // Two digits a cell leave room for 24 sets.
+    let decimals = usize::from(!map.values.iter().any(|value| *value >= 10.0));
+    let map = HeatMap { decimals, ..map };
+    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
+    let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
+    print(&format!("\n{}", map.terminal(coloured)))
+}
 
 /// Prints results to standard output; a reader that has gone away (`| head`) is no error.
 fn print(text: &str) -> anyhow::Result<()> {

@@ -7,14 +7,16 @@ use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
 use super::arguments::Threads;
+use super::compare::variants;
 use super::progress::Bar;
-use super::{compare, measure, print};
+use super::{measure, print};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
 use crate::pipeline::images;
 use crate::pipeline::score::score_folder;
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
+use crate::report::comparison::compare;
 use crate::report::scores::per_set;
 use crate::report::table::TableFormat;
 use crate::simulate::set::SimulationSettings;
@@ -75,7 +77,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         print(&format!("{}\n", table.narrow().render(TableFormat::Table)))?;
         folders.push(folder);
     }
-    let table = compare::table(&folders, &[], None, options, threads)?;
+    let variants = variants(&folders, &[], None, options, threads)?;
+    let table = compare(&variants, options.definition, options.choice);
     print(&table.narrow().render(TableFormat::Table))?;
     eprintln!("\nNext: {}", next_step(out));
     Ok(())

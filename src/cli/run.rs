@@ -8,12 +8,14 @@ use shearq_submissions::Registry;
 
 use super::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use super::progress::Bar;
-use super::{measure, print};
+use super::{measure, print, score};
 use crate::io::atomic;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::run::{Run, Source};
+use crate::io::store;
 use crate::io::table::Format;
 use crate::pipeline::images;
+use crate::pipeline::record::Measured;
 use crate::pipeline::run::run_folder;
 use crate::pipeline::score::score_folder;
 use crate::report::scores::{bandpowers, per_set};
@@ -51,6 +53,9 @@ pub(super) struct Arguments {
     /// Format of the catalogues [default: parquet, or fits in a build without it].
     #[arg(long, value_enum)]
     catalogue_format: Option<Format>,
+    /// Record the scores in this results store, which `compare --store` reads.
+    #[arg(long, value_name = "DIR")]
+    store: Option<PathBuf>,
     #[command(flatten)]
     sharding: Sharding,
     #[command(flatten)]
@@ -67,9 +72,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         simulation,
         out,
         catalogue_format,
+        store,
         sharding,
         threads,
     } = arguments;
+    if let Some(store) = store {
+        store::prepare(store)?;
+    }
     let threads = threads.number();
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
     let data = data.as_ref().map(DataFolder::open).transpose()?;
@@ -105,15 +114,25 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         );
         return Ok(());
     }
-    score(&run, out, sets, threads)
+    score(&run, out, sets, store.as_deref(), threads)
 }
 
 /// Scores a folder of catalogues (those of `sets`, or all), prints the scores and keeps them and the
-/// bandpowers beside the catalogues.
-pub(super) fn score(run: &Run, out: &Path, sets: &[u32], threads: usize) -> anyhow::Result<()> {
+/// bandpowers beside the catalogues, and in the results store if there is one.
+pub(super) fn score(
+    run: &Run,
+    out: &Path,
+    sets: &[u32],
+    store: Option<&Path>,
+    threads: usize,
+) -> anyhow::Result<()> {
     let options = Options::default();
     let truth = run.source.data(out)?;
     let scored = score_folder(&truth, out, run, sets, options, threads)?;
+    if let Some(store) = store {
+        let made = Measured::run(run, &truth, out)?;
+        score::record(store, made, &scored, options)?;
+    }
     let title = format!("Scores of {}", run.submission.name);
     let table = per_set(&scored, &title, options.definition, options.choice);
     for (name, table) in [("scores", &table), ("bandpowers", &bandpowers(&scored))] {

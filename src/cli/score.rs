@@ -10,7 +10,9 @@ use shearq_scoring::{BiasFits, Grid, Noise, Options, Quality, SetScorer, TrueShe
 use super::arguments::{Printing, ScoreSettings, SetList, Threads};
 use super::print;
 use crate::io::layout::DataFolder;
-use crate::io::run::Run;
+use crate::io::run::{Run, Source};
+use crate::io::store;
+use crate::pipeline::record::{Measured, run_record};
 use crate::pipeline::score::{
     Reading, ScoredSet, plain_columns, read_truth, reading_of, score_files, score_folder,
     score_sets,
@@ -80,6 +82,9 @@ pub(super) struct Arguments {
         num_args = 1
     )]
     columns: Vec<String>,
+    /// Record the scores in this results store, which `compare --store` reads.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra"])]
+    store: Option<PathBuf>,
     #[command(flatten)]
     printing: Printing,
     #[command(flatten)]
@@ -125,6 +130,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 }
 
 fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> anyhow::Result<()> {
+    if let Some(store) = &arguments.store {
+        store::prepare(store)?;
+    }
     let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
     let threads = arguments.threads.number();
     let (name, scored) = match (&arguments.measured, &arguments.foreign, data) {
@@ -132,6 +140,10 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             let run = Run::require(measured)?;
             let data = data.map_or_else(|| run.source.data(measured), Ok)?;
             let scored = score_folder(&data, measured, &run, sets, options, threads)?;
+            if let Some(store) = &arguments.store {
+                let made = Measured::run(&run, &data, measured)?;
+                record(store, made, &scored, options)?;
+            }
             (run.submission.name, scored)
         }
         (None, Some(path), Some(data)) => {
@@ -140,6 +152,16 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             let catalogues = |set| foreign.catalogues(set);
             let scored = score_sets(&data, sets, catalogues, &read, options, threads)
                 .with_context(|| path.display().to_string())?;
+            if let Some(store) = &arguments.store {
+                let made = Measured {
+                    name: &foreign.name,
+                    settings: std::fs::read_to_string(path)
+                        .with_context(|| path.display().to_string())?,
+                    source: &Source::folder(&data),
+                    data: &data,
+                };
+                record(store, made, &scored, options)?;
+            }
             (foreign.name.clone(), scored)
         }
         (None, _, _) => bail!("--foreign needs the true shear: --data DIR"),
@@ -147,6 +169,18 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
     let title = format!("Scores of {name}");
     let table = per_set(&scored, &title, options.definition, options.choice);
     print(&arguments.printing.render(&table))
+}
+
+/// Records a scored run in a results store and says where.
+pub(super) fn record(
+    store: &Path,
+    measured: Measured<'_>,
+    scored: &[ScoredSet],
+    options: Options,
+) -> anyhow::Result<()> {
+    let path = store::write(store, &run_record(measured, scored, options)?)?;
+    eprintln!("recorded in {}", path.display());
+    Ok(())
 }
 
 /// Scores the power spectra of a folder, one file per set.

@@ -4,13 +4,16 @@
 //! polars. Every file is written under a temporary name and renamed when whole ([`atomic`]).
 
 pub mod atomic;
+pub mod baseline;
 pub mod error;
+pub mod fingerprint;
 pub mod fits;
 pub mod layout;
 #[cfg(feature = "parquet")]
 mod parquet;
 pub mod psf_table;
 pub mod run;
+pub mod store;
 pub mod table;
 mod text;
 

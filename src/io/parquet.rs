@@ -57,7 +57,7 @@ pub(super) fn write(
 }
 
 /// The crate's errors name the file already; keep the name once.
-fn bare(path: &Path, error: &tables::TableError) -> FileError {
+pub(super) fn bare(path: &Path, error: &tables::TableError) -> FileError {
     let message = error.to_string();
     let prefix = format!("{}: ", path.display());
     FileError::new(path, message.strip_prefix(&prefix).unwrap_or(&message))

@@ -209,8 +209,11 @@ fn open_to_lock(path: &Path) -> std::io::Result<File> {
     writable.or_else(|_| File::open(path))
 }
 
-/// Lines in which two records differ, as `key: first ≠ second`.
-fn differences(
+/// Lines in which two records differ, as `key: first ≠ second`; what one does not have is null.
+///
+/// # Errors
+/// Where a record cannot be put in JSON.
+pub fn differences(
     first: &impl Serialize,
     second: &impl Serialize,
 ) -> Result<Vec<String>, serde_json::Error> {

@@ -263,5 +263,5 @@ fn write_parquet(
 }
 
 #[cfg(not(feature = "parquet"))]
-const WITHOUT_PARQUET: &str =
+pub(super) const WITHOUT_PARQUET: &str =
     "this build of shearq has no Parquet support; rebuild with the feature `parquet` or use FITS";

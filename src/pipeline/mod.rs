@@ -4,6 +4,7 @@
 //! scratch from the caller; everything in it is in order, so that results do not depend on the
 //! number of threads.
 
+pub mod baseline;
 mod calibrate;
 pub mod complete;
 pub mod engine;
@@ -11,6 +12,7 @@ pub mod galaxy;
 pub mod images;
 pub mod measure;
 mod method;
+pub mod record;
 pub mod run;
 pub mod score;
 pub mod simulate;

@@ -94,7 +94,20 @@ pub fn score_files(
     threads: usize,
 ) -> Result<(SetScore, RowCounts), PipelineError> {
     let (grid, shear) = read_truth(truth, reading)?;
-    let mut images = SetImages::new(&grid);
+    let scoring = |source| PipelineError::Scoring { set: 0, source };
+    let scorer = SetScorer::new(grid, shear, options).map_err(scoring)?;
+    let (images, rows) = add_up(&grid, catalogues, read, threads)?;
+    Ok((scorer.score(&images).map_err(scoring)?, rows))
+}
+
+/// Reads catalogues in parallel and adds them up in order.
+fn add_up(
+    grid: &Grid,
+    catalogues: &[PathBuf],
+    read: ReadImage<'_>,
+    threads: usize,
+) -> Result<(SetImages, RowCounts), PipelineError> {
+    let mut images = SetImages::new(grid);
     let mut counts = RowCounts::default();
     engine::ordered(
         threads,
@@ -107,7 +120,7 @@ pub fn score_files(
             Ok(())
         },
         || (),
-        |(), path: PathBuf| Ok(read(&grid, &path)?),
+        |(), path: PathBuf| Ok(read(grid, &path)?),
         |(sum, more)| {
             images.add(&sum);
             counts += more;
@@ -122,14 +135,11 @@ pub fn score_files(
             "no row of the {} catalogue(s) falls on the {1} × {1} grid of {2} px stamps",
             catalogues.len(),
             grid.n,
-            reading.stamp.0
+            grid.stamp.0
         );
         return Err(FileError::new(first, message).into());
     }
-    let score = SetScorer::new(grid, shear, options)
-        .and_then(|scorer| scorer.score(&images))
-        .map_err(|source| PipelineError::Scoring { set: 0, source })?;
-    Ok((score, counts))
+    Ok((images, counts))
 }
 
 /// How the truth of a data folder is to be read.
@@ -142,11 +152,66 @@ pub fn reading_of(data: &DataFolder) -> Reading {
     }
 }
 
+/// Catalogues of one variant of a measurement.
+pub struct Catalogues<'a> {
+    /// Those of a set that are there, by image number.
+    pub of_set: &'a dyn Fn(u32) -> Vec<(u32, PathBuf)>,
+    /// How one is read.
+    pub read: ReadImage<'a>,
+}
+
+/// Scores several variants on sets of a data folder: all sets of which every variant has
+/// catalogues, or those of `sets`, which all must have. The truth of each set is read once.
+///
+/// # Errors
+/// Where files are absent or damaged, or there is nothing to score.
+pub fn score_variants(
+    data: &DataFolder,
+    variants: &[Catalogues<'_>],
+    sets: &[u32],
+    options: Options,
+    threads: usize,
+) -> Result<Vec<Vec<ScoredSet>>, PipelineError> {
+    let reading = reading_of(data);
+    let mut scored: Vec<Vec<ScoredSet>> = variants.iter().map(|_| Vec::new()).collect();
+    for set in 1..=MAX_SET {
+        if !sets.is_empty() && !sets.contains(&set) {
+            continue;
+        }
+        let files: Vec<Vec<(u32, PathBuf)>> = variants.iter().map(|v| (v.of_set)(set)).collect();
+        if files.iter().any(Vec::is_empty) {
+            if sets.contains(&set) {
+                let message = format!("there is no catalogue of set {set} to score");
+                return Err(PipelineError::Request(message));
+            }
+            continue;
+        }
+        let scoring = |source| PipelineError::Scoring { set, source };
+        let (grid, shear) = read_truth(&data.truth(set), &reading)?;
+        let scorer = SetScorer::new(grid, shear, options).map_err(scoring)?;
+        for ((variant, files), scored) in variants.iter().zip(files).zip(&mut scored) {
+            let (numbers, files): (Vec<u32>, Vec<PathBuf>) = files.into_iter().unzip();
+            let (images, rows) = add_up(&grid, &files, variant.read, threads)?;
+            scored.push(ScoredSet {
+                set,
+                images: numbers,
+                score: scorer.score(&images).map_err(scoring)?,
+                rows,
+            });
+        }
+    }
+    if scored.iter().any(Vec::is_empty) {
+        let message = "there is no catalogue to score".into();
+        return Err(PipelineError::Request(message));
+    }
+    Ok(scored)
+}
+
 /// Scores sets of a data folder from catalogues found by `catalogues`: all sets that have some, or
 /// those of `sets`, which then must have some.
 ///
 /// # Errors
-/// Where files are absent or damaged, or there is nothing to score.
+/// As [`score_variants`].
 pub fn score_sets(
     data: &DataFolder,
     sets: &[u32],
@@ -155,37 +220,12 @@ pub fn score_sets(
     options: Options,
     threads: usize,
 ) -> Result<Vec<ScoredSet>, PipelineError> {
-    let reading = reading_of(data);
-    let mut scored = Vec::new();
-    for set in 1..=MAX_SET {
-        if !sets.is_empty() && !sets.contains(&set) {
-            continue;
-        }
-        let (numbers, files): (Vec<u32>, Vec<PathBuf>) = catalogues(set).into_iter().unzip();
-        if files.is_empty() {
-            if sets.contains(&set) {
-                let message = format!("there is no catalogue of set {set} to score");
-                return Err(PipelineError::Request(message));
-            }
-            continue;
-        }
-        let (score, rows) = score_files(&data.truth(set), &files, &reading, read, options, threads)
-            .map_err(|error| match error {
-                PipelineError::Scoring { source, .. } => PipelineError::Scoring { set, source },
-                other => other,
-            })?;
-        scored.push(ScoredSet {
-            set,
-            images: numbers,
-            score,
-            rows,
-        });
-    }
-    if scored.is_empty() {
-        let message = "there is no catalogue to score".into();
-        return Err(PipelineError::Request(message));
-    }
-    Ok(scored)
+    let variant = Catalogues {
+        of_set: &catalogues,
+        read,
+    };
+    let scored = score_variants(data, &[variant], sets, options, threads)?;
+    Ok(scored.into_iter().flatten().collect())
 }
 
 /// Scores every measured set of a results folder (or those of `sets`) against the truth of `data`.

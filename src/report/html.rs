@@ -559,7 +559,7 @@ fn sort_value(value: f64) -> String {
 }
 
 /// Text as contents of an element or as a value of an attribute in quotes.
-fn escape(text: &str) -> String {
+pub(super) fn escape(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
         match c {

@@ -1,9 +1,12 @@
 //! Tables, figures and pages of both.
 
+pub mod baseline;
+pub mod comparison;
 pub mod figure;
 mod font;
 pub mod html;
 pub mod page;
+pub mod runs;
 pub mod scores;
 pub mod steps;
 pub mod table;

@@ -3,12 +3,10 @@
 use std::collections::BTreeMap;
 
 use serde_json::{Value, json};
-use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
 use shearq_scoring::{
     BINS, Bias, BiasFits, Choice, ConventionClass, ConventionScore, Definition, Figures,
     MAX_GROUPS, Quality, SCORED, SetScore,
 };
-use shearq_submissions::Published;
 
 use super::table::{Cell, Heading, Table};
 use crate::pipeline::score::{ScoredSet, means};
@@ -47,7 +45,7 @@ fn kind_label(set: u32) -> String {
 }
 
 /// One line that says what the figures are.
-fn definition_note(definition: Definition, choice: Choice) -> String {
+pub(super) fn definition_note(definition: Definition, choice: Choice) -> String {
     let definition = match definition {
         Definition::Leaderboard => "leaderboard definition (the challenge's own arithmetic)",
         Definition::Corrected => "corrected definition (azimuthal averages, fixed bins)",
@@ -264,169 +262,6 @@ pub fn bandpowers(scored: &[ScoredSet]) -> Table {
         rows,
         notes: Vec::new(),
     }
-}
-
-/// One variant in a comparison.
-pub struct Variant {
-    /// Name of the submission.
-    pub name: String,
-    /// Its scores.
-    pub scored: Vec<ScoredSet>,
-    /// Published figures.
-    pub published: Option<Published>,
-}
-
-/// Variants side by side over the sets that all of them have, with the significance of each one's
-/// difference in Q from the first, paired over the same images, and the published figures.
-pub fn compare(variants: &[Variant], definition: Definition, choice: Choice) -> Table {
-    let common: Vec<u32> = variants.first().map_or_else(Vec::new, |first| {
-        first
-            .scored
-            .iter()
-            .map(|s| s.set)
-            .filter(|set| {
-                variants
-                    .iter()
-                    .all(|v| v.scored.iter().any(|s| s.set == *set))
-            })
-            .collect()
-    });
-    let of = |variant: &Variant| -> BTreeMap<u32, usize> {
-        variant
-            .scored
-            .iter()
-            .enumerate()
-            .map(|(k, s)| (s.set, k))
-            .collect()
-    };
-    let headings = vec![
-        Heading::new("submission", "Submission"),
-        Heading::new("q", "Q"),
-        Heading::new("q_difference", "ΔQ to first"),
-        Heading::new("sigma", "in σ"),
-        Heading::new("q_published", "Q publ."),
-        Heading::new("q_dn", "Q_dn"),
-        Heading::new("m_half", "M/2"),
-        Heading::new("m_half_published", "M/2 publ."),
-        Heading::new("sqrt_a", "√A×10⁴"),
-        Heading::new("sqrt_a_published", "√A publ."),
-        Heading::new("m_cross", "m (cross)"),
-    ];
-    let mut rows = Vec::new();
-    for variant in variants {
-        let index = of(variant);
-        let sets: Vec<&SetScore> = common
-            .iter()
-            .map(|set| &variant.scored[index[set]].score)
-            .collect();
-        let mean = |at: usize, decimals: usize| {
-            let pairs: Vec<(f64, Option<f64>)> = sets
-                .iter()
-                .map(|s| (s.figures.values()[at], s.errors().map(|e| e.values()[at])))
-                .collect();
-            let (value, error) = mean_over_sets(&pairs);
-            Cell::with_error(value, error, decimals)
-        };
-        let published = |value: fn(&Published) -> f64, decimals: usize| {
-            Cell::number(variant.published.as_ref().map_or(f64::NAN, value), decimals)
-        };
-        let difference = difference_from(&variants[0], variant, &common);
-        rows.push(vec![
-            Cell::text(&variant.name),
-            mean(0, 2),
-            Cell::with_error(
-                difference.map_or(f64::NAN, |d| d.difference),
-                difference.map(|d| d.error),
-                2,
-            ),
-            Cell::number(difference.map_or(f64::NAN, |d| d.sigma()), 1),
-            published(|p| p.q, 2),
-            mean(1, 2),
-            mean(2, 4),
-            published(|p| p.m_half, 4),
-            mean(3, 4),
-            published(|p| p.sqrt_a, 4),
-            mean(4, 4),
-        ]);
-    }
-    let images: usize = variants.first().map_or(0, |v| {
-        v.scored
-            .iter()
-            .filter(|s| common.contains(&s.set))
-            .map(|s| s.score.images)
-            .sum()
-    });
-    let list: Vec<String> = common.iter().map(u32::to_string).collect();
-    let mut notes = vec![
-        format!("Means over set(s) {}, {images} images in all.", list.join(", ")),
-        definition_note(definition, choice),
-        "ΔQ: jackknife of the paired difference on the same images. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
-    ];
-    let unpaired: Vec<&str> = variants
-        .iter()
-        .skip(1)
-        .filter(|v| difference_from(&variants[0], v, &common).is_none())
-        .map(|v| v.name.as_str())
-        .collect();
-    if !unpaired.is_empty() {
-        notes.push(format!(
-            "No difference is given for {}: it needs at least two images, the same ones as the first.",
-            unpaired.join(", ")
-        ));
-    }
-    for variant in variants {
-        let kept: Vec<String> = warnings(&variant.scored)
-            .into_iter()
-            .filter(|line| line.starts_with("Warning"))
-            .map(|line| format!("{}: {line}", variant.name))
-            .collect();
-        notes.extend(kept);
-    }
-    Table {
-        title: "Comparison of submissions".into(),
-        headings,
-        rows,
-        notes,
-    }
-}
-
-/// Paired difference in Q of `second` from `first`; `None` for a variant with itself.
-fn difference_from(
-    first: &Variant,
-    second: &Variant,
-    sets: &[u32],
-) -> Option<shearq_scoring::resample::PairedDifference> {
-    if std::ptr::eq(first, second) {
-        return None;
-    }
-    let find = |v: &'_ Variant, set: u32| v.scored.iter().position(|s| s.set == set);
-    let q = |score: &SetScore| -> Vec<f64> { score.replicates.iter().map(|r| r.q).collect() };
-    let mut pairs = Vec::new();
-    for &set in sets {
-        let (a, b) = (
-            &first.scored[find(first, set)?],
-            &second.scored[find(second, set)?],
-        );
-        // Groups pair up only where both have the same images.
-        if a.images != b.images {
-            return None;
-        }
-        let (a, b) = (&a.score, &b.score);
-        pairs.push((a.images, a.figures.q, q(a), b.figures.q, q(b)));
-    }
-    let pairs: Vec<PairedSet<'_>> = pairs
-        .iter()
-        .map(
-            |(images, first, first_replicates, second, second_replicates)| PairedSet {
-                images: *images,
-                first: *first,
-                first_replicates,
-                second: *second,
-                second_replicates,
-            },
-        )
-        .collect();
-    paired_difference(&pairs)
 }
 
 fn bias_json(bias: &Bias) -> Value {

@@ -5,6 +5,9 @@ use serde::Serialize;
 /// Highest set number.
 pub const SETS: u32 = 24;
 
+/// The class of S/N or size that most sets have.
+const FIDUCIAL: &str = "fiducial";
+
 /// Whether a field is the same for all images of a set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -13,6 +16,16 @@ pub enum Variability {
     Fixed,
     /// Different from image to image.
     Variable,
+}
+
+impl Variability {
+    /// In one word.
+    pub fn label(self) -> &'static str {
+        match self {
+            Variability::Fixed => "fixed",
+            Variability::Variable => "variable",
+        }
+    }
 }
 
 /// What the galaxies and the PSF of a set are like.
@@ -55,6 +68,34 @@ impl ImageType {
             ImageType::Kolmogorov => "Kolmogorov PSF",
             ImageType::UniformBulge => "Uniform bulge/disc ratios",
             ImageType::OffsetBulge => "50/50 bulge/disc offset",
+        }
+    }
+
+    /// Class of S/N: `fiducial`, `low`, `high` or `smooth`, a distribution.
+    pub fn snr_class(self) -> &'static str {
+        match self {
+            ImageType::LowSnr => "low",
+            ImageType::HighSnr => "high",
+            ImageType::SmoothSnr => "smooth",
+            _ => FIDUCIAL,
+        }
+    }
+
+    /// Class of galaxy sizes: `fiducial`, `small`, `large` or `smooth`, a distribution.
+    pub fn size_class(self) -> &'static str {
+        match self {
+            ImageType::SmallGalaxy => "small",
+            ImageType::LargeGalaxy => "large",
+            ImageType::SmoothGalaxy => "smooth",
+            _ => FIDUCIAL,
+        }
+    }
+
+    /// Profile of the PSF: `moffat` or `kolmogorov`.
+    pub fn psf_profile(self) -> &'static str {
+        match self {
+            ImageType::Kolmogorov => "kolmogorov",
+            _ => "moffat",
         }
     }
 }

@@ -1,5 +1,6 @@
 //! End to end, through the binary and the library's public face.
 
+mod baselines;
 mod chain;
 mod figures;
 mod galsim_galaxies;
@@ -9,5 +10,6 @@ mod packed;
 mod reproduced;
 mod scoring_cases;
 mod shards;
+mod stored;
 mod submitted;
 mod support;

@@ -64,6 +64,21 @@ pub fn contents(folder: &Path) -> Vec<(String, Vec<u8>)> {
     found
 }
 
+/// Runs a submission on small simulated sets, three images each, with more arguments.
+pub fn run_simulated(sets: &str, submission: &str, out: &Path, more: &[&str]) {
+    let mut arguments = vec!["run", "--simulate", "--images", "3", "--grid", "12"];
+    arguments.extend([
+        "--sets",
+        sets,
+        "--submission",
+        submission,
+        "--out",
+        text(out),
+    ]);
+    arguments.extend(more);
+    succeed(&arguments);
+}
+
 /// A path as an argument.
 pub fn text(path: &Path) -> &str {
     path.to_str().expect("UTF-8 path")

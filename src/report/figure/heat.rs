@@ -61,6 +61,45 @@ impl HeatMap {
     }
 }
 
+impl HeatMap {
+    /// The table for a terminal, with coloured cells if it has colours.
+    pub fn terminal(&self, coloured: bool) -> String {
+        let texts = self.values.map(|&value| self.cell_text(value));
+        let length = |text: &String| text.chars().count();
+        let longest = |texts: &[String]| texts.iter().map(length).max().unwrap_or(0);
+        let names = longest(&self.rows);
+        let cell = texts
+            .iter()
+            .chain(&self.columns)
+            .map(length)
+            .max()
+            .unwrap_or(0);
+        let limits = Limits::of(self.values.iter().copied(), None, self.map);
+        let mut text = format!("{} ({})\n{:names$}", self.title, self.value_label, "");
+        for column in &self.columns {
+            text.push_str(&format!(" {column:>cell$} "));
+        }
+        text.push('\n');
+        for (row, name) in self.rows.iter().enumerate() {
+            text.push_str(&format!("{name:names$}"));
+            for (value, words) in self.values.row(row).iter().zip(texts.row(row)) {
+                let position = limits.position(*value, Stretch::Linear);
+                if coloured && !position.is_nan() {
+                    let paper = self.map.colour(position);
+                    let ([r, g, b], [pr, pg, pb]) = (text_on(paper), paper);
+                    text.push_str(&format!(
+                        "\x1b[38;2;{r};{g};{b};48;2;{pr};{pg};{pb}m {words:>cell$} \x1b[0m"
+                    ));
+                } else {
+                    text.push_str(&format!(" {words:>cell$} "));
+                }
+            }
+            text.push('\n');
+        }
+        text
+    }
+}
+
 impl Figure for HeatMap {
     fn scene(&self) -> Result<Scene, FigureError> {
         self.check()?;

@@ -1,0 +1,117 @@
+//! Baselines: what was measured once, and everything that made it, in a TOML file to compare with.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::atomic;
+use super::error::FileError;
+use super::run::Source;
+
+/// A baseline.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Baseline {
+    /// Version of shearq that measured it.
+    pub version: String,
+    /// Where the galaxies come from.
+    pub source: Source,
+    /// Why it was changed, oldest first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub history: Vec<Change>,
+    /// What was measured.
+    pub submissions: Vec<BaselineSubmission>,
+}
+
+/// One submission of a baseline.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BaselineSubmission {
+    /// Its name.
+    pub name: String,
+    /// All settings. Kept as text would be, so that settings of later versions can be told apart
+    /// from them.
+    pub settings: toml::Table,
+    /// Its sets, in order.
+    pub sets: Vec<BaselineSet>,
+}
+
+/// One set of a submission.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BaselineSet {
+    /// Set number.
+    pub set: u32,
+    /// Fingerprint of its data.
+    pub data: String,
+    /// Numbers of the images.
+    pub images: Vec<u32>,
+    /// Galaxies in their catalogues.
+    pub galaxies: u64,
+    /// Of these, without an ellipticity.
+    pub flagged: u64,
+    /// Value and standard error of each figure, and of the scatter (rms) of either component of the
+    /// ellipticity. An unknown error is NaN.
+    pub figures: BTreeMap<String, [f64; 2]>,
+}
+
+/// A change of a baseline.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Change {
+    /// Why.
+    pub reason: String,
+    /// Version of shearq before.
+    pub from_version: String,
+    /// What moved.
+    pub moved: Vec<String>,
+}
+
+impl Baseline {
+    /// The file of the baseline `name` in `folder`.
+    pub fn path(folder: &Path, name: &str) -> PathBuf {
+        folder.join(format!("{name}.{ENDING}"))
+    }
+
+    /// Names of the baselines in `folder`, in order.
+    ///
+    /// # Errors
+    /// Where the folder cannot be read.
+    pub fn names(folder: &Path) -> Result<Vec<String>, FileError> {
+        let entries = std::fs::read_dir(folder)
+            .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
+            .map_err(FileError::doing(folder, "cannot read the baselines"))?;
+        let mut names: Vec<String> = entries
+            .into_iter()
+            .map(|entry| entry.path())
+            .filter(|path| path.extension().is_some_and(|ending| ending == ENDING))
+            .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
+            .collect();
+        names.sort();
+        Ok(names)
+    }
+
+    /// Reads a baseline.
+    ///
+    /// # Errors
+    /// Where it cannot be read or is not valid.
+    pub fn read(path: &Path) -> Result<Self, FileError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(FileError::doing(path, "cannot read the baseline"))?;
+        toml::from_str(&text).map_err(|error| FileError::new(path, error.to_string().trim_end()))
+    }
+
+    /// Writes the baseline.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn write(&self, path: &Path) -> Result<(), FileError> {
+        let text =
+            toml::to_string(self).map_err(FileError::doing(path, "cannot write the baseline"))?;
+        atomic::write(path, text.as_bytes())
+    }
+}
+
+/// Ending of file names.
+const ENDING: &str = "toml";
