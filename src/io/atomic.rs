@@ -1,7 +1,7 @@
 //! Files that appear whole or not at all.
 
 use std::fs;
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use super::error::FileError;
@@ -36,7 +36,7 @@ impl PartFile {
         let part = folder.join(format!(".{}.part", name.to_string_lossy()));
         match fs::remove_file(&part) {
             Ok(()) => {}
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
             Err(error) => {
                 return Err(FileError::new(
                     &part,
@@ -61,17 +61,18 @@ impl PartFile {
         &self.target
     }
 
-    /// Gives the file its name.
+    /// Gives the file its name, for good: the content is on disk before the name, and the name before
+    /// anything that is written after it.
     ///
     /// # Errors
     /// Where it cannot be flushed to disk or renamed.
     pub fn finish(mut self) -> Result<(), FileError> {
+        let cannot = || FileError::doing(&self.target, "cannot write the file");
         let flush = fs::File::open(&self.part).and_then(|file| file.sync_data());
-        flush.map_err(FileError::doing(&self.target, "cannot write the file"))?;
-        fs::rename(&self.part, &self.target)
-            .map_err(FileError::doing(&self.target, "cannot write the file"))?;
+        flush.map_err(cannot())?;
+        fs::rename(&self.part, &self.target).map_err(cannot())?;
         self.finished = true;
-        Ok(())
+        sync_names(&self.target).map_err(cannot())
     }
 }
 
@@ -82,6 +83,32 @@ impl Drop for PartFile {
             let _ = fs::remove_file(&self.part);
         }
     }
+}
+
+/// Flushes the names in the folder of `file` to disk, so that even a power failure cannot keep later
+/// results without the record that was written before them.
+#[cfg(unix)]
+fn sync_names(file: &Path) -> std::io::Result<()> {
+    let folder = match file.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    let folder = match fs::File::open(folder) {
+        // A folder that may be written to but not read.
+        Err(error) if error.kind() == ErrorKind::PermissionDenied => return Ok(()),
+        folder => folder?,
+    };
+    match folder.sync_all() {
+        // Some network file systems cannot flush folders; they order names themselves.
+        Err(error) if error.kind() == ErrorKind::InvalidInput => Ok(()),
+        result => result,
+    }
+}
+
+/// Elsewhere a folder cannot be opened as a file.
+#[cfg(not(unix))]
+fn sync_names(_file: &Path) -> std::io::Result<()> {
+    Ok(())
 }
 
 /// Writes `bytes` to `target`, whole or not at all.

@@ -4,6 +4,7 @@ mod chain;
 mod figures;
 mod galsim_galaxies;
 mod galsim_measured;
+mod killed;
 mod orientation;
 mod reproduced;
 mod scoring_cases;
