@@ -90,7 +90,7 @@ impl Run {
         let text = match std::fs::read_to_string(&path) {
             Ok(text) => text,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            Err(error) => return Err(FileError::new(&path, error)),
+            Err(error) => return Err(FileError::doing(&path, "cannot read the record")(error)),
         };
         serde_json::from_str(&text)
             .map(Some)
@@ -153,7 +153,7 @@ pub fn claim<R: Serialize + serde::de::DeserializeOwned>(
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
             return write_record(path, record);
         }
-        Err(error) => return Err(FileError::new(path, error)),
+        Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),
         Ok(text) => text,
     };
     let earlier: R = serde_json::from_str(&text)

@@ -1,5 +1,8 @@
 //! End to end, through the binary and the library's public face.
 
+mod bad_catalogues;
+mod bad_images;
+mod bad_settings;
 mod chain;
 mod figures;
 mod galsim_galaxies;
