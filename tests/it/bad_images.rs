@@ -238,7 +238,7 @@ fn compressed_images_are_read_and_damaged_ones_refused() {
 }
 
 /// A gzip file of blocks that are stored, not compressed.
-fn gzip(bytes: &[u8]) -> Vec<u8> {
+pub fn gzip(bytes: &[u8]) -> Vec<u8> {
     let mut packed = vec![0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 255];
     let blocks = bytes.chunks(usize::from(u16::MAX));
     let last = blocks.len() - 1;

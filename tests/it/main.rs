@@ -5,6 +5,7 @@ mod bad_images;
 mod bad_settings;
 mod chain;
 mod figures;
+mod fuzz;
 mod galsim_galaxies;
 mod galsim_measured;
 mod killed;

@@ -15,6 +15,12 @@ use crate::io::table::{Column, Table};
 const MAX_SIDE: usize = 200_000;
 /// Most rows of a table accepted.
 const MAX_ROWS: usize = 200_000_000;
+/// Most pixels of a tile of a compressed image, against the same.
+const MAX_TILE: f64 = 1e8;
+/// Bytes at the start of a file in which the headers of an fpack-compressed image lie.
+const HEADERS: usize = 32 * 2880;
+/// Bytes of a header card.
+const CARD: usize = 80;
 /// Most bytes that deflate makes of one.
 const MAX_INFLATION: u64 = 1032;
 
@@ -251,6 +257,7 @@ fn room(path: &Path, what: &'static str) -> Result<u64, FileError> {
         ));
     }
     if start == *b"SIMPLE" {
+        check_tiles(&mut file, path)?;
         return Ok(size);
     }
     if !start.starts_with(&[0x1f, 0x8b]) || size < 18 {
@@ -281,6 +288,46 @@ fn room(path: &Path, what: &'static str) -> Result<u64, FileError> {
             "the gzip file is truncated, damaged, or of 4 GiB and more: it says that its {size} bytes expand to {stated}; expected {least} to {most}"
         ),
     ))
+}
+
+/// Checks the sizes of the tiles of an fpack-compressed image, by which cfitsio divides and for which
+/// it takes memory unasked.
+fn check_tiles(file: &mut std::fs::File, path: &Path) -> Result<(), FileError> {
+    let mut header = vec![0; HEADERS];
+    let found = file
+        .rewind()
+        .and_then(|()| read_up_to(file, &mut header))
+        .map_err(FileError::doing(path, "cannot open the file"))?;
+    let (mut pixels, mut rice) = (1.0, false);
+    for card in header[..found].chunks_exact(CARD) {
+        let text = String::from_utf8_lossy(card);
+        let Some((key, value)) = text.split_once('=') else {
+            continue;
+        };
+        let key = key.trim();
+        if key == "ZCMPTYPE" {
+            rice = value.contains("RICE");
+        }
+        // The first parameter of Rice compression is the size of a block.
+        if !key.starts_with("ZTILE") && !(rice && key == "ZVAL1") {
+            continue;
+        }
+        let value = value.split('/').next().unwrap_or_default().trim();
+        let size = value.parse::<f64>().unwrap_or(f64::NAN);
+        if !(1.0..=MAX_SIDE as f64).contains(&size) {
+            let message =
+                format!("the header key {key} is {value}; expected 1 to {MAX_SIDE} pixels");
+            return Err(FileError::new(path, message));
+        }
+        if key.starts_with("ZTILE") {
+            pixels *= size;
+        }
+    }
+    if pixels > MAX_TILE {
+        let message = format!("its tiles have {pixels} pixels; expected at most {MAX_TILE}");
+        return Err(FileError::new(path, message));
+    }
+    Ok(())
 }
 
 /// Fills `buffer` as far as the file goes.
