@@ -11,6 +11,7 @@ use super::progress::Bar;
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
+use crate::pipeline::galaxy::flag;
 use crate::pipeline::images::{self, ImageId};
 use crate::pipeline::measure::{Summary, galaxies_to_do, measure_folder};
 
@@ -98,4 +99,14 @@ pub(super) fn report(run: &Run, summary: &Summary, elapsed: Duration, threads: u
         summary.already,
         out.display()
     );
+    if summary.flagged > 0 {
+        let reasons: Vec<String> = summary
+            .flags
+            .iter()
+            .zip(flag::MEANINGS)
+            .filter(|(count, _)| **count > 0)
+            .map(|(count, (_, meaning))| format!("{meaning} ({count})"))
+            .collect();
+        eprintln!("flagged: {}", reasons.join(", "));
+    }
 }

@@ -1,7 +1,7 @@
 //! Files that appear whole or not at all.
 
 use std::fs;
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use super::error::FileError;
@@ -44,7 +44,8 @@ impl PartFile {
         &self.target
     }
 
-    /// Gives the file its name.
+    /// Gives the file its name, for good: the content is on disk before the name, and the name before
+    /// anything that is written after it.
     ///
     /// # Errors
     /// Where it cannot be flushed to disk or renamed.
@@ -53,7 +54,7 @@ impl PartFile {
             .and_then(|()| fs::rename(&self.part, &self.target))
             .map_err(FileError::doing(&self.target, "cannot write the file"))?;
         self.finished = true;
-        Ok(())
+        sync_names(&self.target).map_err(FileError::doing(&self.target, "cannot write the file"))
     }
 
     /// Gives the file its name unless a file has it by now, of which nothing changes then.
@@ -65,7 +66,8 @@ impl PartFile {
             .flush()
             .and_then(|()| fs::hard_link(&self.part, &self.target));
         match named {
-            Ok(()) => Ok(()),
+            Ok(()) => sync_names(&self.target)
+                .map_err(FileError::doing(&self.target, "cannot write the file")),
             Err(_) if self.target.exists() => Ok(()),
             // Some file systems have no links. Then the last of several processes wins.
             Err(_) => self.finish(),
@@ -183,6 +185,32 @@ fn remove_part(path: &Path) -> Result<(), FileError> {
     if name.starts_with('.') && name.ends_with(PART) && path.is_file() {
         fs::remove_file(path).map_err(FileError::doing(path, "cannot remove the leftover"))?;
     }
+    Ok(())
+}
+
+/// Flushes the names in the folder of `file` to disk, so that even a power failure cannot keep later
+/// results without the record that was written before them.
+#[cfg(unix)]
+fn sync_names(file: &Path) -> std::io::Result<()> {
+    let folder = match file.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    let folder = match fs::File::open(folder) {
+        // A folder that may be written to but not read.
+        Err(error) if error.kind() == ErrorKind::PermissionDenied => return Ok(()),
+        folder => folder?,
+    };
+    match folder.sync_all() {
+        // Some network file systems cannot flush folders; they order names themselves.
+        Err(error) if error.kind() == ErrorKind::InvalidInput => Ok(()),
+        result => result,
+    }
+}
+
+/// Elsewhere a folder cannot be opened as a file.
+#[cfg(not(unix))]
+fn sync_names(_file: &Path) -> std::io::Result<()> {
     Ok(())
 }
 

@@ -4,23 +4,22 @@
 //! are read and written row by row in FITS order: the first row of the file is y = 1, row-major.
 //! gzip and tile-compressed (fpack) images are read like plain ones.
 
+mod read;
+
+pub use read::{ImageReader, read_table};
+
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use fitsio::FitsFile;
-use fitsio::hdu::{FitsHdu, HduInfo};
+use fitsio::hdu::FitsHdu;
 use fitsio::images::{ImageDescription, ImageType};
 use fitsio::tables::{ColumnDataType, ColumnDescription};
 
 use super::atomic::PartFile;
 use super::error::FileError;
 use super::table::{Column, Table};
-
-/// Largest image side accepted, against absurd sizes in damaged headers.
-const MAX_SIDE: usize = 200_000;
-/// Most rows of a table accepted.
-const MAX_ROWS: usize = 200_000_000;
 
 static CFITSIO: Mutex<()> = Mutex::new(());
 
@@ -66,124 +65,6 @@ pub enum Value {
     Real(f64),
     /// Text, at most 68 characters.
     Text(String),
-}
-
-/// An image open for reading.
-pub struct ImageReader {
-    file: Handle,
-    hdu: FitsHdu,
-    path: std::path::PathBuf,
-    width: usize,
-    height: usize,
-    next_row: usize,
-}
-
-impl ImageReader {
-    /// Opens the first image of a file: the primary one, or that of the first extension where the
-    /// primary is empty (as fpack writes it).
-    ///
-    /// # Errors
-    /// Where the file cannot be read or holds no two-dimensional image of sensible size.
-    pub fn open(path: impl AsRef<Path>) -> Result<Self, FileError> {
-        let path = path.as_ref();
-        plain_name(path)?;
-        // cfitsio's own message for a missing file is a bare number.
-        let size = std::fs::metadata(path)
-            .map_err(FileError::doing(path, "cannot open the image"))?
-            .len();
-        if size == 0 {
-            return Err(FileError::new(
-                path,
-                "the file is empty; expected a FITS image",
-            ));
-        }
-        let _guard = lock();
-        let cannot = |e| FileError::new(path, format!("cannot open the image: {}", describe(e)));
-        let mut file = FitsFile::open(path).map_err(cannot)?;
-        let mut hdu = file.primary_hdu().map_err(cannot)?;
-        let mut place = "primary";
-        if let HduInfo::ImageInfo { shape, .. } = &hdu.info
-            && shape.is_empty()
-            && file.num_hdus().map_err(cannot)? > 1
-        {
-            hdu = file.hdu(1).map_err(cannot)?;
-            place = "first extension";
-        }
-        let shape = match &hdu.info {
-            HduInfo::ImageInfo { shape, .. } => shape.clone(),
-            _ => {
-                return Err(FileError::new(
-                    path,
-                    format!("the {place} is a table; expected a two-dimensional image"),
-                ));
-            }
-        };
-        let &[height, width] = shape.as_slice() else {
-            return Err(FileError::new(
-                path,
-                format!(
-                    "the {place} image has {} dimensions; expected 2",
-                    shape.len()
-                ),
-            ));
-        };
-        if !(1..=MAX_SIDE).contains(&width) || !(1..=MAX_SIDE).contains(&height) {
-            return Err(FileError::new(
-                path,
-                format!("the image is {width} × {height} pixels; expected 1 to {MAX_SIDE} a side"),
-            ));
-        }
-        Ok(ImageReader {
-            file: Handle(Some(file)),
-            hdu,
-            path: path.to_owned(),
-            width,
-            height,
-            next_row: 0,
-        })
-    }
-
-    /// Columns.
-    pub fn width(&self) -> usize {
-        self.width
-    }
-
-    /// Rows.
-    pub fn height(&self) -> usize {
-        self.height
-    }
-
-    /// A numeric header value, `None` where absent or not a number.
-    pub fn number(&mut self, key: &str) -> Option<f64> {
-        let _guard = lock();
-        self.hdu.read_key::<f64>(self.file.get(), key).ok()
-    }
-
-    /// The next `rows` rows, or fewer at the end of the image.
-    ///
-    /// # Errors
-    /// Where the pixels cannot be read, as in a truncated file.
-    pub fn read_rows(&mut self, rows: usize) -> Result<Vec<f32>, FileError> {
-        let first = self.next_row;
-        let last = (first + rows).min(self.height);
-        let _guard = lock();
-        let pixels = self
-            .hdu
-            .read_section::<Vec<f32>>(self.file.get(), first * self.width, last * self.width)
-            .map_err(|e| {
-                FileError::new(
-                    &self.path,
-                    format!(
-                        "cannot read rows {} to {last} of {}: {}",
-                        first + 1,
-                        self.height,
-                        describe(e)
-                    ),
-                )
-            })?;
-        self.next_row = last;
-        Ok(pixels)
-    }
 }
 
 /// Closes its file under the lock: closing is a cfitsio call like any other.
@@ -397,65 +278,4 @@ pub fn read_table_keys<'a>(
         Some((key.clone(), value))
     };
     Ok(keys.filter_map(&mut value).collect())
-}
-
-/// Columns of the first binary table of a file: those of `wanted`, or all that are numbers.
-///
-/// # Errors
-/// Where the file cannot be read, holds no table, or lacks a column.
-pub fn read_table(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
-    plain_name(path)?;
-    std::fs::metadata(path).map_err(FileError::doing(path, "cannot open the table"))?;
-    let _guard = lock();
-    let cannot = |e| FileError::new(path, format!("cannot read the table: {}", describe(e)));
-    let mut file = FitsFile::open(path).map_err(cannot)?;
-    let count = file.num_hdus().map_err(cannot)?;
-    for index in 0..count {
-        let hdu = file.hdu(index).map_err(cannot)?;
-        let HduInfo::TableInfo {
-            column_descriptions,
-            num_rows,
-        } = &hdu.info
-        else {
-            continue;
-        };
-        if *num_rows > MAX_ROWS {
-            return Err(FileError::new(
-                path,
-                format!("the table says it has {num_rows} rows; expected at most {MAX_ROWS}"),
-            ));
-        }
-        let known: Vec<&str> = column_descriptions
-            .iter()
-            .map(|c| c.name.as_str())
-            .collect();
-        let mut columns = Vec::new();
-        for description in column_descriptions {
-            let name = description.name.as_str();
-            let asked = wanted.is_none_or(|w| w.contains(&name));
-            let text = matches!(description.data_type.typ, ColumnDataType::String);
-            if !asked || (text && wanted.is_none()) {
-                continue;
-            }
-            if text || description.data_type.repeat != 1 {
-                return Err(FileError::new(
-                    path,
-                    format!("column `{name}` does not hold one number per row"),
-                ));
-            }
-            let values: Vec<f64> = hdu.read_col(&mut file, name).map_err(cannot)?;
-            columns.push((name.to_owned(), Column::Real(values)));
-        }
-        if let Some(missing) = wanted.and_then(|w| w.iter().find(|name| !known.contains(name))) {
-            return Err(FileError::new(
-                path,
-                format!(
-                    "there is no column `{missing}`; columns found: {}",
-                    known.join(", ")
-                ),
-            ));
-        }
-        return Table::new(columns).map_err(|message| FileError::new(path, message));
-    }
-    Err(FileError::new(path, "there is no table in this file"))
 }

@@ -13,6 +13,9 @@ pub const MAX_SET: u32 = 99;
 /// Highest image number.
 pub const MAX_IMAGE: u32 = 999;
 
+/// Largest side of a postage stamp, in pixels.
+pub const MAX_STAMP: usize = 1024;
+
 /// Name of the layout file inside a data folder.
 pub const LAYOUT_FILE: &str = "layout.toml";
 
@@ -54,6 +57,43 @@ impl Default for Layout {
     }
 }
 
+impl Layout {
+    /// Checks every value against its range.
+    fn validate(&self) -> Result<(), String> {
+        let Layout {
+            galaxies,
+            psf_star,
+            psf_functional,
+            truth,
+            intrinsic,
+            truth_sign: _,
+            field_degrees,
+            stamp,
+        } = self;
+        check_pattern("galaxies", galaxies, &PLACEHOLDERS)?;
+        // One of these may serve several sets or images.
+        for (key, pattern) in [
+            ("psf_star", psf_star),
+            ("psf_functional", psf_functional),
+            ("truth", truth),
+            ("intrinsic", intrinsic),
+        ] {
+            check_pattern(key, pattern, &[])?;
+        }
+        if !(*field_degrees > 0.0 && field_degrees.is_finite()) {
+            return Err(format!(
+                "`field_degrees` is {field_degrees}; expected a positive number"
+            ));
+        }
+        if !(1..=MAX_STAMP).contains(stamp) {
+            return Err(format!(
+                "`stamp` is {stamp}; expected 1 to {MAX_STAMP} pixels"
+            ));
+        }
+        Ok(())
+    }
+}
+
 /// A data folder with its layout.
 #[derive(Debug, Clone)]
 pub struct DataFolder {
@@ -78,7 +118,12 @@ impl DataFolder {
         let layout = if path.is_file() {
             let text = std::fs::read_to_string(&path)
                 .map_err(FileError::doing(&path, "cannot read the layout"))?;
-            toml::from_str(&text).map_err(|e| FileError::new(&path, e.to_string().trim_end()))?
+            let layout: Layout = toml::from_str(&text)
+                .map_err(|e| FileError::new(&path, e.to_string().trim_end()))?;
+            layout
+                .validate()
+                .map_err(|message| FileError::new(&path, message))?;
+            layout
         } else {
             Layout::default()
         };
@@ -189,13 +234,44 @@ fn rows_of(path: &Path, mut table: table::Table, names: &[&str; 4]) -> Result<Ve
         .collect())
 }
 
+/// What a pattern may hold for the number of a set.
+const SET_PLACEHOLDERS: [&str; 2] = ["{set}", "{set:02}"];
+/// What a pattern may hold for the number of an image.
+pub const IMAGE_PLACEHOLDERS: [&str; 2] = ["{image}", "{image:03}"];
+const PLACEHOLDERS: [[&str; 2]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS];
+
 /// Replaces the numbers in a pattern.
 pub fn fill(pattern: &str, set: u32, image: u32) -> String {
+    let [[set_plain, set_padded], [image_plain, image_padded]] = PLACEHOLDERS;
     pattern
-        .replace("{set:02}", &format!("{set:02}"))
-        .replace("{image:03}", &format!("{image:03}"))
-        .replace("{set}", &set.to_string())
-        .replace("{image}", &image.to_string())
+        .replace(set_padded, &format!("{set:02}"))
+        .replace(image_padded, &format!("{image:03}"))
+        .replace(set_plain, &set.to_string())
+        .replace(image_plain, &image.to_string())
+}
+
+/// Checks that the pattern of `key` has one of each of the `needed` placeholders, and no braces that
+/// stand for nothing.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_pattern(key: &str, pattern: &str, needed: &[[&str; 2]]) -> Result<(), String> {
+    for one_of in needed {
+        if !one_of.iter().any(|name| pattern.contains(name)) {
+            return Err(format!(
+                "`{key}` is \"{pattern}\"; expected a pattern with {}",
+                one_of.join(" or ")
+            ));
+        }
+    }
+    let filled = fill(pattern, 1, 1);
+    if filled.is_empty() || filled.contains(['{', '}']) {
+        return Err(format!(
+            "`{key}` is \"{pattern}\"; expected the name of a file, in which only {} stand for numbers",
+            PLACEHOLDERS.as_flattened().join(", ")
+        ));
+    }
+    Ok(())
 }
 
 #[cfg(test)]

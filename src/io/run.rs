@@ -131,7 +131,7 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
     let text = match std::fs::read_to_string(path) {
         Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-        Err(error) => return Err(FileError::new(path, error)),
+        Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),
     };
     serde_json::from_str(&text)
         .map(Some)

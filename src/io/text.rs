@@ -90,6 +90,12 @@ pub(super) fn read_named(
             .collect::<Result<_, _>>()?,
         None => (0..names.len()).collect(),
     };
+    for &place in &places {
+        if names.iter().filter(|name| **name == names[place]).count() > 1 {
+            let message = format!("there are two columns named `{}`", names[place]);
+            return Err(FileError::new(path, message));
+        }
+    }
     let slot: Vec<Option<usize>> = (0..names.len())
         .map(|column| places.iter().position(|&place| place == column))
         .collect();

@@ -17,7 +17,8 @@ pub mod flag {
     pub const NOT_FINITE: u32 = 1;
     /// The galaxy's PSF cannot be used.
     pub const BAD_PSF: u32 = 2;
-    /// No positive pixel, or a noise level of zero where one is needed: no unit of brightness.
+    /// All pixels are equal, none is positive, or the noise level is zero where one is needed: no unit
+    /// of brightness. Or the brightest pixel is too faint or bright for single precision.
     pub const NO_SCALE: u32 = 4;
     /// Nothing is left after deconvolution.
     pub const NO_LIGHT: u32 = 8;
@@ -32,13 +33,17 @@ pub mod flag {
     pub const MEANINGS: [(u32, &str); 7] = [
         (NOT_FINITE, "a pixel is not a finite number"),
         (BAD_PSF, "the PSF cannot be used"),
-        (NO_SCALE, "no positive pixel or no noise to scale by"),
+        (NO_SCALE, "nothing to scale the brightness by"),
         (NO_LIGHT, "nothing left after deconvolution"),
         (NO_EXTENT, "moments without extent"),
         (NO_SHEAR, "distortion above 1"),
         (NO_RESPONSE, "no response to shear to divide by"),
     ];
 }
+
+/// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
+/// away from the smallest and largest numbers there are.
+const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
 
 /// What was measured on one galaxy.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -178,6 +183,9 @@ impl Measurer {
         if !scratch.usable_psf {
             return Measurement::flagged(flag::BAD_PSF);
         }
+        if scratch.full.iter().all(|v| *v == scratch.full[0]) {
+            return Measurement::flagged(flag::NO_SCALE);
+        }
         let noise = match (self.submission.noise.source, header_noise) {
             (NoiseSource::Header, Some(sigma)) => sigma,
             _ => border_noise(
@@ -197,10 +205,13 @@ impl Measurer {
             let from = (start + y) * full + start;
             row.copy_from_slice(&scratch.full[from..from + n]);
         }
-        let found = self
-            .method
-            .measure(&self.submission, &scratch.cut, noise, &mut scratch.method);
-        let Some(found) = found else {
+        let peak = scratch.cut.iter().copied().fold(0.0f32, f32::max);
+        let found = PEAKS.contains(&peak).then(|| {
+            let cut = &scratch.cut;
+            self.method
+                .measure(&self.submission, cut, noise, &mut scratch.method)
+        });
+        let Some(found) = found.flatten() else {
             return Measurement {
                 noise,
                 ..Measurement::flagged(flag::NO_SCALE)

@@ -7,21 +7,21 @@ use std::sync::Arc;
 use ndarray::{Array2, ArrayView2};
 use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
-use shearq_submissions::{EllipticityType, PsfForm, Submission};
+use shearq_submissions::{EllipticityType, NoiseSource, PsfForm, Submission};
 
 use super::PipelineError;
 use super::calibrate::calibrate;
 use super::engine::{self, Feeder, Progress};
-use super::galaxy::{Measurement, Measurer};
+use super::galaxy::{Measurement, Measurer, flag};
 use super::images::ImageId;
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
-use crate::io::layout::DataFolder;
+use crate::io::layout::{DataFolder, MAX_STAMP};
 use crate::io::psf_table;
 use crate::io::run::{RUN_FILE, Run, claim};
 use crate::io::table::{self, Column, Table};
 use crate::psf::functional::FunctionalPsf;
-use crate::psf::star::star_psf;
+use crate::psf::star::{StarError, star_psf};
 
 /// PSFs of one row of stamps.
 pub enum RowPsf {
@@ -95,7 +95,7 @@ impl ImageSource {
         id: ImageId,
         submission: &Submission,
     ) -> Result<Self, PipelineError> {
-        let (mut image, grid, stamp) = open_galaxies(data, id)?;
+        let (image, grid, stamp) = open_galaxies(data, id)?;
         if !Measurer::fits(submission, stamp) {
             return Err(FileError::new(
                 data.galaxies(id.set, id.image),
@@ -106,7 +106,17 @@ impl ImageSource {
             )
             .into());
         }
-        let header_noise = image.number("NOISESIG");
+        let header_noise = image.number("NOISESIG")?;
+        if submission.noise.source == NoiseSource::Header
+            && !header_noise.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite())
+        {
+            let found = header_noise.map_or("absent".into(), |sigma| sigma.to_string());
+            let message = format!(
+                "the header key NOISESIG is {found}; expected a positive number, as submission {} takes the noise from it",
+                submission.name
+            );
+            return Err(FileError::new(data.galaxies(id.set, id.image), message).into());
+        }
         Ok(ImageSource {
             psf: open_psf(data, id, submission, &grid)?,
             id,
@@ -162,15 +172,9 @@ pub(super) fn open_galaxies(
     id: ImageId,
 ) -> Result<(ImageReader, Grid, usize), PipelineError> {
     let path = data.galaxies(id.set, id.image);
-    let mut image = ImageReader::open(&path)?;
-    let whole = |image: &mut ImageReader, key: &str| {
-        image
-            .number(key)
-            .filter(|v| *v >= 1.0 && *v <= 1e5)
-            .map(|v| v as usize)
-    };
-    let stamp = whole(&mut image, "STAMP").unwrap_or(data.layout().stamp);
-    let n = whole(&mut image, "NGRID").unwrap_or(image.width() / stamp);
+    let image = ImageReader::open(&path)?;
+    let stamp = whole(&image, &path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp);
+    let n = whole(&image, &path, "NGRID", image.width())?.unwrap_or(image.width() / stamp);
     if image.width() != n * stamp || image.height() != n * stamp {
         return Err(FileError::new(
             &path,
@@ -188,6 +192,23 @@ pub(super) fn open_galaxies(
     Ok((image, grid, stamp))
 }
 
+/// A header value that counts something, `None` where absent.
+fn whole(
+    image: &ImageReader,
+    path: &Path,
+    key: &str,
+    most: usize,
+) -> Result<Option<usize>, FileError> {
+    let Some(value) = image.number(key)? else {
+        return Ok(None);
+    };
+    if value.fract() == 0.0 && (1.0..=most as f64).contains(&value) {
+        return Ok(Some(value as usize));
+    }
+    let message = format!("the header key {key} is {value}; expected a whole number, 1 to {most}");
+    Err(FileError::new(path, message))
+}
+
 fn open_psf(
     data: &DataFolder,
     id: ImageId,
@@ -199,6 +220,13 @@ fn open_psf(
         PsfForm::Functional => {
             let path = data.psf_functional(id.set, id.image);
             let rows = psf_table::read(&path, grid)?;
+            if let Some(wide) = rows.iter().find(|psf| psf.fwhm > size as f64) {
+                let message = format!(
+                    "a PSF has a FWHM of {} px; expected at most the {size} pixels a side of the submission's PSF stamp",
+                    wide.fwhm
+                );
+                return Err(FileError::new(&path, message).into());
+            }
             Ok(match rows.as_slice() {
                 [psf] => PsfSource::Shared(Arc::new(functional_psf(psf, size))),
                 _ => PsfSource::Functional(rows),
@@ -215,11 +243,29 @@ fn open_psf(
                 )
                 .into());
             }
-            // One star is never as large as a grid of the smallest PSF stamps that could be cut.
-            let stars = grid.n * size;
-            if width >= stars && width % grid.n == 0 && width / grid.n >= size {
-                let side = width / grid.n;
+            let n = grid.n;
+            let side = match whole(&image, &path, "STAMP", MAX_STAMP)? {
+                Some(side) => side,
+                // One star is never as large as a grid of the smallest PSF stamps that could be cut.
+                None if width >= n * size && width.is_multiple_of(n) => width / n,
+                None => width,
+            };
+            if side < size {
+                let error = StarError::TooSmall {
+                    found: side,
+                    wanted: size,
+                };
+                return Err(FileError::new(&path, error).into());
+            }
+            if side != width && side * n == width {
                 return Ok(PsfSource::Stars { image, side });
+            }
+            if side != width || side > MAX_STAMP {
+                let message = format!(
+                    "the star image is {width} pixels a side; expected one stamp, or {n} × {n} as there are galaxies, of {} pixels",
+                    side.min(MAX_STAMP)
+                );
+                return Err(FileError::new(&path, message).into());
             }
             let pixels = image.read_rows(height)?;
             let stamp = ArrayView2::from_shape((height, width), &pixels)
@@ -310,6 +356,8 @@ pub struct Summary {
     pub galaxies: u64,
     /// Of these, flagged.
     pub flagged: u64,
+    /// Galaxies with each of the [`flag::MEANINGS`].
+    pub flags: [u64; flag::MEANINGS.len()],
 }
 
 impl Summary {
@@ -319,6 +367,9 @@ impl Summary {
         for galaxy in rows.iter().flat_map(|row| &row.galaxies) {
             self.galaxies += 1;
             self.flagged += u64::from(galaxy.flag != 0);
+            for (count, (bit, _)) in self.flags.iter_mut().zip(flag::MEANINGS) {
+                *count += u64::from(galaxy.flag & bit != 0);
+            }
         }
     }
 }

@@ -7,7 +7,7 @@ use shearq_scoring::{Distortion, FieldSum, Grid, Row, RowCounts, Shear};
 use shearq_submissions::EllipticityType;
 
 use crate::io::FileError;
-use crate::io::layout::{MAX_IMAGE, fill};
+use crate::io::layout::{IMAGE_PLACEHOLDERS, MAX_IMAGE, check_pattern, fill};
 use crate::io::table;
 
 /// How to read another program's catalogues.
@@ -88,13 +88,8 @@ impl Foreign {
             let message = format!("`e2_sign` is {}; expected 1 or -1", foreign.e2_sign);
             return Err(FileError::new(path, message));
         }
-        if !foreign.catalogues.contains("{image") {
-            let message = format!(
-                "`catalogues` is \"{}\"; expected a pattern with {{set}} and {{image}}",
-                foreign.catalogues
-            );
-            return Err(FileError::new(path, message));
-        }
+        check_pattern("catalogues", &foreign.catalogues, &[IMAGE_PLACEHOLDERS])
+            .map_err(|message| FileError::new(path, message))?;
         foreign.folder = path.parent().unwrap_or(Path::new("")).to_owned();
         Ok(foreign)
     }

@@ -85,8 +85,10 @@ pub struct Entry {
 #[derive(Debug, Error)]
 pub enum SubmissionError {
     /// Neither a known name nor a file.
-    #[error("there is no submission or file named `{name}`; known submissions: {known}")]
+    #[error("{}there is no submission or file named `{name}`; known submissions: {known}", from.as_ref().map_or_else(String::new, |from| format!("{}: `extends`: ", from.display())))]
     Unknown {
+        /// The file that names it, if one does.
+        from: Option<PathBuf>,
         /// What was asked for.
         name: String,
         /// The names that exist.
@@ -301,6 +303,7 @@ impl Registry {
         };
         if !path.is_file() {
             return Err(SubmissionError::Unknown {
+                from: from.map(Path::to_owned),
                 name: name.to_owned(),
                 known: self.names.join(", "),
             });
@@ -415,6 +418,9 @@ mod tests {
         let cycle = message("e.toml", "extends = \"e.toml\"\n");
         assert!(cycle.contains("circle"), "{cycle}");
         let nobody = message("f.toml", "extends = \"23/raw/stars\"\n");
-        assert!(nobody.contains("23/raw/star,"), "{nobody}");
+        assert!(
+            nobody.contains("f.toml") && nobody.contains("23/raw/star,"),
+            "{nobody}"
+        );
     }
 }

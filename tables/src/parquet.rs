@@ -5,11 +5,13 @@
 //! is memory-mapped (a mapped file that shrinks kills the process), no second thread pool starts,
 //! and 8- and 16-bit integers decode into wider ones without polars' features for them.
 
+use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom, Write};
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
 use std::path::Path;
+use std::sync::Once;
 
 use polars::prelude::{
     ArrowDataType, ArrowField, ChunkedArray, DataFrame, DataType, FileMetadataRef,
@@ -308,7 +310,7 @@ fn guarded<T>(
     place: &str,
     run: impl FnOnce() -> PolarsResult<T>,
 ) -> Result<T, TableError> {
-    let detail = match catch_unwind(AssertUnwindSafe(run)) {
+    let detail = match silently(run) {
         Ok(Ok(value)) => return Ok(value),
         Ok(Err(error)) => error.to_string(),
         Err(_) => "the contents contradict themselves".into(),
@@ -317,6 +319,31 @@ fn guarded<T>(
         path: path.into(),
         detail: format!("{place}: {detail}"),
     })
+}
+
+thread_local! {
+    /// Whether a panic on this thread is caught and reported as an error.
+    static CAUGHT: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Catches a panic of `run` without its message on standard error.
+///
+/// The hook that prints such messages belongs to the whole process, so it is replaced only once, by
+/// one that is silent where this thread catches and else does what the one before did.
+fn silently<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let others = take_hook();
+        set_hook(Box::new(move |panic| {
+            if !CAUGHT.get() {
+                others(panic);
+            }
+        }));
+    });
+    let outer = CAUGHT.replace(true);
+    let result = catch_unwind(AssertUnwindSafe(run));
+    CAUGHT.set(outer);
+    result
 }
 
 /// The type into which a column declared as `declared` is decoded, if a [`Column`] can hold it.

@@ -1,10 +1,15 @@
 //! End to end, through the binary and the library's public face.
 
+mod bad_catalogues;
+mod bad_images;
+mod bad_settings;
 mod baselines;
 mod chain;
 mod figures;
+mod fuzz;
 mod galsim_galaxies;
 mod galsim_measured;
+mod killed;
 mod orientation;
 mod packed;
 mod reproduced;

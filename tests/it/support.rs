@@ -102,3 +102,92 @@ pub fn csv(path: &Path, names: &[&str]) -> Vec<Vec<f64>> {
     }
     columns
 }
+
+/// A simulated set of two images of 8 × 8 galaxies, for tests that spoil one of its files.
+pub struct Small {
+    root: tempfile::TempDir,
+}
+
+impl Small {
+    /// Set 2, which has one PSF, or set 19, which has one per galaxy.
+    pub fn new(set: &str) -> Self {
+        let root = tempfile::tempdir().expect("a temporary folder");
+        let data = root.path().join("data");
+        let simulate = ["simulate", "--images", "2", "--grid", "8", "--seed", "5"];
+        succeed(&[&simulate[..], &["--sets", set, "--out", text(&data)]].concat());
+        Small { root }
+    }
+
+    /// A path in the temporary folder.
+    pub fn at(&self, name: &str) -> PathBuf {
+        self.root.path().join(name)
+    }
+
+    /// Measures `data` into a new folder `out`, as `settings` say, and must fail; gives the error.
+    pub fn fail_to_measure(&self, settings: &[&str]) -> String {
+        let (data, out) = (self.at("data"), self.at("out"));
+        let _ = std::fs::remove_dir_all(&out);
+        fail(
+            &[
+                &["measure", "--data", text(&data), "--out", text(&out)],
+                settings,
+            ]
+            .concat(),
+        )
+    }
+
+    /// The same, and must succeed; gives what was said on standard error.
+    pub fn measure(&self, settings: &[&str]) -> String {
+        let (data, out) = (self.at("data"), self.at("out"));
+        let _ = std::fs::remove_dir_all(&out);
+        let measure = ["measure", "--data", text(&data), "--out", text(&out)];
+        let output = shearq(&[&measure[..], settings].concat());
+        let said = String::from_utf8(output.stderr).expect("UTF-8");
+        assert!(output.status.success(), "{said}");
+        said
+    }
+
+    /// A column of the first image's catalogue in `out`.
+    pub fn measured(&self, set: &str, column: &str) -> Vec<f64> {
+        let path = self.at(&format!("out/set{set}/catalogue-001.parquet"));
+        let mut table = shearq::io::table::read(&path, None).expect("a catalogue");
+        table.take_real(column).expect("a column of it")
+    }
+}
+
+/// A FITS file of one image: the cards given after SIMPLE, BITPIX, NAXIS and its sides, and the
+/// bytes of its pixels.
+pub fn fits_image(bitpix: i32, sides: &[usize], cards: &[&str], pixels: &[u8]) -> Vec<u8> {
+    // Files are made of blocks of so many bytes.
+    const BLOCK: usize = 2880;
+    let mut header = vec![
+        "SIMPLE  =                    T".to_owned(),
+        format!("BITPIX  = {bitpix:>20}"),
+        format!("NAXIS   = {:>20}", sides.len()),
+    ];
+    for (k, side) in sides.iter().enumerate() {
+        header.push(format!("NAXIS{:<3}= {side:>20}", k + 1));
+    }
+    header.extend(cards.iter().map(|card| (*card).to_owned()));
+    header.push("END".to_owned());
+    let mut bytes: Vec<u8> = header
+        .iter()
+        .flat_map(|card| format!("{card:<80}").into_bytes())
+        .collect();
+    bytes.resize(bytes.len().next_multiple_of(BLOCK), b' ');
+    bytes.extend_from_slice(pixels);
+    bytes.resize(bytes.len().next_multiple_of(BLOCK), 0);
+    bytes
+}
+
+/// All pixels of an image, and its side.
+pub fn pixels_of(path: &Path) -> (Vec<f32>, usize) {
+    let mut image = shearq::io::fits::ImageReader::open(path).expect("an image");
+    let side = image.width();
+    (image.read_rows(side).expect("its pixels"), side)
+}
+
+/// Pixels as FITS stores them.
+pub fn floats(pixels: &[f32]) -> Vec<u8> {
+    pixels.iter().flat_map(|v| v.to_be_bytes()).collect()
+}

@@ -1,0 +1,490 @@
+//! Images and PSFs that are damaged, odd, or not there: one error that names file and fault, or a
+//! flag, and nothing lost of what was done before.
+
+use std::fs;
+
+use crate::support::{Small, fits_image, floats, pixels_of};
+
+const RAW: [&str; 2] = ["--submission", "23/raw/star"];
+const FUNCTIONAL: [&str; 2] = ["--submission", "23/raw/func"];
+
+/// Replaces a file, and expects an error that names it and says all of `expected`.
+fn refuse(small: &Small, file: &str, bytes: &[u8], settings: &[&str], expected: &[&str]) {
+    fs::write(small.at(file), bytes).unwrap();
+    let message = small.fail_to_measure(settings);
+    let name = file.rsplit('/').next().unwrap();
+    for part in [&[name], expected].concat() {
+        assert!(message.contains(part), "{part}: {message}");
+    }
+    assert_eq!(message.lines().count(), 1, "{message}");
+}
+
+#[test]
+fn damaged_images_are_refused_and_those_before_are_kept() {
+    let small = Small::new("2");
+    let second = "data/set02/galaxies-002.fits";
+    let whole = fs::read(small.at(second)).unwrap();
+    let card = |key: &str, value: &str| {
+        let mut bytes = whole.clone();
+        let name = format!("{key:<8}=");
+        let at = bytes.windows(9).position(|w| w == name.as_bytes()).unwrap();
+        let text = format!("{name} {value:>20}");
+        bytes[at..at + text.len()].copy_from_slice(text.as_bytes());
+        bytes
+    };
+    let cases: Vec<(Vec<u8>, &[&str])> = vec![
+        (
+            whole[..whole.len() / 2].to_vec(),
+            &["truncated", "it can hold 296640 bytes; expected 592704"],
+        ),
+        (whole[..2880].to_vec(), &["truncated"]),
+        (whole[..1000].to_vec(), &["cannot open the image"]),
+        (vec![], &["the file is empty; expected a FITS image"]),
+        (
+            b"This is no image.".to_vec(),
+            &["starts with `This i`", "`SIMPLE`"],
+        ),
+        (
+            card("NAXIS1", "4000000000"),
+            &["4000000000 × 384", "expected 1 to 200000"],
+        ),
+        (
+            card("NAXIS1", "199999"),
+            &["truncated or its header damaged"],
+        ),
+        (card("NAXIS1", "-384"), &["cannot open the image"]),
+        (card("BITPIX", "12"), &["cannot open the image"]),
+        (
+            card("STAMP", "0"),
+            &["header key STAMP is 0; expected a whole number, 1 to 1024"],
+        ),
+        (
+            card("STAMP", "47"),
+            &["384 × 384 pixels; expected 8 × 8 stamps of 47"],
+        ),
+        (card("NGRID", "7"), &["expected 7 × 7 stamps of 48"]),
+        (
+            card("NGRID", "'eight'"),
+            &["header key NGRID is not a number"],
+        ),
+    ];
+    for (bytes, expected) in cases {
+        refuse(&small, second, &bytes, &RAW, expected);
+        let kept = fs::read_dir(small.at("out/set02")).unwrap().count();
+        assert_eq!(kept, 1, "the first image's catalogue");
+    }
+    fs::write(small.at(second), &whole).unwrap();
+    fs::remove_file(small.at(second)).unwrap();
+    fs::create_dir(small.at(second)).unwrap();
+    // A folder of that name is no image, so there is one image.
+    assert!(small.measure(&RAW).contains("1 images"));
+}
+
+#[test]
+fn images_of_other_shapes_and_types_work_or_are_refused() {
+    let small = Small::new("2");
+    let first = "data/set02/galaxies-001.fits";
+    let (pixels, side) = pixels_of(&small.at(first));
+    let stamp = &["STAMP   =                   48"][..];
+    let float = floats(&pixels);
+    let cases: Vec<(Vec<u8>, &[&str])> = vec![
+        (
+            fits_image(-32, &[side * side], stamp, &float),
+            &["1 dimensions; expected 2"],
+        ),
+        (
+            fits_image(-32, &[side, side, 1], stamp, &float),
+            &["3 dimensions; expected 2"],
+        ),
+        (
+            fits_image(-32, &[side, side - 48], stamp, &float),
+            &["384 × 336 pixels; expected 8 × 8"],
+        ),
+        (
+            fits_image(-32, &[0, side], stamp, &[]),
+            &["0 × 384 pixels; expected 1 to"],
+        ),
+        (fits_image(8, &[], &[], &[]), &["0 dimensions; expected 2"]),
+    ];
+    for (bytes, expected) in cases {
+        refuse(&small, first, &bytes, &RAW, expected);
+    }
+    let table = small.at("data/set02/table.fits");
+    let columns = vec![("a".to_owned(), shearq::io::table::Column::Real(vec![1.0]))];
+    let table_of = shearq::io::table::Table::new(columns).unwrap();
+    shearq::io::fits::write_table(&table, &table_of, &[]).unwrap();
+    let expected = ["the first extension is a table; expected a two-dimensional image"];
+    refuse(&small, first, &fs::read(&table).unwrap(), &RAW, &expected);
+
+    // Whole numbers are the same image in every type that can hold them.
+    let whole: Vec<i16> = pixels.iter().map(|v| (v * 50.0) as i16).collect();
+    let mut found = Vec::new();
+    for bytes in [
+        fits_image(
+            16,
+            &[side, side],
+            stamp,
+            &whole
+                .iter()
+                .flat_map(|v| v.to_be_bytes())
+                .collect::<Vec<_>>(),
+        ),
+        fits_image(
+            32,
+            &[side, side],
+            stamp,
+            &whole
+                .iter()
+                .flat_map(|v| i32::from(*v).to_be_bytes())
+                .collect::<Vec<_>>(),
+        ),
+        fits_image(
+            64,
+            &[side, side],
+            stamp,
+            &whole
+                .iter()
+                .flat_map(|v| i64::from(*v).to_be_bytes())
+                .collect::<Vec<_>>(),
+        ),
+        fits_image(
+            -64,
+            &[side, side],
+            stamp,
+            &whole
+                .iter()
+                .flat_map(|v| f64::from(*v).to_be_bytes())
+                .collect::<Vec<_>>(),
+        ),
+    ] {
+        // gzip is recognised by the content, whatever the name.
+        for bytes in [gzip(&bytes), bytes] {
+            fs::write(small.at(first), bytes).unwrap();
+            small.measure(&RAW);
+            found.push(small.measured("02", "e1"));
+        }
+    }
+    assert!(
+        found
+            .iter()
+            .all(|e1| *e1 == found[0] && e1.iter().all(|e| e.is_finite()))
+    );
+
+    // A pixel with the value of BLANK has none.
+    let cards = [
+        "STAMP   =                   48",
+        "BLANK   =               -32768",
+    ];
+    let mut blank = whole;
+    blank[0] = i16::MIN;
+    let bytes: Vec<u8> = blank.iter().flat_map(|v| v.to_be_bytes()).collect();
+    fs::write(
+        small.at(first),
+        fits_image(16, &[side, side], &cards, &bytes),
+    )
+    .unwrap();
+    assert!(
+        small
+            .measure(&RAW)
+            .contains("flagged: a pixel is not a finite number (1)")
+    );
+}
+
+#[test]
+fn compressed_images_are_read_and_damaged_ones_refused() {
+    let small = Small::new("2");
+    let first = "data/set02/galaxies-001.fits";
+    // The image that tests/data/rice.fits holds, as fpack writes it: 8 × 8 stamps of 24 pixels.
+    let side = 192;
+    let value = |k: i32| {
+        let (dx, dy) = (2 * (k % side % 24) - 23, 2 * (k / side % 24) - 23);
+        (4000 - 9 * (2 * dx * dx + dx * dy + 3 * dy * dy)).max(0) as i16
+    };
+    let pixels: Vec<u8> = (0..side * side)
+        .flat_map(|k| value(k).to_be_bytes())
+        .collect();
+    let plain = fits_image(
+        16,
+        &[192, 192],
+        &["STAMP   =                   24"],
+        &pixels,
+    );
+    let rice = include_bytes!("../data/rice.fits");
+    let mut found = Vec::new();
+    for bytes in [&plain[..], rice] {
+        fs::write(small.at(first), bytes).unwrap();
+        fs::remove_file(small.at("data/set02/galaxies-002.fits")).unwrap_or_default();
+        small.measure(&RAW);
+        found.push((small.measured("02", "e1"), small.measured("02", "e2")));
+    }
+    assert_eq!(found[0], found[1]);
+    assert!(found[0].0.iter().all(|e1| e1.is_finite()));
+    refuse(&small, first, &rice[..rice.len() - 4000], &RAW, &["cannot"]);
+    let packed = gzip(&plain);
+    refuse(
+        &small,
+        first,
+        &packed[..packed.len() / 2],
+        &RAW,
+        &["gzip file is truncated, damaged"],
+    );
+    let mut bomb = packed.clone();
+    let size = bomb.len();
+    bomb[size - 4..].copy_from_slice(&u32::MAX.to_le_bytes());
+    refuse(&small, first, &bomb, &RAW, &["expand to 4294967295"]);
+    let mut corrupt = packed;
+    corrupt[size / 2] ^= 0xff;
+    refuse(&small, first, &corrupt, &RAW, &["cannot open the image"]);
+}
+
+/// A gzip file of blocks that are stored, not compressed.
+pub fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut packed = vec![0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 255];
+    let blocks = bytes.chunks(usize::from(u16::MAX));
+    let last = blocks.len() - 1;
+    for (k, block) in blocks.enumerate() {
+        let length = block.len() as u16;
+        packed.push(u8::from(k == last));
+        packed.extend(length.to_le_bytes());
+        packed.extend((!length).to_le_bytes());
+        packed.extend(block);
+    }
+    // The checksum of RFC 1952, bit by bit.
+    let mut sum = u32::MAX;
+    for byte in bytes {
+        sum ^= u32::from(*byte);
+        for _ in 0..8 {
+            sum = (sum >> 1) ^ (0xedb8_8320 * (sum & 1));
+        }
+    }
+    packed.extend((!sum).to_le_bytes());
+    packed.extend((bytes.len() as u32).to_le_bytes());
+    packed
+}
+
+#[test]
+fn stamps_without_a_galaxy_are_flagged_and_noise_is_measured() {
+    let small = Small::new("2");
+    let first = "data/set02/galaxies-001.fits";
+    let (mut pixels, side) = pixels_of(&small.at(first));
+    let mut fill = |cell: usize, value: &dyn Fn(usize, usize, f32) -> f32| {
+        for y in 0..48 {
+            for x in 0..48 {
+                let pixel = &mut pixels[y * side + cell * 48 + x];
+                *pixel = value(x, y, *pixel);
+            }
+        }
+    };
+    fill(0, &|_, _, _| 0.0);
+    fill(1, &|_, _, _| 7.0);
+    fill(2, &|_, _, _| -7.0);
+    fill(3, &|x, y, v| {
+        if (x, y) == (40, 3) { f32::INFINITY } else { v }
+    });
+    fill(4, &|_, _, v| v * 1e-30);
+    fill(5, &|_, _, v| v * 1e30);
+    // Noise alone, of which denoising leaves nothing.
+    fill(6, &|x, y, _| {
+        ((x * 7919 + y * 104_729) % 101) as f32 / 50.5 - 1.0
+    });
+    let cards = ["STAMP   =                   48"];
+    fs::write(
+        small.at(first),
+        fits_image(-32, &[side, side], &cards, &floats(&pixels)),
+    )
+    .unwrap();
+    for (submission, noise) in [("23/raw/star", 0.0), ("23/den/star", 4.0)] {
+        let said = small.measure(&["--submission", submission]);
+        assert!(
+            said.contains("nothing to scale the brightness by"),
+            "{said}"
+        );
+        let flags = small.measured("02", "flag");
+        assert_eq!(flags[..8], [4.0, 4.0, 4.0, 1.0, 4.0, 4.0, noise, 0.0]);
+        let e1 = small.measured("02", "e1");
+        assert!(
+            e1.iter()
+                .zip(&flags)
+                .all(|(e, flag)| e.is_nan() == (*flag != 0.0))
+        );
+    }
+}
+
+#[test]
+fn stars_that_cannot_be_used_are_refused_with_the_reason() {
+    let small = Small::new("2");
+    let star = "data/set02/psf-001.fits";
+    let (pixels, side) = pixels_of(&small.at(star));
+    let image = |change: &dyn Fn(usize, usize) -> f32| {
+        let changed: Vec<f32> = (0..side * side)
+            .map(|k| change(k % side, k / side))
+            .collect();
+        fits_image(-32, &[side, side], &[], &floats(&changed))
+    };
+    let at = |x: usize, y: usize| pixels[y % side * side + x % side];
+    let cases: Vec<(Vec<u8>, &[&str])> = vec![
+        (image(&|_, _| 0.0), &["sum to 0; expected a positive sum"]),
+        (
+            image(&|x, y| -at(x, y)),
+            &["sum to -0.9", "expected a positive sum"],
+        ),
+        (
+            image(&|x, y| if (x, y) == (4, 9) { f32::NAN } else { at(x, y) }),
+            &["pixel (5, 10)", "not a finite number"],
+        ),
+        (
+            image(&|x, y| at(x + 2, y)),
+            &["(-1.9, -0.0) px off the centre", "expected at most 1 px"],
+        ),
+        (image(&|x, y| at(x, y + 39)), &["+8.5) px off the centre"]),
+        (
+            fits_image(-32, &[14, 14], &[], &[0; 784]),
+            &["14 pixels a side; the submission needs 15"],
+        ),
+        (
+            fits_image(-32, &[side, 40], &[], &floats(&pixels[..side * 40])),
+            &["48 × 40 pixels; expected a square"],
+        ),
+        (
+            fits_image(
+                -32,
+                &[side, side],
+                &["STAMP   =                   20"],
+                &floats(&pixels),
+            ),
+            &["48 pixels a side; expected one stamp, or 8 × 8"],
+        ),
+    ];
+    for (bytes, expected) in cases {
+        refuse(&small, star, &bytes, &RAW, expected);
+        assert!(!small.at("out").exists());
+    }
+    // A stamp larger than the galaxies' is cut like any other, and STAMP tells it from a grid.
+    let mut wide = vec![0.0; 384 * 384];
+    for (k, value) in pixels.iter().enumerate() {
+        wide[(168 + k / side) * 384 + 168 + k % side] = *value;
+    }
+    fs::write(small.at(star), image(&at)).unwrap();
+    small.measure(&RAW);
+    let expected = small.measured("02", "e1");
+    let cards = ["STAMP   =                  384"];
+    fs::write(
+        small.at(star),
+        fits_image(-32, &[384, 384], &cards, &floats(&wide)),
+    )
+    .unwrap();
+    small.measure(&RAW);
+    assert_eq!(small.measured("02", "e1"), expected);
+    fs::remove_file(small.at(star)).unwrap();
+    let message = small.fail_to_measure(&RAW);
+    assert!(
+        message.contains("psf-001.fits: cannot open the file"),
+        "{message}"
+    );
+}
+
+#[test]
+fn a_star_that_cannot_be_used_flags_its_galaxy_alone() {
+    let small = Small::new("19");
+    let stars = "data/set19/psf-001.fits";
+    let (mut pixels, side) = pixels_of(&small.at(stars));
+    for y in 0..32 {
+        pixels[y * side..y * side + 32].fill(0.0);
+    }
+    let cards = ["STAMP   =                   32"];
+    fs::write(
+        small.at(stars),
+        fits_image(-32, &[side, side], &cards, &floats(&pixels)),
+    )
+    .unwrap();
+    let said = small.measure(&RAW);
+    assert!(
+        said.contains("flagged: the PSF cannot be used (1)"),
+        "{said}"
+    );
+    assert_eq!(
+        small
+            .measured("19", "flag")
+            .iter()
+            .filter(|f| **f != 0.0)
+            .count(),
+        1
+    );
+    let wide = small.at("wide.toml");
+    fs::write(&wide, "extends = \"23/raw/star\"\n[psf]\nsize = 48\n").unwrap();
+    let message = small.fail_to_measure(&["--submission", wide.to_str().unwrap()]);
+    assert!(
+        message.contains("32 pixels a side; the submission needs 48"),
+        "{message}"
+    );
+}
+
+#[test]
+fn functional_psfs_with_mistakes_are_named_with_their_line() {
+    let small = Small::new("2");
+    let header = "x,y,profile,beta,fwhm,e1,e2\n";
+    let rows: [(&str, &[&str]); 11] = [
+        (
+            "24.5,24.5,moffat,3,0,0,0\n",
+            &["line 2", "FWHM must be a positive number of pixels, not 0"],
+        ),
+        ("24.5,24.5,moffat,3,NaN,0,0\n", &["line 2", "not NaN"]),
+        (
+            "24.5,24.5,moffat,3,1e9,0,0\n",
+            &["FWHM of 1000000000 px; expected at most the 15"],
+        ),
+        (
+            "24.5,24.5,moffat,3,4,1.2,0\n",
+            &["line 2", "(1.2, 0)", "below 1"],
+        ),
+        (
+            "24.5,24.5,moffat,0,4,0,0\n",
+            &["line 2", "beta must be a number above 1"],
+        ),
+        (
+            "24.5,24.5,gaussian,3,4,0,0\n",
+            &["`gaussian`; expected `moffat` or `kolmogorov`"],
+        ),
+        (
+            "24.5,24.5,moffat,three,4,0,0\n",
+            &["line 2", "`three` in column `beta`"],
+        ),
+        (
+            "24.5,24.5,moffat,3,4\n",
+            &["line 2", "5 fields; expected 7"],
+        ),
+        (
+            "9999,24.5,moffat,3,4,0,0\n2,2,moffat,3,4,0,0\n",
+            &["(9999, 24.5) is outside the grid"],
+        ),
+        (
+            "24.5,24.5,moffat,3,4,0,0\n72.5,24.5,moffat,3,4,0,0\n",
+            &["2 rows; expected one, or one for each of the 64"],
+        ),
+        ("", &["0 rows; expected one"]),
+    ];
+    let table = "data/set02/psf-001.csv";
+    for (row, expected) in rows {
+        refuse(
+            &small,
+            table,
+            format!("{header}{row}").as_bytes(),
+            &FUNCTIONAL,
+            expected,
+        );
+    }
+    refuse(
+        &small,
+        table,
+        b"x,y\n",
+        &FUNCTIONAL,
+        &["the header is `x,y`; expected `x,y,profile"],
+    );
+    refuse(
+        &small,
+        table,
+        b"\xff\xfe",
+        &FUNCTIONAL,
+        &["cannot read the PSF parameters"],
+    );
+}

@@ -1,0 +1,151 @@
+//! TOML with mistakes: the file, the line or key, what was found and what was expected.
+
+use std::fs;
+
+use crate::support::{Small, fail, shearq, text};
+
+#[test]
+fn submissions_with_mistakes_are_refused_with_file_and_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("own.toml");
+    let cases: [(&str, &[&str]); 12] = [
+        (
+            "extends = \"paper\"\n[stamp]\nsise = 3\n",
+            &["line 3", "unknown field `sise`, expected `size`"],
+        ),
+        (
+            "extends = \"paper\"\n[stmap]\nsize = 3\n",
+            &["line 2", "unknown field `stmap`", "`stamp`"],
+        ),
+        (
+            "extends = \"paper\"\n[stamp]\nsize = \"big\"\n",
+            &["line 3", "string \"big\""],
+        ),
+        (
+            "extends = \"paper\"\n[stamp]\nsize = -3\n",
+            &["line 3", "integer `-3`"],
+        ),
+        (
+            "extends = \"paper\"\n[stamp]\nsize = 500\n",
+            &["`stamp.size` is 500; expected 5 to 64 pixels"],
+        ),
+        (
+            "extends = \"paper\"\n[deconvolution]\nlambda = nan\n",
+            &["`deconvolution.lambda` is NaN; expected zero"],
+        ),
+        (
+            "extends = \"paper\"\n[psf]\nform = \"stars\"\n",
+            &["line 3", "`stars`, expected `star` or `functional`"],
+        ),
+        (
+            "extends = \"paper\"\n[stamp\nsize = 3\n",
+            &["line 2", "expected `]`"],
+        ),
+        (
+            "extends = \"paper\"\n[stamp]\nsize = 9\nsize = 10\n",
+            &["line 4", "duplicate key"],
+        ),
+        (
+            "extends = \"papr\"\n",
+            &[
+                "`extends`",
+                "no submission or file named `papr`",
+                "23/den/star",
+            ],
+        ),
+        ("extends = \"own.toml\"\n", &["goes round in a circle"]),
+        (
+            "[stamp]\nsize = 23\n",
+            &["`psf.form` is set neither here nor in what it extends"],
+        ),
+    ];
+    for (content, expected) in cases {
+        fs::write(&path, content).unwrap();
+        let message = fail(&["submissions", "show", text(&path)]);
+        for part in [&["own.toml"], expected].concat() {
+            assert!(message.contains(part), "{content}: {message}");
+        }
+    }
+    fs::write(&path, b"extends = \"\xff\"").unwrap();
+    assert!(
+        fail(&["submissions", "show", text(&path)]).contains("cannot read the submission file")
+    );
+    assert!(fail(&["submissions", "show", text(folder.path())]).contains("no submission or file"));
+}
+
+#[test]
+fn layouts_with_mistakes_are_refused_with_file_and_place() {
+    let small = Small::new("2");
+    let raw = ["--submission", "23/raw/star"];
+    let cases: [(&str, &str); 10] = [
+        ("galaxys = \"x\"\n", "unknown field `galaxys`"),
+        ("stamp = \"a\"\n", "line 1"),
+        ("stamp = 0\n", "`stamp` is 0; expected 1 to 1024 pixels"),
+        (
+            "field_degrees = 0.0\n",
+            "`field_degrees` is 0; expected a positive number",
+        ),
+        ("field_degrees = nan\n", "`field_degrees` is NaN"),
+        (
+            "truth_sign = \"wrong\"\n",
+            "expected `challenge` or `standard`",
+        ),
+        (
+            "galaxies = \"galaxies-{image:03}.fits\"\n",
+            "expected a pattern with {set} or {set:02}",
+        ),
+        (
+            "galaxies = \"set{set:02}/galaxies.fits\"\n",
+            "expected a pattern with {image} or {image:03}",
+        ),
+        (
+            "truth = \"set{set:03}/truth.csv\"\n",
+            "`truth` is \"set{set:03}/truth.csv\"; expected the name of a file",
+        ),
+        ("psf_star = \"\"\n", "`psf_star` is \"\""),
+    ];
+    for (content, expected) in cases {
+        fs::write(small.at("data/layout.toml"), content).unwrap();
+        let message = small.fail_to_measure(&raw);
+        assert!(
+            message.contains("layout.toml") && message.contains(expected),
+            "{message}"
+        );
+        assert!(!small.at("out").exists());
+    }
+    fs::write(
+        small.at("data/layout.toml"),
+        "galaxies = \"a/{set}-{image}.fits\"\n",
+    )
+    .unwrap();
+    assert!(
+        small
+            .fail_to_measure(&raw)
+            .contains("no galaxy images here in the layout expected")
+    );
+    let usage = shearq(&["measure", "--submission", "23/raw/star"]);
+    assert_eq!(usage.status.code(), Some(2));
+}
+
+#[test]
+fn a_header_that_must_give_the_noise_does_so() {
+    let small = Small::new("2");
+    let own = small.at("own.toml");
+    fs::write(
+        &own,
+        "extends = \"23/raw/star\"\n[noise]\nsource = \"header\"\n",
+    )
+    .unwrap();
+    let settings = ["--submission", text(&own)];
+    small.measure(&settings);
+    let image = small.at("data/set02/galaxies-001.fits");
+    let mut bytes = fs::read(&image).unwrap();
+    let at = bytes.windows(8).position(|w| w == b"NOISESIG").unwrap();
+    bytes[at..at + 8].copy_from_slice(b"NOISE   ");
+    fs::write(&image, bytes).unwrap();
+    let message = small.fail_to_measure(&settings);
+    assert!(
+        message.contains("header key NOISESIG is absent; expected a positive number"),
+        "{message}"
+    );
+}

@@ -1,0 +1,90 @@
+//! Killed at any moment: whatever a SIGKILL interrupts, going on ends in the same bytes.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::support::{contents, succeed, text};
+
+/// Kills of each of the three commands in the ordinary test.
+const KILLS: usize = 17;
+/// The same in the long one.
+const MANY_KILLS: usize = 500;
+
+#[test]
+fn killed_commands_go_on_to_the_same_bytes() {
+    kill_all(KILLS);
+}
+
+#[test]
+#[ignore = "minutes of the same with other moments"]
+fn commands_killed_many_times_go_on_to_the_same_bytes() {
+    kill_all(MANY_KILLS);
+}
+
+fn kill_all(kills: usize) {
+    let root = tempfile::tempdir().unwrap();
+    let data = root.path().join("data");
+    let sets = ["--sets", "1,7", "--images", "3", "--grid", "12"];
+    let simulate: Vec<&str> = ["simulate"].into_iter().chain(sets).collect();
+    kill(&simulate, &data, kills, 1);
+    let measure = ["measure", "--submission", "23/den/star", "--data"];
+    let measure: Vec<&str> = measure.into_iter().chain([text(&data)]).collect();
+    kill(&measure, &root.path().join("measured"), kills, 2);
+    let run = ["run", "--submission", "23/raw/star", "--simulate"];
+    let run: Vec<&str> = run.into_iter().chain(sets).collect();
+    kill(&run, &root.path().join("run"), kills, 3);
+}
+
+/// Runs a command undisturbed into `whole`, then again and again into another folder, with kills
+/// spread over the time it took, and each time until it ends by itself.
+fn kill(command: &[&str], whole: &Path, kills: usize, seed: u64) {
+    let start = Instant::now();
+    succeed(&[command, &["--out", text(whole)]].concat());
+    let length = start.elapsed();
+    let expected: BTreeMap<String, Vec<u8>> = contents(whole).into_iter().collect();
+    let mut moments = ChaCha8Rng::seed_from_u64(seed);
+    let mut done = 0;
+    while done < kills {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out");
+        let arguments = [command, &["--out", text(&out)]].concat();
+        while !ends_before(&arguments, length.mul_f64(moments.random())) {
+            done += 1;
+            if !out.exists() {
+                continue;
+            }
+            for (name, bytes) in contents(&out) {
+                // A leftover is hidden and known by its ending; everything else is whole.
+                if !name.ends_with(".part") {
+                    assert!(expected.get(&name) == Some(&bytes), "{command:?}: {name}");
+                }
+            }
+        }
+        let found: BTreeMap<String, Vec<u8>> = contents(&out).into_iter().collect();
+        let names = |files: &BTreeMap<String, Vec<u8>>| files.keys().cloned().collect::<Vec<_>>();
+        assert_eq!(names(&found), names(&expected), "{command:?}");
+        assert!(found == expected, "{command:?}: other bytes");
+    }
+    eprintln!("{}: {done} kills within {length:.2?}", command[0]);
+}
+
+/// Whether the command ends, with success, before it is killed after `delay`.
+fn ends_before(arguments: &[&str], delay: Duration) -> bool {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_shearq"))
+        .args(arguments)
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the binary starts");
+    std::thread::sleep(delay);
+    // On Unix this is SIGKILL; of a process that has ended already it does nothing.
+    child.kill().expect("one's own child can be killed");
+    let status = child.wait().expect("one's own child can be waited for");
+    assert!(status.code().is_none_or(|code| code == 0), "{arguments:?}");
+    status.success()
+}
