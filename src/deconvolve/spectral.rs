@@ -19,6 +19,8 @@
 //! (k_x ∂_x − k_y ∂_y)s, γ₂ by (k_y ∂_x + k_x ∂_y)s (∂ with respect to k). ∂û is the transform of
 //! −i·x times the stamp, so that the change of the autocorrelation with shear follows from the stamp
 //! itself: metacalibration (Huff & Mandelbaum 2017) in the limit of a small shear.
+//! The stamp that is measured is cut from a larger one; a shear moves the galaxy and not the edges of
+//! the cut, so that the change is worked out on the full stamp and then cut.
 
 use ndarray::ArrayView2;
 use rustfft::num_complex::Complex32;
@@ -36,6 +38,7 @@ const LEAST_POWER: f32 = 1e-7;
 #[derive(Clone)]
 pub struct Spectral {
     n: usize,
+    full: usize,
     p: usize,
     reach: usize,
     step: f32,
@@ -45,6 +48,10 @@ pub struct Spectral {
     /// Γ of each mode.
     target: Vec<f32>,
     fft: StampFft,
+    /// For full stamps.
+    full_fft: StampFft,
+    /// As `k`, for full stamps.
+    full_k: Vec<f32>,
     /// k_x of each column and k_y of each place in it, in radians per pixel.
     k: Vec<f32>,
 }
@@ -54,10 +61,11 @@ pub struct Spectral {
 pub struct SpectralPsf {
     /// Factor from |û|² to the power of the result; with the inverse transform's scale in it.
     gain: Vec<f32>,
-    /// Re[(k_x ∂_x − k_y ∂_y)p / p].
-    tilt1: Vec<f32>,
-    /// Re[(k_y ∂_x + k_x ∂_y)p / p].
-    tilt2: Vec<f32>,
+    /// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p on full stamps.
+    tilts: Vec<[Complex32; 2]>,
+    /// Real parts of the same as white noise on the cut stamp sees them on average: smoothed by the
+    /// transform of the cut.
+    noise_tilts: Vec<[f32; 2]>,
 }
 
 /// Buffers for one thread. Their content between calls does not matter.
@@ -67,6 +75,12 @@ pub struct SpectralScratch {
     x: Vec<Complex32>,
     y: Vec<Complex32>,
     fft: FftScratch,
+    full: [Vec<Complex32>; 3],
+    full_fft: FftScratch,
+    /// Derivatives of the cut stamp with shear.
+    changes: [Vec<f32>; 2],
+    /// A kernel on the cut's plane.
+    kernel: Vec<f32>,
 }
 
 /// Autocorrelations on lags dy = 0…R, dx = −R…R: `[dy·(2R+1) + dx + R]`.
@@ -81,17 +95,19 @@ pub struct Lags {
 }
 
 impl Spectral {
-    /// Plans for n×n stamps, p×p PSFs and autocorrelations up to lags of `reach` pixels.
+    /// Plans for n×n cuts of full stamps of `full` pixels, p×p PSFs and autocorrelations up to lags of
+    /// `reach` pixels.
     ///
     /// # Errors
     /// Where a size is out of range.
     pub fn new(
         n: usize,
+        full: usize,
         p: usize,
         reach: usize,
         settings: &Deconvolution,
     ) -> Result<Self, OperatorError> {
-        if !(3..=MAX_STAMP).contains(&n) {
+        if !(3..=MAX_STAMP.min(full)).contains(&n) {
             return Err(OperatorError::StampSize { found: n });
         }
         if !(2..=MAX_PSF).contains(&p) {
@@ -101,19 +117,15 @@ impl Spectral {
             });
         }
         let fft = StampFft::new((n + reach + SPREAD).max(p).max(2 * reach + 1));
-        let size = fft.size as i32;
-        let k: Vec<f64> = (0..size)
-            .map(|i| {
-                let signed = if 2 * i > size { i - size } else { i };
-                std::f64::consts::TAU * f64::from(signed) / f64::from(size)
-            })
-            .collect();
+        let full_fft = StampFft::new((full + SPREAD).max(p));
+        let k = frequencies(fft.size);
         let modes = || {
             let columns = k[..fft.half()].iter();
             columns.flat_map(|&kx| k.iter().map(move |&ky| (kx, ky)))
         };
         Ok(Spectral {
             n,
+            full,
             p,
             reach,
             step: settings.step as f32,
@@ -129,6 +141,11 @@ impl Spectral {
                 .collect(),
             k: k.iter().map(|&k| k as f32).collect(),
             fft,
+            full_k: frequencies(full_fft.size)
+                .iter()
+                .map(|&k| k as f32)
+                .collect(),
+            full_fft,
         })
     }
 
@@ -149,6 +166,10 @@ impl Spectral {
             x: self.fft.spectrum(),
             y: self.fft.spectrum(),
             fft: self.fft.scratch(),
+            full: std::array::from_fn(|_| self.full_fft.spectrum()),
+            full_fft: self.full_fft.scratch(),
+            changes: std::array::from_fn(|_| vec![0.0; self.n * self.n]),
+            kernel: vec![0.0; self.fft.size * self.fft.size],
         }
     }
 
@@ -156,9 +177,9 @@ impl Spectral {
     pub fn psf(&self) -> SpectralPsf {
         let modes = vec![0.0; self.fft.half() * self.fft.size];
         SpectralPsf {
-            gain: modes.clone(),
-            tilt1: modes.clone(),
-            tilt2: modes,
+            noise_tilts: vec![[0.0; 2]; modes.len()],
+            gain: modes,
+            tilts: vec![[Complex32::ZERO; 2]; self.full_fft.half() * self.full_fft.size],
         }
     }
 
@@ -192,28 +213,78 @@ impl Spectral {
         if let Some(((y, x), _)) = psf.indexed_iter().find(|(_, v)| !v.is_finite()) {
             return Err(OperatorError::PsfNotFinite { x: x + 1, y: y + 1 });
         }
-        let rows = psf.rows().into_iter();
-        let rows = rows.map(|row| row.into_iter().map(|&v| v as f32));
-        self.transforms(rows, self.p, scratch);
-        let size = self.fft.size;
-        let scale = 1.0 / (size * size) as f32;
-        for at in 0..out.gain.len() {
-            let (kx, ky) = (self.k[at / size], self.k[at % size]);
-            let p = scratch.u[at];
+        let rows = || {
+            let rows = psf.rows().into_iter();
+            rows.map(|row| row.into_iter().map(|&v| v as f32))
+        };
+        let SpectralScratch { u, fft, .. } = scratch;
+        self.fft.rows(rows(), fft, u);
+        self.fft.columns(fft, u);
+        let scale = 1.0 / (self.fft.size * self.fft.size) as f32;
+        for (at, (gain, p)) in out.gain.iter_mut().zip(&*u).enumerate() {
             let power = p.norm_sqr();
             let amplitude = self.amplitude(at, power);
-            if amplitude == 0.0 {
-                (out.gain[at], out.tilt1[at], out.tilt2[at]) = (0.0, 0.0, 0.0);
-                continue;
-            }
-            out.gain[at] = amplitude * amplitude * power * scale;
-            // Re(∂p/p) = Im(conj(p)·x̂)/|p|², for ∂p = −i·x̂.
-            let gx = (p.conj() * scratch.x[at]).im / power;
-            let gy = (p.conj() * scratch.y[at]).im / power;
-            out.tilt1[at] = kx * gx - ky * gy;
-            out.tilt2[at] = ky * gx + kx * gy;
+            *gain = amplitude * amplitude * power * scale;
+        }
+        let [u, x, y] = &mut scratch.full;
+        let fft = &mut scratch.full_fft;
+        transforms(
+            &self.full_fft,
+            rows(),
+            self.p,
+            fft,
+            [&mut *u, &mut *x, &mut *y],
+        );
+        let size = self.full_fft.size;
+        for (at, tilt) in out.tilts.iter_mut().enumerate() {
+            let (kx, ky) = (self.full_k[at / size], self.full_k[at % size]);
+            *tilt = if u[at].norm_sqr() < LEAST_POWER {
+                [Complex32::ZERO; 2]
+            } else {
+                tilts(u[at], x[at], y[at], kx, ky)
+            };
+        }
+        for component in 0..2 {
+            self.smooth_tilt(component, scratch, out);
         }
         Ok(())
+    }
+
+    /// Works out the noise's tilt of a component: noise on the cut, correlated with itself through the
+    /// tilt's kernel, meets only the pairs of pixels that the cut holds.
+    fn smooth_tilt(&self, component: usize, scratch: &mut SpectralScratch, out: &mut SpectralPsf) {
+        let spectrum = &mut scratch.full[0];
+        for (value, tilt) in spectrum.iter_mut().zip(&out.tilts) {
+            *value = tilt[component];
+        }
+        let fft = &mut scratch.full_fft;
+        self.full_fft.columns_back(fft, spectrum);
+        let (full, size) = (self.full_fft.size, self.fft.size);
+        // Pairs that lie farther apart see nothing of the kernel.
+        let far = (full.min(size) / 2 - 1).min(self.n - 1);
+        let area = (full * full * self.n * self.n) as f32;
+        let pairs = |d: usize| (self.n - d) as f32;
+        scratch.kernel.fill(0.0);
+        for y in -(far as isize)..=far as isize {
+            let from = y.rem_euclid(full as isize) as usize;
+            let to = y.rem_euclid(size as isize) as usize;
+            let line = self.full_fft.row_back(spectrum, from, fft);
+            let row = &mut scratch.kernel[to * size..][..size];
+            let share = pairs(y.unsigned_abs()) / area;
+            for x in 0..=far {
+                row[x] = line[x] * pairs(x) * share;
+            }
+            for x in 1..=far {
+                row[size - x] = line[full - x] * pairs(x) * share;
+            }
+        }
+        let rows = scratch.kernel.chunks_exact(size);
+        let rows = rows.map(|row| row.iter().copied());
+        self.fft.rows(rows, &mut scratch.fft, &mut scratch.u);
+        self.fft.columns(&mut scratch.fft, &mut scratch.u);
+        for (tilt, value) in out.noise_tilts.iter_mut().zip(&scratch.u) {
+            tilt[component] = value.re;
+        }
     }
 
     /// Γ[1 − (1 − c w)^M]/w of a mode with |p|² = `power`; zero where the PSF leaves nothing.
@@ -233,85 +304,101 @@ impl Spectral {
         self.target[at] * (1.0 - left) as f32 / w
     }
 
-    /// Transforms of an image of side `side`, and of it times x and y from its middle.
-    fn transforms(
-        &self,
-        rows: impl Iterator<Item = impl Iterator<Item = f32>> + Clone,
-        side: usize,
-        scratch: &mut SpectralScratch,
-    ) {
-        let SpectralScratch { u, x, y, fft } = scratch;
-        let middle = (side as f32 - 1.0) / 2.0;
-        let along = rows
-            .clone()
-            .map(|row| row.enumerate().map(|(i, v)| v * (i as f32 - middle)));
-        self.fft.rows(along, fft, x);
-        self.fft.rows(rows, fft, u);
-        let columns = u
-            .chunks_exact(self.fft.size)
-            .zip(y.chunks_exact_mut(self.fft.size));
-        for (from, to) in columns {
-            for (j, (value, out)) in from.iter().zip(to).enumerate() {
-                *out = value * (j as f32 - middle);
-            }
-        }
-        self.fft.columns(fft, u);
-        self.fft.columns(fft, x);
-        self.fft.columns(fft, y);
-    }
-
-    /// Deconvolves the row-major n×n `stamp` with white noise of level `noise` and writes the
-    /// autocorrelation, with its derivatives if `response`.
+    /// Deconvolves the middle of the row-major `full` stamp with white noise of level `noise` and writes
+    /// the autocorrelation, with its derivatives if `response`.
     pub fn autocorrelate(
         &self,
         psf: &SpectralPsf,
-        stamp: &[f32],
+        full: &[f32],
         noise: f32,
         response: bool,
         scratch: &mut SpectralScratch,
         out: &mut Lags,
     ) {
-        let rows = stamp.chunks_exact(self.n).map(|row| row.iter().copied());
         if response {
-            self.transforms(rows, self.n, scratch);
-        } else {
-            self.fft.rows(rows, &mut scratch.fft, &mut scratch.u);
-            self.fft.columns(&mut scratch.fft, &mut scratch.u);
+            self.change(psf, full, scratch);
+        }
+        let SpectralScratch {
+            u,
+            x,
+            y,
+            fft,
+            changes,
+            ..
+        } = scratch;
+        let start = self.start();
+        let rows = (start..start + self.n)
+            .map(|row| full[row * self.full + start..][..self.n].iter().copied());
+        self.fft.rows(rows, fft, u);
+        self.fft.columns(fft, u);
+        if response {
+            for (change, spectrum) in changes.iter().zip([&mut *x, &mut *y]) {
+                let rows = change.chunks_exact(self.n).map(|row| row.iter().copied());
+                self.fft.rows(rows, fft, spectrum);
+                self.fft.columns(fft, spectrum);
+            }
         }
         let floor = noise * noise * (self.n * self.n) as f32;
-        let size = self.fft.size;
-        for (i, &kx) in self.k[..self.fft.half()].iter().enumerate() {
-            let column = i * size..(i + 1) * size;
-            let u = &mut scratch.u[column.clone()];
-            let gain = &psf.gain[column.clone()];
-            if !response {
-                for (u, &gain) in u.iter_mut().zip(gain) {
-                    *u = Complex32::new(gain * (u.norm_sqr() - floor), 0.0);
-                }
-                continue;
-            }
-            let x = &mut scratch.x[column.clone()];
-            let y = &mut scratch.y[column.clone()];
-            let (tilt1, tilt2) = (&psf.tilt1[column.clone()], &psf.tilt2[column]);
-            for j in 0..size {
-                let ky = self.k[j];
-                let value = u[j];
-                let power = value.norm_sqr() - floor;
-                // Re(conj(û)·∂û); the noise adds nothing to its mean.
-                let gx = value.re * x[j].im - value.im * x[j].re;
-                let gy = value.re * y[j].im - value.im * y[j].re;
-                let first = kx * gx - ky * gy - power * tilt1[j];
-                let second = ky * gx + kx * gy - power * tilt2[j];
-                u[j] = Complex32::new(gain[j] * power, 0.0);
-                x[j] = Complex32::new(2.0 * gain[j] * first, 0.0);
-                y[j] = Complex32::new(2.0 * gain[j] * second, 0.0);
+        for (at, u) in u.iter_mut().enumerate() {
+            let (value, gain) = (*u, psf.gain[at]);
+            *u = Complex32::new(gain * (value.norm_sqr() - floor), 0.0);
+            if response {
+                // Re(conj(û)·δû), less what the noise adds to its mean.
+                let along = |change: Complex32| value.re * change.re + value.im * change.im;
+                let [first, second] = psf.noise_tilts[at];
+                let first = along(x[at]) + floor * first;
+                let second = along(y[at]) + floor * second;
+                x[at] = Complex32::new(2.0 * gain * first, 0.0);
+                y[at] = Complex32::new(2.0 * gain * second, 0.0);
             }
         }
-        let SpectralScratch { u, x, y, fft } = scratch;
         self.back(u, fft, &mut out.acf);
         if response {
             self.back(x, fft, &mut out.shear1);
             self.back(y, fft, &mut out.shear2);
+        }
+    }
+
+    /// First row and column of the cut.
+    fn start(&self) -> usize {
+        (self.full - self.n) / 2
+    }
+
+    /// Changes of the cut stamp with shears of the galaxy, worked out on the full one: the transform
+    /// of p·(k_x ∂_x − k_y ∂_y)(û/p), and of the other component's.
+    fn change(&self, psf: &SpectralPsf, stamp: &[f32], scratch: &mut SpectralScratch) {
+        let [u, x, y] = &mut scratch.full;
+        let fft = &mut scratch.full_fft;
+        let rows = stamp.chunks_exact(self.full).map(|row| row.iter().copied());
+        transforms(
+            &self.full_fft,
+            rows,
+            self.full,
+            fft,
+            [&mut *u, &mut *x, &mut *y],
+        );
+        let size = self.full_fft.size;
+        for (i, &kx) in self.full_k[..self.full_fft.half()].iter().enumerate() {
+            for (j, &ky) in self.full_k.iter().enumerate() {
+                let at = i * size + j;
+                let [first, second] = psf.tilts[at];
+                // ∂û = −i x̂.
+                let gx = Complex32::new(x[at].im, -x[at].re);
+                let gy = Complex32::new(y[at].im, -y[at].re);
+                x[at] = gx * kx - gy * ky - first * u[at];
+                y[at] = gx * ky + gy * kx - second * u[at];
+            }
+        }
+        let scale = 1.0 / (size * size) as f32;
+        let start = self.start();
+        for (spectrum, change) in [x, y].into_iter().zip(&mut scratch.changes) {
+            self.full_fft.columns_back(fft, spectrum);
+            for (row, out) in change.chunks_exact_mut(self.n).enumerate() {
+                let line = self.full_fft.row_back(spectrum, start + row, fft);
+                for (out, value) in out.iter_mut().zip(&line[start..]) {
+                    *out = value * scale;
+                }
+            }
         }
     }
 
@@ -353,6 +440,50 @@ impl Spectral {
             .flat_map(|y| self.fft.row_back(&scratch.u, y, &mut scratch.fft)[..self.n].to_vec())
             .collect()
     }
+}
+
+/// k of each place along an axis of `size`, in radians per pixel.
+fn frequencies(size: usize) -> Vec<f64> {
+    let side = size as i32;
+    (0..side)
+        .map(|i| {
+            let signed = if 2 * i > side { i - side } else { i };
+            std::f64::consts::TAU * f64::from(signed) / f64::from(side)
+        })
+        .collect()
+}
+
+/// Transforms of an image of side `side`, and of it times x and y from its middle.
+fn transforms(
+    plan: &StampFft,
+    rows: impl Iterator<Item = impl Iterator<Item = f32>> + Clone,
+    side: usize,
+    fft: &mut FftScratch,
+    [u, x, y]: [&mut Vec<Complex32>; 3],
+) {
+    let middle = (side as f32 - 1.0) / 2.0;
+    let along = rows
+        .clone()
+        .map(|row| row.enumerate().map(|(i, v)| v * (i as f32 - middle)));
+    plan.rows(along, fft, x);
+    plan.rows(rows, fft, u);
+    for (from, to) in u.chunks_exact(plan.size).zip(y.chunks_exact_mut(plan.size)) {
+        for (j, (value, out)) in from.iter().zip(to).enumerate() {
+            *out = value * (j as f32 - middle);
+        }
+    }
+    for spectrum in [u, x, y] {
+        plan.columns(fft, spectrum);
+    }
+}
+
+/// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p from the transforms p, x̂ and ŷ of a PSF:
+/// ∂p = −i x̂.
+fn tilts(p: Complex32, x: Complex32, y: Complex32, kx: f32, ky: f32) -> [Complex32; 2] {
+    let over = p.conj() / p.norm_sqr();
+    let gx = Complex32::new(x.im, -x.re) * over;
+    let gy = Complex32::new(y.im, -y.re) * over;
+    [gx * kx - gy * ky, gx * ky + gy * kx]
 }
 
 /// Transform of Sun's kernel, which is real.
@@ -426,7 +557,7 @@ mod tests {
             let residual = &u0 - &convolve(v.view(), h.view());
             v += &convolve(residual.view(), turned.view());
         }
-        let plan = Spectral::new(n, p, reach, &settings(3, 0.0, 0.0)).unwrap();
+        let plan = Spectral::new(n, n, p, reach, &settings(3, 0.0, 0.0)).unwrap();
         let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
         scratch.u.fill(Complex32::new(1e9, -1e9));
         plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
@@ -451,14 +582,15 @@ mod tests {
 
     #[test]
     fn the_response_is_that_of_a_sheared_galaxy() {
-        let (n, p, reach) = (40, 11, 8);
+        // The cut goes through the galaxy.
+        let (full, n, p, reach) = (40, 14, 11, 8);
         let h = psf(p);
-        let plan = Spectral::new(n, p, reach, &settings(1000, 2.0, 0.0)).unwrap();
+        let plan = Spectral::new(n, full, p, reach, &settings(1000, 2.0, 0.0)).unwrap();
         let (mut own, mut scratch) = (plan.psf(), plan.scratch());
         plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
         let mut lags_of = |g1: f64, g2: f64| {
             let mut lags = plan.lags();
-            let stamp = convolve(galaxy(n, g1, g2).view(), h.view());
+            let stamp = convolve(galaxy(full, g1, g2).view(), h.view());
             plan.autocorrelate(&own, &single(&stamp), 0.0, true, &mut scratch, &mut lags);
             lags
         };
@@ -481,7 +613,7 @@ mod tests {
     fn noise_is_subtracted_in_the_mean() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let (n, p, reach) = (24, 9, 5);
-        let plan = Spectral::new(n, p, reach, &settings(1000, 2.0, 1e-4)).unwrap();
+        let plan = Spectral::new(n, n, p, reach, &settings(1000, 2.0, 1e-4)).unwrap();
         let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
         plan.set_psf(psf(p).view(), &mut scratch, &mut own).unwrap();
         let mut with = vec![0.0f64; lags.acf.len()];
@@ -506,9 +638,9 @@ mod tests {
     #[test]
     fn unusable_sizes_and_psfs_are_refused() {
         let settings = settings(10, 1.0, 0.0);
-        assert!(Spectral::new(65, 15, 8, &settings).is_err());
-        assert!(Spectral::new(32, 49, 8, &settings).is_err());
-        let plan = Spectral::new(32, 7, 8, &settings).unwrap();
+        assert!(Spectral::new(65, 65, 15, 8, &settings).is_err());
+        assert!(Spectral::new(32, 48, 49, 8, &settings).is_err());
+        let plan = Spectral::new(32, 48, 7, 8, &settings).unwrap();
         let (mut own, mut scratch) = (plan.psf(), plan.scratch());
         let mut bad = psf(7);
         assert!(plan.set_psf(psf(9).view(), &mut scratch, &mut own).is_err());

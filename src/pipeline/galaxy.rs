@@ -130,7 +130,7 @@ impl Measurer {
                 DenoiseMethod::None => None,
                 DenoiseMethod::WaveletWiener => Some(WaveletWiener::new(full, &submission.denoise)),
             },
-            method: Method::new(submission, n)?,
+            method: Method::new(submission, n, full)?,
             submission: submission.clone(),
         })
     }
@@ -207,9 +207,9 @@ impl Measurer {
         }
         let peak = scratch.cut.iter().copied().fold(0.0f32, f32::max);
         let found = PEAKS.contains(&peak).then(|| {
-            let cut = &scratch.cut;
+            let (full, cut) = (&scratch.full, &scratch.cut);
             self.method
-                .measure(&self.submission, cut, noise, &mut scratch.method)
+                .measure(&self.submission, full, cut, noise, &mut scratch.method)
         });
         let Some(found) = found.flatten() else {
             return Measurement {

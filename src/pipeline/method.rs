@@ -59,14 +59,24 @@ pub(super) struct Found {
 }
 
 impl Method {
-    pub(super) fn new(submission: &Submission, n: usize) -> Result<Self, OperatorError> {
+    pub(super) fn new(
+        submission: &Submission,
+        n: usize,
+        full: usize,
+    ) -> Result<Self, OperatorError> {
         let d = &submission.deconvolution;
         let p = submission.psf.size;
         Ok(match (d.update, submission.shape.weight) {
             (Update::Linear, _) | (_, AcfWeight::Gaussian) => {
                 let sigma = submission.shape.weight_sigma;
                 Method::Linear {
-                    spectral: Box::new(Spectral::new(n, p, AdaptiveMoments::reach(sigma), d)?),
+                    spectral: Box::new(Spectral::new(
+                        n,
+                        full,
+                        p,
+                        AdaptiveMoments::reach(sigma),
+                        d,
+                    )?),
                     moments: AdaptiveMoments::new(sigma),
                     iterations: u32::try_from(d.max_iterations).unwrap_or(u32::MAX),
                 }
@@ -130,10 +140,11 @@ impl Method {
         }
     }
 
-    /// Measures a cut stamp of noise level `noise`. `None` where there is no scale to work in.
+    /// Measures a stamp of noise level `noise`, given as it is and cut. `None` where there is no scale to work in.
     pub(super) fn measure(
         &self,
         submission: &Submission,
+        full: &[f32],
         cut: &[f32],
         noise: f64,
         scratch: &mut MethodScratch,
@@ -183,7 +194,7 @@ impl Method {
                 if !(noise >= 0.0 && noise.is_finite()) {
                     return None;
                 }
-                spectral.autocorrelate(psf, cut, noise as f32, true, buffers, lags);
+                spectral.autocorrelate(psf, full, noise as f32, true, buffers, lags);
                 let shape = moments.measure(&lags.acf, own);
                 let mut response = [[f64::NAN; 2]; 2];
                 if let Ok(shape) = &shape {

@@ -173,8 +173,8 @@ struct Sums {
     along: Mean,
     /// Square of the PSF's ellipticity.
     psf: Mean,
-    /// Mean response, over versions and components.
-    response: Mean,
+    /// Mean response over versions, per component.
+    response: [Mean; 2],
 }
 
 impl Sums {
@@ -190,38 +190,41 @@ impl Sums {
             let offset = e.iter().sum::<f64>() / 4.0;
             self.offset[k].add(offset);
             along += offset * psf;
+            let responses = versions.iter().map(|version| version.response[k]);
+            self.response[k].add(responses.sum::<f64>() / 4.0);
         }
         self.along.add(along);
         self.psf.add(psf.e1 * psf.e1 + psf.e2 * psf.e2);
-        let responses = versions.iter().flat_map(|version| version.response);
-        self.response.add(responses.sum::<f64>() / 8.0);
     }
 
     fn merge(&mut self, other: &Self) {
         self.galaxies += other.galaxies;
-        let mine = self.slope.iter_mut().chain(&mut self.offset);
-        for (mean, more) in mine.zip(other.slope.iter().chain(&other.offset)) {
-            mean.merge(more);
+        for (mine, other) in [
+            (&mut self.slope, &other.slope),
+            (&mut self.offset, &other.offset),
+            (&mut self.response, &other.response),
+        ] {
+            mine[0].merge(&other[0]);
+            mine[1].merge(&other[1]);
         }
         self.along.merge(&other.along);
         self.psf.merge(&other.psf);
-        self.response.merge(&other.response);
     }
 
     fn bias(&self, calibration: Calibration) -> Bias {
         let count = self.galaxies as f64;
         let response = match calibration {
-            Calibration::None => 1.0,
-            Calibration::Response => self.response.value(count),
+            Calibration::None => [1.0; 2],
+            Calibration::Response => self.response.map(|mean| mean.value(count)),
         };
         let of = |means: &[Mean; 2], less: f64| {
             (
-                means.map(|mean| mean.value(count) / response - less),
-                means.map(|mean| mean.error(count) / response),
+                [0, 1].map(|k| means[k].value(count) / response[k] - less),
+                [0, 1].map(|k| means[k].error(count) / response[k]),
             )
         };
         let ((m, m_error), (c, c_error)) = (of(&self.slope, 1.0), of(&self.offset, 0.0));
-        let psf = self.psf.value(count) * response;
+        let psf = self.psf.value(count) * (response[0] + response[1]) / 2.0;
         Bias {
             galaxies: self.galaxies,
             m,

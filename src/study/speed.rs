@@ -156,7 +156,7 @@ pub fn stages(
         "One thread; fastest of several passes over {SAMPLE} galaxies."
     )];
     if submission.deconvolution.update == Update::Linear {
-        linear_stages(submission, psf.view(), &cut, &mut rows)?;
+        linear_stages(submission, psf.view(), &inputs.stamps, &mut rows)?;
     } else {
         notes.extend(network_stages(submission, psf.view(), &cut, &mut rows)?);
     }
@@ -250,13 +250,13 @@ fn network_stages(
 fn linear_stages(
     submission: &Submission,
     psf: ArrayView2<'_, f64>,
-    cut: &[Vec<f32>],
+    stamps: &[Vec<f32>],
     rows: &mut Vec<(&'static str, f64)>,
 ) -> Result<(), PipelineError> {
     let (n, p) = (submission.stamp.size, submission.psf.size);
     let sigma = submission.shape.weight_sigma;
     let reach = AdaptiveMoments::reach(sigma);
-    let spectral = Spectral::new(n, p, reach, &submission.deconvolution)?;
+    let spectral = Spectral::new(n, STAMP, p, reach, &submission.deconvolution)?;
     let (mut own, mut scratch) = (spectral.psf(), spectral.scratch());
     let mut lags = spectral.lags();
     rows.push((
@@ -272,7 +272,7 @@ fn linear_stages(
         let cost = time(|k| {
             spectral.autocorrelate(
                 &own,
-                black_box(&cut[k]),
+                black_box(&stamps[k]),
                 1.0,
                 response,
                 &mut scratch,
