@@ -3,11 +3,12 @@
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
-use shearq::deconvolve::{Network, Rule, Step};
+use shearq::deconvolve::{Network, Rule, Spectral, Step};
+use shearq::denoise::WaveletWiener;
 use shearq::pipeline::galaxy::Measurer;
 use shearq::pipeline::measure::functional_psf;
 use shearq::psf::functional::{FunctionalPsf, PsfProfile};
-use shearq::shape::Autocorrelation;
+use shearq::shape::{AdaptiveMoments, Autocorrelation};
 use shearq_benches::{stamp, submission};
 use shearq_scoring::Shear;
 use shearq_submissions::Start;
@@ -51,19 +52,76 @@ fn autocorrelation(c: &mut Criterion) {
     group.finish();
 }
 
-fn galaxy(c: &mut Criterion) {
-    let mut group = c.benchmark_group("galaxy");
-    for name in ["23/raw/star", "23/den/star", "29/den/func"] {
-        let measurer = Measurer::new(&submission(name), 48).expect("a valid submission");
-        let mut scratch = measurer.scratch();
-        measurer.set_psf(&mut scratch, Some(moffat(15).view()));
-        let data = stamp(48);
-        group.bench_function(name, |b| {
-            b.iter(|| measurer.measure(black_box(&data), 48, None, &mut scratch));
+fn denoise(c: &mut Criterion) {
+    let settings = submission("23/den/star").denoise;
+    let mut group = c.benchmark_group("denoise");
+    for n in [24, 48] {
+        let filter = WaveletWiener::new(n, &settings);
+        let mut scratch = filter.scratch();
+        let data = stamp(n);
+        let mut work = data.clone();
+        group.bench_function(BenchmarkId::from_parameter(n), |b| {
+            b.iter(|| {
+                work.copy_from_slice(&data);
+                filter.apply(black_box(&mut work), 1.0, &mut scratch);
+            });
         });
     }
     group.finish();
 }
 
-criterion_group!(benches, network, autocorrelation, galaxy);
+fn linear(c: &mut Criterion) {
+    let submission = submission("32/linear/star");
+    let sigma = submission.shape.weight_sigma;
+    let moments = AdaptiveMoments::new(sigma);
+    let mut group = c.benchmark_group("linear");
+    for n in [24, 32, 48] {
+        let settings = &submission.deconvolution;
+        let plan = Spectral::new(n, 48, 32, AdaptiveMoments::reach(sigma), settings);
+        let plan = plan.expect("valid sizes");
+        let (mut psf, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+        plan.set_psf(moffat(32).view(), &mut scratch, &mut psf)
+            .expect("a valid PSF");
+        let data = stamp(48);
+        group.bench_function(BenchmarkId::new("autocorrelate", n), |b| {
+            b.iter(|| {
+                plan.autocorrelate(&psf, black_box(&data), 1.0, true, &mut scratch, &mut lags);
+            });
+        });
+    }
+    let side = 2 * AdaptiveMoments::reach(sigma) + 1;
+    let acf: Vec<f32> = (0..side * side.div_ceil(2))
+        .map(|k| {
+            let (y, x) = ((k / side) as f32, (k % side) as f32 - (side / 2) as f32);
+            (-(x * x + y * y + 0.3 * x * y) / 20.0).exp()
+        })
+        .collect();
+    let mut values = moments.scratch();
+    group.bench_function("adaptive moments", |b| {
+        b.iter(|| moments.measure(black_box(&acf), &mut values));
+    });
+    group.finish();
+}
+
+fn galaxy(c: &mut Criterion) {
+    let mut group = c.benchmark_group("galaxy");
+    for name in [
+        "23/raw/star",
+        "23/den/star",
+        "29/den/func",
+        "32/linear/star",
+    ] {
+        let submission = submission(name);
+        let measurer = Measurer::new(&submission, 48).expect("a valid submission");
+        let mut scratch = measurer.scratch();
+        measurer.set_psf(&mut scratch, Some(moffat(submission.psf.size).view()));
+        let data = stamp(48);
+        group.bench_function(name, |b| {
+            b.iter(|| measurer.measure(black_box(&data), 48, Some(1.0), &mut scratch));
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, network, autocorrelation, denoise, linear, galaxy);
 criterion_main!(benches);

@@ -463,45 +463,56 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
         }
     }
     let constant = 0.5 * V::sum(constant);
-    // `residual` looks at the candidate, which the first state is too.
-    std::mem::swap(&mut b.state, &mut b.next);
-    let mut cost = residual::<T, V>(operator, b);
-    std::mem::swap(&mut b.state, &mut b.next);
     let mut outcome = Outcome {
         iterations: 0,
         stop: Stop::MaxIterations,
-        first_energy: cost - constant,
-        energy: cost - constant,
+        first_energy: 0.0,
+        energy: 0.0,
         updated: 0,
     };
     let accelerated = matches!(rule.step, Step::Accelerated(_));
-    let mut momentum = 1.0;
     if accelerated {
         b.last.copy_from(&b.state);
     }
-    for _ in 0..rule.max_iterations {
+    let (mut momentum, mut extrapolated) = (1.0, false);
+    let mut cost = None;
+    // `residual` looks at the candidate, which the first state is too. It stands here once, because
+    // it is inlined and by far the largest part of the code.
+    std::mem::swap(&mut b.state, &mut b.next);
+    loop {
+        let next = residual::<T, V>(operator, b);
+        match cost {
+            None => {
+                std::mem::swap(&mut b.state, &mut b.next);
+                outcome.first_energy = next - constant;
+            }
+            Some(cost) if next < cost => {
+                std::mem::swap(&mut b.state, &mut b.next);
+                std::mem::swap(&mut b.last, &mut b.moved);
+                outcome.iterations += 1;
+            }
+            Some(_) if extrapolated => {
+                // Too far: the update itself is left.
+                (momentum, extrapolated) = (1.0, false);
+                b.next.copy_from(&b.moved);
+                continue;
+            }
+            Some(_) => {
+                outcome.stop = Stop::EnergyRise;
+                break;
+            }
+        }
+        cost = Some(next);
+        outcome.energy = next - constant;
+        if outcome.iterations as usize >= rule.max_iterations {
+            break;
+        }
         outcome.updated = update::<T, V>(operator, rule, b);
         if outcome.updated == 0 {
             outcome.stop = Stop::Stable;
             break;
         }
-        let extrapolated = accelerated && extrapolate::<T, V>(operator, b, &mut momentum);
-        let mut next = residual::<T, V>(operator, b);
-        if extrapolated && (next.is_nan() || next >= cost) {
-            // Too far: the update itself is left.
-            momentum = 1.0;
-            b.next.copy_from(&b.moved);
-            next = residual::<T, V>(operator, b);
-        }
-        if next.is_nan() || next >= cost {
-            outcome.stop = Stop::EnergyRise;
-            break;
-        }
-        std::mem::swap(&mut b.state, &mut b.next);
-        std::mem::swap(&mut b.last, &mut b.moved);
-        cost = next;
-        outcome.energy = cost - constant;
-        outcome.iterations += 1;
+        extrapolated = accelerated && extrapolate::<T, V>(operator, b, &mut momentum);
     }
     outcome
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::support::{contents, fail, shearq, succeed, text};
+use crate::support::{contents, fail, succeed, text};
 
 fn simulate(folder: &Path, sets: &str, images: &str, threads: &str) {
     succeed(&[
