@@ -104,7 +104,7 @@ impl Matrices {
         };
         // With momentum: the update of the iteration before, and Nesterov's t.
         let mut last = v.clone();
-        let mut momentum = 1.0;
+        let mut momentum: f64 = 1.0;
         for _ in 0..rule.max_iterations {
             // Eq. 11.
             let f = &q - &self.weights.dot(&v);
@@ -138,7 +138,7 @@ impl Matrices {
                 if (&v - &moved).dot(&on) > 0.0 {
                     momentum = 1.0;
                 }
-                let grown = 0.5 * (1.0 + (1.0 + 4.0 * momentum * momentum as f64).sqrt());
+                let grown = 0.5 * (1.0 + (1.0 + 4.0 * momentum * momentum).sqrt());
                 beta = (momentum - 1.0) / grown;
                 momentum = grown;
                 next = (&moved + &(on * beta)).mapv(|v| v.max(0.0));

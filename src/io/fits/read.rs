@@ -309,7 +309,7 @@ fn check_tiles(file: &mut std::fs::File, path: &Path) -> Result<(), FileError> {
             rice = value.contains("RICE");
         }
         // The first parameter of Rice compression is the size of a block.
-        if !key.starts_with("ZTILE") && !(rice && key == "ZVAL1") {
+        if !(key.starts_with("ZTILE") || rice && key == "ZVAL1") {
             continue;
         }
         let value = value.split('/').next().unwrap_or_default().trim();
