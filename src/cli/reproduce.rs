@@ -146,7 +146,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
 const SECT_THREE: &str = "A stamp is deconvolved by the network; the ellipticity is measured on the autocorrelation (ACF) of the result, clipped at the radius that holds 90 % of its light.";
 const SECT_FOUR: &str = "Exponential galaxies on stamps, convolved with a Moffat PSF each, with white noise of 10, 20 and 40 dB, deconvolved for λ from 10⁻⁶ to 10⁶ by both updating rules. Everything here is simulated.";
-const SECT_FIVE: &str = "The seven submissions of Table 1 on the 24 kinds of set of Table 2. The images are simulated, not the challenge's own: distributions of S/N and size, PSF fields and shear spectra that were not published are chosen here. Figures are for the convention that matches the truth, by the leaderboard's definition, with jackknife errors.";
+const SECT_FIVE: &str = "The seven submissions of Table 1 on the 24 kinds of set of Table 2. The images are simulated, not the challenge's own: distributions of S/N and size, PSF fields and shear spectra that were not published are chosen here. Figures are for the standard convention, in which the ellipticities are measured, by the leaderboard's definition, with jackknife errors.";
 
 /// Fig. 3: the steps of one galaxy at S/N 10, 20 and 40.
 fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {

@@ -129,7 +129,7 @@ pub fn contest_table(
         notes: vec![
             "Scatter of ε per component after dividing by its slope, and over the Cramér–Rao bound of the galaxies.".into(),
             "m and c from pairs of galaxies with shears of ± 0.02, intrinsic ellipticities ± e and the same noise; leakage: c along the PSF's ellipticity.".into(),
-            "Q of the catalogues, and of cross-spectra between groups of images, in which noise has no mean; leaderboard definition, matched convention.".into(),
+            "Q of the catalogues, and of cross-spectra between groups of images, in which noise has no mean; leaderboard definition, standard convention.".into(),
         ],
     })
 }

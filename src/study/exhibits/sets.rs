@@ -85,7 +85,7 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
         rows,
         notes: vec![
             "Q calibrated: after dividing the ellipticities by the mean slope at which they follow the true ones.".into(),
-            "Matched convention, leaderboard definition, jackknife errors. Published figures are of the challenge's own images, 200 per set.".into(),
+            "Standard convention, leaderboard definition, jackknife errors. Published figures are of the challenge's own images, 200 per set.".into(),
         ],
     }
 }
