@@ -241,7 +241,7 @@ impl Spectral {
             *tilt = if u[at].norm_sqr() < LEAST_POWER {
                 [Complex32::ZERO; 2]
             } else {
-                tilts(u[at], x[at], y[at], kx, ky)
+                sheared(x[at], y[at], kx, ky).map(|change| change / u[at])
             };
         }
         for component in 0..2 {
@@ -382,11 +382,9 @@ impl Spectral {
             for (j, &ky) in self.full_k.iter().enumerate() {
                 let at = i * size + j;
                 let [first, second] = psf.tilts[at];
-                // ∂û = −i x̂.
-                let gx = Complex32::new(x[at].im, -x[at].re);
-                let gy = Complex32::new(y[at].im, -y[at].re);
-                x[at] = gx * kx - gy * ky - first * u[at];
-                y[at] = gx * ky + gy * kx - second * u[at];
+                let [along, across] = sheared(x[at], y[at], kx, ky);
+                x[at] = along - first * u[at];
+                y[at] = across - second * u[at];
             }
         }
         let scale = 1.0 / (size * size) as f32;
@@ -477,12 +475,11 @@ fn transforms(
     }
 }
 
-/// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p from the transforms p, x̂ and ŷ of a PSF:
-/// ∂p = −i x̂.
-fn tilts(p: Complex32, x: Complex32, y: Complex32, kx: f32, ky: f32) -> [Complex32; 2] {
-    let over = p.conj() / p.norm_sqr();
-    let gx = Complex32::new(x.im, -x.re) * over;
-    let gy = Complex32::new(y.im, -y.re) * over;
+/// (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y) of a transform whose image times x and y has the
+/// transforms x̂ and ŷ: ∂ of it is −i x̂.
+fn sheared(x: Complex32, y: Complex32, kx: f32, ky: f32) -> [Complex32; 2] {
+    let gx = Complex32::new(x.im, -x.re);
+    let gy = Complex32::new(y.im, -y.re);
     [gx * kx - gy * ky, gx * ky + gy * kx]
 }
 

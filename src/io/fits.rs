@@ -6,9 +6,8 @@
 
 mod read;
 
-pub use read::{ImageReader, read_table};
+pub use read::{ImageReader, read_table, read_table_keys};
 
-use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -258,24 +257,4 @@ pub fn write_table(path: &Path, table: &Table, header: &[(&str, Value)]) -> Resu
     };
     close(file, path)?;
     part.finish()
-}
-
-/// Text values of the header of a table that [`write_table`] wrote, of those of `keys` that are there.
-///
-/// # Errors
-/// Where the file cannot be read.
-pub fn read_table_keys<'a>(
-    path: &Path,
-    keys: impl Iterator<Item = &'a String>,
-) -> Result<BTreeMap<String, String>, FileError> {
-    plain_name(path)?;
-    let _guard = lock();
-    let cannot = |e| FileError::new(path, format!("cannot read the table: {}", describe(e)));
-    let mut file = FitsFile::open(path).map_err(cannot)?;
-    let hdu = file.hdu(1).map_err(cannot)?;
-    let mut value = |key: &String| {
-        let value = hdu.read_key(&mut file, &key.to_ascii_uppercase()).ok()?;
-        Some((key.clone(), value))
-    };
-    Ok(keys.filter_map(&mut value).collect())
 }

@@ -25,7 +25,6 @@ pub(super) enum Method {
     Linear {
         spectral: Box<Spectral>,
         moments: AdaptiveMoments,
-        iterations: u32,
     },
 }
 
@@ -78,7 +77,6 @@ impl Method {
                         d,
                     )?),
                     moments: AdaptiveMoments::new(sigma),
-                    iterations: u32::try_from(d.max_iterations).unwrap_or(u32::MAX),
                 }
             }
             (Update::Adaptive | Update::Accelerated | Update::Constant, AcfWeight::Clipped) => {
@@ -111,9 +109,7 @@ impl Method {
                     acf: vec![0.0; acf.len()],
                 }
             }
-            Method::Linear {
-                spectral, moments, ..
-            } => MethodScratch::Linear {
+            Method::Linear { spectral, moments } => MethodScratch::Linear {
                 psf: spectral.psf(),
                 buffers: Box::new(spectral.scratch()),
                 lags: spectral.lags(),
@@ -179,11 +175,7 @@ impl Method {
                 })
             }
             (
-                Method::Linear {
-                    spectral,
-                    moments,
-                    iterations,
-                },
+                Method::Linear { spectral, moments },
                 MethodScratch::Linear {
                     psf,
                     buffers,
@@ -204,7 +196,7 @@ impl Method {
                 }
                 Some(Found {
                     outcome: Outcome {
-                        iterations: *iterations,
+                        iterations: submission.deconvolution.max_iterations as u32,
                         stop: Stop::MaxIterations,
                         first_energy: f64::NAN,
                         energy: f64::NAN,

@@ -8,7 +8,7 @@ use shearq_scoring::Shear;
 use shearq_submissions::{PsfForm, Submission};
 
 use super::calibrate::calibrate;
-use super::engine::{self, Progress};
+use super::engine::{self, Feeder, Progress};
 use super::galaxy::{MeasureScratch, Measurer, Steps};
 use super::images::ImageId;
 use super::measure::{
@@ -24,9 +24,9 @@ use crate::simulate::set::{
 };
 
 /// One row of stamps to draw and measure.
-struct RowJob {
-    fields: Arc<ImageFields>,
-    iy: usize,
+pub(crate) struct RowJob {
+    pub(crate) fields: Arc<ImageFields>,
+    pub(crate) iy: usize,
 }
 
 /// A row of stamps, measured by each measurer.
@@ -132,15 +132,7 @@ pub fn run_set(
     engine::ordered(
         threads,
         |feeder| {
-            for &image in images {
-                let fields = Arc::new(set.image_fields(image));
-                for iy in 0..n {
-                    let fields = Arc::clone(&fields);
-                    if !feeder.push(RowJob { fields, iy }) {
-                        return Ok(());
-                    }
-                }
-            }
+            feed(set, images, feeder);
             Ok(())
         },
         || Scratch {
@@ -170,6 +162,19 @@ pub fn run_set(
             Ok(())
         },
     )
+}
+
+/// Hands out the rows of images of a set, in order.
+pub(crate) fn feed(set: &SetSimulator, images: &[u32], feeder: &mut Feeder<'_, RowJob>) {
+    for &image in images {
+        let fields = Arc::new(set.image_fields(image));
+        for iy in 0..set.grid().n {
+            let fields = Arc::clone(&fields);
+            if !feeder.push(RowJob { fields, iy }) {
+                return;
+            }
+        }
+    }
 }
 
 fn draw_and_measure(

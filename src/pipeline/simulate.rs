@@ -176,7 +176,7 @@ pub(super) fn draw_stars(set: &SetSimulator, fields: &ImageFields, iy: usize) ->
 }
 
 /// Copies a stamp to its place in a strip of `n`.
-fn place(stamp: &[f32], side: usize, ix: usize, n: usize, strip: &mut [f32]) {
+pub(crate) fn place(stamp: &[f32], side: usize, ix: usize, n: usize, strip: &mut [f32]) {
     for (y, row) in stamp.chunks_exact(side).enumerate() {
         let at = y * n * side + ix * side;
         strip[at..at + side].copy_from_slice(row);

@@ -10,8 +10,6 @@
 //!
 //! with m far better known than the scatter of one galaxy suggests.
 
-use std::sync::Arc;
-
 use serde::{Deserialize, Serialize};
 use shearq_scoring::Shear;
 use shearq_submissions::Calibration;
@@ -19,7 +17,8 @@ use shearq_submissions::Calibration;
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::{self, Progress};
 use crate::pipeline::galaxy::{MeasureScratch, Measurement, Measurer};
-use crate::pipeline::run::measure_strip;
+use crate::pipeline::run::{RowJob, feed, measure_strip};
+use crate::pipeline::simulate::place;
 use crate::simulate::render::RenderScratch;
 use crate::simulate::set::{ImageFields, STAMP, SetSimulator};
 
@@ -64,21 +63,14 @@ pub fn biases(
     engine::ordered(
         threads,
         |feeder| {
-            for &image in images {
-                let fields = Arc::new(set.image_fields(image));
-                for iy in 0..n {
-                    if !feeder.push((Arc::clone(&fields), iy)) {
-                        return Ok(());
-                    }
-                }
-            }
+            feed(set, images, feeder);
             Ok(())
         },
         || {
             let scratch: Vec<MeasureScratch> = measurers.iter().map(Measurer::scratch).collect();
             (RenderScratch::new(), scratch)
         },
-        |(render, scratch), (fields, iy): (Arc<ImageFields>, usize)| {
+        |(render, scratch), RowJob { fields, iy }| {
             let versions = VERSIONS.map(|version| {
                 let strip = draw(set, &fields, iy, version, render);
                 measure_strip(set, &fields, iy, strip, measurers, scratch)
@@ -125,10 +117,7 @@ fn draw(
         let e = fields.intrinsic[(ix, iy)] * intrinsic;
         let shape = Shear::new(e.re, e.im).sheared_by(gamma);
         set.draw_as(fields, (ix, iy), shape, scratch, &mut stamp);
-        for (y, row) in stamp.chunks_exact(STAMP).enumerate() {
-            let at = y * n * STAMP + ix * STAMP;
-            strip[at..at + STAMP].copy_from_slice(row);
-        }
+        place(&stamp, STAMP, ix, n, &mut strip);
     }
     strip
 }

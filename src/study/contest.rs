@@ -9,8 +9,7 @@ use super::bias::{Bias, biases};
 use super::bound::cramer_rao;
 use super::reproduce::{Plan, SetResult};
 use super::speed;
-use crate::io::FileError;
-use crate::io::run::write_record;
+use crate::io::run::{read_record, write_record};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Progress;
 use crate::pipeline::run::measurers;
@@ -47,13 +46,8 @@ pub fn bias_sets(
     let mut found = Vec::new();
     for &set in sets {
         let path = folder.join(format!("bias/set{set:02}-{images}.json"));
-        if path.is_file() {
-            let text = std::fs::read_to_string(&path)
-                .map_err(FileError::doing(&path, "cannot read the result"))?;
-            found.push(
-                serde_json::from_str(&text)
-                    .map_err(FileError::doing(&path, "not a result of biases"))?,
-            );
+        if let Some(result) = read_record::<SetBiases>(&path)? {
+            found.push(result);
             progress.advance(u64::from(images) * (plan.simulation.grid as u64).pow(2));
             continue;
         }

@@ -11,8 +11,7 @@ use shearq_scoring::{
 use shearq_submissions::Submission;
 
 use super::response::{Regression, Response};
-use crate::io::FileError;
-use crate::io::run::write_record;
+use crate::io::run::{read_record, write_record};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Progress;
 use crate::pipeline::measure::MeasuredRow;
@@ -97,11 +96,7 @@ pub fn run_sets(
     let mut results = Vec::new();
     for &set in sets {
         let path = result_path(folder, set);
-        if path.is_file() {
-            let text = std::fs::read_to_string(&path)
-                .map_err(FileError::doing(&path, "cannot read the result"))?;
-            let result: SetResult = serde_json::from_str(&text)
-                .map_err(FileError::doing(&path, "not a result of a set"))?;
+        if let Some(result) = read_record::<SetResult>(&path)? {
             progress.advance(u64::from(plan.images) * (plan.simulation.grid as u64).pow(2));
             results.push(result);
             continue;

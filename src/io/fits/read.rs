@@ -1,5 +1,6 @@
 //! Reading, by cfitsio's own functions: what a header says is checked before it is believed.
 
+use std::collections::BTreeMap;
 use std::ffi::{CString, c_char, c_int};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -503,6 +504,22 @@ pub fn read_table(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileErr
         columns.push((name.to_owned(), read_column(&file, description, rows)?));
     }
     Table::new(columns).map_err(|message| file.fault(message))
+}
+
+/// Text values of the header of a file's first extension, of those of `keys` that are there.
+///
+/// # Errors
+/// Where the file cannot be read or has no extension.
+pub fn read_table_keys<'a>(
+    path: &Path,
+    keys: impl Iterator<Item = &'a String>,
+) -> Result<BTreeMap<String, String>, FileError> {
+    let file = File::open(path, "table")?;
+    if !file.extension(2) {
+        return Err(file.fault("there is no table in this file".into()));
+    }
+    let value = |key: &String| (key.clone(), file.text(&key.to_ascii_uppercase()));
+    Ok(keys.map(value).filter(|(_, v)| !v.is_empty()).collect())
 }
 
 /// Rows of the table here, which the file must be able to hold.

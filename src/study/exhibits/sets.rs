@@ -10,6 +10,7 @@ use crate::report::figure::{
 use crate::report::table::{Cell, Heading, Table};
 use crate::simulate::kinds::{ImageType, SetKind};
 use crate::study::reproduce::SetResult;
+use crate::study::response::Response;
 
 /// Figures of one submission over sets, from its place in each set's results.
 pub(super) fn over_sets(
@@ -288,7 +289,7 @@ pub fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table
     let mut rows = Vec::new();
     for (snr, kind) in kinds {
         for &(place, name) in places {
-            let responses: Vec<_> = results
+            let responses: Vec<Response> = results
                 .iter()
                 .filter(|set| SetKind::of(set.set).is_some_and(|own| own.image == kind))
                 .map(|set| set.results[place].response)
@@ -298,39 +299,22 @@ pub fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table
             }
             // Sets of a kind have equally many galaxies.
             let count = responses.len() as f64;
-            let mean = |values: Vec<(f64, f64)>, decimals| {
-                let value = values.iter().map(|v| v.0).sum::<f64>() / count;
-                let error = values.iter().map(|v| v.1 * v.1).sum::<f64>().sqrt() / count;
-                Cell::with_error(value, Some(error), decimals)
+            let mean = |of: &dyn Fn(&Response) -> (f64, f64), decimals| {
+                let (mut value, mut square) = (0.0, 0.0);
+                for (v, error) in responses.iter().map(of) {
+                    value += v;
+                    square += error * error;
+                }
+                Cell::with_error(value / count, Some(square.sqrt() / count), decimals)
             };
-            let component = |k: usize, decimals| {
-                mean(
-                    responses
-                        .iter()
-                        .map(|r| (r.slope[k], r.slope_error[k]))
-                        .collect(),
-                    decimals,
-                )
-            };
-            let offset = |k: usize| {
-                mean(
-                    responses
-                        .iter()
-                        .map(|r| (r.offset[k], r.offset_error[k]))
-                        .collect(),
-                    4,
-                )
-            };
-            let scatter = responses
-                .iter()
-                .map(|r| (r.rms_scatter(), r.rms_scatter_error()))
-                .collect();
+            let slope = |k: usize| mean(&|r| (r.slope[k], r.slope_error[k]), 3);
+            let offset = |k: usize| mean(&|r| (r.offset[k], r.offset_error[k]), 4);
             rows.push(vec![
                 Cell::number(snr, 0),
                 Cell::text(name),
-                component(0, 3),
-                component(1, 3),
-                mean(scatter, 4),
+                slope(0),
+                slope(1),
+                mean(&|r| (r.rms_scatter(), r.rms_scatter_error()), 4),
                 offset(0),
                 offset(1),
             ]);
