@@ -71,34 +71,38 @@ fn denoise(c: &mut Criterion) {
 }
 
 fn linear(c: &mut Criterion) {
-    let submission = submission("32/linear/star");
-    let sigma = submission.shape.weight_sigma;
-    let moments = AdaptiveMoments::new(sigma);
+    let submission = submission("48/linear/star");
+    let settings = &submission.deconvolution;
     let mut group = c.benchmark_group("linear");
-    for n in [24, 32, 48] {
-        let settings = &submission.deconvolution;
-        let plan = Spectral::new(n, 48, 32, AdaptiveMoments::reach(sigma), settings);
-        let plan = plan.expect("valid sizes");
+    for n in [32, 40, 48] {
+        let plan = Spectral::new(n, n, settings).expect("valid sizes");
         let (mut psf, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
-        plan.set_psf(moffat(32).view(), &mut scratch, &mut psf)
+        let moffat = moffat(n);
+        group.bench_function(BenchmarkId::new("take a PSF", n), |b| {
+            b.iter(|| plan.set_psf(black_box(moffat.view()), &mut scratch, &mut psf));
+        });
+        plan.set_psf(moffat.view(), &mut scratch, &mut psf)
             .expect("a valid PSF");
-        let data = stamp(48);
+        let data = stamp(n);
         group.bench_function(BenchmarkId::new("autocorrelate", n), |b| {
-            b.iter(|| {
-                plan.autocorrelate(&psf, black_box(&data), 1.0, true, &mut scratch, &mut lags);
-            });
+            b.iter(|| plan.autocorrelate(&psf, black_box(&data), 1.0, &mut scratch, &mut lags));
+        });
+        group.bench_function(BenchmarkId::new("field of noise", n), |b| {
+            b.iter(|| plan.noise_field(&psf, black_box(1), &mut scratch, &mut lags));
         });
     }
-    let side = 2 * AdaptiveMoments::reach(sigma) + 1;
-    let acf: Vec<f32> = (0..side * side.div_ceil(2))
+    let reach = 10;
+    let moments = AdaptiveMoments::new(submission.shape.weight_scale, 2.0, reach);
+    let side = 2 * reach + 1;
+    let acf: Vec<f32> = (0..side * (reach + 1))
         .map(|k| {
-            let (y, x) = ((k / side) as f32, (k % side) as f32 - (side / 2) as f32);
-            (-(x * x + y * y + 0.3 * x * y) / 20.0).exp()
+            let (y, x) = ((k / side) as f32, (k % side) as f32 - reach as f32);
+            (-(x * x + y * y + 0.3 * x * y) / 5.0).exp()
         })
         .collect();
     let mut values = moments.scratch();
     group.bench_function("adaptive moments", |b| {
-        b.iter(|| moments.measure(black_box(&acf), &mut values));
+        b.iter(|| moments.measure(black_box(&acf), 0.0, &mut values));
     });
     group.finish();
 }
@@ -109,7 +113,7 @@ fn galaxy(c: &mut Criterion) {
         "23/raw/star",
         "23/den/star",
         "29/den/func",
-        "32/linear/star",
+        "48/linear/star",
     ] {
         let submission = submission(name);
         let measurer = Measurer::new(&submission, 48).expect("a valid submission");

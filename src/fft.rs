@@ -129,7 +129,7 @@ impl StampFft {
 }
 
 /// The smallest even length of at least `least` with no prime factor above 5.
-fn transform_size(least: usize) -> usize {
+pub(crate) fn transform_size(least: usize) -> usize {
     (least..)
         .find(|&size| {
             let mut rest = size;

@@ -21,7 +21,7 @@ use crate::study::speed;
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Name of a submission or a TOML file of your own. May be given several times.
-    #[arg(long, value_name = "NAME|FILE", default_values = ["23/den/star", "32/linear/star"])]
+    #[arg(long, value_name = "NAME|FILE", default_values = ["23/den/star", "48/linear/star"])]
     submission: Vec<String>,
     /// Catalogues scored.
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u16).range(2..=2000))]

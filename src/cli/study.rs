@@ -22,7 +22,7 @@ use crate::study::reproduce::{Plan, run_sets};
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Names of submissions, or TOML files of your own. May be given several times.
-    #[arg(long, value_name = "NAME|FILE", default_values = ["23/raw/star", "23/den/star", "32/linear/star"])]
+    #[arg(long, value_name = "NAME|FILE", default_values = ["23/raw/star", "23/den/star", "48/linear/star"])]
     submission: Vec<String>,
     /// Sets; by default one of each kind, with a fixed PSF.
     #[arg(

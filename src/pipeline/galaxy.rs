@@ -1,10 +1,10 @@
 //! One galaxy: from its postage stamp and PSF to an ellipticity. Serial; allocates nothing.
 
 use ndarray::{Array2, ArrayView2};
-use shearq_scoring::Shear;
+use shearq_scoring::{Distortion, Shear};
 use shearq_submissions::{DenoiseMethod, EllipticityType, NoiseSource, Submission};
 
-use super::method::{Found, Method, MethodScratch};
+use super::method::{Found, Images, Method, Response, Worker};
 use crate::deconvolve::reference::convolve;
 use crate::deconvolve::{OperatorError, Outcome, Stop};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
@@ -54,7 +54,9 @@ pub struct Measurement {
     pub e2: f64,
     /// Bits of [`flag`].
     pub flag: u32,
-    /// Response of e1 to γ1 and of e2 to γ2, before any calibration; NaN where it is not measured.
+    /// Response of e1 to γ1 and of e2 to γ2, before any calibration; NaN where it is not measured. Fit
+    /// for means over many galaxies: what sheared noise adds to the mean is subtracted from a few of
+    /// them, for all.
     pub response: [f64; 2],
     /// How the network ran; `None` if it did not.
     pub outcome: Option<Outcome>,
@@ -100,13 +102,14 @@ impl Measurement {
 pub struct Measurer {
     submission: Submission,
     full: usize,
+    n: usize,
     denoise: Option<WaveletWiener>,
     method: Method,
 }
 
 /// One thread's buffers, its PSF among them.
 pub struct MeasureScratch {
-    method: MethodScratch,
+    method: Box<dyn Worker>,
     denoise: Option<DenoiseScratch>,
     /// Full stamp, denoised in place.
     full: Vec<f32>,
@@ -126,11 +129,12 @@ impl Measurer {
         let n = submission.stamp.size.min(full);
         Ok(Measurer {
             full,
+            n,
             denoise: match submission.denoise.method {
                 DenoiseMethod::None => None,
                 DenoiseMethod::WaveletWiener => Some(WaveletWiener::new(full, &submission.denoise)),
             },
-            method: Method::new(submission, n, full)?,
+            method: Method::new(submission, n)?,
             submission: submission.clone(),
         })
     }
@@ -147,9 +151,9 @@ impl Measurer {
 
     /// Buffers for one thread.
     pub fn scratch(&self) -> MeasureScratch {
-        let n = self.method.stamp_size();
+        let n = self.n;
         MeasureScratch {
-            method: self.method.scratch(),
+            method: self.method.worker(),
             denoise: self.denoise.as_ref().map(WaveletWiener::scratch),
             full: vec![0.0; self.full * self.full],
             cut: vec![0.0; n * n],
@@ -160,8 +164,7 @@ impl Measurer {
 
     /// Takes the PSF for the galaxies that follow; `None`, or one the network refuses, flags them.
     pub fn set_psf(&self, scratch: &mut MeasureScratch, psf: Option<ArrayView2<'_, f64>>) {
-        scratch.usable_psf =
-            psf.is_some_and(|psf| self.method.set_psf(&mut scratch.method, psf).is_ok());
+        scratch.usable_psf = psf.is_some_and(|psf| scratch.method.set_psf(psf).is_ok());
     }
 
     /// Measures the galaxy whose full stamp's row `y` is `pixels[y·stride..]`. `header_noise` is the
@@ -199,18 +202,15 @@ impl Measurer {
         if let (Some(filter), Some(buffers)) = (&self.denoise, &mut scratch.denoise) {
             filter.apply(&mut scratch.full, noise as f32, buffers);
         }
-        let n = self.method.stamp_size();
+        let n = self.n;
         let start = cut_start(full, n).unwrap_or(0);
         for (y, row) in scratch.cut.chunks_exact_mut(n).enumerate() {
             let from = (start + y) * full + start;
             row.copy_from_slice(&scratch.full[from..from + n]);
         }
         let peak = scratch.cut.iter().copied().fold(0.0f32, f32::max);
-        let found = PEAKS.contains(&peak).then(|| {
-            let (full, cut) = (&scratch.full, &scratch.cut);
-            self.method
-                .measure(&self.submission, full, cut, noise, &mut scratch.method)
-        });
+        let MeasureScratch { method, cut, .. } = scratch;
+        let found = PEAKS.contains(&peak).then(|| method.measure(cut, noise));
         let Some(found) = found.flatten() else {
             return Measurement {
                 noise,
@@ -234,27 +234,42 @@ impl Measurer {
     /// The ellipticity of the submission's type with its response, and the flag.
     fn report(&self, found: &Found) -> (f64, f64, [f64; 2], u32) {
         let none = |flag| (f64::NAN, f64::NAN, [f64::NAN; 2], flag);
+        let kind = self.submission.shape.ellipticity;
         let chi = match found.distortion {
             Ok(chi) => chi,
             Err(flag) => return none(flag),
         };
-        let r = found.response;
-        match self.submission.shape.ellipticity {
-            EllipticityType::Distortion => (chi.e1, chi.e2, [r[0][0], r[1][1]], 0),
-            EllipticityType::Shear => match chi.to_shear() {
-                Some(Shear { e1, e2 }) => {
-                    // ε = χ f, f = 1/(1 + s), s = √(1 − |χ|²): ∂ε_i/∂χ_j = f δ_ij + χ_i χ_j f²/s.
-                    let s = (1.0 - chi.e1 * chi.e1 - chi.e2 * chi.e2).sqrt();
-                    let f = 1.0 / (1.0 + s);
-                    let cross = |a: f64, b: f64| a * b * f * f / s;
-                    let response = [
-                        (f + cross(chi.e1, chi.e1)) * r[0][0] + cross(chi.e1, chi.e2) * r[1][0],
-                        (f + cross(chi.e2, chi.e2)) * r[1][1] + cross(chi.e1, chi.e2) * r[0][1],
-                    ];
-                    (e1, e2, response, 0)
+        let Some((e1, e2, mut response)) = reported(kind, chi, found.response) else {
+            return none(flag::NO_SHEAR);
+        };
+        if let Some(noise) = &found.sheared_noise {
+            let sides = noise.sides.map(|(chi, r)| reported(kind, chi, r));
+            if let [Some((_, _, plus)), Some((_, _, minus))] = sides {
+                for k in 0..2 {
+                    response[k] -= noise.weight * (plus[k] - minus[k]);
                 }
-                None => none(flag::NO_SHEAR),
-            },
+            }
+        }
+        (e1, e2, response, 0)
+    }
+}
+
+/// The ellipticity of type `kind` for a distortion, and the response of each of its components to the
+/// same component of shear; `None` where there is none of that type.
+fn reported(kind: EllipticityType, chi: Distortion, r: Response) -> Option<(f64, f64, [f64; 2])> {
+    match kind {
+        EllipticityType::Distortion => Some((chi.e1, chi.e2, [r[0][0], r[1][1]])),
+        EllipticityType::Shear => {
+            let Shear { e1, e2 } = chi.to_shear()?;
+            // ε = χ f, f = 1/(1 + s), s = √(1 − |χ|²): ∂ε_i/∂χ_j = f δ_ij + χ_i χ_j f²/s.
+            let s = (1.0 - chi.e1 * chi.e1 - chi.e2 * chi.e2).sqrt();
+            let f = 1.0 / (1.0 + s);
+            let cross = |a: f64, b: f64| a * b * f * f / s;
+            let response = [
+                (f + cross(chi.e1, chi.e1)) * r[0][0] + cross(chi.e1, chi.e2) * r[1][0],
+                (f + cross(chi.e2, chi.e2)) * r[1][1] + cross(chi.e1, chi.e2) * r[0][1],
+            ];
+            Some((e1, e2, response))
         }
     }
 }
@@ -284,17 +299,22 @@ impl Measurer {
         measurement: &Measurement,
         scratch: &mut MeasureScratch,
     ) -> Steps {
-        let n = self.method.stamp_size();
+        let n = self.n;
         let start = cut_start(self.full, n).unwrap_or(0);
         let stamp = Array2::from_shape_fn((n, n), |(y, x)| {
             f64::from(pixels[(start + y) * stride + start + x])
         });
-        let (deconvolved, acf) = self.method.images(&scratch.cut, psf, &mut scratch.method);
+        let MeasureScratch { method, cut, .. } = scratch;
+        let Images {
+            deconvolved,
+            acf,
+            spacing,
+        } = method.images(cut, psf);
         let reconvolved = convolve(deconvolved.view(), psf);
         let middle = (acf.nrows() / 2) as f64;
         let clipped = Array2::from_shape_fn(acf.dim(), |at| {
             let (dy, dx) = (at.0 as f64 - middle, at.1 as f64 - middle);
-            if dy.hypot(dx) <= measurement.radius {
+            if dy.hypot(dx) * spacing <= measurement.radius {
                 acf[at]
             } else {
                 f64::NAN

@@ -156,7 +156,7 @@ pub fn stages(
         "One thread; fastest of several passes over {SAMPLE} galaxies."
     )];
     if submission.deconvolution.update == Update::Linear {
-        linear_stages(submission, psf.view(), &inputs.stamps, &mut rows)?;
+        linear_stages(submission, psf.view(), &cut, &mut rows)?;
     } else {
         notes.extend(network_stages(submission, psf.view(), &cut, &mut rows)?);
     }
@@ -253,10 +253,8 @@ fn linear_stages(
     stamps: &[Vec<f32>],
     rows: &mut Vec<(&'static str, f64)>,
 ) -> Result<(), PipelineError> {
-    let (n, p) = (submission.stamp.size, submission.psf.size);
-    let sigma = submission.shape.weight_sigma;
-    let reach = AdaptiveMoments::reach(sigma);
-    let spectral = Spectral::new(n, STAMP, p, reach, &submission.deconvolution)?;
+    let n = submission.stamp.size;
+    let spectral = Spectral::new(n, submission.psf.size, &submission.deconvolution)?;
     let (mut own, mut scratch) = (spectral.psf(), spectral.scratch());
     let mut lags = spectral.lags();
     rows.push((
@@ -265,28 +263,17 @@ fn linear_stages(
             let _ = black_box(spectral.set_psf(psf, &mut scratch, &mut own));
         }),
     ));
-    for (name, response) in [
-        ("deconvolve and autocorrelate", false),
-        ("the same with response", true),
-    ] {
-        let cost = time(|k| {
-            spectral.autocorrelate(
-                &own,
-                black_box(&stamps[k]),
-                1.0,
-                response,
-                &mut scratch,
-                &mut lags,
-            );
-        });
-        rows.push((name, cost));
-    }
-    let moments = AdaptiveMoments::new(sigma);
+    rows.push((
+        "deconvolve and autocorrelate, with response",
+        time(|k| spectral.autocorrelate(&own, black_box(&stamps[k]), 1.0, &mut scratch, &mut lags)),
+    ));
+    let scale = submission.shape.weight_scale;
+    let moments = AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach());
     let mut values = moments.scratch();
     rows.push((
         "adaptive moments and response",
         time(|_| {
-            if let Ok(shape) = black_box(moments.measure(black_box(&lags.acf), &mut values)) {
+            if let Ok(shape) = black_box(moments.measure(black_box(&lags.acf), 0.0, &mut values)) {
                 black_box(moments.response(&shape, &lags.shear1, &mut values));
                 black_box(moments.response(&shape, &lags.shear2, &mut values));
             }

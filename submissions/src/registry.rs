@@ -46,12 +46,12 @@ const EMBEDDED: [(&str, &str); 10] = [
         include_str!("../named/29-den-func.toml"),
     ),
     (
-        "32-linear-star.toml",
-        include_str!("../named/32-linear-star.toml"),
+        "48-linear-star.toml",
+        include_str!("../named/48-linear-star.toml"),
     ),
     (
-        "32-linear-func.toml",
-        include_str!("../named/32-linear-func.toml"),
+        "48-linear-func.toml",
+        include_str!("../named/48-linear-func.toml"),
     ),
 ];
 

@@ -104,6 +104,8 @@ section! {
         /// σ in pixels of the round Gaussian with which the linear update's result is convolved
         /// before its shape is measured.
         target_sigma: f64,
+        /// σ in pixels of the round Gaussian window by which the linear update multiplies the stamp.
+        window_sigma: f64,
     }
 }
 
@@ -114,8 +116,11 @@ section! {
         weight: AcfWeight,
         /// Share of the ACF's light inside the radius at which it is clipped; above 0, at most 1.
         acf_share: f64,
-        /// σ in pixels of the Gaussian weight.
-        weight_sigma: f64,
+        /// Scale in pixels of the Moffat weight.
+        weight_scale: f64,
+        /// Added to the weighted Qxx + Qyy by which the moments are divided: px² times the noise of the
+        /// ACF at zero lag.
+        softening: f64,
         /// Which ellipticity the catalogue reports as e1, e2.
         ellipticity: EllipticityType,
         /// What ellipticities are divided by.
@@ -209,8 +214,8 @@ pub enum BrightnessUnit {
 pub enum AcfWeight {
     /// One inside the radius that holds `acf_share` of the light, zero outside (Sect. 3.2).
     Clipped,
-    /// A Gaussian of size `weight_sigma` and of the galaxy's own ellipticity.
-    Gaussian,
+    /// A Moffat profile of scale `weight_scale` and of the galaxy's own ellipticity.
+    Moffat,
 }
 
 /// Calibration of reported ellipticities.
@@ -385,18 +390,24 @@ impl Submission {
             a > 0.0 && a <= 1.0,
             "above 0 and at most 1",
         )?;
-        let w = shape.weight_sigma;
-        let fits = (1.0..=6.0).contains(&w);
-        real("shape.weight_sigma", w, fits, "1 to 6 pixels")?;
+        let w = shape.weight_scale;
+        let fits = (0.5..=10.0).contains(&w);
+        real("shape.weight_scale", w, fits, "0.5 to 10 pixels")?;
+        let s = shape.softening;
+        real("shape.softening", s, s >= 0.0, "zero or a positive number")?;
         let t = d.target_sigma;
-        let fits = (0.0..=6.0).contains(&t);
-        real("deconvolution.target_sigma", t, fits, "0 to 6 pixels")?;
+        let fits = (1.0..=6.0).contains(&t);
+        real("deconvolution.target_sigma", t, fits, "1 to 6 pixels")?;
+        let w = d.window_sigma;
+        let fits = (2.0..=16.0).contains(&w);
+        real("deconvolution.window_sigma", w, fits, "2 to 16 pixels")?;
         self.validate_linear()
     }
 
-    /// What the linear update and the Gaussian weight, which come together, allow.
+    /// What the linear update and the Moffat weight, which come together, allow.
     fn validate_linear(&self) -> Result<(), OutOfRange> {
         let Submission {
+            stamp,
             denoise,
             deconvolution: d,
             shape,
@@ -414,12 +425,12 @@ impl Submission {
                 expected,
             })
         };
-        let weighted = shape.weight == AcfWeight::Gaussian;
+        let weighted = shape.weight == AcfWeight::Moffat;
         need(
             linear == weighted,
             "shape.weight",
             &shape.weight,
-            "\"gaussian\" with the linear update, \"clipped\" with the others",
+            "\"moffat\" with the linear update, \"clipped\" with the others",
         )?;
         need(
             linear || shape.calibration == Calibration::None,
@@ -448,6 +459,13 @@ impl Submission {
             "deconvolution.step",
             &d.step,
             "below 2 with the linear update, which diverges beyond",
+        )?;
+        // Noise beyond the stamp's edges, which its level is subtracted for, is 1 % of the window's.
+        need(
+            4.0 * d.window_sigma <= stamp.size as f64,
+            "deconvolution.window_sigma",
+            &d.window_sigma,
+            "at most a quarter of stamp.size with the linear update",
         )
     }
 }

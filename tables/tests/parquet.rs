@@ -252,7 +252,7 @@ fn a_wrong_byte_anywhere_never_panics() {
 /// two rows of one column per type, `None` where a value is missing.
 #[test]
 fn files_of_other_writers_are_converted() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/types.parquet");
+    let path = "tests/data/types.parquet";
     let names = [
         "i8", "i16", "i32", "u64", "u8", "u16", "flag", "category", "f32", "f64",
     ];

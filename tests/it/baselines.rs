@@ -9,8 +9,8 @@ use crate::support::{fail, run_simulated, shearq, succeed, text};
 
 #[test]
 fn the_named_submissions_have_not_moved_from_the_projects_baseline() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("submissions/baselines");
-    let output = shearq(&["baseline", "check", "named", "--folder", text(&folder)]);
+    let folder = Path::new("submissions/baselines");
+    let output = shearq(&["baseline", "check", "named", "--folder", text(folder)]);
     assert!(
         output.status.success(),
         "{}{}",

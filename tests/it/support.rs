@@ -3,11 +3,9 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// A folder of `shared` beside the project; says so and gives none where it is absent.
+/// A folder of `shared` beside the project, in whose root tests run; says so and gives none where it is absent.
 pub fn shared(name: &str) -> Option<PathBuf> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../shared")
-        .join(name);
+    let folder = Path::new("../shared").join(name);
     if folder.is_dir() {
         return Some(folder);
     }
