@@ -28,6 +28,7 @@
 
 mod plane;
 
+use multiversion::multiversion;
 use ndarray::ArrayView2;
 use rustfft::num_complex::Complex32;
 use shearq_submissions::Deconvolution;
@@ -158,7 +159,11 @@ impl Spectral {
         let least = plane.wave(plane.modes);
         let scale = |&[kx, ky]: &[f64; 2]| {
             let area = (plane.size * plane.size) as f32;
-            if kx.hypot(ky) <= least { 1.0 / area } else { 0.0 }
+            if kx.hypot(ky) <= least {
+                1.0 / area
+            } else {
+                0.0
+            }
         };
         let centre = |&[kx, ky]: &[f64; 2]| {
             let phase = (p as f64 - 1.0) / 2.0 * (kx + ky);
@@ -283,7 +288,7 @@ impl Spectral {
         for (value, restore) in tilt.iter_mut().zip(&out.restore) {
             *value = restore.norm_sqr();
         }
-        spread(&self.plane, &self.leak, tilt, along, &mut out.floor);
+        spread(self.plane.side, &self.leak, tilt, along, &mut out.floor);
         let terms = out.floor.iter().zip(&self.scale).enumerate();
         // Columns with k_x > 0 stand for those with k_x < 0 too.
         let twice = |at| if at < self.plane.side { 1.0 } else { 2.0 };
@@ -293,7 +298,7 @@ impl Spectral {
             for (value, (tilts, restore)) in tilt.iter_mut().zip(modes) {
                 *value = tilts[component].re * restore.norm_sqr();
             }
-            spread(&self.plane, &self.leak, tilt, along, smooth);
+            spread(self.plane.side, &self.leak, tilt, along, smooth);
             for (out, value) in out.noise_tilts.iter_mut().zip(&*smooth) {
                 out[component] = *value;
             }
@@ -394,9 +399,8 @@ impl Spectral {
         let [u, x, y] = &mut plane.half;
         for (at, u) in u.iter_mut().enumerate() {
             let (value, scale) = (v[at], self.scale[at]);
-            let along = |change: Complex32| {
-                2.0 * scale * (value.re * change.re + value.im * change.im)
-            };
+            let along =
+                |change: Complex32| 2.0 * scale * (value.re * change.re + value.im * change.im);
             *u = Complex32::new(along(*u), along(x[at]));
             x[at] = Complex32::new(along(y[at]), 0.0);
         }
@@ -416,7 +420,13 @@ impl Spectral {
                 if at % 64 == 0 {
                     bits = [(); 2].map(|()| split_mix(&mut state));
                 }
-                let sign = |bits: u64| if bits >> (at % 64) & 1 == 0 { size } else { -size };
+                let sign = |bits: u64| {
+                    if bits >> (at % 64) & 1 == 0 {
+                        size
+                    } else {
+                        -size
+                    }
+                };
                 *value = Complex32::new(sign(bits[0]), sign(bits[1]));
             }
             line[side / 2] = Complex32::ZERO;
@@ -517,11 +527,14 @@ fn split_mix(state: &mut u64) -> u64 {
 }
 
 /// What a real even half spectrum becomes when each mode's power leaks into its neighbours, on the
-/// torus of the coarse grid. `along` is room for as many values.
-fn spread(plane: &Plane, leak: &[f32], spectrum: &[f32], along: &mut [f32], out: &mut [f32]) {
-    let side = plane.side;
+/// torus of the coarse grid of `side` places. `along` is room for as many values.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn spread(side: usize, leak: &[f32], spectrum: &[f32], along: &mut [f32], out: &mut [f32]) {
     along.fill(0.0);
-    for (line, to) in spectrum.chunks_exact(side).zip(along.chunks_exact_mut(side)) {
+    for (line, to) in spectrum
+        .chunks_exact(side)
+        .zip(along.chunks_exact_mut(side))
+    {
         for (from, &value) in line.iter().enumerate() {
             let (before, after) = to.split_at_mut(from);
             for (to, share) in after.iter_mut().zip(leak) {

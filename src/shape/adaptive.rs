@@ -335,7 +335,8 @@ mod tests {
         let soft = moments
             .measure(&acf, 0.2 * hard.trace, &mut scratch)
             .unwrap();
-        let turn = soft.distortion.e1 * hard.distortion.e2 - soft.distortion.e2 * hard.distortion.e1;
+        let turn =
+            soft.distortion.e1 * hard.distortion.e2 - soft.distortion.e2 * hard.distortion.e1;
         // The grid of lags is square.
         assert!(turn.abs() < 1e-3, "{turn}");
         let modulus = |shape: &AdaptiveShape| shape.distortion.e1.hypot(shape.distortion.e2);

@@ -274,18 +274,19 @@ impl SetSimulator {
         scratch: &mut RenderScratch,
         out: &mut [f32],
     ) -> Shear {
-        let shape = self.observed(fields, ix, iy);
-        self.draw_as(fields, (ix, iy), shape, scratch, out);
-        shape
+        let e = fields.intrinsic[(ix, iy)];
+        let lensed = (Shear::new(e.re, e.im), self.shear_at(ix, iy));
+        self.draw_as(fields, (ix, iy), lensed, scratch, out);
+        self.observed(fields, ix, iy)
     }
 
     /// Draws galaxy `(ix, iy)` like [`SetSimulator::draw`], with all of its random numbers the same,
-    /// but of ellipticity `shape`.
+    /// but of another intrinsic ellipticity and under another shear.
     pub fn draw_as(
         &self,
         fields: &ImageFields,
         (ix, iy): (usize, usize),
-        shape: Shear,
+        lensed: (Shear, Shear),
         scratch: &mut RenderScratch,
         out: &mut [f32],
     ) {
@@ -296,7 +297,7 @@ impl SetSimulator {
         let centre = (STAMP as f64 - 1.0) / 2.0;
         let x = centre + rng.random_range(-0.5..0.5);
         let y = centre + rng.random_range(-0.5..0.5);
-        let (galaxy, snr) = self.galaxy(shape, &mut rng);
+        let (galaxy, snr) = self.galaxy(lensed, &mut rng);
         let psf = self
             .transform
             .of(fields.psf.at(ix, iy))
@@ -317,8 +318,9 @@ impl SetSimulator {
         Shear::new(e.re, e.im).sheared_by(self.shear_at(ix, iy))
     }
 
-    /// The galaxy of the set's kind, and its S/N.
-    fn galaxy(&self, shape: Shear, rng: &mut ChaCha8Rng) -> (Galaxy, f64) {
+    /// The galaxy of the set's kind, of an intrinsic ellipticity and under a shear, and its S/N.
+    fn galaxy(&self, (intrinsic, shear): (Shear, Shear), rng: &mut ChaCha8Rng) -> (Galaxy, f64) {
+        let shape = intrinsic.sheared_by(shear);
         let (mut bulge, mut disc) = match self.kind.image {
             ImageType::SmallGalaxy => (1.8, 2.6),
             ImageType::LargeGalaxy => (3.4, 10.0),
@@ -344,7 +346,9 @@ impl SetSimulator {
             ImageType::OffsetBulge => {
                 let dx: f64 = StandardNormal.sample(rng);
                 let dy: f64 = StandardNormal.sample(rng);
-                offset = Some((dx, dy));
+                // A shear moves the bulge with the rest of the galaxy.
+                let [[xx, xy], [yx, yy]] = shear.matrix();
+                offset = Some((xx * dx + xy * dy, yx * dx + yy * dy));
             }
             _ => {}
         }

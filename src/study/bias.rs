@@ -115,8 +115,8 @@ fn draw(
     let mut stamp = vec![0.0; STAMP * STAMP];
     for ix in 0..n {
         let e = fields.intrinsic[(ix, iy)] * intrinsic;
-        let shape = Shear::new(e.re, e.im).sheared_by(gamma);
-        set.draw_as(fields, (ix, iy), shape, scratch, &mut stamp);
+        let lensed = (Shear::new(e.re, e.im), gamma);
+        set.draw_as(fields, (ix, iy), lensed, scratch, &mut stamp);
         place(&stamp, STAMP, ix, n, &mut strip);
     }
     strip
@@ -206,13 +206,19 @@ impl Sums {
             Calibration::None => [1.0; 2],
             Calibration::Response => self.response.map(|mean| mean.value(count)),
         };
-        let of = |means: &[Mean; 2], less: f64| {
-            (
-                [0, 1].map(|k| means[k].value(count) / response[k] - less),
-                [0, 1].map(|k| means[k].error(count) / response[k]),
-            )
+        // Relative errors of the responses.
+        let uncertain = match calibration {
+            Calibration::None => [0.0; 2],
+            Calibration::Response => [0, 1].map(|k| self.response[k].error(count) / response[k]),
         };
-        let ((m, m_error), (c, c_error)) = (of(&self.slope, 1.0), of(&self.offset, 0.0));
+        let of = |means: &[Mean; 2]| {
+            let values = [0, 1].map(|k| means[k].value(count) / response[k]);
+            let errors = [0, 1]
+                .map(|k| (means[k].error(count) / response[k]).hypot(values[k] * uncertain[k]));
+            (values, errors)
+        };
+        let ((slope, m_error), (c, c_error)) = (of(&self.slope), of(&self.offset));
+        let m = slope.map(|slope| slope - 1.0);
         let psf = self.psf.value(count) * (response[0] + response[1]) / 2.0;
         Bias {
             galaxies: self.galaxies,

@@ -22,7 +22,13 @@ pub fn cramer_rao(set: &SetSimulator) -> f64 {
     let mut scratch = RenderScratch::new();
     let mut draw = |at: (usize, usize), shape: Shear| {
         let mut stamp = vec![0.0; STAMP * STAMP];
-        set.draw_as(&fields, at, shape, &mut scratch, &mut stamp);
+        set.draw_as(
+            &fields,
+            at,
+            (Shear::new(0.0, 0.0), shape),
+            &mut scratch,
+            &mut stamp,
+        );
         stamp
     };
     let count = GALAXIES.min(n * n);

@@ -77,7 +77,11 @@ fn plain(
     let waves: Vec<f64> = (-(modes as i32)..=modes as i32)
         .map(|j| unit * f64::from(j))
         .collect();
-    let plane = || waves.iter().flat_map(|&kx| waves.iter().map(move |&ky| (kx, ky)));
+    let plane = || {
+        waves
+            .iter()
+            .flat_map(|&kx| waves.iter().map(move |&ky| (kx, ky)))
+    };
     // v̂ of each mode.
     let restored: Vec<Complex64> = plane()
         .map(|(kx, ky)| {
@@ -120,7 +124,11 @@ fn plain(
         .filter(|(kx, ky)| kx.hypot(*ky) <= circle)
         .map(|(kx, ky)| {
             let v = transform(windowed.view(), kx * spacing, ky * spacing);
-            (kx, ky, v.norm_sqr() * spacing.powi(4) / (size * size) as f64)
+            (
+                kx,
+                ky,
+                v.norm_sqr() * spacing.powi(4) / (size * size) as f64,
+            )
         })
         .collect();
     let mut lags = Vec::new();
@@ -253,7 +261,10 @@ fn noise_is_subtracted_in_the_mean_from_the_autocorrelation_and_its_derivatives(
     }
     let [with, without] = means;
     let peak = without[0][plan.reach()];
-    assert!((peak / f64::from(own.noise_peak()) - 1.0).abs() < 0.02, "{peak}");
+    assert!(
+        (peak / f64::from(own.noise_peak()) - 1.0).abs() < 0.02,
+        "{peak}"
+    );
     let largest = |lags: &[f64]| lags.iter().fold(0.0f64, |a, b| a.max(b.abs()));
     for (kind, (with, without)) in with.iter().zip(&without).enumerate() {
         let (left, all) = (largest(with), largest(without));
