@@ -46,6 +46,9 @@ pub enum ScoringError {
     /// No image was added.
     #[error("no image to score")]
     NoImages,
+    /// Cross-spectra of one image.
+    #[error("there is one image; cross-spectra need two or more")]
+    OneImage,
     /// A negative or non-finite noise variance.
     #[error("the noise variance is {0}; expected a finite number, zero or more")]
     NoiseVariance(f64),

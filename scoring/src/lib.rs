@@ -37,6 +37,7 @@
 pub mod bandpower;
 mod catalogue;
 mod convention;
+mod cross;
 mod ellipticity;
 mod error;
 mod grid;
@@ -49,6 +50,7 @@ pub mod units;
 pub use bandpower::{BINS, Bins, Definition, SCORED};
 pub use catalogue::{FieldSum, Row, RowCounts, TrueShear, TruthSign};
 pub use convention::{Convention, ConventionClass};
+pub use cross::cross_bandpowers;
 pub use ellipticity::{Distortion, Shear};
 pub use error::ScoringError;
 pub use grid::Grid;

@@ -81,6 +81,11 @@ impl SetImages {
         self.next += 1;
     }
 
+    /// The groups.
+    pub fn groups(&self) -> &[FieldSum] {
+        &self.groups
+    }
+
     /// The sum of all images.
     pub fn total(&self) -> &FieldSum {
         &self.total

@@ -4,8 +4,8 @@ use ndarray::Array2;
 use rustfft::num_complex::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Bins, Choice, Convention, Definition, FieldSum, Grid, Noise, Options, Row, SCORED, SetImages,
-    SetScore, SetScorer, TrueShear,
+    BINS, Bins, Choice, Convention, Definition, FieldSum, Grid, Noise, Options, Row, SCORED,
+    SetImages, SetScore, SetScorer, TrueShear, cross_bandpowers,
 };
 
 /// Standard normal numbers from a linear congruential generator (Box–Muller).
@@ -248,6 +248,64 @@ fn noise_is_measured_as_it_is_and_the_jackknife_errors_are_those_of_repeated_tri
         .unwrap();
     let total = |p: [f64; 20]| SCORED.map(|b| p[b]).sum::<f64>();
     assert!((total(measured) / total(power) - 1.0).abs() < 0.1);
+}
+
+#[test]
+fn cross_spectra_are_the_spectrum_without_its_noise() {
+    let grid = Grid::great10(32).unwrap();
+    let shear = field(&grid, Content::E, 3);
+    // Groups of equal size: the same algebra by another way.
+    let images_of = |count, seed| images(&grid, &shear, count, 0.05, seed, |_, _| true);
+    let even = images_of(40, 1);
+    let options = Options {
+        choice: Choice::Insist(Convention::STANDARD),
+        ..Options::default()
+    };
+    let scored = score(grid, &shear, &even, options);
+    let (_, cross) = cross_bandpowers(&grid, &even, Convention::STANDARD).unwrap();
+    let (ee, noise) = (scored.spectra().ee, scored.noise.unwrap());
+    for b in SCORED {
+        assert!((cross[b] / (ee[b] - noise[b]) - 1.0).abs() < 1e-9);
+    }
+    // Groups of two and of one image: the mean over trials is the truth within its error.
+    let trials: Vec<[f64; BINS]> = (0..60)
+        .map(|trial| {
+            let images = images_of(31, 100 + trial);
+            cross_bandpowers(&grid, &images, Convention::STANDARD)
+                .unwrap()
+                .1
+        })
+        .collect();
+    let count = trials.len() as f64;
+    for b in SCORED {
+        let mean = trials.iter().map(|p| p[b]).sum::<f64>() / count;
+        let square = trials.iter().map(|p| (p[b] - mean).powi(2)).sum::<f64>();
+        let error = (square / (count * (count - 1.0))).sqrt();
+        assert!((mean - scored.true_ee[b]).abs() < 4.0 * error, "bin {b}");
+        assert!(
+            error < 0.2 * scored.noise.unwrap()[b],
+            "bin {b}: nothing is tested"
+        );
+    }
+    let one = images_of(1, 1);
+    assert!(cross_bandpowers(&grid, &one, Convention::STANDARD).is_err());
+}
+
+#[test]
+fn cross_spectra_do_without_galaxies_that_are_missing() {
+    let grid = Grid::great10(16).unwrap();
+    let shear = field(&grid, Content::E, 5);
+    // Every image lacks one galaxy in three; of the three images of a group one lacks each.
+    let of = |keep: &dyn Fn(usize, usize) -> bool| {
+        let images = images(&grid, &shear, 60, 0.0, 1, keep);
+        cross_bandpowers(&grid, &images, Convention::STANDARD)
+            .unwrap()
+            .1
+    };
+    let (gaps, whole) = (of(&|image, k| (image + k) % 3 != 0), of(&|_, _| true));
+    for b in SCORED {
+        assert!((gaps[b] / whole[b] - 1.0).abs() < 1e-9, "bin {b}");
+    }
 }
 
 #[test]

@@ -15,7 +15,9 @@ const MAX_METHOD: usize = 64;
 /// Write measured catalogues as the files that the challenge takes, with a manifest.
 ///
 /// Either one ASCII catalogue per image (`g10_v1_objs_{set}_{image}.{method}.dat`), or one power
-/// spectrum per set (`{method}_set{set}.dat`). manifest.json lists them with their SHA-256 checksums
+/// spectrum per set (`{method}_set{set}.dat`): of the ellipticities averaged over the images, as the
+/// original scoring takes it from catalogues, or from cross-spectra between groups of images, in which
+/// noise has no mean. manifest.json lists them with their SHA-256 checksums
 /// and says what made them. The same catalogues give the same bytes, archives included. `shearq check`
 /// validates the result, `shearq unpack` unpacks an archive.
 #[derive(Debug, Args)]

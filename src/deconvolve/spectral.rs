@@ -65,7 +65,7 @@ pub struct Spectral {
     window: Vec<f32>,
     window_sigma: f64,
     /// Power that windowed white noise brings from a mode to one so many frequencies away along an
-    /// axis; the product of both axes is in units of σ².
+    /// axis, either way; the product of both axes is in units of σ².
     leak: Vec<f32>,
     /// Scale of the autocorrelation for modes in the largest circle of those kept, zero outside.
     scale: Vec<f32>,
@@ -501,20 +501,25 @@ fn taper(k: f64) -> f64 {
     (std::f64::consts::FRAC_PI_2 * place).cos().powi(2)
 }
 
-/// Power of the transform of a window along an axis, times the period.
+/// Power of the transform of a window along an axis, times the period, at frequencies 0, 1, …: as many
+/// as hold all but a millionth.
 fn window_power(window: &[f64], period: usize) -> Vec<f32> {
     let side = window.len();
-    (0..side)
-        .map(|mode| {
-            let (mut re, mut im) = (0.0, 0.0);
-            for (at, w) in window.iter().enumerate() {
-                let phase = std::f64::consts::TAU * ((mode * at) % side) as f64 / side as f64;
-                re += w * phase.cos();
-                im += w * phase.sin();
-            }
-            ((re * re + im * im) * period as f64) as f32
-        })
-        .collect()
+    let power = |mode: usize| {
+        let (mut re, mut im) = (0.0, 0.0);
+        for (at, w) in window.iter().enumerate() {
+            let phase = std::f64::consts::TAU * ((mode * at) % side) as f64 / side as f64;
+            re += w * phase.cos();
+            im += w * phase.sin();
+        }
+        (re * re + im * im) * period as f64
+    };
+    let powers: Vec<f64> = (0..side / 2).map(power).collect();
+    let beyond = |count: usize| 2.0 * powers[count..].iter().sum::<f64>();
+    let least = 1e-6 * (powers[0] + beyond(1));
+    let enough = (1..powers.len()).find(|&count| beyond(count) < least);
+    let kept = &powers[..enough.unwrap_or(powers.len())];
+    kept.iter().map(|&power| power as f32).collect()
 }
 
 /// The next number of the SplitMix64 sequence.
@@ -526,41 +531,54 @@ fn split_mix(state: &mut u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// What a real even half spectrum becomes when each mode's power leaks into its neighbours, on the
-/// torus of the coarse grid of `side` places. `along` is room for as many values.
+/// What a real even half spectrum becomes when each mode's power leaks into its neighbours, `leak`
+/// frequencies away along each axis of the torus of the coarse grid of `side` places. `along` is room
+/// for as many values.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn spread(side: usize, leak: &[f32], spectrum: &[f32], along: &mut [f32], out: &mut [f32]) {
-    along.fill(0.0);
-    for (line, to) in spectrum
-        .chunks_exact(side)
-        .zip(along.chunks_exact_mut(side))
-    {
-        for (from, &value) in line.iter().enumerate() {
-            let (before, after) = to.split_at_mut(from);
-            for (to, share) in after.iter_mut().zip(leak) {
-                *to += value * share;
-            }
-            for (to, share) in before.iter_mut().zip(&leak[side - from..]) {
-                *to += value * share;
-            }
+    let lines = spectrum.chunks_exact(side);
+    for (line, to) in lines.zip(along.chunks_exact_mut(side)) {
+        scaled(to, line, leak[0]);
+        for (distance, &share) in leak.iter().enumerate().skip(1) {
+            let (head, tail) = line.split_at(distance);
+            add_scaled(&mut to[..side - distance], tail, share);
+            add_scaled(&mut to[side - distance..], head, share);
+            let (head, tail) = line.split_at(side - distance);
+            add_scaled(&mut to[distance..], head, share);
+            add_scaled(&mut to[..distance], tail, share);
         }
     }
-    out.fill(0.0);
+    let columns = along.len() / side;
     for (x, to) in out.chunks_exact_mut(side).enumerate() {
-        for (from, line) in along.chunks_exact(side).enumerate() {
-            let share = leak[(x + side - from) % side];
-            for (to, value) in to.iter_mut().zip(line) {
-                *to += share * value;
-            }
-            if from > 0 {
-                // The column of −k_x: what k_x holds at −k_y.
-                let share = leak[(x + from) % side];
-                to[0] += share * line[0];
-                for (to, value) in to[1..].iter_mut().zip(line[1..].iter().rev()) {
-                    *to += share * value;
+        scaled(to, &along[x * side..][..side], leak[0]);
+        for (distance, &share) in leak.iter().enumerate().skip(1) {
+            for from in [x + distance, x + side - distance].map(|x| x % side) {
+                if from < columns {
+                    add_scaled(to, &along[from * side..][..side], share);
+                } else if side - from < columns {
+                    // A column of negative k_x: what that of −k_x holds at −k_y.
+                    let line = &along[(side - from) * side..][..side];
+                    to[0] += share * line[0];
+                    for (to, value) in to[1..].iter_mut().zip(line[1..].iter().rev()) {
+                        *to += share * value;
+                    }
                 }
             }
         }
+    }
+}
+
+#[inline(always)]
+fn scaled(to: &mut [f32], from: &[f32], share: f32) {
+    for (to, value) in to.iter_mut().zip(from) {
+        *to = share * value;
+    }
+}
+
+#[inline(always)]
+fn add_scaled(to: &mut [f32], from: &[f32], share: f32) {
+    for (to, value) in to.iter_mut().zip(from) {
+        *to += share * value;
     }
 }
 

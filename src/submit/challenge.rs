@@ -7,7 +7,9 @@
 
 use std::path::{Path, PathBuf};
 
-use shearq_scoring::{Convention, FieldSum, Grid, Row, SCORED, SetImages, measured_bandpowers};
+use shearq_scoring::{
+    Convention, FieldSum, Grid, Row, SCORED, SetImages, cross_bandpowers, measured_bandpowers,
+};
 
 use crate::io::FileError;
 use crate::io::layout::read_rows;
@@ -108,19 +110,35 @@ pub fn catalogue_text(catalogue: &Path) -> Result<(String, usize), FileError> {
     Ok((text, rows.len()))
 }
 
+/// How a set's catalogues become a power spectrum.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Spectrum {
+    /// That of the ellipticities averaged over the images, with their noise.
+    Averaged,
+    /// From cross-spectra between groups of images.
+    Cross,
+}
+
 /// The power spectrum of a set's catalogues in the challenge's format.
 ///
 /// # Errors
 /// Where a catalogue cannot be read, or nothing of it falls on the grid.
-pub fn spectrum_text(grid: &Grid, catalogues: &[PathBuf]) -> Result<String, FileError> {
+pub fn spectrum_text(
+    grid: &Grid,
+    catalogues: &[PathBuf],
+    spectrum: Spectrum,
+) -> Result<String, FileError> {
     let mut images = SetImages::new(grid);
     for path in catalogues {
         let mut sum = FieldSum::new(grid);
         sum.add_image(grid, read_rows(path, &COLUMNS)?);
         images.add(&sum);
     }
-    let (bins, power) = measured_bandpowers(grid, images.total(), Convention::STANDARD)
-        .map_err(|error| FileError::new(&catalogues[0], error))?;
+    let (bins, power) = match spectrum {
+        Spectrum::Averaged => measured_bandpowers(grid, images.total(), Convention::STANDARD),
+        Spectrum::Cross => cross_bandpowers(grid, &images, Convention::STANDARD),
+    }
+    .map_err(|error| FileError::new(&catalogues[0], error))?;
     Ok(SCORED
         .map(|b| format!("{} {:.6} {:.12e}\n", b + 1, bins.l[b], power[b]))
         .collect())

@@ -465,7 +465,7 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
             report.warn(
                 path,
                 "negative",
-                format!("the power of bin {index} is negative: {power:e}"),
+                format!("the power of bin {index} is negative: {power:e} (noise can do that to cross-spectra)"),
             );
         }
         if (1..=bins.l.len()).contains(&bin) {

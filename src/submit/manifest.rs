@@ -20,8 +20,10 @@ pub enum Contents {
     /// Ellipticity catalogues.
     #[default]
     Catalogues,
-    /// Shear power spectra.
+    /// Power spectra of the ellipticities averaged over the images, noise included.
     Spectra,
+    /// Shear power spectra from cross-spectra between groups of images, in which noise has no mean.
+    CrossSpectra,
 }
 
 /// A packed submission.

@@ -7,7 +7,7 @@ use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
 
 use super::archive::{ArchiveWriter, is_archive};
-use super::challenge::{Kind, catalogue_text, spectrum_text};
+use super::challenge::{Kind, Spectrum, catalogue_text, spectrum_text};
 use super::manifest::{Contents, FileSum, MANIFEST_FILE, Manifest};
 use crate::io::atomic::PartFolder;
 use crate::io::layout::MAX_SET;
@@ -69,12 +69,17 @@ impl Packing<'_> {
         };
         for (set, catalogues) in self.catalogues() {
             let method = self.method.clone();
-            if self.contents == Contents::Spectra {
+            let spectrum = match self.contents {
+                Contents::Catalogues => None,
+                Contents::Spectra => Some(Spectrum::Averaged),
+                Contents::CrossSpectra => Some(Spectrum::Cross),
+            };
+            if let Some(spectrum) = spectrum {
                 let grid = self.grid(&catalogues[0].1)?;
                 let paths: Vec<PathBuf> = catalogues.into_iter().map(|(_, path)| path).collect();
                 add(
                     Kind::Spectrum { set, method },
-                    spectrum_text(&grid, &paths)?,
+                    spectrum_text(&grid, &paths, spectrum)?,
                 )?;
                 progress.advance((paths.len() * grid.cells()) as u64);
                 continue;

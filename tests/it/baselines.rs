@@ -8,15 +8,17 @@ use serde_json::Value;
 use crate::support::{fail, run_simulated, shearq, succeed, text};
 
 #[test]
-fn the_named_submissions_have_not_moved_from_the_projects_baseline() {
+fn the_named_submissions_have_not_moved_from_the_projects_baselines() {
     let folder = Path::new("submissions/baselines");
-    let output = shearq(&["baseline", "check", "named", "--folder", text(folder)]);
-    assert!(
-        output.status.success(),
-        "{}{}",
-        String::from_utf8_lossy(&output.stdout),
-        String::from_utf8_lossy(&output.stderr)
-    );
+    for name in ["named", "linear"] {
+        let output = shearq(&["baseline", "check", name, "--folder", text(folder)]);
+        assert!(
+            output.status.success(),
+            "{}{}",
+            String::from_utf8_lossy(&output.stdout),
+            String::from_utf8_lossy(&output.stderr)
+        );
+    }
 }
 
 #[test]

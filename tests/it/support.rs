@@ -5,8 +5,7 @@ use std::process::{Command, Output};
 
 /// A folder of `shared` beside the project, in whose root tests run; says so and gives none where it is absent.
 pub fn shared(name: &str) -> Option<PathBuf> {
-    let folder = Path::new("../shared").join(name);
-    if folder.is_dir() {
+    if let Ok(folder) = Path::new("../shared").join(name).canonicalize() {
         return Some(folder);
     }
     eprintln!("skipped: there is no folder shared/{name} beside the project");
