@@ -14,7 +14,7 @@ use shearq_scoring::{
 
 fn cases() -> Vec<PathBuf> {
     let folder = Path::new("../../shared/scoring-cases");
-    let Ok(entries) = fs::read_dir(&folder) else {
+    let Ok(entries) = fs::read_dir(folder) else {
         eprintln!("skipped: there is no folder shared/scoring-cases beside the project");
         return Vec::new();
     };

@@ -21,11 +21,11 @@ use crate::report::scores::per_set;
 use crate::report::table::TableFormat;
 use crate::simulate::set::SimulationSettings;
 
-/// The whole chain on a small simulated default: simulate, measure with two submissions, score,
+/// The whole chain on a small simulated default: simulate, measure with three submissions, score,
 /// compare. Takes well under two minutes.
 ///
 /// It runs what these commands would: `simulate --sets 2,8 --images 10 --grid 40 --seed 2013`, then
-/// `measure` and `score` with 23/raw/star and 23/den/star, then `compare`. The data are simulated,
+/// `measure` and `score` with 23/raw/star, 23/den/star and 48/linear/star, then `compare`. The data are simulated,
 /// and few: the errors printed are what tells whether a difference is one.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -40,7 +40,7 @@ const SETS: [u32; 2] = [2, 8];
 const IMAGES: u32 = 10;
 const GRID: usize = 40;
 const SEED: u64 = 2013;
-const SUBMISSIONS: [&str; 2] = ["23/raw/star", "23/den/star"];
+const SUBMISSIONS: [&str; 3] = ["23/raw/star", "23/den/star", "48/linear/star"];
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Arguments { out, threads } = arguments;

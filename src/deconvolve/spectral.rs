@@ -245,8 +245,8 @@ impl Spectral {
         }
     }
 
-    /// Takes a PSF; it is used as it is, so it should sum to one. Where it is centred is of no
-    /// matter.
+    /// Takes a PSF; it is used as it is, so it should sum to one and be centred on the middle of its
+    /// stamp, (p − 1)/2 on both axes: the window is where the galaxy is left by deconvolution.
     ///
     /// # Errors
     /// Where its size is not the planned one or a pixel is not finite.

@@ -156,6 +156,8 @@ struct Sums {
     galaxies: u64,
     /// Half the difference between +γ and −γ, over γ.
     slope: [Mean; 2],
+    /// The same less the mean response over versions.
+    surplus: [Mean; 2],
     /// Mean of all versions.
     offset: [Mean; 2],
     /// Offset times the PSF's ellipticity, over components.
@@ -175,12 +177,15 @@ impl Sums {
         let mut along = 0.0;
         for (k, psf) in [psf.e1, psf.e2].into_iter().enumerate() {
             let e = versions.map(|version| [version.e1, version.e2][k]);
-            self.slope[k].add((e[0] - e[1] + e[2] - e[3]) / (4.0 * SHEAR));
+            let slope = (e[0] - e[1] + e[2] - e[3]) / (4.0 * SHEAR);
+            let responses = versions.iter().map(|version| version.response[k]);
+            let response = responses.sum::<f64>() / 4.0;
+            self.slope[k].add(slope);
+            self.surplus[k].add(slope - response);
+            self.response[k].add(response);
             let offset = e.iter().sum::<f64>() / 4.0;
             self.offset[k].add(offset);
             along += offset * psf;
-            let responses = versions.iter().map(|version| version.response[k]);
-            self.response[k].add(responses.sum::<f64>() / 4.0);
         }
         self.along.add(along);
         self.psf.add(psf.e1 * psf.e1 + psf.e2 * psf.e2);
@@ -190,6 +195,7 @@ impl Sums {
         self.galaxies += other.galaxies;
         for (mine, other) in [
             (&mut self.slope, &other.slope),
+            (&mut self.surplus, &other.surplus),
             (&mut self.offset, &other.offset),
             (&mut self.response, &other.response),
         ] {
@@ -206,19 +212,20 @@ impl Sums {
             Calibration::None => [1.0; 2],
             Calibration::Response => self.response.map(|mean| mean.value(count)),
         };
-        // Relative errors of the responses.
-        let uncertain = match calibration {
-            Calibration::None => [0.0; 2],
-            Calibration::Response => [0, 1].map(|k| self.response[k].error(count) / response[k]),
-        };
         let of = |means: &[Mean; 2]| {
-            let values = [0, 1].map(|k| means[k].value(count) / response[k]);
-            let errors = [0, 1]
-                .map(|k| (means[k].error(count) / response[k]).hypot(values[k] * uncertain[k]));
-            (values, errors)
+            (
+                [0, 1].map(|k| means[k].value(count) / response[k]),
+                [0, 1].map(|k| means[k].error(count) / response[k]),
+            )
         };
-        let ((slope, m_error), (c, c_error)) = (of(&self.slope), of(&self.offset));
-        let m = slope.map(|slope| slope - 1.0);
+        let surplus = match calibration {
+            Calibration::None => &self.slope,
+            Calibration::Response => &self.surplus,
+        };
+        let ((mut m, m_error), (c, c_error)) = (of(surplus), of(&self.offset));
+        if calibration == Calibration::None {
+            m = m.map(|slope| slope - 1.0);
+        }
         let psf = self.psf.value(count) * (response[0] + response[1]) / 2.0;
         Bias {
             galaxies: self.galaxies,

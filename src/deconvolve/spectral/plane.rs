@@ -201,11 +201,11 @@ impl Plane {
         self.backward.process_with_scratch(pairs, fft);
         let width = 2 * reach + 1;
         for (y, line) in pairs.chunks_exact(side).enumerate() {
-            for x in 0..=reach {
-                out(y * width + reach + x, line[x]);
+            for (x, value) in line[..=reach].iter().enumerate() {
+                out(y * width + reach + x, *value);
             }
-            for x in 1..=reach {
-                out(y * width + reach - x, line[side - x]);
+            for (x, value) in line[side - reach..].iter().enumerate() {
+                out(y * width + x, *value);
             }
         }
     }
