@@ -7,7 +7,7 @@
 //! * [`deconvolve`], [`denoise`], [`shape`], [`psf`]: the method, one galaxy at a time.
 //! * [`simulate`]: GREAT10-like sets.
 //! * [`io`]: files; [`pipeline`]: the chain over many galaxies; [`report`]: tables and figures.
-//! * [`study`]: the paper's calibration of λ and its results on 24 sets.
+//! * [`study`]: the paper's calibration of λ and its results on 24 sets; biases, bounds and speed.
 //! * [`submit`]: challenge files, other programs' catalogues, checks.
 //! * [`cli`]: the command line; nothing else knows it.
 //! * The crates `shearq-scoring` (spectra and figures of merit), `shearq-submissions` (settings) and

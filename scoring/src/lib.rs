@@ -50,7 +50,7 @@ pub mod units;
 pub use bandpower::{BINS, Bins, Definition, SCORED};
 pub use catalogue::{FieldSum, Row, RowCounts, TrueShear, TruthSign};
 pub use convention::{Convention, ConventionClass};
-pub use cross::cross_bandpowers;
+pub use cross::{CrossSpectrum, cross_spectrum};
 pub use ellipticity::{Distortion, Shear};
 pub use error::ScoringError;
 pub use grid::Grid;

@@ -27,6 +27,24 @@ pub fn quality(bins: &Bins, measured: &[f64; BINS], truth: &[f64; BINS]) -> Qual
     }
 }
 
+/// Standard error of Q, to first order, where the bandpowers have the covariance `covariance`: that of
+/// σ_sys in units of it, with each term keeping its sign. Where a bin's deviation is of the size of its
+/// own error, so is Q's, and this is a rough guide.
+pub fn quality_error(
+    bins: &Bins,
+    measured: &[f64; BINS],
+    truth: &[f64; BINS],
+    covariance: &[[f64; BINS]; BINS],
+) -> f64 {
+    let slope = |b: usize| bins.dln_l[b] * (measured[b] - truth[b]).signum();
+    let variance: f64 = SCORED
+        .flat_map(|i| SCORED.map(move |j| (i, j)))
+        .map(|(i, j)| slope(i) * covariance[i][j] * slope(j))
+        .sum();
+    let Quality { q, sigma_sys } = quality(bins, measured, truth);
+    q * variance.max(0.0).sqrt() / sigma_sys
+}
+
 /// Multiplicative and additive bias of a power spectrum:
 /// C_b − C_b^true = A + M·C_b^true, by unweighted least squares over bins 2 to 9.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]

@@ -1,7 +1,9 @@
 //! Scores of one set: every convention, noise, biases, null tests, and errors of all of them.
 
+use std::collections::BTreeMap;
+
 use ndarray::Array2;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::bandpower::{BINS, Bins, Definition, SCORED};
 use crate::catalogue::{FieldSum, TrueShear};
@@ -14,6 +16,8 @@ use crate::resample::jackknife_error;
 
 /// Most groups of images that the jackknife leaves out in turn.
 pub const MAX_GROUPS: usize = 20;
+/// Standard deviations of chance at which a correlation with the truth is believed.
+const CLEAR_MATCH: f64 = 4.0;
 
 /// Which convention the figures of a table are taken from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -119,7 +123,7 @@ pub struct ConventionScore {
 }
 
 /// Headline figures of one set, or of a jackknife replicate of it.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Figures {
     /// Quality factor.
     pub q: f64,
@@ -202,6 +206,20 @@ impl Figures {
     }
 }
 
+/// JSON has no NaN: what was written as null is read as that.
+impl<'de> Deserialize<'de> for Figures {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let found = BTreeMap::<String, Option<f64>>::deserialize(deserializer)?;
+        let mut values = [0.0; Self::NAMES.len()];
+        for (value, name) in values.iter_mut().zip(Self::NAMES) {
+            let number = found.get(name);
+            let number = number.ok_or_else(|| serde::de::Error::missing_field(name))?;
+            *value = number.unwrap_or(f64::NAN);
+        }
+        Ok(Self::from_values(values))
+    }
+}
+
 /// Everything found about one set.
 #[derive(Debug, Clone)]
 pub struct SetScore {
@@ -255,6 +273,16 @@ impl SetScore {
     /// is then the gain from a wrong convention, not from a good measurement.
     pub fn wrong_convention_wins(&self) -> bool {
         self.best.class() != self.matched.class()
+    }
+
+    /// The matched convention's correlation with the truth, and whether it is clearly more than chance:
+    /// of N modes without anything in common the correlation scatters by 1/√(N/2), opposite modes being
+    /// conjugates.
+    pub fn match_with_truth(&self) -> (f64, bool) {
+        let modes: usize = SCORED.map(|b| self.bins.modes[b]).sum();
+        let correlation = self.conventions[self.matched.index()].correlation;
+        let chance = (2.0 / modes as f64).sqrt();
+        (correlation, correlation >= CLEAR_MATCH * chance)
     }
 
     /// The highest correlation with the truth among the conventions of a class.

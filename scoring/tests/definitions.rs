@@ -4,8 +4,8 @@ use ndarray::Array2;
 use rustfft::num_complex::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    BINS, Bins, Choice, Convention, Definition, FieldSum, Grid, Noise, Options, Row, SCORED,
-    SetImages, SetScore, SetScorer, TrueShear, cross_bandpowers,
+    BINS, Bins, Choice, Convention, CrossSpectrum, Definition, FieldSum, Grid, Noise, Options, Row,
+    SCORED, SetImages, SetScore, SetScorer, TrueShear, cross_spectrum,
 };
 
 /// Standard normal numbers from a linear congruential generator (Box–Muller).
@@ -95,9 +95,22 @@ fn images(
     seed: u64,
     keep: impl Fn(usize, usize) -> bool,
 ) -> SetImages {
+    images_of_noise(grid, shear, count, &|_| sigma, seed, keep)
+}
+
+/// The same with noise that differs from image to image.
+fn images_of_noise(
+    grid: &Grid,
+    shear: &Array2<Complex64>,
+    count: usize,
+    sigma: &dyn Fn(usize) -> f64,
+    seed: u64,
+    keep: impl Fn(usize, usize) -> bool,
+) -> SetImages {
     let mut normal = Normal(seed);
     let mut images = SetImages::new(grid);
     for image in 0..count {
+        let sigma = sigma(image);
         let mut sum = FieldSum::new(grid);
         let all: Vec<Row> = rows(grid, shear)
             .into_iter()
@@ -251,44 +264,69 @@ fn noise_is_measured_as_it_is_and_the_jackknife_errors_are_those_of_repeated_tri
 }
 
 #[test]
-fn cross_spectra_are_the_spectrum_without_its_noise() {
+fn cross_spectra_are_the_mean_product_of_pairs_without_noise_and_know_their_errors() {
     let grid = Grid::great10(32).unwrap();
     let shear = field(&grid, Content::E, 3);
-    // Groups of equal size: the same algebra by another way.
-    let images_of = |count, seed| images(&grid, &shear, count, 0.05, seed, |_, _| true);
-    let even = images_of(40, 1);
-    let options = Options {
-        choice: Choice::Insist(Convention::STANDARD),
-        ..Options::default()
+    // Every fourth image has three times the noise; groups of two and of one image.
+    let images_of = |seed| {
+        let sigma = |image: usize| if image % 4 == 0 { 0.15 } else { 0.05 };
+        images_of_noise(&grid, &shear, 31, &sigma, seed, |_, _| true)
     };
-    let scored = score(grid, &shear, &even, options);
-    let (_, cross) = cross_bandpowers(&grid, &even, Convention::STANDARD).unwrap();
-    let (ee, noise) = (scored.spectra().ee, scored.noise.unwrap());
-    for b in SCORED {
-        assert!((cross[b] / (ee[b] - noise[b]) - 1.0).abs() < 1e-9);
+    let cross = |images: &SetImages| cross_spectrum(&grid, images, Convention::STANDARD).unwrap();
+    // The same by other algebra: the square of the sum less the squares.
+    let set = images_of(1);
+    let found = cross(&set);
+    let decomposer = Decomposer::new(grid);
+    let mean_modes = |group: &FieldSum| {
+        let mean = |e: &Array2<f64>| e / &group.count;
+        let field = Convention::STANDARD.apply(&mean(&group.e1), &mean(&group.e2));
+        decomposer.decompose(field).e
+    };
+    let modes: Vec<_> = set.groups().iter().map(mean_modes).collect();
+    let (mut all, mut pairs) = (Array2::<Complex64>::zeros((grid.n, grid.n)), 1.0);
+    let mut own = [0.0; BINS];
+    for (modes, &weight) in modes.iter().zip(&found.weights) {
+        all.scaled_add(Complex64::from(weight), modes);
+        pairs -= weight * weight;
+        for (own, power) in own.iter_mut().zip(found.bins.power(modes, modes)) {
+            *own += weight * weight * power;
+        }
     }
-    // Groups of two and of one image: the mean over trials is the truth within its error.
-    let trials: Vec<[f64; BINS]> = (0..60)
-        .map(|trial| {
-            let images = images_of(31, 100 + trial);
-            cross_bandpowers(&grid, &images, Convention::STANDARD)
-                .unwrap()
-                .1
-        })
+    let all = found.bins.power(&all, &all);
+    for b in SCORED {
+        let expected = (all[b] - own[b]) / pairs;
+        assert!((found.power[b] - expected).abs() < 1e-9 * all[b], "bin {b}");
+    }
+    // The mean over trials is the truth within its error, and their covariance the one that is stated.
+    let truth = score(grid, &shear, &set, Options::default()).true_ee;
+    let trials: Vec<_> = (0..60)
+        .map(|trial| cross(&images_of(100 + trial)))
         .collect();
     let count = trials.len() as f64;
+    let mut ratios = Vec::new();
     for b in SCORED {
-        let mean = trials.iter().map(|p| p[b]).sum::<f64>() / count;
-        let square = trials.iter().map(|p| (p[b] - mean).powi(2)).sum::<f64>();
-        let error = (square / (count * (count - 1.0))).sqrt();
-        assert!((mean - scored.true_ee[b]).abs() < 4.0 * error, "bin {b}");
-        assert!(
-            error < 0.2 * scored.noise.unwrap()[b],
-            "bin {b}: nothing is tested"
-        );
+        let mean = trials.iter().map(|t| t.power[b]).sum::<f64>() / count;
+        let apart = |t: &&CrossSpectrum| (t.power[b] - mean).powi(2);
+        let variance = trials.iter().map(|t| apart(&t)).sum::<f64>() / (count - 1.0);
+        let error = (variance / count).sqrt();
+        assert!((mean - truth[b]).abs() < 4.0 * error, "bin {b}");
+        let own = |t: &CrossSpectrum| t.covariance.as_ref().unwrap()[b][b];
+        ratios.push(trials.iter().map(own).sum::<f64>() / count / variance);
     }
-    let one = images_of(1, 1);
-    assert!(cross_bandpowers(&grid, &one, Convention::STANDARD).is_err());
+    // A variance from 60 trials is good to 18 %, the mean over eight bins to 7 %.
+    let ratio = ratios.iter().sum::<f64>() / ratios.len() as f64;
+    assert!((0.8..1.25).contains(&ratio), "{ratio}");
+    // Groups of noisy images, whose variance is that of nine and one halved, count less.
+    let mean_of = |noisy: bool| {
+        let of = |w: &&CrossSpectrum| w.weights[if noisy { 0 } else { 1 }];
+        trials.iter().map(|t| of(&t)).sum::<f64>() / count
+    };
+    // Groups 0 and 1 have two images: 0 and 20, both noisy, and 1 and 21. The noise that weights are
+    // measured from is that of some hundred modes in each trial.
+    assert!((mean_of(false) / mean_of(true) / 9.0 - 1.0).abs() < 0.1);
+    let mut one = SetImages::new(&grid);
+    one.add(&set.groups()[0]);
+    assert!(cross_spectrum(&grid, &one, Convention::STANDARD).is_err());
 }
 
 #[test]
@@ -298,9 +336,9 @@ fn cross_spectra_do_without_galaxies_that_are_missing() {
     // Every image lacks one galaxy in three; of the three images of a group one lacks each.
     let of = |keep: &dyn Fn(usize, usize) -> bool| {
         let images = images(&grid, &shear, 60, 0.0, 1, keep);
-        cross_bandpowers(&grid, &images, Convention::STANDARD)
+        cross_spectrum(&grid, &images, Convention::STANDARD)
             .unwrap()
-            .1
+            .power
     };
     let (gaps, whole) = (of(&|image, k| (image + k) % 3 != 0), of(&|_, _| true));
     for b in SCORED {

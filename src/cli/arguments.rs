@@ -28,7 +28,7 @@ impl FromStr for SetList {
             match part.trim().parse() {
                 Ok(set) if (1..=MAX_SET).contains(&set) => Ok(set),
                 _ => Err(format!(
-                    "`{part}` is not a set; expected numbers from 1 as in `1,2,7-9`, or `all`"
+                    "`{part}` is not a set; expected numbers from 1 to {MAX_SET} as in `1,2,7-9`, or `all`"
                 )),
             }
         };
@@ -51,25 +51,59 @@ impl FromStr for SetList {
     }
 }
 
-/// How to print a table.
+impl std::fmt::Display for SetList {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let sets: Vec<String> = self.0.iter().map(u32::to_string).collect();
+        f.write_str(&sets.join(","))
+    }
+}
+
+impl SetList {
+    /// The sets, if all of them can be simulated.
+    pub(super) fn simulated(&self) -> anyhow::Result<&[u32]> {
+        if let Some(set) = self.0.iter().find(|&&set| set > SETS) {
+            anyhow::bail!("--sets: there is no set {set} to simulate; expected 1 to {SETS}");
+        }
+        Ok(&self.0)
+    }
+}
+
+/// How to print a table that has columns of detail.
 #[derive(Debug, Clone, Args)]
 pub(super) struct Printing {
-    /// How to print; `csv` and `json` have every column in full precision.
-    #[arg(long, value_enum, default_value_t)]
-    pub(super) format: TableFormat,
+    #[command(flatten)]
+    form: Form,
     /// Print the columns of detail (c, m per component, null tests) in the other formats too.
     #[arg(long)]
     wide: bool,
 }
 
 impl Printing {
+    pub(super) fn format(&self) -> TableFormat {
+        self.form.format
+    }
+
     pub(super) fn render(&self, table: &Table) -> String {
-        let people = !matches!(self.format, TableFormat::Csv | TableFormat::Json);
+        let people = !matches!(self.form.format, TableFormat::Csv | TableFormat::Json);
         if people && !self.wide {
-            table.narrow().render(self.format)
+            self.form.render(&table.narrow())
         } else {
-            table.render(self.format)
+            self.form.render(table)
         }
+    }
+}
+
+/// How to print a table.
+#[derive(Debug, Clone, Args)]
+pub(super) struct Form {
+    /// How to print; `csv` and `json` have every column in full precision.
+    #[arg(long, value_enum, default_value_t)]
+    pub(super) format: TableFormat,
+}
+
+impl Form {
+    pub(super) fn render(&self, table: &Table) -> String {
+        table.render(self.format)
     }
 }
 

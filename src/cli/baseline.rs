@@ -6,9 +6,9 @@ use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
 use shearq_submissions::{Registry, Submission};
 
-use super::arguments::{Printing, SetList, SimulationArguments, Threads};
-use super::print;
+use super::arguments::{Form, SetList, SimulationArguments, Threads};
 use super::progress::Bar;
+use super::{print, tell};
 use crate::io::atomic;
 use crate::io::baseline::{Baseline, BaselineSet, BaselineSubmission, Change};
 use crate::io::layout::{DataFolder, MAX_IMAGE};
@@ -100,7 +100,7 @@ struct CheckArguments {
     #[command(flatten)]
     place: Place,
     #[command(flatten)]
-    printing: Printing,
+    form: Form,
     #[command(flatten)]
     threads: Threads,
 }
@@ -160,7 +160,7 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
         submissions,
     };
     baseline.write(&path)?;
-    eprintln!("recorded {}", path.display());
+    tell(format_args!("recorded {}", path.display()));
     Ok(())
 }
 
@@ -254,15 +254,12 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     if let Some(path) = &arguments.junit {
         atomic::write(path, junit(&checks).as_bytes())?;
     }
-    let all = matches!(
-        arguments.printing.format,
-        TableFormat::Csv | TableFormat::Json
-    );
+    let all = matches!(arguments.form.format, TableFormat::Csv | TableFormat::Json);
     let table = shift_table(&checks, all);
-    if table.rows.is_empty() && arguments.printing.format == TableFormat::Table {
+    if table.rows.is_empty() && arguments.form.format == TableFormat::Table {
         print(&(table.notes.join("\n") + "\n"))?;
     } else {
-        print(&arguments.printing.render(&table))?;
+        print(&arguments.form.render(&table))?;
     }
     let failed = checks.iter().filter(|check| check.failed()).count();
     anyhow::ensure!(
@@ -350,7 +347,10 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
     let moved: Vec<String> = checks.iter().flat_map(Checked::moved).collect();
     if let (true, Some(reason)) = (arguments.update, &arguments.reason) {
         if moved.is_empty() && checks.iter().all(|check| check.notes.is_empty()) {
-            eprintln!("{}: nothing moved; it stays as it is", path.display());
+            tell(format_args!(
+                "{}: nothing moved; it stays as it is",
+                path.display()
+            ));
         } else {
             let mut history = baseline.history;
             history.push(Change {
@@ -365,7 +365,7 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
                 submissions,
             };
             updated.write(path)?;
-            eprintln!("updated {}", path.display());
+            tell(format_args!("updated {}", path.display()));
         }
     }
     Ok(checks)

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use shearq_submissions::{Registry, Submission, Update};
 
-use super::arguments::{Printing, Threads};
+use super::arguments::{Form, Threads};
 use super::print;
 use crate::report::page::Page;
 use crate::report::table::Table;
@@ -30,7 +30,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
-    printing: Printing,
+    form: Form,
     #[command(flatten)]
     threads: Threads,
 }
@@ -56,7 +56,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         if let Some(page) = page {
             page.table(name, &table)?;
         }
-        print(&(arguments.printing.render(&table) + "\n"))
+        print(&(arguments.form.render(&table) + "\n"))
     };
     if let Some(page) = &mut page {
         page.section(

@@ -2,15 +2,14 @@
 
 use std::path::PathBuf;
 
+use anyhow::Context;
 use clap::Args;
-use shearq_submissions::Registry;
+use shearq_submissions::{Registry, Update};
 
-use super::arguments::{Printing, Threads};
-use super::print;
+use super::arguments::{Form, Threads};
 use super::progress::Bar;
-use crate::io::atomic;
-use crate::report::figure::Figure;
-use crate::report::table::TableFormat;
+use super::{print, tell};
+use crate::report::page::Page;
 use crate::study::calibration::calibrate;
 use crate::study::exhibits;
 
@@ -34,13 +33,22 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
-    printing: Printing,
+    form: Form,
     #[command(flatten)]
     threads: Threads,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let submission = Registry::embedded()?.get(&arguments.submission)?.submission;
+    anyhow::ensure!(
+        submission.deconvolution.update != Update::Linear,
+        "{} has update = \"linear\"; λ is calibrated for the adaptive and the constant update",
+        submission.name
+    );
+    if let Some(out) = &arguments.out {
+        std::fs::create_dir_all(out)
+            .with_context(|| format!("{}: cannot make the folder", out.display()))?;
+    }
     let mut bar = Bar::new("calibrating", arguments.galaxies);
     let curves = calibrate(
         &submission,
@@ -50,18 +58,29 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         &mut bar,
     )?;
     drop(bar);
-    if let Some(out) = &arguments.out {
-        for ending in ["png", "svg"] {
-            let path = |name: &str| out.join(format!("{name}.{ending}"));
-            exhibits::ctr_over_snr(&curves).save(path("fig4-ctr-snr"))?;
-            exhibits::ctr_over_lambda(&curves).save(path("fig5-ctr-lambda"))?;
-            exhibits::dsnr_over_lambda(&curves).save(path("fig6-dsnr-lambda"))?;
-            exhibits::inverse_rmsd(&curves).save(path("fig7-rmsd-lambda"))?;
-        }
-        let data = exhibits::curves_table(&curves).render(TableFormat::Csv);
-        atomic::write(out.join("curves.csv"), data.as_bytes())?;
-        eprintln!("figures and data in {}", out.display());
-    }
     let table = exhibits::calibration_table(&curves, &submission);
-    print(&arguments.printing.render(&table))
+    if let Some(out) = &arguments.out {
+        let made_by = vec![
+            ("Version".into(), format!("shearq {}", crate::VERSION)),
+            ("Seed".into(), arguments.seed.to_string()),
+            (
+                "Data".into(),
+                format!("{} synthetic galaxies", arguments.galaxies),
+            ),
+            ("Settings".into(), toml::to_string(&submission)?),
+        ];
+        let title = format!("Calibration of λ for {}", submission.name);
+        let mut page = Page::new(out, &title, "Simulated data", made_by);
+        page.section("Curves", "Figs 4 to 7 of the paper.");
+        exhibits::calibration_figures(&mut page, &curves)?;
+        page.data("curves", &exhibits::curves_table(&curves))?;
+        page.section("λ", "The best λ at each S/N, and the one chosen.");
+        page.table("lambda", &table)?;
+        page.save()?;
+        tell(format_args!(
+            "figures, data and report in {}",
+            out.display()
+        ));
+    }
+    print(&arguments.form.render(&table))
 }

@@ -7,7 +7,7 @@ use clap::Args;
 use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
 
-use super::{Findings, print};
+use super::{Findings, count, print};
 use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, MAX_SET, read_truth_rows};
 use crate::pipeline::score::grid_side;
 use crate::submit::check::{Expected, Severity, check};
@@ -35,9 +35,9 @@ pub(super) struct Arguments {
     /// Pixels a side of a grid cell [default: that of the data's layout, or 48].
     #[arg(long, value_name = "PX", allow_negative_numbers = true)]
     stamp: Option<f64>,
-    /// Images that every set must have.
-    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=i64::from(MAX_IMAGE)))]
-    images: u32,
+    /// Images that every set must have [default: as many as the highest number says].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    images: Option<u32>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -80,7 +80,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let expected = Expected {
         grid,
         truth,
-        images: *images,
+        images: images.unwrap_or(0),
     };
     let findings = check(path, &expected);
     let errors = findings
@@ -104,7 +104,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         let summary = match findings.len() {
             0 => "no findings".to_owned(),
-            all => format!("{errors} errors and {} warnings found", all - errors),
+            all => format!(
+                "{} and {} found",
+                count(errors, "error"),
+                count(all - errors, "warning")
+            ),
         };
         print(&format!("{}: {summary}\n", path.display()))?;
     }

@@ -92,7 +92,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         map.save(path)?;
     }
     print(&arguments.printing.render(&table))?;
-    if arguments.printing.format == TableFormat::Table {
+    if arguments.printing.format() == TableFormat::Table {
         print_heat_map(map)?;
     }
     Ok(())

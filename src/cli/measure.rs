@@ -8,6 +8,7 @@ use shearq_submissions::Registry;
 
 use super::arguments::{SetList, Sharding, Threads};
 use super::progress::Bar;
+use super::{count, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
@@ -57,12 +58,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let data = DataFolder::open(data)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
     measure(
-        &Run {
-            version: crate::VERSION.into(),
-            source: Source::folder(&data),
+        &Run::new(
+            Source::folder(&data),
             submission,
-            format: catalogue_format.unwrap_or_default(),
-        },
+            catalogue_format.unwrap_or_default(),
+        ),
         &data,
         out,
         &sharding.part(&images::of_folder(&data, sets)?),
@@ -89,16 +89,22 @@ pub(super) fn measure(
 /// Says on standard error what was done and how fast.
 pub(super) fn report(run: &Run, summary: &Summary, elapsed: Duration, threads: usize, out: &Path) {
     let seconds = elapsed.as_secs_f64();
-    eprintln!(
-        "{}: {} images ({} galaxies, {} flagged) in {seconds:.1} s, {:.0} µs a galaxy and thread; {} there already, in {}",
+    let speed = if summary.galaxies == 0 {
+        String::new()
+    } else {
+        let each = 1e6 * seconds * threads as f64 / summary.galaxies as f64;
+        format!(
+            " ({} galaxies, {} flagged) in {seconds:.1} s, {each:.0} µs a galaxy and thread",
+            summary.galaxies, summary.flagged
+        )
+    };
+    tell(format_args!(
+        "{}: {}{speed}; {} there already, in {}",
         run.submission.name,
-        summary.images,
-        summary.galaxies,
-        summary.flagged,
-        1e6 * seconds * threads as f64 / (summary.galaxies.max(1)) as f64,
+        count(summary.images as usize, "image"),
         summary.already,
         out.display()
-    );
+    ));
     if summary.flagged > 0 {
         let reasons: Vec<String> = summary
             .flags
@@ -107,6 +113,6 @@ pub(super) fn report(run: &Run, summary: &Summary, elapsed: Duration, threads: u
             .filter(|(count, _)| **count > 0)
             .map(|(count, (_, meaning))| format!("{meaning} ({count})"))
             .collect();
-        eprintln!("flagged: {}", reasons.join(", "));
+        tell(format_args!("flagged: {}", reasons.join(", ")));
     }
 }

@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::arguments::{SetList, Threads};
 use super::progress::Bar;
-use super::{Findings, print, run};
+use super::{Findings, count, print, run, tell};
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::run::{RUN_FILE, Run, Source, claim, read_record};
 use crate::pipeline::complete::{Fault, Results};
@@ -92,7 +92,10 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
     if images.iter().any(|id| data.truth(id.set).is_file()) {
         return run::score(run, out, sets, None, arguments.threads.number());
     }
-    eprintln!("not scored: {} has no true shear", data.root().display());
+    tell(format_args!(
+        "not scored: {} has no true shear",
+        data.root().display()
+    ));
     Ok(())
 }
 
@@ -118,7 +121,10 @@ fn require_complete(
     let faults = results.faults(images, arguments.threads.number(), &mut bar)?;
     drop(bar);
     if faults.is_empty() {
-        eprintln!("{} images are complete in {out}", images.len());
+        tell(format_args!(
+            "{} complete in {out}",
+            count(images.len(), "image")
+        ));
         return Ok(());
     }
     let mut text = String::new();
@@ -160,7 +166,7 @@ fn discard(faults: &[Fault]) -> anyhow::Result<()> {
     for path in faults.iter().map(|f| f.result.as_path()).filter(there) {
         std::fs::remove_file(path)
             .with_context(|| format!("{}: cannot remove the file", path.display()))?;
-        eprintln!("removed {}", path.display());
+        tell(format_args!("removed {}", path.display()));
     }
     Ok(())
 }

@@ -86,7 +86,7 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) if error.is::<Findings>() => ExitCode::FAILURE,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            tell(format_args!("error: {error:#}"));
             ExitCode::FAILURE
         }
     }
@@ -110,6 +110,18 @@ fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
     let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
     print(&format!("\n{}", map.terminal(coloured)))
+}
+
+/// Says something on standard error; a reader that has gone away is no error.
+fn tell(line: std::fmt::Arguments<'_>) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stderr(), "{line}");
+}
+
+/// A number of things.
+fn count(number: usize, thing: &str) -> String {
+    let ending = if number == 1 { "" } else { "s" };
+    format!("{number} {thing}{ending}")
 }
 
 /// Prints results to standard output; a reader that has gone away (`| head`) is no error.

@@ -5,27 +5,32 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::progress::Bar;
+use super::{count, tell};
 use crate::io::run::Run;
+use crate::submit::archive::is_archive;
 use crate::submit::manifest::Contents;
 use crate::submit::pack::Packing;
 
 /// Longest name of a method, in bytes: a tar header has 100 for the file names made with it.
 const MAX_METHOD: usize = 64;
 
+/// Endings of archives that are not made.
+const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"];
+
 /// Write measured catalogues as the files that the challenge takes, with a manifest.
 ///
 /// Either one ASCII catalogue per image (`g10_v1_objs_{set}_{image}.{method}.dat`), or one power
 /// spectrum per set (`{method}_set{set}.dat`): of the ellipticities averaged over the images, as the
 /// original scoring takes it from catalogues, or from cross-spectra between groups of images, in which
-/// noise has no mean. manifest.json lists them with their SHA-256 checksums
-/// and says what made them. The same catalogues give the same bytes, archives included. `shearq check`
+/// noise has no mean (up to twenty groups; at least two images). manifest.json lists the files with their
+/// SHA-256 checksums and says what made them; of cross-spectra it has the covariances too. The same catalogues give the same bytes, archives included. `shearq check`
 /// validates the result, `shearq unpack` unpacks an archive.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Folder that `measure` or `run` wrote.
     #[arg(long, value_name = "DIR")]
     measured: PathBuf,
-    /// New folder to write to, or an archive ending in .tar.gz.
+    /// New folder to write to, or an archive ending in .tar.gz or .tgz.
     #[arg(long, value_name = "PATH")]
     out: PathBuf,
     /// Method's name in file names [default: the submission's, with `-` for `/`].
@@ -43,6 +48,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         method,
         kind,
     } = arguments;
+    let ending = out.extension().unwrap_or_default().to_string_lossy();
+    anyhow::ensure!(
+        is_archive(out) || !OTHER_ARCHIVES.contains(&ending.as_ref()),
+        "--out {}: expected a folder, or an archive ending in .tar.gz or .tgz",
+        out.display()
+    );
     let run = Run::require(measured)?;
     let method = method
         .clone()
@@ -63,9 +74,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let mut bar = Bar::new("packing", packing.galaxies()?);
     let files = packing.write(out, &mut bar)?;
     drop(bar);
-    eprintln!(
-        "{files} files and their manifest written to {}",
+    tell(format_args!(
+        "{} and a manifest written to {}",
+        count(files, "file"),
         out.display()
-    );
+    ));
     Ok(())
 }

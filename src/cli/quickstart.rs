@@ -9,7 +9,7 @@ use shearq_submissions::Registry;
 use super::arguments::Threads;
 use super::compare::variants;
 use super::progress::Bar;
-use super::{measure, print};
+use super::{measure, print, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
@@ -55,21 +55,17 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let images = images::of_simulation(&SETS, IMAGES);
     simulate_folder(&record, &images, &data, threads, &mut bar)?;
     drop(bar);
-    eprintln!(
+    tell(format_args!(
         "simulated sets {SETS:?}, {IMAGES} images of {GRID} × {GRID} galaxies each, in {}",
         data.root().display()
-    );
+    ));
     let registry = Registry::embedded()?;
     let options = Options::default();
     let mut folders = Vec::new();
     for name in SUBMISSIONS {
         let folder = out.join(name.replace('/', "-"));
-        let run = Run {
-            version: crate::VERSION.into(),
-            source: Source::folder(&data),
-            submission: registry.get(name)?.submission,
-            format: Format::default(),
-        };
+        let submission = registry.get(name)?.submission;
+        let run = Run::new(Source::folder(&data), submission, Format::default());
         measure::measure(&run, &data, &folder, &images, threads)?;
         let scored = score_folder(&data, &folder, &run, &[], options, threads)?;
         let title = format!("Scores of {name} (simulated data)");
@@ -80,13 +76,16 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let variants = variants(&folders, &[], None, options, threads)?;
     let table = compare(&variants, options.definition, options.choice);
     print(&table.narrow().render(TableFormat::Table))?;
-    eprintln!("\nNext: {}", next_step(out));
+    tell(format_args!(
+        "\nWith few images Q rewards submissions that shrink noise and shear alike: compare m (cross) too, which\nis zero for an unbiased one.\n\nNext: {}",
+        next_step(out)
+    ));
     Ok(())
 }
 
 fn next_step(out: &Path) -> String {
     format!(
-        "shearq show --submission 23/den/star --data {} --galaxy 8/1/1 --out galaxy.png",
+        "shearq show --submission 48/linear/star --data {} --galaxy 8/1/1 --out galaxy.png",
         out.join("data").display()
     )
 }

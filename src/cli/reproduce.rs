@@ -6,8 +6,8 @@ use clap::Args;
 use shearq_submissions::{Published, Registry, Submission};
 
 use super::arguments::{SetList, Threads};
-use super::print;
 use super::progress::Bar;
+use super::{print, tell};
 use crate::io::layout::MAX_IMAGE;
 use crate::pipeline::run::{measurers, simulated_steps};
 use crate::pipeline::simulate::simulator;
@@ -17,7 +17,7 @@ use crate::report::table::TableFormat;
 use crate::simulate::set::SimulationSettings;
 use crate::study::calibration::calibrate;
 use crate::study::exhibits;
-use crate::study::reproduce::{Plan, SetResult, run_sets};
+use crate::study::reproduce::{Plan, SetResult, Study, run_sets};
 
 /// Reproduce the paper's figures and tables on simulated data.
 ///
@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR", default_value = "shearq-reproduce")]
     out: PathBuf,
     /// Images per set.
-    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(2..=i64::from(MAX_IMAGE)))]
     images: u32,
     /// Galaxies a side of an image.
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u16).range(8..=400))]
@@ -61,6 +61,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
     } = arguments;
     let threads = threads.number();
+    let sets = sets.simulated()?;
     let registry = Registry::embedded()?;
     let submissions = registry.published()?;
     let plan = Plan {
@@ -69,9 +70,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         images: *images,
         submissions: submissions.iter().map(|(s, _)| s.clone()).collect(),
     };
-    let total = sets.0.len() as u64 * u64::from(*images) * u64::from(*grid).pow(2);
+    let total = sets.len() as u64 * u64::from(*images) * u64::from(*grid).pow(2);
     let mut bar = Bar::new("simulating and measuring", total);
-    let results = run_sets(&plan, &sets.0, out, threads, &mut bar)?;
+    let study = Study::open(&plan, out)?;
+    let results = run_sets(&study, sets, threads, &mut bar)?;
     drop(bar);
     let mut bar = Bar::new("calibrating", *galaxies);
     let base = registry.get("paper")?.submission;
@@ -85,7 +87,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             "Data".into(),
             format!(
                 "simulated: {} sets, {images} images of {grid} × {grid} galaxies",
-                sets.0.len()
+                sets.len()
             ),
         ),
         (
@@ -105,26 +107,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     );
     method(&mut page, &plan)?;
     page.section("Calibration of λ (Sect. 4)", SECT_FOUR);
-    page.figure(
-        "fig4-ctr-snr",
-        &exhibits::ctr_over_snr(&curves),
-        "Fig. 4: correct transition rate against S/N for the adaptive and the constant update.",
-    )?;
-    page.figure(
-        "fig5-ctr-lambda",
-        &exhibits::ctr_over_lambda(&curves),
-        "Fig. 5: correct transition rate against λ, adaptive update.",
-    )?;
-    page.figure(
-        "fig6-dsnr-lambda",
-        &exhibits::dsnr_over_lambda(&curves),
-        "Fig. 6: discriminative signal-to-noise ratio against λ, adaptive update.",
-    )?;
-    page.figure(
-        "fig7-rmsd-lambda",
-        &exhibits::inverse_rmsd(&curves),
-        "Fig. 7: 1/RMSD of the ellipticities against λ for both updates.",
-    )?;
+    exhibits::calibration_figures(&mut page, &curves)?;
     page.table("calibration", &exhibits::calibration_table(&curves, &base))?;
     page.table(
         "findings-lambda",
@@ -140,7 +123,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             .render(TableFormat::Table),
         exhibits::calibration_table(&curves, &base).render(TableFormat::Table),
     ))?;
-    eprintln!("report, figures and data in {}", out.display());
+    tell(format_args!(
+        "report, figures and data in {}",
+        out.display()
+    ));
     Ok(())
 }
 

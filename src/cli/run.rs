@@ -8,7 +8,7 @@ use shearq_submissions::Registry;
 
 use super::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use super::progress::Bar;
-use super::{measure, print, score};
+use super::{measure, print, score, tell};
 use crate::io::atomic;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::run::{Run, Source};
@@ -80,17 +80,22 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         store::prepare(store)?;
     }
     let threads = threads.number();
-    let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
-    let data = data.as_ref().map(DataFolder::open).transpose()?;
-    let run = Run {
-        version: crate::VERSION.into(),
-        source: match &data {
-            Some(data) => Source::folder(data),
-            None => Source::Simulated(simulation.settings()?),
-        },
-        submission: Registry::embedded()?.get(submission)?.submission,
-        format: catalogue_format.unwrap_or_default(),
+    let expected = [
+        sets.as_ref().map(|list| format!(" --sets {list}")),
+        images.map(|images| format!(" --images {images}")),
+    ];
+    let sets = match sets {
+        None => &[],
+        Some(list) if data.is_none() => list.simulated()?,
+        Some(list) => &list.0[..],
     };
+    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let source = match &data {
+        Some(data) => Source::folder(data),
+        None => Source::Simulated(simulation.settings()?),
+    };
+    let submission = Registry::embedded()?.get(submission)?.submission;
+    let run = Run::new(source, submission, catalogue_format.unwrap_or_default());
     match (&run.source, &data) {
         (Source::Simulated(settings), _) => {
             let images = sharding.part(&images::of_simulation(sets, images.unwrap_or(1)));
@@ -108,10 +113,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         (Source::Folder { .. }, None) => {}
     }
     if let Some(shard) = sharding.shard {
-        eprintln!(
-            "shard {shard} is done; `shearq merge {}` scores when all are",
-            out.display()
-        );
+        tell(format_args!(
+            "shard {shard} is done; `shearq merge {}{} --shards {}` scores when all are",
+            out.display(),
+            expected.map(Option::unwrap_or_default).concat(),
+            shard.of()
+        ));
         return Ok(());
     }
     score(&run, out, sets, store.as_deref(), threads)

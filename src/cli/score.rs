@@ -1,5 +1,6 @@
 //! `shearq score`.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -8,7 +9,7 @@ use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{BiasFits, Grid, Noise, Options, Quality, SetScorer, TrueShear, TruthSign};
 
 use super::arguments::{Printing, ScoreSettings, SetList, Threads};
-use super::print;
+use super::{print, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::store;
@@ -179,7 +180,7 @@ pub(super) fn record(
     options: Options,
 ) -> anyhow::Result<()> {
     let path = store::write(store, &run_record(measured, scored, options)?)?;
-    eprintln!("recorded in {}", path.display());
+    tell(format_args!("recorded in {}", path.display()));
     Ok(())
 }
 
@@ -190,25 +191,32 @@ fn spectrum_folder(
     folder: &Path,
     options: Options,
 ) -> anyhow::Result<()> {
-    let mut files: Vec<(u32, PathBuf)> = std::fs::read_dir(folder)
-        .with_context(|| format!("{}: cannot read the folder", folder.display()))?
-        .filter_map(|entry| {
-            let path = entry.ok()?.path();
-            let wanted = arguments.sets.as_ref();
-            match Kind::of(&path)? {
-                Kind::Spectrum { set, .. } => wanted
-                    .is_none_or(|list| list.0.contains(&set))
-                    .then_some((set, path)),
-                Kind::Catalogue { .. } => None,
-            }
-        })
-        .collect();
-    files.sort();
+    let mut files = BTreeMap::<u32, PathBuf>::new();
+    let cannot_read = || format!("{}: cannot read the folder", folder.display());
+    for entry in std::fs::read_dir(folder).with_context(cannot_read)? {
+        let path = entry.with_context(cannot_read)?.path();
+        let Some(Kind::Spectrum { set, .. }) = Kind::of(&path) else {
+            continue;
+        };
+        if let Some(other) = files.insert(set, path.clone()) {
+            bail!(
+                "{}: {} is a spectrum of set {set} too; expected one method",
+                path.display(),
+                other.display()
+            );
+        }
+    }
     anyhow::ensure!(
         !files.is_empty(),
         "{}: there is no file named {{method}}_set{{set}}.dat",
         folder.display()
     );
+    if let Some(wanted) = &arguments.sets {
+        if let Some(set) = wanted.0.iter().find(|set| !files.contains_key(set)) {
+            bail!("{}: there is no spectrum of set {set}", folder.display());
+        }
+        files.retain(|set, _| wanted.0.contains(set));
+    }
     let reading = reading_of(data);
     let mut scored = Vec::new();
     for (set, path) in &files {
@@ -283,7 +291,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         score,
         rows,
     };
-    if arguments.printing.format == TableFormat::Json {
+    if arguments.printing.format() == TableFormat::Json {
         let name = |path: &Path| path.display().to_string();
         let input = SetInput {
             case: truth

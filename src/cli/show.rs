@@ -7,6 +7,8 @@ use anyhow::Context;
 use clap::Args;
 use shearq_submissions::Registry;
 
+use super::tell;
+use crate::deconvolve::Stop;
 use crate::io::layout::DataFolder;
 use crate::pipeline::galaxy::{Measurement, Measurer};
 use crate::pipeline::images::ImageId;
@@ -106,13 +108,20 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         println!("{}", describe(image, index, &measured));
     }
     steps_figure(&submission.name, rows).save(out)?;
-    eprintln!("wrote {}", out.display());
+    tell(format_args!("wrote {}", out.display()));
     Ok(())
 }
 
 fn describe(id: ImageId, index: usize, m: &Measurement) -> String {
     let stop = m.outcome.map_or_else(String::new, |o| {
-        format!("{} iterations, {:?}", o.iterations, o.stop)
+        let ended = match o.stop {
+            // The closed form has no energy to follow.
+            _ if o.energy.is_nan() => "in closed form",
+            Stop::Stable => "until no neuron was to be updated",
+            Stop::EnergyRise => "until the energy fell no more",
+            Stop::MaxIterations => "as many as allowed",
+        };
+        format!("{} iterations ({ended})", o.iterations)
     });
     format!(
         "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4}, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",

@@ -6,6 +6,7 @@ use clap::Args;
 
 use super::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use super::progress::Bar;
+use super::tell;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::pipeline::images;
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
@@ -46,15 +47,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         version: crate::VERSION.into(),
         settings: simulation.settings()?,
     };
-    let images = sharding.part(&images::of_simulation(&sets.0, *images));
+    let images = sharding.part(&images::of_simulation(sets.simulated()?, *images));
     let galaxies = images.len() as u64 * (record.settings.grid as u64).pow(2);
     let mut bar = Bar::new("simulating", galaxies);
     let data = DataFolder::new(out);
     let (made, already) = simulate_folder(&record, &images, &data, threads.number(), &mut bar)?;
     drop(bar);
-    eprintln!(
+    tell(format_args!(
         "{made} images simulated, {already} there already, in {}",
         out.display()
-    );
+    ));
     Ok(())
 }

@@ -5,13 +5,13 @@ use std::path::PathBuf;
 use clap::Args;
 use shearq_submissions::{Registry, Submission};
 
-use super::arguments::{Printing, SetList, SimulationArguments, Threads};
+use super::arguments::{Form, SetList, SimulationArguments, Threads};
 use super::print;
 use super::progress::Bar;
 use crate::io::layout::MAX_IMAGE;
 use crate::report::page::Page;
 use crate::study::contest::{bias_sets, contest_table};
-use crate::study::reproduce::{Plan, run_sets};
+use crate::study::reproduce::{Plan, Study, run_sets};
 
 /// Hold submissions against each other and against what can be reached.
 ///
@@ -34,7 +34,7 @@ pub(super) struct Arguments {
     /// Images per set for Q and scatter; the challenge has 200.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=i64::from(MAX_IMAGE)))]
     images: u32,
-    /// Images per set whose galaxies are drawn four times for the biases.
+    /// Images per set whose galaxies are drawn eight times for the biases.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     pairs: u32,
     #[command(flatten)]
@@ -43,7 +43,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR", default_value = "shearq-study")]
     out: PathBuf,
     #[command(flatten)]
-    printing: Printing,
+    form: Form,
     #[command(flatten)]
     threads: Threads,
 }
@@ -56,9 +56,16 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         pairs,
         simulation,
         out,
-        printing,
+        form,
         threads,
     } = arguments;
+    let sets = sets.simulated()?;
+    for (k, name) in submission.iter().enumerate() {
+        anyhow::ensure!(
+            !submission[..k].contains(name),
+            "--submission {name} is given twice"
+        );
+    }
     let registry = Registry::embedded()?;
     let submissions = submission
         .iter()
@@ -70,13 +77,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         images: *images,
         submissions,
     };
+    let study = Study::open(&plan, out)?;
     let threads = threads.number();
-    let image = (plan.simulation.grid as u64).pow(2) * sets.0.len() as u64;
+    let image = (plan.simulation.grid as u64).pow(2) * sets.len() as u64;
     let mut bar = Bar::new("simulating and measuring", image * u64::from(*images));
-    let results = run_sets(&plan, &sets.0, out, threads, &mut bar)?;
+    let results = run_sets(&study, sets, threads, &mut bar)?;
     drop(bar);
     let mut bar = Bar::new("measuring biases", image * u64::from(*pairs));
-    let biases = bias_sets(&plan, &sets.0, *pairs, out, threads, &mut bar)?;
+    let biases = bias_sets(&study, sets, *pairs, threads, &mut bar)?;
     drop(bar);
     let table = contest_table(&plan, &results, &biases)?;
     let mut made_by = vec![
@@ -89,6 +97,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 plan.simulation.grid
             ),
         ),
+        ("Simulation".into(), toml::to_string(&plan.simulation)?),
     ];
     for submission in &plan.submissions {
         made_by.push((submission.name.clone(), toml::to_string(submission)?));
@@ -97,5 +106,5 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.section("Every kind of set", "Scatter, bias, quality and cost.");
     page.table("study", &table)?;
     page.save()?;
-    print(&printing.render(&table))
+    print(&form.render(&table))
 }

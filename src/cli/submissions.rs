@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use shearq_submissions::{DenoiseMethod, PsfForm, Registry, TEMPLATE};
 
-use super::print;
+use super::{print, tell};
 use crate::io::atomic;
 use crate::report::table::{Cell, Heading, Table, TableFormat};
 
@@ -56,7 +56,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 file.display()
             );
             atomic::write(file, template().as_bytes())?;
-            eprintln!("wrote {}", file.display());
+            tell(format_args!("wrote {}", file.display()));
             Ok(())
         }
     }

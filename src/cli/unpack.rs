@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use super::{count, tell};
 use crate::submit::archive::{read, unpack};
 use crate::submit::manifest::MANIFEST_FILE;
 
@@ -43,10 +44,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Some(_) => format!("are as {MANIFEST_FILE} says"),
         None => format!("were not verified: there is no {MANIFEST_FILE}"),
     };
-    eprintln!(
-        "{} files of {} {compared}",
-        unpacked.files.len(),
+    tell(format_args!(
+        "{} of {} {compared}",
+        count(unpacked.files.len(), "file"),
         archive.display()
-    );
+    ));
     Ok(())
 }

@@ -1,4 +1,5 @@
-//! Deconvolution by a Hopfield network (Nurbaeva et al., Sects. 2.1 to 3.1).
+//! Deconvolution by a Hopfield network (Nurbaeva et al., Sects. 2.1 to 3.1), and the closed form of its
+//! linear part ([`Spectral`]).
 //!
 //! The network's state v is the deconvolved stamp. It lowers the energy (Eq. 7)
 //!
@@ -16,7 +17,8 @@
 //!
 //! Stamps are row-major, rows along y. A PSF of side p has its centre at pixel c = p/2 (integer
 //! division) on both axes: `(Hv)[y, x] = Σ h[j, i]·v[y − (j − c), x − (i − c)]`, pixels outside the
-//! stamp counting as zero.
+//! stamp counting as zero. The closed form takes (p − 1)/2 for the centre, as stamps have it, because its
+//! window is fixed at the stamp's middle.
 //!
 //! [`reference`](mod@reference) builds the matrices and iterates on them; [`Network`] never forms them and is what
 //! the pipeline runs.

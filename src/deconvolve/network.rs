@@ -48,11 +48,6 @@ impl<T: Real> Network<T> {
         self.operator.n
     }
 
-    /// PSF side p.
-    pub fn psf_size(&self) -> usize {
-        self.operator.p
-    }
-
     /// Thresholds TH_i (Eq. 9) for a unit of brightness of one, row-major.
     pub fn thresholds(&self) -> &[T] {
         &self.operator.thresholds

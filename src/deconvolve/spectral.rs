@@ -37,13 +37,16 @@ use self::plane::{Plane, PlaneScratch};
 use super::operator::{MAX_PSF, MAX_STAMP, OperatorError, SUN_KERNEL};
 use crate::fft::StampFft;
 
-/// Pixels by which the deconvolved stamp may spread beyond the stamp before it wraps around.
+/// Pixels by which the deconvolved stamp may spread beyond the stamp before it wraps around. The window
+/// is down to a hundredth at the stamp's edge.
 const SPREAD: usize = 8;
-/// Modes with |p|² below this are left out: they are noise alone.
+/// Modes with |p|² below this are left out: they are noise alone. The PSFs of the simulated sets are above
+/// 1e-3 where Γ is not yet zero; this keeps single precision finite for broader ones.
 const LEAST_POWER: f32 = 1e-7;
-/// |k|·σ of the largest mode, σ being Γ's.
+/// |k|·σ of the largest mode, σ being Γ's, which is down to 0.09 there: farther out the noise that a PSF
+/// leaves undamped outweighs the galaxy.
 pub const CUT: f64 = 2.2;
-/// Largest lag in σ of the window.
+/// Largest lag in σ of the window: the autocorrelation of a window has √2 σ, and is down to a fifth.
 const REACH: f64 = 2.5;
 
 /// The linear network for one stamp size.
@@ -108,7 +111,8 @@ pub struct SpectralScratch {
     real: [Vec<f32>; 3],
 }
 
-/// Autocorrelations on lags dy = 0…R, dx = −R…R of the coarse grid: `[dy·(2R+1) + dx + R]`.
+/// Autocorrelations on lags dy = 0…R, dx = −R…R, in steps of [`Spectral::spacing`]:
+/// `[dy·(2R+1) + dx + R]`.
 #[derive(Debug, Clone)]
 pub struct Lags {
     /// Of the result.
@@ -135,6 +139,7 @@ impl Spectral {
             });
         }
         let sigma = settings.target_sigma;
+        // Below the stamp's own Nyquist frequency, π.
         let cut = (CUT / sigma).min(3.0);
         let plane = Plane::new((n + SPREAD).max(p), cut);
         let side = plane.side;
@@ -155,7 +160,7 @@ impl Spectral {
             })
             .collect();
         let leak = window_power(&window, plane.size);
-        let reach = (REACH * settings.window_sigma / plane.spacing()) as usize;
+        let reach = (REACH * settings.window_sigma / plane.lag_spacing()) as usize;
         let least = plane.wave(plane.modes);
         let scale = |&[kx, ky]: &[f64; 2]| {
             let area = (plane.size * plane.size) as f32;
@@ -172,7 +177,7 @@ impl Spectral {
         Ok(Spectral {
             n,
             p,
-            reach: reach.clamp(1, side / 2 - 1),
+            reach: reach.clamp(1, plane.lags / 2 - 1),
             step: settings.step as f32,
             iterations: i32::try_from(settings.max_iterations).unwrap_or(i32::MAX),
             rough: waves
@@ -202,14 +207,14 @@ impl Spectral {
         (self.plane.size, self.plane.side, self.plane.modes)
     }
 
-    /// Largest lag, in steps of the coarse grid.
+    /// Largest lag, in steps of [`Spectral::spacing`].
     pub fn reach(&self) -> usize {
         self.reach
     }
 
     /// Pixels between lags.
     pub fn spacing(&self) -> f64 {
-        self.plane.spacing()
+        self.plane.lag_spacing()
     }
 
     /// Buffers that fit this plan.
@@ -452,7 +457,7 @@ impl Spectral {
             .lags(1, self.reach, plane, |at, value| shear2[at] = value.re);
     }
 
-    /// The deconvolved stamp itself, windowed and convolved with Γ, for pictures.
+    /// The deconvolved stamp itself, convolved with Γ and windowed, for pictures.
     pub fn deconvolved(&self, psf: ArrayView2<'_, f64>, stamp: &[f32]) -> Vec<f32> {
         let plan = StampFft::new(self.plane.size);
         let (mut u, mut h, mut fft) = (plan.spectrum(), plan.spectrum(), plan.scratch());
@@ -460,16 +465,7 @@ impl Spectral {
         let rows = rows.map(|row| row.into_iter().map(|&v| v as f32));
         plan.rows(rows, &mut fft, &mut h);
         plan.columns(&mut fft, &mut h);
-        let window = |at: usize| {
-            let x = (at as f64 - (self.n as f64 - 1.0) / 2.0) / self.window_sigma;
-            (-0.5 * x * x).exp() as f32
-        };
-        let windowed: Vec<f32> = stamp
-            .iter()
-            .enumerate()
-            .map(|(at, v)| v * window(at / self.n) * window(at % self.n))
-            .collect();
-        let rows = windowed.chunks_exact(self.n);
+        let rows = stamp.chunks_exact(self.n);
         plan.rows(rows.map(|row| row.iter().copied()), &mut fft, &mut u);
         plan.columns(&mut fft, &mut u);
         let centre = (self.p / 2) as f32;
@@ -483,14 +479,25 @@ impl Spectral {
             }
             let mode = x * side + if y > modes { y + side - size } else { y };
             let [kx, ky] = self.waves[mode];
-            // The PSF's transform about its central pixel.
+            // The PSF's transform about the pixel that a convolution takes for its centre.
             let p = h[at] * Complex32::from_polar(1.0, centre * (kx + ky));
             *u *= p.conj() * (self.amplitude(mode, p.norm_sqr()) / (size * size) as f32);
         }
         plan.columns_back(&mut fft, &mut u);
-        (0..self.n)
-            .flat_map(|y| plan.row_back(&u, y, &mut fft)[..self.n].to_vec())
-            .collect()
+        let window = |at: usize| {
+            let x = (at as f64 - (self.n as f64 - 1.0) / 2.0) / self.window_sigma;
+            (-0.5 * x * x).exp() as f32
+        };
+        let mut image = Vec::with_capacity(self.n * self.n);
+        for y in 0..self.n {
+            let row = &plan.row_back(&u, y, &mut fft)[..self.n];
+            image.extend(
+                row.iter()
+                    .enumerate()
+                    .map(|(x, v)| v * window(x) * window(y)),
+            );
+        }
+        image
     }
 }
 

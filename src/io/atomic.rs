@@ -121,12 +121,18 @@ impl PartFolder {
         &self.part
     }
 
-    /// Gives the folder its name.
+    /// Gives the folder its name, its files being on disk.
     ///
     /// # Errors
-    /// Where it cannot be renamed.
+    /// Where a file cannot be flushed or the folder cannot be renamed.
     pub fn finish(mut self) -> Result<(), FileError> {
+        for path in list(&self.part)? {
+            fs::File::open(&path)
+                .and_then(|file| file.sync_data())
+                .map_err(FileError::doing(&self.target, "cannot write the files"))?;
+        }
         fs::rename(&self.part, &self.target)
+            .and_then(|()| sync_names(&self.target))
             .map_err(FileError::doing(&self.target, "cannot make the folder"))?;
         self.finished = true;
         Ok(())

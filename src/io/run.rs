@@ -4,7 +4,7 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use shearq_submissions::Submission;
 
 use super::atomic;
@@ -91,6 +91,16 @@ impl Run {
         read_record(&folder.join(RUN_FILE))
     }
 
+    /// What this version makes of `source`.
+    pub fn new(source: Source, submission: Submission, format: Format) -> Self {
+        Run {
+            version: crate::VERSION.into(),
+            source,
+            submission,
+            format,
+        }
+    }
+
     /// Reads the record of a folder that must be one of catalogues.
     ///
     /// # Errors
@@ -155,6 +165,36 @@ pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileE
         .map_err(FileError::doing(path, "cannot write the record"))?;
     text.push('\n');
     Ok(text)
+}
+
+/// Numbers of records that may be NaN, which JSON does not have.
+pub trait Numbers: Sized {
+    /// As they are read: null for NaN.
+    type Form: DeserializeOwned;
+    /// With NaN for null.
+    fn from_form(form: Self::Form) -> Self;
+}
+
+impl Numbers for f64 {
+    type Form = Option<f64>;
+    fn from_form(form: Option<f64>) -> Self {
+        form.unwrap_or(f64::NAN)
+    }
+}
+
+impl Numbers for [f64; 2] {
+    type Form = [Option<f64>; 2];
+    fn from_form(form: [Option<f64>; 2]) -> Self {
+        form.map(f64::from_form)
+    }
+}
+
+/// For `#[serde(deserialize_with)]`: reads null as NaN.
+///
+/// # Errors
+/// Where there is anything but numbers and null.
+pub fn nan_for_null<'de, D: Deserializer<'de>, N: Numbers>(deserializer: D) -> Result<N, D::Error> {
+    N::Form::deserialize(deserializer).map(N::from_form)
 }
 
 /// A folder of results that this process writes to, alone or with others of the same settings, until
@@ -242,9 +282,30 @@ fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut 
                 );
             }
         }
+        (serde_json::Value::Array(a), serde_json::Value::Array(b))
+            if names(a).is_some() && names(a) != names(b) =>
+        {
+            let list = |values| names(values).unwrap_or_default().join(", ");
+            found.push(format!("{key}: {} ≠ {}", list(a), list(b)));
+        }
+        (serde_json::Value::Array(a), serde_json::Value::Array(b))
+            if names(a).is_some() && a.len() == b.len() =>
+        {
+            for (k, (a, b)) in a.iter().zip(b).enumerate() {
+                compare(&format!("{key}[{k}]"), a, b, found);
+            }
+        }
         _ if a != b => found.push(format!("{key}: {a} ≠ {b}")),
         _ => {}
     }
+}
+
+/// The names of objects that all have one.
+fn names(values: &[serde_json::Value]) -> Option<Vec<&str>> {
+    values
+        .iter()
+        .map(|value| value.get("name")?.as_str())
+        .collect()
 }
 
 #[cfg(test)]
@@ -270,5 +331,17 @@ mod tests {
         assert!(!left.exists());
         let message = claim(&path, &2).unwrap_err().to_string();
         assert!(message.contains(": 1 ≠ 2"), "{message}");
+    }
+
+    #[test]
+    fn lists_of_named_things_differ_by_their_names_or_else_by_what_differs() {
+        let of = |values: &[(&str, u32)]| -> Vec<serde_json::Value> {
+            let object = |&(name, size)| serde_json::json!({ "name": name, "size": size });
+            values.iter().map(object).collect()
+        };
+        let found = differences(&of(&[("a", 1), ("b", 2)]), &of(&[("a", 1)])).unwrap();
+        assert_eq!(found, [": a, b ≠ a"]);
+        let found = differences(&of(&[("a", 1), ("b", 2)]), &of(&[("a", 1), ("b", 3)])).unwrap();
+        assert_eq!(found, ["[1].size: 2 ≠ 3"]);
     }
 }

@@ -62,12 +62,7 @@ pub fn measure(
         "cannot make a temporary folder",
     ))?;
     let out = folder.path();
-    let run = Run {
-        version: crate::VERSION.into(),
-        source: source.clone(),
-        submission: submission.clone(),
-        format: Format::default(),
-    };
+    let run = Run::new(source.clone(), submission.clone(), Format::default());
     match source {
         Source::Simulated(settings) => {
             let images: Vec<ImageId> = wanted

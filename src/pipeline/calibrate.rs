@@ -22,7 +22,7 @@ pub(super) fn calibrate(submission: &Submission, rows: &mut [MeasuredRow]) {
             .filter(|g| g.flag == 0)
     };
     let count = good().count() as f64;
-    // Components apart: the stamp's square cut tells them from each other.
+    // Components apart: lags on a square grid, and PSFs with a direction, tell them from each other.
     let means = [0, 1].map(|k| good().map(|g| g.response[k]).sum::<f64>() / count);
     let usable = means.iter().all(|mean| *mean > 0.0 && mean.is_finite());
     for galaxy in rows.iter_mut().flat_map(|row| &mut row.galaxies) {

@@ -4,7 +4,9 @@
 //! At most [`IN_FLIGHT`] items per worker exist at a time, so memory does not grow with the length
 //! of the work.
 
+use std::any::Any;
 use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Mutex, PoisonError};
 
@@ -48,11 +50,17 @@ impl<I> Feeder<'_, I> {
     }
 }
 
+/// What became of an item; a panic is handed on to the calling thread.
+type Outcome<O> = Result<Result<O, PipelineError>, Box<dyn Any + Send>>;
+
 /// Runs `read` on a thread of its own, `work` on `threads` workers, each with a scratch of its own,
 /// and `write` on the calling thread, in the order of reading.
 ///
 /// # Errors
 /// The first error of any part; what was written before stays written.
+///
+/// # Panics
+/// Where a part does.
 pub fn ordered<I, O, S>(
     threads: usize,
     read: impl FnOnce(&mut Feeder<'_, I>) -> Result<(), PipelineError> + Send,
@@ -69,8 +77,7 @@ where
         .build()?;
     let capacity = IN_FLIGHT * threads;
     let (item_sender, item_receiver) = sync_channel::<(u64, I)>(capacity);
-    let (result_sender, result_receiver) =
-        sync_channel::<(u64, Result<O, PipelineError>)>(capacity);
+    let (result_sender, result_receiver) = sync_channel::<(u64, Outcome<O>)>(capacity);
     let (permit_sender, permit_receiver) = sync_channel::<()>(capacity);
     for _ in 0..capacity {
         // The channel was just made with room for all of them.
@@ -86,7 +93,7 @@ where
             };
             read(&mut feeder)
         });
-        let mut outcome = Ok(());
+        let mut outcome = Ok(Ok(()));
         let (work, scratch, items) = (&work, &scratch, &items);
         pool.in_place_scope(|workers| {
             for _ in 0..threads {
@@ -96,7 +103,8 @@ where
                     loop {
                         let next = items.lock().unwrap_or_else(PoisonError::into_inner).recv();
                         let Ok((number, item)) = next else { break };
-                        let result = work(&mut own, item);
+                        // A panic that ended this worker alone would leave the others waiting.
+                        let result = catch_unwind(AssertUnwindSafe(|| work(&mut own, item)));
                         if results.send((number, result)).is_err() {
                             break;
                         }
@@ -108,36 +116,39 @@ where
             // Whoever still waits finds nobody at the other end and stops.
             drop(result_receiver);
             drop(permit_sender);
-            if outcome.is_err() {
+            if !matches!(outcome, Ok(Ok(()))) {
                 let waiting = items.lock().unwrap_or_else(PoisonError::into_inner);
                 while waiting.recv().is_ok() {}
             }
         });
-        match reader.join() {
-            Ok(read) => outcome.and(read),
-            Err(panic) => std::panic::resume_unwind(panic),
+        match (outcome, reader.join()) {
+            (Ok(outcome), Ok(read)) => outcome.and(read),
+            (Err(panic), _) | (_, Err(panic)) => resume_unwind(panic),
         }
     })
 }
 
 /// Writes results in order as they come.
 fn collect<O>(
-    results: &Receiver<(u64, Result<O, PipelineError>)>,
+    results: &Receiver<(u64, Outcome<O>)>,
     permits: &SyncSender<()>,
     write: &mut impl FnMut(O) -> Result<(), PipelineError>,
-) -> Result<(), PipelineError> {
+) -> Outcome<()> {
     let mut early = BTreeMap::new();
     let mut next = 0;
     for (number, result) in results {
         early.insert(number, result);
         while let Some(result) = early.remove(&next) {
-            write(result?)?;
+            let written = result?.and_then(&mut *write);
+            if written.is_err() {
+                return Ok(written);
+            }
             next += 1;
             // The reader may have finished and gone.
             let _ = permits.try_send(());
         }
     }
-    Ok(())
+    Ok(Ok(()))
 }
 
 #[cfg(test)]
@@ -173,6 +184,27 @@ mod tests {
             .unwrap();
             assert_eq!(found, (0..200).map(|k| k * k).collect::<Vec<_>>());
         }
+    }
+
+    #[test]
+    fn a_panic_of_one_worker_reaches_the_caller() {
+        let result = catch_unwind(|| {
+            ordered(
+                2,
+                |feeder| {
+                    for k in 0..1000 {
+                        if !feeder.push(k) {
+                            break;
+                        }
+                    }
+                    Ok(())
+                },
+                || (),
+                |(), k| if k == 20 { panic!("worker") } else { Ok(()) },
+                |()| Ok(()),
+            )
+        });
+        assert_eq!(result.unwrap_err().downcast_ref(), Some(&"worker"));
     }
 
     #[test]

@@ -6,7 +6,7 @@ use shearq_submissions::{DenoiseMethod, EllipticityType, NoiseSource, Submission
 
 use super::method::{Found, Images, Method, Response, Worker};
 use crate::deconvolve::reference::convolve;
-use crate::deconvolve::{OperatorError, Outcome, Stop};
+use crate::deconvolve::{OperatorError, Outcome};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::psf::star::cut_start;
 
@@ -62,11 +62,11 @@ pub struct Measurement {
     pub outcome: Option<Outcome>,
     /// Noise level used, in image units; NaN if unknown.
     pub noise: f64,
-    /// Sum of the deconvolved stamp, in image units.
+    /// Sum of the deconvolved stamp, in image units; of the stamp itself under the linear update.
     pub flux: f64,
-    /// Radius of the clipped ACF in pixels.
+    /// Radius of the clipped ACF in pixels; of the lags used under the linear update.
     pub radius: f64,
-    /// Qxx + Qyy of the clipped ACF in px².
+    /// Qxx + Qyy of the clipped, or weighted, ACF in px².
     pub size: f64,
 }
 
@@ -89,11 +89,6 @@ impl Measurement {
     /// Code of the stop reason in catalogues; −1 if the network did not run.
     pub fn stop_code(&self) -> i64 {
         self.outcome.map_or(-1, |o| i64::from(o.stop.code()))
-    }
-
-    /// Why the network stopped.
-    pub fn stop(&self) -> Option<Stop> {
-        self.outcome.map(|o| o.stop)
     }
 }
 
@@ -168,7 +163,7 @@ impl Measurer {
     }
 
     /// Measures the galaxy whose full stamp's row `y` is `pixels[y·stride..]`. `header_noise` is the
-    /// image's NOISESIG.
+    /// image's NOISESIG, without which a submission that needs it flags the galaxy.
     pub fn measure(
         &self,
         pixels: &[f32],
@@ -190,8 +185,8 @@ impl Measurer {
             return Measurement::flagged(flag::NO_SCALE);
         }
         let noise = match (self.submission.noise.source, header_noise) {
-            (NoiseSource::Header, Some(sigma)) => sigma,
-            _ => border_noise(
+            (NoiseSource::Header, header) => header.unwrap_or(f64::NAN),
+            (NoiseSource::Border, _) => border_noise(
                 &scratch.full,
                 full,
                 self.submission.noise.border,
@@ -285,7 +280,7 @@ pub struct Steps {
     /// Autocorrelation, zero lag in the middle: all lags for the network, those that the weight
     /// reaches for the linear one.
     pub acf: Array2<f64>,
-    /// The same, NaN beyond the clipping radius.
+    /// The same, NaN beyond the radius within which it is used.
     pub clipped: Array2<f64>,
 }
 

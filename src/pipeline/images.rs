@@ -80,6 +80,11 @@ impl Shard {
         }
     }
 
+    /// Number of parts.
+    pub fn of(&self) -> u32 {
+        self.of
+    }
+
     /// Number of this part, from 1.
     pub fn number(&self) -> u32 {
         self.number

@@ -3,7 +3,7 @@
 //! The centre of a side of N pixels is at (N − 1)/2 counted from 0: between pixels for even N. A cut
 //! of another parity starts half a pixel early, so that its central pixel (odd side) or corner (even
 //! side) is half a pixel before the stamp's centre on both axes. The autocorrelation does not see
-//! such shifts.
+//! such shifts; the window of the linear update would, whose stamp and PSF must have one parity.
 
 use ndarray::{Array2, ArrayView2, s};
 use thiserror::Error;

@@ -105,7 +105,7 @@ pub fn compare(variants: &[Variant], definition: Definition, choice: Choice) -> 
     let images: usize = first.iter().flatten().map(|set| set.images.len()).sum();
     let list: Vec<String> = common.iter().map(u32::to_string).collect();
     let mut notes = vec![
-        format!("Means over set(s) {}, {images} images in all.", list.join(", ")),
+        format!("Means over sets {}; {images} images in all.", list.join(", ")),
         definition_note(definition, choice),
         "ΔQ: jackknife of the paired difference on the same images. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
     ];

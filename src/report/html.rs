@@ -480,7 +480,7 @@ impl Column {
     fn cell(self, k: usize, cell: Option<&Cell>, text: &mut String) {
         let class = self.class();
         match cell {
-            None => text.push_str(&format!("<td{class}></td>")),
+            None | Some(Cell::Empty) => text.push_str(&format!("<td{class}></td>")),
             Some(Cell::Text(words)) if k == 0 => {
                 // Folded on narrow screens, where this column stays while others scroll.
                 let long = words.chars().count() > LONG;

@@ -73,7 +73,17 @@ pub fn warnings(scored: &[ScoredSet]) -> Vec<String> {
         } else {
             format!("set {set}")
         };
-        if score.wrong_convention_wins() {
+        let (correlation, clear) = score.match_with_truth();
+        if rows.used == 0 {
+            lines.push(format!(
+                "Warning: no galaxy of {name} has an ellipticity; its figures are those of an empty submission."
+            ));
+        } else if !clear {
+            lines.push(format!(
+                "Warning: no convention clearly correlates with the truth in {name} (best {correlation:.2}, convention {}): too much noise to tell; --convention sets one.",
+                score.matched.number()
+            ));
+        } else if score.wrong_convention_wins() {
             let (best, matched) = (
                 &score.conventions[score.best.index()],
                 &score.conventions[score.matched.index()],
@@ -147,11 +157,11 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition, choice
         let (mean, errors) = means(scored);
         let mut row = vec![
             Cell::text("mean"),
-            Cell::text(""),
+            Cell::Empty,
             Cell::number(scored.iter().map(|s| s.score.images as f64).sum(), 0),
         ];
         row.extend(figure_cells(&mean, errors.as_ref()));
-        row.push(Cell::text(""));
+        row.push(Cell::Empty);
         let best = scored
             .iter()
             .map(|s| s.score.conventions[s.score.best.index()].quality.q)
@@ -208,7 +218,7 @@ pub fn spectra(
         };
         rows.push(vec![
             Cell::text("mean"),
-            Cell::text(""),
+            Cell::Empty,
             Cell::number(mean(|s| s.0.q), 2),
             Cell::number(mean(|s| s.0.sigma_sys * 1e4), 4),
             Cell::number(mean(|s| s.1.cl.m), 4),

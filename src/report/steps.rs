@@ -5,7 +5,7 @@ use ndarray::Array2;
 use super::figure::{ColourMap, ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
 use crate::pipeline::galaxy::Steps;
 
-/// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, clipped ACF.
+/// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, and the part of it that is used.
 pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
     use ColourMap::{Diverging, Viridis};
     let panel = |title: &str, image, map, stretch| ImagePanel {
@@ -23,7 +23,7 @@ pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
             panel("Deconvolved", steps.deconvolved, Viridis, Stretch::Linear),
             panel("Residual", steps.residual, Diverging, Stretch::Linear),
             panel("ACF", steps.acf, Viridis, Stretch::Linear),
-            panel("ACF clipped", steps.clipped, Viridis, Stretch::Linear),
+            panel("ACF used", steps.clipped, Viridis, Stretch::Linear),
         ],
     }
 }

@@ -25,6 +25,8 @@ pub enum TableFormat {
 /// One cell.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Cell {
+    /// Nothing, in a column of words or of numbers.
+    Empty,
     /// Words.
     Text(String),
     /// A number, perhaps with an error, to be printed with so many decimals.
@@ -65,6 +67,7 @@ impl Cell {
     /// For people; `latex` wraps numbers in mathematics.
     fn print(&self, latex: bool) -> String {
         match self {
+            Cell::Empty => String::new(),
             Cell::Text(words) if latex => escape_latex(words),
             Cell::Text(words) => words.clone(),
             Cell::Number { value, .. } if value.is_nan() => "–".into(),
@@ -241,6 +244,7 @@ impl Table {
             let numbers: Option<Vec<(f64, f64)>> = cells()
                 .map(|cell| match cell {
                     Cell::Text(_) => None,
+                    Cell::Empty => Some((f64::NAN, f64::NAN)),
                     Cell::Number { value, error, .. } => Some((*value, error.unwrap_or(f64::NAN))),
                 })
                 .collect();
@@ -277,6 +281,12 @@ impl Table {
             let mut fields = Vec::new();
             for (k, cell) in row.iter().enumerate() {
                 match cell {
+                    Cell::Empty => {
+                        fields.push(String::new());
+                        if self.has_errors(k) {
+                            fields.push(String::new());
+                        }
+                    }
                     Cell::Text(words) => fields.push(quote(words)),
                     Cell::Number { value, error, .. } => {
                         fields.push(number(*value));
@@ -300,11 +310,18 @@ impl Table {
                 let mut object = Map::new();
                 for (heading, cell) in self.headings.iter().zip(row) {
                     match cell {
+                        Cell::Empty => {
+                            object.insert(heading.key.into(), Value::Null);
+                        }
                         Cell::Text(words) => {
                             object.insert(heading.key.into(), json!(words));
                         }
-                        Cell::Number { value, error, .. } => {
-                            object.insert(heading.key.into(), json!(value));
+                        Cell::Number {
+                            value,
+                            error,
+                            decimals,
+                        } => {
+                            object.insert(heading.key.into(), exact(*value, *decimals));
                             if let Some(error) = error {
                                 object.insert(format!("{}_error", heading.key), json!(error));
                             }
@@ -315,6 +332,16 @@ impl Table {
             })
             .collect();
         json!({ "title": self.title, "rows": rows, "notes": self.notes })
+    }
+}
+
+/// A number as JSON: counts without a decimal point.
+fn exact(value: f64, decimals: usize) -> Value {
+    const EXACT: f64 = 9_007_199_254_740_992.0;
+    if decimals == 0 && value.fract() == 0.0 && value.abs() < EXACT {
+        json!(value as i64)
+    } else {
+        json!(value)
     }
 }
 
@@ -335,6 +362,11 @@ fn escape_latex(words: &str) -> String {
                 text.push(c);
             }
             '√' => text.push_str("$\\sqrt{}$"),
+            'Δ' => text.push_str("$\\Delta$"),
+            'λ' => text.push_str("$\\lambda$"),
+            'µ' | 'μ' => text.push_str("$\\mu$"),
+            'ℓ' => text.push_str("$\\ell$"),
+            '³' => text.push_str("$^{3}$"),
             'χ' => text.push_str("$\\chi$"),
             'ε' => text.push_str("$\\varepsilon$"),
             'σ' => text.push_str("$\\sigma$"),

@@ -110,6 +110,17 @@ pub struct SetSimulator {
     transform: PsfTransform,
 }
 
+/// One galaxy as it might have been.
+#[derive(Debug, Clone, Copy)]
+pub struct Version {
+    /// Ellipticity before lensing.
+    pub intrinsic: Shear,
+    /// The shear on it.
+    pub shear: Shear,
+    /// Factor of its noise.
+    pub noise: f32,
+}
+
 /// What is common to all galaxies of one image.
 pub struct ImageFields {
     /// Image number, from 1.
@@ -275,18 +286,22 @@ impl SetSimulator {
         out: &mut [f32],
     ) -> Shear {
         let e = fields.intrinsic[(ix, iy)];
-        let lensed = (Shear::new(e.re, e.im), self.shear_at(ix, iy));
-        self.draw_as(fields, (ix, iy), lensed, scratch, out);
+        let version = Version {
+            intrinsic: Shear::new(e.re, e.im),
+            shear: self.shear_at(ix, iy),
+            noise: 1.0,
+        };
+        self.draw_as(fields, (ix, iy), version, scratch, out);
         self.observed(fields, ix, iy)
     }
 
     /// Draws galaxy `(ix, iy)` like [`SetSimulator::draw`], with all of its random numbers the same,
-    /// but of another intrinsic ellipticity and under another shear.
+    /// but as another version of it.
     pub fn draw_as(
         &self,
         fields: &ImageFields,
         (ix, iy): (usize, usize),
-        lensed: (Shear, Shear),
+        version: Version,
         scratch: &mut RenderScratch,
         out: &mut [f32],
     ) {
@@ -297,7 +312,7 @@ impl SetSimulator {
         let centre = (STAMP as f64 - 1.0) / 2.0;
         let x = centre + rng.random_range(-0.5..0.5);
         let y = centre + rng.random_range(-0.5..0.5);
-        let (galaxy, snr) = self.galaxy(lensed, &mut rng);
+        let (galaxy, snr) = self.galaxy(version.intrinsic, version.shear, &mut rng);
         let psf = self
             .transform
             .of(fields.psf.at(ix, iy))
@@ -306,9 +321,10 @@ impl SetSimulator {
         // S/N = √(Σ I²)/σ over the stamp.
         let norm: f64 = out.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
         let scale = (snr * NOISE_SIGMA / norm.sqrt()) as f32;
+        let sigma = version.noise * NOISE_SIGMA as f32;
         for value in out.iter_mut() {
             let noise: f32 = StandardNormal.sample(&mut rng);
-            *value = *value * scale + noise * NOISE_SIGMA as f32;
+            *value = *value * scale + noise * sigma;
         }
     }
 
@@ -319,7 +335,7 @@ impl SetSimulator {
     }
 
     /// The galaxy of the set's kind, of an intrinsic ellipticity and under a shear, and its S/N.
-    fn galaxy(&self, (intrinsic, shear): (Shear, Shear), rng: &mut ChaCha8Rng) -> (Galaxy, f64) {
+    fn galaxy(&self, intrinsic: Shear, shear: Shear, rng: &mut ChaCha8Rng) -> (Galaxy, f64) {
         let shape = intrinsic.sheared_by(shear);
         let (mut bulge, mut disc) = match self.kind.image {
             ImageType::SmallGalaxy => (1.8, 2.6),

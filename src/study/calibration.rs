@@ -31,6 +31,8 @@ use crate::simulate::galaxy::{Component, Sersic};
 pub const SNR_DB: [f64; 3] = [10.0, 20.0, 40.0];
 /// log₁₀ λ of the curves: −6 to 6 in halves.
 pub const LOG_LAMBDA: [f64; 25] = log_lambda();
+/// Place of the paper's choice among them, λ = 10⁻⁴.
+pub const PAPER_LAMBDA: usize = 4;
 /// S/N in dB of the CTR curve at the λ of the paper's Fig. 4.
 pub const CTR_SNR_DB: [f64; 7] = [10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0];
 /// log₁₀ of that λ.

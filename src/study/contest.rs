@@ -1,13 +1,12 @@
 //! Submissions held against each other and against what can be reached: scatter, bias, Q and cost.
 
-use std::path::Path;
-
 use serde::{Deserialize, Serialize};
+use shearq_scoring::resample::mean_over_sets;
 use shearq_submissions::Submission;
 
 use super::bias::{Bias, biases};
-use super::bound::cramer_rao;
-use super::reproduce::{Plan, SetResult};
+use super::bound::{cramer_rao, sample_limit};
+use super::reproduce::{Plan, Result, SetResult, Study};
 use super::speed;
 use crate::io::run::{read_record, write_record};
 use crate::pipeline::PipelineError;
@@ -22,25 +21,26 @@ use crate::simulate::kinds::SetKind;
 pub struct SetBiases {
     /// Set number.
     pub set: u32,
-    /// Cramér–Rao bound on the scatter of ε per component.
-    pub bound: f64,
+    /// Cramér–Rao bound on the scatter of ε per component, where there is one.
+    pub bound: Option<f64>,
+    /// Mean Q of spectra of the plan's images with a scatter at the bound.
+    pub limit: Option<f64>,
     /// One per submission, in the plan's order.
     pub biases: Vec<Bias>,
 }
 
-/// Measures biases on the galaxies of `images` images of each set, keeping each set's result in
-/// `folder`, which [`super::reproduce::run_sets`] has claimed for the same plan.
+/// Measures biases on the galaxies of `images` images of each set, keeping each set's result.
 ///
 /// # Errors
 /// Where a file cannot be written, or read back.
 pub fn bias_sets(
-    plan: &Plan,
+    study: &Study<'_>,
     sets: &[u32],
     images: u32,
-    folder: &Path,
     threads: usize,
     progress: &mut dyn Progress,
-) -> Result<Vec<SetBiases>, PipelineError> {
+) -> std::result::Result<Vec<SetBiases>, PipelineError> {
+    let &Study { plan, folder, .. } = study;
     let measurers = measurers(&plan.submissions)?;
     let numbers: Vec<u32> = (1..=images).collect();
     let mut found = Vec::new();
@@ -53,9 +53,11 @@ pub fn bias_sets(
         }
         let simulator = simulator(set, plan.simulation)?;
         progress.note(&format!("set {set:02}"));
+        let bound = cramer_rao(&simulator);
         let result = SetBiases {
             set,
-            bound: cramer_rao(&simulator),
+            bound,
+            limit: bound.map(|bound| sample_limit(&simulator, bound, plan.images)),
             biases: biases(&simulator, &numbers, &measurers, threads, progress)?,
         };
         write_record(&path, &result)?;
@@ -72,12 +74,12 @@ pub fn contest_table(
     plan: &Plan,
     results: &[SetResult],
     biases: &[SetBiases],
-) -> Result<Table, PipelineError> {
+) -> std::result::Result<Table, PipelineError> {
     let costs = plan
         .submissions
         .iter()
         .map(|submission| speed::whole(submission, plan.simulation))
-        .collect::<Result<Vec<f64>, _>>()?;
+        .collect::<std::result::Result<Vec<f64>, _>>()?;
     let mut rows = Vec::new();
     for (result, bias) in results.iter().zip(biases) {
         for (k, submission) in plan.submissions.iter().enumerate() {
@@ -85,18 +87,24 @@ pub fn contest_table(
         }
     }
     if results.len() > 1 {
+        let limits = biases.iter().filter_map(|b| b.limit);
+        let limit = mean_over_sets(&limits.map(|limit| (limit, None)).collect::<Vec<_>>()).0;
         for (k, submission) in plan.submissions.iter().enumerate() {
-            let mean = |value: &dyn Fn(&SetResult) -> f64| {
-                results.iter().map(value).sum::<f64>() / results.len() as f64
+            let mean = |value: &dyn Fn(&Result) -> (f64, Option<f64>), decimals: usize| {
+                let all: Vec<_> = results.iter().map(|r| value(&r.results[k])).collect();
+                let (mean, error) = mean_over_sets(&all);
+                Cell::with_error(mean, error, decimals)
             };
             let mut row = vec![
                 Cell::text("mean"),
-                Cell::text(""),
+                Cell::Empty,
                 Cell::text(&submission.name),
             ];
-            row.extend((0..7).map(|_| Cell::text("")));
-            row.push(Cell::number(mean(&|r| r.results[k].figures.q), 1));
-            row.push(Cell::number(mean(&|r| r.results[k].figures.values()[1]), 0));
+            row.extend((0..7).map(|_| Cell::Empty));
+            row.push(mean(&|r| (r.figures.q, r.errors.map(|e| e.q)), 1));
+            row.push(mean(&spectrum, 0));
+            row.push(Cell::number(limit, 0));
+            row.push(Cell::Empty);
             row.push(Cell::number(costs[k], 0));
             rows.push(row);
         }
@@ -114,6 +122,8 @@ pub fn contest_table(
         ("leakage", "PSF leakage"),
         ("q", "Q catalogue"),
         ("q_spectrum", "Q spectrum"),
+        ("q_limit", "limit"),
+        ("unmeasured", "unmeasured"),
         ("microseconds", "µs"),
     ];
     Ok(Table {
@@ -121,9 +131,9 @@ pub fn contest_table(
         headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
         rows,
         notes: vec![
-            "Scatter of ε per component after dividing by its slope, and over the Cramér–Rao bound of the galaxies.".into(),
-            "m and c from pairs of galaxies with shears of ± 0.02, intrinsic ellipticities ± e and the same noise; leakage: c along the PSF's ellipticity.".into(),
-            "Q of the catalogues, and of cross-spectra between groups of images, in which noise has no mean; leaderboard definition, standard convention.".into(),
+            "Scatter of ε per component after dividing by its slope, and over the Cramér–Rao bound of the galaxies (none for bulges off their discs' centres).".into(),
+            "m and c from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign; leakage: c along the PSF's ellipticity.".into(),
+            "Q of the catalogues, and of cross-spectra between groups of images, in which noise has no mean; leaderboard definition, standard convention. limit: mean Q that noise at the bound leaves of a perfect spectrum; unmeasured: galaxies without ellipticity, for which m and c stand not.".into(),
         ],
     })
 }
@@ -136,10 +146,6 @@ fn row(
     cost: f64,
 ) -> Vec<Cell> {
     let (own, biases) = (&result.results[k], &bias.biases[k]);
-    let errors = own.errors.map(|e| e.values());
-    let figure = |at: usize, decimals: usize| {
-        Cell::with_error(own.figures.values()[at], errors.map(|e| e[at]), decimals)
-    };
     let scaled = |value: f64, error: f64, scale: f64| {
         Cell::with_error(value * scale, Some(error * scale), 1)
     };
@@ -149,14 +155,27 @@ fn row(
         Cell::text(SetKind::of(result.set).map_or("", |kind| kind.image.label())),
         Cell::text(&submission.name),
         Cell::with_error(scatter, Some(own.response.rms_scatter_error()), 4),
-        Cell::number(scatter / bias.bound, 3),
+        Cell::number(bias.bound.map_or(f64::NAN, |bound| scatter / bound), 3),
         scaled(biases.m[0], biases.m_error[0], 1e3),
         scaled(biases.m[1], biases.m_error[1], 1e3),
         scaled(biases.c[0], biases.c_error[0], 1e4),
         scaled(biases.c[1], biases.c_error[1], 1e4),
         Cell::with_error(biases.leakage, Some(biases.leakage_error), 3),
-        figure(0, 1),
-        figure(1, 0),
+        Cell::with_error(own.figures.q, own.errors.map(|e| e.q), 1),
+        {
+            let (q, error) = spectrum(own);
+            Cell::with_error(q, error, 0)
+        },
+        Cell::number(bias.limit.unwrap_or(f64::NAN), 0),
+        Cell::number((own.response.flagged + biases.dropped) as f64, 0),
         Cell::number(cost, 0),
     ]
+}
+
+/// Q of a submission's cross-spectrum and its error.
+fn spectrum(result: &Result) -> (f64, Option<f64>) {
+    (
+        result.q_spectrum.unwrap_or(f64::NAN),
+        result.q_spectrum_error,
+    )
 }

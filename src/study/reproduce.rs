@@ -3,15 +3,16 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shearq_scoring::quality::quality;
+use shearq_scoring::quality::{quality, quality_error};
 use shearq_scoring::{
     BINS, Choice, Convention, FieldSum, Figures, Noise, Options, Row, SetImages, SetScore,
-    SetScorer,
+    SetScorer, cross_spectrum,
 };
 use shearq_submissions::Submission;
 
 use super::response::{Regression, Response};
-use crate::io::run::{read_record, write_record};
+use crate::io::FileError;
+use crate::io::run::{Claim, claim, read_record, write_record};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Progress;
 use crate::pipeline::measure::MeasuredRow;
@@ -30,6 +31,30 @@ pub struct Plan {
     pub images: u32,
     /// Submissions, resolved.
     pub submissions: Vec<Submission>,
+}
+
+/// A folder of results that belongs to a plan for as long as this lives.
+#[derive(Debug)]
+pub struct Study<'a> {
+    /// What is done.
+    pub plan: &'a Plan,
+    /// Where results are kept.
+    pub folder: &'a Path,
+    _claim: Claim,
+}
+
+impl<'a> Study<'a> {
+    /// Makes `folder` that of `plan`.
+    ///
+    /// # Errors
+    /// Where it holds results of another plan, or cannot be written to.
+    pub fn open(plan: &'a Plan, folder: &'a Path) -> std::result::Result<Self, FileError> {
+        Ok(Study {
+            plan,
+            folder,
+            _claim: claim(&folder.join("plan.json"), plan)?,
+        })
+    }
 }
 
 /// One submission on one set.
@@ -53,6 +78,10 @@ pub struct Result {
     pub ee: [f64; BINS],
     /// Q of those bandpowers over the square of the response's mean slope.
     pub q_calibrated: f64,
+    /// Q of the cross-spectrum of the images' groups, `None` for a single image.
+    pub q_spectrum: Option<f64>,
+    /// Its standard error, `None` for fewer than four images.
+    pub q_spectrum_error: Option<f64>,
     /// How ellipticities follow the true ones.
     pub response: Response,
 }
@@ -77,19 +106,18 @@ fn result_path(folder: &Path, set: u32) -> PathBuf {
     folder.join(format!("sets/set{set:02}.json"))
 }
 
-/// Runs `plan` on `sets`, keeping each set's result in `folder` as soon as it is there; results that
-/// are there already, of the same plan, are read.
+/// Runs the submissions on `sets`, keeping each set's result as soon as it is there; results that are
+/// there already are read.
 ///
 /// # Errors
-/// Where the folder holds results of another plan, or a file cannot be written.
+/// Where a file cannot be written, or read back.
 pub fn run_sets(
-    plan: &Plan,
+    study: &Study<'_>,
     sets: &[u32],
-    folder: &Path,
     threads: usize,
     progress: &mut dyn Progress,
 ) -> std::result::Result<Vec<SetResult>, PipelineError> {
-    let _claim = crate::io::run::claim(&folder.join("plan.json"), plan)?;
+    let &Study { plan, folder, .. } = study;
     // Submissions that differ in name alone are measured once.
     let (distinct, place) = distinct(&plan.submissions);
     let measurers = measurers(&distinct)?;
@@ -148,6 +176,7 @@ pub fn run_sets(
                 .zip(&place)
                 .map(|(submission, &at)| {
                     let score = &scores[at];
+                    let spectrum = spectrum_quality(score, &sums[at]);
                     Result {
                         submission: submission.name.clone(),
                         figures: score.figures,
@@ -158,6 +187,8 @@ pub fn run_sets(
                         matched: score.matched,
                         ee: score.spectra().ee,
                         q_calibrated: calibrated_q(score, &responses[at]),
+                        q_spectrum: spectrum.map(|(q, _)| q),
+                        q_spectrum_error: spectrum.and_then(|(_, error)| error),
                         response: responses[at],
                     }
                 })
@@ -175,6 +206,16 @@ fn calibrated_q(score: &SetScore, response: &Response) -> f64 {
     let slope = response.slope.iter().sum::<f64>() / 2.0;
     let calibrated = score.spectra().ee.map(|power| power / (slope * slope));
     quality(&score.bins, &calibrated, &score.true_ee).q
+}
+
+/// Q of the cross-spectrum of `images`, with its error where that is known.
+fn spectrum_quality(score: &SetScore, images: &SetImages) -> Option<(f64, Option<f64>)> {
+    let cross = cross_spectrum(&score.grid, images, Convention::STANDARD).ok()?;
+    let truth = &score.true_ee;
+    let error = cross
+        .covariance
+        .map(|covariance| quality_error(&cross.bins, &cross.power, truth, &covariance));
+    Some((quality(&cross.bins, &cross.power, truth).q, error))
 }
 
 /// Submissions without repetition, and the place of each one given among them.

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use shearq_scoring::Shear;
 
+use crate::io::run::nan_for_null;
 use crate::pipeline::galaxy::Measurement;
 
 /// Least squares of measured against true ellipticities, component by component:
@@ -32,15 +33,20 @@ pub struct Response {
     /// Galaxies left out because they are flagged.
     pub flagged: u64,
     /// Slope of the reported ellipticity against the true shear-type one, per component.
+    #[serde(deserialize_with = "nan_for_null")]
     pub slope: [f64; 2],
     /// Standard errors of the slopes.
+    #[serde(deserialize_with = "nan_for_null")]
     pub slope_error: [f64; 2],
     /// Reported ellipticity of a round galaxy.
+    #[serde(deserialize_with = "nan_for_null")]
     pub offset: [f64; 2],
     /// Standard errors of the offsets.
+    #[serde(deserialize_with = "nan_for_null")]
     pub offset_error: [f64; 2],
     /// Standard deviation of the ellipticity about the line, divided by the slope: the scatter of a
     /// calibrated ε.
+    #[serde(deserialize_with = "nan_for_null")]
     pub scatter: [f64; 2],
 }
 

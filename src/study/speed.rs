@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use ndarray::ArrayView2;
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
-use shearq_submissions::{Start, Submission, Update};
+use shearq_submissions::{DenoiseMethod, NoiseSource, Start, Submission, Update};
 
 use crate::deconvolve::reference::Matrices;
 use crate::deconvolve::{Network, Rule, Spectral, Step};
@@ -26,7 +26,7 @@ use crate::report::figure::{LinePlot, Series, Style};
 use crate::report::table::{Cell, Heading, Table};
 use crate::shape::{AdaptiveMoments, Autocorrelation, ClippedMoments};
 use crate::simulate::render::RenderScratch;
-use crate::simulate::set::{STAMP, SetSimulator, SimulationSettings};
+use crate::simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, SimulationSettings};
 
 /// Different noisy galaxies that a timing runs through, so that no branch is learnt by heart.
 const SAMPLE: usize = 64;
@@ -85,7 +85,18 @@ impl Inputs {
         let mut scratch = measurer.scratch();
         measurer.set_psf(&mut scratch, Some(psf.view()));
         Ok(time(|k| {
-            black_box(measurer.measure(&self.stamps[k], STAMP, None, &mut scratch));
+            let noise = Some(NOISE_SIGMA);
+            black_box(measurer.measure(&self.stamps[k], STAMP, noise, &mut scratch));
+        }))
+    }
+
+    /// Microseconds of taking a PSF.
+    fn taking_a_psf(&self, submission: &Submission) -> Result<f64, PipelineError> {
+        let psf = self.psf(submission.psf.size);
+        let measurer = Measurer::new(submission, STAMP)?;
+        let mut scratch = measurer.scratch();
+        Ok(time(|_| {
+            measurer.set_psf(&mut scratch, Some(black_box(psf.view())))
         }))
     }
 
@@ -119,6 +130,54 @@ pub fn stages(
     let mut render = RenderScratch::new();
     let mut stamp = vec![0.0; STAMP * STAMP];
     let mut rows: Vec<(&str, f64)> = Vec::new();
+    let before = rows.len();
+    if submission.noise.source == NoiseSource::Border {
+        let mut border = Vec::new();
+        rows.push((
+            "noise level",
+            time(|k| {
+                let stamp = &inputs.stamps[k];
+                black_box(border_noise(
+                    stamp,
+                    STAMP,
+                    submission.noise.border,
+                    &mut border,
+                ));
+            }),
+        ));
+    }
+    if submission.denoise.method == DenoiseMethod::WaveletWiener {
+        let filter = WaveletWiener::new(STAMP, &submission.denoise);
+        let mut filter_scratch = filter.scratch();
+        rows.push((
+            "denoise",
+            time(|k| {
+                stamp.copy_from_slice(&inputs.stamps[k]);
+                filter.apply(black_box(&mut stamp), 1.0, &mut filter_scratch);
+            }),
+        ));
+    }
+    let cut = inputs.cuts(n);
+    let mut notes = vec![format!(
+        "One thread; fastest of several passes over {SAMPLE} galaxies."
+    )];
+    let linear = submission.deconvolution.update == Update::Linear;
+    if linear {
+        linear_stages(submission, psf.view(), &cut, &mut rows)?;
+    } else {
+        notes.extend(network_stages(submission, psf.view(), &cut, &mut rows)?);
+    }
+    let whole = inputs.whole(submission)?;
+    let stages: f64 = rows[before..].iter().map(|(_, time)| time).sum();
+    let rest = if linear {
+        "sheared noise (one galaxy in four) and the rest"
+    } else {
+        "the rest"
+    };
+    rows.push((rest, whole - stages));
+    rows.push(("whole measurement", whole));
+    let taken = inputs.taking_a_psf(submission)?;
+    rows.push(("take a PSF, where each galaxy has its own", taken));
     rows.push((
         "simulate",
         time(|k| {
@@ -129,38 +188,6 @@ pub fn stages(
             );
         }),
     ));
-    let mut border = Vec::new();
-    rows.push((
-        "noise level",
-        time(|k| {
-            let level = border_noise(
-                &inputs.stamps[k],
-                STAMP,
-                submission.noise.border,
-                &mut border,
-            );
-            black_box(level);
-        }),
-    ));
-    let filter = WaveletWiener::new(STAMP, &submission.denoise);
-    let mut filter_scratch = filter.scratch();
-    rows.push((
-        "denoise (den variants)",
-        time(|k| {
-            stamp.copy_from_slice(&inputs.stamps[k]);
-            filter.apply(black_box(&mut stamp), 1.0, &mut filter_scratch);
-        }),
-    ));
-    let cut = inputs.cuts(n);
-    let mut notes = vec![format!(
-        "One thread; fastest of several passes over {SAMPLE} galaxies."
-    )];
-    if submission.deconvolution.update == Update::Linear {
-        linear_stages(submission, psf.view(), &cut, &mut rows)?;
-    } else {
-        notes.extend(network_stages(submission, psf.view(), &cut, &mut rows)?);
-    }
-    rows.push(("whole measurement", inputs.whole(submission)?));
     Ok(Table {
         title: format!("Stages of {}", submission.name),
         headings: vec![
@@ -257,12 +284,7 @@ fn linear_stages(
     let spectral = Spectral::new(n, submission.psf.size, &submission.deconvolution)?;
     let (mut own, mut scratch) = (spectral.psf(), spectral.scratch());
     let mut lags = spectral.lags();
-    rows.push((
-        "take a PSF",
-        time(|_| {
-            let _ = black_box(spectral.set_psf(psf, &mut scratch, &mut own));
-        }),
-    ));
+    spectral.set_psf(psf, &mut scratch, &mut own)?;
     rows.push((
         "deconvolve and autocorrelate, with response",
         time(|k| spectral.autocorrelate(&own, black_box(&stamps[k]), 1.0, &mut scratch, &mut lags)),

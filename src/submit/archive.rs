@@ -17,6 +17,12 @@ use crate::io::atomic::{PartFile, PartFolder};
 /// Largest manifest accepted, in bytes: some four times that of 999 images of 99 sets.
 const MAX_MANIFEST: u64 = 1 << 26;
 
+/// Most bytes that one byte of an archive may unpack to, beyond the first [`FREE`]: numbers in ASCII come
+/// to three, blank catalogues to a hundred or so.
+const MAX_RATIO: u64 = 300;
+/// Bytes that any archive may unpack to.
+const FREE: u64 = 1 << 24;
+
 /// Whether a path's ending is that of an archive.
 pub fn is_archive(path: &Path) -> bool {
     let name = path.to_string_lossy();
@@ -141,6 +147,8 @@ pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileE
 pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     let cannot_read = || FileError::doing::<std::io::Error>(path, "cannot read the archive");
     let file = File::open(path).map_err(cannot_read())?;
+    let most = FREE + MAX_RATIO * file.metadata().map_err(cannot_read())?.len();
+    let mut total = 0u64;
     let mut archive = Archive::new(GzDecoder::new(BufReader::new(file)));
     let mut unpacked = Unpacked {
         manifest: None,
@@ -158,6 +166,12 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
             || (name == MANIFEST_FILE && unpacked.manifest.is_some())
         {
             let message = format!("it holds `{name}` twice");
+            return Err(FileError::new(path, message));
+        }
+        total = total.saturating_add(entry.size());
+        if total > most {
+            let message =
+                format!("it unpacks to more than {most} bytes, {MAX_RATIO} times its own");
             return Err(FileError::new(path, message));
         }
         let mut bytes = Vec::new();

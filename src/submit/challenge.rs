@@ -8,7 +8,7 @@
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::{
-    Convention, FieldSum, Grid, Row, SCORED, SetImages, cross_bandpowers, measured_bandpowers,
+    Convention, FieldSum, Grid, Row, SCORED, SetImages, cross_spectrum, measured_bandpowers,
 };
 
 use crate::io::FileError;
@@ -119,29 +119,47 @@ pub enum Spectrum {
     Cross,
 }
 
-/// The power spectrum of a set's catalogues in the challenge's format.
+/// Covariance of the eight bandpowers of a power-spectrum file.
+pub type Covariance = [[f64; SCORED.end - SCORED.start]; SCORED.end - SCORED.start];
+
+/// The power spectrum of a set's catalogues in the challenge's format, and where it is known, the
+/// covariance of its bandpowers.
 ///
 /// # Errors
-/// Where a catalogue cannot be read, or nothing of it falls on the grid.
+/// Where a catalogue cannot be read, no ellipticity falls on the grid, or there is one image and none to
+/// multiply it with.
 pub fn spectrum_text(
     grid: &Grid,
     catalogues: &[PathBuf],
     spectrum: Spectrum,
-) -> Result<String, FileError> {
+) -> Result<(String, Option<Covariance>), FileError> {
     let mut images = SetImages::new(grid);
+    let mut used = 0;
     for path in catalogues {
         let mut sum = FieldSum::new(grid);
-        sum.add_image(grid, read_rows(path, &COLUMNS)?);
+        used += sum.add_image(grid, read_rows(path, &COLUMNS)?).used;
         images.add(&sum);
     }
-    let (bins, power) = match spectrum {
-        Spectrum::Averaged => measured_bandpowers(grid, images.total(), Convention::STANDARD),
-        Spectrum::Cross => cross_bandpowers(grid, &images, Convention::STANDARD),
+    if used == 0 {
+        let message =
+            "neither this catalogue nor others of the set have an ellipticity on the grid";
+        return Err(FileError::new(&catalogues[0], message));
     }
-    .map_err(|error| FileError::new(&catalogues[0], error))?;
-    Ok(SCORED
+    let standard = Convention::STANDARD;
+    let found = match spectrum {
+        Spectrum::Averaged => measured_bandpowers(grid, images.total(), standard)
+            .map(|(bins, power)| (bins, power, None)),
+        Spectrum::Cross => cross_spectrum(grid, &images, standard)
+            .map(|cross| (cross.bins, cross.power, cross.covariance)),
+    };
+    let (bins, power, covariance) = found.map_err(|error| FileError::new(&catalogues[0], error))?;
+    let text = SCORED
         .map(|b| format!("{} {:.6} {:.12e}\n", b + 1, bins.l[b], power[b]))
-        .collect())
+        .collect();
+    let first = SCORED.start;
+    let scored = covariance
+        .map(|all| std::array::from_fn(|i| std::array::from_fn(|j| all[first + i][first + j])));
+    Ok((text, scored))
 }
 
 /// Reads a power-spectrum file as it is; [`super::check`] says whether it is complete.

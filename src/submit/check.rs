@@ -1,6 +1,6 @@
 //! Checks of a submission before it is sent.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::{
@@ -94,6 +94,7 @@ fn check_files(path: &Path, expected: &Expected) -> Vec<Finding> {
         check_manifest(path, &files, &mut report);
     }
     let mut sets: BTreeMap<u32, SetFiles> = BTreeMap::new();
+    let mut spectra = BTreeSet::new();
     let mut methods: BTreeMap<String, PathBuf> = BTreeMap::new();
     for file in &files {
         let kind = Kind::of(file);
@@ -118,6 +119,7 @@ fn check_files(path: &Path, expected: &Expected) -> Vec<Finding> {
             None => looks_like_spectrum(file),
         };
         if spectrum {
+            spectra.extend(kind.as_ref().map(Kind::set));
             check_spectrum(file, kind.as_ref(), expected, &mut report);
             continue;
         }
@@ -152,6 +154,14 @@ fn check_files(path: &Path, expected: &Expected) -> Vec<Finding> {
             "method",
             format!("files of several methods: {}", names.join(", ")),
         );
+    }
+    if path.is_dir() && !(sets.is_empty() && spectra.is_empty()) {
+        for set in expected.truth.keys() {
+            if !sets.contains_key(set) && !spectra.contains(set) {
+                let message = format!("there is no file for set {set}, of which there are data");
+                report.warn(path, "sets", message);
+            }
+        }
     }
     for (set, files) in &mut sets {
         check_images(*set, files, path, expected, &mut report);
@@ -401,20 +411,17 @@ fn check_against_truth(
     };
     let standard = &score.conventions[Convention::STANDARD.index()];
     let matched = &score.conventions[score.matched.index()];
-    // Two uncorrelated sets of N modes correlate by 1/√N; ask for a clear excess over that.
-    let modes: usize = SCORED.map(|b| score.bins.modes[b]).sum();
-    let noise = (2.0 / modes as f64).sqrt();
-    if matched.correlation < 4.0 * noise {
-        let message = format!(
-            "set {set}: no convention correlates with the true shear (best {:.2})",
-            matched.correlation
-        );
+    let (best, clear) = score.match_with_truth();
+    if !clear {
+        let message =
+            format!("set {set}: no convention correlates with the true shear (best {best:.2})");
         report.warn(path, "correlation", message);
         return;
     }
-    if score.matched != Convention::STANDARD
-        && matched.correlation - standard.correlation > 4.0 * noise
-    {
+    // Twice the noise of a correlation of that many modes, for both.
+    let modes: usize = SCORED.map(|b| score.bins.modes[b]).sum();
+    let excess = matched.correlation - standard.correlation;
+    if score.matched != Convention::STANDARD && excess > 4.0 * (2.0 / modes as f64).sqrt() {
         let message = format!(
             "set {set}: wrong convention suspected: {} (convention {}) correlates with the true shear by {:.2}, as given only by {:.2}",
             matched.convention.describe(),
@@ -453,8 +460,21 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
         );
     }
     let bins = Bins::new(&expected.grid, Definition::Leaderboard);
-    for SpectrumLine { index, l, power } in &lines {
-        let bin = *index as usize;
+    let place = |line: &SpectrumLine| bins.l.get((line.index as usize).wrapping_sub(1)).copied();
+    let off = |line: &SpectrumLine| {
+        place(line).filter(|centre| !(line.l - centre).abs().le(&(0.5 * bins.width)))
+    };
+    let wrong = lines.iter().filter_map(|line| Some((line, off(line)?)));
+    if let Some((SpectrumLine { index, l, .. }, centre)) = wrong.clone().next() {
+        let message = format!(
+            "{} of {} multipoles are not those of {n} × {n} galaxies (--grid): bin {index} has l = {l}, expected {centre:.1}",
+            wrong.count(),
+            lines.len(),
+            n = expected.grid.n
+        );
+        report.error(path, "multipole", message);
+    }
+    for SpectrumLine { index, power, .. } in &lines {
         if !power.is_finite() {
             report.error(
                 path,
@@ -467,13 +487,6 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
                 "negative",
                 format!("the power of bin {index} is negative: {power:e} (noise can do that to cross-spectra)"),
             );
-        }
-        if (1..=bins.l.len()).contains(&bin) {
-            let centre = bins.l[bin - 1];
-            if !(l - centre).abs().le(&(0.5 * bins.width)) {
-                let message = format!("bin {index} has l = {l}; expected {centre:.1}");
-                report.error(path, "multipole", message);
-            }
         }
     }
     let truth = kind.and_then(|kind| expected.truth.get(&kind.set()));
@@ -488,7 +501,8 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
                 sums.1 + true_power[line.index as usize - 1],
             )
         });
-        let ratio = sum / true_sum;
+        // Noise alone makes a cross-spectrum negative.
+        let ratio = (sum / true_sum).abs();
         if !(0.01..100.0).contains(&ratio) {
             let message = format!(
                 "the power is {ratio:.1e} times the true one; the unit is ℓ²C_ℓ/2π (noise raises it, too)"

@@ -7,6 +7,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::challenge::Covariance;
 use crate::io::FileError;
 use crate::io::run::{Run, read_record};
 
@@ -39,6 +40,9 @@ pub struct Manifest {
     pub run: Run,
     /// The files by name, but for the manifest.
     pub files: BTreeMap<String, FileSum>,
+    /// Covariance of the bandpowers of each cross-spectrum under noise, by the name of its file.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub covariances: BTreeMap<String, Covariance>,
 }
 
 /// Size and checksum of a file.

@@ -59,6 +59,7 @@ impl Packing<'_> {
     pub fn write(&self, out: &Path, progress: &mut dyn Progress) -> Result<usize, FileError> {
         let mut destination = Destination::create(out)?;
         let mut files = BTreeMap::new();
+        let mut covariances = BTreeMap::new();
         let mut add = |kind: Kind, text: String| -> Result<(), FileError> {
             let (name, mut bytes) = (kind.file_name(), text.as_bytes());
             destination.add(&name, bytes)?;
@@ -77,10 +78,12 @@ impl Packing<'_> {
             if let Some(spectrum) = spectrum {
                 let grid = self.grid(&catalogues[0].1)?;
                 let paths: Vec<PathBuf> = catalogues.into_iter().map(|(_, path)| path).collect();
-                add(
-                    Kind::Spectrum { set, method },
-                    spectrum_text(&grid, &paths, spectrum)?,
-                )?;
+                let kind = Kind::Spectrum { set, method };
+                let (text, covariance) = spectrum_text(&grid, &paths, spectrum)?;
+                if let Some(covariance) = covariance {
+                    covariances.insert(kind.file_name(), covariance);
+                }
+                add(kind, text)?;
                 progress.advance((paths.len() * grid.cells()) as u64);
                 continue;
             }
@@ -98,6 +101,7 @@ impl Packing<'_> {
             contents: self.contents,
             run: self.run.clone(),
             files,
+            covariances,
         };
         destination.add(MANIFEST_FILE, record_text(out, &manifest)?.as_bytes())?;
         destination.finish()?;

@@ -104,7 +104,7 @@ section! {
         /// σ in pixels of the round Gaussian with which the linear update's result is convolved
         /// before its shape is measured.
         target_sigma: f64,
-        /// σ in pixels of the round Gaussian window by which the linear update multiplies the stamp.
+        /// σ in pixels of the round Gaussian window by which the linear update's result is multiplied.
         window_sigma: f64,
     }
 }
@@ -118,8 +118,8 @@ section! {
         acf_share: f64,
         /// Scale in pixels of the Moffat weight.
         weight_scale: f64,
-        /// Added to the weighted Qxx + Qyy by which the moments are divided: px² times the noise of the
-        /// ACF at zero lag.
+        /// Added to the weighted integral of x² + y² by which the moments are divided: px⁴ times the noise
+        /// of the ACF at zero lag.
         softening: f64,
         /// Which ellipticity the catalogue reports as e1, e2.
         ellipticity: EllipticityType,
@@ -300,6 +300,25 @@ impl PartialSubmission {
     }
 }
 
+/// Checks a value that others depend on.
+fn need(
+    good: bool,
+    key: &'static str,
+    found: &impl Serialize,
+    expected: &'static str,
+) -> Result<(), OutOfRange> {
+    if good {
+        return Ok(());
+    }
+    // As a settings file has it.
+    let found = toml::Value::try_from(found).map_or_else(|e| e.to_string(), |v| v.to_string());
+    Err(OutOfRange {
+        key,
+        found,
+        expected,
+    })
+}
+
 /// A value that is out of range.
 pub(crate) struct OutOfRange {
     pub(crate) key: &'static str,
@@ -394,7 +413,8 @@ impl Submission {
         let fits = (0.5..=10.0).contains(&w);
         real("shape.weight_scale", w, fits, "0.5 to 10 pixels")?;
         let s = shape.softening;
-        real("shape.softening", s, s >= 0.0, "zero or a positive number")?;
+        let fits = (0.0..=1e6).contains(&s);
+        real("shape.softening", s, fits, "0 to 1e6")?;
         let t = d.target_sigma;
         let fits = (1.0..=6.0).contains(&t);
         real("deconvolution.target_sigma", t, fits, "1 to 6 pixels")?;
@@ -408,23 +428,13 @@ impl Submission {
     fn validate_linear(&self) -> Result<(), OutOfRange> {
         let Submission {
             stamp,
+            psf,
             denoise,
             deconvolution: d,
             shape,
             ..
         } = self;
         let linear = d.update == Update::Linear;
-        let need = |good: bool, key, found: &dyn std::fmt::Debug, expected| {
-            if good {
-                return Ok(());
-            }
-            let found = format!("{found:?}").to_lowercase();
-            Err(OutOfRange {
-                key,
-                found,
-                expected,
-            })
-        };
         let weighted = shape.weight == AcfWeight::Moffat;
         need(
             linear == weighted,
@@ -453,12 +463,26 @@ impl Submission {
             &d.step_scale,
             "\"fixed\" with the linear update",
         )?;
-        // The largest eigenvalue of W is 1 for a PSF of sum one.
+        // The largest eigenvalue of W is 1 for a PSF of sum one, and 0.0093 λ that of its other term
+        // (Sun's kernel has a transform of −0.096 at most).
         need(
-            d.step < 2.0,
+            d.step * (1.0 + 0.0093 * d.lambda) < 2.0,
             "deconvolution.step",
             &d.step,
-            "below 2 with the linear update, which diverges beyond",
+            "step·(1 + 0.0093 lambda) below 2 with the linear update, which diverges beyond",
+        )?;
+        // Lags are up to 0.95 target_sigma apart; of a sharper weight their sums depend on where they lie.
+        need(
+            shape.weight_scale >= d.target_sigma,
+            "shape.weight_scale",
+            &shape.weight_scale,
+            "at least deconvolution.target_sigma",
+        )?;
+        need(
+            stamp.size % 2 == psf.size % 2,
+            "psf.size",
+            &psf.size,
+            "even with an even stamp.size and odd with an odd one, with the linear update, whose window is centred on the stamp",
         )?;
         // Noise beyond the stamp's edges, which its level is subtracted for, is 1 % of the window's.
         need(

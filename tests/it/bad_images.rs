@@ -77,7 +77,7 @@ fn damaged_images_are_refused_and_those_before_are_kept() {
     fs::remove_file(small.at(second)).unwrap();
     fs::create_dir(small.at(second)).unwrap();
     // A folder of that name is no image, so there is one image.
-    assert!(small.measure(&RAW).contains("1 images"));
+    assert!(small.measure(&RAW).contains("1 image "));
 }
 
 #[test]

@@ -4,7 +4,7 @@ use shearq::pipeline::Quiet;
 use shearq::simulate::set::SimulationSettings;
 use shearq::study::calibration::calibrate;
 use shearq::study::exhibits::{Finding, findings, lambda_findings};
-use shearq::study::reproduce::{Plan, run_sets};
+use shearq::study::reproduce::{Plan, Study, run_sets};
 use shearq_submissions::Registry;
 
 /// Whether the finding that begins with `paper` agrees.
@@ -33,7 +33,8 @@ fn submissions_compare_as_the_paper_found() {
     let folder = tempfile::tempdir().unwrap();
     // Fiducial, low S/N, high S/N, small galaxies: 1,536 galaxies each. The differences are many
     // times their errors: denoising 30 %, S/N and size factors of two, PSF form below 1 %.
-    let results = run_sets(&plan, &[2, 5, 8, 14], folder.path(), 2, &mut Quiet).unwrap();
+    let study = Study::open(&plan, folder.path()).unwrap();
+    let results = run_sets(&study, &[2, 5, 8, 14], 2, &mut Quiet).unwrap();
     let found = findings(&results, &names);
     for paper in [
         "Denoising improves Q (star PSF)",

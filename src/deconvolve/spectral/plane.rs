@@ -5,7 +5,9 @@
 //! |j| ≤ `modes` along each axis are kept; images of them are sampled without loss at `side` < `size`
 //! places an axis, `size/side` pixels apart, the first at the stamp's first pixel. Half spectra have
 //! `modes + 1` columns (frequencies along x) of `side` frequencies along y, in the order of the
-//! transform.
+//! transform. Lags are [`FINER`] times closer together: an autocorrelation is multiplied by a weight with
+//! structure of its own, and sums over places as far apart as its own modes allow would depend on
+//! whether a galaxy lies along the grid or across it.
 
 use std::sync::Arc;
 
@@ -13,6 +15,9 @@ use rustfft::num_complex::Complex32;
 use rustfft::{Fft, FftPlanner};
 
 use crate::fft::transform_size;
+
+/// Least number of lags to a place of the coarse grid, along an axis.
+const FINER: f64 = 1.5;
 
 /// Plans for one size.
 #[derive(Clone)]
@@ -23,9 +28,12 @@ pub(super) struct Plane {
     pub(super) side: usize,
     /// Largest index of a mode.
     pub(super) modes: usize,
+    /// Lags along an axis.
+    pub(super) lags: usize,
     wide: Arc<dyn Fft<f32>>,
     forward: Arc<dyn Fft<f32>>,
     backward: Arc<dyn Fft<f32>>,
+    fine: Arc<dyn Fft<f32>>,
 }
 
 /// Buffers for one thread. Their content between calls does not matter.
@@ -40,36 +48,43 @@ pub(super) struct PlaneScratch {
     pub(super) half: [Vec<Complex32>; 3],
     /// Two rows of an image as real and imaginary part of one.
     pairs: Vec<Complex32>,
+    /// Columns of an autocorrelation's spectrum, and its rows.
+    fine: [Vec<Complex32>; 2],
     fft: Vec<Complex32>,
 }
 
 impl Plane {
-    /// A plane of at least `least` pixels (a power of two, which transforms fastest) that keeps wave numbers up to `cut` radians per pixel.
+    /// A plane of at least `least` pixels (a power of two, which transforms fastest) that keeps wave
+    /// numbers up to `cut` radians per pixel.
     pub(super) fn new(least: usize, cut: f64) -> Self {
         let size = least.next_power_of_two();
         let places = cut * size as f64 / std::f64::consts::PI;
         let side = transform_size(places.ceil() as usize + 2).min(size);
+        let lags = transform_size((FINER * side as f64).ceil() as usize);
         let mut planner = FftPlanner::new();
         Plane {
             size,
             side,
             modes: side / 2 - 1,
+            lags,
             wide: planner.plan_fft_forward(size),
             forward: planner.plan_fft_forward(side),
             backward: planner.plan_fft_inverse(side),
+            fine: planner.plan_fft_inverse(lags),
         }
     }
 
     /// Buffers for images of up to `n` rows.
     pub(super) fn scratch(&self, n: usize) -> PlaneScratch {
         let zeros = |count| vec![Complex32::ZERO; count];
-        let plans = [&self.wide, &self.forward, &self.backward];
+        let plans = [&self.wide, &self.forward, &self.backward, &self.fine];
         let fft = plans.map(|plan| plan.get_inplace_scratch_len());
         PlaneScratch {
             rows: zeros(n * self.size),
             wide: std::array::from_fn(|_| zeros((self.modes + 1) * self.size)),
             half: std::array::from_fn(|_| self.spectrum()),
             pairs: zeros(self.side * self.side),
+            fine: [self.columns(), self.lags].map(|lines| zeros(lines * self.lags)),
             fft: zeros(fft.into_iter().max().unwrap_or(0)),
         }
     }
@@ -87,6 +102,11 @@ impl Plane {
     /// Pixels between places of the coarse grid.
     pub(super) fn spacing(&self) -> f64 {
         self.size as f64 / self.side as f64
+    }
+
+    /// Pixels between lags.
+    pub(super) fn lag_spacing(&self) -> f64 {
+        self.size as f64 / self.lags as f64
     }
 
     /// Wave number of frequency `at` of the coarse grid, in radians per pixel.
@@ -182,29 +202,38 @@ impl Plane {
         mut out: impl FnMut(usize, Complex32),
     ) {
         let PlaneScratch {
-            half, pairs, fft, ..
+            half,
+            fine: [columns, rows],
+            fft,
+            ..
         } = scratch;
-        let side = self.side;
-        let half = &mut half[which];
-        self.backward.process_with_scratch(half, fft);
-        let pairs = &mut pairs[..(reach + 1) * side];
-        pairs.fill(Complex32::ZERO);
-        for (y, line) in pairs.chunks_exact_mut(side).enumerate() {
+        let (side, lags) = (self.side, self.lags);
+        let (low, high) = (self.modes + 1, side - self.modes);
+        let lines = half[which].chunks_exact(side);
+        for (from, to) in lines.zip(columns.chunks_exact_mut(lags)) {
+            to[..low].copy_from_slice(&from[..low]);
+            to[low..lags - self.modes].fill(Complex32::ZERO);
+            to[lags - self.modes..].copy_from_slice(&from[high..]);
+        }
+        self.fine.process_with_scratch(columns, fft);
+        let rows = &mut rows[..(reach + 1) * lags];
+        for (y, line) in rows.chunks_exact_mut(lags).enumerate() {
             // The spectrum is even: what column −kx holds at y, column kx holds at −y.
-            let opposite = (side - y) % side;
-            line[0] = half[y];
+            let opposite = (lags - y) % lags;
+            line[0] = columns[y];
+            line[low..lags - self.modes].fill(Complex32::ZERO);
             for column in 1..=self.modes {
-                line[column] = half[column * side + y];
-                line[side - column] = half[column * side + opposite];
+                line[column] = columns[column * lags + y];
+                line[lags - column] = columns[column * lags + opposite];
             }
         }
-        self.backward.process_with_scratch(pairs, fft);
+        self.fine.process_with_scratch(rows, fft);
         let width = 2 * reach + 1;
-        for (y, line) in pairs.chunks_exact(side).enumerate() {
+        for (y, line) in rows.chunks_exact(lags).enumerate() {
             for (x, value) in line[..=reach].iter().enumerate() {
                 out(y * width + reach + x, *value);
             }
-            for (x, value) in line[side - reach..].iter().enumerate() {
+            for (x, value) in line[lags - reach..].iter().enumerate() {
                 out(y * width + x, *value);
             }
         }

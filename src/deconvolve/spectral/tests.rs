@@ -135,7 +135,7 @@ fn plain(
     for y in 0..=reach {
         for x in -reach..=reach {
             let terms = powers.iter().map(|(kx, ky, power)| {
-                power * (spacing * (kx * f64::from(x) + ky * f64::from(y))).cos()
+                power * (plan.spacing() * (kx * f64::from(x) + ky * f64::from(y))).cos()
             });
             lags.push(terms.sum());
         }

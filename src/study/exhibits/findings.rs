@@ -5,7 +5,7 @@ use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
 use super::sets::over_sets;
 use crate::report::table::{Cell, Heading, Table};
 use crate::simulate::kinds::{ImageType, SetKind};
-use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, SNR_DB, Sums};
+use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, PAPER_LAMBDA, SNR_DB, Sums};
 use crate::study::reproduce::SetResult;
 
 /// One qualitative statement of the paper and what the simulation says.
@@ -186,8 +186,7 @@ fn range(values: impl Iterator<Item = f64>, decimals: usize) -> String {
 pub fn lambda_findings(curves: &Curves) -> Vec<Finding> {
     let [adaptive, constant] = [&curves.over_lambda[0], &curves.over_lambda[1]];
     let over_snr = |rule: usize| curves.over_snr[rule].iter().map(Sums::ctr);
-    let at = |log: f64| LOG_LAMBDA.iter().position(|l| *l == log).unwrap_or(0);
-    let weak = at(-4.0);
+    let weak = PAPER_LAMBDA;
     let rising = |values: Vec<f64>| values.windows(2).all(|pair| pair[1] > pair[0]);
     let ctr_rises = rising(adaptive.iter().map(|curve| curve[weak].ctr()).collect());
     let dsnr_rises = rising(adaptive.iter().map(|c| c[weak].mean_dsnr()).collect());

@@ -3,8 +3,9 @@
 use shearq_submissions::Submission;
 
 use crate::report::figure::{LinePlot, PanelGrid, Series, Style};
+use crate::report::page::Page;
 use crate::report::table::{Cell, Heading, Table};
-use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, SNR_DB, Sums};
+use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, PAPER_LAMBDA, SNR_DB, Sums};
 
 /// Names of the two rules in legends, in the order of [`crate::study::calibration::UPDATES`].
 const RULES: [&str; 2] = ["adaptive", "constant"];
@@ -17,8 +18,35 @@ fn over_lambda(curve: &[Sums], value: fn(&Sums) -> f64) -> Vec<f64> {
     curve.iter().map(value).collect()
 }
 
+/// Draws Figs 4 to 7.
+///
+/// # Errors
+/// Where a file cannot be written.
+pub fn calibration_figures(page: &mut Page<'_>, curves: &Curves) -> anyhow::Result<()> {
+    page.figure(
+        "fig4-ctr-snr",
+        &ctr_over_snr(curves),
+        "Fig. 4: correct transition rate against S/N for the adaptive and the constant update.",
+    )?;
+    page.figure(
+        "fig5-ctr-lambda",
+        &ctr_over_lambda(curves),
+        "Fig. 5: correct transition rate against λ, adaptive update.",
+    )?;
+    page.figure(
+        "fig6-dsnr-lambda",
+        &dsnr_over_lambda(curves),
+        "Fig. 6: discriminative signal-to-noise ratio against λ, adaptive update.",
+    )?;
+    page.figure(
+        "fig7-rmsd-lambda",
+        &inverse_rmsd(curves),
+        "Fig. 7: 1/RMSD of the ellipticities against λ for both updates.",
+    )
+}
+
 /// Fig. 4: CTR against S/N at λ = 10^−3.5 for both rules.
-pub fn ctr_over_snr(curves: &Curves) -> LinePlot {
+fn ctr_over_snr(curves: &Curves) -> LinePlot {
     let series = curves
         .over_snr
         .iter()
@@ -65,18 +93,18 @@ fn adaptive_over_lambda(
 }
 
 /// Fig. 5: CTR against λ.
-pub fn ctr_over_lambda(curves: &Curves) -> LinePlot {
+fn ctr_over_lambda(curves: &Curves) -> LinePlot {
     adaptive_over_lambda(curves, "Correct transition rate", "CTR", Sums::ctr)
 }
 
 /// Fig. 6: dSNR against λ.
-pub fn dsnr_over_lambda(curves: &Curves) -> LinePlot {
+fn dsnr_over_lambda(curves: &Curves) -> LinePlot {
     let title = "Discriminative signal-to-noise ratio";
     adaptive_over_lambda(curves, title, "dSNR [dB]", Sums::mean_dsnr)
 }
 
 /// Fig. 7: 1/RMSD against λ for both rules at the three S/N.
-pub fn inverse_rmsd(curves: &Curves) -> PanelGrid {
+fn inverse_rmsd(curves: &Curves) -> PanelGrid {
     let plots = SNR_DB
         .iter()
         .enumerate()
@@ -151,7 +179,6 @@ pub fn curves_table(curves: &Curves) -> Table {
 
 /// A short table for terminals: per rule and S/N, the best λ and the figures at 10⁻⁴.
 pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
-    let at = |log: f64| LOG_LAMBDA.iter().position(|l| *l == log).unwrap_or(0);
     let mut rows = Vec::new();
     for (rule, name) in RULES.iter().enumerate() {
         for (s, snr) in SNR_DB.iter().enumerate() {
@@ -163,7 +190,7 @@ pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
                         .total_cmp(&curve[*b].inverse_rmsd())
                 })
                 .unwrap_or(0);
-            let paper = &curve[at(-4.0)];
+            let paper = &curve[PAPER_LAMBDA];
             let value = |sums: &Sums| {
                 Cell::with_error(sums.inverse_rmsd(), Some(sums.inverse_rmsd_error()), 3)
             };
