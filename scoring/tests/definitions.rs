@@ -269,7 +269,7 @@ fn cross_spectra_are_the_mean_product_of_pairs_without_noise_and_know_their_erro
     let shear = field(&grid, Content::E, 3);
     // Every fourth image has three times the noise; groups of two and of one image.
     let images_of = |seed| {
-        let sigma = |image: usize| if image % 4 == 0 { 0.15 } else { 0.05 };
+        let sigma = |image: usize| if image.is_multiple_of(4) { 0.15 } else { 0.05 };
         images_of_noise(&grid, &shear, 31, &sigma, seed, |_, _| true)
     };
     let cross = |images: &SetImages| cross_spectrum(&grid, images, Convention::STANDARD).unwrap();

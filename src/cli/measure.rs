@@ -101,7 +101,7 @@ pub(super) fn report(run: &Run, summary: &Summary, elapsed: Duration, threads: u
     tell(format_args!(
         "{}: {}{speed}; {} there already, in {}",
         run.submission.name,
-        count(summary.images as usize, "image"),
+        count(summary.images, "image"),
         summary.already,
         out.display()
     ));

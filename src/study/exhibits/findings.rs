@@ -95,21 +95,27 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
     let Some(den) = place("23/den/star") else {
         return found;
     };
-    let mean_of = |wanted: &dyn Fn(ImageType) -> bool, figure: usize| -> Option<f64> {
-        let values: Vec<f64> = results
+    // Mean Q over the sets of a kind, and its error.
+    let mean_of = |wanted: ImageType| -> Option<(f64, f64)> {
+        let values: Vec<(f64, Option<f64>)> = results
             .iter()
-            .filter(|set| SetKind::of(set.set).is_some_and(|kind| wanted(kind.image)))
-            .map(|set| set.results[den].figures.values()[figure])
+            .filter(|set| SetKind::of(set.set).is_some_and(|kind| kind.image == wanted))
+            .map(|set| &set.results[den])
+            .map(|result| (result.figures.q, result.errors.map(|errors| errors.q)))
             .collect();
-        (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+        let (mean, error) = mean_over_sets(&values);
+        (!values.is_empty()).then_some((mean, error.unwrap_or(f64::NAN)))
     };
-    let fiducial = mean_of(&|kind| kind == ImageType::Fiducial, 0);
+    let fiducial = mean_of(ImageType::Fiducial);
     let mut kinds = |paper, label: &str, kind: ImageType, above: bool| {
-        if let (Some(q), Some(base)) = (mean_of(&|k| k == kind, 0), fiducial) {
+        if let (Some((q, error)), Some((base, base_error))) = (mean_of(kind), fiducial) {
+            let told = (q - base).abs() > 2.0 * error.hypot(base_error);
             found.push(Finding {
                 paper,
-                here: format!("{label}: Q {q:.1}, fiducial {base:.1}"),
-                agrees: Some((q > base) == above),
+                here: format!(
+                    "{label}: Q {q:.1} ± {error:.1}, fiducial {base:.1} ± {base_error:.1}"
+                ),
+                agrees: told.then_some((q > base) == above),
             });
         }
     };
