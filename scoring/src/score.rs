@@ -245,6 +245,8 @@ pub struct SetScore {
     pub matched: Convention,
     /// The convention of the headline figures.
     pub chosen: Convention,
+    /// How it was chosen.
+    pub choice: Choice,
     /// Headline figures.
     pub figures: Figures,
     /// The same with each group of images left out in turn; empty with fewer than two images.
@@ -429,6 +431,7 @@ impl SetScorer {
             best,
             matched,
             chosen,
+            choice: self.options.choice,
             figures,
             replicates,
         })

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use shearq_scoring::Options;
+use shearq_scoring::{Choice, Convention, Options};
 use shearq_submissions::Registry;
 
 use super::arguments::Threads;
@@ -25,7 +25,8 @@ use crate::simulate::set::SimulationSettings;
 /// compare. Takes well under two minutes.
 ///
 /// It runs what these commands would: `simulate --sets 2,8 --images 10 --grid 40 --seed 2013`, then
-/// `measure` and `score` with 23/raw/star, 23/den/star and 48/linear/star, then `compare`. The data are simulated,
+/// `measure` and `score --convention 5` with 23/raw/star, 23/den/star and 48/linear/star, then
+/// `compare --convention 5`. The data are simulated,
 /// and few: the errors printed are what tells whether a difference is one.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -60,7 +61,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         data.root().display()
     ));
     let registry = Registry::embedded()?;
-    let options = Options::default();
+    let options = Options {
+        // Known here; ten images can be too noisy to tell.
+        choice: Choice::Insist(Convention::STANDARD),
+        ..Options::default()
+    };
     let mut folders = Vec::new();
     for name in SUBMISSIONS {
         let folder = out.join(name.replace('/', "-"));

@@ -78,12 +78,12 @@ pub fn warnings(scored: &[ScoredSet]) -> Vec<String> {
             lines.push(format!(
                 "Warning: no galaxy of {name} has an ellipticity; its figures are those of an empty submission."
             ));
-        } else if !clear {
+        } else if !clear && !matches!(score.choice, Choice::Insist(_)) {
             lines.push(format!(
                 "Warning: no convention clearly correlates with the truth in {name} (best {correlation:.2}, convention {}): too much noise to tell; --convention sets one.",
                 score.matched.number()
             ));
-        } else if score.wrong_convention_wins() {
+        } else if clear && score.wrong_convention_wins() {
             let (best, matched) = (
                 &score.conventions[score.best.index()],
                 &score.conventions[score.matched.index()],
