@@ -36,6 +36,9 @@ use crate::grid::Grid;
 use crate::modes::Decomposer;
 use crate::score::SetImages;
 
+/// Fewest groups whose pairs tell a covariance: it is a difference, and of fewer often negative.
+const MIN_GROUPS: usize = 8;
+
 /// A spectrum from cross-spectra: what a power-spectrum submission holds, and how well it is known.
 #[derive(Debug, Clone)]
 pub struct CrossSpectrum {
@@ -43,7 +46,7 @@ pub struct CrossSpectrum {
     pub bins: Bins,
     /// E-mode bandpowers ≈ ℓ²C_ℓ/2π; they can be negative.
     pub power: [f64; BINS],
-    /// Covariance of the bandpowers under noise; `None` with fewer than four groups.
+    /// Covariance of the bandpowers under noise; `None` with fewer than eight groups.
     pub covariance: Option<[[f64; BINS]; BINS]>,
     /// Weights of the groups; their sum is one.
     pub weights: Vec<f64>,
@@ -136,7 +139,7 @@ fn weights(own: &[[f64; BINS]], pairs: &[Pair], images: Vec<f64>) -> Vec<f64> {
 /// Covariance of the weighted mean over pairs, see the module's description.
 fn covariance(pairs: &[Pair], weights: &[f64], power: &[f64; BINS]) -> Option<[[f64; BINS]; BINS]> {
     let groups = weights.len() as f64;
-    if weights.len() < 4 {
+    if weights.len() < MIN_GROUPS {
         return None;
     }
     let total: f64 = pairs.iter().map(|pair| pair.weight(weights)).sum();

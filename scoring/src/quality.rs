@@ -29,7 +29,8 @@ pub fn quality(bins: &Bins, measured: &[f64; BINS], truth: &[f64; BINS]) -> Qual
 
 /// Standard error of Q, to first order, where the bandpowers have the covariance `covariance`: that of
 /// σ_sys in units of it, with each term keeping its sign. Where a bin's deviation is of the size of its
-/// own error, so is Q's, and this is a rough guide.
+/// own error, so is Q's, and this is a rough guide. Not a number where an estimated covariance gives σ_sys a
+/// negative variance.
 pub fn quality_error(
     bins: &Bins,
     measured: &[f64; BINS],
@@ -42,7 +43,7 @@ pub fn quality_error(
         .map(|(i, j)| slope(i) * covariance[i][j] * slope(j))
         .sum();
     let Quality { q, sigma_sys } = quality(bins, measured, truth);
-    q * variance.max(0.0).sqrt() / sigma_sys
+    q * variance.sqrt() / sigma_sys
 }
 
 /// Multiplicative and additive bias of a power spectrum:

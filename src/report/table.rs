@@ -355,13 +355,18 @@ fn number(value: f64) -> String {
 
 fn escape_latex(words: &str) -> String {
     let mut text = String::new();
-    for c in words.chars() {
+    let mut rest = words.chars();
+    while let Some(c) = rest.next() {
         match c {
             '_' | '%' | '&' | '#' | '$' | '{' | '}' => {
                 text.push('\\');
                 text.push(c);
             }
-            '√' => text.push_str("$\\sqrt{}$"),
+            // Of the one letter that follows.
+            '√' => text.push_str(&format!(
+                "$\\sqrt{{{}}}$",
+                rest.next().map_or(String::new(), String::from)
+            )),
             'Δ' => text.push_str("$\\Delta$"),
             'λ' => text.push_str("$\\lambda$"),
             'µ' | 'μ' => text.push_str("$\\mu$"),
@@ -412,6 +417,7 @@ mod tests {
             table().render(TableFormat::Csv),
             "name,q,q_error\n\"a,b\",87.125,1.5\nc_d,,\n"
         );
+        assert_eq!(escape_latex("√A×10⁴"), "$\\sqrt{A}\\times$10$^{4}$");
         let columns = table().columns().unwrap();
         let names: Vec<&str> = columns.columns().iter().map(|(n, _)| n.as_str()).collect();
         assert_eq!(names, ["name", "q", "q_error"]);

@@ -80,7 +80,7 @@ pub struct Result {
     pub q_calibrated: f64,
     /// Q of the cross-spectrum of the images' groups, `None` for a single image.
     pub q_spectrum: Option<f64>,
-    /// Its standard error, `None` for fewer than four images.
+    /// Its standard error, `None` where it is not known: with fewer than eight images.
     pub q_spectrum_error: Option<f64>,
     /// How ellipticities follow the true ones.
     pub response: Response,
@@ -214,7 +214,8 @@ fn spectrum_quality(score: &SetScore, images: &SetImages) -> Option<(f64, Option
     let truth = &score.true_ee;
     let error = cross
         .covariance
-        .map(|covariance| quality_error(&cross.bins, &cross.power, truth, &covariance));
+        .map(|covariance| quality_error(&cross.bins, &cross.power, truth, &covariance))
+        .filter(|error| error.is_finite());
     Some((quality(&cross.bins, &cross.power, truth).q, error))
 }
 
