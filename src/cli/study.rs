@@ -10,7 +10,8 @@ use super::print;
 use super::progress::Bar;
 use crate::io::layout::MAX_IMAGE;
 use crate::report::page::Page;
-use crate::study::contest::{bias_sets, contest_table};
+use crate::report::table::TableFormat;
+use crate::study::contest::{bias_sets, contest_parts, contest_table};
 use crate::study::reproduce::{Plan, Study, run_sets};
 
 /// Hold submissions against each other and against what can be reached.
@@ -103,8 +104,19 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         made_by.push((submission.name.clone(), toml::to_string(submission)?));
     }
     let mut page = Page::new(out, "Submissions compared", "Simulated data", made_by);
-    page.section("Every kind of set", "Scatter, bias, quality and cost.");
-    page.table("study", &table)?;
+    let [shapes, quality] = contest_parts(&table);
+    page.section("Ellipticities", "Scatter and biases on every kind of set.");
+    page.table("biases", &shapes)?;
+    page.section("Spectra", "Quality on every kind of set, and cost.");
+    page.table("quality", &quality)?;
+    page.data("study", &table)?;
     page.save()?;
-    print(&form.render(&table))
+    if matches!(form.format, TableFormat::Csv | TableFormat::Json) {
+        return print(&form.render(&table));
+    }
+    print(&format!(
+        "{}\n{}",
+        form.render(&shapes),
+        form.render(&quality)
+    ))
 }

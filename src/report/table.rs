@@ -145,6 +145,24 @@ impl Table {
         table
     }
 
+    /// The columns of `keys`, of rows that have something in the last of them, under another title and
+    /// with some of the notes.
+    pub fn part(&self, keys: &[&str], title: &str, notes: &[String]) -> Self {
+        let kept: Vec<usize> = (0..self.headings.len())
+            .filter(|&k| keys.contains(&self.headings[k].key))
+            .collect();
+        let cells = |row: &Vec<Cell>| kept.iter().map(|&k| row[k].clone()).collect::<Vec<_>>();
+        let rows = self.rows.iter().map(cells);
+        Table {
+            title: title.to_owned(),
+            headings: kept.iter().map(|&k| self.headings[k].clone()).collect(),
+            rows: rows
+                .filter(|row| row.last() != Some(&Cell::Empty))
+                .collect(),
+            notes: notes.to_vec(),
+        }
+    }
+
     /// The table in a format, ending in a line break.
     pub fn render(&self, format: TableFormat) -> String {
         match format {
@@ -428,5 +446,20 @@ mod tests {
         let json: Value = serde_json::from_str(&table().render(TableFormat::Json)).unwrap();
         assert_eq!(json["rows"][0]["q_error"], 1.5);
         assert!(json["rows"][1]["q"].is_null());
+    }
+
+    #[test]
+    fn empty_cells_leave_columns_of_numbers_and_parts_leave_out_their_rows() {
+        let mut whole = table();
+        whole.rows.push(vec![Cell::text("mean"), Cell::Empty]);
+        let columns = whole.columns().unwrap();
+        let Column::Real(values) = &columns.columns()[1].1 else {
+            panic!("numbers")
+        };
+        assert!(values[0] == 87.125 && values[2].is_nan());
+        assert!(whole.render(TableFormat::Csv).ends_with("mean,,\n"));
+        assert!(whole.json()["rows"][2]["q"].is_null());
+        let part = whole.part(&["name", "q"], "Part", &[]);
+        assert_eq!((part.rows.len(), part.headings.len()), (2, 2));
     }
 }

@@ -100,11 +100,10 @@ pub fn contest_table(
                 Cell::Empty,
                 Cell::text(&submission.name),
             ];
-            row.extend((0..7).map(|_| Cell::Empty));
+            row.extend((0..8).map(|_| Cell::Empty));
             row.push(mean(&|r| (r.figures.q, r.errors.map(|e| e.q)), 1));
             row.push(mean(&spectrum, 0));
             row.push(Cell::number(limit, 0));
-            row.push(Cell::Empty);
             row.push(Cell::number(costs[k], 0));
             rows.push(row);
         }
@@ -120,10 +119,10 @@ pub fn contest_table(
         ("c1", "c1×10⁴"),
         ("c2", "c2×10⁴"),
         ("leakage", "PSF leakage"),
+        ("unmeasured", "unmeasured"),
         ("q", "Q catalogue"),
         ("q_spectrum", "Q spectrum"),
         ("q_limit", "limit"),
-        ("unmeasured", "unmeasured"),
         ("microseconds", "µs"),
     ];
     Ok(Table {
@@ -132,10 +131,41 @@ pub fn contest_table(
         rows,
         notes: vec![
             "Scatter of ε per component after dividing by its slope, and over the Cramér–Rao bound of the galaxies (none for bulges off their discs' centres).".into(),
-            "m and c from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign; leakage: c along the PSF's ellipticity.".into(),
-            "Q of the catalogues, and of cross-spectra between groups of images, in which noise has no mean; leaderboard definition, standard convention. limit: mean Q that noise at the bound leaves of a perfect spectrum; unmeasured: galaxies without ellipticity, for which m and c stand not.".into(),
+            "m and c from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign; leakage: c along the PSF's ellipticity; unmeasured: galaxies without ellipticity, which all of these leave out.".into(),
+            "Q of the catalogues, and of cross-spectra between groups of images, in which noise has no mean; leaderboard definition, standard convention. limit: mean Q that noise at the bound leaves of a perfect spectrum.".into(),
         ],
     })
+}
+
+/// Two tables that fit on a page: scatter and biases; Q and cost.
+pub fn contest_parts(table: &Table) -> [Table; 2] {
+    let (biases, quality) = table.notes.split_at(2);
+    let shapes = [
+        "set",
+        "kind",
+        "submission",
+        "scatter",
+        "scatter_over_bound",
+        "m1",
+        "m2",
+        "c1",
+        "c2",
+        "leakage",
+        "unmeasured",
+    ];
+    let spectra = [
+        "set",
+        "kind",
+        "submission",
+        "q",
+        "q_spectrum",
+        "q_limit",
+        "microseconds",
+    ];
+    [
+        table.part(&shapes, "Scatter and biases (simulated data)", biases),
+        table.part(&spectra, "Quality and cost (simulated data)", quality),
+    ]
 }
 
 fn row(
@@ -154,20 +184,20 @@ fn row(
         Cell::text(format!("{:02}", result.set)),
         Cell::text(SetKind::of(result.set).map_or("", |kind| kind.image.label())),
         Cell::text(&submission.name),
-        Cell::with_error(scatter, Some(own.response.rms_scatter_error()), 4),
+        Cell::with_error(scatter, Some(own.response.rms_scatter_error()), 5),
         Cell::number(bias.bound.map_or(f64::NAN, |bound| scatter / bound), 3),
         scaled(biases.m[0], biases.m_error[0], 1e3),
         scaled(biases.m[1], biases.m_error[1], 1e3),
         scaled(biases.c[0], biases.c_error[0], 1e4),
         scaled(biases.c[1], biases.c_error[1], 1e4),
         Cell::with_error(biases.leakage, Some(biases.leakage_error), 3),
+        Cell::number((own.response.flagged + biases.dropped) as f64, 0),
         Cell::with_error(own.figures.q, own.errors.map(|e| e.q), 1),
         {
             let (q, error) = spectrum(own);
             Cell::with_error(q, error, 0)
         },
         Cell::number(bias.limit.unwrap_or(f64::NAN), 0),
-        Cell::number((own.response.flagged + biases.dropped) as f64, 0),
         Cell::number(cost, 0),
     ]
 }
