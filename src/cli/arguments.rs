@@ -107,14 +107,19 @@ impl Form {
     }
 }
 
+/// Galaxies a side of a simulated image, by default.
+const GRID: u16 = 100;
+/// Seed of a simulation, by default.
+const SEED: u64 = 1;
+
 /// What simulated data are made from.
 #[derive(Debug, Clone, Args)]
 pub(super) struct SimulationArguments {
     /// Galaxies a side of a simulated image.
-    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u16).range(8..=400))]
+    #[arg(long, value_name = "N", default_value_t = GRID, value_parser = clap::value_parser!(u16).range(8..=400))]
     grid: u16,
     /// Seed of all random numbers of a simulation.
-    #[arg(long, value_name = "SEED", default_value_t = 1)]
+    #[arg(long, value_name = "SEED", default_value_t = SEED)]
     seed: u64,
     /// Factor on the simulated shear power spectrum.
     #[arg(
@@ -150,6 +155,15 @@ impl SimulationArguments {
             spectrum: ShearSpectrum { amplitude, tilt },
             ..SimulationSettings::new(seed, usize::from(grid))
         })
+    }
+
+    /// Refuses them where nothing is simulated.
+    pub(super) fn must_be_unused(&self) -> anyhow::Result<()> {
+        anyhow::ensure!(
+            self.settings()? == SimulationSettings::new(SEED, usize::from(GRID)),
+            "--grid, --seed, --amplitude and --tilt are for simulated data"
+        );
+        Ok(())
     }
 }
 

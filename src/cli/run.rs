@@ -91,7 +91,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     };
     let data = data.as_ref().map(DataFolder::open).transpose()?;
     let source = match &data {
-        Some(data) => Source::folder(data),
+        Some(data) => {
+            simulation.must_be_unused()?;
+            Source::folder(data)
+        }
         None => Source::Simulated(simulation.settings()?),
     };
     let submission = Registry::embedded()?.get(submission)?.submission;
