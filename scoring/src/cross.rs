@@ -1,9 +1,10 @@
 //! The shear's E-mode spectrum from cross-spectra between groups of images.
 //!
 //! All images of a set have the same shear and noise of their own. The mean product of two groups'
-//! modes is the shear's power, without a mean of noise (nor of intrinsic B modes, which differ from
-//! image to image); the product of a group with itself is not used. With E_g the modes of the mean field
-//! of group g and w_g its weight,
+//! modes is the shear's power, without a mean of noise; the product of a group with itself is not used.
+//! Intrinsic ellipticities are B modes. Where they are the same in all images, what a measurement turns of
+//! them into E modes is common to all groups, and stays. With E_g the modes of the mean field of group g
+//! and w_g its weight,
 //!
 //! ```text
 //! P = Σ_{g<h} w_g w_h P_gh / Σ_{g<h} w_g w_h,    P_gh = bandpowers of Re(E_g E_h*).
