@@ -7,8 +7,8 @@
 Every galaxy is drawn four times: with intrinsic ellipticity e under shears of (g, g) and (-g, -g), and with -e
 under (g, -g) and (-g, g), all with the same noise, so that shape noise cancels exactly, noise to first order,
 and so does what one component of shear does to the other. Each rendered stamp is used with several fields of
-noise, every other the negative of the one before. Nothing of shearq's simulator is used; its binary is run on FITS images in the layout that `measure`
-reads.
+noise, every other the negative of the one before. Nothing of shearq's simulator is used; its binary is run on
+FITS images in the layout that `measure` reads.
 
 m is half the difference between +g and -g over g, less the response that the submission measured, over that
 response; c the mean of all four over it. Errors are the scatter over galaxies over the root of their number.

@@ -277,14 +277,17 @@ impl SetScore {
         self.best.class() != self.matched.class()
     }
 
-    /// The matched convention's correlation with the truth, and whether it is clearly more than chance:
-    /// of N modes without anything in common the correlation scatters by 1/√(N/2), opposite modes being
-    /// conjugates.
-    pub fn match_with_truth(&self) -> (f64, bool) {
+    /// The least correlation, or difference of two, that is clearly more than chance: of N modes without
+    /// anything in common it scatters by 1/√(N/2), opposite modes being conjugates.
+    pub fn clear_correlation(&self) -> f64 {
         let modes: usize = SCORED.map(|b| self.bins.modes[b]).sum();
+        CLEAR_MATCH * (2.0 / modes as f64).sqrt()
+    }
+
+    /// The matched convention's correlation with the truth, and whether it is clearly more than chance.
+    pub fn match_with_truth(&self) -> (f64, bool) {
         let correlation = self.conventions[self.matched.index()].correlation;
-        let chance = (2.0 / modes as f64).sqrt();
-        (correlation, correlation >= CLEAR_MATCH * chance)
+        (correlation, correlation >= self.clear_correlation())
     }
 
     /// The highest correlation with the truth among the conventions of a class.

@@ -80,7 +80,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let expected = Expected {
         grid,
         truth,
-        images: images.unwrap_or(0),
+        images: *images,
     };
     let findings = check(path, &expected);
     let errors = findings

@@ -23,8 +23,9 @@ const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"]
 /// spectrum per set (`{method}_set{set}.dat`): of the ellipticities averaged over the images, as the
 /// original scoring takes it from catalogues, or from cross-spectra between groups of images, in which
 /// noise has no mean (up to twenty groups; at least two images). manifest.json lists the files with their
-/// SHA-256 checksums and says what made them; of cross-spectra it has the covariances too. The same catalogues give the same bytes, archives included. `shearq check`
-/// validates the result, `shearq unpack` unpacks an archive.
+/// SHA-256 checksums and says what made them; of cross-spectra it has the covariances too, from eight
+/// images on. The same catalogues give the same bytes, archives included. `shearq check` validates the
+/// result, `shearq unpack` unpacks an archive.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Folder that `measure` or `run` wrote.

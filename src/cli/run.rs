@@ -80,11 +80,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         store::prepare(store)?;
     }
     let threads = threads.number();
-    let expected = [
-        sets.as_ref().map(|list| format!(" --sets {list}")),
-        images.map(|images| format!(" --images {images}")),
-    ];
-    let sets = match sets {
+    let wanted = match sets {
         None => &[],
         Some(list) if data.is_none() => list.simulated()?,
         Some(list) => &list.0[..],
@@ -101,7 +97,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let run = Run::new(source, submission, catalogue_format.unwrap_or_default());
     match (&run.source, &data) {
         (Source::Simulated(settings), _) => {
-            let images = sharding.part(&images::of_simulation(sets, images.unwrap_or(1)));
+            let images = sharding.part(&images::of_simulation(wanted, images.unwrap_or(1)));
             let galaxies = images.len() as u64 * (settings.grid as u64).pow(2);
             let mut bar = Bar::new("simulating and measuring", galaxies);
             let start = std::time::Instant::now();
@@ -110,12 +106,16 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             measure::report(&run, &summary, start.elapsed(), threads, out);
         }
         (Source::Folder { .. }, Some(data)) => {
-            let images = sharding.part(&images::of_folder(data, sets)?);
+            let images = sharding.part(&images::of_folder(data, wanted)?);
             measure::measure(&run, data, out, &images, threads)?;
         }
         (Source::Folder { .. }, None) => {}
     }
     if let Some(shard) = sharding.shard {
+        let expected = [
+            sets.as_ref().map(|list| format!(" --sets {list}")),
+            images.map(|images| format!(" --images {images}")),
+        ];
         tell(format_args!(
             "shard {shard} is done; `shearq merge {}{} --shards {}` scores when all are",
             out.display(),
@@ -124,7 +124,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ));
         return Ok(());
     }
-    score(&run, out, sets, store.as_deref(), threads)
+    score(&run, out, wanted, store.as_deref(), threads)
 }
 
 /// Scores a folder of catalogues (those of `sets`, or all), prints the scores and keeps them and the

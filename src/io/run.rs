@@ -264,6 +264,19 @@ pub fn differences(
 }
 
 fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut Vec<String>) {
+    if let (serde_json::Value::Array(a), serde_json::Value::Array(b)) = (a, b)
+        && let (Some(first), Some(second)) = (names(a), names(b))
+    {
+        if first != second {
+            let (first, second) = (first.join(", "), second.join(", "));
+            found.push(format!("{key}: {first} ≠ {second}"));
+            return;
+        }
+        for (k, (a, b)) in a.iter().zip(b).enumerate() {
+            compare(&format!("{key}[{k}]"), a, b, found);
+        }
+        return;
+    }
     match (a, b) {
         (serde_json::Value::Object(a), serde_json::Value::Object(b)) => {
             let keys: std::collections::BTreeSet<&String> = a.keys().chain(b.keys()).collect();
@@ -280,19 +293,6 @@ fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut 
                     b.get(name).unwrap_or(&null),
                     found,
                 );
-            }
-        }
-        (serde_json::Value::Array(a), serde_json::Value::Array(b))
-            if names(a).is_some() && names(a) != names(b) =>
-        {
-            let list = |values| names(values).unwrap_or_default().join(", ");
-            found.push(format!("{key}: {} ≠ {}", list(a), list(b)));
-        }
-        (serde_json::Value::Array(a), serde_json::Value::Array(b))
-            if names(a).is_some() && a.len() == b.len() =>
-        {
-            for (k, (a, b)) in a.iter().zip(b).enumerate() {
-                compare(&format!("{key}[{k}]"), a, b, found);
             }
         }
         _ if a != b => found.push(format!("{key}: {a} ≠ {b}")),

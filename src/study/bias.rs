@@ -298,8 +298,8 @@ mod tests {
         let (calibrated, raw) = (&found[0], &found[1]);
         assert_eq!((calibrated.galaxies, calibrated.dropped), (1024, 0));
         for k in 0..2 {
-            // A thousand galaxies tell m to 0.002 and c to 0.0005. A response of the wrong component, of
-            // distortions, or without its terms of noise is wrong by far more.
+            // A thousand galaxies tell m to 0.002 and c to 0.0005. A response of the wrong component or of
+            // distortions is wrong by far more.
             assert!(calibrated.m_error[k] < 0.004, "{calibrated:?}");
             assert!(calibrated.c_error[k] < 0.001, "{calibrated:?}");
             let (m, c) = (calibrated.m[k], calibrated.c[k]);

@@ -87,8 +87,8 @@ pub fn contest_table(
         }
     }
     if results.len() > 1 {
-        let limits = biases.iter().filter_map(|b| b.limit);
-        let limit = mean_over_sets(&limits.map(|limit| (limit, None)).collect::<Vec<_>>()).0;
+        let limits: Vec<f64> = biases.iter().filter_map(|b| b.limit).collect();
+        let limit = limits.iter().sum::<f64>() / limits.len() as f64;
         for (k, submission) in plan.submissions.iter().enumerate() {
             let mean = |value: &dyn Fn(&Result) -> (f64, Option<f64>), decimals: usize| {
                 let all: Vec<_> = results.iter().map(|r| value(&r.results[k])).collect();
@@ -180,6 +180,7 @@ fn row(
         Cell::with_error(value * scale, Some(error * scale), 1)
     };
     let scatter = own.response.rms_scatter();
+    let (q_spectrum, q_spectrum_error) = spectrum(own);
     vec![
         Cell::text(format!("{:02}", result.set)),
         Cell::text(SetKind::of(result.set).map_or("", |kind| kind.image.label())),
@@ -193,10 +194,7 @@ fn row(
         Cell::with_error(biases.leakage, Some(biases.leakage_error), 3),
         Cell::number((own.response.flagged + biases.dropped) as f64, 0),
         Cell::with_error(own.figures.q, own.errors.map(|e| e.q), 1),
-        {
-            let (q, error) = spectrum(own);
-            Cell::with_error(q, error, 0)
-        },
+        Cell::with_error(q_spectrum, q_spectrum_error, 0),
         Cell::number(bias.limit.unwrap_or(f64::NAN), 0),
         Cell::number(cost, 0),
     ]

@@ -44,8 +44,8 @@ pub struct Expected {
     pub grid: Grid,
     /// True shear by set, where known: then conventions and the type of ellipticity are checked.
     pub truth: BTreeMap<u32, TrueShear>,
-    /// Images that every set must have; 0 if not known.
-    pub images: u32,
+    /// Images that every set must have, where known.
+    pub images: Option<u32>,
 }
 
 /// Largest share of a cell by which positions may be off its centre.
@@ -366,7 +366,7 @@ fn check_images(
         .last()
         .copied()
         .unwrap_or(0)
-        .max(expected.images);
+        .max(expected.images.unwrap_or(0));
     let missing: Vec<String> = (1..=last)
         .filter(|image| files.numbers.binary_search(image).is_err())
         .map(|image| image.to_string())
@@ -385,11 +385,8 @@ fn check_images(
         );
         report.error(path, "images", message);
     }
-    if expected.images > 0 && last > expected.images {
-        let message = format!(
-            "set {set} has an image {last}; expected {} images",
-            expected.images
-        );
+    if let Some(images) = expected.images.filter(|images| last > *images) {
+        let message = format!("set {set} has an image {last}; expected {images} images");
         report.error(path, "images", message);
     }
 }
@@ -418,10 +415,8 @@ fn check_against_truth(
         report.warn(path, "correlation", message);
         return;
     }
-    // Twice the noise of a correlation of that many modes, for both.
-    let modes: usize = SCORED.map(|b| score.bins.modes[b]).sum();
     let excess = matched.correlation - standard.correlation;
-    if score.matched != Convention::STANDARD && excess > 4.0 * (2.0 / modes as f64).sqrt() {
+    if score.matched != Convention::STANDARD && excess > score.clear_correlation() {
         let message = format!(
             "set {set}: wrong convention suspected: {} (convention {}) correlates with the true shear by {:.2}, as given only by {:.2}",
             matched.convention.describe(),
