@@ -204,6 +204,25 @@ impl Bins {
         })
     }
 
+    /// Calls with every scored mode (in FFT order), its bin, and its weight w in P_b = Σ w·Re(a b*).
+    pub(crate) fn each_scored(&self, mut call: impl FnMut((usize, usize), usize, f64)) {
+        let n4 = (self.n as f64).powi(4);
+        for (at, &bin) in self.bin_of.indexed_iter() {
+            let bin = usize::from(bin);
+            if SCORED.contains(&bin) {
+                let l = self.modulus[at];
+                let weight = match self.definition {
+                    Definition::Leaderboard => l / (n4 * self.width),
+                    Definition::Corrected => {
+                        let modes = self.modes[bin] as f64;
+                        (l * self.side).powi(2) / (2.0 * std::f64::consts::PI * n4 * modes)
+                    }
+                };
+                call(at, bin, weight);
+            }
+        }
+    }
+
     /// Plain sums over scored modes of Re(a·b*), each mode counting once.
     pub(crate) fn scored_product(&self, a: &Array2<Complex64>, b: &Array2<Complex64>) -> f64 {
         self.bin_of

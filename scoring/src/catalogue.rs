@@ -22,8 +22,11 @@ pub struct Row {
     pub e2: f64,
 }
 
-/// How the rows of one catalogue, or of several, were used.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+/// An ellipticity larger than this is none: a value that stands for "not measured", or another quantity.
+const ABSURD: f64 = 5.0;
+
+/// How the rows of one catalogue, or of several, were used, and what is odd about them.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct RowCounts {
     /// Rows added to a cell.
     pub used: usize,
@@ -33,6 +36,16 @@ pub struct RowCounts {
     pub excess: usize,
     /// Rows with an ellipticity that is not a finite number; counted as missing.
     pub not_finite: usize,
+    /// Rows added to a cell that had one of the same image.
+    pub repeated: usize,
+    /// Cells of the images without any row.
+    pub missing: usize,
+    /// Rows used with |e| > 1, which no ellipse has.
+    pub above_one: usize,
+    /// Of these, rows with |e| > 5, which are no ellipticities.
+    pub absurd: usize,
+    /// The first of those: its place, counted from 1, and its ellipticity.
+    pub first_absurd: Option<(usize, f64, f64)>,
 }
 
 impl std::ops::AddAssign for RowCounts {
@@ -41,6 +54,67 @@ impl std::ops::AddAssign for RowCounts {
         self.outside += other.outside;
         self.excess += other.excess;
         self.not_finite += other.not_finite;
+        self.repeated += other.repeated;
+        self.missing += other.missing;
+        self.above_one += other.above_one;
+        self.absurd += other.absurd;
+        self.first_absurd = self.first_absurd.or(other.first_absurd);
+    }
+}
+
+impl RowCounts {
+    /// Why these rows of another program should not be scored as they are, if so.
+    pub fn fault(&self, grid: &Grid) -> Option<String> {
+        if let Some((row, e1, e2)) = self.first_absurd {
+            return Some(format!(
+                "{} rows have |e| > {ABSURD}, the first of them row {row} with ({e1}, {e2}); expected ellipticities. If the value stands for \"not measured\", name it as missing; if it is an outlier, set a largest |e|",
+                self.absurd
+            ));
+        }
+        (2 * self.repeated > self.used).then(|| {
+            format!(
+                "{} of {} rows fall into cells that have a row already; expected positions in pixels, of {} px stamps on a {3} × {3} grid",
+                self.repeated, self.used, grid.stamp.0, grid.n
+            )
+        })
+    }
+
+    /// What is odd, a line each, of the catalogues of `whose`: what, how much, and what was done with it.
+    pub fn oddities(&self, whose: &str) -> Vec<String> {
+        let mut lines = Vec::new();
+        if self.outside + self.excess > 0 {
+            lines.push(format!(
+                "Warning: {whose} has {} rows outside the grid and {} beyond the number of cells; they do not count.",
+                self.outside, self.excess
+            ));
+        }
+        if self.repeated > 0 {
+            lines.push(format!(
+                "Warning: {} rows of {whose} are of galaxies that have one already; they add up.",
+                self.repeated
+            ));
+        }
+        if self.missing > 0 {
+            lines.push(format!(
+                "Warning: {} of {} galaxies of {whose} are not in the catalogues; each counts as zero.",
+                self.missing,
+                self.missing + self.used + self.not_finite - self.repeated
+            ));
+        }
+        if self.above_one > 0 {
+            lines.push(format!(
+                "Warning: {} rows of {whose} have |e| > 1; they are scored as they are.",
+                self.above_one
+            ));
+        }
+        if self.not_finite > 0 {
+            lines.push(format!(
+                "Note: {} of {} galaxies of {whose} have no ellipticity and count as missing.",
+                self.not_finite,
+                self.not_finite + self.used
+            ));
+        }
+        lines
     }
 }
 
@@ -76,6 +150,7 @@ impl FieldSum {
     /// not finite numbers count as missing.
     pub fn add_image(&mut self, grid: &Grid, rows: impl IntoIterator<Item = Row>) -> RowCounts {
         let mut counts = RowCounts::default();
+        let mut seen = Array2::from_elem((grid.n, grid.n), false);
         self.images += 1;
         for (place, row) in rows.into_iter().enumerate() {
             if place >= grid.cells() {
@@ -86,6 +161,7 @@ impl FieldSum {
                 counts.outside += 1;
                 continue;
             };
+            let repeated = std::mem::replace(&mut seen[cell], true);
             if !(row.e1.is_finite() && row.e2.is_finite()) {
                 counts.not_finite += 1;
                 continue;
@@ -94,7 +170,17 @@ impl FieldSum {
             self.e2[cell] += row.e2;
             self.count[cell] += 1.0;
             counts.used += 1;
+            counts.repeated += usize::from(repeated);
+            let square = row.e1 * row.e1 + row.e2 * row.e2;
+            counts.above_one += usize::from(square > 1.0);
+            if square > ABSURD * ABSURD {
+                counts.absurd += 1;
+                counts
+                    .first_absurd
+                    .get_or_insert((place + 1, row.e1, row.e2));
+            }
         }
+        counts.missing = seen.iter().filter(|seen| !**seen).count();
         counts
     }
 
@@ -136,7 +222,20 @@ pub enum TruthSign {
     Standard,
 }
 
+/// True shears closer together than this are the same.
+const SAME_SHEAR: f64 = 1e-10;
+
 impl TrueShear {
+    /// The shear, where it is the same in all cells: then there is no power beyond the zero mode.
+    pub fn constant(&self) -> Option<[f64; 2]> {
+        let value = |g: &Array2<f64>| {
+            let first = *g.first()?;
+            let same = g.iter().all(|g| (g - first).abs() <= SAME_SHEAR);
+            same.then_some(first)
+        };
+        Some([value(&self.g1)?, value(&self.g2)?])
+    }
+
     /// From rows of (x, y, g₁, g₂), in any order.
     ///
     /// # Errors

@@ -25,6 +25,27 @@ pub enum ConventionClass {
     B,
 }
 
+impl ConventionClass {
+    /// Both, in order.
+    pub const BOTH: [ConventionClass; 2] = [ConventionClass::A, ConventionClass::B];
+
+    /// Place in [`ConventionClass::BOTH`].
+    pub fn index(self) -> usize {
+        match self {
+            ConventionClass::A => 0,
+            ConventionClass::B => 1,
+        }
+    }
+
+    /// The member that does not swap x and y, and leaves e1 as it is.
+    pub fn representative(self) -> Convention {
+        match self {
+            ConventionClass::A => Convention(6),
+            ConventionClass::B => Convention::STANDARD,
+        }
+    }
+}
+
 impl Convention {
     /// All eight, in order.
     pub const ALL: [Convention; 8] = [
@@ -84,6 +105,14 @@ impl Convention {
             6 => "e2 flipped",
             7 => "e1 and e2 flipped",
             _ => "e1 flipped",
+        }
+    }
+
+    /// A field on `[ix, iy]` as this convention indexes it.
+    pub(crate) fn turn(self, field: &Array2<f64>) -> Array2<f64> {
+        match self.transposes() {
+            true => field.t().to_owned(),
+            false => field.clone(),
         }
     }
 

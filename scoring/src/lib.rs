@@ -40,7 +40,10 @@ mod convention;
 mod cross;
 mod ellipticity;
 mod error;
+mod errors;
+mod figures;
 mod grid;
+mod matching;
 pub mod modes;
 pub mod quality;
 pub mod resample;
@@ -53,9 +56,11 @@ pub use convention::{Convention, ConventionClass};
 pub use cross::{CrossSpectrum, cross_spectrum};
 pub use ellipticity::{Distortion, Shear};
 pub use error::ScoringError;
+pub use figures::{Figure, Figures};
 pub use grid::Grid;
+pub use matching::ConventionMatch;
 pub use quality::{Bias, BiasFits, Quality};
 pub use score::{
-    Choice, ConventionScore, Figures, MAX_GROUPS, Noise, Options, SetImages, SetScore, SetScorer,
-    measured_bandpowers,
+    Choice, ConventionScore, MAX_GROUPS, MeanShear, Noise, Options, SetImages, SetScore, SetScorer,
+    SpectrumCovariance, SpectrumScore, measured_bandpowers,
 };

@@ -82,6 +82,17 @@ impl Decomposer {
         field
     }
 
+    /// The plain FFT of a field on the grid.
+    pub(crate) fn fft(&self, mut field: Array2<Complex64>) -> Array2<Complex64> {
+        self.transform(&mut field, &self.forward);
+        field
+    }
+
+    /// K = exp(−2iφ) of a mode in FFT order; zero at the zero mode.
+    pub(crate) fn kernel(&self, mode: (usize, usize)) -> Complex64 {
+        self.kernel[mode]
+    }
+
     /// One-dimensional transforms along both axes, unscaled.
     fn transform(&self, field: &mut Array2<Complex64>, fft: &Arc<dyn Fft<f64>>) {
         for _ in 0..2 {

@@ -66,25 +66,34 @@ pub struct Bias {
 
 /// Fits M and A to `measured` against `truth` after multiplying each bin by `scale`.
 pub fn bias(measured: &[f64; BINS], truth: &[f64; BINS], scale: impl Fn(usize) -> f64) -> Bias {
-    let points: Vec<(f64, f64)> = SCORED
-        .map(|b| {
-            let t = truth[b] * scale(b);
-            (t, measured[b] * scale(b) - t)
-        })
-        .collect();
-    let count = points.len() as f64;
-    let mean_x = points.iter().map(|p| p.0).sum::<f64>() / count;
-    let mean_y = points.iter().map(|p| p.1).sum::<f64>() / count;
-    let sxx: f64 = points.iter().map(|p| (p.0 - mean_x).powi(2)).sum();
-    let sxy: f64 = points.iter().map(|p| (p.0 - mean_x) * (p.1 - mean_y)).sum();
-    let slope = sxy / sxx;
-    let intercept = mean_y - slope * mean_x;
+    let (mut slope, mut intercept) = (0.0, 0.0);
+    for (b, (of_m, of_a)) in SCORED.zip(bias_weights(truth, &scale)) {
+        let apart = (measured[b] - truth[b]) * scale(b);
+        slope += of_m * apart;
+        intercept += of_a * apart;
+    }
     Bias {
         M: slope,
         A: intercept,
         sqrtA: intercept.signum() * intercept.abs().sqrt(),
         m: slope / 2.0,
     }
+}
+
+/// The weights of each scored bin's C_b − C_b^true in M and in A.
+pub(crate) fn bias_weights(
+    truth: &[f64; BINS],
+    scale: impl Fn(usize) -> f64,
+) -> [(f64, f64); SCORED.end - SCORED.start] {
+    let x: [f64; SCORED.end - SCORED.start] =
+        std::array::from_fn(|k| truth[SCORED.start + k] * scale(SCORED.start + k));
+    let count = x.len() as f64;
+    let mean = x.iter().sum::<f64>() / count;
+    let sxx: f64 = x.iter().map(|x| (x - mean).powi(2)).sum();
+    x.map(|x| {
+        let of_m = (x - mean) / sxx;
+        (of_m, 1.0 / count - of_m * mean)
+    })
 }
 
 /// The same fit in the units that have been in use. The published figures are `cl`; in ℓ²C_ℓ units

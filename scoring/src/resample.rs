@@ -43,15 +43,12 @@ pub fn jackknife_error(full: f64, replicates: impl IntoIterator<Item = f64>, ima
 }
 
 /// Mean over sets of a figure and its standard error. Sets have noise of their own, so their
-/// variances add: error = √(Σ σ²)/N.
-pub fn mean_over_sets(values_and_errors: &[(f64, Option<f64>)]) -> (f64, Option<f64>) {
+/// variances add: error = √(Σ σ²)/N, not a number where one of them is unknown.
+pub fn mean_over_sets(values_and_errors: &[(f64, f64)]) -> (f64, f64) {
     let count = values_and_errors.len() as f64;
     let mean = values_and_errors.iter().map(|v| v.0).sum::<f64>() / count;
-    let variance = values_and_errors
-        .iter()
-        .map(|v| v.1.map(|e| e * e))
-        .sum::<Option<f64>>();
-    (mean, variance.map(|v| v.sqrt() / count))
+    let variance: f64 = values_and_errors.iter().map(|v| v.1 * v.1).sum();
+    (mean, variance.sqrt() / count)
 }
 
 /// Difference of two figures measured on the same images, in units of its own error.

@@ -1,28 +1,28 @@
 //! Scores of one set: every convention, noise, biases, null tests, and errors of all of them.
 
-use std::collections::BTreeMap;
-
 use ndarray::Array2;
-use serde::{Deserialize, Deserializer, Serialize};
+use rustfft::num_complex::Complex64;
+use serde::Serialize;
 
 use crate::bandpower::{BINS, Bins, Definition, SCORED};
 use crate::catalogue::{FieldSum, TrueShear};
 use crate::convention::{Convention, ConventionClass};
 use crate::error::ScoringError;
+use crate::errors::{self, Scatter};
+use crate::figures::Figures;
 use crate::grid::Grid;
+use crate::matching::ConventionMatch;
 use crate::modes::{Decomposer, Modes};
-use crate::quality::{BiasFits, Quality, bias_fits, quality};
+use crate::quality::{BiasFits, Quality, bias_fits, quality, quality_error};
 use crate::resample::jackknife_error;
 
 /// Most groups of images that the jackknife leaves out in turn.
 pub const MAX_GROUPS: usize = 20;
-/// Standard deviations of chance at which a correlation with the truth is believed.
-const CLEAR_MATCH: f64 = 4.0;
 
 /// Which convention the figures of a table are taken from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Choice {
-    /// The one whose E modes correlate best with the truth.
+    /// The one whose E modes clearly correlate best with the truth, otherwise the standard one.
     #[default]
     Matched,
     /// The one with the highest Q, as the challenge's leaderboard took it.
@@ -116,108 +116,24 @@ pub struct ConventionScore {
     pub quality: Quality,
     /// The same after removing the noise power; `None` where the noise is not known.
     pub quality_dn: Option<Quality>,
+    /// E-mode bandpowers less those of noise; the former where noise is not known.
+    noise_free: [f64; BINS],
     /// M and A before removing noise.
     pub fit: BiasFits,
     /// M and A after removing noise.
     pub fit_dn: Option<BiasFits>,
 }
 
-/// Headline figures of one set, or of a jackknife replicate of it.
+/// What is known of a set whose true shear is the same everywhere, in the chosen convention: it has no
+/// power to compare, and its means are its figures.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Figures {
-    /// Quality factor.
-    pub q: f64,
-    /// Quality factor after removing the noise; not a number where the noise is unknown.
-    pub q_dn: f64,
-    /// M/2 from the power spectrum.
-    pub m_half: f64,
-    /// signed √A in units of 10⁻⁴ (C_ℓ in steradian).
-    pub sqrt_a: f64,
-    /// Multiplicative bias by cross-correlation of E modes with the truth.
-    pub m_cross: f64,
-    /// Multiplicative bias of component 1, from the catalogue.
-    pub m1: f64,
-    /// Multiplicative bias of component 2.
-    pub m2: f64,
-    /// Additive bias of component 1.
-    pub c1: f64,
-    /// Additive bias of component 2.
-    pub c2: f64,
-    /// Mean C_ℓ of the B modes over bins 2 to 9, in 10⁻⁹ steradian.
-    pub b_power: f64,
-    /// Mean C_ℓ of the EB cross-spectrum over bins 2 to 9, in 10⁻⁹ steradian.
-    pub eb_power: f64,
-}
-
-impl Figures {
-    /// Names of the figures, in the order of [`Figures::values`].
-    pub const NAMES: [&'static str; 11] = [
-        "q", "q_dn", "m_half", "sqrt_a", "m_cross", "m1", "m2", "c1", "c2", "b_power", "eb_power",
-    ];
-
-    /// All figures as an array.
-    pub fn values(&self) -> [f64; 11] {
-        let Figures {
-            q,
-            q_dn,
-            m_half,
-            sqrt_a,
-            m_cross,
-            m1,
-            m2,
-            c1,
-            c2,
-            b_power,
-            eb_power,
-        } = *self;
-        [
-            q, q_dn, m_half, sqrt_a, m_cross, m1, m2, c1, c2, b_power, eb_power,
-        ]
-    }
-
-    /// The inverse of [`Figures::values`].
-    pub fn from_values(values: [f64; 11]) -> Self {
-        let [
-            q,
-            q_dn,
-            m_half,
-            sqrt_a,
-            m_cross,
-            m1,
-            m2,
-            c1,
-            c2,
-            b_power,
-            eb_power,
-        ] = values;
-        Figures {
-            q,
-            q_dn,
-            m_half,
-            sqrt_a,
-            m_cross,
-            m1,
-            m2,
-            c1,
-            c2,
-            b_power,
-            eb_power,
-        }
-    }
-}
-
-/// JSON has no NaN: what was written as null is read as that.
-impl<'de> Deserialize<'de> for Figures {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let found = BTreeMap::<String, Option<f64>>::deserialize(deserializer)?;
-        let mut values = [0.0; Self::NAMES.len()];
-        for (value, name) in values.iter_mut().zip(Self::NAMES) {
-            let number = found.get(name);
-            let number = number.ok_or_else(|| serde::de::Error::missing_field(name))?;
-            *value = number.unwrap_or(f64::NAN);
-        }
-        Ok(Self::from_values(values))
-    }
+pub struct MeanShear {
+    /// Mean ellipticity of the galaxies.
+    pub e: [f64; 2],
+    /// Its standard error.
+    pub error: [f64; 2],
+    /// The true shear.
+    pub truth: [f64; 2],
 }
 
 /// Everything found about one set.
@@ -241,16 +157,18 @@ pub struct SetScore {
     pub conventions: Vec<ConventionScore>,
     /// The convention with the highest Q.
     pub best: Convention,
-    /// The convention whose E modes correlate best with the truth.
-    pub matched: Convention,
+    /// How well each convention correlates with the truth.
+    pub matching: ConventionMatch,
     /// The convention of the headline figures.
     pub chosen: Convention,
-    /// How it was chosen.
-    pub choice: Choice,
     /// Headline figures.
     pub figures: Figures,
-    /// The same with each group of images left out in turn; empty with fewer than two images.
+    /// Their standard errors; not a number where unknown.
+    pub errors: Figures,
+    /// The figures with each group of images left out in turn; empty with fewer than two images.
     pub replicates: Vec<Figures>,
+    /// Means, where the true shear is the same everywhere. All figures but c1 and c2 are then unknown.
+    pub constant: Option<MeanShear>,
 }
 
 impl SetScore {
@@ -259,43 +177,10 @@ impl SetScore {
         &self.conventions[self.chosen.index()]
     }
 
-    /// Jackknife standard errors of the headline figures; `None` with fewer than two images.
-    pub fn errors(&self) -> Option<Figures> {
-        if self.replicates.len() < 2 {
-            return None;
-        }
-        let full = self.figures.values();
-        let rows: Vec<[f64; 11]> = self.replicates.iter().map(Figures::values).collect();
-        Some(Figures::from_values(std::array::from_fn(|i| {
-            jackknife_error(full[i], rows.iter().map(|row| row[i]), self.images)
-        })))
-    }
-
-    /// Whether the leaderboard's best convention is of another class than the matched one: its Q
-    /// is then the gain from a wrong convention, not from a good measurement.
+    /// Whether the leaderboard's best convention is of another class than the chosen one: its Q is then
+    /// the gain from a wrong convention, not from a good measurement.
     pub fn wrong_convention_wins(&self) -> bool {
-        self.best.class() != self.matched.class()
-    }
-
-    /// The least correlation, or difference of two, that is clearly more than chance: of N modes without
-    /// anything in common it scatters by 1/√(N/2), opposite modes being conjugates.
-    pub fn clear_correlation(&self) -> f64 {
-        let modes: usize = SCORED.map(|b| self.bins.modes[b]).sum();
-        CLEAR_MATCH * (2.0 / modes as f64).sqrt()
-    }
-
-    /// The matched convention's correlation with the truth, and whether it is clearly more than chance.
-    pub fn match_with_truth(&self) -> (f64, bool) {
-        let correlation = self.conventions[self.matched.index()].correlation;
-        (correlation, correlation >= self.clear_correlation())
-    }
-
-    /// The highest correlation with the truth among the conventions of a class.
-    pub fn class_correlation(&self, class: ConventionClass) -> f64 {
-        self.conventions
-            .iter()
-            .filter(|c| c.convention.class() == class)
-            .fold(f64::NEG_INFINITY, |best, c| best.max(c.correlation))
+        self.best.class() != self.chosen.class()
     }
 
     /// Share of the scored true power that is in B modes; a truth read with the wrong sign of g₂
@@ -307,23 +192,37 @@ impl SetScore {
     }
 }
 
-/// What the noise of a group of images is measured from.
+/// Covariance of the eight bandpowers of a power-spectrum submission.
+pub type SpectrumCovariance = [[f64; SCORED.end - SCORED.start]; SCORED.end - SCORED.start];
+
+/// Figures of a power-spectrum submission; errors are not numbers where the covariance is unknown.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SpectrumScore {
+    /// Q and σ_sys.
+    pub quality: Quality,
+    /// Standard error of Q.
+    pub quality_error: f64,
+    /// M/2.
+    pub m_half: f64,
+    /// Its standard error.
+    pub m_half_error: f64,
+    /// Signed √A in 10⁻⁴ (C_ℓ in steradian).
+    pub sqrt_a: f64,
+    /// Its standard error.
+    pub sqrt_a_error: f64,
+}
+
+/// What the noise of a mean field is measured from: that of a group of images, or of all.
 #[derive(Debug, Clone, Copy)]
-struct GroupPower {
-    /// E-mode bandpowers of the group's mean field.
-    power: [f64; BINS],
+struct MeanPower {
+    /// Its E-mode bandpowers in conventions of either class.
+    power: [[f64; BINS]; 2],
     /// Variance of its noise per unit variance of a galaxy's.
     gain: f64,
 }
 
-impl Default for GroupPower {
-    fn default() -> Self {
-        GroupPower {
-            power: [0.0; BINS],
-            gain: 0.0,
-        }
-    }
-}
+/// Noise bandpowers in conventions of either class.
+type NoisePower = [[f64; BINS]; 2];
 
 /// Scores submissions of one set against its true shear.
 pub struct SetScorer {
@@ -363,58 +262,45 @@ impl SetScorer {
         if total.images == 0 {
             return Err(ScoringError::NoImages);
         }
-        let groups = self.group_powers(images);
+        let groups: Vec<MeanPower> = match self.options.noise {
+            Noise::Given(_) => Vec::new(),
+            Noise::Measured => images.groups.iter().map(|g| self.mean_power(g)).collect(),
+        };
         let noise = self.noise_power(total, &groups);
-        let modes: Vec<Modes> = Convention::ALL.map(|k| self.modes(total, k)).into();
-        let true_modes = self.true_modes(total, Convention::STANDARD);
-        let conventions: Vec<ConventionScore> = Convention::ALL
-            .iter()
-            .zip(&modes)
-            .map(|(&k, modes)| {
-                let truth = match self.options.definition {
-                    Definition::Leaderboard => &true_modes,
-                    // The mask is turned with the convention.
-                    Definition::Corrected => &self.true_modes(total, k),
-                };
-                self.convention_score(k, modes, truth, noise.as_ref())
-            })
-            .collect();
-        let argmax = |value: fn(&ConventionScore) -> f64| {
-            conventions
-                .iter()
-                .fold(None::<&ConventionScore>, |best, c| match best {
-                    Some(b) if value(b) >= value(c) || value(c).is_nan() => Some(b),
-                    _ => Some(c),
-                })
-                .map_or(Convention::STANDARD, |c| c.convention)
-        };
-        let best = argmax(|c| c.quality.q);
-        // A blank submission correlates with nothing: then no convention is better than the standard.
-        let matched = if conventions.iter().all(|c| c.correlation.is_nan()) {
-            Convention::STANDARD
-        } else {
-            argmax(|c| c.correlation)
-        };
+        let conventions = Convention::ALL.map(|k| {
+            let (modes, truth) = (self.modes(total, k), self.true_modes(total, k));
+            self.convention_score(k, &modes, &truth, noise.as_ref())
+        });
+        let matching = ConventionMatch::new(
+            conventions.each_ref().map(|c| c.correlation),
+            self.scored_modes(),
+        );
+        let best = best_of(&conventions);
         let chosen = match self.options.choice {
-            Choice::Matched => matched,
+            Choice::Matched => matching.convention(),
             Choice::Best => best,
             Choice::Insist(k) => k,
         };
         let figures = self.figures(total, &conventions[chosen.index()]);
-        let replicates = if images.groups.len() < 2 {
-            Vec::new()
-        } else {
-            images
-                .groups
-                .iter()
-                .enumerate()
-                .map(|(k, group)| {
+        let replicates: Vec<Figures> = match images.groups.len() {
+            0 | 1 => Vec::new(),
+            _ => (0..images.groups.len())
+                .map(|k| {
                     let mut rest = groups.clone();
-                    rest.remove(k);
-                    self.replicate(total, group, chosen, &rest, noise.as_ref())
+                    if k < rest.len() {
+                        rest.remove(k);
+                    }
+                    self.replicate(total, &images.groups[k], chosen, &rest, noise.as_ref())
                 })
-                .collect()
+                .collect(),
         };
+        let errors = self.errors(images, &conventions[chosen.index()], &figures, &replicates);
+        let constant = self.truth.constant().map(|truth| MeanShear {
+            e: [truth[0] + figures.c1, truth[1] + figures.c2],
+            error: [errors.c1, errors.c2],
+            truth,
+        });
+        let noise = noise.map(|power| power[chosen.class().index()]);
         let noise_variance = noise.as_ref().map(|power| match self.options.noise {
             Noise::Given(variance) => variance,
             Noise::Measured => {
@@ -422,6 +308,7 @@ impl SetScorer {
                 SCORED.map(|b| power[b]).sum::<f64>() / SCORED.map(|b| unit[b]).sum::<f64>()
             }
         });
+        let true_modes = self.true_modes(total, Convention::STANDARD);
         Ok(SetScore {
             grid: self.grid,
             bins: self.bins.clone(),
@@ -430,21 +317,48 @@ impl SetScorer {
             true_bb: self.bins.power(&true_modes.b, &true_modes.b),
             noise,
             noise_variance,
-            conventions,
+            conventions: conventions.into(),
             best,
-            matched,
+            matching,
             chosen,
-            choice: self.options.choice,
             figures,
+            errors,
             replicates,
+            constant,
         })
     }
 
-    /// Q of a power-spectrum submission: bandpowers of bins 2 to 9 against the true E modes.
+    /// How well each convention of a submission's field correlates with the truth over bins 2 to 9.
+    pub fn match_convention(&self, images: &SetImages) -> ConventionMatch {
+        let total = &images.total;
+        let correlations = Convention::ALL.map(|k| {
+            let (modes, truth) = (self.modes(total, k), self.true_modes(total, k));
+            self.correlation(&modes, &truth)
+        });
+        ConventionMatch::new(correlations, self.scored_modes())
+    }
+
+    fn scored_modes(&self) -> usize {
+        SCORED.map(|b| self.bins.modes[b]).sum()
+    }
+
+    /// Correlation of E modes with the true ones over the scored bins.
+    fn correlation(&self, modes: &Modes, truth: &Modes) -> f64 {
+        let product = |a, b| self.bins.scored_product(a, b);
+        let power = product(&truth.e, &truth.e) * product(&modes.e, &modes.e);
+        product(&truth.e, &modes.e) / power.sqrt()
+    }
+
+    /// Scores a power-spectrum submission: bandpowers of bins 2 to 9 against the true E modes, with
+    /// errors where their covariance is known.
     ///
     /// # Errors
     /// Where there are not exactly eight bandpowers.
-    pub fn score_spectrum(&self, powers: &[f64]) -> Result<(Quality, BiasFits), ScoringError> {
+    pub fn score_spectrum(
+        &self,
+        powers: &[f64],
+        covariance: Option<&SpectrumCovariance>,
+    ) -> Result<SpectrumScore, ScoringError> {
         if powers.len() != SCORED.len() {
             return Err(ScoringError::SpectrumBins {
                 found: powers.len(),
@@ -454,10 +368,24 @@ impl SetScorer {
         let mut measured = [0.0; BINS];
         measured[SCORED].copy_from_slice(powers);
         let truth = self.true_bandpowers();
-        Ok((
-            quality(&self.bins, &measured, &truth),
-            bias_fits(&self.bins, self.grid.side().0, &measured, &truth),
-        ))
+        let unknown = [[f64::NAN; BINS]; BINS];
+        let covariance = covariance.map_or(unknown, |scored| {
+            let mut all = [[0.0; BINS]; BINS];
+            for (i, row) in SCORED.zip(scored) {
+                all[i][SCORED].copy_from_slice(row);
+            }
+            all
+        });
+        let fit = bias_fits(&self.bins, self.grid.side().0, &measured, &truth);
+        let (m, a) = errors::of_biases(&self.bins, &truth, &covariance);
+        Ok(SpectrumScore {
+            quality: quality(&self.bins, &measured, &truth),
+            quality_error: quality_error(&self.bins, &measured, &truth, &covariance),
+            m_half: fit.cl.m,
+            m_half_error: m / 2.0,
+            sqrt_a: fit.cl.sqrtA * 1e4,
+            sqrt_a_error: errors::of_sqrt_a(fit.cl.A, a),
+        })
     }
 
     /// Bandpowers of the true shear's E modes without a mask.
@@ -537,29 +465,16 @@ impl SetScorer {
         }
     }
 
-    /// E-mode bandpowers of each group's mean field, with its noise gain. The sign and axis
-    /// convention does not matter to the mean of the noise; the standard one is used.
-    fn group_powers(&self, images: &SetImages) -> Vec<GroupPower> {
-        match self.options.noise {
-            Noise::Given(_) => images
-                .groups
-                .iter()
-                .map(|_| GroupPower::default())
-                .collect(),
-            Noise::Measured => images
-                .groups
-                .iter()
-                .map(|group| GroupPower {
-                    power: self.standard_power(group),
-                    gain: self.noise_gain(group),
-                })
-                .collect(),
+    /// E-mode bandpowers of a mean field in either class of conventions, with its noise gain. Within a
+    /// class the scored bandpowers are the same.
+    fn mean_power(&self, sum: &FieldSum) -> MeanPower {
+        MeanPower {
+            power: ConventionClass::BOTH.map(|class| {
+                let modes = self.modes(sum, class.representative());
+                self.bins.power(&modes.e, &modes.e)
+            }),
+            gain: self.noise_gain(sum),
         }
-    }
-
-    fn standard_power(&self, sum: &FieldSum) -> [f64; BINS] {
-        let modes = self.modes(sum, Convention::STANDARD);
-        self.bins.power(&modes.e, &modes.e)
     }
 
     /// Noise bandpowers of the E modes averaged in `sum`, which is made of `groups`; `None` where
@@ -567,19 +482,22 @@ impl SetScorer {
     ///
     /// Measured: with noise gains r_g of the groups and r of all, ⟨P(E_g)⟩ = S + σ²⟨r_g⟩ and
     /// P(Ē) = S + σ²r, so σ²r = r(⟨P(E_g)⟩ − P(Ē)) / (⟨r_g⟩ − r). It counts whatever changes from
-    /// image to image in the E modes, and nothing else.
-    fn noise_power(&self, sum: &FieldSum, groups: &[GroupPower]) -> Option<[f64; BINS]> {
+    /// image to image in the E modes, and nothing else; in the wrong class of conventions half of the
+    /// intrinsic ellipticities' power are E modes, so each class has noise of its own.
+    fn noise_power(&self, sum: &FieldSum, groups: &[MeanPower]) -> Option<NoisePower> {
         let gain = self.noise_gain(sum);
         match self.options.noise {
-            Noise::Given(variance) => Some(self.bins.white_noise(variance * gain)),
+            Noise::Given(variance) => Some([self.bins.white_noise(variance * gain); 2]),
             Noise::Measured if groups.len() < 2 => None,
             Noise::Measured => {
                 let count = groups.len() as f64;
                 let mean_gain = groups.iter().map(|g| g.gain).sum::<f64>() / count;
-                let total = self.standard_power(sum);
-                Some(std::array::from_fn(|b| {
-                    let mean = groups.iter().map(|g| g.power[b]).sum::<f64>() / count;
-                    gain * (mean - total[b]) / (mean_gain - gain)
+                let total = self.mean_power(sum);
+                Some(std::array::from_fn(|class| {
+                    std::array::from_fn(|b| {
+                        let mean = groups.iter().map(|g| g.power[class][b]).sum::<f64>() / count;
+                        gain * (mean - total.power[class][b]) / (mean_gain - gain)
+                    })
                 }))
             }
         }
@@ -590,26 +508,29 @@ impl SetScorer {
         convention: Convention,
         modes: &Modes,
         truth: &Modes,
-        noise: Option<&[f64; BINS]>,
+        noise: Option<&NoisePower>,
     ) -> ConventionScore {
         let side = self.grid.side().0;
         let ee = self.bins.power(&modes.e, &modes.e);
         let true_ee = self.bins.power(&truth.e, &truth.e);
         let cross = self.bins.scored_product(&truth.e, &modes.e);
         let true_power = self.bins.scored_product(&truth.e, &truth.e);
-        let power = self.bins.scored_product(&modes.e, &modes.e);
-        let denoised = noise.map(|n| std::array::from_fn::<f64, BINS, _>(|b| ee[b] - n[b]));
+        let denoised = noise.map(|n| {
+            let n = &n[convention.class().index()];
+            std::array::from_fn::<f64, BINS, _>(|b| ee[b] - n[b])
+        });
         ConventionScore {
             convention,
             ee,
             bb: self.bins.power(&modes.b, &modes.b),
             eb: self.bins.power(&modes.e, &modes.b),
-            correlation: cross / (true_power * power).sqrt(),
+            correlation: self.correlation(modes, truth),
             m_cross: cross / true_power - 1.0,
             quality: quality(&self.bins, &ee, &true_ee),
             quality_dn: denoised
                 .as_ref()
                 .map(|ee| quality(&self.bins, ee, &true_ee)),
+            noise_free: denoised.unwrap_or(ee),
             fit: bias_fits(&self.bins, side, &ee, &true_ee),
             fit_dn: denoised
                 .as_ref()
@@ -624,13 +545,13 @@ impl SetScorer {
         total: &FieldSum,
         group: &FieldSum,
         chosen: Convention,
-        others: &[GroupPower],
-        noise: Option<&[f64; BINS]>,
+        others: &[MeanPower],
+        noise: Option<&NoisePower>,
     ) -> Figures {
         let rest = total.without(group);
         let own = self.noise_power(&rest, others).or_else(|| {
             let more = self.noise_gain(&rest) / self.noise_gain(total);
-            noise.map(|n| n.map(|power| power * more))
+            noise.map(|n| n.map(|class| class.map(|power| power * more)))
         });
         let score = self.convention_score(
             chosen,
@@ -642,50 +563,170 @@ impl SetScorer {
     }
 
     fn figures(&self, sum: &FieldSum, score: &ConventionScore) -> Figures {
-        let k = score.convention;
-        let turn = |a: &Array2<f64>| {
-            if k.transposes() {
-                a.t().to_owned()
-            } else {
-                a.clone()
-            }
-        };
-        let (s1, s2) = k.signs();
-        let count = turn(&sum.count);
-        let (m1, c1) = shear_bias(&self.truth.g1, &(turn(&sum.e1) * s1), &count);
-        let (m2, c2) = shear_bias(&self.truth.g2, &(turn(&sum.e2) * s2), &count);
+        let [first, second] = self.biases(sum, score.convention);
         let mean_c_l = |power: &[f64; BINS]| {
             SCORED.map(|b| power[b] * self.bins.to_c_l(b)).sum::<f64>() / SCORED.len() as f64 * 1e9
         };
-        Figures {
+        let own = Figures {
             q: score.quality.q,
             q_dn: score.quality_dn.map_or(f64::NAN, |quality| quality.q),
             m_half: score.fit.cl.m,
             sqrt_a: score.fit.cl.sqrtA * 1e4,
             m_cross: score.m_cross,
-            m1,
-            m2,
-            c1,
-            c2,
+            m1: first.m,
+            m2: second.m,
+            c1: first.c,
+            c2: second.c,
             b_power: mean_c_l(&score.bb),
             eb_power: mean_c_l(&score.eb),
+        };
+        match self.truth.constant() {
+            None => own,
+            Some(_) => Figures {
+                c1: own.c1,
+                c2: own.c2,
+                ..Figures::unknown()
+            },
+        }
+    }
+
+    /// m and c of both components, from the galaxies.
+    fn biases(&self, sum: &FieldSum, convention: Convention) -> [ShearBias; 2] {
+        let (s1, s2) = convention.signs();
+        let count = convention.turn(&sum.count);
+        [
+            ShearBias::new(&self.truth.g1, &convention.turn(&sum.e1) * s1, &count),
+            ShearBias::new(&self.truth.g2, &convention.turn(&sum.e2) * s2, &count),
+        ]
+    }
+
+    /// Standard errors of the figures ([`crate::errors`]). c has the jackknife's over images where that is
+    /// larger: what moves all galaxies of an image alike shows nowhere else.
+    fn errors(
+        &self,
+        images: &SetImages,
+        score: &ConventionScore,
+        figures: &Figures,
+        replicates: &[Figures],
+    ) -> Figures {
+        let (sum, bins, k) = (&images.total, &self.bins, score.convention);
+        let biases = self.biases(sum, k);
+        let [v1, v2] = {
+            let residual = |bias: &ShearBias| bias.residual.mapv(|r| r / sum.images as f64);
+            let field = Convention::STANDARD.apply(&residual(&biases[0]), &residual(&biases[1]));
+            let scatter = Scatter::new(&self.grid, bins.width, &self.decomposer.decompose(field));
+            let images = sum.images as f64;
+            let sums = |weights: [&Array2<f64>; 2]| {
+                scatter
+                    .of_sums(&self.decomposer, weights)
+                    .map(|variance| variance.sqrt() * images)
+            };
+            let m = sums([&biases[0].of_m, &biases[1].of_m]);
+            let c = sums([&biases[0].of_c, &biases[1].of_c]);
+            [(m[0], c[0]), (m[1], c[1])]
+        };
+        let jackknife = |of: fn(&Figures) -> f64| {
+            jackknife_error(of(figures), replicates.iter().map(of), images.total.images)
+        };
+        let c1 = v1.1.max(jackknife(|f| f.c1));
+        let c2 = v2.1.max(jackknife(|f| f.c2));
+        if self.truth.constant().is_some() {
+            return Figures {
+                c1,
+                c2,
+                ..Figures::unknown()
+            };
+        }
+        let (mut modes, truth) = (self.modes(sum, k), self.true_modes(sum, k));
+        let signal = &truth.e * Complex64::from(1.0 + score.m_cross);
+        modes.e -= &signal;
+        let scatter = Scatter::new(&self.grid, bins.width, &modes);
+        let true_ee = bins.power(&truth.e, &truth.e);
+        let power = scatter.of_power(bins, &signal, 1.0);
+        let apart = std::array::from_fn(|b| score.ee[b] - true_ee[b]);
+        let q_dn = match (self.options.noise, images.groups.len() as f64) {
+            (_, _) if score.quality_dn.is_none() => f64::NAN,
+            (noise, groups) => {
+                let own = match noise {
+                    Noise::Given(_) => 1.0,
+                    Noise::Measured => groups / (groups - 1.0),
+                };
+                let apart = std::array::from_fn(|b| score.noise_free[b] - true_ee[b]);
+                let variance = scatter.of_power(bins, &signal, own);
+                errors::of_quality(bins, figures.q_dn, &apart, &variance)
+            }
+        };
+        let independent =
+            std::array::from_fn(|i| std::array::from_fn(|j| if i == j { power[i] } else { 0.0 }));
+        let (m, a) = errors::of_biases(bins, &true_ee, &independent);
+        let fit = &score.fit.cl;
+        let [bb, eb] = scatter.of_null_tests(bins, &signal);
+        Figures {
+            q: errors::of_quality(bins, figures.q, &apart, &power),
+            q_dn,
+            m_half: m / 2.0,
+            sqrt_a: errors::of_sqrt_a(fit.A, a),
+            m_cross: scatter.of_cross(bins, &truth.e).sqrt(),
+            m1: v1.0,
+            m2: v2.0,
+            c1,
+            c2,
+            b_power: errors::of_mean_c_l(bins, &bb),
+            eb_power: errors::of_mean_c_l(bins, &eb),
         }
     }
 }
 
-/// (m, c) of e = (1 + m)·g + c over all galaxies of a set: least squares of each galaxy's
-/// ellipticity on its true shear, from the sums per cell.
-fn shear_bias(g: &Array2<f64>, sum: &Array2<f64>, count: &Array2<f64>) -> (f64, f64) {
-    let mut s = [0.0; 5];
-    for ((&g, &e), &w) in g.iter().zip(sum).zip(count) {
-        s[0] += w;
-        s[1] += w * g;
-        s[2] += w * g * g;
-        s[3] += e;
-        s[4] += e * g;
+/// The convention with the highest Q, the first of equals.
+fn best_of(conventions: &[ConventionScore; 8]) -> Convention {
+    conventions
+        .iter()
+        .reduce(|best, c| match c.quality.q > best.quality.q {
+            true => c,
+            false => best,
+        })
+        .map_or(Convention::STANDARD, |c| c.convention)
+}
+
+/// e = (1 + m)·g + c over all galaxies of a set: least squares of each galaxy's ellipticity on its true
+/// shear, from the sums per cell.
+struct ShearBias {
+    /// Not a number where the true shear is the same everywhere; c is then the mean of e − g.
+    m: f64,
+    c: f64,
+    /// Sum per cell of what the fit leaves.
+    residual: Array2<f64>,
+    /// Weights of the sums per cell in m.
+    of_m: Array2<f64>,
+    /// Weights of the sums per cell in c.
+    of_c: Array2<f64>,
+}
+
+impl ShearBias {
+    fn new(g: &Array2<f64>, sum: Array2<f64>, count: &Array2<f64>) -> Self {
+        let galaxies = count.sum();
+        let mean = (g * count).sum() / galaxies;
+        let apart = g - mean;
+        let square = (&apart * &apart * count).sum();
+        let constant = g.iter().all(|value| *value == g[(0, 0)]);
+        let of_m = match constant {
+            true => Array2::zeros(g.dim()),
+            false => &apart / square,
+        };
+        let slope = match constant {
+            true => 1.0,
+            false => (&of_m * &sum).sum(),
+        };
+        let of_c = of_m.mapv(|w| 1.0 / galaxies - w * mean);
+        let c = sum.sum() / galaxies - slope * mean;
+        ShearBias {
+            m: if constant { f64::NAN } else { slope - 1.0 },
+            c,
+            residual: &sum - &(g.mapv(|g| slope * g + c) * count),
+            of_m,
+            of_c,
+        }
     }
-    let slope = (s[4] - s[3] * s[1] / s[0]) / (s[2] - s[1] * s[1] / s[0]);
-    (slope - 1.0, (s[3] - slope * s[1]) / s[0])
 }
 
 /// E-mode bandpowers of a submission's averaged field and the bins they refer to: what a

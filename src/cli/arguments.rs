@@ -6,8 +6,10 @@ use std::str::FromStr;
 use clap::{Args, ValueEnum};
 use shearq_scoring::{Choice, Convention, Definition};
 
+use super::{print, tell};
 use crate::io::layout::MAX_SET;
 use crate::pipeline::images::{ImageId, Shard};
+use crate::pipeline::score::OWN;
 use crate::report::table::{Table, TableFormat};
 use crate::simulate::field::ShearSpectrum;
 use crate::simulate::kinds::SETS;
@@ -83,12 +85,13 @@ impl Printing {
         self.form.format
     }
 
-    pub(super) fn render(&self, table: &Table) -> String {
+    /// Prints a table.
+    pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
         let people = !matches!(self.form.format, TableFormat::Csv | TableFormat::Json);
         if people && !self.wide {
-            self.form.render(&table.narrow())
+            self.form.print(&table.narrow())
         } else {
-            self.form.render(table)
+            self.form.print(table)
         }
     }
 }
@@ -102,8 +105,14 @@ pub(super) struct Form {
 }
 
 impl Form {
-    pub(super) fn render(&self, table: &Table) -> String {
-        table.render(self.format)
+    /// Prints a table. CSV has no room for its notes, which go to standard error.
+    pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
+        if self.format == TableFormat::Csv {
+            for note in &table.notes {
+                tell(format_args!("{note}"));
+            }
+        }
+        print(&table.render(self.format))
     }
 }
 
@@ -211,14 +220,16 @@ enum DefinitionArgument {
 }
 
 /// How to score.
-#[derive(Debug, Clone, Args)]
+#[derive(Debug, Clone, Default, Args)]
 pub(super) struct ScoreSettings {
     /// How bandpowers and Q are defined.
     #[arg(long, value_enum, default_value_t)]
     definition: DefinitionArgument,
-    /// Convention of the figures: `matched` to the truth, `best` as the leaderboard took it, or 1 to 8.
-    #[arg(long, value_name = "WHICH", default_value = "matched", value_parser = parse_choice)]
-    convention: Choice,
+    /// Convention of the figures: 1 to 8 (5 is the standard one), `matched` to the truth of all sets
+    /// together, or `best` as the leaderboard took it, set by set [default: 5 for what shearq measured,
+    /// matched for other catalogues].
+    #[arg(long, value_name = "WHICH", value_parser = parse_choice)]
+    convention: Option<Choice>,
 }
 
 impl ScoreSettings {
@@ -229,8 +240,14 @@ impl ScoreSettings {
         }
     }
 
+    /// The convention asked for, or that of other programs' catalogues.
     pub(super) fn choice(&self) -> Choice {
-        self.convention
+        self.convention.unwrap_or(Choice::Matched)
+    }
+
+    /// The convention asked for, or that of our own measurements.
+    pub(super) fn own_choice(&self) -> Choice {
+        self.convention.unwrap_or(OWN)
     }
 }
 

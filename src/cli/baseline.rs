@@ -259,7 +259,7 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     if table.rows.is_empty() && arguments.form.format == TableFormat::Table {
         print(&(table.notes.join("\n") + "\n"))?;
     } else {
-        print(&arguments.form.render(&table))?;
+        arguments.form.print(&table)?;
     }
     let failed = checks.iter().filter(|check| check.failed()).count();
     anyhow::ensure!(

@@ -56,7 +56,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         if let Some(page) = page {
             page.table(name, &table)?;
         }
-        print(&(arguments.form.render(&table) + "\n"))
+        arguments.form.print(&table)?;
+        print("\n")
     };
     if let Some(page) = &mut page {
         page.section(

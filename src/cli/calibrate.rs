@@ -8,7 +8,7 @@ use shearq_submissions::{Registry, Update};
 
 use super::arguments::{Form, Threads};
 use super::progress::Bar;
-use super::{print, tell};
+use super::tell;
 use crate::report::page::Page;
 use crate::study::calibration::calibrate;
 use crate::study::exhibits;
@@ -82,5 +82,5 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             out.display()
         ));
     }
-    print(&arguments.form.render(&table))
+    arguments.form.print(&table)
 }

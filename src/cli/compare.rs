@@ -4,20 +4,20 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
-use shearq_scoring::{Grid, Noise, Options};
+use shearq_scoring::{Grid, Options};
 use shearq_submissions::{Published, Registry};
 
 use super::arguments::{Printing, ScoreSettings, Threads};
-use super::{print, print_heat_map};
+use super::print_heat_map;
 use crate::io::layout::{DataFolder, MAX_SET};
 use crate::io::run::{Run, Source};
 use crate::io::store::{self, Conditions};
 use crate::pipeline::record::set_record;
-use crate::pipeline::score::{COLUMNS, Catalogues, ScoredSet, plain_columns, score_variants};
+use crate::pipeline::score::{Catalogues, ScoredSet, own_catalogue, score_variants};
 use crate::report::comparison::{Variant, compare, q_heat_map};
 use crate::report::figure::{Figure, HeatMap};
 use crate::report::runs::{Grouping, Order, compare_runs, runs_heat_map};
-use crate::report::scores::warnings;
+use crate::report::scores::notes;
 use crate::report::table::{Table, TableFormat};
 use crate::submit::foreign::Foreign;
 
@@ -68,30 +68,25 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (table, map) = match &arguments.store {
         Some(store) => stored(arguments, store)?,
         None => {
-            let options = Options {
-                definition: arguments.settings.definition(),
-                noise: Noise::Measured,
-                choice: arguments.settings.choice(),
-            };
             let variants = variants(
                 &arguments.measured,
                 &arguments.foreign,
                 arguments.data.as_deref(),
-                options,
+                &arguments.settings,
                 arguments.threads.number(),
             )?;
             let rows: Vec<_> = variants
                 .iter()
                 .map(|v| (v.name.clone(), v.sets.iter().collect()))
                 .collect();
-            let table = compare(&variants, options.definition, options.choice);
+            let table = compare(&variants, arguments.settings.definition());
             (table, q_heat_map(&rows))
         }
     };
     if let Some(path) = &arguments.heat_map {
         map.save(path)?;
     }
-    print(&arguments.printing.render(&table))?;
+    arguments.printing.print(&table)?;
     if arguments.printing.format() == TableFormat::Table {
         print_heat_map(map)?;
     }
@@ -133,7 +128,7 @@ pub(super) fn variants(
     folders: &[PathBuf],
     foreign: &[PathBuf],
     data: Option<&Path>,
-    options: Options,
+    settings: &ScoreSettings,
     threads: usize,
 ) -> anyhow::Result<Vec<Variant>> {
     let foreign: Vec<Foreign> = foreign
@@ -195,14 +190,13 @@ pub(super) fn variants(
         (1..=MAX_SET).any(common),
         "the variants have no set in common; there is nothing to compare"
     );
-    let own = plain_columns(COLUMNS);
     let readers: Vec<_> = entrants
         .iter()
         .map(|entrant| {
-            let (own, foreign) = (&own, entrant.foreign);
+            let foreign = entrant.foreign;
             move |grid: &Grid, path: &Path| match foreign {
                 Some(foreign) => foreign.sum(grid, path),
-                None => own(grid, path),
+                None => own_catalogue(grid, path),
             }
         })
         .collect();
@@ -212,8 +206,16 @@ pub(super) fn variants(
         .map(|(entrant, read)| Catalogues {
             of_set: &entrant.of_set,
             read,
+            choice: match entrant.foreign {
+                Some(_) => settings.choice(),
+                None => settings.own_choice(),
+            },
         })
         .collect();
+    let options = Options {
+        definition: settings.definition(),
+        ..Options::default()
+    };
     let scored = score_variants(&data, &catalogues, &[], options, threads)?;
     drop(catalogues);
     drop(readers);
@@ -233,9 +235,6 @@ fn variant(name: String, published: Option<Published>, scored: &[ScoredSet]) -> 
             .iter()
             .map(|set| set_record(set, String::new()))
             .collect(),
-        warnings: warnings(scored)
-            .into_iter()
-            .filter(|line| line.starts_with("Warning"))
-            .collect(),
+        notes: notes(scored),
     }
 }

@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use shearq_scoring::{Choice, Convention, Options};
+use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
-use super::arguments::Threads;
+use super::arguments::{ScoreSettings, Threads};
 use super::compare::variants;
 use super::progress::Bar;
 use super::{measure, print, tell};
@@ -14,7 +14,7 @@ use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
 use crate::pipeline::images;
-use crate::pipeline::score::score_folder;
+use crate::pipeline::score::{OWN, score_folder};
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
 use crate::report::comparison::compare;
 use crate::report::scores::per_set;
@@ -62,8 +62,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     ));
     let registry = Registry::embedded()?;
     let options = Options {
-        // Known here; ten images can be too noisy to tell.
-        choice: Choice::Insist(Convention::STANDARD),
+        choice: OWN,
         ..Options::default()
     };
     let mut folders = Vec::new();
@@ -74,12 +73,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         measure::measure(&run, &data, &folder, &images, threads)?;
         let scored = score_folder(&data, &folder, &run, &[], options, threads)?;
         let title = format!("Scores of {name} (simulated data)");
-        let table = per_set(&scored, &title, options.definition, options.choice);
+        let table = per_set(&scored, &title, options.definition);
         print(&format!("{}\n", table.narrow().render(TableFormat::Table)))?;
         folders.push(folder);
     }
-    let variants = variants(&folders, &[], None, options, threads)?;
-    let table = compare(&variants, options.definition, options.choice);
+    let variants = variants(&folders, &[], None, &ScoreSettings::default(), threads)?;
+    let table = compare(&variants, options.definition);
     print(&table.narrow().render(TableFormat::Table))?;
     tell(format_args!(
         "\nWith few images Q rewards submissions that shrink noise and shear alike: compare m (cross) too, which\nis zero for an unbiased one.\n\nNext: {}",

@@ -195,12 +195,24 @@ fn sect_five(
         let both = [(raw, "23/raw/star"), (den, "23/den/star")];
         page.figure(
             "fig10-multiplicative",
-            &exhibits::bias_per_set(results, &both, 2, "Multiplicative bias per set", "M/2"),
+            &exhibits::bias_per_set(
+                results,
+                &both,
+                |f| f.m_half,
+                "Multiplicative bias per set",
+                "M/2",
+            ),
             "Fig. 10: multiplicative bias per set.",
         )?;
         page.figure(
             "fig11-additive",
-            &exhibits::bias_per_set(results, &both, 3, "Additive bias per set", "√A × 10⁴"),
+            &exhibits::bias_per_set(
+                results,
+                &both,
+                |f| f.sqrt_a,
+                "Additive bias per set",
+                "√A × 10⁴",
+            ),
             "Fig. 11: additive bias per set.",
         )?;
     }

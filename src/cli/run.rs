@@ -17,7 +17,7 @@ use crate::io::table::Format;
 use crate::pipeline::images;
 use crate::pipeline::record::Measured;
 use crate::pipeline::run::run_folder;
-use crate::pipeline::score::score_folder;
+use crate::pipeline::score::{OWN, score_folder};
 use crate::report::scores::{bandpowers, per_set};
 use crate::report::table::TableFormat;
 
@@ -136,7 +136,10 @@ pub(super) fn score(
     store: Option<&Path>,
     threads: usize,
 ) -> anyhow::Result<()> {
-    let options = Options::default();
+    let options = Options {
+        choice: OWN,
+        ..Options::default()
+    };
     let truth = run.source.data(out)?;
     let scored = score_folder(&truth, out, run, sets, options, threads)?;
     if let Some(store) = store {
@@ -144,7 +147,7 @@ pub(super) fn score(
         score::record(store, made, &scored, options)?;
     }
     let title = format!("Scores of {}", run.submission.name);
-    let table = per_set(&scored, &title, options.definition, options.choice);
+    let table = per_set(&scored, &title, options.definition);
     for (name, table) in [("scores", &table), ("bandpowers", &bandpowers(&scored))] {
         let text = table.render(TableFormat::Csv);
         atomic::write(out.join(format!("{name}.csv")), text.as_bytes())?;

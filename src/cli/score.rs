@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use clap::{ArgGroup, Args, ValueEnum};
 use shearq_scoring::units::{Degrees, Pixels};
-use shearq_scoring::{BiasFits, Grid, Noise, Options, Quality, SetScorer, TrueShear, TruthSign};
+use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore, TrueShear, TruthSign};
 
 use super::arguments::{Printing, ScoreSettings, SetList, Threads};
 use super::{print, tell};
@@ -15,13 +15,14 @@ use crate::io::run::{Run, Source};
 use crate::io::store;
 use crate::pipeline::record::{Measured, run_record};
 use crate::pipeline::score::{
-    Reading, ScoredSet, plain_columns, read_truth, reading_of, score_files, score_folder,
+    Reading, ScoredSet, Screen, plain_columns, read_truth, reading_of, score_files, score_folder,
     score_sets,
 };
 use crate::report::scores::{SetInput, one_set_json, per_set, spectra};
 use crate::report::table::TableFormat;
 use crate::submit::challenge::{Kind, read_bandpowers};
 use crate::submit::foreign::Foreign;
+use crate::submit::manifest::Manifest;
 
 /// Score ellipticities against the true shear: Q, Q_dn, M/2, √A.
 ///
@@ -83,6 +84,17 @@ pub(super) struct Arguments {
         num_args = 1
     )]
     columns: Vec<String>,
+    /// A value of either component that stands for "not measured", as -99; for --truth.
+    #[arg(
+        long,
+        value_name = "VALUE",
+        requires = "truth",
+        allow_negative_numbers = true
+    )]
+    missing: Option<f64>,
+    /// Rows with a larger |e| have no ellipticity; for --truth [default: no limit].
+    #[arg(long, value_name = "E", requires = "truth")]
+    max_modulus: Option<f64>,
     /// Record the scores in this results store, which `compare --store` reads.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra"])]
     store: Option<PathBuf>,
@@ -116,7 +128,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let options = Options {
         definition: arguments.settings.definition(),
         noise: arguments.noise_var.map_or(Noise::Measured, Noise::Given),
-        choice: arguments.settings.choice(),
+        choice: match arguments.measured {
+            Some(_) => arguments.settings.own_choice(),
+            None => arguments.settings.choice(),
+        },
     };
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
     match (&arguments.truth, &arguments.spectra, data) {
@@ -168,8 +183,8 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
         (None, _, _) => bail!("--foreign needs the true shear: --data DIR"),
     };
     let title = format!("Scores of {name}");
-    let table = per_set(&scored, &title, options.definition, options.choice);
-    print(&arguments.printing.render(&table))
+    let table = per_set(&scored, &title, options.definition);
+    arguments.printing.print(&table)
 }
 
 /// Records a scored run in a results store and says where.
@@ -218,10 +233,12 @@ fn spectrum_folder(
         files.retain(|set, _| wanted.0.contains(set));
     }
     let reading = reading_of(data);
+    let manifest = Manifest::read(folder)?;
     let mut scored = Vec::new();
     for (set, path) in &files {
         let (grid, truth) = read_truth(&data.truth(*set), &reading)?;
-        scored.push((*set, score_spectrum(grid, truth, path, options)?));
+        let score = score_spectrum(grid, truth, path, manifest.as_ref(), options)?;
+        scored.push((*set, score));
     }
     print_spectra(arguments, &scored, folder, options)
 }
@@ -233,7 +250,9 @@ fn spectrum_file(
     options: Options,
 ) -> anyhow::Result<()> {
     let (grid, shear) = read_truth(truth, &plain_reading(arguments))?;
-    let scored = [(0, score_spectrum(grid, shear, spectrum, options)?)];
+    let manifest = Manifest::read(spectrum.parent().unwrap_or(Path::new("")))?;
+    let score = score_spectrum(grid, shear, spectrum, manifest.as_ref(), options)?;
+    let scored = [(0, score)];
     print_spectra(arguments, &scored, spectrum, options)
 }
 
@@ -241,21 +260,26 @@ fn score_spectrum(
     grid: Grid,
     truth: TrueShear,
     path: &Path,
+    manifest: Option<&Manifest>,
     options: Options,
-) -> anyhow::Result<(Quality, BiasFits)> {
+) -> anyhow::Result<SpectrumScore> {
     let powers = read_bandpowers(path)?;
-    Ok(SetScorer::new(grid, truth, options)?.score_spectrum(&powers)?)
+    let covariance = manifest.and_then(|manifest| {
+        let name = path.file_name()?.to_str()?;
+        manifest.covariances.get(name)
+    });
+    Ok(SetScorer::new(grid, truth, options)?.score_spectrum(&powers, covariance)?)
 }
 
 fn print_spectra(
     arguments: &Arguments,
-    scored: &[(u32, (Quality, BiasFits))],
+    scored: &[(u32, SpectrumScore)],
     path: &Path,
     options: Options,
 ) -> anyhow::Result<()> {
     let title = format!("Scores of the power spectra of {}", path.display());
     let table = spectra(scored, &title, options.definition);
-    print(&arguments.printing.render(&table))
+    arguments.printing.print(&table)
 }
 
 /// How the truth given by `--truth` is to be read.
@@ -277,20 +301,18 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
             columns.len()
         )
     })?;
-    let (score, rows) = score_files(
+    let screen = Screen {
+        missing: arguments.missing,
+        max_modulus: arguments.max_modulus,
+    };
+    let scored = score_files(
         truth,
         &arguments.catalogues,
         &plain_reading(arguments),
-        &plain_columns(columns),
+        &plain_columns(columns, screen),
         options,
         arguments.threads.number(),
     )?;
-    let scored = ScoredSet {
-        set: 0,
-        images: (1..=score.images as u32).collect(),
-        score,
-        rows,
-    };
     if arguments.printing.format() == TableFormat::Json {
         let name = |path: &Path| path.display().to_string();
         let input = SetInput {
@@ -307,6 +329,6 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         return print(&text);
     }
     let title = format!("Scores against {}", truth.display());
-    let table = per_set(&[scored], &title, options.definition, options.choice);
-    print(&arguments.printing.render(&table))
+    let table = per_set(&[scored], &title, options.definition);
+    arguments.printing.print(&table)
 }

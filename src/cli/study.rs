@@ -112,11 +112,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.data("study", &table)?;
     page.save()?;
     if matches!(form.format, TableFormat::Csv | TableFormat::Json) {
-        return print(&form.render(&table));
+        return form.print(&table);
     }
-    print(&format!(
-        "{}\n{}",
-        form.render(&shapes),
-        form.render(&quality)
-    ))
+    form.print(&shapes)?;
+    print("\n")?;
+    form.print(&quality)
 }

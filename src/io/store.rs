@@ -8,7 +8,7 @@ use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shearq_scoring::Figures;
+use shearq_scoring::{Figure, Figures};
 
 use super::error::FileError;
 use super::fingerprint::Fingerprint;
@@ -56,14 +56,16 @@ pub struct SetRecord {
     pub flagged: u64,
     /// Figures of the chosen convention.
     pub figures: Figures,
-    /// Their jackknife errors; none with fewer than two images.
-    pub errors: Option<Figures>,
+    /// Their standard errors; not a number where unknown.
+    pub errors: Figures,
     /// Q with each group of images left out in turn, for paired differences.
     pub q_replicates: Vec<f64>,
     /// The leaderboard's Q: the best of the eight conventions.
     pub q_leaderboard: f64,
     /// Number of the chosen convention.
     pub convention: u8,
+    /// Whether it is known: told, or clearly matched to the truth, and not chosen by its Q.
+    pub convention_known: bool,
     /// Number of the leaderboard's convention.
     pub convention_leaderboard: u8,
 }
@@ -154,10 +156,8 @@ impl RunRecord {
         .into_iter()
         .map(|(name, value)| (name.to_owned(), value))
         .collect::<Vec<_>>();
-        let errors = set
-            .errors
-            .map_or([f64::NAN; Figures::NAMES.len()], |e| e.values());
-        for ((name, value), error) in Figures::NAMES.iter().zip(set.figures.values()).zip(errors) {
+        let values = set.figures.values().into_iter().zip(set.errors.values());
+        for (Figure { name, .. }, (value, error)) in Figures::ALL.iter().zip(values) {
             row.push(((*name).to_owned(), Value::Real(value)));
             row.push((format!("{name}_error"), Value::Real(error)));
         }
@@ -165,6 +165,10 @@ impl RunRecord {
             [
                 ("q_leaderboard", Value::Real(set.q_leaderboard)),
                 ("convention", Value::Count(u64::from(set.convention))),
+                (
+                    "convention_known",
+                    Value::Count(u64::from(set.convention_known)),
+                ),
                 (
                     "convention_leaderboard",
                     Value::Count(u64::from(set.convention_leaderboard)),

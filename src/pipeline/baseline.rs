@@ -11,7 +11,7 @@ use super::images::{self, ImageId};
 use super::measure::measure_folder;
 use super::record::set_record;
 use super::run::run_folder;
-use super::score::score_folder;
+use super::score::{OWN, score_folder};
 use super::{PipelineError, engine};
 use crate::io::FileError;
 use crate::io::baseline::{BaselineSet, BaselineSubmission};
@@ -91,7 +91,11 @@ pub fn figures_of(
     out: &Path,
     threads: usize,
 ) -> Result<Vec<BaselineSet>, PipelineError> {
-    let scored = score_folder(data, out, run, &[], Options::default(), threads)?;
+    let options = Options {
+        choice: OWN,
+        ..Options::default()
+    };
+    let scored = score_folder(data, out, run, &[], options, threads)?;
     scored
         .iter()
         .map(|scored| {
@@ -106,12 +110,10 @@ pub fn figures_of(
                 errors,
                 ..
             } = set_record(scored, print);
-            let unknown = [f64::NAN; Figures::NAMES.len()];
-            let errors = errors.map_or(unknown, |e| e.values());
-            let mut all: BTreeMap<String, [f64; 2]> = Figures::NAMES
+            let mut all: BTreeMap<String, [f64; 2]> = Figures::ALL
                 .iter()
-                .zip(figures.values().into_iter().zip(errors))
-                .map(|(name, (value, error))| ((*name).to_owned(), [value, error]))
+                .zip(figures.values().into_iter().zip(errors.values()))
+                .map(|(figure, (value, error))| (figure.name.to_owned(), [value, error]))
                 .collect();
             for (name, value) in SCATTER.iter().zip(scatter(run, out, set, threads)?) {
                 all.insert((*name).to_owned(), value);

@@ -96,6 +96,7 @@ pub fn set_record(scored: &ScoredSet, data: String) -> SetRecord {
         images,
         score,
         rows,
+        basis,
     } = scored;
     SetRecord {
         set: *set,
@@ -104,10 +105,11 @@ pub fn set_record(scored: &ScoredSet, data: String) -> SetRecord {
         galaxies: (rows.used + rows.not_finite) as u64,
         flagged: rows.not_finite as u64,
         figures: score.figures,
-        errors: score.errors(),
+        errors: score.errors,
         q_replicates: score.replicates.iter().map(|r| r.q).collect(),
         q_leaderboard: score.conventions[score.best.index()].quality.q,
         convention: score.chosen.number(),
+        convention_known: basis.is_known(),
         convention_leaderboard: score.best.number(),
     }
 }

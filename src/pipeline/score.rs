@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{
-    FieldSum, Figures, Grid, Options, Row, RowCounts, SetImages, SetScore, SetScorer, TrueShear,
-    TruthSign,
+    Choice, Convention, ConventionMatch, FieldSum, Figures, Grid, Options, Row, RowCounts,
+    SetImages, SetScore, SetScorer, TrueShear, TruthSign,
 };
 
 use super::PipelineError;
@@ -18,6 +18,9 @@ use crate::io::run::Run;
 /// Columns of our catalogues that are scored.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 
+/// The convention of what shearq measured, which it is in by construction.
+pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
+
 /// The score of one set and where its rows went.
 pub struct ScoredSet {
     /// Set number; 0 for a set given as plain files.
@@ -28,6 +31,30 @@ pub struct ScoredSet {
     pub score: SetScore,
     /// How the catalogues' rows were used.
     pub rows: RowCounts,
+    /// How the convention was chosen.
+    pub basis: Basis,
+}
+
+/// What the convention of a submission's figures rests on. It is the same for all its sets.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Basis {
+    /// It was told, or is that of our own measurements.
+    Told,
+    /// It was matched to the truth of all sets together.
+    Matched(ConventionMatch),
+    /// The highest Q, set by set, as the leaderboard took it.
+    HighestQ,
+}
+
+impl Basis {
+    /// Whether the convention is known, so that differences from other submissions mean something.
+    pub fn is_known(&self) -> bool {
+        match self {
+            Basis::Told => true,
+            Basis::Matched(matching) => matching.is_clear(),
+            Basis::HighestQ => false,
+        }
+    }
 }
 
 /// How a truth file is to be read.
@@ -45,15 +72,69 @@ pub struct Reading {
 pub type ReadImage<'a> =
     &'a (dyn Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync);
 
-/// A [`ReadImage`] for catalogues with the given columns in standard signs.
+/// Which values of other programs' ellipticities stand for "not measured".
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Deserialize)]
+pub struct Screen {
+    /// A value of either component.
+    pub missing: Option<f64>,
+    /// The largest |e| that is one.
+    pub max_modulus: Option<f64>,
+}
+
+impl Screen {
+    /// The row, without an ellipticity where its value stands for none.
+    pub fn apply(&self, row: Row) -> Row {
+        let missing = self.missing.is_some_and(|m| row.e1 == m || row.e2 == m);
+        if missing
+            || self
+                .max_modulus
+                .is_some_and(|max| row.e1.hypot(row.e2) > max)
+        {
+            return Row {
+                e1: f64::NAN,
+                e2: f64::NAN,
+                ..row
+            };
+        }
+        row
+    }
+}
+
+/// A [`ReadImage`] for catalogues that we wrote.
+///
+/// # Errors
+/// Where one cannot be read.
+pub fn own_catalogue(grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
+    let mut sum = FieldSum::new(grid);
+    let counts = sum.add_image(grid, read_rows(path, &COLUMNS)?);
+    Ok((sum, counts))
+}
+
+/// Sums rows of another program, of the catalogue `path`.
+///
+/// # Errors
+/// Where they are not what they are taken for: values that are no ellipticities, positions in other units.
+pub fn sum_foreign(
+    grid: &Grid,
+    path: &Path,
+    rows: impl IntoIterator<Item = Row>,
+) -> Result<(FieldSum, RowCounts), FileError> {
+    let mut sum = FieldSum::new(grid);
+    let counts = sum.add_image(grid, rows);
+    match counts.fault(grid) {
+        Some(fault) => Err(FileError::new(path, fault)),
+        None => Ok((sum, counts)),
+    }
+}
+
+/// A [`ReadImage`] for other programs' catalogues with the given columns.
 pub fn plain_columns<'a>(
     columns: [&'a str; 4],
+    screen: Screen,
 ) -> impl Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync + 'a {
     move |grid, path| {
-        let rows: Vec<Row> = read_rows(path, &columns)?;
-        let mut sum = FieldSum::new(grid);
-        let counts = sum.add_image(grid, rows);
-        Ok((sum, counts))
+        let rows = read_rows(path, &columns)?;
+        sum_foreign(grid, path, rows.into_iter().map(|row| screen.apply(row)))
     }
 }
 
@@ -92,12 +173,23 @@ pub fn score_files(
     read: ReadImage<'_>,
     options: Options,
     threads: usize,
-) -> Result<(SetScore, RowCounts), PipelineError> {
+) -> Result<ScoredSet, PipelineError> {
     let (grid, shear) = read_truth(truth, reading)?;
     let scoring = |source| PipelineError::Scoring { set: 0, source };
     let scorer = SetScorer::new(grid, shear, options).map_err(scoring)?;
     let (images, rows) = add_up(&grid, catalogues, read, threads)?;
-    Ok((scorer.score(&images).map_err(scoring)?, rows))
+    let score = scorer.score(&images).map_err(scoring)?;
+    Ok(ScoredSet {
+        set: 0,
+        images: (1..=catalogues.len() as u32).collect(),
+        basis: match options.choice {
+            Choice::Matched => Basis::Matched(score.matching),
+            Choice::Best => Basis::HighestQ,
+            Choice::Insist(_) => Basis::Told,
+        },
+        score,
+        rows,
+    })
 }
 
 /// Reads catalogues in parallel and adds them up in order.
@@ -158,10 +250,16 @@ pub struct Catalogues<'a> {
     pub of_set: &'a dyn Fn(u32) -> Vec<(u32, PathBuf)>,
     /// How one is read.
     pub read: ReadImage<'a>,
+    /// Which convention they are scored in; [`Choice::Matched`] is one for all sets together.
+    pub choice: Choice,
 }
 
+/// A set to score, and every variant's catalogues of it.
+type SetFiles = (u32, Vec<Vec<(u32, PathBuf)>>);
+
 /// Scores several variants on sets of a data folder: all sets of which every variant has
-/// catalogues, or those of `sets`, which all must have. The truth of each set is read once.
+/// catalogues, or those of `sets`, which all must have. Of `options`, each variant has its own choice of a
+/// convention.
 ///
 /// # Errors
 /// Where files are absent or damaged, or there is nothing to score.
@@ -172,39 +270,102 @@ pub fn score_variants(
     options: Options,
     threads: usize,
 ) -> Result<Vec<Vec<ScoredSet>>, PipelineError> {
-    let reading = reading_of(data);
-    let mut scored: Vec<Vec<ScoredSet>> = variants.iter().map(|_| Vec::new()).collect();
-    for set in 1..=MAX_SET {
-        if !sets.is_empty() && !sets.contains(&set) {
-            continue;
-        }
-        let files: Vec<Vec<(u32, PathBuf)>> = variants.iter().map(|v| (v.of_set)(set)).collect();
-        if files.iter().any(Vec::is_empty) {
-            if sets.contains(&set) {
-                let message = format!("there is no catalogue of set {set} to score");
-                return Err(PipelineError::Request(message));
-            }
-            continue;
-        }
-        let scoring = |source| PipelineError::Scoring { set, source };
-        let (grid, shear) = read_truth(&data.truth(set), &reading)?;
-        let scorer = SetScorer::new(grid, shear, options).map_err(scoring)?;
-        for ((variant, files), scored) in variants.iter().zip(files).zip(&mut scored) {
-            let (numbers, files): (Vec<u32>, Vec<PathBuf>) = files.into_iter().unzip();
-            let (images, rows) = add_up(&grid, &files, variant.read, threads)?;
-            scored.push(ScoredSet {
-                set,
-                images: numbers,
+    let sets = sets_to_score(variants, sets)?;
+    let mut scored = Vec::new();
+    for (k, variant) in variants.iter().enumerate() {
+        let basis = match variant.choice {
+            Choice::Matched => Basis::Matched(match_over_sets(data, &sets, k, variant, threads)?),
+            Choice::Best => Basis::HighestQ,
+            Choice::Insist(_) => Basis::Told,
+        };
+        let options = Options {
+            choice: match basis {
+                Basis::Matched(matching) => Choice::Insist(matching.convention()),
+                Basis::Told | Basis::HighestQ => variant.choice,
+            },
+            ..options
+        };
+        let mut own = Vec::new();
+        for (set, files) in &sets {
+            let scoring = |source| PipelineError::Scoring { set: *set, source };
+            let (scorer, images, rows) =
+                prepare(data, *set, &files[k], variant.read, options, threads)?;
+            own.push(ScoredSet {
+                set: *set,
+                images: files[k].iter().map(|file| file.0).collect(),
                 score: scorer.score(&images).map_err(scoring)?,
                 rows,
+                basis,
             });
         }
+        scored.push(own);
     }
-    if scored.iter().any(Vec::is_empty) {
+    Ok(scored)
+}
+
+/// The sets of which every variant has catalogues.
+fn sets_to_score(
+    variants: &[Catalogues<'_>],
+    wanted: &[u32],
+) -> Result<Vec<SetFiles>, PipelineError> {
+    let mut sets = Vec::new();
+    for set in 1..=MAX_SET {
+        if !wanted.is_empty() && !wanted.contains(&set) {
+            continue;
+        }
+        let files: Vec<_> = variants.iter().map(|v| (v.of_set)(set)).collect();
+        if files.iter().all(|files| !files.is_empty()) {
+            sets.push((set, files));
+        } else if wanted.contains(&set) {
+            let message = format!("there is no catalogue of set {set} to score");
+            return Err(PipelineError::Request(message));
+        }
+    }
+    if sets.is_empty() {
         let message = "there is no catalogue to score".into();
         return Err(PipelineError::Request(message));
     }
-    Ok(scored)
+    Ok(sets)
+}
+
+/// How well each convention of the `k`-th variant goes with the truth of all sets together.
+fn match_over_sets(
+    data: &DataFolder,
+    sets: &[SetFiles],
+    k: usize,
+    variant: &Catalogues<'_>,
+    threads: usize,
+) -> Result<ConventionMatch, PipelineError> {
+    let mut all = ConventionMatch::default();
+    for (set, files) in sets {
+        let (scorer, images, _) = prepare(
+            data,
+            *set,
+            &files[k],
+            variant.read,
+            Options::default(),
+            threads,
+        )?;
+        all.merge(&scorer.match_convention(&images));
+    }
+    Ok(all)
+}
+
+/// One set's scorer and catalogues.
+fn prepare(
+    data: &DataFolder,
+    set: u32,
+    files: &[(u32, PathBuf)],
+    read: ReadImage<'_>,
+    options: Options,
+    threads: usize,
+) -> Result<(SetScorer, SetImages, RowCounts), PipelineError> {
+    let (grid, shear) = read_truth(&data.truth(set), &reading_of(data))?;
+    let scorer = SetScorer::new(grid, shear, options)
+        .map_err(|source| PipelineError::Scoring { set, source })?;
+    let files: Vec<PathBuf> = files.iter().map(|file| file.1.clone()).collect();
+    let (images, rows) = add_up(&grid, &files, read, threads)?;
+    Ok((scorer, images, rows))
 }
 
 /// Scores sets of a data folder from catalogues found by `catalogues`: all sets that have some, or
@@ -223,6 +384,7 @@ pub fn score_sets(
     let variant = Catalogues {
         of_set: &catalogues,
         read,
+        choice: options.choice,
     };
     let scored = score_variants(data, &[variant], sets, options, threads)?;
     Ok(scored.into_iter().flatten().collect())
@@ -240,40 +402,26 @@ pub fn score_folder(
     options: Options,
     threads: usize,
 ) -> Result<Vec<ScoredSet>, PipelineError> {
-    let read = plain_columns(COLUMNS);
     let catalogues = |set| run.catalogues(out, set);
-    score_sets(data, sets, catalogues, &read, options, threads).map_err(|error| match error {
-        PipelineError::Request(message) => FileError::new(out, message).into(),
-        other => other,
-    })
+    score_sets(data, sets, catalogues, &own_catalogue, options, threads).map_err(
+        |error| match error {
+            PipelineError::Request(message) => FileError::new(out, message).into(),
+            other => other,
+        },
+    )
 }
 
-/// Means over sets of the headline figures and their errors, `None` for errors that are unknown.
-pub fn means(scored: &[ScoredSet]) -> (Figures, Option<Figures>) {
-    let values: Vec<([f64; 11], Option<[f64; 11]>)> = scored
-        .iter()
-        .map(|s| {
-            (
-                s.score.figures.values(),
-                s.score.errors().map(|e| e.values()),
-            )
-        })
-        .collect();
-    let column = |k: usize| {
-        let pairs: Vec<(f64, Option<f64>)> = values
+/// Means over sets of the headline figures and their errors.
+pub fn means(scored: &[ScoredSet]) -> (Figures, Figures) {
+    let columns: [(f64, f64); Figures::ALL.len()] = std::array::from_fn(|k| {
+        let pairs: Vec<(f64, f64)> = scored
             .iter()
-            .map(|(v, e)| (v[k], e.map(|e| e[k])))
+            .map(|s| (s.score.figures.values()[k], s.score.errors.values()[k]))
             .collect();
         mean_over_sets(&pairs)
-    };
-    let columns: [(f64, Option<f64>); 11] = std::array::from_fn(column);
-    let errors = columns
-        .iter()
-        .map(|c| c.1)
-        .collect::<Option<Vec<f64>>>()
-        .and_then(|errors| <[f64; 11]>::try_from(errors).ok());
+    });
     (
         Figures::from_values(columns.map(|c| c.0)),
-        errors.map(Figures::from_values),
+        Figures::from_values(columns.map(|c| c.1)),
     )
 }

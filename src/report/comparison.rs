@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use ndarray::Array2;
 use shearq_scoring::resample::{PairedDifference, PairedSet, mean_over_sets, paired_difference};
-use shearq_scoring::{Choice, Definition, Figures};
+use shearq_scoring::{Definition, Figures};
 use shearq_submissions::Published;
 
 use super::figure::{ColourMap, HeatMap};
@@ -21,24 +21,37 @@ pub struct Variant {
     /// Published figures.
     pub published: Option<Published>,
     /// What readers of its figures should know.
-    pub warnings: Vec<String>,
+    pub notes: Vec<String>,
 }
 
-/// Mean over sets of the figure called `name`, and its error where that is known.
-pub fn mean_figure(sets: &[&SetRecord], name: &str) -> (f64, Option<f64>) {
-    let at = Figures::NAMES.iter().position(|own| *own == name);
-    let value = |figures: &Figures| at.map_or(f64::NAN, |at| figures.values()[at]);
-    let pairs: Vec<(f64, Option<f64>)> = sets
+/// Mean over sets of the figure called `name`, and its error.
+pub fn mean_figure(sets: &[&SetRecord], name: &str) -> (f64, f64) {
+    let value =
+        |figures: &Figures| Figures::place(name).map_or(f64::NAN, |place| figures.values()[place]);
+    let pairs: Vec<(f64, f64)> = sets
         .iter()
-        .map(|set| (value(&set.figures), set.errors.as_ref().map(value)))
+        .map(|set| (value(&set.figures), value(&set.errors)))
         .collect();
     mean_over_sets(&pairs)
 }
 
-/// The cell of a mean over sets.
-pub fn mean_cell(sets: &[&SetRecord], name: &str, decimals: usize) -> Cell {
+/// The cell of a mean over sets of the figure called `name`.
+pub fn mean_cell(sets: &[&SetRecord], name: &str) -> Cell {
     let (value, error) = mean_figure(sets, name);
-    Cell::with_error(value, error, decimals)
+    let decimals = Figures::place(name).map_or(0, |place| Figures::ALL[place].decimals);
+    Cell::with_error(value, Some(error), decimals)
+}
+
+/// The heading of the figure called `name`.
+pub fn figure_heading(name: &'static str) -> Heading {
+    let label = Figures::place(name).map_or(name, |place| Figures::ALL[place].label);
+    Heading::new(name, label)
+}
+
+/// The cell of the leaderboard's Q, the mean over sets.
+pub fn leaderboard_cell(sets: &[&SetRecord]) -> Cell {
+    let sum: f64 = sets.iter().map(|set| set.q_leaderboard).sum();
+    Cell::number(sum / sets.len() as f64, 2)
 }
 
 /// Cells of a difference in Q and of its significance.
@@ -55,20 +68,21 @@ pub fn difference_cells(difference: Option<PairedDifference>) -> [Cell; 2] {
 
 /// Variants side by side over the sets that all of them have, with the significance of each one's
 /// difference in Q from the first, paired over the same images, and the published figures.
-pub fn compare(variants: &[Variant], definition: Definition, choice: Choice) -> Table {
+pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     let common = common_sets(variants);
     let headings = vec![
         Heading::new("submission", "Submission"),
-        Heading::new("q", "Q"),
+        figure_heading("q"),
         Heading::new("q_difference", "ΔQ to first"),
         Heading::new("sigma", "in σ"),
+        Heading::new("q_leaderboard", "Q leaderboard"),
         Heading::new("q_published", "Q publ."),
-        Heading::new("q_dn", "Q_dn"),
-        Heading::new("m_half", "M/2"),
+        figure_heading("q_dn"),
+        figure_heading("m_half"),
         Heading::new("m_half_published", "M/2 publ."),
-        Heading::new("sqrt_a", "√A×10⁴"),
+        figure_heading("sqrt_a"),
         Heading::new("sqrt_a_published", "√A publ."),
-        Heading::new("m_cross", "m (cross)"),
+        figure_heading("m_cross"),
     ];
     let mut rows = Vec::new();
     let mut unpaired = Vec::new();
@@ -89,16 +103,17 @@ pub fn compare(variants: &[Variant], definition: Definition, choice: Choice) -> 
         let [delta, sigma] = difference_cells(difference);
         rows.push(vec![
             Cell::text(&variant.name),
-            mean_cell(&sets, "q", 2),
+            mean_cell(&sets, "q"),
             delta,
             sigma,
+            leaderboard_cell(&sets),
             published(|p| p.q, 2),
-            mean_cell(&sets, "q_dn", 2),
-            mean_cell(&sets, "m_half", 4),
+            mean_cell(&sets, "q_dn"),
+            mean_cell(&sets, "m_half"),
             published(|p| p.m_half, 4),
-            mean_cell(&sets, "sqrt_a", 4),
+            mean_cell(&sets, "sqrt_a"),
             published(|p| p.sqrt_a, 4),
-            mean_cell(&sets, "m_cross", 4),
+            mean_cell(&sets, "m_cross"),
         ]);
         first.get_or_insert(sets);
     }
@@ -106,12 +121,12 @@ pub fn compare(variants: &[Variant], definition: Definition, choice: Choice) -> 
     let list: Vec<String> = common.iter().map(u32::to_string).collect();
     let mut notes = vec![
         format!("Means over sets {}; {images} images in all.", list.join(", ")),
-        definition_note(definition, choice),
+        definition_note(definition),
         "ΔQ: jackknife of the paired difference on the same images. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
     ];
     notes.extend(unpaired_note(&unpaired));
     for variant in variants {
-        for line in &variant.warnings {
+        for line in &variant.notes {
             notes.push(format!("{}: {line}", variant.name));
         }
     }
@@ -138,17 +153,18 @@ fn common_sets(variants: &[Variant]) -> BTreeSet<u32> {
 pub fn unpaired_note(names: &[&str]) -> Option<String> {
     (!names.is_empty()).then(|| {
         format!(
-            "No difference is given for {}: it needs at least two images, the same ones as the first.",
+            "No difference is given for {}: it needs at least two images, the same ones as the first, and conventions that are known.",
             names.join(", ")
         )
     })
 }
 
 /// Paired difference in Q of `second` from `first`; `None` where they are not of the same sets, data
-/// and images.
+/// and images, or where noise may have chosen the convention of either.
 pub fn q_difference(first: &[&SetRecord], second: &[&SetRecord]) -> Option<PairedDifference> {
     let same = |(a, b): (&&SetRecord, &&SetRecord)| {
-        a.set == b.set && a.data == b.data && a.images == b.images
+        let known = a.convention_known && b.convention_known;
+        known && a.set == b.set && a.data == b.data && a.images == b.images
     };
     if first.len() != second.len() || !first.iter().zip(second).all(same) {
         return None;

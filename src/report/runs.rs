@@ -7,7 +7,8 @@ use clap::ValueEnum;
 use shearq_scoring::Figures;
 
 use super::comparison::{
-    difference_cells, mean_cell, mean_figure, q_difference, q_heat_map, unpaired_note,
+    difference_cells, figure_heading, leaderboard_cell, mean_cell, mean_figure, q_difference,
+    q_heat_map, unpaired_note,
 };
 use super::figure::HeatMap;
 use super::table::{Cell, Heading, Table};
@@ -75,11 +76,11 @@ impl FromStr for Order {
                 return Err(format!("`{other}` is no order; expected `asc` or `desc`"));
             }
         };
-        if !SORTED.contains(&field) && !Figures::NAMES.contains(&field) {
+        if !SORTED.contains(&field) && Figures::place(field).is_none() {
             return Err(format!(
                 "a table cannot be sorted by `{field}`; expected one of {}, {}",
                 SORTED.join(", "),
-                Figures::NAMES.join(", ")
+                Figures::ALL.map(|figure| figure.name).join(", ")
             ));
         }
         Ok(Order {
@@ -174,19 +175,22 @@ pub fn compare_runs(runs: &[RunRecord], group: Option<Grouping>, order: Option<&
     headings.extend([
         Heading::new("sets", "Sets"),
         Heading::new("images", "Images"),
-        Heading::new("q", "Q"),
+        figure_heading("q"),
         Heading::new("q_difference", "ΔQ to first"),
         Heading::new("sigma", "in σ"),
-        Heading::new("q_dn", "Q_dn"),
-        Heading::new("m_half", "M/2"),
-        Heading::new("sqrt_a", "√A×10⁴"),
-        Heading::new("m_cross", "m (cross)"),
+        Heading::new("q_leaderboard", "Q leaderboard"),
+        figure_heading("q_dn"),
+        figure_heading("m_half"),
+        figure_heading("sqrt_a"),
+        figure_heading("m_cross"),
     ]);
     let mut rows = Vec::new();
     let mut unpaired = Vec::new();
     for (k, entry) in entries.iter().enumerate() {
         let first = entries[..k].iter().find(|e| e.group == entry.group);
-        let difference = first.and_then(|first| q_difference(&first.sets, &entry.sets));
+        let difference = first
+            .filter(|first| first.run.definition == entry.run.definition)
+            .and_then(|first| q_difference(&first.sets, &entry.sets));
         if first.is_some() && difference.is_none() && !unpaired.contains(&entry.id.as_str()) {
             unpaired.push(entry.id.as_str());
         }
@@ -203,14 +207,15 @@ pub fn compare_runs(runs: &[RunRecord], group: Option<Grouping>, order: Option<&
         row.extend([
             Cell::text(ranges(&entry.sets)),
             Cell::number(entry.images() as f64, 0),
-            mean_cell(&entry.sets, "q", 2),
+            mean_cell(&entry.sets, "q"),
         ]);
         row.extend(difference_cells(difference));
         row.extend([
-            mean_cell(&entry.sets, "q_dn", 2),
-            mean_cell(&entry.sets, "m_half", 4),
-            mean_cell(&entry.sets, "sqrt_a", 4),
-            mean_cell(&entry.sets, "m_cross", 4),
+            leaderboard_cell(&entry.sets),
+            mean_cell(&entry.sets, "q_dn"),
+            mean_cell(&entry.sets, "m_half"),
+            mean_cell(&entry.sets, "sqrt_a"),
+            mean_cell(&entry.sets, "m_cross"),
         ]);
         rows.push(row);
     }

@@ -3,39 +3,21 @@
 use std::collections::BTreeMap;
 
 use serde_json::{Value, json};
+use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
-    BINS, Bias, BiasFits, Choice, ConventionClass, ConventionScore, Definition, Figures,
-    MAX_GROUPS, Quality, SCORED, SetScore,
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Figures, SCORED, SetScore,
+    SpectrumScore,
 };
 
 use super::table::{Cell, Heading, Table};
-use crate::pipeline::score::{ScoredSet, means};
+use crate::pipeline::score::{Basis, ScoredSet, means};
 use crate::simulate::kinds::SetKind;
 
-/// Figures of a table: key, heading, decimals, place in [`Figures::values`], and whether it is one of
-/// the columns of detail.
-const COLUMNS: [(&str, &str, usize, usize, bool); 11] = [
-    ("q", "Q", 2, 0, false),
-    ("q_dn", "Q_dn", 2, 1, false),
-    ("m_half", "M/2", 4, 2, false),
-    ("sqrt_a", "√A×10⁴", 4, 3, false),
-    ("m_cross", "m (cross)", 4, 4, false),
-    ("m1", "m1", 4, 5, true),
-    ("m2", "m2", 4, 6, true),
-    ("c1", "c1", 5, 7, true),
-    ("c2", "c2", 5, 8, true),
-    ("b_power", "B mode×10⁹", 3, 9, true),
-    ("eb_power", "EB×10⁹", 3, 10, true),
-];
-
-fn figure_cells(figures: &Figures, errors: Option<&Figures>) -> Vec<Cell> {
-    let values = figures.values();
-    let errors = errors.map(Figures::values);
-    COLUMNS
-        .iter()
-        .map(|&(_, _, decimals, at, _)| {
-            Cell::with_error(values[at], errors.map(|e| e[at]), decimals)
-        })
+fn figure_cells(figures: &Figures, errors: &Figures) -> Vec<Cell> {
+    let pairs = figures.values().into_iter().zip(errors.values());
+    let cells = pairs.zip(Figures::ALL);
+    cells
+        .map(|((value, error), figure)| Cell::with_error(value, Some(error), figure.decimals))
         .collect()
 }
 
@@ -45,25 +27,49 @@ fn kind_label(set: u32) -> String {
 }
 
 /// One line that says what the figures are.
-pub(super) fn definition_note(definition: Definition, choice: Choice) -> String {
+pub(super) fn definition_note(definition: Definition) -> String {
     let definition = match definition {
         Definition::Leaderboard => "leaderboard definition (the challenge's own arithmetic)",
         Definition::Corrected => "corrected definition (azimuthal averages, fixed bins)",
     };
-    let choice = match choice {
-        Choice::Matched => "the convention that correlates best with the truth".to_owned(),
-        Choice::Best => "the convention with the highest Q, as the leaderboard took it".to_owned(),
-        Choice::Insist(k) => format!("convention {} ({})", k.number(), k.describe()),
-    };
     format!(
-        "Figures: {definition}; {choice}. Errors: delete-one jackknife over up to {MAX_GROUPS} groups of images. √A in 10⁻⁴ for C_ℓ in steradian."
+        "Figures: {definition}. Errors: from what the truth leaves unexplained, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian."
     )
 }
 
-/// Warnings about sets whose leaderboard Q comes from a wrong convention, or whose truth looks
-/// misread.
-pub fn warnings(scored: &[ScoredSet]) -> Vec<String> {
-    let mut lines = Vec::new();
+/// Which convention the figures of a submission's sets are in, and why.
+pub fn convention_note(scored: &[ScoredSet]) -> String {
+    let Some(first) = scored.first() else {
+        return String::new();
+    };
+    let chosen = first.score.chosen;
+    let name = format!("{} ({})", chosen.number(), chosen.describe());
+    let constant = scored.iter().all(|set| set.score.constant.is_some());
+    match first.basis {
+        Basis::Told => format!("Convention {name}."),
+        Basis::HighestQ => {
+            "Convention: set by set the one with the highest Q, as the leaderboard took it.".into()
+        }
+        Basis::Matched(_) if constant => {
+            format!("Convention {name}: a shear that is the same everywhere does not tell it.")
+        }
+        Basis::Matched(matching) if matching.is_clear() => format!(
+            "Convention {name}, matched to the truth of all sets together (correlation {:.2}).",
+            matching.correlation(chosen)
+        ),
+        Basis::Matched(matching) => format!(
+            "Warning: the data do not tell the convention (best {}, correlation {:.2}; {:.2} more than any other would be clear); figures are in convention {name}, and differences from other submissions mean nothing. --convention sets one.",
+            matching.best().number(),
+            matching.correlation(matching.best()),
+            matching.least_clear()
+        ),
+    }
+}
+
+/// What readers of a submission's scores should know: its convention, sets whose leaderboard Q comes
+/// from another one, truth that looks misread, and what is odd about the catalogues.
+pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
+    let mut lines = vec![convention_note(scored)];
     for ScoredSet {
         set, score, rows, ..
     } in scored
@@ -73,84 +79,73 @@ pub fn warnings(scored: &[ScoredSet]) -> Vec<String> {
         } else {
             format!("set {set}")
         };
-        let (correlation, clear) = score.match_with_truth();
         if rows.used == 0 {
             lines.push(format!(
                 "Warning: no galaxy of {name} has an ellipticity; its figures are those of an empty submission."
             ));
-        } else if !clear && !matches!(score.choice, Choice::Insist(_)) {
+        } else if let Some(mean) = &score.constant {
             lines.push(format!(
-                "Warning: no convention clearly correlates with the truth in {name} (best {correlation:.2}, convention {}): too much noise to tell; --convention sets one.",
-                score.matched.number()
+                "Note: the true shear of {name} is ({}, {}) everywhere, without power to compare: mean e = ({:.5} ± {:.5}, {:.5} ± {:.5}).",
+                mean.truth[0], mean.truth[1], mean.e[0], mean.error[0], mean.e[1], mean.error[1]
             ));
-        } else if clear && score.wrong_convention_wins() {
-            let (best, matched) = (
-                &score.conventions[score.best.index()],
-                &score.conventions[score.matched.index()],
-            );
+        } else if score.wrong_convention_wins() {
+            let [best, chosen] = [score.best, score.chosen].map(|k| {
+                let q = score.conventions[k.index()].quality.q;
+                format!(
+                    "convention {} ({}) with Q = {q:.2}",
+                    k.number(),
+                    k.describe()
+                )
+            });
             lines.push(format!(
-                "Warning: in {name} the leaderboard takes convention {} ({}) with Q = {:.2}, but convention {} ({}) matches the truth, with Q = {:.2}.",
-                best.convention.number(),
-                best.convention.describe(),
-                best.quality.q,
-                matched.convention.number(),
-                matched.convention.describe(),
-                matched.quality.q
+                "Warning: in {name} the leaderboard takes {best}, where these figures are of {chosen}."
             ));
         }
-        if score.true_b_share() > 0.2 {
+        if score.constant.is_none() && score.true_b_share() > 0.2 {
             lines.push(format!(
                 "Warning: {:.0} % of the true power of {name} is in B modes; its g2 may have the other sign (--truth-sign).",
                 100.0 * score.true_b_share()
             ));
         }
-        if rows.outside + rows.excess > 0 {
-            lines.push(format!(
-                "Warning: {name} has {} rows outside the grid and {} beyond the number of cells; they do not count.",
-                rows.outside, rows.excess
-            ));
-        }
-        if rows.not_finite > 0 {
-            lines.push(format!(
-                "Note: {} of {} galaxies of {name} have no ellipticity and count as missing.",
-                rows.not_finite,
-                rows.not_finite + rows.used
-            ));
-        }
+        lines.extend(rows.oddities(&name));
     }
     lines
 }
 
+/// What a set is called in a table's first column.
+fn set_cell(set: u32) -> Cell {
+    Cell::text(match set {
+        0 => "–".into(),
+        set => format!("{set:02}"),
+    })
+}
+
 /// Figures per set, with a row of means where there are several sets.
-pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition, choice: Choice) -> Table {
+pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Table {
+    if scored.iter().all(|set| set.score.constant.is_some()) {
+        return constant_shear(scored, title);
+    }
     let mut headings = vec![
         Heading::new("set", "Set"),
         Heading::new("kind", "Kind"),
         Heading::new("images", "Images"),
     ];
-    headings.extend(COLUMNS.iter().map(|&(key, label, _, _, detail)| Heading {
-        detail,
-        ..Heading::new(key, label)
+    headings.extend(Figures::ALL.iter().map(|figure| Heading {
+        detail: figure.detail,
+        ..Heading::new(figure.name, figure.label)
     }));
     headings.push(Heading::new("convention", "Conv."));
     headings.push(Heading::new("q_leaderboard", "Q leaderboard"));
     let mut rows = Vec::new();
     for ScoredSet { set, score, .. } in scored {
         let mut row = vec![
-            Cell::text(if *set == 0 {
-                "–".into()
-            } else {
-                format!("{set:02}")
-            }),
+            set_cell(*set),
             Cell::text(kind_label(*set)),
             Cell::number(score.images as f64, 0),
         ];
-        row.extend(figure_cells(&score.figures, score.errors().as_ref()));
+        row.extend(figure_cells(&score.figures, &score.errors));
         row.push(Cell::text(score.chosen.number().to_string()));
-        row.push(Cell::number(
-            score.conventions[score.best.index()].quality.q,
-            2,
-        ));
+        row.push(Cell::number(q_leaderboard(score), 2));
         rows.push(row);
     }
     if scored.len() > 1 {
@@ -160,32 +155,69 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition, choice
             Cell::Empty,
             Cell::number(scored.iter().map(|s| s.score.images as f64).sum(), 0),
         ];
-        row.extend(figure_cells(&mean, errors.as_ref()));
+        row.extend(figure_cells(&mean, &errors));
         row.push(Cell::Empty);
-        let best = scored
-            .iter()
-            .map(|s| s.score.conventions[s.score.best.index()].quality.q)
-            .sum::<f64>();
+        let best: f64 = scored.iter().map(|s| q_leaderboard(&s.score)).sum();
         row.push(Cell::number(best / scored.len() as f64, 2));
         rows.push(row);
     }
-    let mut notes = vec![definition_note(definition, choice)];
-    notes.extend(warnings(scored));
+    let mut lines = vec![definition_note(definition)];
+    lines.extend(notes(scored));
     Table {
         title: title.to_owned(),
         headings,
         rows,
-        notes,
+        notes: lines,
     }
 }
 
-/// Figures of power-spectrum submissions, one row per set and one of means. There are no errors: a
-/// spectrum does not say how its images scatter.
-pub fn spectra(
-    scored: &[(u32, (Quality, BiasFits))],
-    title: &str,
-    definition: Definition,
-) -> Table {
+/// Q of the best of the eight conventions; not a number where the truth has no power.
+fn q_leaderboard(score: &SetScore) -> f64 {
+    match score.constant {
+        None => score.conventions[score.best.index()].quality.q,
+        Some(_) => f64::NAN,
+    }
+}
+
+/// Means of sets whose true shear is the same everywhere.
+fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
+    let headings = [
+        ("set", "Set"),
+        ("kind", "Kind"),
+        ("images", "Images"),
+        ("e1", "mean e1"),
+        ("e2", "mean e2"),
+        ("g1", "true g1"),
+        ("g2", "true g2"),
+        ("c1", "c1"),
+        ("c2", "c2"),
+    ];
+    let rows = scored.iter().filter_map(|scored| {
+        let score = &scored.score;
+        let mean = score.constant?;
+        let shear = |value, error| Cell::with_error(value, Some(error), 5);
+        Some(vec![
+            set_cell(scored.set),
+            Cell::text(kind_label(scored.set)),
+            Cell::number(score.images as f64, 0),
+            shear(mean.e[0], mean.error[0]),
+            shear(mean.e[1], mean.error[1]),
+            Cell::number(mean.truth[0], 5),
+            Cell::number(mean.truth[1], 5),
+            shear(score.figures.c1, mean.error[0]),
+            shear(score.figures.c2, mean.error[1]),
+        ])
+    });
+    Table {
+        title: title.to_owned(),
+        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
+        rows: rows.collect(),
+        notes: notes(scored),
+    }
+}
+
+/// Figures of power-spectrum submissions, one row per set and one of means.
+pub fn spectra(scored: &[(u32, SpectrumScore)], title: &str, definition: Definition) -> Table {
     let headings = vec![
         Heading::new("set", "Set"),
         Heading::new("kind", "Kind"),
@@ -194,47 +226,50 @@ pub fn spectra(
         Heading::new("m_half", "M/2"),
         Heading::new("sqrt_a", "√A×10⁴"),
     ];
+    let figures = |score: &SpectrumScore| {
+        [
+            (score.quality.q, score.quality_error),
+            (score.quality.sigma_sys * 1e4, f64::NAN),
+            (score.m_half, score.m_half_error),
+            (score.sqrt_a, score.sqrt_a_error),
+        ]
+    };
+    let cells = |figures: [(f64, f64); 4]| {
+        let decimals = [2, 4, 4, 4];
+        let pairs = figures.into_iter().zip(decimals);
+        pairs.map(|((value, error), decimals)| Cell::with_error(value, Some(error), decimals))
+    };
     let mut rows: Vec<Vec<Cell>> = scored
         .iter()
-        .map(|(set, (quality, fit))| {
-            let label = if *set == 0 {
-                "–".into()
-            } else {
-                format!("{set:02}")
-            };
-            vec![
-                Cell::text(label),
-                Cell::text(kind_label(*set)),
-                Cell::number(quality.q, 2),
-                Cell::number(quality.sigma_sys * 1e4, 4),
-                Cell::number(fit.cl.m, 4),
-                Cell::number(fit.cl.sqrtA * 1e4, 4),
-            ]
+        .map(|(set, score)| {
+            let mut row = vec![set_cell(*set), Cell::text(kind_label(*set))];
+            row.extend(cells(figures(score)));
+            row
         })
         .collect();
     if scored.len() > 1 {
-        let mean = |value: fn(&(Quality, BiasFits)) -> f64| {
-            scored.iter().map(|(_, s)| value(s)).sum::<f64>() / scored.len() as f64
+        let mean = |k: usize| {
+            let all: Vec<(f64, f64)> = scored.iter().map(|s| figures(&s.1)[k]).collect();
+            mean_over_sets(&all)
         };
-        rows.push(vec![
-            Cell::text("mean"),
-            Cell::Empty,
-            Cell::number(mean(|s| s.0.q), 2),
-            Cell::number(mean(|s| s.0.sigma_sys * 1e4), 4),
-            Cell::number(mean(|s| s.1.cl.m), 4),
-            Cell::number(mean(|s| s.1.cl.sqrtA * 1e4), 4),
-        ]);
+        let mut row = vec![Cell::text("mean"), Cell::Empty];
+        row.extend(cells(std::array::from_fn(mean)));
+        rows.push(row);
     }
     let definition = match definition {
         Definition::Leaderboard => "leaderboard",
         Definition::Corrected => "corrected",
+    };
+    let errors = match scored.iter().all(|s| s.1.quality_error.is_nan()) {
+        true => "There are no errors: no covariance of the bandpowers is known.",
+        false => "Errors: from the covariance in the manifest, to first order.",
     };
     Table {
         title: title.to_owned(),
         headings,
         rows,
         notes: vec![format!(
-            "Figures: {definition} definition. √A in 10⁻⁴ for C_ℓ in steradian."
+            "Figures: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian."
         )],
     }
 }
@@ -294,7 +329,7 @@ fn class_json(score: &SetScore, representative: &ConventionScore, class: Convent
         "EB": representative.eb,
         "sigma_sys": representative.quality.sigma_sys,
         "Q": representative.quality.q,
-        "corr": score.class_correlation(class),
+        "corr": score.matching.class_correlation(class),
         "M": representative.fit.cl.M,
         "A": representative.fit.cl.A,
         "sqrtA": representative.fit.cl.sqrtA,
@@ -325,7 +360,7 @@ pub struct SetInput {
 pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
     let score = &scored.score;
     let best = &score.conventions[score.best.index()];
-    let matched = &score.conventions[score.matched.index()];
+    let matched = &score.conventions[score.matching.best().index()];
     let bins = &score.bins;
     let per_convention: BTreeMap<String, f64> = score
         .conventions
@@ -333,8 +368,7 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
         .map(|c| (c.convention.number().to_string(), c.quality.q))
         .collect();
     let weights: Vec<f64> = (0..BINS).map(|b| bins.mode_weight(b)).collect();
-    let errors = score.errors();
-    json!({
+    let mut object = json!({
         "case": input.case,
         "description": format!(
             "{} catalogue(s) scored by shearq {}",
@@ -363,8 +397,8 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
         "sigma_sys": best.quality.sigma_sys,
         "winner": score.best.number(),
         "winner_class": score.best.class(),
-        "matched": score.matched.number(),
-        "matched_class": score.matched.class(),
+        "matched": matched.convention.number(),
+        "matched_class": matched.convention.class(),
         "corr_matched": matched.correlation,
         "Q_matched": matched.quality.q,
         "M": best.fit.cl.M,
@@ -377,11 +411,20 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
             "A": class_json(score, &score.conventions[5], ConventionClass::A),
             "B": class_json(score, &score.conventions[4], ConventionClass::B),
         },
+    });
+    // What the public cases do not have.
+    let own = json!({
         "chosen": score.chosen.number(),
+        "convention_known": scored.basis.is_known(),
         "figures": score.figures,
-        "figure_errors": errors,
-        "error_method": format!("delete-one jackknife over up to {MAX_GROUPS} groups of images"),
+        "figure_errors": score.errors,
+        "error_method": "from the modes that the truth leaves unexplained, at fixed truth; c1 and c2 at least the jackknife over images",
+        "mean_shear": score.constant,
         "rows": scored.rows,
-        "warnings": warnings(std::slice::from_ref(scored)),
-    })
+        "warnings": notes(std::slice::from_ref(scored)),
+    });
+    if let (Value::Object(object), Value::Object(own)) = (&mut object, own) {
+        object.extend(own);
+    }
+    object
 }

@@ -90,10 +90,10 @@ pub fn contest_table(
         let limits: Vec<f64> = biases.iter().filter_map(|b| b.limit).collect();
         let limit = limits.iter().sum::<f64>() / limits.len() as f64;
         for (k, submission) in plan.submissions.iter().enumerate() {
-            let mean = |value: &dyn Fn(&Result) -> (f64, Option<f64>), decimals: usize| {
+            let mean = |value: &dyn Fn(&Result) -> (f64, f64), decimals: usize| {
                 let all: Vec<_> = results.iter().map(|r| value(&r.results[k])).collect();
                 let (mean, error) = mean_over_sets(&all);
-                Cell::with_error(mean, error, decimals)
+                Cell::with_error(mean, Some(error), decimals)
             };
             let mut row = vec![
                 Cell::text("mean"),
@@ -101,7 +101,7 @@ pub fn contest_table(
                 Cell::text(&submission.name),
             ];
             row.extend((0..8).map(|_| Cell::Empty));
-            row.push(mean(&|r| (r.figures.q, r.errors.map(|e| e.q)), 1));
+            row.push(mean(&|r| (r.figures.q, r.errors.q), 1));
             row.push(mean(&spectrum, 0));
             row.push(Cell::number(limit, 0));
             row.push(Cell::number(costs[k], 0));
@@ -193,17 +193,17 @@ fn row(
         scaled(biases.c[1], biases.c_error[1], 1e4),
         Cell::with_error(biases.leakage, Some(biases.leakage_error), 3),
         Cell::number((own.response.flagged + biases.dropped) as f64, 0),
-        Cell::with_error(own.figures.q, own.errors.map(|e| e.q), 1),
-        Cell::with_error(q_spectrum, q_spectrum_error, 0),
+        Cell::with_error(own.figures.q, Some(own.errors.q), 1),
+        Cell::with_error(q_spectrum, Some(q_spectrum_error), 0),
         Cell::number(bias.limit.unwrap_or(f64::NAN), 0),
         Cell::number(cost, 0),
     ]
 }
 
 /// Q of a submission's cross-spectrum and its error.
-fn spectrum(result: &Result) -> (f64, Option<f64>) {
+fn spectrum(result: &Result) -> (f64, f64) {
     (
         result.q_spectrum.unwrap_or(f64::NAN),
-        result.q_spectrum_error,
+        result.q_spectrum_error.unwrap_or(f64::NAN),
     )
 }

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use shearq_scoring::quality::{quality, quality_error};
 use shearq_scoring::{
-    BINS, Choice, Convention, FieldSum, Figures, Noise, Options, Row, SetImages, SetScore,
-    SetScorer, cross_spectrum,
+    BINS, Convention, FieldSum, Figures, Noise, Options, Row, SetImages, SetScore, SetScorer,
+    cross_spectrum,
 };
 use shearq_submissions::Submission;
 
@@ -17,6 +17,7 @@ use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Progress;
 use crate::pipeline::measure::MeasuredRow;
 use crate::pipeline::run::{measurers, run_set};
+use crate::pipeline::score::OWN;
 use crate::pipeline::simulate::simulator;
 use crate::simulate::set::SimulationSettings;
 
@@ -64,8 +65,8 @@ pub struct Result {
     pub submission: String,
     /// Headline figures in the standard convention, leaderboard definition.
     pub figures: Figures,
-    /// Their jackknife errors.
-    pub errors: Option<Figures>,
+    /// Their standard errors.
+    pub errors: Figures,
     /// Q of the delete-one replicates, for paired differences.
     pub q_replicates: Vec<f64>,
     /// The leaderboard's Q.
@@ -154,8 +155,7 @@ pub fn run_sets(
         progress.note(&format!("set {set:02}"));
         let options = Options {
             noise: Noise::Measured,
-            // Known here; with few noisy images the best match may be another.
-            choice: Choice::Insist(Convention::STANDARD),
+            choice: OWN,
             ..Options::default()
         };
         let scorer = SetScorer::new(grid, simulator.truth(), options).map_err(scoring)?;
@@ -180,11 +180,11 @@ pub fn run_sets(
                     Result {
                         submission: submission.name.clone(),
                         figures: score.figures,
-                        errors: score.errors(),
+                        errors: score.errors,
                         q_replicates: score.replicates.iter().map(|r| r.q).collect(),
                         q_leaderboard: score.conventions[score.best.index()].quality.q,
                         best: score.best,
-                        matched: score.matched,
+                        matched: score.matching.best(),
                         ee: score.spectra().ee,
                         q_calibrated: calibrated_q(score, &responses[at]),
                         q_spectrum: spectrum.map(|(q, _)| q),

@@ -20,7 +20,7 @@ use crate::pipeline::engine::Quiet;
 use crate::pipeline::galaxy::Measurer;
 use crate::pipeline::measure::functional_psf;
 use crate::pipeline::run::{measurers, run_set};
-use crate::pipeline::score::{COLUMNS, Reading, plain_columns, score_files};
+use crate::pipeline::score::{COLUMNS, Reading, Screen, plain_columns, score_files};
 use crate::pipeline::simulate::simulator;
 use crate::report::figure::{LinePlot, Series, Style};
 use crate::report::table::{Cell, Heading, Table};
@@ -590,7 +590,7 @@ fn best_score(
     let mut best = f64::INFINITY;
     for _ in 0..3 {
         let start = Instant::now();
-        let read = plain_columns(COLUMNS);
+        let read = plain_columns(COLUMNS, Screen::default());
         black_box(score_files(
             truth,
             paths,

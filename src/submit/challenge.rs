@@ -8,7 +8,8 @@
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::{
-    Convention, FieldSum, Grid, Row, SCORED, SetImages, cross_spectrum, measured_bandpowers,
+    Convention, FieldSum, Grid, Row, SCORED, SetImages, SpectrumCovariance, cross_spectrum,
+    measured_bandpowers,
 };
 
 use crate::io::FileError;
@@ -119,9 +120,6 @@ pub enum Spectrum {
     Cross,
 }
 
-/// Covariance of the eight bandpowers of a power-spectrum file.
-pub type Covariance = [[f64; SCORED.end - SCORED.start]; SCORED.end - SCORED.start];
-
 /// The power spectrum of a set's catalogues in the challenge's format, and where it is known, the
 /// covariance of its bandpowers.
 ///
@@ -132,7 +130,7 @@ pub fn spectrum_text(
     grid: &Grid,
     catalogues: &[PathBuf],
     spectrum: Spectrum,
-) -> Result<(String, Option<Covariance>), FileError> {
+) -> Result<(String, Option<SpectrumCovariance>), FileError> {
     let mut images = SetImages::new(grid);
     let mut used = 0;
     for path in catalogues {

@@ -254,60 +254,58 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
     };
     let grid = &expected.grid;
     let cells = grid.cells();
-    if rows.len() > cells {
-        let message = format!(
-            "{} rows; the {cells} cells take no more, the rest is ignored",
-            rows.len()
-        );
-        report.error(path, "excess", message);
-    }
-    let mut count = vec![0u32; cells];
-    let (mut outside, mut off_centre, mut offset) = (0, 0, (0.0, 0.0));
-    let (mut not_finite, mut too_large, mut square) = (0, 0, 0.0);
-    for Row { x, y, e1, e2 } in &rows {
+    let mut sum = FieldSum::new(grid);
+    let counts = sum.add_image(grid, rows.iter().copied());
+    let (mut off_centre, mut offset) = (0, (0.0, 0.0));
+    for Row { x, y, .. } in &rows {
         let Some((ix, iy)) = grid.cell(*x, *y) else {
-            outside += 1;
             continue;
         };
-        count[iy * grid.n + ix] += 1;
         let centre = grid.centre(ix, iy);
         let (dx, dy) = (x - centre.0, y - centre.1);
         if dx.abs().max(dy.abs()) > POSITION_TOLERANCE * grid.stamp.0 {
             off_centre += 1;
             offset = (offset.0 + dx, offset.1 + dy);
         }
-        let modulus = e1.hypot(*e2);
-        if !modulus.is_finite() {
-            not_finite += 1;
-        } else {
-            square += modulus * modulus;
-            if modulus > 1.0 {
-                too_large += 1;
-            }
-        }
     }
-    let missing = count.iter().filter(|c| **c == 0).count();
-    let repeated = count.iter().filter(|c| **c > 1).count();
-    if outside > 0 {
+    if let Some(fault) = counts.fault(grid) {
+        report.error(path, "values", fault);
+    }
+    if counts.excess > 0 {
+        let message = format!(
+            "{} rows; the {cells} cells take no more, the rest is ignored",
+            rows.len()
+        );
+        report.error(path, "excess", message);
+    }
+    if counts.outside > 0 {
         report.error(
             path,
             "outside",
-            format!("{outside} rows lie outside the {0} × {0} grid", grid.n),
+            format!(
+                "{} rows lie outside the {1} × {1} grid",
+                counts.outside, grid.n
+            ),
         );
     }
-    if missing == cells {
+    if counts.missing == cells {
         report.error(path, "missing", "no galaxy of the grid is there".into());
-    } else if missing > 0 {
-        let message = format!("{missing} of {cells} galaxies are missing; each counts as zero");
-        if missing * 10 > cells {
+    } else if counts.missing > 0 {
+        let message = format!(
+            "{} of {cells} galaxies are missing; each counts as zero",
+            counts.missing
+        );
+        if counts.missing * 10 > cells {
             report.error(path, "missing", message);
         } else {
             report.warn(path, "missing", message);
         }
     }
-    if repeated > 0 {
-        let message =
-            format!("{repeated} galaxies are given more than once; their ellipticities add up");
+    if counts.repeated > 0 {
+        let message = format!(
+            "{} rows are of galaxies that have one already; their ellipticities add up",
+            counts.repeated
+        );
         report.error(path, "duplicates", message);
     }
     if off_centre > 0 {
@@ -320,25 +318,24 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
         );
         report.warn(path, "positions", message);
     }
-    if not_finite > 0 {
+    if counts.not_finite > 0 {
         report.error(
             path,
             "not-finite",
-            format!("{not_finite} ellipticities are not finite numbers"),
+            format!("{} ellipticities are not finite numbers", counts.not_finite),
         );
     }
-    if too_large > 0 {
-        let message = format!("{too_large} galaxies have |e| > 1");
-        if too_large * 20 > rows.len() {
+    if counts.above_one > 0 {
+        let message = format!("{} galaxies have |e| > 1", counts.above_one);
+        if counts.above_one * 20 > rows.len() {
             report.error(path, "range", message);
         } else {
             report.warn(path, "range", message);
         }
     }
-    let used = rows.len() - outside - not_finite;
-    if used > 0 && square == 0.0 {
+    if counts.used > 0 && sum.e1.iter().chain(&sum.e2).all(|e| *e == 0.0) {
         report.error(path, "constant", "all ellipticities are zero".into());
-    } else if used > 1 {
+    } else if counts.used > 1 {
         let first = rows.iter().find(|r| r.e1.is_finite());
         if first.is_some_and(|f| rows.iter().all(|r| r.e1 == f.e1 && r.e2 == f.e2)) {
             report.error(
@@ -348,8 +345,6 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
             );
         }
     }
-    let mut sum = FieldSum::new(grid);
-    sum.add_image(grid, rows);
     Some(sum)
 }
 
@@ -407,16 +402,16 @@ fn check_against_truth(
         return;
     };
     let standard = &score.conventions[Convention::STANDARD.index()];
-    let matched = &score.conventions[score.matched.index()];
-    let (best, clear) = score.match_with_truth();
-    if !clear {
-        let message =
-            format!("set {set}: no convention correlates with the true shear (best {best:.2})");
+    let matched = &score.conventions[score.matching.best().index()];
+    if score.constant.is_none() && !score.matching.is_clear() {
+        let message = format!(
+            "set {set}: no convention clearly correlates with the true shear (best {:.2})",
+            matched.correlation
+        );
         report.warn(path, "correlation", message);
         return;
     }
-    let excess = matched.correlation - standard.correlation;
-    if score.matched != Convention::STANDARD && excess > score.clear_correlation() {
+    if score.chosen != Convention::STANDARD {
         let message = format!(
             "set {set}: wrong convention suspected: {} (convention {}) correlates with the true shear by {:.2}, as given only by {:.2}",
             matched.convention.describe(),
@@ -427,8 +422,7 @@ fn check_against_truth(
         report.error(path, "convention", message);
         return;
     }
-    let errors = score.errors().map_or(0.1, |e| e.m_cross);
-    if standard.m_cross - 0.5 > 3.0 * errors {
+    if standard.m_cross - 0.5 > 3.0 * score.errors.m_cross {
         let message = format!(
             "set {set}: ellipticities respond to shear by a factor {:.2}; a distortion (about 2) may have been given for a shear-type ellipticity",
             1.0 + standard.m_cross

@@ -9,6 +9,7 @@ use shearq_submissions::EllipticityType;
 use crate::io::FileError;
 use crate::io::layout::{IMAGE_PLACEHOLDERS, MAX_IMAGE, check_pattern, fill};
 use crate::io::table;
+use crate::pipeline::score::sum_foreign;
 
 /// How to read another program's catalogues.
 ///
@@ -22,6 +23,7 @@ use crate::io::table;
 /// e1 = "e1"
 /// e2 = "e2"
 /// flag = "flag"                   # rows with another value than 0 have no ellipticity
+/// missing = -99                   # rows with this value in e1 or e2 have none [default: no such value]
 /// max_modulus = 1.0               # rows with a larger |e| (as reported) have none [default: no limit]
 /// position_offset = 0.0           # added to x and y to make them FITS pixels (1 for 0-based ones)
 /// e2_sign = 1                     # -1 where e2 is positive along x = -y
@@ -44,6 +46,7 @@ pub struct Foreign {
     #[serde(default = "e2")]
     e2: String,
     flag: Option<String>,
+    missing: Option<f64>,
     max_modulus: Option<f64>,
     #[serde(default)]
     position_offset: f64,
@@ -106,7 +109,7 @@ impl Foreign {
     /// Flagged rows and distortions above 1 count as missing.
     ///
     /// # Errors
-    /// Where it cannot be read or a column is absent.
+    /// Where it cannot be read, a column is absent, or the values are no ellipticities.
     pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
         let mut names = vec![
             self.x.as_str(),
@@ -121,7 +124,8 @@ impl Foreign {
         let (x, y) = (column(&self.x)?, column(&self.y)?);
         let (e1, e2) = (column(&self.e1)?, column(&self.e2)?);
         let rows = (0..x.len()).map(|k| {
-            let good = flags.as_ref().is_none_or(|flags| flags[k] == 0.0);
+            let good = flags.as_ref().is_none_or(|flags| flags[k] == 0.0)
+                && self.missing.is_none_or(|m| e1[k] != m && e2[k] != m);
             let shape = if good {
                 self.convert(e1[k], f64::from(self.e2_sign) * e2[k])
             } else {
@@ -137,9 +141,7 @@ impl Foreign {
                 e2,
             }
         });
-        let mut sum = FieldSum::new(grid);
-        let counts = sum.add_image(grid, rows);
-        Ok((sum, counts))
+        sum_foreign(grid, path, rows)
     }
 
     fn convert(&self, e1: f64, e2: f64) -> Option<(f64, f64)> {

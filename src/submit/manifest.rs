@@ -6,8 +6,8 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use shearq_scoring::SpectrumCovariance;
 
-use super::challenge::Covariance;
 use crate::io::FileError;
 use crate::io::run::{Run, read_record};
 
@@ -42,7 +42,7 @@ pub struct Manifest {
     pub files: BTreeMap<String, FileSum>,
     /// Covariance of the bandpowers of each cross-spectrum under noise, by the name of its file.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub covariances: BTreeMap<String, Covariance>,
+    pub covariances: BTreeMap<String, SpectrumCovariance>,
 }
 
 /// Size and checksum of a file.

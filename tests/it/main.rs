@@ -5,6 +5,7 @@ mod bad_images;
 mod bad_settings;
 mod baselines;
 mod chain;
+mod examined;
 mod figures;
 mod fuzz;
 mod galsim_galaxies;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_scoring::Figures;
+use shearq_scoring::{Figure, Figures};
 use shearq_tables::{Column, Table, TableError, read_parquet, write_parquet};
 
 use super::{RunRecord, SetRecord, Value};
@@ -162,14 +162,12 @@ impl Rows<'_> {
 
     fn set(&self, row: usize) -> Result<SetRecord, FileError> {
         let figures = |suffix: &str| -> Result<Figures, FileError> {
-            let mut values = [f64::NAN; Figures::NAMES.len()];
-            for (value, name) in values.iter_mut().zip(Figures::NAMES) {
+            let mut values = [f64::NAN; Figures::ALL.len()];
+            for (value, Figure { name, .. }) in values.iter_mut().zip(Figures::ALL) {
                 *value = self.real(&format!("{name}{suffix}"), row)?;
             }
             Ok(Figures::from_values(values))
         };
-        let q_replicates: Vec<f64> = self.list("q_replicates", row)?;
-        let errors = figures("_error")?;
         Ok(SetRecord {
             set: self.count("set", row)?,
             data: self.text("data", row)?.to_owned(),
@@ -177,10 +175,15 @@ impl Rows<'_> {
             galaxies: self.count("galaxies", row)?,
             flagged: self.count("flagged", row)?,
             figures: figures("")?,
-            errors: (q_replicates.len() > 1).then_some(errors),
-            q_replicates,
+            errors: figures("_error")?,
+            q_replicates: self.list("q_replicates", row)?,
             q_leaderboard: self.real("q_leaderboard", row)?,
             convention: self.count("convention", row)?,
+            // Earlier versions let each set choose.
+            convention_known: match self.table.column("convention_known") {
+                Some(_) => self.count::<u8>("convention_known", row)? > 0,
+                None => self.text("choice", row)?.parse::<u8>().is_ok(),
+            },
             convention_leaderboard: self.count("convention_leaderboard", row)?,
         })
     }

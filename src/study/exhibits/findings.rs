@@ -1,5 +1,6 @@
 //! The paper's qualitative statements, held against results.
 
+use shearq_scoring::Figures;
 use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
 
 use super::sets::over_sets;
@@ -32,7 +33,7 @@ fn q_difference(results: &[SetResult], first: usize, second: usize) -> Option<(f
         })
         .collect();
     let difference = paired_difference(&sets)?;
-    let mean = mean_over_sets(&over_sets(results, first, 0)).0;
+    let mean = mean_over_sets(&over_sets(results, first, |f| f.q)).0;
     Some((difference.difference, difference.error, mean))
 }
 
@@ -97,14 +98,13 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
     };
     // Mean Q over the sets of a kind, and its error.
     let mean_of = |wanted: ImageType| -> Option<(f64, f64)> {
-        let values: Vec<(f64, Option<f64>)> = results
+        let values: Vec<(f64, f64)> = results
             .iter()
             .filter(|set| SetKind::of(set.set).is_some_and(|kind| kind.image == wanted))
             .map(|set| &set.results[den])
-            .map(|result| (result.figures.q, result.errors.map(|errors| errors.q)))
+            .map(|result| (result.figures.q, result.errors.q))
             .collect();
-        let (mean, error) = mean_over_sets(&values);
-        (!values.is_empty()).then_some((mean, error.unwrap_or(f64::NAN)))
+        (!values.is_empty()).then(|| mean_over_sets(&values))
     };
     let fiducial = mean_of(ImageType::Fiducial);
     let mut kinds = |paper, label: &str, kind: ImageType, above: bool| {
@@ -151,12 +151,10 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
         true,
     );
     if let Some(raw) = place("23/raw/star") {
-        let mean = |place: usize, figure: usize| mean_over_sets(&over_sets(results, place, figure));
-        let mut bias = |paper, figure: usize, name: &str, lower: bool| {
-            let ((raw, raw_error), (den, den_error)) = (mean(raw, figure), mean(den, figure));
-            let error = raw_error
-                .unwrap_or(f64::NAN)
-                .hypot(den_error.unwrap_or(f64::NAN));
+        let mut bias = |paper, figure: fn(&Figures) -> f64, name: &str, lower: bool| {
+            let mean = |place: usize| mean_over_sets(&over_sets(results, place, figure));
+            let ((raw, raw_error), (den, den_error)) = (mean(raw), mean(den));
+            let error = raw_error.hypot(den_error);
             let change = den.abs() - raw.abs();
             found.push(Finding {
                 paper,
@@ -166,13 +164,13 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
         };
         bias(
             "Denoising decreases the multiplicative bias",
-            2,
+            |f| f.m_half,
             "M/2",
             true,
         );
         bias(
             "Denoising slightly increases the additive bias",
-            3,
+            |f| f.sqrt_a,
             "√A×10⁴",
             false,
         );

@@ -1,7 +1,7 @@
 //! Sect. 5: Table 1, Figs 8 to 11, and what denoising does to ellipticities.
 
-use shearq_scoring::SCORED;
 use shearq_scoring::resample::mean_over_sets;
+use shearq_scoring::{Figures, SCORED};
 use shearq_submissions::{DenoiseMethod, PsfForm, Published, Submission};
 
 use crate::report::figure::{
@@ -16,15 +16,12 @@ use crate::study::response::Response;
 pub(super) fn over_sets(
     results: &[SetResult],
     place: usize,
-    figure: usize,
-) -> Vec<(f64, Option<f64>)> {
+    figure: fn(&Figures) -> f64,
+) -> Vec<(f64, f64)> {
     results
         .iter()
-        .map(|set| {
-            let result = &set.results[place];
-            let error = result.errors.map(|e| e.values()[figure]);
-            (result.figures.values()[figure], error)
-        })
+        .map(|set| &set.results[place])
+        .map(|result| (figure(&result.figures), figure(&result.errors)))
         .collect()
 }
 
@@ -32,9 +29,9 @@ pub(super) fn over_sets(
 pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)]) -> Table {
     let mut rows = Vec::new();
     for (place, (submission, published)) in submissions.iter().enumerate() {
-        let mean = |figure: usize, decimals: usize| {
+        let mean = |figure: fn(&Figures) -> f64, decimals: usize| {
             let (value, error) = mean_over_sets(&over_sets(results, place, figure));
-            Cell::with_error(value, error, decimals)
+            Cell::with_error(value, Some(error), decimals)
         };
         let given = |value: fn(&Published) -> f64, decimals: usize| {
             Cell::number(value(published), decimals)
@@ -48,11 +45,11 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
                 PsfForm::Star => "Star",
                 PsfForm::Functional => "Func",
             }),
-            mean(2, 4),
+            mean(|f| f.m_half, 4),
             given(|p| p.m_half, 4),
-            mean(3, 4),
+            mean(|f| f.sqrt_a, 4),
             given(|p| p.sqrt_a, 4),
-            mean(0, 2),
+            mean(|f| f.q, 2),
             given(|p| p.q, 2),
             Cell::number(
                 results
@@ -62,8 +59,8 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
                     / results.len() as f64,
                 2,
             ),
-            mean(1, 1),
-            mean(4, 4),
+            mean(|f| f.q_dn, 1),
+            mean(|f| f.m_cross, 4),
         ]);
     }
     Table {
@@ -100,7 +97,7 @@ pub fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
     let mut columns = set_labels(results);
     columns.push("mean".into());
     let values = ndarray::Array2::from_shape_fn((names.len(), columns.len()), |(place, k)| {
-        let over = over_sets(results, place, 0);
+        let over = over_sets(results, place, |f| f.q);
         over.get(k)
             .map_or_else(|| mean_over_sets(&over).0, |value| value.0)
     });
@@ -122,21 +119,23 @@ pub fn per_set_table(results: &[SetResult]) -> Table {
     let mut rows = Vec::new();
     for set in results {
         for result in &set.results {
-            let values = result.figures.values();
-            let errors = result.errors.map(|e| e.values());
-            let cell = |at: usize, decimals: usize| {
-                Cell::with_error(values[at], errors.map(|e| e[at]), decimals)
+            let cell = |figure: fn(&Figures) -> f64, decimals: usize| {
+                Cell::with_error(
+                    figure(&result.figures),
+                    Some(figure(&result.errors)),
+                    decimals,
+                )
             };
             rows.push(vec![
                 Cell::number(f64::from(set.set), 0),
                 Cell::text(SetKind::of(set.set).map_or("", |kind| kind.image.label())),
                 Cell::text(&result.submission),
-                cell(0, 2),
+                cell(|f| f.q, 2),
                 Cell::number(result.q_leaderboard, 2),
-                cell(1, 1),
-                cell(2, 4),
-                cell(3, 4),
-                cell(4, 4),
+                cell(|f| f.q_dn, 1),
+                cell(|f| f.m_half, 4),
+                cell(|f| f.sqrt_a, 4),
+                cell(|f| f.m_cross, 4),
                 Cell::text(format!(
                     "{}/{}",
                     result.matched.number(),
@@ -255,7 +254,7 @@ pub fn power_spectra_table(results: &[SetResult], place: usize) -> Table {
 pub fn bias_per_set(
     results: &[SetResult],
     places: &[(usize, &str)],
-    figure: usize,
+    figure: fn(&Figures) -> f64,
     title: &str,
     y_label: &str,
 ) -> BarPlot {
@@ -266,7 +265,10 @@ pub fn bias_per_set(
             BarGroup {
                 label: name.into(),
                 values: over.iter().map(|v| v.0).collect(),
-                errors: over.iter().map(|v| v.1).collect(),
+                errors: over
+                    .iter()
+                    .map(|v| v.1.is_finite().then_some(v.1))
+                    .collect(),
             }
         })
         .collect();

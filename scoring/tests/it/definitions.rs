@@ -2,89 +2,13 @@
 
 use ndarray::Array2;
 use rustfft::num_complex::Complex64;
-use shearq_scoring::modes::{Decomposer, Modes};
+use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{
     BINS, Bins, Choice, Convention, CrossSpectrum, Definition, FieldSum, Grid, Noise, Options, Row,
-    SCORED, SetImages, SetScore, SetScorer, TrueShear, cross_spectrum,
+    SCORED, SetImages, SetScore, SetScorer, cross_spectrum,
 };
 
-/// Standard normal numbers from a linear congruential generator (Box–Muller).
-struct Normal(u64);
-
-impl Normal {
-    fn uniform(&mut self) -> f64 {
-        self.0 = self
-            .0
-            .wrapping_mul(6364136223846793005)
-            .wrapping_add(1442695040888963407);
-        ((self.0 >> 11) as f64 + 0.5) / (1u64 << 53) as f64
-    }
-
-    fn draw(&mut self) -> f64 {
-        let radius = (-2.0 * self.uniform().ln()).sqrt();
-        radius * (2.0 * std::f64::consts::PI * self.uniform()).cos()
-    }
-}
-
-/// Which modes a test field has.
-#[derive(Clone, Copy, PartialEq)]
-enum Content {
-    E,
-    B,
-    Mixed,
-}
-
-/// A Gaussian field with C_ℓ ∝ 1/ℓ² below the Nyquist multipole, rms of a few per cent.
-fn field(grid: &Grid, content: Content, seed: u64) -> Array2<Complex64> {
-    let n = grid.n;
-    let mut normal = Normal(seed);
-    let decomposer = Decomposer::new(*grid);
-    let white = Array2::from_shape_fn((n, n), |_| Complex64::new(normal.draw(), normal.draw()));
-    let Modes { mut e, mut b } = decomposer.decompose(white);
-    for ((i, j), value) in e.indexed_iter_mut() {
-        let f = |k: usize| {
-            if 2 * k > n {
-                k as f64 - n as f64
-            } else {
-                k as f64
-            }
-        };
-        let l = f(i).hypot(f(j));
-        let inside = l > 0.0 && 2.0 * l < n as f64 && 2 * i != n && 2 * j != n;
-        let scale = if inside { 0.02 / l } else { 0.0 };
-        *value *= scale;
-        b[(i, j)] *= scale;
-    }
-    if content == Content::E {
-        b.fill(Complex64::ZERO);
-    }
-    if content == Content::B {
-        e.fill(Complex64::ZERO);
-    }
-    decomposer.compose(&Modes { e, b })
-}
-
-fn rows(grid: &Grid, field: &Array2<Complex64>) -> Vec<Row> {
-    field
-        .indexed_iter()
-        .map(|((ix, iy), e)| {
-            let (x, y) = grid.centre(ix, iy);
-            Row {
-                x,
-                y,
-                e1: e.re,
-                e2: e.im,
-            }
-        })
-        .collect()
-}
-
-fn truth(field: &Array2<Complex64>) -> TrueShear {
-    TrueShear {
-        g1: field.mapv(|g| g.re),
-        g2: field.mapv(|g| g.im),
-    }
-}
+use crate::common::{Content, Normal, field, rows, truth};
 
 /// Images of shear plus noise of `sigma`, every row kept for which `keep` says so.
 fn images(
@@ -230,7 +154,7 @@ fn noise_is_measured_as_it_is_and_the_jackknife_errors_are_those_of_repeated_tri
         let score = score(grid, &shear, &images, options);
         q_dn.push(score.figures.q_dn / score.figures.q);
         m.push(score.figures.m_cross);
-        errors.push(score.errors().unwrap().m_cross);
+        errors.push(score.errors.m_cross);
         variances.push(score.noise_variance.unwrap());
     }
     let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
@@ -388,7 +312,7 @@ fn every_convention_is_recognised_by_its_correlation() {
         let images = images(&grid, &given, 2, 0.001, 5, |_, _| true);
         let score = score(grid, &shear, &images, Options::default());
         assert!(score.conventions[k.index()].correlation > 0.8, "{k:?}");
-        assert_eq!(score.matched.class(), k.class(), "{k:?}");
+        assert_eq!(score.matching.best().class(), k.class(), "{k:?}");
         assert!(
             score.figures.m_cross.abs() < 0.05,
             "{k:?}: {:?}",
@@ -405,7 +329,7 @@ fn noise_makes_the_wrong_convention_win_and_that_is_seen() {
     let images = images(&grid, &shear, 20, 0.02, 6, |_, _| true);
     let score = score(grid, &shear, &images, Options::default());
     assert!(score.wrong_convention_wins());
-    assert_eq!(score.matched.class(), Convention::STANDARD.class());
+    assert_eq!(score.matching.best().class(), Convention::STANDARD.class());
     let q = |k: Convention| score.conventions[k.index()].quality.q;
-    assert!(q(score.best) > q(score.matched));
+    assert!(q(score.best) > q(score.matching.best()));
 }

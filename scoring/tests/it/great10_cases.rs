@@ -189,7 +189,7 @@ fn every_public_figure_is_reproduced() {
             &expected["classes"]["B"],
         );
         for (name, class) in [("A", ConventionClass::A), ("B", ConventionClass::B)] {
-            let corr = score.class_correlation(class);
+            let corr = score.matching.class_correlation(class);
             check.close("corr", corr, &expected["classes"][name]["corr"], 1e-3);
         }
         failures.extend(check.failures);
@@ -200,7 +200,7 @@ fn every_public_figure_is_reproduced() {
             expected["winner_class"].as_str().unwrap()
         );
         assert_eq!(
-            u64::from(score.matched.number()),
+            u64::from(score.matching.best().number()),
             expected["matched"].as_u64().unwrap()
         );
     }

@@ -1,0 +1,230 @@
+//! Standard errors of a set's figures, from what the truth does not explain of its averaged field.
+//!
+//! A jackknife over images cannot see what all images have in common: intrinsic shapes that are the same in
+//! all of them, and it knows little with few images. The averaged field itself shows both. With the E modes
+//! E, their truth T and m of the cross-correlation, ν = ⟨|E − (1 + m)T|²⟩ in rings of |ℓ| is the power of
+//! all that scatters them, noise or shapes, whatever it comes from; B modes have ⟨|B|²⟩ = ν_B. As Gaussian
+//! noise on a fixed truth, opposite modes being conjugates, with s = (1 + m)T and P_b = Σ w|E|²:
+//!
+//! ```text
+//! var P_b      = Σ 2w²(2|s|²ν + ν²)          bandpowers; ν²·G/(G − 1) once noise is removed that G groups tell
+//! var m_cross  = Σ |T|²ν / (Σ|T|²)²
+//! var Σ_x u e₁ = n⁻⁴ Σ |U|²(cos²2φ ν + sin²2φ ν_B)   any sum over cells, U = FFT(u); sin and cos exchanged for e₂
+//! ```
+//!
+//! M, A and the null tests are linear in bandpowers, m₁ to c₂ sums over cells. σ_sys is a sum of moduli: each
+//! term has the scatter of a folded normal number. A mean, which is the zero mode, has the E modes' power
+//! at the lowest multipoles: intrinsic ellipticities, B modes, have no mean.
+
+use ndarray::Array2;
+use rustfft::num_complex::Complex64;
+
+use crate::bandpower::{BINS, Bins, SCORED};
+use crate::grid::Grid;
+use crate::modes::{Decomposer, Modes};
+use crate::quality::bias_weights;
+
+/// Standard errors by which A must differ from zero for that of √A to be the first order's.
+const CLEAR_A: f64 = 2.0;
+/// Rings of lowest |ℓ| from which the power of the zero mode is taken.
+const LOWEST: usize = 4;
+
+/// Power of scattered E and B modes in rings of |ℓ| as wide as the bins, Nyquist rows included.
+pub(crate) struct Scatter {
+    ring_of: Array2<u8>,
+    e: [f64; BINS],
+    b: [f64; BINS],
+    /// E-mode power of the lowest rings.
+    lowest: f64,
+}
+
+impl Scatter {
+    /// Of modes of which the truth has been taken away.
+    pub(crate) fn new(grid: &Grid, width: f64, unexplained: &Modes) -> Self {
+        let mut ring_of = Array2::from_elem((grid.n, grid.n), BINS as u8);
+        let (mut e, mut b, mut count) = ([0.0; BINS], [0.0; BINS], [0.0; BINS]);
+        for i in 0..grid.n {
+            for j in 0..grid.n {
+                if grid.frequency(i) == 0 && grid.frequency(j) == 0 {
+                    continue;
+                }
+                let l = grid.wave(i).hypot(grid.wave(j));
+                let ring = ((l - grid.l_min().0) / width).round().max(0.0) as usize;
+                let at = (grid.fft_index(i), grid.fft_index(j));
+                ring_of[at] = ring as u8;
+                e[ring] += unexplained.e[at].norm_sqr();
+                b[ring] += unexplained.b[at].norm_sqr();
+                count[ring] += 1.0;
+            }
+        }
+        let lowest = e[..LOWEST].iter().sum::<f64>() / count[..LOWEST].iter().sum::<f64>();
+        for (ring, &count) in count.iter().enumerate() {
+            if count > 0.0 {
+                e[ring] /= count;
+                b[ring] /= count;
+            }
+        }
+        Scatter {
+            ring_of,
+            e,
+            b,
+            lowest,
+        }
+    }
+
+    /// (ν, ν_B) of a mode; both are that of the lowest rings' E modes for the zero mode.
+    fn at(&self, mode: (usize, usize)) -> (f64, f64) {
+        match usize::from(self.ring_of[mode]) {
+            BINS => (self.lowest, self.lowest),
+            ring => (self.e[ring], self.b[ring]),
+        }
+    }
+
+    /// Variance of Σ_x u·e over cells for both components, `u` of the same convention as the modes.
+    pub(crate) fn of_sums(&self, decomposer: &Decomposer, weights: [&Array2<f64>; 2]) -> [f64; 2] {
+        let n4 = (decomposer.grid().cells() as f64).powi(2);
+        let mut component = 0;
+        weights.map(|u| {
+            let modes = decomposer.fft(u.mapv(Complex64::from));
+            let sum: f64 = modes
+                .indexed_iter()
+                .map(|(at, u)| {
+                    let (e, b) = self.at(at);
+                    // K = exp(−2iφ); at the zero mode, where it is none, both powers are the same.
+                    let cos2 = decomposer.kernel(at).re.powi(2);
+                    let own = if component == 0 { cos2 } else { 1.0 - cos2 };
+                    u.norm_sqr() * (own * e + (1.0 - own) * b)
+                })
+                .sum();
+            component += 1;
+            sum / n4
+        })
+    }
+
+    /// Variance of m by cross-correlation with `truth`.
+    pub(crate) fn of_cross(&self, bins: &Bins, truth: &Array2<Complex64>) -> f64 {
+        let (mut noise, mut power) = (0.0, 0.0);
+        bins.each_scored(|mode, _, _| {
+            let t = truth[mode].norm_sqr();
+            noise += t * self.at(mode).0;
+            power += t;
+        });
+        noise / (power * power)
+    }
+
+    /// Variances of the scored bandpowers of E modes whose explained part is `signal`; `own` multiplies the
+    /// noise's power by itself.
+    pub(crate) fn of_power(
+        &self,
+        bins: &Bins,
+        signal: &Array2<Complex64>,
+        own: f64,
+    ) -> [f64; BINS] {
+        let mut variance = [0.0; BINS];
+        bins.each_scored(|mode, bin, w| {
+            let (nu, s) = (self.at(mode).0, signal[mode].norm_sqr());
+            variance[bin] += 2.0 * w * w * nu * (2.0 * s + own * nu);
+        });
+        variance
+    }
+
+    /// Variances of the scored bandpowers of B modes, and of EB.
+    pub(crate) fn of_null_tests(
+        &self,
+        bins: &Bins,
+        signal: &Array2<Complex64>,
+    ) -> [[f64; BINS]; 2] {
+        let (mut bb, mut eb) = ([0.0; BINS], [0.0; BINS]);
+        bins.each_scored(|mode, bin, w| {
+            let (e, b) = self.at(mode);
+            bb[bin] += 2.0 * w * w * b * b;
+            eb[bin] += w * w * b * (signal[mode].norm_sqr() + e);
+        });
+        [bb, eb]
+    }
+}
+
+/// Standard error of Q where the scored bandpowers are `apart` from the truth and have these variances.
+///
+/// σ_sys is a sum of |P_b − P_b^true|. The mean of each is taken as √max(0, x² − variance), and its scatter is
+/// that of the modulus of a normal number. The error of Q ∝ 1/σ_sys is that of σ_sys to first order, damped
+/// where the two are of one size: a σ_sys that is small by chance would have Q's error without bound.
+pub(crate) fn of_quality(bins: &Bins, q: f64, apart: &[f64; BINS], variance: &[f64; BINS]) -> f64 {
+    let (mut sigma_sys, mut total) = (0.0, 0.0);
+    for b in SCORED {
+        sigma_sys += apart[b].abs() * bins.dln_l[b];
+        total += folded_variance(apart[b], variance[b]) * bins.dln_l[b].powi(2);
+    }
+    let relative = total.sqrt() / sigma_sys;
+    q * relative / (1.0 + relative * relative)
+}
+
+/// Variance of |x| where x is normal with variance `variance` and was found to be `found`.
+fn folded_variance(found: f64, variance: f64) -> f64 {
+    if variance <= 0.0 {
+        return 0.0;
+    }
+    let mean2 = (found * found - variance).max(0.0);
+    let t = (mean2 / (2.0 * variance)).sqrt();
+    let folded = (2.0 * variance / std::f64::consts::PI).sqrt() * (-t * t).exp()
+        + mean2.sqrt() * libm::erf(t);
+    mean2 + variance - folded * folded
+}
+
+/// Standard errors of M and A in units of C_ℓ, for bandpowers of a covariance.
+pub(crate) fn of_biases(
+    bins: &Bins,
+    truth: &[f64; BINS],
+    covariance: &[[f64; BINS]; BINS],
+) -> (f64, f64) {
+    let weights = bias_weights(truth, |b| bins.to_c_l(b));
+    let (mut m, mut a) = (0.0, 0.0);
+    for (i, first) in SCORED.zip(weights) {
+        for (j, second) in SCORED.zip(weights) {
+            let c_l = covariance[i][j] * bins.to_c_l(i) * bins.to_c_l(j);
+            m += first.0 * second.0 * c_l;
+            a += first.1 * second.1 * c_l;
+        }
+    }
+    (m.sqrt(), a.sqrt())
+}
+
+/// Standard error of √A in 10⁻⁴, for A and its error; not a number where A is not clear of zero.
+pub(crate) fn of_sqrt_a(a: f64, error: f64) -> f64 {
+    match a.abs() >= CLEAR_A * error {
+        true => error / (2.0 * a.abs().sqrt()) * 1e4,
+        false => f64::NAN,
+    }
+}
+
+/// Standard error of the mean C_ℓ of the scored bins, in 10⁻⁹ steradian.
+pub(crate) fn of_mean_c_l(bins: &Bins, variance: &[f64; BINS]) -> f64 {
+    let sum: f64 = SCORED.map(|b| variance[b] * bins.to_c_l(b).powi(2)).sum();
+    sum.sqrt() / SCORED.len() as f64 * 1e9
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_modulus_scatters_less_near_zero_and_like_its_number_far_from_it() {
+        // Of |x| with mean zero: 1 − 2/π.
+        let half = 1.0 - 2.0 / std::f64::consts::PI;
+        assert!((folded_variance(0.5, 1.0) - half).abs() < 1e-12);
+        assert!((folded_variance(-1.0, 4.0) - 4.0 * half).abs() < 1e-12);
+        assert!((folded_variance(30.0, 1.0) - 1.0).abs() < 1e-9);
+        // Mean 1, variance 1: by sums over the density.
+        let (mut mean, mut square) = (0.0, 0.0);
+        for k in -80_000..80_000 {
+            let x = f64::from(k) * 1e-4;
+            let p =
+                (-(x - 1.0_f64).powi(2) / 2.0).exp() / (2.0 * std::f64::consts::PI).sqrt() * 1e-4;
+            mean += x.abs() * p;
+            square += x * x * p;
+        }
+        let expected = square - mean * mean;
+        assert!((folded_variance(2.0_f64.sqrt(), 1.0) - expected).abs() < 1e-6);
+        assert_eq!(folded_variance(1.0, 0.0), 0.0);
+    }
+}

@@ -1,0 +1,122 @@
+//! The figures of a scored set, declared once: everything that names, prints or stores them reads this.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Deserializer, Serialize};
+
+/// What one figure is and how it is printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Figure {
+    /// Name in files: columns, keys, conditions.
+    pub name: &'static str,
+    /// Heading of tables, with the unit where there is one.
+    pub label: &'static str,
+    /// Decimals in tables for people.
+    pub decimals: usize,
+    /// Whether tables for people leave it out unless they are to be wide.
+    pub detail: bool,
+    /// What it is, in a sentence.
+    pub meaning: &'static str,
+}
+
+macro_rules! figures {
+    ($($name:ident: $label:literal, $decimals:literal, $detail:literal, $meaning:literal;)+) => {
+        /// Figures of one set, of a replicate of it, or the errors of them. Not a number where unknown.
+        #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+        pub struct Figures {
+            $(#[doc = $meaning] pub $name: f64,)+
+        }
+
+        impl Figures {
+            /// What each is, in the order of [`Figures::values`].
+            pub const ALL: [Figure; [$($label),+].len()] = [$(Figure {
+                name: stringify!($name),
+                label: $label,
+                decimals: $decimals,
+                detail: $detail,
+                meaning: $meaning,
+            }),+];
+
+            /// All as an array.
+            pub fn values(&self) -> [f64; Self::ALL.len()] {
+                [$(self.$name),+]
+            }
+
+            /// The inverse of [`Figures::values`].
+            pub fn from_values(values: [f64; Self::ALL.len()]) -> Self {
+                let [$($name),+] = values;
+                Figures { $($name),+ }
+            }
+        }
+    };
+}
+
+figures! {
+    q: "Q", 2, false, "Quality factor, 5·10⁻³/σ_sys.";
+    q_dn: "Q_dn", 2, false, "Quality factor after removing the noise's power.";
+    m_half: "M/2", 4, false, "Multiplicative bias of the power spectrum, halved.";
+    sqrt_a: "√A×10⁴", 4, false, "Additive bias of the power spectrum: sign(A)·√|A| in 10⁻⁴, C_ℓ in steradian.";
+    m_cross: "m (cross)", 4, false, "Multiplicative bias by cross-correlation of E modes with the truth.";
+    m1: "m1", 4, true, "Multiplicative bias of component 1, from the galaxies.";
+    m2: "m2", 4, true, "Multiplicative bias of component 2, from the galaxies.";
+    c1: "c1", 5, true, "Additive bias of component 1, from the galaxies.";
+    c2: "c2", 5, true, "Additive bias of component 2, from the galaxies.";
+    b_power: "B mode×10⁹", 3, true, "Mean C_ℓ of the B modes over bins 2 to 9, in 10⁻⁹ steradian.";
+    eb_power: "EB×10⁹", 3, true, "Mean C_ℓ of the EB cross-spectrum over bins 2 to 9, in 10⁻⁹ steradian.";
+}
+
+impl Figures {
+    /// The place in [`Figures::values`] of the figure called `name`.
+    pub fn place(name: &str) -> Option<usize> {
+        Self::ALL.iter().position(|figure| figure.name == name)
+    }
+
+    /// None known.
+    pub fn unknown() -> Self {
+        Self::from_values([f64::NAN; Self::ALL.len()])
+    }
+}
+
+/// JSON has no NaN: what was written as null is read as that.
+impl<'de> Deserialize<'de> for Figures {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let found = BTreeMap::<String, Option<f64>>::deserialize(deserializer)?;
+        let mut values = [0.0; Self::ALL.len()];
+        for (value, Figure { name, .. }) in values.iter_mut().zip(Self::ALL) {
+            let number = found.get(name);
+            let number = number.ok_or_else(|| serde::de::Error::missing_field(name))?;
+            *value = number.unwrap_or(f64::NAN);
+        }
+        Ok(Self::from_values(values))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_names_and_fields_go_together() {
+        let values: [f64; Figures::ALL.len()] = std::array::from_fn(|k| k as f64);
+        let figures = Figures::from_values(values);
+        assert_eq!(figures.values(), values);
+        for (name, field) in [
+            ("q", figures.q),
+            ("m_cross", figures.m_cross),
+            ("c2", figures.c2),
+        ] {
+            assert_eq!(Figures::place(name), Some(field as usize));
+        }
+        assert_eq!(Figures::place("q_best"), None);
+        let text = serde_json::to_string(&figures).unwrap();
+        assert_eq!(serde_json::from_str::<Figures>(&text).unwrap(), figures);
+        let unknown = serde_json::to_string(&Figures::unknown()).unwrap();
+        assert!(
+            serde_json::from_str::<Figures>(&unknown)
+                .unwrap()
+                .q
+                .is_nan()
+        );
+        assert!(serde_json::from_str::<Figures>("{\"q\":1.0}").is_err());
+    }
+}

@@ -1,0 +1,83 @@
+//! Fields and random numbers that tests of the scoring share.
+use ndarray::Array2;
+use rustfft::num_complex::Complex64;
+use shearq_scoring::modes::{Decomposer, Modes};
+use shearq_scoring::{Grid, Row, TrueShear};
+
+/// Standard normal numbers from a linear congruential generator (Box–Muller).
+pub struct Normal(pub u64);
+
+impl Normal {
+    pub fn uniform(&mut self) -> f64 {
+        self.0 = self
+            .0
+            .wrapping_mul(6364136223846793005)
+            .wrapping_add(1442695040888963407);
+        ((self.0 >> 11) as f64 + 0.5) / (1u64 << 53) as f64
+    }
+
+    pub fn draw(&mut self) -> f64 {
+        let radius = (-2.0 * self.uniform().ln()).sqrt();
+        radius * (2.0 * std::f64::consts::PI * self.uniform()).cos()
+    }
+}
+
+/// Which modes a test field has.
+#[derive(Clone, Copy, PartialEq)]
+pub enum Content {
+    E,
+    B,
+    Mixed,
+}
+
+/// A Gaussian field with C_ℓ ∝ 1/ℓ² below the Nyquist multipole, rms of a few per cent.
+pub fn field(grid: &Grid, content: Content, seed: u64) -> Array2<Complex64> {
+    let n = grid.n;
+    let mut normal = Normal(seed);
+    let decomposer = Decomposer::new(*grid);
+    let white = Array2::from_shape_fn((n, n), |_| Complex64::new(normal.draw(), normal.draw()));
+    let Modes { mut e, mut b } = decomposer.decompose(white);
+    for ((i, j), value) in e.indexed_iter_mut() {
+        let f = |k: usize| {
+            if 2 * k > n {
+                k as f64 - n as f64
+            } else {
+                k as f64
+            }
+        };
+        let l = f(i).hypot(f(j));
+        let inside = l > 0.0 && 2.0 * l < n as f64 && 2 * i != n && 2 * j != n;
+        let scale = if inside { 0.02 / l } else { 0.0 };
+        *value *= scale;
+        b[(i, j)] *= scale;
+    }
+    if content == Content::E {
+        b.fill(Complex64::ZERO);
+    }
+    if content == Content::B {
+        e.fill(Complex64::ZERO);
+    }
+    decomposer.compose(&Modes { e, b })
+}
+
+pub fn rows(grid: &Grid, field: &Array2<Complex64>) -> Vec<Row> {
+    field
+        .indexed_iter()
+        .map(|((ix, iy), e)| {
+            let (x, y) = grid.centre(ix, iy);
+            Row {
+                x,
+                y,
+                e1: e.re,
+                e2: e.im,
+            }
+        })
+        .collect()
+}
+
+pub fn truth(field: &Array2<Complex64>) -> TrueShear {
+    TrueShear {
+        g1: field.mapv(|g| g.re),
+        g2: field.mapv(|g| g.im),
+    }
+}

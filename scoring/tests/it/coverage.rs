@@ -1,0 +1,131 @@
+//! The errors of a set's figures against the scatter of repeated trials.
+
+use ndarray::Array2;
+use rustfft::num_complex::Complex64;
+use shearq_scoring::modes::{Decomposer, Modes};
+use shearq_scoring::{
+    Choice, Convention, Definition, FieldSum, Figures, Grid, Options, SetImages, SetScorer,
+};
+
+use crate::common::{Content, Normal, field, rows, truth};
+
+/// Intrinsic ellipticities: B modes of equal power in all modes, of this scatter per component before the
+/// E modes are taken out.
+const SHAPES: f64 = 0.2;
+
+/// White noise without its E modes.
+fn shapes(grid: &Grid, normal: &mut Normal) -> Array2<Complex64> {
+    let decomposer = Decomposer::new(*grid);
+    let white = Array2::from_shape_fn((grid.n, grid.n), |_| {
+        Complex64::new(SHAPES * normal.draw(), SHAPES * normal.draw())
+    });
+    let Modes { mut e, b } = decomposer.decompose(white);
+    e.fill(Complex64::ZERO);
+    decomposer.compose(&Modes { e, b })
+}
+
+/// One kind of set.
+#[derive(Debug)]
+struct Kind {
+    images: usize,
+    /// Noise of a galaxy's ellipticity per component.
+    noise: f64,
+    /// Whether all images have the same intrinsic shapes.
+    shared: bool,
+    /// The method's own bias.
+    m: f64,
+}
+
+/// Scatter over trials of each figure that has an error, over the mean of its error, and the share of
+/// trials that have one.
+fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(&'static str, f64, f64)> {
+    const TRIALS: usize = 200;
+    let shear = field(grid, Content::E, 5);
+    let options = Options {
+        definition,
+        choice: Choice::Insist(Convention::STANDARD),
+        ..Options::default()
+    };
+    let scorer = SetScorer::new(*grid, truth(&shear), options).unwrap();
+    let mut normal = Normal(77);
+    let mut found: Vec<([f64; Figures::ALL.len()], [f64; Figures::ALL.len()])> = Vec::new();
+    for _ in 0..TRIALS {
+        let mut common = shapes(grid, &mut normal);
+        let mut images = SetImages::new(grid);
+        for _ in 0..kind.images {
+            if !kind.shared {
+                common = shapes(grid, &mut normal);
+            }
+            let mut observed = &shear * Complex64::from(1.0 + kind.m) + &common;
+            for e in &mut observed {
+                *e += Complex64::new(kind.noise * normal.draw(), kind.noise * normal.draw());
+            }
+            let mut sum = FieldSum::new(grid);
+            sum.add_image(grid, rows(grid, &observed));
+            images.add(&sum);
+        }
+        let score = scorer.score(&images).unwrap();
+        found.push((score.figures.values(), score.errors.values()));
+    }
+    (0..Figures::ALL.len())
+        .map(|k| {
+            let known: Vec<(f64, f64)> = found
+                .iter()
+                .map(|(values, errors)| (values[k], errors[k]))
+                .filter(|(_, error)| error.is_finite())
+                .collect();
+            let count = known.len() as f64;
+            let mean = |of: &dyn Fn(&(f64, f64)) -> f64| known.iter().map(of).sum::<f64>() / count;
+            let centre = mean(&|v| v.0);
+            let scatter = mean(&|v| (v.0 - centre).powi(2)).sqrt();
+            let ratio = scatter / mean(&|v| v.1);
+            (Figures::ALL[k].name, ratio, count / TRIALS as f64)
+        })
+        .collect()
+}
+
+#[test]
+fn errors_are_the_scatter_of_repeated_trials() {
+    let grid = Grid::great10(20).unwrap();
+    let kind = |images, noise, shared, m| Kind {
+        images,
+        noise,
+        shared,
+        m,
+    };
+    for (definition, kind) in [
+        (Definition::Leaderboard, kind(4, 0.107, false, 0.0)),
+        (Definition::Leaderboard, kind(10, 0.107, true, -0.4)),
+        (Definition::Leaderboard, kind(4, 0.054, true, 0.0)),
+        (Definition::Leaderboard, kind(2, 0.107, true, 0.0)),
+        (Definition::Corrected, kind(4, 0.054, true, 0.0)),
+    ] {
+        for (name, ratio, share) in coverage(&grid, &kind, definition) {
+            // A scatter from 200 trials is good to 5 %; errors to first order, of squares and moduli, are
+            // not exact.
+            assert!(
+                (0.8..1.25).contains(&ratio),
+                "{definition:?} {kind:?}: {name} {ratio}"
+            );
+            assert!(share > 0.95, "{kind:?}: {name} has an error in {share}");
+        }
+    }
+}
+
+#[test]
+fn errors_of_one_image_are_known_but_for_its_noise() {
+    let grid = Grid::great10(20).unwrap();
+    let kind = Kind {
+        images: 1,
+        noise: 0.02,
+        shared: false,
+        m: 0.0,
+    };
+    for (name, ratio, share) in coverage(&grid, &kind, Definition::Leaderboard) {
+        if name == "q_dn" {
+            assert_eq!(share, 0.0);
+        } else {
+            assert!((0.8..1.25).contains(&ratio), "{name} {ratio}");
+        }
+    }
+}
