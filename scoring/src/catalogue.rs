@@ -22,8 +22,10 @@ pub struct Row {
     pub e2: f64,
 }
 
-/// An ellipticity larger than this is none: a value that stands for "not measured", or another quantity.
+/// An ellipticity larger than this is far from any ellipse's.
 const ABSURD: f64 = 5.0;
+/// Where one row in so many is, they are another quantity.
+const TOO_MANY: usize = 20;
 
 /// How the rows of one catalogue, or of several, were used, and what is odd about them.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -42,10 +44,15 @@ pub struct RowCounts {
     pub missing: usize,
     /// Rows used with |e| > 1, which no ellipse has.
     pub above_one: usize,
-    /// Of these, rows with |e| > 5, which are no ellipticities.
+    /// Of these, rows with |e| > 5.
     pub absurd: usize,
     /// The first of those: its place, counted from 1, and its ellipticity.
     pub first_absurd: Option<(usize, f64, f64)>,
+    /// Of these, rows with a whole number beyond 5 in a component, as -99: a value that stands for "not
+    /// measured".
+    pub sentinels: usize,
+    /// The first of those.
+    pub first_sentinel: Option<(usize, f64, f64)>,
 }
 
 impl std::ops::AddAssign for RowCounts {
@@ -59,16 +66,26 @@ impl std::ops::AddAssign for RowCounts {
         self.above_one += other.above_one;
         self.absurd += other.absurd;
         self.first_absurd = self.first_absurd.or(other.first_absurd);
+        self.sentinels += other.sentinels;
+        self.first_sentinel = self.first_sentinel.or(other.first_sentinel);
     }
 }
 
 impl RowCounts {
     /// Why these rows of another program should not be scored as they are, if so.
     pub fn fault(&self, grid: &Grid) -> Option<String> {
-        if let Some((row, e1, e2)) = self.first_absurd {
+        if let Some((row, e1, e2)) = self.first_sentinel {
             return Some(format!(
-                "{} rows have |e| > {ABSURD}, the first of them row {row} with ({e1}, {e2}); expected ellipticities. If the value stands for \"not measured\", name it as missing; if it is an outlier, set a largest |e|",
-                self.absurd
+                "{} rows have a whole number as ellipticity, the first of them row {row} with ({e1}, {e2}): if it stands for \"not measured\", name it as missing; otherwise set a largest |e|",
+                self.sentinels
+            ));
+        }
+        if let Some((row, e1, e2)) = self.first_absurd
+            && TOO_MANY * self.absurd > self.used
+        {
+            return Some(format!(
+                "{} of {} rows have |e| > {ABSURD}, the first of them row {row} with ({e1}, {e2}); expected ellipticities, below 1. If these are outliers, set a largest |e|",
+                self.absurd, self.used
             ));
         }
         (2 * self.repeated > self.used).then(|| {
@@ -103,8 +120,8 @@ impl RowCounts {
         }
         if self.above_one > 0 {
             lines.push(format!(
-                "Warning: {} rows of {whose} have |e| > 1; they are scored as they are.",
-                self.above_one
+                "Warning: {} rows of {whose} have |e| > 1, {} of them |e| > {ABSURD}; they are scored as they are.",
+                self.above_one, self.absurd
             ));
         }
         if self.not_finite > 0 {
@@ -175,9 +192,13 @@ impl FieldSum {
             counts.above_one += usize::from(square > 1.0);
             if square > ABSURD * ABSURD {
                 counts.absurd += 1;
-                counts
-                    .first_absurd
-                    .get_or_insert((place + 1, row.e1, row.e2));
+                let found = (place + 1, row.e1, row.e2);
+                counts.first_absurd.get_or_insert(found);
+                let whole = |e: f64| e.abs() > ABSURD && e.fract() == 0.0;
+                if whole(row.e1) || whole(row.e2) {
+                    counts.sentinels += 1;
+                    counts.first_sentinel.get_or_insert(found);
+                }
             }
         }
         counts.missing = seen.iter().filter(|seen| !**seen).count();

@@ -41,17 +41,16 @@ impl ConventionMatch {
         self.sums[convention.index()] / self.modes
     }
 
-    /// The convention that correlates best, the first of equals. It may be so by chance.
+    /// The convention that correlates best, of equals the standard one or else the first. It may be so by
+    /// chance.
     pub fn best(&self) -> Convention {
+        let better = |best, k| match self.correlation(k) > self.correlation(best) {
+            true => k,
+            false => best,
+        };
         Convention::ALL
             .into_iter()
-            .reduce(
-                |best, k| match self.correlation(k) > self.correlation(best) {
-                    true => k,
-                    false => best,
-                },
-            )
-            .unwrap_or(Convention::STANDARD)
+            .fold(Convention::STANDARD, better)
     }
 
     /// The least correlation, or difference of two, that is clearly more than chance: of N modes without
@@ -139,6 +138,7 @@ mod tests {
     fn nothing_is_in_the_standard_convention() {
         let nothing = ConventionMatch::new([f64::NAN; 8], 100);
         assert!(!nothing.is_clear());
+        assert_eq!(nothing.best(), Convention::STANDARD);
         assert_eq!(nothing.convention(), Convention::STANDARD);
         assert_eq!(
             ConventionMatch::default().convention(),

@@ -403,9 +403,9 @@ fn check_against_truth(
     };
     let standard = &score.conventions[Convention::STANDARD.index()];
     let matched = &score.conventions[score.matching.best().index()];
-    if score.constant.is_none() && !score.matching.is_clear() {
+    if score.constant.is_none() && matched.correlation < score.matching.least_clear() {
         let message = format!(
-            "set {set}: no convention clearly correlates with the true shear (best {:.2})",
+            "set {set}: no convention correlates with the true shear (best {:.2})",
             matched.correlation
         );
         report.warn(path, "correlation", message);

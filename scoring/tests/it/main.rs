@@ -1,5 +1,6 @@
 //! Tests of the scoring through its public face.
 
+mod by_hand;
 mod common;
 mod conventions;
 mod coverage;
