@@ -9,6 +9,7 @@ use shearq_scoring::units::{Degrees, Pixels};
 
 use super::{Findings, count, print};
 use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, MAX_SET, read_truth_rows};
+use crate::io::open::is_there;
 use crate::pipeline::score::grid_side;
 use crate::submit::check::{Expected, Severity, check};
 
@@ -55,7 +56,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let data = data.as_ref().map(DataFolder::open).transpose()?;
     let sets: Vec<u32> = data.as_ref().map_or_else(Vec::new, |data| {
         (1..=MAX_SET)
-            .filter(|set| data.truth(*set).is_file())
+            .filter(|set| is_there(&data.truth(*set)))
             .collect()
     });
     let mut side = *grid;

@@ -9,6 +9,7 @@ use super::arguments::{SetList, Threads};
 use super::progress::Bar;
 use super::{Findings, count, print, run, tell};
 use crate::io::layout::{DataFolder, MAX_IMAGE};
+use crate::io::open::is_there;
 use crate::io::run::{RUN_FILE, Run, Source, claim, read_record};
 use crate::pipeline::complete::{Fault, Results};
 use crate::pipeline::images::{self, ImageId, Shard};
@@ -89,7 +90,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
         out,
     };
     require_complete(arguments, &results, &images)?;
-    if images.iter().any(|id| data.truth(id.set).is_file()) {
+    if images.iter().any(|id| is_there(&data.truth(id.set))) {
         return run::score(run, out, sets, None, arguments.threads.number());
     }
     tell(format_args!(
@@ -117,7 +118,7 @@ fn require_complete(
     images: &[ImageId],
 ) -> anyhow::Result<()> {
     let out = arguments.out.display();
-    let mut bar = Bar::new("checking", results.galaxies(images)?);
+    let mut bar = Bar::new("checking", results.galaxies(images));
     let faults = results.faults(images, arguments.threads.number(), &mut bar)?;
     drop(bar);
     if faults.is_empty() {

@@ -171,7 +171,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             if let Some(store) = &arguments.store {
                 let made = Measured {
                     name: &foreign.name,
-                    settings: std::fs::read_to_string(path)
+                    settings: crate::io::open::read_to_string(path)
                         .with_context(|| path.display().to_string())?,
                     source: &Source::folder(&data),
                     data: &data,

@@ -97,7 +97,7 @@ impl Baseline {
     /// # Errors
     /// Where it cannot be read or is not valid.
     pub fn read(path: &Path) -> Result<Self, FileError> {
-        let text = std::fs::read_to_string(path)
+        let text = super::open::read_to_string(path)
             .map_err(FileError::doing(path, "cannot read the baseline"))?;
         toml::from_str(&text).map_err(|error| FileError::new(path, error.to_string().trim_end()))
     }

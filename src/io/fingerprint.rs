@@ -1,6 +1,5 @@
 //! Short names for contents: what tells whether two results were made from the same data.
 
-use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
@@ -8,6 +7,7 @@ use sha2::{Digest, Sha256};
 
 use super::error::FileError;
 use super::layout::{DataFolder, MAX_SET};
+use super::open;
 use super::run::Source;
 
 /// Bytes at the beginning of an image that count: its headers and some of its noise.
@@ -61,7 +61,7 @@ pub fn of_set(
     print.add(read(&data.truth(set))?);
     for &image in images {
         let path = data.galaxies(set, image);
-        if path.is_file() {
+        if open::is_there(&path) {
             let (length, head) = beginning(&path)?;
             print.add(image.to_le_bytes());
             print.add(length.to_le_bytes());
@@ -87,7 +87,7 @@ pub fn of_source(source: &Source, data: &DataFolder) -> Result<String, FileError
         Source::Folder { .. } => {
             for set in 1..=MAX_SET {
                 let path = data.truth(set);
-                if path.is_file() {
+                if open::is_there(&path) {
                     print.add(set.to_le_bytes());
                     print.add(read(&path)?);
                 }
@@ -98,13 +98,13 @@ pub fn of_source(source: &Source, data: &DataFolder) -> Result<String, FileError
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, FileError> {
-    std::fs::read(path).map_err(FileError::doing(path, "cannot read the file"))
+    open::read(path).map_err(FileError::doing(path, "cannot read the file"))
 }
 
 /// Length of a file and its first bytes.
 fn beginning(path: &Path) -> Result<(u64, Vec<u8>), FileError> {
     let mut head = Vec::new();
-    let length = File::open(path)
+    let length = open::open(path)
         .and_then(|file| {
             let length = file.metadata()?.len();
             file.take(HEAD).read_to_end(&mut head)?;

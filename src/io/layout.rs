@@ -1,11 +1,15 @@
 //! Where the files of a challenge lie, and which conventions they follow.
 
+use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsString;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
 
 use super::error::FileError;
+use super::open::{self, is_there};
 use super::table;
 
 /// Highest set number.
@@ -115,8 +119,8 @@ impl DataFolder {
             ));
         }
         let path = root.join(LAYOUT_FILE);
-        let layout = if path.is_file() {
-            let text = std::fs::read_to_string(&path)
+        let layout = if is_there(&path) {
+            let text = open::read_to_string(&path)
                 .map_err(FileError::doing(&path, "cannot read the layout"))?;
             let layout: Layout = toml::from_str(&text)
                 .map_err(|e| FileError::new(&path, e.to_string().trim_end()))?;
@@ -174,22 +178,66 @@ impl DataFolder {
         self.root.join(fill(&self.layout.intrinsic, set, image))
     }
 
-    /// Numbers of the images of a set that are there, in order.
-    pub fn images(&self, set: u32) -> Vec<u32> {
-        let any = self.galaxies(set, 1);
-        if !any.parent().is_some_and(Path::is_dir) {
-            return Vec::new();
+    /// Numbers of the images of a set that are there, in order: whatever is called like one, so that
+    /// none is left out that cannot be read.
+    ///
+    /// # Errors
+    /// Where a folder that is there cannot be read.
+    pub fn images(&self, set: u32) -> Result<Vec<u32>, FileError> {
+        let mut folders: BTreeMap<PathBuf, BTreeSet<OsString>> = BTreeMap::new();
+        let mut found = Vec::new();
+        for image in 1..=MAX_IMAGE {
+            let path = self.galaxies(set, image);
+            let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else {
+                continue;
+            };
+            if !folders.contains_key(folder) {
+                folders.insert(folder.to_owned(), self.names(folder)?);
+            }
+            if folders[folder].contains(name) {
+                found.push(image);
+            }
         }
-        (1..=MAX_IMAGE)
-            .filter(|&image| self.galaxies(set, image).is_file())
-            .collect()
+        Ok(found)
+    }
+
+    /// Names of the files in a folder below this one, of which there may be none.
+    fn names(&self, folder: &Path) -> Result<BTreeSet<OsString>, FileError> {
+        let entries = match std::fs::read_dir(folder) {
+            Ok(entries) => entries,
+            Err(error) if error.kind() == ErrorKind::NotFound => {
+                // A link that leads nowhere is there.
+                let mut folders = folder.ancestors().take_while(|f| *f != self.root);
+                return match folders.find(|folder| is_there(folder)) {
+                    Some(link) if !link.is_dir() => Err(FileError::new(
+                        link,
+                        "this leads nowhere; expected a folder",
+                    )),
+                    _ => Ok(BTreeSet::new()),
+                };
+            }
+            Err(error) => {
+                return Err(FileError::doing(folder, "cannot read the folder")(error));
+            }
+        };
+        entries
+            .map(|entry| entry.map(|entry| entry.file_name()))
+            .collect::<std::io::Result<_>>()
+            .map_err(FileError::doing(folder, "cannot read the folder"))
     }
 
     /// Sets that have an image, in order.
-    pub fn sets(&self) -> Vec<u32> {
-        (1..=MAX_SET)
-            .filter(|&set| !self.images(set).is_empty())
-            .collect()
+    ///
+    /// # Errors
+    /// As [`DataFolder::images`].
+    pub fn sets(&self) -> Result<Vec<u32>, FileError> {
+        let mut found = Vec::new();
+        for set in 1..=MAX_SET {
+            if !self.images(set)?.is_empty() {
+                found.push(set);
+            }
+        }
+        Ok(found)
     }
 
     /// True shear of a set on `grid`.

@@ -6,6 +6,7 @@ use shearq_scoring::{Grid, Shear};
 
 use super::atomic;
 use super::error::FileError;
+use super::open;
 use crate::psf::functional::{FunctionalPsf, PsfProfile};
 
 /// Header of the table.
@@ -17,7 +18,7 @@ const HEADER: &str = "x,y,profile,beta,fwhm,e1,e2";
 /// Where the file cannot be read, a row is not valid, or the rows are neither one nor one per
 /// galaxy of the grid.
 pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
-    let text = std::fs::read_to_string(path)
+    let text = open::read_to_string(path)
         .map_err(FileError::doing(path, "cannot read the PSF parameters"))?;
     let mut lines = text
         .lines()

@@ -128,7 +128,7 @@ impl Run {
         (1..=MAX_IMAGE)
             .map(|image| (image, self.catalogue(folder, set, image)))
             .take_while(|(_, path)| path.parent().is_some_and(Path::is_dir))
-            .filter(|(_, path)| path.is_file())
+            .filter(|(_, path)| super::open::is_there(path))
             .collect()
     }
 }
@@ -138,7 +138,7 @@ impl Run {
 /// # Errors
 /// Where it exists and cannot be read.
 pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileError> {
-    let text = match std::fs::read_to_string(path) {
+    let text = match super::open::read_to_string(path) {
         Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),

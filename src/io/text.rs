@@ -24,7 +24,7 @@ pub(super) fn read_named(
     wanted: Option<&[&str]>,
     default_names: &[&str],
 ) -> Result<Table, FileError> {
-    let text = std::fs::read(path).map_err(FileError::doing(path, "cannot read the table"))?;
+    let text = super::open::read(path).map_err(FileError::doing(path, "cannot read the table"))?;
     let text = std::str::from_utf8(&text).map_err(|e| {
         FileError::new(
             path,

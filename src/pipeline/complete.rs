@@ -52,13 +52,10 @@ pub struct Fault {
 }
 
 impl Results<'_> {
-    /// Number of galaxies of `images`, for progress bars: an estimate from the first.
-    ///
-    /// # Errors
-    /// Where the first image is needed and cannot be read.
-    pub fn galaxies(&self, images: &[ImageId]) -> Result<u64, PipelineError> {
-        let first = images.first().map_or(Ok(0), |&id| self.cells(id))?;
-        Ok((images.len() * first) as u64)
+    /// Number of galaxies of `images`, for progress bars: an estimate from the first that can be read.
+    pub fn galaxies(&self, images: &[ImageId]) -> u64 {
+        let first = images.iter().find_map(|&id| self.cells(id).ok());
+        (images.len() * first.unwrap_or(0)) as u64
     }
 
     /// Every fault of the results of `images`, which are all that there should be, in their order.

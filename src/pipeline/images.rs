@@ -21,13 +21,13 @@ pub struct ImageId {
 /// Where a set has no image, or the folder none at all.
 pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, PipelineError> {
     let sets = if sets.is_empty() {
-        data.sets()
+        data.sets()?
     } else {
         sets.to_vec()
     };
     let mut found = Vec::new();
     for set in sets {
-        let images = data.images(set);
+        let images = data.images(set)?;
         if images.is_empty() {
             let path = data.galaxies(set, 1);
             let message = format!("there is no image of set {set}; expected this file");

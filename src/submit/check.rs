@@ -211,7 +211,7 @@ fn files_of(path: &Path) -> std::io::Result<Vec<PathBuf>> {
         let own = file
             .file_name()
             .is_some_and(|name| name == MANIFEST_FILE || name.to_string_lossy().starts_with('.'));
-        if file.is_file() && !own {
+        if !file.is_dir() && !own {
             files.push(file);
         }
     }

@@ -81,7 +81,7 @@ impl Foreign {
     /// # Errors
     /// Where it cannot be read or is not valid.
     pub fn read(path: &Path) -> Result<Self, FileError> {
-        let text = std::fs::read_to_string(path).map_err(FileError::doing(
+        let text = crate::io::open::read_to_string(path).map_err(FileError::doing(
             path,
             "cannot read the description of catalogues",
         ))?;
@@ -101,7 +101,7 @@ impl Foreign {
     pub fn catalogues(&self, set: u32) -> Vec<(u32, PathBuf)> {
         (1..=MAX_IMAGE)
             .map(|image| (image, self.folder.join(fill(&self.catalogues, set, image))))
-            .filter(|(_, path)| path.is_file())
+            .filter(|(_, path)| crate::io::open::is_there(path))
             .collect()
     }
 

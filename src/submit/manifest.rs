@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_scoring::SpectrumCovariance;
 
-use crate::io::FileError;
 use crate::io::run::{Run, read_record};
+use crate::io::{FileError, open};
 
 /// Name of the manifest beside the files.
 pub const MANIFEST_FILE: &str = "manifest.json";
@@ -86,7 +86,7 @@ impl FileSum {
     /// # Errors
     /// Where it cannot be read.
     pub fn of(path: &Path) -> Result<Self, FileError> {
-        std::fs::File::open(path)
+        open::open(path)
             .and_then(|mut file| FileSum::copying(&mut file, &mut std::io::sink()))
             .map_err(FileError::doing(path, "cannot read the file"))
     }

@@ -41,7 +41,7 @@ fn measured_ellipticities_follow_the_truth() {
     let data = DataFolder::open(&folder).unwrap();
     let out = tempfile::tempdir().unwrap();
     let registry = Registry::embedded().unwrap();
-    let sets = data.sets();
+    let sets = data.sets().unwrap();
     for name in registry.names() {
         let run = Run {
             version: "test".into(),
@@ -55,7 +55,7 @@ fn measured_ellipticities_follow_the_truth() {
         let mut line = format!("{name:18}");
         for &set in &sets {
             let (mut truth, mut measured) = ([Vec::new(), Vec::new()], [Vec::new(), Vec::new()]);
-            for image in data.images(set) {
+            for image in data.images(set).unwrap() {
                 let path = run.catalogue(&results, set, image);
                 let mut catalogue = table::read(&path, None).unwrap();
                 let flags = catalogue.take_real("flag").unwrap();

@@ -11,6 +11,7 @@ mod fuzz;
 mod galsim_galaxies;
 mod galsim_measured;
 mod killed;
+mod odd_files;
 mod orientation;
 mod packed;
 mod reproduced;

@@ -1,0 +1,66 @@
+//! Opening files for reading: the one place that does, so that nothing but a file is ever read. A pipe
+//! would wait for a writer for ever, and a device gives bytes without end.
+
+use std::fs::{File, Metadata};
+use std::io::{Error, ErrorKind, Read};
+use std::path::Path;
+
+/// Most bytes of a file that is read whole: some hundred times those of a challenge's catalogue.
+const MOST: u64 = 1 << 27;
+
+/// Opens a regular file, or a link to one.
+///
+/// # Errors
+/// Where it cannot be opened or is not a file.
+pub fn open(path: &Path) -> std::io::Result<File> {
+    // Before, as opening a pipe waits and opening a device may act; after, for what was opened.
+    regular(&std::fs::metadata(path)?)?;
+    let file = File::open(path)?;
+    regular(&file.metadata()?)?;
+    Ok(file)
+}
+
+/// Whether there is anything of this name, be it what it may: who reads it says what is wrong with it.
+pub fn is_there(path: &Path) -> bool {
+    std::fs::symlink_metadata(path)
+        .map_or_else(|error| error.kind() != ErrorKind::NotFound, |_| true)
+}
+
+/// All bytes of a file.
+///
+/// # Errors
+/// As [`open`], and where there are more than 128 MiB of them.
+pub fn read(path: &Path) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?.take(MOST + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > MOST {
+        let message =
+            format!("it has more than {MOST} bytes, the most that is read of such a file");
+        return Err(Error::new(ErrorKind::FileTooLarge, message));
+    }
+    Ok(bytes)
+}
+
+/// All of a file as text.
+///
+/// # Errors
+/// As [`read`], and where it is not UTF-8.
+pub fn read_to_string(path: &Path) -> std::io::Result<String> {
+    String::from_utf8(read(path)?).map_err(|error| {
+        let message = format!("byte {} is not UTF-8", error.utf8_error().valid_up_to() + 1);
+        Error::new(ErrorKind::InvalidData, message)
+    })
+}
+
+fn regular(about: &Metadata) -> std::io::Result<()> {
+    if about.is_file() {
+        return Ok(());
+    }
+    let kind = if about.is_dir() {
+        "a folder"
+    } else {
+        "a pipe, a socket or a device"
+    };
+    let message = format!("this is {kind}; expected a file");
+    Err(Error::new(ErrorKind::InvalidInput, message))
+}
