@@ -4,7 +4,12 @@
 //! are read and written row by row in FITS order: the first row of the file is y = 1, row-major.
 //! gzip and tile-compressed (fpack) images are read like plain ones.
 
+mod cards;
+mod file;
 mod read;
+mod source;
+mod streams;
+mod tiles;
 
 pub use read::{ImageReader, read_table, read_table_keys};
 
@@ -50,7 +55,7 @@ fn plain_name(path: &Path) -> Result<(), FileError> {
 
 fn describe(error: fitsio::errors::Error) -> String {
     match error {
-        fitsio::errors::Error::Fits(e) => format!("cfitsio error {}: {}", e.status, e.message),
+        fitsio::errors::Error::Fits(e) => file::describe(e.status),
         other => other.to_string(),
     }
 }

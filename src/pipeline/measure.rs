@@ -23,6 +23,10 @@ use crate::io::table::{self, Column, Table};
 use crate::psf::functional::FunctionalPsf;
 use crate::psf::star::{StarError, star_psf};
 
+/// Most pixels of a row of stamps, several of which are in memory at a time: those of the largest grid of
+/// stamps of the challenge's size and somewhat more.
+const MAX_STRIP: usize = 1 << 24;
+
 /// PSFs of one row of stamps.
 pub enum RowPsf {
     /// The same for all galaxies of the image, cut and normalised.
@@ -81,7 +85,10 @@ pub struct ImageSource {
 
 enum PsfSource {
     Shared(Arc<Array2<f64>>),
-    Stars { image: ImageReader, side: usize },
+    Stars {
+        image: Box<ImageReader>,
+        side: usize,
+    },
     Functional(Vec<FunctionalPsf>),
 }
 
@@ -186,10 +193,23 @@ pub(super) fn open_galaxies(
         )
         .into());
     }
+    check_strip(&path, n, stamp)?;
     let field = Degrees(data.layout().field_degrees);
     let grid =
         Grid::new(n, Pixels(stamp as f64), field).map_err(|error| FileError::new(&path, error))?;
     Ok((image, grid, stamp))
+}
+
+/// Checks that a row of `n` stamps of `side` pixels a side is one that can be held in memory.
+fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), FileError> {
+    let pixels = n * side * side;
+    if pixels <= MAX_STRIP {
+        return Ok(());
+    }
+    let message = format!(
+        "a row of {n} stamps of {side} pixels a side has {pixels} pixels; expected at most {MAX_STRIP}"
+    );
+    Err(FileError::new(path, message))
 }
 
 /// A header value that counts something, `None` where absent.
@@ -258,7 +278,11 @@ fn open_psf(
                 return Err(FileError::new(&path, error).into());
             }
             if side != width && side * n == width {
-                return Ok(PsfSource::Stars { image, side });
+                check_strip(&path, n, side)?;
+                return Ok(PsfSource::Stars {
+                    image: Box::new(image),
+                    side,
+                });
             }
             if side != width || side > MAX_STAMP {
                 let message = format!(

@@ -38,7 +38,7 @@ fn damaged_images_are_refused_and_those_before_are_kept() {
             &["truncated", "it can hold 296640 bytes; expected 592704"],
         ),
         (whole[..2880].to_vec(), &["truncated"]),
-        (whole[..1000].to_vec(), &["cannot open the image"]),
+        (whole[..1000].to_vec(), &["has no END in 1000 bytes"]),
         (vec![], &["the file is empty; expected a FITS image"]),
         (
             b"This is no image.".to_vec(),
@@ -76,8 +76,11 @@ fn damaged_images_are_refused_and_those_before_are_kept() {
     fs::write(small.at(second), &whole).unwrap();
     fs::remove_file(small.at(second)).unwrap();
     fs::create_dir(small.at(second)).unwrap();
-    // A folder of that name is no image, so there is one image.
-    assert!(small.measure(&RAW).contains("1 image "));
+    let message = small.fail_to_measure(&RAW);
+    assert!(
+        message.contains("galaxies-002.fits: cannot open the file: this is a folder"),
+        "{message}"
+    );
 }
 
 #[test]
@@ -211,30 +214,240 @@ fn compressed_images_are_read_and_damaged_ones_refused() {
     );
     let rice = include_bytes!("../data/rice.fits");
     let mut found = Vec::new();
-    for bytes in [&plain[..], rice] {
+    let mut all = vec![plain.clone(), rice.to_vec()];
+    for name in ["gzip", "hcompress", "hcompress32", "plio", "lossless"] {
+        all.push(fs::read(format!("tests/data/{name}.fits")).unwrap());
+    }
+    all.push(gzip(rice));
+    for bytes in all {
         fs::write(small.at(first), bytes).unwrap();
         fs::remove_file(small.at("data/set02/galaxies-002.fits")).unwrap_or_default();
         small.measure(&RAW);
         found.push((small.measured("02", "e1"), small.measured("02", "e2")));
     }
-    assert_eq!(found[0], found[1]);
+    assert!(found.iter().all(|measured| *measured == found[0]));
     assert!(found[0].0.iter().all(|e1| e1.is_finite()));
-    refuse(&small, first, &rice[..rice.len() - 4000], &RAW, &["cannot"]);
+    refuse(
+        &small,
+        first,
+        &rice[..rice.len() - 4000],
+        &RAW,
+        &["truncated"],
+    );
     let packed = gzip(&plain);
     refuse(
         &small,
         first,
         &packed[..packed.len() / 2],
         &RAW,
-        &["gzip file is truncated, damaged"],
+        &["cannot unpack the gzip file"],
     );
     let mut bomb = packed.clone();
     let size = bomb.len();
     bomb[size - 4..].copy_from_slice(&u32::MAX.to_le_bytes());
-    refuse(&small, first, &bomb, &RAW, &["expand to 4294967295"]);
+    refuse(&small, first, &bomb, &RAW, &["cannot unpack the gzip file"]);
     let mut corrupt = packed;
     corrupt[size / 2] ^= 0xff;
-    refuse(&small, first, &corrupt, &RAW, &["cannot open the image"]);
+    refuse(
+        &small,
+        first,
+        &corrupt,
+        &RAW,
+        &["cannot unpack the gzip file"],
+    );
+}
+
+/// A compressed image of those in tests/data with a card of its second header in the place of another.
+fn with_card(name: &str, old: &str, new: &str) -> Vec<u8> {
+    let mut bytes = fs::read(format!("tests/data/{name}.fits")).unwrap();
+    let place = |key: &str| {
+        let card = format!("{key:<8}");
+        let cards = bytes.chunks_exact(80).skip(36);
+        36 + cards
+            .clone()
+            .position(|c| c.starts_with(card.as_bytes()))
+            .unwrap()
+    };
+    let at = 80 * place(old);
+    bytes[at..at + 80].copy_from_slice(format!("{new:<80}").as_bytes());
+    bytes
+}
+
+#[test]
+fn what_cfitsio_would_divide_by_is_refused_however_it_is_written() {
+    let small = Small::new("2");
+    let first = "data/set02/galaxies-001.fits";
+    let mut cases: Vec<(Vec<u8>, &str)> = Vec::new();
+    for (old, new, expected) in [
+        (
+            "ZTILE1",
+            "ZTILE1  = 0",
+            "ZTILE1 is 0; expected a whole number, 1 to 200000",
+        ),
+        ("ZTILE1", "ztile1  = 0", "ZTILE1 is 0"),
+        ("ZTILE1", "HIERARCH ZTILE1 = 0", "ZTILE1 is 0"),
+        ("ZTILE1", "HIERARCH ztile1=0", "ZTILE1 is 0"),
+        ("ZTILE1", "ZTILE1 =0", "ZTILE1 is 0"),
+        ("ZTILE1", "ZTILE1  = '0       '", "ZTILE1 is '0"),
+        ("ZTILE1", "ZTILE1  = 0.5", "ZTILE1 is 0.5"),
+        ("ZTILE1", "ZTILE1  = -1", "ZTILE1 is -1"),
+        ("ZVAL1", "ZVAL1   = 0", "ZVAL1 is 0"),
+        ("ZVAL1", "ZVAL1   = 1E-3", "ZVAL1 is 1E-3"),
+        // Before the card that says that this is Rice compression.
+        ("TFIELDS", "ZVAL1   = 0", "the second one named ZVAL1"),
+        ("STAMP", "ZTILE1  = 0", "the second one named ZTILE1"),
+        (
+            "ZTILE2",
+            "ZTILE2  = 200000",
+            "in a row of tiles; expected at most",
+        ),
+        ("ZNAXIS", "ZNAXIS  = 7", "7 dimensions; expected 2"),
+        ("ZBITPIX", "ZBITPIX = 64", "ZBITPIX is 64"),
+        ("ZCMPTYPE", "ZCMPTYPE= 'BZIP2_1 '", "ZCMPTYPE is BZIP2_1"),
+        ("ZNAME1", "ZDITHER0= -99999999", "ZDITHER0 is -99999999"),
+        ("ZNAME1", "ZQUANTIZ= 'NONE    '", "compressed as they are"),
+        (
+            "ZNAME1",
+            "A=111111111111111111111111111111111111111111111111111111111111111111111111111111",
+            "is too long",
+        ),
+    ] {
+        cases.push((with_card("rice", old, new), expected));
+    }
+    // Far down the header.
+    let mut long = with_card("rice", "ZTILE1", "ZTILE1  = 0");
+    long.splice(2880 + 8 * 80..2880 + 8 * 80, vec![b' '; 40 * 2880]);
+    cases.push((long, "ZTILE1 is 0"));
+    for (bytes, expected) in cases {
+        refuse(&small, first, &bytes, &RAW, &[expected]);
+        refuse(&small, first, &gzip(&bytes), &RAW, &[expected]);
+    }
+}
+
+#[test]
+fn damaged_tiles_are_refused_before_they_are_unpacked() {
+    let small = Small::new("2");
+    let first = "data/set02/galaxies-001.fits";
+    for name in [
+        "rice",
+        "gzip",
+        "hcompress",
+        "hcompress32",
+        "plio",
+        "lossless",
+        "dithered",
+    ] {
+        let whole = fs::read(format!("tests/data/{name}.fits")).unwrap();
+        let key = |name: &str| {
+            let name = format!("{name:<8}= ");
+            let cards = whole.chunks_exact(80).skip(36);
+            let card = cards
+                .clone()
+                .find(|c| c.starts_with(name.as_bytes()))
+                .unwrap();
+            let value = String::from_utf8_lossy(&card[10..30]).trim().to_owned();
+            value.parse::<usize>().unwrap()
+        };
+        let table = 2 * 2880
+            + 2880
+                * whole[2 * 2880..]
+                    .chunks_exact(2880)
+                    .position(|b| b[0] == 0)
+                    .unwrap();
+        let heap = table + key("NAXIS1") * key("NAXIS2");
+        let length = u32::from_be_bytes(whole[table..table + 4].try_into().unwrap());
+        let spoil = |change: &dyn Fn(&mut Vec<u8>)| {
+            let mut bytes = whole.clone();
+            change(&mut bytes);
+            refuse(&small, first, &bytes, &RAW, &["tile 1"]);
+        };
+        let size = |value: u32| {
+            move |b: &mut Vec<u8>| b[table..table + 4].copy_from_slice(&value.to_be_bytes())
+        };
+        // Half of the bytes, none, more than any tile takes, and a place beyond the file.
+        spoil(&size(length / 2));
+        spoil(&size(0));
+        spoil(&size(1_000_000_000));
+        spoil(&|b| b[table + 4..table + 8].copy_from_slice(&2_000_000_000u32.to_be_bytes()));
+        if name.starts_with("hcompress") {
+            // The side that the pixels themselves tell.
+            spoil(&|b| b[heap + 4] = 0xff);
+            spoil(&|b| b[heap + 22..heap + 25].fill(0xff));
+        }
+        if name == "plio" {
+            spoil(&|b| b[heap + 6..heap + 10].fill(0x7f));
+        }
+    }
+}
+
+/// Measures with 1 GB of address space, which must fail with an error.
+fn refuse_in_little_memory(small: &Small, file: &str, bytes: &[u8], expected: &str) {
+    fs::write(small.at(file), bytes).unwrap();
+    let command = format!(
+        "ulimit -v 1000000; exec {} measure --threads 2 --data {} --out {} {}",
+        env!("CARGO_BIN_EXE_shearq"),
+        small.at("data").display(),
+        small.at("out").display(),
+        RAW.join(" ")
+    );
+    let output = std::process::Command::new("sh")
+        .args(["-c", &command])
+        .output()
+        .unwrap();
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{message}");
+    assert!(message.contains(expected), "{expected}: {message}");
+}
+
+#[test]
+fn memory_is_not_taken_on_the_word_of_a_header() {
+    let small = Small::new("2");
+    let first = "data/set02/galaxies-001.fits";
+    // One tile of 20000² pixels.
+    let mut tile = with_card("rice", "ZTILE1", "ZTILE1  = 20000");
+    for key in ["ZTILE2", "ZNAXIS1", "ZNAXIS2"] {
+        let name = format!("{key:<8}= ");
+        let at = tile
+            .windows(10)
+            .rposition(|w| w == name.as_bytes())
+            .unwrap();
+        tile[at..at + 30].copy_from_slice(format!("{name}{:>20}", 20000).as_bytes());
+    }
+    for bytes in [gzip(&tile), tile] {
+        refuse_in_little_memory(&small, first, &bytes, "in a row of tiles; expected at most");
+    }
+    // A gzip file that says it expands to three gigabytes of an image that has no grid, and blanks.
+    let header = fits_image(16, &[40_001, 40_001], &[], &[]);
+    let mut bomb = gzip(&[header, vec![0; 16 << 20]].concat());
+    let end = bomb.len() - 4;
+    bomb[end..].copy_from_slice(&3_200_000_000u32.to_le_bytes());
+    refuse_in_little_memory(
+        &small,
+        first,
+        &bomb,
+        "expected at most 1073741824 in a gzip file",
+    );
+    let bomb = gzip(&fits_image(16, &[20_001, 20_001], &[], &[0; 1 << 20]));
+    refuse_in_little_memory(&small, first, &bomb, "expected 416 × 416 stamps");
+}
+
+#[test]
+fn the_words_of_cfitsio_reach_the_user() {
+    let small = Small::new("2");
+    let first = "data/set02/galaxies-001.fits";
+    // The primary image is empty, and what is wrong is in the extension.
+    for (key, card, expected) in [
+        ("TFORM1", "TFORM1  = 'Y       '", "TFORM"),
+        ("NAXIS1", "NAXIS1  = 9", "sum of column widths"),
+        (
+            "TTYPE1",
+            "TTYPE1  = 'NOTHING '",
+            "couldn't find COMPRESSED_DATA column",
+        ),
+    ] {
+        let bytes = with_card("rice", key, card);
+        refuse(&small, first, &bytes, &RAW, &["cfitsio error", expected]);
+    }
 }
 
 /// A gzip file of blocks that are stored, not compressed.
