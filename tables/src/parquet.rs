@@ -7,7 +7,7 @@
 
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io::{Cursor, Read, Seek, SeekFrom, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
 use std::path::Path;
@@ -25,6 +25,14 @@ use polars_parquet::read::{
 
 use crate::table::SCHEMA_KEY;
 use crate::{Column, Table, TableError};
+
+/// Most values read from a file of fewer bytes than that; a larger one may have one for each byte.
+const FREE_VALUES: u64 = 1 << 22;
+/// Most bytes that the pages of a column chunk, and all texts of a file, may unpack to beyond
+/// [`INFLATION`] times the file's own.
+const FREE_BYTES: u64 = 1 << 26;
+/// Most bytes for one of the file's in a large file.
+const INFLATION: u64 = 8;
 
 /// Writes `table` as a Parquet file into `writer`.
 ///
@@ -84,6 +92,7 @@ pub fn read_parquet(path: impl AsRef<Path>, wanted: Option<&[&str]>) -> Result<T
         None => source.fields.clone(),
         Some(names) => source.pick(names)?,
     };
+    source.check_size(fields.len())?;
     let columns = fields
         .iter()
         .map(|field| Ok((field.name.to_string(), source.read_column(field)?)))
@@ -127,6 +136,8 @@ struct Source<'a> {
     footer: FileMetadataRef,
     /// The columns with the types the file declares.
     fields: Vec<ArrowField>,
+    /// Bytes of text that may still be read.
+    text_left: u64,
 }
 
 impl<'a> Source<'a> {
@@ -135,14 +146,19 @@ impl<'a> Source<'a> {
             path: path.into(),
             source,
         };
-        let mut file = File::open(path).map_err(io)?;
-        let about = file.metadata().map_err(io)?;
-        if !about.is_file() {
-            return Err(TableError::Damaged {
+        let length = |about: Metadata| {
+            if about.is_file() {
+                return Ok(about.len());
+            }
+            Err(TableError::Damaged {
                 path: path.into(),
                 detail: "found no regular file".into(),
-            });
-        }
+            })
+        };
+        // Before it is opened, which would wait for the writer of a pipe, and for what was opened.
+        std::fs::metadata(path).map_err(io).and_then(length)?;
+        let mut file = File::open(path).map_err(io)?;
+        let length = file.metadata().map_err(io).and_then(length)?;
         let (footer, fields) = guarded(path, "footer", || {
             let mut reader = ParquetReader::new(&mut file);
             let fields = reader.schema()?.iter_values().cloned().collect();
@@ -151,10 +167,38 @@ impl<'a> Source<'a> {
         Ok(Self {
             path,
             file,
-            length: about.len(),
+            length,
             footer,
             fields,
+            text_left: unpacked_bytes(length),
         })
+    }
+
+    /// Checks that the rows of `columns` columns can be those of a file of this size, before memory is
+    /// taken for them: repeated values take next to nothing in a file.
+    fn check_size(&self, columns: usize) -> Result<(), TableError> {
+        let damaged = |detail| TableError::Damaged {
+            path: self.path.into(),
+            detail,
+        };
+        let groups = self.footer.row_groups.iter();
+        let rows = groups.fold(0, |rows: usize, group| {
+            rows.saturating_add(group.num_rows())
+        });
+        if rows != self.footer.num_rows {
+            return Err(damaged(format!(
+                "found row groups of {rows} rows, expected {} as in the footer",
+                self.footer.num_rows
+            )));
+        }
+        let values = (rows as u64).saturating_mul(columns as u64);
+        let most = FREE_VALUES.max(self.length);
+        if values > most {
+            return Err(damaged(format!(
+                "found {rows} rows of {columns} columns, expected at most {most} values in a file of this size"
+            )));
+        }
+        Ok(())
     }
 
     fn names(&self) -> Vec<String> {
@@ -204,11 +248,7 @@ impl<'a> Source<'a> {
         };
         let field = ArrowField::new(field.name.clone(), decoded, field.is_nullable);
         let footer = self.footer.clone();
-        // A false count in a damaged footer must not ask for more memory than the file suggests.
-        let room = footer
-            .num_rows
-            .min(usize::try_from(self.length).unwrap_or(usize::MAX));
-        let mut column = empty_column(&field.dtype, room);
+        let mut column = empty_column(&field.dtype, footer.num_rows);
         for (number, group) in footer.row_groups.iter().enumerate() {
             let place = format!("column `{name}`, row group {number}");
             let damaged = |detail| TableError::Damaged {
@@ -235,7 +275,8 @@ impl<'a> Source<'a> {
             let bytes = self
                 .read_bytes(start, chunk.compressed_size())
                 .map_err(damaged)?;
-            let series = guarded(path, &place, || decode(chunk, bytes, &field))?;
+            let most = unpacked_bytes(self.length);
+            let series = guarded(path, &place, || decode(chunk, bytes, &field, most))?;
             if series.len() != group.num_rows() {
                 return Err(damaged(format!(
                     "found {} rows, expected {}",
@@ -243,6 +284,8 @@ impl<'a> Source<'a> {
                     group.num_rows()
                 )));
             }
+            let left = self.text_left.checked_sub(text_bytes(&series));
+            self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
             append(&mut column, path, &series)?;
         }
         Ok(column)
@@ -272,25 +315,44 @@ impl<'a> Source<'a> {
 }
 
 /// The values in one column chunk of a file, as the type in `field`.
-fn decode(chunk: &ColumnChunkMetadata, bytes: Vec<u8>, field: &ArrowField) -> PolarsResult<Series> {
+fn decode(
+    chunk: &ColumnChunkMetadata,
+    bytes: Vec<u8>,
+    field: &ArrowField,
+    most: u64,
+) -> PolarsResult<Series> {
+    let wrong = |what: String| PolarsError::ComputeError(what.into());
     let length = bytes.len();
+    let dictionary = unpacked_size_of_first_page(&bytes);
     // Cloning it shares the bytes.
     let source = Cursor::new(bytes.into());
     let pages = || PageReader::new(source.clone(), chunk, Vec::new(), length);
     // The decoder makes room for as many values as a page claims, a negative count being taken for
-    // a huge one, and a failed allocation ends the process: add the claims up first.
-    let mut claimed = 0_usize;
+    // a huge one, and for as many bytes; a failed allocation ends the process: add the claims up first.
+    let (mut claimed, mut unpacked) = (0_usize, 0_u64);
     for page in pages() {
-        if let CompressedPage::Data(page) = page? {
-            claimed = claimed.saturating_add(page.num_values());
-        }
+        let size = match page? {
+            CompressedPage::Data(page) => {
+                claimed = claimed.saturating_add(page.num_values());
+                if page.header().encoding().0 == DELTA_BYTE_ARRAY {
+                    return Err(wrong("found texts without their common beginnings (DELTA_BYTE_ARRAY), expected whole ones".into()));
+                }
+                page.uncompressed_size() as u64
+            }
+            CompressedPage::Dict(_) => dictionary.unwrap_or(u64::MAX),
+        };
+        unpacked = unpacked.saturating_add(size);
     }
     if i64::try_from(claimed) != Ok(chunk.num_values()) {
         let expected = chunk.num_values();
-        return Err(PolarsError::ComputeError(
-            format!("found pages with {claimed} values, expected {expected} as in the footer")
-                .into(),
-        ));
+        return Err(wrong(format!(
+            "found pages with {claimed} values, expected {expected} as in the footer"
+        )));
+    }
+    if unpacked > most {
+        return Err(wrong(format!(
+            "found pages that unpack to {unpacked} bytes, expected at most {most} in a file of this size"
+        )));
     }
     let (arrays, _) = column_iter_to_arrays(
         vec![BasicDecompressor::new(pages(), Vec::new())],
@@ -299,6 +361,50 @@ fn decode(chunk: &ColumnChunkMetadata, bytes: Vec<u8>, field: &ArrowField) -> Po
         None,
     )?;
     Series::try_from((field, arrays))
+}
+
+/// Number of the encoding in which a text repeats the beginning of the one before, so that a few bytes
+/// stand for any number.
+const DELTA_BYTE_ARRAY: i32 = 7;
+
+/// Most bytes that a part of a file of `length` bytes may unpack to.
+fn unpacked_bytes(length: u64) -> u64 {
+    length.saturating_mul(INFLATION).max(FREE_BYTES)
+}
+
+/// Bytes of the texts of a column.
+fn text_bytes(series: &Series) -> u64 {
+    let texts = series.str().ok();
+    texts.map_or(0, |texts| {
+        texts.iter().flatten().map(|text| text.len() as u64).sum()
+    })
+}
+
+/// Unpacked size of the page that starts a column chunk, `None` where it cannot be told. The reader
+/// keeps that of a dictionary page to itself.
+///
+/// The header of a page is a list of fields in Thrift's compact form, each a byte that tells its number
+/// and type and a value: first the type of the page, then its unpacked size.
+fn unpacked_size_of_first_page(bytes: &[u8]) -> Option<u64> {
+    const NEXT_FIELD_OF_32_BITS: u8 = 0x15;
+    let mut rest = bytes.iter();
+    let mut field = || {
+        if rest.next() != Some(&NEXT_FIELD_OF_32_BITS) {
+            return None;
+        }
+        // Seven bits a byte, the lowest first; the lowest of all is the sign.
+        let mut number = 0;
+        for shift in (0..35).step_by(7) {
+            let byte = *rest.next()?;
+            number |= u64::from(byte & 0x7f) << shift;
+            if byte < 0x80 {
+                return (number & 1 == 0).then_some(number >> 1);
+            }
+        }
+        None
+    };
+    field()?;
+    field()
 }
 
 /// Runs a part of polars on what a file says.

@@ -207,6 +207,13 @@ fn files_that_are_no_parquet_are_refused() {
         read_parquet(folder.path(), None),
         Err(TableError::Damaged { .. })
     ));
+    let pipe = folder.path().join("pipe");
+    let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+    assert!(made.expect("mkfifo starts").success());
+    assert!(matches!(
+        read_parquet(&pipe, None),
+        Err(TableError::Damaged { .. })
+    ));
     for garbage in [
         &b""[..],
         b"PAR1",
@@ -218,6 +225,29 @@ fn files_that_are_no_parquet_are_refused() {
         let error = read_parquet(&path, None).expect_err("garbage").to_string();
         assert!(error.starts_with(&path.display().to_string()), "{error}");
     }
+}
+
+#[test]
+fn rows_and_texts_that_take_next_to_nothing_in_a_file_are_counted() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let refusal = |column: Column| {
+        let table = Table::new(vec![("a".into(), column)], BTreeMap::new()).expect("a table");
+        let path = place(folder.path(), &encode(&table));
+        read_parquet(&path, None)
+            .err()
+            .map(|error| error.to_string())
+    };
+    assert_eq!(refusal(Column::I64(vec![7; 1 << 20])), None);
+    let error = refusal(Column::I64(vec![7; 5_000_000])).expect("too many rows");
+    assert!(
+        error.contains("found 5000000 rows of 1 columns, expected at most"),
+        "{error}"
+    );
+    let error = refusal(Column::Text(vec!["x".repeat(10_000); 100_000])).expect("too much text");
+    assert!(
+        error.contains("too much text") || error.contains("unpack to"),
+        "{error}"
+    );
 }
 
 #[test]
