@@ -11,8 +11,9 @@ use flate2::{Compression, GzBuilder};
 use tar::{Archive, Builder, Header};
 
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
-use crate::io::FileError;
 use crate::io::atomic::{PartFile, PartFolder};
+use crate::io::open::open;
+use crate::io::{FileError, layout};
 
 /// Largest manifest accepted, in bytes: some four times that of 999 images of 99 sets.
 const MAX_MANIFEST: u64 = 1 << 26;
@@ -22,6 +23,10 @@ const MAX_MANIFEST: u64 = 1 << 26;
 const MAX_RATIO: u64 = 300;
 /// Bytes that any archive may unpack to.
 const FREE: u64 = 1 << 24;
+/// Bytes that a file counts for in addition to its own, as it takes them on disk.
+const FILE: u64 = 1 << 12;
+/// Most files: a catalogue for every image of every set, and a manifest.
+const MAX_FILES: u64 = layout::MAX_SET as u64 * layout::MAX_IMAGE as u64 + 1;
 
 /// Whether a path's ending is that of an archive.
 pub fn is_archive(path: &Path) -> bool {
@@ -146,10 +151,14 @@ pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileE
 /// of one name.
 pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     let cannot_read = || FileError::doing::<std::io::Error>(path, "cannot read the archive");
-    let file = File::open(path).map_err(cannot_read())?;
+    let file = open(path).map_err(cannot_read())?;
     let most = FREE + MAX_RATIO * file.metadata().map_err(cannot_read())?.len();
-    let mut total = 0u64;
-    let mut archive = Archive::new(GzDecoder::new(BufReader::new(file)));
+    let mut files = 0;
+    let mut archive = Archive::new(Bounded {
+        decoder: GzDecoder::new(BufReader::new(file)),
+        read: 0,
+        most,
+    });
     let mut unpacked = Unpacked {
         manifest: None,
         files: BTreeMap::new(),
@@ -168,10 +177,9 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
             let message = format!("it holds `{name}` twice");
             return Err(FileError::new(path, message));
         }
-        total = total.saturating_add(entry.size());
-        if total > most {
-            let message =
-                format!("it unpacks to more than {most} bytes, {MAX_RATIO} times its own");
+        files += 1;
+        if files > MAX_FILES.min(most / FILE) {
+            let message = format!("it holds more than {} files", files - 1);
             return Err(FileError::new(path, message));
         }
         let mut bytes = Vec::new();
@@ -196,12 +204,13 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
             unpacked.files.insert(name, sum);
             continue;
         }
-        unpacked.manifest = serde_json::from_slice(&bytes).map_err(|error| {
+        let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|error| {
             FileError::new(
                 path,
                 format!("its {MANIFEST_FILE} is not one of a submission: {error}"),
             )
         })?;
+        unpacked.manifest = Some(manifest);
         if let Some(folder) = into {
             std::fs::write(folder.join(MANIFEST_FILE), &bytes)
                 .map_err(FileError::doing(folder, "cannot write the manifest"))?;
@@ -211,12 +220,38 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     Ok(unpacked)
 }
 
+/// What an archive unpacks to, of which there is an end.
+struct Bounded {
+    decoder: GzDecoder<BufReader<File>>,
+    /// Bytes read.
+    read: u64,
+    /// Most bytes read.
+    most: u64,
+}
+
+impl Read for Bounded {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        let found = self.decoder.read(buffer)?;
+        self.read += found as u64;
+        if self.read > self.most {
+            let most = self.most;
+            let message =
+                format!("it unpacks to more than {most} bytes, {MAX_RATIO} times its own");
+            return Err(std::io::Error::new(
+                std::io::ErrorKind::FileTooLarge,
+                message,
+            ));
+        }
+        Ok(found)
+    }
+}
+
 /// Reads what follows the last file: blank blocks, gzip's own checksum and nothing else.
-fn check_end(mut decoder: GzDecoder<BufReader<File>>) -> std::io::Result<()> {
+fn check_end(mut archive: Bounded) -> std::io::Result<()> {
     let wrong = |what| Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
     let mut buffer = [0; 4096];
     loop {
-        let read = decoder.read(&mut buffer)?;
+        let read = archive.read(&mut buffer)?;
         if read == 0 {
             break;
         }
@@ -224,7 +259,7 @@ fn check_end(mut decoder: GzDecoder<BufReader<File>>) -> std::io::Result<()> {
             return wrong("there are data after its end");
         }
     }
-    if decoder.into_inner().read(&mut buffer)? > 0 {
+    if archive.decoder.into_inner().read(&mut buffer)? > 0 {
         return wrong("there are data after its end");
     }
     Ok(())
@@ -235,4 +270,52 @@ fn is_plain_name(name: &str) -> bool {
     !name.is_empty()
         && !name.starts_with('.')
         && !name.contains(|c: char| "/\\:".contains(c) || c.is_control())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The error of reading an archive of files, and bytes after its end.
+    fn refusal(files: &mut dyn Iterator<Item = (String, &[u8])>, after: u64) -> String {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.tar.gz");
+        let mut writer = ArchiveWriter::create(&path).unwrap();
+        for (name, bytes) in files {
+            writer.add(&name, bytes).unwrap();
+        }
+        writer.builder.finish().unwrap();
+        let zeros = std::io::repeat(0).take(after);
+        std::io::copy(&mut { zeros }, writer.builder.get_mut()).unwrap();
+        writer.finish().unwrap();
+        read(&path, None)
+            .err()
+            .map_or_else(String::new, |e| e.message)
+    }
+
+    #[test]
+    fn everything_in_an_archive_is_counted() {
+        let mut one = [("a".to_owned(), &b"x"[..])].into_iter();
+        assert_eq!(refusal(&mut one.clone(), 1 << 20), "");
+        let message = refusal(&mut one, 200 << 20);
+        assert!(message.contains("it unpacks to more than"), "{message}");
+        let mut empty = (0..30_000).map(|k| (format!("{k}"), &b""[..]));
+        let message = refusal(&mut empty, 0);
+        assert!(message.contains("it holds more than"), "{message}");
+        let zeros = vec![0; 64 << 20];
+        let message = refusal(&mut [("a".to_owned(), &zeros[..])].into_iter(), 0);
+        assert!(message.contains("it unpacks to more than"), "{message}");
+    }
+
+    #[test]
+    fn a_manifest_that_is_none_is_refused() {
+        for wrong in ["null", "[]", "{}", "1", "", "{\"method\": null}"] {
+            let mut files = [(MANIFEST_FILE.to_owned(), wrong.as_bytes())].into_iter();
+            let message = refusal(&mut files, 0);
+            assert!(
+                message.contains("is not one of a submission"),
+                "{wrong}: {message}"
+            );
+        }
+    }
 }
