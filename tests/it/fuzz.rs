@@ -24,7 +24,9 @@ const INPUTS: u64 = 300;
 /// Images in the long one.
 const MANY_IMAGES: u64 = 100_000;
 /// Longest that one input may take. It takes a millisecond; the rest is for busy machines.
-const LONGEST: Duration = Duration::from_secs(10);
+const LONGEST: Duration = Duration::from_secs(5);
+/// Most memory that one may take, in bytes, where no other test takes any at the same time.
+const LARGEST: u64 = 200 << 20;
 
 #[test]
 fn mutated_files_are_read_or_refused() {
@@ -51,34 +53,59 @@ fn fuzz(
         assert!(read(seed), "{reader}: an input that is not mutated");
     }
     let start = Instant::now();
-    let (mut taken, mut longest) = (0, Duration::ZERO);
+    let (mut taken, mut longest, mut largest) = (0, Duration::ZERO, 0);
     for number in 0..count {
         let mut random = ChaCha8Rng::seed_from_u64(number);
         let mut bytes = seeds[random.random_range(0..seeds.len())].clone();
         for _ in 0..random.random_range(1..=4) {
             mutate(&mut bytes, &mut random);
         }
+        let before = Memory::start();
         let begun = Instant::now();
         // A panic ends the test here, with the number printed by it.
         let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| read(&bytes)));
         let took = begun.elapsed();
         assert!(result.is_ok(), "{reader}: input {number} panics");
         assert!(took < LONGEST, "{reader}: input {number} takes {took:?}");
+        largest = largest.max(before.taken());
+        if count > INPUTS {
+            assert!(
+                largest < LARGEST,
+                "{reader}: input {number} takes {largest} bytes"
+            );
+        }
         taken += u64::from(result.unwrap_or(false));
         longest = longest.max(took);
     }
     let rate = count as f64 / start.elapsed().as_secs_f64();
     eprintln!(
-        "{reader}: {count} inputs, {rate:.0} a second, {taken} read, the others refused; longest {longest:.1?}; memory so far {}",
-        peak_memory()
+        "{reader}: {count} inputs, {rate:.0} a second, {taken} read, the others refused; longest {longest:.1?}; most memory {:.1} MB",
+        largest as f64 / 1e6
     );
 }
 
-/// Most memory that the process held, as the system says.
-fn peak_memory() -> String {
-    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-    line.unwrap_or(" unknown").trim().to_owned()
+/// Memory of the process before something is done.
+struct Memory(u64);
+
+impl Memory {
+    /// Forgets the most that was held before.
+    fn start() -> Self {
+        // Where the system does not let it, the most ever held counts.
+        let _ = fs::write("/proc/self/clear_refs", "5");
+        Memory(Memory::held("VmRSS:"))
+    }
+
+    /// Bytes held since, at most, beyond those held then.
+    fn taken(&self) -> u64 {
+        Memory::held("VmHWM:").saturating_sub(self.0)
+    }
+
+    fn held(key: &str) -> u64 {
+        let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+        let line = status.lines().find_map(|line| line.strip_prefix(key));
+        let kilobytes = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
+        kilobytes.unwrap_or(0) * 1024
+    }
 }
 
 /// Changes bytes, or the length.
@@ -116,12 +143,51 @@ fn mutate_bytes(bytes: &mut Vec<u8>, random: &mut ChaCha8Rng) {
 /// Changes header cards of a FITS file, or its bytes.
 fn mutate_fits(bytes: &mut Vec<u8>, random: &mut ChaCha8Rng) {
     const CARD: usize = 80;
-    const KEYS: [&str; 26] = [
-        "SIMPLE", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "NAXIS3", "PCOUNT", "GCOUNT", "EXTEND",
-        "BSCALE", "BZERO", "BLANK", "STAMP", "NGRID", "NOISESIG", "ZBITPIX", "ZNAXIS", "ZNAXIS1",
-        "ZNAXIS2", "ZTILE1", "ZTILE2", "ZCMPTYPE", "TFIELDS", "TFORM1", "THEAP", "END",
+    const KEYS: [&str; 42] = [
+        "SIMPLE",
+        "BITPIX",
+        "NAXIS",
+        "NAXIS1",
+        "NAXIS2",
+        "NAXIS3",
+        "PCOUNT",
+        "GCOUNT",
+        "EXTEND",
+        "BSCALE",
+        "BZERO",
+        "BLANK",
+        "STAMP",
+        "NGRID",
+        "NOISESIG",
+        "ZBITPIX",
+        "ZNAXIS",
+        "ZNAXIS1",
+        "ZNAXIS2",
+        "ZTILE1",
+        "ZTILE2",
+        "ZCMPTYPE",
+        "TFIELDS",
+        "TFORM1",
+        "THEAP",
+        "END",
+        "ZIMAGE",
+        "ZVAL1",
+        "ZVAL2",
+        "ZNAME1",
+        "ZNAME2",
+        "ZQUANTIZ",
+        "ZDITHER0",
+        "ZBLANK",
+        "ZSCALE",
+        "ZZERO",
+        "TFORM2",
+        "TTYPE1",
+        "TTYPE2",
+        "ztile1",
+        "HIERARCH ZTILE2",
+        "HIERARCH zval1",
     ];
-    const VALUES: [&str; 22] = [
+    const VALUES: [&str; 30] = [
         "0",
         "1",
         "-1",
@@ -144,6 +210,14 @@ fn mutate_fits(bytes: &mut Vec<u8>, random: &mut ChaCha8Rng) {
         "'RICE_1  '",
         "'1PB(99999999)'",
         "NaN",
+        "'GZIP_1  '",
+        "'GZIP_2  '",
+        "'PLIO_1  '",
+        "'HCOMPRESS_1'",
+        "'NONE    '",
+        "'SUBTRACTIVE_DITHER_1'",
+        "'1PI     '",
+        "'1QB     '",
     ];
     let cards = bytes.len().min(4 * 2880) / CARD;
     if cards == 0 || random.random_bool(0.4) {
@@ -159,7 +233,7 @@ fn mutate_fits(bytes: &mut Vec<u8>, random: &mut ChaCha8Rng) {
             let found = (0..cards)
                 .map(|k| k * CARD)
                 .find(|at| bytes[*at..].starts_with(name.as_bytes()));
-            let text = format!("{name}{value:>20}{:50}", "");
+            let text = format!("{:<CARD$}", format!("{name}{value:>20}"));
             let at = found.unwrap_or(card);
             bytes[at..at + CARD].copy_from_slice(text.as_bytes());
         }
@@ -194,7 +268,16 @@ fn fuzz_images(count: u64) {
         .flat_map(|v| f32::from(*v).to_be_bytes())
         .collect();
     let real = fits_image(-32, &[side / 2, side / 2], &stamp, &bytes);
-    let rice = include_bytes!("../data/rice.fits").to_vec();
+    let packed = [
+        "rice",
+        "gzip",
+        "hcompress",
+        "hcompress32",
+        "plio",
+        "lossless",
+        "dithered",
+    ]
+    .map(|name| fs::read(format!("tests/data/{name}.fits")).unwrap());
     let submission = Registry::embedded()
         .unwrap()
         .get("23/raw/star")
@@ -202,12 +285,30 @@ fn fuzz_images(count: u64) {
         .submission;
     let folder = DataFolder::open(&data).unwrap();
     let image = folder.galaxies(2, 1);
-    let seeds = [gzip(&whole), whole, real, rice];
-    fuzz("FITS image", &seeds, count, mutate_fits, |bytes| {
+    let plain = [whole, real];
+    let all = [&plain[..], &packed].concat();
+    let read = |bytes: &[u8]| {
         fs::write(&image, bytes).unwrap();
         read_image(&folder, &submission)
-    });
-    fs::write(&image, &seeds[1]).unwrap();
+    };
+    fuzz("FITS image", &plain, count, mutate_fits, read);
+    fuzz("compressed FITS image", &packed, count, mutate_fits, read);
+    fuzz(
+        "FITS image in gzip",
+        &all,
+        count / 4,
+        mutate_fits,
+        |bytes| read(&gzip(bytes)),
+    );
+    let gzipped = all.iter().map(|bytes| gzip(bytes)).collect::<Vec<_>>();
+    fuzz(
+        "gzip of a FITS image",
+        &gzipped,
+        count / 4,
+        mutate_bytes,
+        read,
+    );
+    fs::write(&image, &plain[0]).unwrap();
     let star = folder.psf_star(2, 1);
     let seed = fs::read(&star).unwrap();
     fuzz("FITS star", &[seed], count / 10, mutate_fits, |bytes| {
@@ -247,6 +348,7 @@ fn fuzz_others(count: u64) {
             table::read(&path, Some(&["x", "y", "e1", "e2"])).is_ok()
         });
     };
+    table("table.fits.gz", &[gzip(&fits)], mutate_bytes);
     table("table.fits", &[fits], mutate_fits);
     table("table.parquet", &[parquet], mutate_bytes);
     let ascii = "# x y e1 e2\n24.5 24.5 0.1 -2e-3\n72.5 24.5 NaN 0\n";
