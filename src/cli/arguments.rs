@@ -156,14 +156,12 @@ impl SimulationArguments {
             amplitude,
             tilt,
         } = self;
-        anyhow::ensure!(
-            amplitude.is_finite() && amplitude >= 0.0 && tilt.is_finite(),
-            "--amplitude is {amplitude} and --tilt {tilt}; expected finite numbers, the amplitude not negative"
-        );
-        Ok(SimulationSettings {
+        let settings = SimulationSettings {
             spectrum: ShearSpectrum { amplitude, tilt },
             ..SimulationSettings::new(seed, usize::from(grid))
-        })
+        };
+        settings.validate().map_err(anyhow::Error::msg)?;
+        Ok(settings)
     }
 
     /// Refuses them where nothing is simulated.

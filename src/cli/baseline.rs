@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use clap::{Args, Subcommand};
+use clap::{ArgGroup, Args, Subcommand};
 use shearq_submissions::{Registry, Submission};
 
 use super::arguments::{Form, SetList, SimulationArguments, Threads};
@@ -38,28 +38,32 @@ enum Command {
 
 /// Store figures as a new baseline.
 ///
-/// Either of folders that `measure` or `run` wrote (--measured), or of sets simulated for it
-/// (--simulate).
+/// Of folders that `measure` or `run` wrote (--measured), of a data folder (--data), or of sets simulated
+/// for it (--simulate).
 #[derive(Debug, Args)]
+#[command(group = ArgGroup::new("input").required(true).args(["measured", "data", "simulate"]))]
 struct RecordArguments {
     /// Name of the baseline; it must be new.
     #[arg(value_name = "NAME", value_parser = file_stem)]
     name: String,
     /// Folders of catalogues, of the same data.
-    #[arg(long, value_name = "OUT", num_args = 1.., required_unless_present = "simulate")]
+    #[arg(long, value_name = "OUT", num_args = 1.., conflicts_with_all = ["submission", "sets", "images"])]
     measured: Vec<PathBuf>,
+    /// Data folder to measure, now and at each check.
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
     /// Simulate the data in memory, now and at each check.
-    #[arg(long, conflicts_with = "measured", requires_all = ["sets", "images"])]
+    #[arg(long, requires_all = ["sets", "images"])]
     simulate: bool,
     /// Submission to measure, by name or file; may be given several times [default: all that
     /// `submissions list` shows].
-    #[arg(long, value_name = "NAME|FILE", requires = "simulate")]
+    #[arg(long, value_name = "NAME|FILE")]
     submission: Vec<String>,
-    /// Sets to simulate, as `1,2,7-9` or `all`.
-    #[arg(long, value_name = "LIST", requires = "simulate")]
+    /// Sets to measure, as `1,2,7-9` or `all` [default with --data: all there are].
+    #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
-    /// Images per set to simulate.
-    #[arg(long, value_name = "N", requires = "simulate", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    /// Images per set to measure, from the first on [default with --data: all there are].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     images: Option<u32>,
     #[command(flatten)]
     simulation: SimulationArguments,
@@ -131,37 +135,77 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 }
 
 fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
-    let path = Baseline::path(&arguments.place.folder, &arguments.name);
-    anyhow::ensure!(
-        !path.exists(),
-        "{}: the baseline exists; `baseline check {} --update --reason TEXT` changes it",
-        path.display(),
-        arguments.name
-    );
+    let folder = &arguments.place.folder;
+    let path = Baseline::path(folder, &arguments.name);
+    // Before the work; whoever is first in the end is known then.
+    if path.exists() {
+        return Err(Baseline::exists(&path).into());
+    }
     let threads = arguments.threads.number();
-    let mut submissions = Vec::new();
-    let source = if arguments.simulate {
-        let source = Source::Simulated(arguments.simulation.settings()?);
-        let images = arguments.images.unwrap_or(1);
-        let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
-        let wanted: Vec<Wanted> = sets.iter().map(|&set| Wanted { set, images }).collect();
-        for submission in chosen(&arguments.submission)? {
-            let sets = measured(&source, &submission, &wanted, threads)?;
-            submissions.push(stored(&submission, sets)?);
+    let (source, submissions) = match &arguments.data {
+        None if arguments.simulate => {
+            let images = arguments.images.unwrap_or(1);
+            let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
+            let wanted = sets.iter().map(|&set| Wanted { set, images }).collect();
+            let source = Source::Simulated(arguments.simulation.settings()?);
+            of_source(arguments, source, wanted)?
         }
-        source
-    } else {
-        of_folders(&arguments.measured, threads, &mut submissions)?
+        None => {
+            arguments.simulation.must_be_unused()?;
+            of_folders(&arguments.measured, folder, threads)?
+        }
+        Some(data) => {
+            arguments.simulation.must_be_unused()?;
+            let data = DataFolder::open(data)?;
+            let sets = match &arguments.sets {
+                Some(list) => list.0.clone(),
+                None => data.sets()?,
+            };
+            let all = sets.into_iter().map(|set| {
+                let images = match arguments.images {
+                    Some(images) => images,
+                    None => data.images(set)?.len() as u32,
+                };
+                anyhow::Ok(Wanted { set, images })
+            });
+            let all = all.collect::<anyhow::Result<_>>()?;
+            of_source(arguments, Source::folder(&data, folder)?, all)?
+        }
     };
+    for set in submissions.iter().flat_map(|submission| &submission.sets) {
+        anyhow::ensure!(
+            set.images.iter().copied().eq(1..=set.images.len() as u32),
+            "set {} has images {:?}; a baseline can be measured again from images 1 to N",
+            set.set,
+            set.images
+        );
+    }
     let baseline = Baseline {
         version: crate::VERSION.into(),
         source,
         history: Vec::new(),
         submissions,
     };
-    baseline.write(&path)?;
+    baseline.create(&path)?;
     tell(format_args!("recorded {}", path.display()));
     Ok(())
+}
+
+/// Measures the submissions asked for.
+fn of_source(
+    arguments: &RecordArguments,
+    source: Source,
+    wanted: Vec<Wanted>,
+) -> anyhow::Result<(Source, Vec<BaselineSubmission>)> {
+    let (folder, threads) = (&arguments.place.folder, arguments.threads.number());
+    let submissions = chosen(&arguments.submission)?
+        .iter()
+        .map(|submission| {
+            let sets = measured(&source, folder, submission, &wanted, threads)?;
+            stored(submission, sets)
+        })
+        .collect::<anyhow::Result<_>>()?;
+    Ok((source, submissions))
 }
 
 /// The submissions called `names`, or all named ones.
@@ -178,35 +222,28 @@ fn chosen(names: &[String]) -> anyhow::Result<Vec<Submission>> {
         .collect()
 }
 
-/// Takes the figures of folders of catalogues; the source that all of them have.
+/// Takes the figures of folders of catalogues, and the source that all of them have, for a record in the
+/// folder `beside`.
 fn of_folders(
     folders: &[PathBuf],
+    beside: &Path,
     threads: usize,
-    submissions: &mut Vec<BaselineSubmission>,
-) -> anyhow::Result<Source> {
+) -> anyhow::Result<(Source, Vec<BaselineSubmission>)> {
     let mut first: Option<Source> = None;
+    let mut submissions = Vec::new();
     for folder in folders {
         let run = Run::require(folder)?;
-        let source = first.get_or_insert_with(|| run.source.clone());
+        let own = run.source.moved(folder, beside)?;
+        let source = first.get_or_insert_with(|| own.clone());
         anyhow::ensure!(
-            *source == run.source,
-            "{}: it was measured from {}, the first from {source}; a baseline has one source",
+            *source == own,
+            "{}: it was measured from {own}, the first from {source}; a baseline has one source",
             folder.display(),
-            run.source,
         );
         let sets = figures_of(&run, &run.source.data(folder)?, folder, threads)?;
-        for set in &sets {
-            anyhow::ensure!(
-                set.images.iter().copied().eq(1..=set.images.len() as u32),
-                "{}: set {} has images {:?}; a baseline can be measured again from images 1 to N",
-                folder.display(),
-                set.set,
-                set.images
-            );
-        }
         submissions.push(stored(&run.submission, sets)?);
     }
-    first.context("--measured names no folder")
+    Ok((first.context("--measured names no folder")?, submissions))
 }
 
 fn stored(submission: &Submission, sets: Vec<BaselineSet>) -> anyhow::Result<BaselineSubmission> {
@@ -220,6 +257,7 @@ fn stored(submission: &Submission, sets: Vec<BaselineSet>) -> anyhow::Result<Bas
 /// Measures with a progress bar.
 fn measured(
     source: &Source,
+    beside: &Path,
     submission: &Submission,
     wanted: &[Wanted],
     threads: usize,
@@ -231,7 +269,9 @@ fn measured(
         Source::Folder { .. } => 100,
     };
     let mut bar = Bar::new("measuring", images * (side as u64).pow(2));
-    Ok(measure(source, submission, wanted, threads, &mut bar)?)
+    Ok(measure(
+        source, beside, submission, wanted, threads, &mut bar,
+    )?)
 }
 
 fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
@@ -289,8 +329,9 @@ fn with_defaults(stored: &toml::Table, base: &Submission) -> anyhow::Result<Subm
 /// Measures one baseline again, and updates it where that is asked for.
 fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Result<Vec<Checked>> {
     let baseline = Baseline::read(path)?;
+    let beside = &arguments.place.folder;
     let source = match &arguments.data {
-        Some(data) => Source::folder(&DataFolder::open(data)?),
+        Some(data) => Source::folder(&DataFolder::open(data)?, beside)?,
         None => baseline.source.clone(),
     };
     let registry = Registry::embedded()?;
@@ -325,7 +366,13 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
                 images: set.images.len() as u32,
             })
             .collect();
-        let sets = measured(&source, &submission, &wanted, arguments.threads.number())?;
+        let sets = measured(
+            &source,
+            beside,
+            &submission,
+            &wanted,
+            arguments.threads.number(),
+        )?;
         for old in &before.sets {
             let Some(now) = sets.iter().find(|now| now.set == old.set) else {
                 bail!("{}: set {} was not measured again", path.display(), old.set);
@@ -364,7 +411,7 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
                 history,
                 submissions,
             };
-            updated.write(path)?;
+            updated.replace(path)?;
             tell(format_args!("updated {}", path.display()));
         }
     }

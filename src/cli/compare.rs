@@ -12,6 +12,7 @@ use super::print_heat_map;
 use crate::io::layout::{DataFolder, MAX_SET};
 use crate::io::run::{Run, Source};
 use crate::io::store::{self, Conditions};
+use crate::pipeline::inputs;
 use crate::pipeline::record::set_record;
 use crate::pipeline::score::{Catalogues, ScoredSet, own_catalogue, score_variants};
 use crate::report::comparison::{Variant, compare, q_heat_map};
@@ -138,14 +139,14 @@ pub(super) fn variants(
     let registry = Registry::embedded()?;
     let mut data = data.map(DataFolder::open).transpose()?;
     let given = data.is_some();
-    let mut first: Option<Source> = None;
+    let mut first: Option<(&Path, Source)> = None;
     let mut entrants = Vec::new();
     for folder in folders {
         let run = Run::require(folder)?;
         if !given {
-            let source = first.get_or_insert_with(|| run.source.clone());
+            let (beside, source) = first.get_or_insert_with(|| (folder, run.source.clone()));
             anyhow::ensure!(
-                *source == run.source,
+                *source == run.source.moved(folder, beside)?,
                 "{}: it was measured from {}, the first from {source}; give --data DIR to score both against one truth",
                 folder.display(),
                 run.source,
@@ -158,6 +159,9 @@ pub(super) fn variants(
                     folder.display()
                 )
             })?);
+        }
+        if let Some(data) = &data {
+            inputs::verify(data, folder, &run, &[], threads)?;
         }
         entrants.push(Entrant {
             // Published figures belong to the embedded settings, not to a file of the same name.

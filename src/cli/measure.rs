@@ -59,7 +59,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
     measure(
         &Run::new(
-            Source::folder(&data),
+            Source::folder(&data, out)?,
             submission,
             catalogue_format.unwrap_or_default(),
         ),

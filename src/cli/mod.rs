@@ -1,4 +1,5 @@
-//! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage.
+//! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage. A reader of
+//! standard output that goes away (`| head`) is no failure: the command does its work and ends quietly.
 
 mod arguments;
 mod baseline;
@@ -24,6 +25,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+use crate::report::escape::visible;
 use crate::report::figure::HeatMap;
 
 /// Score and submit weak-lensing shape measurements, and measure them by Hopfield-network
@@ -63,7 +65,11 @@ enum Command {
 
 /// Parses the arguments, runs the command and reports its error, if any, in one place.
 pub fn main() -> ExitCode {
-    let result = match Cli::parse().command {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(message) => return usage(&message),
+    };
+    let result = match cli.command {
         Command::Quickstart(arguments) => quickstart::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Measure(arguments) => measure::run(&arguments),
@@ -92,6 +98,17 @@ pub fn main() -> ExitCode {
     }
 }
 
+/// Prints help, the version or what is wrong with the arguments.
+fn usage(message: &clap::Error) -> ExitCode {
+    match written(|| message.print()) {
+        Ok(()) => ExitCode::from(u8::try_from(message.exit_code()).unwrap_or(2)),
+        Err(error) => {
+            tell(format_args!("error: {error:#}"));
+            ExitCode::FAILURE
+        }
+    }
+}
+
 /// Failure of a command whose printed results say already what was found.
 #[derive(Debug, thiserror::Error)]
 #[error("there are findings")]
@@ -109,13 +126,14 @@ fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
     let map = HeatMap { decimals, ..map };
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
     let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
-    print(&format!("\n{}", map.terminal(coloured)))
+    // Its colours are control characters; names were checked when they were read.
+    write(&format!("\n{}", map.terminal(coloured)))
 }
 
 /// Says something on standard error; a reader that has gone away is no error.
 fn tell(line: std::fmt::Arguments<'_>) {
     use std::io::Write;
-    let _ = writeln!(std::io::stderr(), "{line}");
+    let _ = writeln!(std::io::stderr(), "{}", visible(&line.to_string()));
 }
 
 /// A number of things.
@@ -124,11 +142,24 @@ fn count(number: usize, thing: &str) -> String {
     format!("{number} {thing}{ending}")
 }
 
-/// Prints results to standard output; a reader that has gone away (`| head`) is no error.
+/// Prints results to standard output; a reader that has gone away is no error.
 fn print(text: &str) -> anyhow::Result<()> {
+    write(&visible(text))
+}
+
+/// The same for text with control characters of ours.
+fn write(text: &str) -> anyhow::Result<()> {
     use std::io::Write;
-    match std::io::stdout().write_all(text.as_bytes()) {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
+    written(|| std::io::stdout().write_all(text.as_bytes()))
+}
+
+/// Writes to standard output, of which nothing may be left in a buffer whose loss would not be noticed.
+fn written(write: impl FnOnce() -> std::io::Result<()>) -> anyhow::Result<()> {
+    use std::io::Write;
+    match write().and_then(|()| std::io::stdout().flush()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(anyhow::Error::new(error).context("standard output"))
+        }
         _ => Ok(()),
     }
 }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use shearq_submissions::is_control;
 
 use super::progress::Bar;
 use super::{count, tell};
@@ -62,8 +63,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     anyhow::ensure!(
         (1..=MAX_METHOD).contains(&method.len())
             && !method.starts_with('.')
-            && !method
-                .contains(|c: char| "/\\:".contains(c) || c.is_whitespace() || c.is_control()),
+            && !method.contains(|c: char| "/\\:".contains(c) || c.is_whitespace() || is_control(c)),
         "the method's name is `{method}`; expected 1 to {MAX_METHOD} bytes without `/`, `\\`, `:`, blanks and a first `.`"
     );
     let packing = Packing {

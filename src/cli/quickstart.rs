@@ -69,7 +69,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     for name in SUBMISSIONS {
         let folder = out.join(name.replace('/', "-"));
         let submission = registry.get(name)?.submission;
-        let run = Run::new(Source::folder(&data), submission, Format::default());
+        let run = Run::new(
+            Source::folder(&data, &folder)?,
+            submission,
+            Format::default(),
+        );
         measure::measure(&run, &data, &folder, &images, threads)?;
         let scored = score_folder(&data, &folder, &run, &[], options, threads)?;
         let title = format!("Scores of {name} (simulated data)");

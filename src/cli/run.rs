@@ -89,7 +89,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let source = match &data {
         Some(data) => {
             simulation.must_be_unused()?;
-            Source::folder(data)
+            Source::folder(data, out)?
         }
         None => Source::Simulated(simulation.settings()?),
     };

@@ -173,7 +173,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
                     name: &foreign.name,
                     settings: crate::io::open::read_to_string(path)
                         .with_context(|| path.display().to_string())?,
-                    source: &Source::folder(&data),
+                    source: &Source::folder(&data, path.parent().unwrap_or(path))?,
                     data: &data,
                 };
                 record(store, made, &scored, options)?;

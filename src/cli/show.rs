@@ -7,7 +7,7 @@ use anyhow::Context;
 use clap::Args;
 use shearq_submissions::Registry;
 
-use super::tell;
+use super::{print, tell};
 use crate::deconvolve::Stop;
 use crate::io::layout::DataFolder;
 use crate::pipeline::galaxy::{Measurement, Measurer};
@@ -105,7 +105,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let steps = measurer.steps(pixels, stride, psf.view(), &measured, &mut scratch);
         let label = format!("{}/{}/{index}", image.set, image.image);
         rows.push(steps_row(&label, psf, steps));
-        println!("{}", describe(image, index, &measured));
+        print(&format!("{}\n", describe(image, index, &measured)))?;
     }
     steps_figure(&submission.name, rows).save(out)?;
     tell(format_args!("wrote {}", out.display()));

@@ -51,11 +51,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         Command::Init { file } => {
             anyhow::ensure!(
-                !file.exists(),
+                atomic::write_if_absent(file, template().as_bytes())?,
                 "{}: the file exists; expected a new one",
                 file.display()
             );
-            atomic::write(file, template().as_bytes())?;
             tell(format_args!("wrote {}", file.display()));
             Ok(())
         }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use shearq_submissions::checked_name;
 
 use super::atomic;
 use super::error::FileError;
@@ -29,6 +30,7 @@ pub struct Baseline {
 #[serde(deny_unknown_fields)]
 pub struct BaselineSubmission {
     /// Its name.
+    #[serde(deserialize_with = "checked_name")]
     pub name: String,
     /// All settings. Kept as text would be, so that settings of later versions can be told apart
     /// from them.
@@ -102,14 +104,40 @@ impl Baseline {
         toml::from_str(&text).map_err(|error| FileError::new(path, error.to_string().trim_end()))
     }
 
-    /// Writes the baseline.
+    /// Writes the baseline, which must be new.
+    ///
+    /// # Errors
+    /// Where it cannot be written, or another process was first.
+    pub fn create(&self, path: &Path) -> Result<(), FileError> {
+        atomic::sweep_beside(path);
+        if atomic::write_if_absent(path, self.text(path)?.as_bytes())? {
+            return Ok(());
+        }
+        Err(Baseline::exists(path))
+    }
+
+    /// Writes the baseline in place of what is there.
     ///
     /// # Errors
     /// Where it cannot be written.
-    pub fn write(&self, path: &Path) -> Result<(), FileError> {
-        let text =
-            toml::to_string(self).map_err(FileError::doing(path, "cannot write the baseline"))?;
-        atomic::write(path, text.as_bytes())
+    pub fn replace(&self, path: &Path) -> Result<(), FileError> {
+        atomic::sweep_beside(path);
+        atomic::write(path, self.text(path)?.as_bytes())
+    }
+
+    /// What is wrong where a baseline that is to be new exists.
+    pub fn exists(path: &Path) -> FileError {
+        let name = path.file_stem().unwrap_or_default().to_string_lossy();
+        FileError::new(
+            path,
+            format!(
+                "the baseline exists; `baseline check {name} --update --reason TEXT` changes it"
+            ),
+        )
+    }
+
+    fn text(&self, path: &Path) -> Result<String, FileError> {
+        toml::to_string(self).map_err(FileError::doing(path, "cannot write the baseline"))
     }
 }
 

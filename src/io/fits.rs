@@ -13,7 +13,9 @@ mod tiles;
 
 pub use read::{ImageReader, read_table, read_table_keys};
 
+use std::ffi::{CString, c_int};
 use std::path::Path;
+use std::ptr;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use fitsio::FitsFile;
@@ -214,11 +216,31 @@ fn write_header(
     for (key, value) in header {
         match value {
             Value::Int(v) => hdu.write_key(file, key, *v)?,
-            Value::Real(v) => hdu.write_key(file, key, *v)?,
+            Value::Real(v) => write_real(file, key, *v)?,
             Value::Text(v) => hdu.write_key(file, key, v.as_str())?,
         }
     }
     Ok(())
+}
+
+/// Writes a real number to the header in use with all its digits; [`FitsHdu::write_key`] keeps fifteen.
+fn write_real(file: &mut FitsFile, key: &str, value: f64) -> fitsio::errors::Result<()> {
+    /// Significant digits that tell any two numbers apart; negative where leading zeros do not count.
+    const DIGITS: c_int = -17;
+    let name = CString::new(key)?;
+    let mut status = 0;
+    // SAFETY: the file is open, the name ends in a zero byte, and there is no comment.
+    unsafe {
+        fitsio::sys::ffpkyd(
+            file.as_raw(),
+            name.as_ptr(),
+            value,
+            DIGITS,
+            ptr::null(),
+            &mut status,
+        );
+    }
+    fitsio::errors::check_status(status)
 }
 
 /// Writes `table` as the only binary table of a file, with `header` keys of at most eight characters.

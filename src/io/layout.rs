@@ -5,7 +5,7 @@ use std::ffi::OsString;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
 
 use super::error::FileError;
@@ -24,9 +24,9 @@ pub const MAX_STAMP: usize = 1024;
 pub const LAYOUT_FILE: &str = "layout.toml";
 
 /// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for the plain
-/// numbers, `{set:02}` and `{image:03}` for zero-padded ones.
+/// numbers, `{set:02}` and `{image:03}` for zero-padded ones. Wherever it is read from, it is checked.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[serde(remote = "Self", deny_unknown_fields, default)]
 pub struct Layout {
     /// Galaxy images.
     pub galaxies: String,
@@ -58,6 +58,22 @@ impl Default for Layout {
             field_degrees: 10.0,
             stamp: 48,
         }
+    }
+}
+
+impl Serialize for Layout {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived one.
+        Layout::serialize(self, serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for Layout {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        // The derived one.
+        let layout = Layout::deserialize(deserializer)?;
+        layout.validate().map_err(serde::de::Error::custom)?;
+        Ok(layout)
     }
 }
 
@@ -122,12 +138,7 @@ impl DataFolder {
         let layout = if is_there(&path) {
             let text = open::read_to_string(&path)
                 .map_err(FileError::doing(&path, "cannot read the layout"))?;
-            let layout: Layout = toml::from_str(&text)
-                .map_err(|e| FileError::new(&path, e.to_string().trim_end()))?;
-            layout
-                .validate()
-                .map_err(|message| FileError::new(&path, message))?;
-            layout
+            toml::from_str(&text).map_err(|e| FileError::new(&path, e.to_string().trim_end()))?
         } else {
             Layout::default()
         };

@@ -13,6 +13,7 @@ pub mod open;
 #[cfg(feature = "parquet")]
 mod parquet;
 pub mod psf_table;
+mod relative;
 pub mod run;
 pub mod store;
 pub mod table;

@@ -10,6 +10,7 @@ use shearq_submissions::Submission;
 use super::atomic;
 use super::error::FileError;
 use super::layout::{DataFolder, Layout, MAX_IMAGE};
+use super::relative;
 use super::table::Format;
 use crate::simulate::set::SimulationSettings;
 
@@ -22,7 +23,7 @@ pub const RUN_FILE: &str = "run.json";
 pub enum Source {
     /// Images of a data folder.
     Folder {
-        /// The folder as given.
+        /// The folder, from the one that holds the record.
         path: PathBuf,
         /// Its layout.
         layout: Layout,
@@ -32,12 +33,29 @@ pub enum Source {
 }
 
 impl Source {
-    /// A data folder as it is.
-    pub fn folder(data: &DataFolder) -> Self {
-        Source::Folder {
-            path: data.root().to_owned(),
+    /// A data folder, for a record in the folder `beside`.
+    ///
+    /// # Errors
+    /// Where the way from one to the other is not known.
+    pub fn folder(data: &DataFolder, beside: &Path) -> Result<Self, FileError> {
+        Ok(Source::Folder {
+            path: way(beside, data.root())?,
             layout: data.layout().clone(),
-        }
+        })
+    }
+
+    /// The same source, of a record in the folder `from`, for one in the folder `to`.
+    ///
+    /// # Errors
+    /// Where the way from one to the other is not known.
+    pub fn moved(&self, from: &Path, to: &Path) -> Result<Self, FileError> {
+        Ok(match self {
+            Source::Folder { path, layout } => Source::Folder {
+                path: way(to, &from.join(path))?,
+                layout: layout.clone(),
+            },
+            Source::Simulated(settings) => Source::Simulated(*settings),
+        })
     }
 
     /// Layout of the data, that of simulated ones included.
@@ -48,16 +66,21 @@ impl Source {
         }
     }
 
-    /// The data folder with the true shear of a run whose catalogues lie in `measured`.
+    /// The data folder with the true shear of a run whose record and catalogues lie in `measured`.
     ///
     /// # Errors
     /// Where it is not there any more.
     pub fn data(&self, measured: &Path) -> Result<DataFolder, FileError> {
         match self {
-            Source::Folder { path, .. } => DataFolder::open(path),
+            Source::Folder { path, .. } => DataFolder::open(measured.join(path)),
             Source::Simulated(_) => DataFolder::open(measured),
         }
     }
+}
+
+/// The way from the folder of a record to a data folder.
+fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
+    relative::from(from, to).map_err(FileError::doing(to, "cannot tell where the folder is"))
 }
 
 impl std::fmt::Display for Source {
@@ -216,7 +239,7 @@ pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result
     let mut earlier: Option<R> = read_record(path)?;
     if earlier.is_none() {
         // Another process may be first; then its record is compared like any earlier one.
-        atomic::write_if_absent(path, record_text(path, record)?.as_bytes())?;
+        let _ = atomic::write_if_absent(path, record_text(path, record)?.as_bytes())?;
         earlier = read_record(path)?;
     }
     let differences = differences(&earlier, &Some(record))

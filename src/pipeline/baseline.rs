@@ -13,7 +13,7 @@ use super::record::set_record;
 use super::run::run_folder;
 use super::score::{OWN, score_folder};
 use super::{PipelineError, engine};
-use crate::io::FileError;
+use crate::io::atomic::Scratch;
 use crate::io::baseline::{BaselineSet, BaselineSubmission};
 use crate::io::fingerprint;
 use crate::io::layout::DataFolder;
@@ -46,24 +46,24 @@ pub struct Wanted {
     pub images: u32,
 }
 
-/// Measures a submission into a folder that is removed again, and takes its figures.
+/// Measures a submission into a folder that is removed again, and takes its figures. `source` is as in a
+/// record in the folder `beside`.
 ///
 /// # Errors
 /// Where data are absent or damaged, or nothing can be written to the temporary folder.
 pub fn measure(
     source: &Source,
+    beside: &Path,
     submission: &Submission,
     wanted: &[Wanted],
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Vec<BaselineSet>, PipelineError> {
-    let folder = tempfile::tempdir().map_err(FileError::doing(
-        &std::env::temp_dir(),
-        "cannot make a temporary folder",
-    ))?;
+    let folder = Scratch::new()?;
     let out = folder.path();
-    let run = Run::new(source.clone(), submission.clone(), Format::default());
-    match source {
+    let source = source.moved(beside, out)?;
+    let run = Run::new(source, submission.clone(), Format::default());
+    match &run.source {
         Source::Simulated(settings) => {
             let images: Vec<ImageId> = wanted
                 .iter()
@@ -73,12 +73,17 @@ pub fn measure(
         }
         Source::Folder { .. } => {
             let sets: Vec<u32> = wanted.iter().map(|w| w.set).collect();
-            let data = source.data(out)?;
-            let images = images::of_folder(&data, &sets)?;
+            let data = run.source.data(out)?;
+            let asked = |id: &ImageId| {
+                let mut of_set = wanted.iter().filter(|w| w.set == id.set);
+                of_set.any(|w| id.image <= w.images)
+            };
+            let mut images = images::of_folder(&data, &sets)?;
+            images.retain(asked);
             measure_folder(&run, &data, out, &images, threads, progress)?;
         }
     }
-    figures_of(&run, &source.data(out)?, out, threads)
+    figures_of(&run, &run.source.data(out)?, out, threads)
 }
 
 /// Figures of every set in a folder of catalogues.

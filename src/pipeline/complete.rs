@@ -1,5 +1,6 @@
 //! Whether a folder holds every result that it should, whole and of its settings.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::Grid;
@@ -8,6 +9,7 @@ use shearq_scoring::units::{Degrees, Pixels};
 use super::PipelineError;
 use super::engine::{self, Progress};
 use super::images::ImageId;
+use super::inputs::Inputs;
 use super::measure::{metadata, open_galaxies};
 use super::simulate::SimulationRecord;
 use crate::io::FileError;
@@ -69,6 +71,10 @@ impl Results<'_> {
         progress: &mut dyn Progress,
     ) -> Result<Vec<Fault>, PipelineError> {
         let mut faults = Vec::new();
+        let inputs = match self {
+            Results::Catalogues { run, data, .. } => Some(Inputs::new(run, data, images)?),
+            Results::Images { .. } => None,
+        };
         engine::ordered(
             threads,
             |feeder| {
@@ -82,7 +88,10 @@ impl Results<'_> {
             || (),
             |(), position| {
                 let first = position == 0 || images[position - 1].set != images[position].set;
-                Ok((position, self.check(images[position], first)))
+                Ok((
+                    position,
+                    self.check(images[position], first, inputs.as_ref()),
+                ))
             },
             |(position, checked)| {
                 match checked {
@@ -128,8 +137,13 @@ impl Results<'_> {
     }
 
     /// Number of galaxies of an image whose results are in order; with those of the `first` image of
-    /// a set, what the set shares is looked at.
-    fn check(&self, id: ImageId, first: bool) -> Result<usize, PipelineError> {
+    /// a set, what the set shares is looked at. Catalogues are those of `inputs`.
+    fn check(
+        &self,
+        id: ImageId,
+        first: bool,
+        inputs: Option<&Inputs<'_>>,
+    ) -> Result<usize, PipelineError> {
         let result = self.result(id);
         if !result.is_file() {
             return Err(FileError::new(result, "there is no such file").into());
@@ -137,7 +151,8 @@ impl Results<'_> {
         let cells = self.cells(id)?;
         let simulated = match self {
             Results::Catalogues { run, .. } => {
-                check_catalogue(run, id, &result, cells)?;
+                let prints = inputs.map_or(Ok(BTreeMap::new()), |inputs| inputs.prints(id))?;
+                check_catalogue(run, id, prints, &result, cells)?;
                 matches!(run.source, Source::Simulated(_))
             }
             Results::Images { record, data } => {
@@ -156,9 +171,15 @@ impl Results<'_> {
     }
 }
 
-fn check_catalogue(run: &Run, id: ImageId, path: &Path, cells: usize) -> Result<(), PipelineError> {
+fn check_catalogue(
+    run: &Run,
+    id: ImageId,
+    prints: BTreeMap<String, String>,
+    path: &Path,
+    cells: usize,
+) -> Result<(), PipelineError> {
     check_rows(path, table::read(path, None)?.rows(), cells)?;
-    let expected = kept(&metadata(run, id)?, run.format);
+    let expected = kept(&metadata(run, id, prints)?, run.format);
     let found = read_metadata(path, run.format, expected.keys())?;
     let differing = expected
         .iter()
@@ -167,7 +188,7 @@ fn check_catalogue(run: &Run, id: ImageId, path: &Path, cells: usize) -> Result<
         None => Ok(()),
         Some((key, _)) => {
             let message = format!(
-                "its `{key}` is not that of set {} image {} of this run; it belongs to another",
+                "its `{key}` is not that of set {} image {} of this run; it belongs to another, or to other data",
                 id.set, id.image
             );
             Err(FileError::new(path, message).into())

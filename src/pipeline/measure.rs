@@ -14,6 +14,7 @@ use super::calibrate::calibrate;
 use super::engine::{self, Feeder, Progress};
 use super::galaxy::{Measurement, Measurer, flag};
 use super::images::ImageId;
+use super::inputs::Inputs;
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
 use crate::io::layout::{DataFolder, MAX_STAMP};
@@ -415,9 +416,11 @@ pub fn measure_folder(
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
     let _claim = claim(&out.join(RUN_FILE), run)?;
-    let todo = to_do(run, out, images);
+    let inputs = Inputs::new(run, data, images)?;
+    let (todo, done) = to_do(run, out, images);
+    inputs.verify(out, &done, threads)?;
     let mut summary = Summary {
-        already: images.len() - todo.len(),
+        already: done.len(),
         ..Summary::default()
     };
     let Some(&first) = todo.first() else {
@@ -427,9 +430,18 @@ pub fn measure_folder(
     let stamp = ImageSource::open(data, first, &run.submission)?.stamp;
     let measurer = Measurer::new(&run.submission, stamp)?;
     let mut rows = Vec::new();
+    // Of each image as it was when it was opened, in the images' order.
+    let (send, receive) = std::sync::mpsc::channel();
     engine::ordered(
         threads,
-        |feeder| read_images(data, &todo, &run.submission, stamp, feeder),
+        |feeder| {
+            let print = |id| {
+                // Nobody listens after an error, which is reported elsewhere.
+                let _ = send.send(inputs.prints(id)?);
+                Ok(())
+            };
+            read_images(data, &todo, &run.submission, stamp, print, feeder)
+        },
         || measurer.scratch(),
         |scratch, row: StampRow| Ok(measure_row(&measurer, scratch, &row)),
         |row: MeasuredRow| {
@@ -438,7 +450,8 @@ pub fn measure_folder(
             rows.push(row);
             if rows.len() == grid.n {
                 calibrate(&run.submission, &mut rows);
-                write_catalogue(run, out, &rows)?;
+                let prints = receive.recv().unwrap_or_default();
+                write_catalogue(run, out, &rows, prints)?;
                 summary.count(&rows);
                 rows.clear();
                 progress.note(&format!("set {:02} image {:03}", id.set, id.image));
@@ -460,7 +473,7 @@ pub fn galaxies_to_do(
     out: &Path,
     images: &[ImageId],
 ) -> Result<u64, PipelineError> {
-    let todo = to_do(run, out, images);
+    let (todo, _) = to_do(run, out, images);
     let Some(&first) = todo.first() else {
         return Ok(0);
     };
@@ -468,13 +481,11 @@ pub fn galaxies_to_do(
     Ok((todo.len() * grid.cells()) as u64)
 }
 
-/// Those of `images` that have no catalogue yet.
-pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> Vec<ImageId> {
+/// Those of `images` that have no catalogue yet, and those that have one.
+pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> (Vec<ImageId>, Vec<ImageId>) {
     images
         .iter()
-        .filter(|id| !run.catalogue(out, id.set, id.image).is_file())
-        .copied()
-        .collect()
+        .partition(|id| !run.catalogue(out, id.set, id.image).is_file())
 }
 
 fn read_images(
@@ -482,9 +493,11 @@ fn read_images(
     todo: &[ImageId],
     submission: &Submission,
     stamp: usize,
+    mut opened: impl FnMut(ImageId) -> Result<(), FileError>,
     feeder: &mut Feeder<'_, StampRow>,
 ) -> Result<(), PipelineError> {
     for &id in todo {
+        opened(id)?;
         let mut source = ImageSource::open(data, id, submission)?;
         if source.stamp != stamp {
             let path = data.galaxies(id.set, id.image);
@@ -556,21 +569,28 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
     ])
 }
 
-/// Writes the catalogue of one image from its rows of stamps, in grid order.
+/// Writes the catalogue of one image from its rows of stamps, in grid order; `prints` are the
+/// fingerprints of what they were measured from.
 pub(super) fn write_catalogue(
     run: &Run,
     out: &Path,
     rows: &[MeasuredRow],
+    prints: BTreeMap<String, String>,
 ) -> Result<(), PipelineError> {
     let id = rows[0].id;
     let path = run.catalogue(out, id.set, id.image);
     let table = catalogue(rows).map_err(|message| FileError::new(&path, message))?;
-    table::write(&path, run.format, table, &metadata(run, id)?)?;
+    table::write(&path, run.format, table, &metadata(run, id, prints)?)?;
     Ok(())
 }
 
-/// What made the catalogue of an image, as the catalogue carries it.
-pub(super) fn metadata(run: &Run, id: ImageId) -> Result<BTreeMap<String, String>, PipelineError> {
+/// What made the catalogue of an image from files with the fingerprints `prints`, as the catalogue carries
+/// it.
+pub(super) fn metadata(
+    run: &Run,
+    id: ImageId,
+    prints: BTreeMap<String, String>,
+) -> Result<BTreeMap<String, String>, PipelineError> {
     let ellipticity = match run.submission.shape.ellipticity {
         EllipticityType::Distortion => "distortion",
         EllipticityType::Shear => "shear",
@@ -578,12 +598,17 @@ pub(super) fn metadata(run: &Run, id: ImageId) -> Result<BTreeMap<String, String
     let settings = toml::to_string(&run.submission).map_err(|error| {
         PipelineError::Request(format!("the settings cannot be stored: {error}"))
     })?;
-    Ok(BTreeMap::from([
-        ("creator".to_owned(), format!("shearq {}", run.version)),
-        ("submiss".to_owned(), run.submission.name.clone()),
-        ("elltype".to_owned(), ellipticity.to_owned()),
-        ("set".to_owned(), id.set.to_string()),
-        ("image".to_owned(), id.image.to_string()),
-        ("settings".to_owned(), settings),
-    ]))
+    let mut all = prints;
+    all.extend(
+        [
+            ("creator", format!("shearq {}", run.version)),
+            ("submiss", run.submission.name.clone()),
+            ("elltype", ellipticity.to_owned()),
+            ("set", id.set.to_string()),
+            ("image", id.image.to_string()),
+            ("settings", settings),
+        ]
+        .map(|(key, value)| (key.to_owned(), value)),
+    );
+    Ok(all)
 }

@@ -10,6 +10,7 @@ pub mod complete;
 pub mod engine;
 pub mod galaxy;
 pub mod images;
+pub mod inputs;
 pub mod measure;
 mod method;
 pub mod record;

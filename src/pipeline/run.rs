@@ -1,5 +1,6 @@
 //! Simulating and measuring in memory: no image is stored.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -89,9 +90,9 @@ pub fn run_folder(
     let _claim = claim(&out.join(RUN_FILE), run)?;
     let measurers = measurers(std::slice::from_ref(&run.submission))?;
     let truth = DataFolder::new(out);
-    let todo = to_do(run, out, images);
+    let (todo, done) = to_do(run, out, images);
     let mut summary = Summary {
-        already: images.len() - todo.len(),
+        already: done.len(),
         ..Summary::default()
     };
     progress.advance((summary.already * settings.grid * settings.grid) as u64);
@@ -102,7 +103,7 @@ pub fn run_folder(
         simulate::write_truth(&truth, &simulator)?;
         progress.note(&format!("set {set:02}"));
         run_set(&simulator, &todo, &measurers, threads, progress, |image| {
-            write_catalogue(run, out, &image.rows[0])?;
+            write_catalogue(run, out, &image.rows[0], BTreeMap::new())?;
             summary.count(&image.rows[0]);
             Ok(())
         })?;

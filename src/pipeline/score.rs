@@ -11,6 +11,7 @@ use shearq_scoring::{
 
 use super::PipelineError;
 use super::engine;
+use super::inputs;
 use crate::io::FileError;
 use crate::io::layout::{DataFolder, MAX_SET, read_rows, read_truth_rows};
 use crate::io::run::Run;
@@ -403,6 +404,7 @@ pub fn score_folder(
     threads: usize,
 ) -> Result<Vec<ScoredSet>, PipelineError> {
     let catalogues = |set| run.catalogues(out, set);
+    inputs::verify(data, out, run, sets, threads)?;
     score_sets(data, sets, catalogues, &own_catalogue, options, threads).map_err(
         |error| match error {
             PipelineError::Request(message) => FileError::new(out, message).into(),

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::html::escape;
+use super::escape::markup as escape;
 use super::table::{Cell, Heading, Table};
 use crate::pipeline::baseline::Shift;
 

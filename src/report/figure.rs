@@ -176,10 +176,7 @@ pub trait Figure {
 /// The scene as a PNG file. Plotters encodes into files only, so it passes through a temporary one.
 fn encode_png(scene: &Scene) -> Result<Vec<u8>, FigureError> {
     let (pixels, size) = scene.to_pixels()?;
-    let folder = tempfile::tempdir().map_err(|source| FigureError::Io {
-        path: std::env::temp_dir(),
-        source,
-    })?;
+    let folder = atomic::Scratch::new()?;
     let path = folder.path().join("figure.png");
     let failed = |error: &dyn std::fmt::Display| FigureError::Drawing {
         detail: error.to_string(),

@@ -21,6 +21,7 @@ use std::path::Path;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
 
+use super::escape::markup as escape;
 use super::figure::{Figure, FigureError, Format};
 use super::table::{Cell, Table, TableFormat};
 use crate::io::{FileError, atomic};
@@ -558,24 +559,6 @@ fn sort_value(value: f64) -> String {
     value.to_string()
 }
 
-/// Text as contents of an element or as a value of an attribute in quotes.
-pub(super) fn escape(text: &str) -> String {
-    let mut safe = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => safe.push_str("&amp;"),
-            '<' => safe.push_str("&lt;"),
-            '>' => safe.push_str("&gt;"),
-            '"' => safe.push_str("&quot;"),
-            '\'' => safe.push_str("&#39;"),
-            // HTML cannot hold these, written out or not.
-            c if c.is_control() && !matches!(c, '\n' | '\t') => safe.push('\u{fffd}'),
-            c => safe.push(c),
-        }
-    }
-    safe
-}
-
 /// The paragraphs of a text, each with its line breaks turned into spaces.
 fn paragraphs(text: &str) -> Vec<String> {
     let mut paragraphs = vec![String::new()];
@@ -884,7 +867,7 @@ mod tests {
         assert_eq!(inline("``** ** **"), "``<b> </b> **");
         assert_eq!(plain("the `a`\n**b**"), "the a b");
         assert_eq!(paragraphs("a\nb\n\n \nc\n"), ["a b", "c"]);
-        assert_eq!(escape("a\u{0}\r\n"), "a\u{fffd}\u{fffd}\n");
+        assert_eq!(escape("a\u{0}\r\n"), "a\\u0000\\u000d\n");
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 pub mod baseline;
 pub mod comparison;
+pub mod escape;
 pub mod figure;
 mod font;
 pub mod html;

@@ -4,6 +4,7 @@ use clap::ValueEnum;
 use comfy_table::{CellAlignment, ContentArrangement, TableComponent, presets};
 use serde_json::{Map, Value, json};
 
+use super::escape;
 use crate::io::table::{Column, Table as Columns};
 
 /// How to print a table.
@@ -14,7 +15,8 @@ pub enum TableFormat {
     Table,
     /// Machine-readable, full precision.
     Json,
-    /// Comma-separated, full precision, value and error in columns of their own.
+    /// Comma-separated, full precision, value and error in columns of their own; words that a spreadsheet
+    /// would take for a formula have an apostrophe in front.
     Csv,
     /// Markdown.
     Markdown,
@@ -64,12 +66,11 @@ impl Cell {
         }
     }
 
-    /// For people; `latex` wraps numbers in mathematics.
-    fn print(&self, latex: bool) -> String {
+    /// For people, words by `escape`; `latex` wraps numbers in mathematics.
+    fn print(&self, escape: fn(&str) -> String, latex: bool) -> String {
         match self {
             Cell::Empty => String::new(),
-            Cell::Text(words) if latex => escape_latex(words),
-            Cell::Text(words) => words.clone(),
+            Cell::Text(words) => escape(words),
             Cell::Number { value, .. } if value.is_nan() => "–".into(),
             Cell::Number {
                 value,
@@ -166,8 +167,8 @@ impl Table {
     /// The table in a format, ending in a line break.
     pub fn render(&self, format: TableFormat) -> String {
         match format {
-            TableFormat::Table => self.people(presets::UTF8_HORIZONTAL_ONLY, ""),
-            TableFormat::Markdown => self.people(presets::ASCII_MARKDOWN, "\n"),
+            TableFormat::Table => self.people(presets::UTF8_HORIZONTAL_ONLY, "", escape::line),
+            TableFormat::Markdown => self.people(presets::ASCII_MARKDOWN, "\n", escape::markdown),
             TableFormat::Latex => self.latex(),
             TableFormat::Csv => self.csv(),
             TableFormat::Json => {
@@ -178,7 +179,7 @@ impl Table {
         }
     }
 
-    fn people(&self, preset: &str, gap: &str) -> String {
+    fn people(&self, preset: &str, gap: &str, escape: fn(&str) -> String) -> String {
         let mut table = comfy_table::Table::new();
         table
             .load_preset(preset)
@@ -187,9 +188,9 @@ impl Table {
             .remove_style(TableComponent::LeftBorderIntersections)
             .remove_style(TableComponent::RightBorderIntersections)
             .set_content_arrangement(ContentArrangement::Disabled)
-            .set_header(self.headings.iter().map(|h| h.label.as_str()));
+            .set_header(self.headings.iter().map(|h| escape(&h.label)));
         for row in &self.rows {
-            table.add_row(row.iter().map(|cell| cell.print(false)));
+            table.add_row(row.iter().map(|cell| cell.print(escape, false)));
         }
         for (k, column) in table.column_iter_mut().enumerate() {
             let numbers = self
@@ -202,11 +203,11 @@ impl Table {
         }
         let mut text = String::new();
         if !self.title.is_empty() {
-            text.push_str(&format!("{}\n{gap}", self.title));
+            text.push_str(&format!("{}\n{gap}", escape(&self.title)));
         }
         text.push_str(&format!("{table}\n"));
         for note in &self.notes {
-            text.push_str(&format!("{gap}{note}\n"));
+            text.push_str(&format!("{gap}{}\n", escape(note)));
         }
         text
     }
@@ -224,21 +225,25 @@ impl Table {
         let line = |cells: Vec<String>| format!("{} \\\\\n", cells.join(" & "));
         let mut text = format!(
             "% {}\n\\begin{{tabular}}{{{columns}}}\n\\hline\n",
-            self.title
+            escape::line(&self.title)
         );
         text.push_str(&line(
             self.headings
                 .iter()
-                .map(|h| escape_latex(&h.label))
+                .map(|h| escape::latex(&h.label))
                 .collect(),
         ));
         text.push_str("\\hline\n");
         for row in &self.rows {
-            text.push_str(&line(row.iter().map(|cell| cell.print(true)).collect()));
+            text.push_str(&line(
+                row.iter()
+                    .map(|cell| cell.print(escape::latex, true))
+                    .collect(),
+            ));
         }
         text.push_str("\\hline\n\\end{tabular}\n");
         for note in &self.notes {
-            text.push_str(&format!("% {note}\n"));
+            text.push_str(&format!("% {}\n", escape::line(note)));
         }
         text
     }
@@ -267,7 +272,9 @@ impl Table {
                 })
                 .collect();
             let Some((values, errors)) = numbers.map(|pairs| pairs.into_iter().unzip()) else {
-                let words = cells().map(|cell| cell.print(false)).collect();
+                let words = cells()
+                    .map(|cell| cell.print(str::to_owned, false))
+                    .collect();
                 columns.push((heading.key.to_owned(), Column::Text(words)));
                 continue;
             };
@@ -280,35 +287,31 @@ impl Table {
     }
 
     fn csv(&self) -> String {
-        let quote = |words: &str| {
-            if words.contains([',', '"', '\n']) {
-                format!("\"{}\"", words.replace('"', "\"\""))
-            } else {
-                words.to_owned()
-            }
-        };
+        let errors: Vec<bool> = (0..self.headings.len())
+            .map(|k| self.has_errors(k))
+            .collect();
         let mut header = Vec::new();
-        for (k, heading) in self.headings.iter().enumerate() {
+        for (heading, &errors) in self.headings.iter().zip(&errors) {
             header.push(heading.key.to_owned());
-            if self.has_errors(k) {
+            if errors {
                 header.push(format!("{}_error", heading.key));
             }
         }
         let mut text = header.join(",") + "\n";
         for row in &self.rows {
             let mut fields = Vec::new();
-            for (k, cell) in row.iter().enumerate() {
+            for (cell, &errors) in row.iter().zip(&errors) {
                 match cell {
                     Cell::Empty => {
                         fields.push(String::new());
-                        if self.has_errors(k) {
+                        if errors {
                             fields.push(String::new());
                         }
                     }
-                    Cell::Text(words) => fields.push(quote(words)),
+                    Cell::Text(words) => fields.push(escape::csv(words)),
                     Cell::Number { value, error, .. } => {
                         fields.push(number(*value));
-                        if self.has_errors(k) {
+                        if errors {
                             fields.push(error.map_or(String::new(), number));
                         }
                     }
@@ -371,39 +374,6 @@ fn number(value: f64) -> String {
     }
 }
 
-fn escape_latex(words: &str) -> String {
-    let mut text = String::new();
-    let mut rest = words.chars();
-    while let Some(c) = rest.next() {
-        match c {
-            '_' | '%' | '&' | '#' | '$' | '{' | '}' => {
-                text.push('\\');
-                text.push(c);
-            }
-            // Of the one letter that follows.
-            '√' => text.push_str(&format!(
-                "$\\sqrt{{{}}}$",
-                rest.next().map_or(String::new(), String::from)
-            )),
-            'Δ' => text.push_str("$\\Delta$"),
-            'λ' => text.push_str("$\\lambda$"),
-            'µ' | 'μ' => text.push_str("$\\mu$"),
-            'ℓ' => text.push_str("$\\ell$"),
-            '³' => text.push_str("$^{3}$"),
-            'χ' => text.push_str("$\\chi$"),
-            'ε' => text.push_str("$\\varepsilon$"),
-            'σ' => text.push_str("$\\sigma$"),
-            '±' => text.push_str("$\\pm$"),
-            '×' => text.push_str("$\\times$"),
-            '−' => text.push_str("$-$"),
-            '⁻' => text.push_str("$^{-}$"),
-            '⁴' => text.push_str("$^{4}$"),
-            other => text.push(other),
-        }
-    }
-    text.replace("$$", "")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -435,7 +405,7 @@ mod tests {
             table().render(TableFormat::Csv),
             "name,q,q_error\n\"a,b\",87.125,1.5\nc_d,,\n"
         );
-        assert_eq!(escape_latex("√A×10⁴"), "$\\sqrt{A}\\times$10$^{4}$");
+        assert_eq!(escape::latex("√A×10⁴"), "$\\sqrt{A}\\times$10$^{4}$");
         let columns = table().columns().unwrap();
         let names: Vec<&str> = columns.columns().iter().map(|(n, _)| n.as_str()).collect();
         assert_eq!(names, ["name", "q", "q_error"]);

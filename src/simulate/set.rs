@@ -4,12 +4,14 @@
 //! galaxy's place on the grid. What a galaxy is like therefore does not depend on the order or the
 //! thread in which it is drawn.
 
+use std::ops::RangeInclusive;
+
 use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rustfft::num_complex::Complex64;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{Grid, Shear, TrueShear};
 
@@ -34,8 +36,13 @@ const FWHM: f64 = 3.4;
 /// Range of S/N in the "smooth" sets, around which the distribution is cut.
 const SNR_RANGE: (f64, f64) = (10.0, 80.0);
 
-/// What a simulation is made from, beside the sets and images asked for.
+/// Galaxies a side that a simulated image may have.
+const SIDES: RangeInclusive<usize> = 8..=400;
+
+/// What a simulation is made from, beside the sets and images asked for. Wherever it is read from, it is
+/// checked by [`SimulationSettings::validate`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(remote = "Self", deny_unknown_fields)]
 pub struct SimulationSettings {
     /// Seed of all random streams.
     pub seed: u64,
@@ -45,6 +52,22 @@ pub struct SimulationSettings {
     pub spectrum: ShearSpectrum,
     /// Standard deviation of each component of the intrinsic ellipticities (shear-type).
     pub intrinsic_sigma: f64,
+}
+
+impl Serialize for SimulationSettings {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived one.
+        SimulationSettings::serialize(self, serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for SimulationSettings {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        // The derived one.
+        let settings = SimulationSettings::deserialize(deserializer)?;
+        settings.validate().map_err(serde::de::Error::custom)?;
+        Ok(settings)
+    }
 }
 
 /// What a random stream is for.
@@ -68,6 +91,38 @@ impl SimulationSettings {
             spectrum: ShearSpectrum::default(),
             intrinsic_sigma: INTRINSIC_SIGMA,
         }
+    }
+
+    /// Checks every value against its range.
+    ///
+    /// # Errors
+    /// A message with what was found and what was expected.
+    pub fn validate(&self) -> Result<(), String> {
+        let &SimulationSettings {
+            seed: _,
+            grid,
+            spectrum: ShearSpectrum { amplitude, tilt },
+            intrinsic_sigma,
+        } = self;
+        if !SIDES.contains(&grid) {
+            let (least, most) = (SIDES.start(), SIDES.end());
+            return Err(format!(
+                "the simulation has {grid} galaxies a side; expected {least} to {most}"
+            ));
+        }
+        for (what, value, least) in [
+            ("amplitude", amplitude, 0.0),
+            ("tilt", tilt, f64::MIN),
+            ("intrinsic_sigma", intrinsic_sigma, 0.0),
+        ] {
+            if !(value.is_finite() && value >= least) {
+                let sign = if least == 0.0 { ", not negative" } else { "" };
+                return Err(format!(
+                    "the simulation's {what} is {value}; expected a finite number{sign}"
+                ));
+            }
+        }
+        Ok(())
     }
 
     fn stream(&self, set: u32, image: u32, purpose: Purpose) -> ChaCha8Rng {

@@ -8,7 +8,7 @@ use shearq_scoring::{
     BINS, Convention, FieldSum, Figures, Noise, Options, Row, SetImages, SetScore, SetScorer,
     cross_spectrum,
 };
-use shearq_submissions::Submission;
+use shearq_submissions::{Submission, checked_name};
 
 use super::response::{Regression, Response};
 use crate::io::FileError;
@@ -62,6 +62,7 @@ impl<'a> Study<'a> {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Result {
     /// Submission's name.
+    #[serde(deserialize_with = "checked_name")]
     pub submission: String,
     /// Headline figures in the standard convention, leaderboard definition.
     pub figures: Figures,

@@ -14,6 +14,7 @@ use crate::deconvolve::{Network, Rule, Spectral, Step};
 use crate::denoise::{WaveletWiener, border_noise};
 use crate::fft::StampFft;
 use crate::io::FileError;
+use crate::io::atomic::{self, Scratch};
 use crate::io::table::{self, Column, Format, Table as Columns};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Quiet;
@@ -503,8 +504,7 @@ pub fn scaling(
 /// # Errors
 /// Where the files cannot be written or read.
 pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
-    let folder =
-        tempfile::tempdir().map_err(|error| FileError::new(std::env::temp_dir(), error))?;
+    let folder = Scratch::new()?;
     let side = 100;
     let position = |k: usize| (k as f64).mul_add(48.0, 24.5);
     let x: Vec<f64> = (0..side * side).map(|k| position(k % side)).collect();
@@ -525,7 +525,7 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
         text
     };
     let truth = folder.path().join("truth.csv");
-    crate::io::atomic::write(&truth, ascii("x,y,g1,g2\n", ",").as_bytes())?;
+    atomic::write(&truth, ascii("x,y,g1,g2\n", ",").as_bytes())?;
     let dat = ascii("", " ");
     let columns = || {
         let column = |name: &str, v: &[f64]| (name.to_owned(), Column::Real(v.to_vec()));
@@ -545,7 +545,7 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
         for k in 0..images {
             let path = folder.path().join(format!("{k}.{ending}"));
             match ending {
-                "dat" => crate::io::atomic::write(&path, dat.as_bytes())?,
+                "dat" => atomic::write(&path, dat.as_bytes())?,
                 _ => {
                     let kind = if ending == "fits" {
                         Format::Fits

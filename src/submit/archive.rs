@@ -11,7 +11,7 @@ use flate2::{Compression, GzBuilder};
 use tar::{Archive, Builder, Header};
 
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
-use crate::io::atomic::{PartFile, PartFolder};
+use crate::io::atomic::{PartFile, PartFolder, sweep_beside};
 use crate::io::open::open;
 use crate::io::{FileError, layout};
 
@@ -46,8 +46,8 @@ impl ArchiveWriter {
     /// # Errors
     /// Where the file cannot be made.
     pub fn create(path: &Path) -> Result<Self, FileError> {
-        let part = PartFile::new(path)?;
-        let file = File::create(part.path()).map_err(cannot_write(path))?;
+        sweep_beside(path);
+        let (part, file) = PartFile::create(path)?;
         // Neither the time nor the system of its making.
         let encoder = GzBuilder::new()
             .mtime(0)

@@ -11,7 +11,7 @@ use shearq_scoring::{
 use super::archive::{self, is_archive};
 use super::challenge::{Kind, SpectrumLine, read_spectrum};
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
-use crate::io::FileError;
+use crate::io::atomic::Scratch;
 use crate::io::layout::read_rows;
 use crate::pipeline::score::COLUMNS;
 
@@ -57,9 +57,8 @@ pub fn check(path: &Path, expected: &Expected) -> Vec<Finding> {
         return check_files(path, expected);
     }
     let mut report = Report::default();
-    let unpacked = tempfile::tempdir()
-        .map_err(|error| FileError::new(std::env::temp_dir(), error))
-        .and_then(|folder| archive::read(path, Some(folder.path())).map(|_| folder));
+    let unpacked =
+        Scratch::new().and_then(|folder| archive::read(path, Some(folder.path())).map(|_| folder));
     match unpacked {
         Err(error) => report.error(&error.path, "readable", error.message),
         Ok(folder) => {

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use shearq_scoring::{Distortion, FieldSum, Grid, Row, RowCounts, Shear};
-use shearq_submissions::EllipticityType;
+use shearq_submissions::{EllipticityType, checked_name};
 
 use crate::io::FileError;
 use crate::io::layout::{IMAGE_PLACEHOLDERS, MAX_IMAGE, check_pattern, fill};
@@ -32,6 +32,7 @@ use crate::pipeline::score::sum_foreign;
 #[serde(deny_unknown_fields)]
 pub struct Foreign {
     /// Name in tables.
+    #[serde(deserialize_with = "checked_name")]
     pub name: String,
     catalogues: String,
     ellipticity: EllipticityType,

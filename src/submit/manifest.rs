@@ -7,6 +7,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_scoring::SpectrumCovariance;
+use shearq_submissions::checked_name;
 
 use crate::io::run::{Run, read_record};
 use crate::io::{FileError, open};
@@ -33,6 +34,7 @@ pub struct Manifest {
     /// Version of shearq that packed it.
     pub version: String,
     /// Method's name in the file names.
+    #[serde(deserialize_with = "checked_name")]
     pub method: String,
     /// What the files hold.
     pub contents: Contents,

@@ -6,9 +6,11 @@
 //! or another file. Unknown keys, values out of range, unknown names and cycles are refused with the
 //! file and place.
 
+mod name;
 mod registry;
 mod settings;
 
+pub use name::{MAX_NAME, check_name, checked_name, is_control};
 pub use registry::{Entry, Published, Registry, SubmissionError, TEMPLATE};
 pub use settings::{
     AcfWeight, BrightnessUnit, Calibration, Deconvolution, Denoise, DenoiseMethod, EllipticityType,

@@ -129,16 +129,12 @@ pub enum SubmissionError {
         key: &'static str,
     },
     /// A value out of range.
-    #[error("{path}: `{key}` is {found}; expected {expected}")]
+    #[error("{path}: {message}")]
     Range {
         /// The file asked for.
         path: PathBuf,
-        /// The key.
-        key: &'static str,
-        /// Its value.
-        found: String,
-        /// The accepted range.
-        expected: &'static str,
+        /// The key, its value and the accepted range.
+        message: String,
     },
 }
 
@@ -279,12 +275,12 @@ impl Registry {
                     path: path.clone(),
                     key,
                 })?;
-        submission.validate().map_err(|e| SubmissionError::Range {
-            path,
-            key: e.key,
-            found: e.found,
-            expected: e.expected,
-        })?;
+        submission
+            .validate()
+            .map_err(|error| SubmissionError::Range {
+                path,
+                message: error.to_string(),
+            })?;
         Ok(Entry {
             submission,
             published,
@@ -388,6 +384,36 @@ mod tests {
             DenoiseMethod::WaveletWiener
         );
         assert_eq!(entry.published, None);
+    }
+
+    #[test]
+    fn settings_read_back_are_checked_like_those_of_a_file() {
+        let submission = Registry::embedded().unwrap().get("23/den/star").unwrap();
+        let good = toml::Table::try_from(&submission.submission).unwrap();
+        let read = |table: toml::Table| table.try_into::<Submission>().map_err(|e| e.to_string());
+        assert_eq!(read(good.clone()), Ok(submission.submission));
+        let spoilt = |section: &str, key: &str, value: toml::Value| {
+            let mut table = good.clone();
+            let place = match section {
+                "" => &mut table,
+                section => table[section].as_table_mut().unwrap(),
+            };
+            place.insert(key.into(), value);
+            read(table).unwrap_err()
+        };
+        let message = spoilt("denoise", "levels", 100_000_000.into());
+        assert!(
+            message.contains("`denoise.levels` is 100000000; expected 1 to 4"),
+            "{message}"
+        );
+        let message = spoilt("denoise", "strength", (-1.0).into());
+        assert!(
+            message.contains("`denoise.strength` is -1; expected a positive"),
+            "{message}"
+        );
+        assert!(spoilt("denoise", "levles", 2.into()).contains("unknown field `levles`"));
+        assert!(spoilt("", "name", "a\nb".into()).contains("without control characters"));
+        assert!(spoilt("", "name", "x".repeat(101).into()).contains("101 bytes"));
     }
 
     #[test]

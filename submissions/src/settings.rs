@@ -3,7 +3,9 @@
 //! Each section exists twice: complete, as the pipeline takes it, and partial, as one file of an
 //! inheritance chain gives it. One macro writes both, so that a field cannot be forgotten in one.
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+use crate::name;
 
 /// Declares a section's complete and partial structs, and how one is made of the other.
 macro_rules! section {
@@ -12,6 +14,7 @@ macro_rules! section {
     }) => {
         $(#[$doc])*
         #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields)]
         pub struct $name {
             $($(#[$field_doc])* pub $field: $type,)*
         }
@@ -238,8 +241,10 @@ pub enum EllipticityType {
     Shear,
 }
 
-/// Every setting of a submission, resolved.
+/// Every setting of a submission, resolved. Wherever they are read from, they are checked against their
+/// ranges.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(remote = "Self", deny_unknown_fields)]
 pub struct Submission {
     /// Name, as tables print it.
     pub name: String,
@@ -257,6 +262,22 @@ pub struct Submission {
     pub deconvolution: Deconvolution,
     /// Shape measurement.
     pub shape: Shape,
+}
+
+impl Serialize for Submission {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived one.
+        Submission::serialize(self, serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for Submission {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        // The derived one.
+        let submission = Submission::deserialize(deserializer)?;
+        submission.validate().map_err(serde::de::Error::custom)?;
+        Ok(submission)
+    }
 }
 
 /// The sections of one file, none of which must be complete.
@@ -320,6 +341,8 @@ fn need(
 }
 
 /// A value that is out of range.
+#[derive(Debug, thiserror::Error)]
+#[error("`{key}` is {found}; expected {expected}")]
 pub(crate) struct OutOfRange {
     pub(crate) key: &'static str,
     pub(crate) found: String,
@@ -330,7 +353,7 @@ impl Submission {
     /// Checks every value against its range.
     pub(crate) fn validate(&self) -> Result<(), OutOfRange> {
         let Submission {
-            name: _,
+            name,
             description: _,
             stamp,
             psf,
@@ -361,6 +384,13 @@ impl Submission {
                 })
             }
         };
+        if name::check_name(name).is_err() {
+            return Err(OutOfRange {
+                key: "name",
+                found: name::shown(name),
+                expected: name::EXPECTED,
+            });
+        }
         whole("stamp.size", stamp.size, 5, 64, "5 to 64 pixels")?;
         whole("psf.size", psf.size, 3, 48, "3 to 48 pixels")?;
         whole("noise.border", noise.border, 1, 16, "1 to 16 pixels")?;

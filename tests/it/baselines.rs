@@ -125,3 +125,183 @@ fn a_changed_digit_and_a_changed_setting_are_seen_and_an_update_keeps_the_reason
     let table: Value = serde_json::from_str(&succeed(&other)).unwrap();
     assert!(table["notes"].to_string().contains("not the baseline's"));
 }
+
+/// Two small runs on data of other seeds, and a folder for baselines.
+fn two_runs(root: &Path) -> [std::path::PathBuf; 3] {
+    let at = |name: &str| root.join(name);
+    for (seed, out) in [("1", "one"), ("2", "two")] {
+        run_simulated("2", "23/raw/star", &at(out), &["--seed", seed]);
+    }
+    [at("one"), at("two"), at("baselines")]
+}
+
+#[test]
+fn of_two_that_record_one_baseline_one_fails() {
+    let root = tempfile::tempdir().unwrap();
+    let [one, two, folder] = two_runs(root.path());
+    for _ in 0..5 {
+        let _ = fs::remove_dir_all(&folder);
+        let start = |measured: &Path| {
+            std::process::Command::new(env!("CARGO_BIN_EXE_shearq"))
+                .args(["baseline", "record", "mine", "--folder", text(&folder)])
+                .args(["--measured", text(measured)])
+                .stderr(std::process::Stdio::piped())
+                .spawn()
+                .unwrap()
+        };
+        let outputs = [start(&one), start(&two)].map(|child| child.wait_with_output().unwrap());
+        let codes = outputs.each_ref().map(|output| output.status.code());
+        assert!(
+            codes == [Some(0), Some(1)] || codes == [Some(1), Some(0)],
+            "{codes:?}"
+        );
+        let (won, lost) = if codes[0] == Some(0) { (0, 1) } else { (1, 0) };
+        let said = String::from_utf8_lossy(&outputs[lost].stderr);
+        assert!(said.contains("the baseline exists"), "{said}");
+        let kept: toml::Table = fs::read_to_string(folder.join("mine.toml"))
+            .unwrap()
+            .parse()
+            .unwrap();
+        let seed = kept["source"]["simulated"]["seed"].as_integer();
+        assert_eq!(seed, Some(won as i64 + 1));
+    }
+}
+
+#[test]
+fn settings_of_a_baseline_are_checked_like_those_of_a_submission() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let (own, out, folder) = (at("own.toml"), at("out"), at("baselines"));
+    fs::write(&own, "extends = \"23/den/star\"\n").unwrap();
+    run_simulated("2", text(&own), &out, &[]);
+    succeed(&[
+        "baseline",
+        "record",
+        "mine",
+        "--folder",
+        text(&folder),
+        "--measured",
+        text(&out),
+    ]);
+    let path = folder.join("mine.toml");
+    let sound = fs::read_to_string(&path).unwrap();
+    let check = ["baseline", "check", "--folder", text(&folder)];
+    succeed(&check);
+    for (section, key, value, expected) in [
+        (
+            "denoise",
+            "levels",
+            toml::Value::from(100_000_000),
+            "`denoise.levels` is 100000000; expected 1 to 4",
+        ),
+        (
+            "denoise",
+            "strength",
+            (-1.0).into(),
+            "`denoise.strength` is -1; expected a positive number",
+        ),
+        ("denoise", "levles", 2.into(), "unknown field `levles`"),
+        ("shape", "acf_share", 2.0.into(), "`shape.acf_share` is 2"),
+    ] {
+        let mut edited: toml::Table = sound.parse().unwrap();
+        let settings = &mut edited["submissions"][0]["settings"][section];
+        settings.as_table_mut().unwrap().insert(key.into(), value);
+        fs::write(&path, toml::to_string(&edited).unwrap()).unwrap();
+        let message = fail(&check);
+        assert!(
+            message.contains("mine.toml") && message.contains(expected),
+            "{message}"
+        );
+    }
+    for (key, value, expected) in [
+        (
+            "grid",
+            toml::Value::from(1_000_000),
+            "1000000 galaxies a side; expected 8 to 400",
+        ),
+        ("intrinsic_sigma", f64::NAN.into(), "intrinsic_sigma is NaN"),
+    ] {
+        let mut edited: toml::Table = sound.parse().unwrap();
+        let settings = edited["source"]["simulated"].as_table_mut().unwrap();
+        settings.insert(key.into(), value);
+        fs::write(&path, toml::to_string(&edited).unwrap()).unwrap();
+        let message = fail(&check);
+        assert!(
+            message.contains("mine.toml") && message.contains(expected),
+            "{message}"
+        );
+    }
+    // What is kept with catalogues goes the same way.
+    let record = out.join("run.json");
+    let spoilt = fs::read_to_string(&record)
+        .unwrap()
+        .replace("\"levels\": ", "\"levels\": 90");
+    fs::write(&record, spoilt).unwrap();
+    let message = fail(&["score", "--measured", text(&out)]);
+    assert!(
+        message.contains("run.json") && message.contains("expected 1 to 4"),
+        "{message}"
+    );
+}
+
+#[test]
+fn a_baseline_of_a_data_folder_has_the_images_asked_for() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let (data, folder) = (at("data"), at("baselines"));
+    let simulate = |images: &str| {
+        let simulate = [
+            "simulate", "--sets", "2,5", "--grid", "8", "--images", images,
+        ];
+        succeed(&[&simulate[..], &["--out", text(&data)]].concat());
+    };
+    simulate("3");
+    let record = |name: &str, more: &[&str]| {
+        let record = [
+            "baseline",
+            "record",
+            name,
+            "--folder",
+            text(&folder),
+            "--data",
+            text(&data),
+        ];
+        succeed(&[&record[..], &["--submission", "23/raw/star"], more].concat());
+        let text = fs::read_to_string(folder.join(format!("{name}.toml"))).unwrap();
+        let baseline: toml::Table = text.parse().unwrap();
+        let sets = baseline["submissions"][0]["sets"].as_array().unwrap();
+        sets.iter()
+            .map(|set| {
+                (
+                    set["set"].as_integer().unwrap(),
+                    set["images"].as_array().unwrap().len(),
+                )
+            })
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(record("all", &[]), [(2, 3), (5, 3)]);
+    assert_eq!(record("some", &["--images", "2", "--sets", "5"]), [(5, 2)]);
+    // As many are measured again, whatever was added, wherever the command is given.
+    simulate("4");
+    let check = [
+        "baseline",
+        "check",
+        "some",
+        "--folder",
+        text(&folder),
+        "--format",
+        "json",
+    ];
+    let table: Value = serde_json::from_str(&succeed(&check)).unwrap();
+    assert!(
+        !table["notes"].to_string().contains("not the baseline's"),
+        "{table}"
+    );
+    assert!(
+        table["rows"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .all(|row| row["difference"] == 0.0)
+    );
+}

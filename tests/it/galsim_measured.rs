@@ -45,7 +45,7 @@ fn measured_ellipticities_follow_the_truth() {
     for name in registry.names() {
         let run = Run {
             version: "test".into(),
-            source: Source::folder(&data),
+            source: Source::folder(&data, out.path()).unwrap(),
             submission: registry.get(name).unwrap().submission,
             format: Format::Fits,
         };

@@ -73,15 +73,100 @@ fn kill(command: &[&str], whole: &Path, kills: usize, seed: u64) {
     eprintln!("{}: {done} kills within {length:.2?}", command[0]);
 }
 
+#[test]
+fn what_killed_commands_leave_is_removed_by_the_next() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let (measured, archive) = (at("measured"), at("whole.tar.gz"));
+    let sets = ["--sets", "1,7", "--images", "20", "--grid", "16"];
+    let run = [
+        "run",
+        "--simulate",
+        "--submission",
+        "23/raw/star",
+        "--out",
+        text(&measured),
+    ];
+    succeed(&[&run[..], &sets].concat());
+    succeed(&[
+        "pack",
+        "--measured",
+        text(&measured),
+        "--out",
+        text(&archive),
+    ]);
+    let pack = ["pack", "--measured", text(&measured), "--out"];
+    let unpack = ["unpack", text(&archive), "--out"];
+    let store = ["score", "--measured", text(&measured), "--store"];
+    let record = [
+        "baseline",
+        "record",
+        "mine",
+        "--simulate",
+        "--submission",
+        "23/raw/star",
+    ];
+    let record = [&record[..], &sets, &["--folder"]].concat();
+    // With what is taken away so that the command can run again.
+    for (command, out, made) in [
+        (&pack[..], "sent", "sent"),
+        (&pack, "sent.tar.gz", "sent.tar.gz"),
+        (&unpack, "unpacked", "unpacked"),
+        (&store, "store", "nothing"),
+        (&record, "baselines", "baselines/mine.toml"),
+    ] {
+        let place = tempfile::tempdir().unwrap();
+        let temporary = place.path().join("tmp");
+        std::fs::create_dir(&temporary).unwrap();
+        let (out, made) = (place.path().join(out), place.path().join(made));
+        let arguments = [command, &[text(&out)]].concat();
+        let run = |delay| {
+            let _ = std::fs::remove_dir_all(&made);
+            let _ = std::fs::remove_file(&made);
+            ends_within(&arguments, delay, &temporary)
+        };
+        let start = Instant::now();
+        assert!(run(Duration::MAX));
+        let length = start.elapsed();
+        let mut moments = ChaCha8Rng::seed_from_u64(4);
+        let kills = (0..KILLS).filter(|_| !run(length.mul_f64(moments.random())));
+        eprintln!(
+            "{}: {} kills within {length:.2?}",
+            command[0],
+            kills.count()
+        );
+        assert!(run(Duration::MAX));
+        for folder in [place.path(), &temporary, &out] {
+            let names = std::fs::read_dir(folder).into_iter().flatten();
+            let names = names.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+            let left: Vec<String> = names.filter(|name| name.starts_with('.')).collect();
+            assert!(
+                left.is_empty(),
+                "{command:?}: {left:?} in {}",
+                folder.display()
+            );
+        }
+    }
+}
+
 /// Whether the command ends, with success, before it is killed after `delay`.
 fn ends_before(arguments: &[&str], delay: Duration) -> bool {
+    ends_within(arguments, delay, &std::env::temp_dir())
+}
+
+/// The same with another folder for what is temporary.
+fn ends_within(arguments: &[&str], delay: Duration, temporary: &Path) -> bool {
     let mut child = Command::new(env!("CARGO_BIN_EXE_shearq"))
         .args(arguments)
+        .env("TMPDIR", temporary)
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
         .expect("the binary starts");
-    std::thread::sleep(delay);
+    let start = Instant::now();
+    while start.elapsed() < delay && child.try_wait().expect("one's own child").is_none() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
     // On Unix this is SIGKILL; of a process that has ended already it does nothing.
     child.kill().expect("one's own child can be killed");
     let status = child.wait().expect("one's own child can be waited for");

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::{Figure, Figures};
+use shearq_submissions::check_name;
 use shearq_tables::{Column, Table, TableError, read_parquet, write_parquet};
 
 use super::{RunRecord, SetRecord, Value};
@@ -16,7 +17,10 @@ use crate::io::parquet::bare;
 const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");
 
 pub fn prepare(store: &Path) -> Result<(), FileError> {
-    std::fs::create_dir_all(store).map_err(FileError::doing(store, "cannot make the results store"))
+    std::fs::create_dir_all(store)
+        .map_err(FileError::doing(store, "cannot make the results store"))?;
+    atomic::sweep(store);
+    Ok(())
 }
 
 pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
@@ -83,8 +87,10 @@ pub fn read(path: &Path) -> Result<RunRecord, FileError> {
         table: &table,
     };
     let text = |name| rows.text(name, 0).map(str::to_owned);
+    let submission = text("submission")?;
+    check_name(&submission).map_err(|message| FileError::new(path, message))?;
     let run = RunRecord {
-        submission: text("submission")?,
+        submission,
         version: text("version")?,
         settings: text("settings")?,
         source: text("source")?,

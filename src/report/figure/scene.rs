@@ -12,6 +12,7 @@ use plotters::style::{
 
 use super::FigureError;
 use super::colour::{Rgb, WHITE};
+use crate::report::escape::line;
 use crate::report::font;
 
 /// Backend pixels per point.
@@ -169,7 +170,7 @@ impl Scene {
         upwards: bool,
     ) {
         if !text.is_empty() {
-            let text = text.to_owned();
+            let text = line(text);
             self.shapes.push(Shape::Text {
                 baseline,
                 text,
