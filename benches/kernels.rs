@@ -3,20 +3,19 @@
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
-use shearq::deconvolve::{Network, Rule, Spectral, Step};
-use shearq::denoise::WaveletWiener;
-use shearq::pipeline::galaxy::Measurer;
-use shearq::pipeline::measure::functional_psf;
-use shearq::psf::functional::{FunctionalPsf, PsfProfile};
-use shearq::shape::{AdaptiveMoments, Autocorrelation};
+use ndarray::ArrayView2;
 use shearq_benches::{stamp, submission};
+use shearq_measure::parts::{
+    AdaptiveMoments, Autocorrelation, Network, Rule, Spectral, Step, WaveletWiener,
+};
+use shearq_measure::{FunctionalPsf, Measurer, PsfProfile};
 use shearq_scoring::Shear;
 use shearq_submissions::Start;
 
 fn moffat(size: usize) -> ndarray::Array2<f64> {
     let profile = PsfProfile::Moffat { beta: 3.0 };
     let psf = FunctionalPsf::new(profile, 3.4, Shear::new(0.02, -0.015)).expect("a valid PSF");
-    functional_psf(&psf, size)
+    psf.stamp(size)
 }
 
 fn network(c: &mut Criterion) {
@@ -53,10 +52,11 @@ fn autocorrelation(c: &mut Criterion) {
 }
 
 fn denoise(c: &mut Criterion) {
-    let settings = submission("23/den/star").denoise;
+    let submission = submission("23/den/star");
+    let settings = submission.wavelet().expect("a denoised submission");
     let mut group = c.benchmark_group("denoise");
     for n in [24, 48] {
-        let filter = WaveletWiener::new(n, &settings);
+        let filter = WaveletWiener::new(n, settings);
         let mut scratch = filter.scratch();
         let data = stamp(n);
         let mut work = data.clone();
@@ -72,7 +72,8 @@ fn denoise(c: &mut Criterion) {
 
 fn linear(c: &mut Criterion) {
     let submission = submission("48/linear/star");
-    let settings = &submission.deconvolution;
+    let method = submission.linear().expect("a linear submission");
+    let settings = &method.deconvolution;
     let mut group = c.benchmark_group("linear");
     for n in [32, 40, 48] {
         let plan = Spectral::new(n, n, settings).expect("valid sizes");
@@ -92,7 +93,7 @@ fn linear(c: &mut Criterion) {
         });
     }
     let reach = 10;
-    let moments = AdaptiveMoments::new(submission.shape.weight_scale, 2.0, reach);
+    let moments = AdaptiveMoments::new(method.shape.weight_scale, 2.0, reach);
     let side = 2 * reach + 1;
     let acf: Vec<f32> = (0..side * (reach + 1))
         .map(|k| {
@@ -117,11 +118,14 @@ fn galaxy(c: &mut Criterion) {
     ] {
         let submission = submission(name);
         let measurer = Measurer::new(&submission, 48).expect("a valid submission");
-        let mut scratch = measurer.scratch();
-        measurer.set_psf(&mut scratch, Some(moffat(submission.psf.size).view()));
+        let mut worker = measurer.worker();
+        worker
+            .set_psf(moffat(submission.psf.size).view())
+            .expect("a valid PSF");
         let data = stamp(48);
+        let data = ArrayView2::from_shape((48, 48), &data).expect("a full stamp");
         group.bench_function(name, |b| {
-            b.iter(|| measurer.measure(black_box(&data), 48, Some(1.0), &mut scratch));
+            b.iter(|| worker.measure(black_box(data), Some(1.0)));
         });
     }
     group.finish();

@@ -4,14 +4,13 @@
 //!
 //! # Where things are
 //!
-//! * [`deconvolve`], [`denoise`], [`shape`], [`psf`]: the method, one galaxy at a time.
 //! * [`simulate`]: GREAT10-like sets.
 //! * [`io`]: files; [`pipeline`]: the chain over many galaxies; [`report`]: tables and figures.
 //! * [`study`]: the paper's calibration of λ and its results on 24 sets; biases, bounds and speed.
 //! * [`submit`]: challenge files, other programs' catalogues, checks.
 //! * [`cli`]: the command line; nothing else knows it.
-//! * The crates `shearq-scoring` (spectra and figures of merit), `shearq-submissions` (settings) and
-//!   `shearq-tables` (Parquet) stand below this one.
+//! * The crates `shearq-measure` (stamps and PSFs into ellipticities), `shearq-scoring` (spectra and figures
+//!   of merit), `shearq-submissions` (settings) and `shearq-tables` (Parquet) stand below this one.
 //!
 //! # Conventions
 //!
@@ -20,15 +19,9 @@
 //! Ellipticity types, FFT scaling and units of spectra are stated in `shearq-scoring`.
 
 pub mod cli;
-pub mod deconvolve;
-pub mod denoise;
-mod fft;
 pub mod io;
 pub mod pipeline;
-pub mod psf;
-mod radial;
 pub mod report;
-pub mod shape;
 pub mod simulate;
 pub mod study;
 pub mod submit;

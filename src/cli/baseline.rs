@@ -17,8 +17,13 @@ use crate::pipeline::baseline::{Wanted, figures_of, measure, settings_moved, shi
 use crate::report::baseline::{Checked, junit, shift_table};
 use crate::report::table::TableFormat;
 
-/// The submission that all others rest on.
-const BASE: &str = "paper";
+/// The submission that those with the method of `settings` rest on.
+fn base_of(settings: &toml::Table) -> &'static str {
+    match settings.get("method").and_then(toml::Value::as_str) {
+        Some("linear") => "48/linear/star",
+        _ => "paper",
+    }
+}
 
 /// Keep figures as baselines, and see later whether they moved.
 ///
@@ -341,7 +346,7 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
         let submission = if registry.names().contains(&before.name) {
             registry.get(&before.name)?.submission
         } else {
-            let base = registry.get(BASE)?.submission;
+            let base = registry.get(base_of(&before.settings))?.submission;
             with_defaults(&before.settings, &base)
                 .with_context(|| format!("{}: settings of {}", path.display(), before.name))?
         };

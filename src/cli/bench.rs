@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use shearq_submissions::{Registry, Submission, Update};
+use shearq_submissions::{Registry, Submission};
 
 use super::arguments::{Form, Threads};
 use super::print;
@@ -102,7 +102,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         );
     }
     for submission in &submissions {
-        if submission.deconvolution.update == Update::Linear {
+        if submission.linear().is_some() {
             continue;
         }
         let name = format!("energy-{}", submission.name.replace('/', "-"));

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
-use shearq_submissions::{Registry, Update};
+use shearq_submissions::Registry;
 
 use super::arguments::{Form, Threads};
 use super::progress::Bar;
@@ -41,8 +41,8 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let submission = Registry::embedded()?.get(&arguments.submission)?.submission;
     anyhow::ensure!(
-        submission.deconvolution.update != Update::Linear,
-        "{} has update = \"linear\"; λ is calibrated for the adaptive and the constant update",
+        submission.network().is_some(),
+        "{} has method = \"linear\"; λ is calibrated for the network's adaptive and constant update",
         submission.name
     );
     if let Some(out) = &arguments.out {

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
+use shearq_measure::Flag;
 use shearq_submissions::Registry;
 
 use super::arguments::{SetList, Sharding, Threads};
@@ -12,7 +13,6 @@ use super::{count, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
-use crate::pipeline::galaxy::flag;
 use crate::pipeline::images::{self, ImageId};
 use crate::pipeline::measure::{Summary, galaxies_to_do, measure_folder};
 
@@ -109,9 +109,9 @@ pub(super) fn report(run: &Run, summary: &Summary, elapsed: Duration, threads: u
         let reasons: Vec<String> = summary
             .flags
             .iter()
-            .zip(flag::MEANINGS)
+            .zip(Flag::ALL)
             .filter(|(count, _)| **count > 0)
-            .map(|(count, (_, meaning))| format!("{meaning} ({count})"))
+            .map(|(count, flag)| format!("{flag} ({count})"))
             .collect();
         tell(format_args!("flagged: {}", reasons.join(", ")));
     }

@@ -5,12 +5,12 @@ use std::str::FromStr;
 
 use anyhow::Context;
 use clap::Args;
+use ndarray::Axis;
+use shearq_measure::{Measurement, Measurer, Stop, strip};
 use shearq_submissions::Registry;
 
 use super::{print, tell};
-use crate::deconvolve::Stop;
 use crate::io::layout::DataFolder;
-use crate::pipeline::galaxy::{Measurement, Measurer};
 use crate::pipeline::images::ImageId;
 use crate::pipeline::measure::{ImageSource, psf_of};
 use crate::report::figure::{Figure, Format};
@@ -91,18 +91,17 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         };
         let psf = psf_of(&row, ix, submission.psf.size)
             .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
-        let measurer = Measurer::new(&submission, row.stamp)?;
-        let mut scratch = measurer.scratch();
-        measurer.set_psf(&mut scratch, Some(psf.view()));
-        let pixels = &row.pixels[ix * row.stamp..];
-        let stride = grid.n * row.stamp;
-        let measured = measurer.measure(pixels, stride, row.header_noise, &mut scratch);
+        let mut worker = Measurer::new(&submission, row.stamp)?.worker();
+        worker.set_psf(psf.view())?;
+        let stamps = strip(&row.pixels, grid.n, row.stamp)?;
+        let stamp = stamps.index_axis(Axis(0), ix);
+        let measured = worker.measure(stamp, row.header_noise)?;
         anyhow::ensure!(
-            measured.outcome.is_some(),
-            "galaxy {index} could not be measured: flag {}",
-            measured.flag
+            measured.descent.is_some(),
+            "galaxy {index} could not be measured: {}",
+            measured.flags
         );
-        let steps = measurer.steps(pixels, stride, psf.view(), &measured, &mut scratch);
+        let steps = worker.steps(stamp, psf.view(), &measured)?;
         let label = format!("{}/{}/{index}", image.set, image.image);
         rows.push(steps_row(&label, psf, steps));
         print(&format!("{}\n", describe(image, index, &measured)))?;
@@ -113,18 +112,24 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 }
 
 fn describe(id: ImageId, index: usize, m: &Measurement) -> String {
-    let stop = m.outcome.map_or_else(String::new, |o| {
-        let ended = match o.stop {
+    let stop = m.descent.map_or_else(String::new, |d| {
+        let ended = match d.stop {
             // The closed form has no energy to follow.
-            _ if o.energy.is_nan() => "in closed form",
+            _ if d.energy.is_nan() => "in closed form",
             Stop::Stable => "until no neuron was to be updated",
             Stop::EnergyRise => "until the energy fell no more",
             Stop::MaxIterations => "as many as allowed",
         };
-        format!("{} iterations ({ended})", o.iterations)
+        format!("{} iterations ({ended})", d.iterations)
     });
     format!(
         "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4}, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",
-        id.set, id.image, m.e1, m.e2, m.flag, m.noise, m.radius
+        id.set,
+        id.image,
+        m.e1,
+        m.e2,
+        m.flags.bits(),
+        m.noise,
+        m.radius
     )
 }

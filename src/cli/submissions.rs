@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Subcommand};
-use shearq_submissions::{DenoiseMethod, PsfForm, Registry, TEMPLATE};
+use clap::{Args, Subcommand, ValueEnum};
+use shearq_submissions::{PsfForm, Registry, Template};
 
 use super::{print, tell};
 use crate::io::atomic;
@@ -35,7 +35,19 @@ enum Command {
         /// File to write; it must not exist.
         #[arg(value_name = "FILE")]
         file: PathBuf,
+        /// Method whose settings it has.
+        #[arg(long, value_enum, default_value_t = Method::Network)]
+        method: Method,
     },
+}
+
+/// A method to start with.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Method {
+    /// The Hopfield network of the paper.
+    Network,
+    /// The linear network in closed form.
+    Linear,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -49,9 +61,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             }
             print(&text)
         }
-        Command::Init { file } => {
+        Command::Init { file, method } => {
+            let template = match method {
+                Method::Network => Template::Network,
+                Method::Linear => Template::Linear,
+            };
             anyhow::ensure!(
-                atomic::write_if_absent(file, template().as_bytes())?,
+                atomic::write_if_absent(file, template.text()?.as_bytes())?,
                 "{}: the file exists; expected a new one",
                 file.display()
             );
@@ -59,17 +75,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             Ok(())
         }
     }
-}
-
-/// The base's commented settings as a file of the user's, to be changed or thinned out.
-fn template() -> String {
-    let rest = TEMPLATE
-        .lines()
-        .filter(|line| !line.starts_with("name =") && !line.starts_with("description ="))
-        .collect::<Vec<_>>()
-        .join("\n");
-    let (comments, sections) = rest.split_once("\n\n").unwrap_or(("", &rest));
-    format!("{comments}\nextends = \"paper\"\ndescription = \"my own variant\"\n\n{sections}\n")
 }
 
 fn list() -> anyhow::Result<Table> {
@@ -84,9 +89,9 @@ fn list() -> anyhow::Result<Table> {
         rows.push(vec![
             Cell::text(name),
             Cell::text(format!("{0}×{0}", s.stamp.size)),
-            Cell::text(match s.denoise.method {
-                DenoiseMethod::None => "raw",
-                DenoiseMethod::WaveletWiener => "denoised",
+            Cell::text(match s.wavelet() {
+                None => "raw",
+                Some(_) => "denoised",
             }),
             Cell::text(match s.psf.form {
                 PsfForm::Star => "star",

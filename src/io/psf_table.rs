@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
+use shearq_measure::{FunctionalPsf, PsfProfile};
 use shearq_scoring::{Grid, Shear};
 
 use super::atomic;
 use super::error::FileError;
 use super::open;
-use crate::psf::functional::{FunctionalPsf, PsfProfile};
 
 /// Header of the table.
 const HEADER: &str = "x,y,profile,beta,fwhm,e1,e2";

@@ -51,7 +51,7 @@ impl<I> Feeder<'_, I> {
 }
 
 /// What became of an item; a panic is handed on to the calling thread.
-type Outcome<O> = Result<Result<O, PipelineError>, Box<dyn Any + Send>>;
+type Done<O> = Result<Result<O, PipelineError>, Box<dyn Any + Send>>;
 
 /// Runs `read` on a thread of its own, `work` on `threads` workers, each with a scratch of its own,
 /// and `write` on the calling thread, in the order of reading.
@@ -77,7 +77,7 @@ where
         .build()?;
     let capacity = IN_FLIGHT * threads;
     let (item_sender, item_receiver) = sync_channel::<(u64, I)>(capacity);
-    let (result_sender, result_receiver) = sync_channel::<(u64, Outcome<O>)>(capacity);
+    let (result_sender, result_receiver) = sync_channel::<(u64, Done<O>)>(capacity);
     let (permit_sender, permit_receiver) = sync_channel::<()>(capacity);
     for _ in 0..capacity {
         // The channel was just made with room for all of them.
@@ -130,10 +130,10 @@ where
 
 /// Writes results in order as they come.
 fn collect<O>(
-    results: &Receiver<(u64, Outcome<O>)>,
+    results: &Receiver<(u64, Done<O>)>,
     permits: &SyncSender<()>,
     write: &mut impl FnMut(O) -> Result<(), PipelineError>,
-) -> Outcome<()> {
+) -> Done<()> {
     let mut early = BTreeMap::new();
     let mut next = 0;
     for (number, result) in results {

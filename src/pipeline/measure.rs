@@ -4,15 +4,16 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, ArrayView2, Axis};
+use shearq_measure::{
+    Flag, FunctionalPsf, Measurement, Measurer, Psfs, Worker, calibrate, star_psf, strip,
+};
 use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_submissions::{EllipticityType, NoiseSource, PsfForm, Submission};
 
 use super::PipelineError;
-use super::calibrate::calibrate;
 use super::engine::{self, Feeder, Progress};
-use super::galaxy::{Measurement, Measurer, flag};
 use super::images::ImageId;
 use super::inputs::Inputs;
 use crate::io::FileError;
@@ -21,8 +22,6 @@ use crate::io::layout::{DataFolder, MAX_STAMP};
 use crate::io::psf_table;
 use crate::io::run::{RUN_FILE, Run, claim};
 use crate::io::table::{self, Column, Table};
-use crate::psf::functional::FunctionalPsf;
-use crate::psf::star::{StarError, star_psf};
 
 /// Most pixels of a row of stamps, several of which are in memory at a time: those of the largest grid of
 /// stamps of the challenge's size and somewhat more.
@@ -73,6 +72,18 @@ pub struct MeasuredRow {
     pub galaxies: Vec<Measurement>,
 }
 
+impl AsRef<[Measurement]> for MeasuredRow {
+    fn as_ref(&self) -> &[Measurement] {
+        &self.galaxies
+    }
+}
+
+impl AsMut<[Measurement]> for MeasuredRow {
+    fn as_mut(&mut self) -> &mut [Measurement] {
+        &mut self.galaxies
+    }
+}
+
 /// An open image with its PSFs.
 pub struct ImageSource {
     id: ImageId,
@@ -104,7 +115,7 @@ impl ImageSource {
         submission: &Submission,
     ) -> Result<Self, PipelineError> {
         let (image, grid, stamp) = open_galaxies(data, id)?;
-        if !Measurer::fits(submission, stamp) {
+        if stamp < submission.stamp.size {
             return Err(FileError::new(
                 data.galaxies(id.set, id.image),
                 format!(
@@ -115,7 +126,7 @@ impl ImageSource {
             .into());
         }
         let header_noise = image.number("NOISESIG")?;
-        if submission.noise.source == NoiseSource::Header
+        if submission.noise == NoiseSource::Header
             && !header_noise.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite())
         {
             let found = header_noise.map_or("absent".into(), |sigma| sigma.to_string());
@@ -249,7 +260,17 @@ fn open_psf(
                 return Err(FileError::new(&path, message).into());
             }
             Ok(match rows.as_slice() {
-                [psf] => PsfSource::Shared(Arc::new(functional_psf(psf, size))),
+                [psf] => {
+                    let stamp = psf.stamp(size);
+                    if stamp.iter().any(|value| !value.is_finite()) {
+                        let message = format!(
+                            "a PSF with a FWHM of {} px has no light on its stamp; expected a width of about a pixel or more",
+                            psf.fwhm
+                        );
+                        return Err(FileError::new(&path, message).into());
+                    }
+                    PsfSource::Shared(Arc::new(stamp))
+                }
                 _ => PsfSource::Functional(rows),
             })
         }
@@ -272,11 +293,9 @@ fn open_psf(
                 None => width,
             };
             if side < size {
-                let error = StarError::TooSmall {
-                    found: side,
-                    wanted: size,
-                };
-                return Err(FileError::new(&path, error).into());
+                let message =
+                    format!("the PSF stamp has {side} pixels a side; the submission needs {size}");
+                return Err(FileError::new(&path, message).into());
             }
             if side != width && side * n == width {
                 check_strip(&path, n, side)?;
@@ -301,73 +320,45 @@ fn open_psf(
     }
 }
 
-/// A functional PSF on its p×p stamp, centred on the pixel (odd p) or corner (even p) in the middle,
-/// normalised to a sum of one.
-pub fn functional_psf(psf: &FunctionalPsf, size: usize) -> Array2<f64> {
-    let mut stamp = Array2::zeros((size, size));
-    let centre = (size as f64 - 1.0) / 2.0;
-    psf.draw_into(centre, centre, stamp.view_mut());
-    let sum = stamp.sum();
-    stamp / sum
-}
-
-/// Measures every galaxy of a row with a thread's scratch.
-pub fn measure_row(
-    measurer: &Measurer,
-    scratch: &mut super::galaxy::MeasureScratch,
-    row: &StampRow,
-) -> MeasuredRow {
-    let n = row.grid.n;
-    let stride = n * row.stamp;
-    let size = measurer.submission().psf.size;
-    if let RowPsf::Shared(psf) = &row.psf {
-        measurer.set_psf(scratch, Some(psf.view()));
-    }
-    let galaxies = (0..n)
-        .map(|ix| {
-            match &row.psf {
-                RowPsf::Shared(_) => {}
-                RowPsf::Stars { pixels, side } => {
-                    let star = star_of(pixels, n, *side, ix);
-                    let psf = star.and_then(|star| star_psf(star, size).ok());
-                    measurer.set_psf(scratch, psf.as_ref().map(|psf| psf.view()));
-                }
-                RowPsf::Functional(field) => {
-                    let psf = functional_psf(&field[ix], size);
-                    measurer.set_psf(scratch, Some(psf.view()));
-                }
-            }
-            measurer.measure(
-                &row.pixels[ix * row.stamp..],
-                stride,
-                row.header_noise,
-                scratch,
-            )
-        })
-        .collect();
-    MeasuredRow {
+/// Measures every galaxy of a row, before any calibration.
+///
+/// # Errors
+/// Where the row's stamps have other sizes than planned.
+pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, PipelineError> {
+    let (n, noise) = (row.grid.n, row.header_noise);
+    let stamps = strip(&row.pixels, n, row.stamp)?;
+    let galaxies = match &row.psf {
+        RowPsf::Shared(psf) => {
+            worker.measure_each(stamps, Psfs::<f32>::Prepared(psf.view()), noise)
+        }
+        RowPsf::Stars { pixels, side } => {
+            worker.measure_each(stamps, Psfs::Stars(strip(pixels, n, *side)?), noise)
+        }
+        RowPsf::Functional(field) => {
+            worker.measure_each(stamps, Psfs::<f32>::Functional(field), noise)
+        }
+    };
+    Ok(MeasuredRow {
         id: row.id,
         iy: row.iy,
         grid: row.grid,
-        galaxies,
-    }
+        galaxies: galaxies?,
+    })
 }
 
-/// Star `ix` of a strip of `n` stars.
-fn star_of(pixels: &[f32], n: usize, side: usize, ix: usize) -> Option<ArrayView2<'_, f32>> {
-    let strip = ArrayView2::from_shape((side, n * side), pixels).ok()?;
-    Some(strip.slice_move(ndarray::s![.., ix * side..(ix + 1) * side]))
-}
-
-/// The PSF of galaxy `ix` of a row as the network takes it; `None` if it cannot be used.
-pub fn psf_of(row: &StampRow, ix: usize, size: usize) -> Option<Array2<f64>> {
-    match &row.psf {
-        RowPsf::Shared(psf) => Some(psf.as_ref().clone()),
+/// The PSF of galaxy `ix` of a row as it is deconvolved with.
+///
+/// # Errors
+/// Where it cannot be used.
+pub fn psf_of(row: &StampRow, ix: usize, size: usize) -> Result<Array2<f64>, PipelineError> {
+    Ok(match &row.psf {
+        RowPsf::Shared(psf) => psf.as_ref().clone(),
         RowPsf::Stars { pixels, side } => {
-            star_psf(star_of(pixels, row.grid.n, *side, ix)?, size).ok()
+            let stars = strip(pixels, row.grid.n, *side)?;
+            star_psf(stars.index_axis(Axis(0), ix), size)?
         }
-        RowPsf::Functional(field) => Some(functional_psf(&field[ix], size)),
-    }
+        RowPsf::Functional(field) => field[ix].stamp(size),
+    })
 }
 
 /// What a measurement did.
@@ -381,8 +372,8 @@ pub struct Summary {
     pub galaxies: u64,
     /// Of these, flagged.
     pub flagged: u64,
-    /// Galaxies with each of the [`flag::MEANINGS`].
-    pub flags: [u64; flag::MEANINGS.len()],
+    /// Galaxies with each of [`Flag::ALL`].
+    pub flags: [u64; Flag::ALL.len()],
 }
 
 impl Summary {
@@ -391,9 +382,9 @@ impl Summary {
         self.images += 1;
         for galaxy in rows.iter().flat_map(|row| &row.galaxies) {
             self.galaxies += 1;
-            self.flagged += u64::from(galaxy.flag != 0);
-            for (count, (bit, _)) in self.flags.iter_mut().zip(flag::MEANINGS) {
-                *count += u64::from(galaxy.flag & bit != 0);
+            self.flagged += u64::from(!galaxy.flags.is_empty());
+            for (count, flag) in self.flags.iter_mut().zip(Flag::ALL) {
+                *count += u64::from(galaxy.flags.contains(flag));
             }
         }
     }
@@ -442,8 +433,8 @@ pub fn measure_folder(
             };
             read_images(data, &todo, &run.submission, stamp, print, feeder)
         },
-        || measurer.scratch(),
-        |scratch, row: StampRow| Ok(measure_row(&measurer, scratch, &row)),
+        || measurer.worker(),
+        |worker, row: StampRow| measure_row(worker, &row),
         |row: MeasuredRow| {
             progress.advance(row.galaxies.len() as u64);
             let (id, grid) = (row.id, row.grid);
@@ -532,8 +523,8 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
     let whole = |value: &dyn Fn(&Measurement) -> i64| {
         Column::Whole(galaxies().map(|(_, _, g)| value(g)).collect())
     };
-    let energy = |g: &Measurement| g.outcome.map_or(f64::NAN, |o| o.energy);
-    let first = |g: &Measurement| g.outcome.map_or(f64::NAN, |o| o.first_energy);
+    let energy = |g: &Measurement| g.descent.map_or(f64::NAN, |d| d.energy);
+    let first = |g: &Measurement| g.descent.map_or(f64::NAN, |d| d.first_energy);
     let positions: Vec<(f64, f64)> = galaxies()
         .map(|(row, ix, _)| row.grid.centre(ix, row.iy))
         .collect();
@@ -548,15 +539,19 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
         ),
         ("e1".into(), real(&|g| g.e1)),
         ("e2".into(), real(&|g| g.e2)),
-        ("flag".into(), whole(&|g| i64::from(g.flag))),
+        ("flag".into(), whole(&|g| i64::from(g.flags.bits()))),
         (
             "iterations".into(),
-            whole(&|g| g.outcome.map_or(0, |o| i64::from(o.iterations))),
+            whole(&|g| g.descent.map_or(0, |d| i64::from(d.iterations))),
         ),
-        ("stop".into(), whole(&|g| g.stop_code())),
+        (
+            "stop".into(),
+            // −1 where the network did not run.
+            whole(&|g| g.descent.map_or(-1, |d| i64::from(d.stop.code()))),
+        ),
         (
             "updated".into(),
-            whole(&|g| g.outcome.map_or(0, |o| i64::from(o.updated))),
+            whole(&|g| g.descent.map_or(0, |d| i64::from(d.updated))),
         ),
         ("first_energy".into(), real(&first)),
         ("energy".into(), real(&energy)),
@@ -591,7 +586,7 @@ pub(super) fn metadata(
     id: ImageId,
     prints: BTreeMap<String, String>,
 ) -> Result<BTreeMap<String, String>, PipelineError> {
-    let ellipticity = match run.submission.shape.ellipticity {
+    let ellipticity = match run.submission.ellipticity() {
         EllipticityType::Distortion => "distortion",
         EllipticityType::Shear => "shear",
     };

@@ -5,14 +5,11 @@
 //! number of threads.
 
 pub mod baseline;
-mod calibrate;
 pub mod complete;
 pub mod engine;
-pub mod galaxy;
 pub mod images;
 pub mod inputs;
 pub mod measure;
-mod method;
 pub mod record;
 pub mod run;
 pub mod score;
@@ -20,9 +17,9 @@ pub mod simulate;
 
 pub use engine::{Progress, Quiet};
 
+use shearq_measure::MeasureError;
 use thiserror::Error;
 
-use crate::deconvolve::OperatorError;
 use crate::io::FileError;
 
 /// What can stop the pipeline.
@@ -31,9 +28,9 @@ pub enum PipelineError {
     /// A file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Sizes that the network cannot work with.
+    /// Sizes or PSFs that cannot be measured with.
     #[error(transparent)]
-    Operator(#[from] OperatorError),
+    Measure(#[from] MeasureError),
     /// Scores.
     #[error("{}", if *set == 0 { "this set cannot be scored".to_owned() } else { format!("set {set}") })]
     Scoring {

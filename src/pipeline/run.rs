@@ -4,21 +4,17 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, ArrayView2, Axis};
+use shearq_measure::{Measurer, Steps, Worker, calibrate, star_psf, strip};
 use shearq_scoring::Shear;
 use shearq_submissions::{PsfForm, Submission};
 
-use super::calibrate::calibrate;
 use super::engine::{self, Feeder, Progress};
-use super::galaxy::{MeasureScratch, Measurer, Steps};
 use super::images::ImageId;
-use super::measure::{
-    MeasuredRow, RowPsf, StampRow, Summary, functional_psf, measure_row, to_do, write_catalogue,
-};
+use super::measure::{MeasuredRow, RowPsf, StampRow, Summary, measure_row, to_do, write_catalogue};
 use super::{PipelineError, simulate};
 use crate::io::layout::DataFolder;
 use crate::io::run::{RUN_FILE, Run, claim};
-use crate::psf::star::star_psf;
 use crate::simulate::render::RenderScratch;
 use crate::simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
@@ -50,7 +46,7 @@ pub struct SimulatedImage<'a> {
 /// One thread's buffers.
 struct Scratch {
     render: RenderScratch,
-    measure: Vec<MeasureScratch>,
+    workers: Vec<Worker>,
 }
 
 /// Plans the measurement of simulated stamps by each of `submissions`.
@@ -60,15 +56,7 @@ struct Scratch {
 pub fn measurers(submissions: &[Submission]) -> Result<Vec<Measurer>, PipelineError> {
     submissions
         .iter()
-        .map(|submission| {
-            if Measurer::fits(submission, STAMP) {
-                return Ok(Measurer::new(submission, STAMP)?);
-            }
-            Err(PipelineError::Request(format!(
-                "submission {} needs stamps of {} pixels; simulated ones have {STAMP}",
-                submission.name, submission.stamp.size
-            )))
-        })
+        .map(|submission| Ok(Measurer::new(submission, STAMP)?))
         .collect()
 }
 
@@ -138,9 +126,9 @@ pub fn run_set(
         },
         || Scratch {
             render: RenderScratch::new(),
-            measure: measurers.iter().map(Measurer::scratch).collect(),
+            workers: measurers.iter().map(Measurer::worker).collect(),
         },
-        |scratch, job| Ok(draw_and_measure(set, measurers, scratch, &job)),
+        |scratch, job| draw_and_measure(set, scratch, &job),
         |measured: MeasuredJob| {
             progress.advance(n as u64);
             let (image, iy) = (measured.rows[0].id.image, measured.rows[0].iy);
@@ -180,52 +168,49 @@ pub(crate) fn feed(set: &SetSimulator, images: &[u32], feeder: &mut Feeder<'_, R
 
 fn draw_and_measure(
     set: &SetSimulator,
-    measurers: &[Measurer],
     scratch: &mut Scratch,
     job: &RowJob,
-) -> MeasuredJob {
+) -> Result<MeasuredJob, PipelineError> {
     let (pixels, observed) = simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render);
-    let rows = measure_strip(
-        set,
-        &job.fields,
-        job.iy,
-        pixels,
-        measurers,
-        &mut scratch.measure,
-    );
-    MeasuredJob { observed, rows }
+    let rows = measure_strip(set, &job.fields, job.iy, pixels, &mut scratch.workers)?;
+    Ok(MeasuredJob { observed, rows })
 }
 
 /// Simulates galaxy `(ix, iy)` of an image and measures it, keeping the steps; `None` where it could
 /// not be measured. Returns the PSF with them.
+///
+/// # Errors
+/// Where the measurer is for stamps of another size.
 pub fn simulated_steps(
     set: &SetSimulator,
     measurer: &Measurer,
     image: u32,
     (ix, iy): (usize, usize),
-) -> Option<(Array2<f64>, Steps)> {
+) -> Result<Option<(Array2<f64>, Steps)>, PipelineError> {
     let fields = Arc::new(set.image_fields(image));
     let mut pixels = vec![0.0; STAMP * STAMP];
     set.draw(&fields, ix, iy, &mut RenderScratch::new(), &mut pixels);
-    let size = measurer.submission().psf.size;
-    let psf = functional_psf(fields.psf.at(ix, iy), size);
-    let mut scratch = measurer.scratch();
-    measurer.set_psf(&mut scratch, Some(psf.view()));
-    let measured = measurer.measure(&pixels, STAMP, Some(NOISE_SIGMA), &mut scratch);
-    measured.outcome?;
-    let steps = measurer.steps(&pixels, STAMP, psf.view(), &measured, &mut scratch);
-    Some((psf, steps))
+    let stamps = strip(&pixels, 1, STAMP)?;
+    let stamp = stamps.index_axis(Axis(0), 0);
+    let psf = fields.psf.at(ix, iy).stamp(measurer.submission().psf.size);
+    let mut worker = measurer.worker();
+    worker.set_psf(psf.view())?;
+    let measured = worker.measure(stamp, Some(NOISE_SIGMA))?;
+    if measured.descent.is_none() {
+        return Ok(None);
+    }
+    let steps = worker.steps(stamp, psf.view(), &measured)?;
+    Ok(Some((psf, steps)))
 }
 
-/// Measures a strip of simulated stamps by each measurer.
+/// Measures a strip of simulated stamps by each worker.
 pub(crate) fn measure_strip(
     set: &SetSimulator,
     fields: &ImageFields,
     iy: usize,
     pixels: Vec<f32>,
-    measurers: &[Measurer],
-    scratch: &mut [MeasureScratch],
-) -> Vec<MeasuredRow> {
+    workers: &mut [Worker],
+) -> Result<Vec<MeasuredRow>, PipelineError> {
     let mut row = StampRow {
         id: ImageId {
             set: set.kind().set,
@@ -238,12 +223,12 @@ pub(crate) fn measure_strip(
         header_noise: Some(NOISE_SIGMA),
         psf: RowPsf::Functional(Vec::new()),
     };
-    let mut measured = Vec::with_capacity(measurers.len());
-    for (measurer, own) in measurers.iter().zip(scratch) {
-        row.psf = row_psf(set, fields, iy, measurer.submission());
-        measured.push(measure_row(measurer, own, &row));
+    let mut measured = Vec::with_capacity(workers.len());
+    for worker in workers {
+        row.psf = row_psf(set, fields, iy, worker.submission());
+        measured.push(measure_row(worker, &row)?);
     }
-    measured
+    Ok(measured)
 }
 
 /// The PSFs of a row in the form that a submission uses.
@@ -251,9 +236,7 @@ fn row_psf(set: &SetSimulator, fields: &ImageFields, iy: usize, submission: &Sub
     let n = set.grid().n;
     let size = submission.psf.size;
     match (&fields.psf, submission.psf.form) {
-        (PsfField::One(psf), PsfForm::Functional) => {
-            RowPsf::Shared(Arc::new(functional_psf(psf, size)))
-        }
+        (PsfField::One(psf), PsfForm::Functional) => RowPsf::Shared(Arc::new(psf.stamp(size))),
         (PsfField::One(psf), PsfForm::Star) => {
             let star = simulate::star(psf, STAMP);
             let cut = ArrayView2::from_shape((STAMP, STAMP), &star)

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
+use shearq_measure::FunctionalPsf;
 use shearq_scoring::Shear;
 
 use super::PipelineError;
@@ -13,7 +14,6 @@ use crate::io::fits::{ImageWriter, Value};
 use crate::io::layout::DataFolder;
 use crate::io::psf_table;
 use crate::io::run::claim;
-use crate::psf::functional::FunctionalPsf;
 use crate::simulate::kinds::{SETS, SetKind};
 use crate::simulate::render::RenderScratch;
 use crate::simulate::set::{
@@ -185,8 +185,7 @@ pub(crate) fn place(stamp: &[f32], side: usize, ix: usize, n: usize, strip: &mut
 
 /// A noise-free star stamp with a sum of one.
 pub(super) fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
-    let stamp = super::measure::functional_psf(psf, side);
-    stamp.iter().map(|&v| v as f32).collect()
+    psf.stamp(side).iter().map(|&v| v as f32).collect()
 }
 
 /// Writes the true shear of a set.

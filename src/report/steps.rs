@@ -1,9 +1,9 @@
 //! The steps of a measurement as pictures, after the paper's Fig. 3.
 
 use ndarray::Array2;
+use shearq_measure::Steps;
 
 use super::figure::{ColourMap, ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
-use crate::pipeline::galaxy::Steps;
 
 /// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, and the part of it that is used.
 pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {

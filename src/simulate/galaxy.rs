@@ -6,10 +6,9 @@ use std::f64::consts::PI;
 use std::sync::LazyLock;
 
 use puruspe::bessel::Kn;
+use shearq_measure::parts::{QuadraticForm, RadialTable, composite_rule};
 use shearq_scoring::Shear;
 use thiserror::Error;
-
-use crate::radial::{QuadraticForm, RadialTable, composite_rule};
 
 /// Half-light radius of an exponential profile in scale radii: the root of (1 + x) e^{−x} = 1/2.
 pub const EXPONENTIAL_HALF_LIGHT: f64 = 1.678_346_990_016_660_7;
@@ -283,9 +282,9 @@ impl Galaxy {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::radial::gauss_legendre;
     use puruspe::bessel::Jn;
     use puruspe::gamma::gamma;
+    use shearq_measure::parts::gauss_legendre;
 
     fn table(k: f64) -> f64 {
         Sersic::DeVaucouleurs.fourier(k * k)

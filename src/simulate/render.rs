@@ -15,11 +15,11 @@ use ndarray::Array2;
 use realfft::{ComplexToReal, RealFftPlanner};
 use rustfft::num_complex::{Complex32, Complex64};
 use rustfft::{Fft, FftPlanner};
+use shearq_measure::FunctionalPsf;
+use shearq_measure::parts::{QuadraticForm, SingleTable, TransformedPsf};
 use shearq_scoring::Shear;
 
 use super::galaxy::{Component, EXPONENTIAL_HALF_LIGHT, Galaxy, Sersic};
-use crate::psf::functional::{FunctionalPsf, TransformedPsf};
-use crate::radial::{QuadraticForm, SingleTable};
 
 /// Wavenumbers are dropped where galaxy × PSF is below this share of the flux. The image loses
 /// about 1/(2π) ∫ k |F| dk over them; in a PSF's exponential tail near k = 3 that is of the same
@@ -579,8 +579,8 @@ pub fn render_reference(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::psf::functional::{PsfProfile, PsfTransform};
-    use crate::radial::composite_rule;
+    use shearq_measure::PsfProfile;
+    use shearq_measure::parts::{PsfTransform, composite_rule};
 
     const STAMP: usize = 48;
     const MOFFAT: PsfProfile = PsfProfile::Moffat { beta: 3.0 };

@@ -12,6 +12,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rustfft::num_complex::Complex64;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use shearq_measure::parts::PsfTransform;
+use shearq_measure::{FunctionalPsf, PsfProfile};
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{Grid, Shear, TrueShear};
 
@@ -19,7 +21,6 @@ use super::field::{Content, ShearSpectrum, random_field};
 use super::galaxy::Galaxy;
 use super::kinds::{ImageType, SetKind, Variability};
 use super::render::{RenderScratch, Renderer};
-use crate::psf::functional::{FunctionalPsf, PsfProfile, PsfTransform};
 
 /// Pixels a side of a postage stamp.
 pub const STAMP: usize = 48;

@@ -16,13 +16,13 @@
 //! γ as under −γ, while lensing at fixed flux would change the S/N of an elliptical one a little.
 
 use serde::{Deserialize, Serialize};
+use shearq_measure::{Measurement, Measurer, Worker};
 use shearq_scoring::Shear;
 use shearq_submissions::Calibration;
 
 use crate::io::run::nan_for_null;
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::{self, Progress};
-use crate::pipeline::galaxy::{MeasureScratch, Measurement, Measurer};
 use crate::pipeline::run::{RowJob, feed, measure_strip};
 use crate::pipeline::simulate::place;
 use crate::simulate::render::RenderScratch;
@@ -33,7 +33,7 @@ pub const SHEAR: f64 = 0.02;
 
 /// Biases of a submission on one kind of set.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Bias {
+pub struct ShearBias {
     /// Galaxies whose versions were all measured.
     pub galaxies: u64,
     /// The others, which m and c leave out.
@@ -83,9 +83,9 @@ pub fn biases(
     measurers: &[Measurer],
     threads: usize,
     progress: &mut dyn Progress,
-) -> Result<Vec<Bias>, PipelineError> {
+) -> Result<Vec<ShearBias>, PipelineError> {
     let n = set.grid().n;
-    let mut sums = vec![Sums::default(); measurers.len()];
+    let mut sums = vec![BiasSums::default(); measurers.len()];
     engine::ordered(
         threads,
         |feeder| {
@@ -93,26 +93,27 @@ pub fn biases(
             Ok(())
         },
         || {
-            let scratch: Vec<MeasureScratch> = measurers.iter().map(Measurer::scratch).collect();
-            (RenderScratch::new(), scratch)
+            let workers: Vec<Worker> = measurers.iter().map(Measurer::worker).collect();
+            (RenderScratch::new(), workers)
         },
-        |(render, scratch), RowJob { fields, iy }| {
-            let versions = VERSIONS.map(|version| {
+        |(render, workers), RowJob { fields, iy }| {
+            let mut versions = Vec::with_capacity(VERSIONS.len());
+            for version in VERSIONS {
                 let strip = draw(set, &fields, iy, version, render);
-                measure_strip(set, &fields, iy, strip, measurers, scratch)
-            });
+                versions.push(measure_strip(set, &fields, iy, strip, workers)?);
+            }
             let found = (0..measurers.len()).map(|k| {
-                let mut sums = Sums::default();
+                let mut sums = BiasSums::default();
                 for ix in 0..n {
                     let psf = fields.psf.at(ix, iy).shape;
-                    let galaxy = versions.each_ref().map(|rows| &rows[k].galaxies[ix]);
+                    let galaxy = std::array::from_fn(|v| &versions[v][k].galaxies[ix]);
                     sums.add(galaxy, psf);
                 }
                 sums
             });
             Ok(found.collect())
         },
-        |row: Vec<Sums>| {
+        |row: Vec<BiasSums>| {
             progress.advance(n as u64);
             for (sums, more) in sums.iter_mut().zip(row) {
                 sums.merge(&more);
@@ -123,7 +124,7 @@ pub fn biases(
     Ok(sums
         .iter()
         .zip(measurers)
-        .map(|(sums, measurer)| sums.bias(measurer.submission().shape.calibration))
+        .map(|(sums, measurer)| sums.bias(measurer.submission().calibration()))
         .collect())
 }
 
@@ -180,9 +181,9 @@ impl Mean {
     }
 }
 
-/// Sums over galaxies.
+/// BiasSums over galaxies.
 #[derive(Debug, Clone, Default)]
-struct Sums {
+struct BiasSums {
     galaxies: u64,
     dropped: u64,
     /// Half the difference between +γ and −γ, over γ.
@@ -199,9 +200,9 @@ struct Sums {
     response: [Mean; 2],
 }
 
-impl Sums {
+impl BiasSums {
     fn add(&mut self, versions: [&Measurement; VERSIONS.len()], psf: Shear) {
-        if versions.iter().any(|version| version.flag != 0) {
+        if versions.iter().any(|version| !version.flags.is_empty()) {
             self.dropped += 1;
             return;
         }
@@ -243,7 +244,7 @@ impl Sums {
         self.psf.merge(&other.psf);
     }
 
-    fn bias(&self, calibration: Calibration) -> Bias {
+    fn bias(&self, calibration: Calibration) -> ShearBias {
         let count = self.galaxies as f64;
         let response = match calibration {
             Calibration::None => [1.0; 2],
@@ -264,7 +265,7 @@ impl Sums {
             m = m.map(|slope| slope - 1.0);
         }
         let psf = self.psf.value(count) * (response[0] + response[1]) / 2.0;
-        Bias {
+        ShearBias {
             galaxies: self.galaxies,
             dropped: self.dropped,
             m,

@@ -15,16 +15,16 @@ use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
+use shearq_measure::parts::{
+    AcfScratch, Autocorrelation, ClippedMoments, Network, NetworkScratch, Rule, convolve,
+};
+use shearq_measure::{FunctionalPsf, PsfProfile};
 use shearq_scoring::{Distortion, Shear};
-use shearq_submissions::{Submission, Update};
+use shearq_submissions::{NetworkDeconvolution, Submission, Update};
 
-use crate::deconvolve::reference::convolve;
-use crate::deconvolve::{Network, NetworkScratch, Rule};
+use super::speed::network_of;
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::{self, Progress};
-use crate::pipeline::measure::functional_psf;
-use crate::psf::functional::{FunctionalPsf, PsfProfile};
-use crate::shape::{AcfScratch, Autocorrelation, ClippedMoments};
 use crate::simulate::galaxy::{Component, Sersic};
 
 /// S/N in dB of the curves.
@@ -50,9 +50,9 @@ const fn log_lambda() -> [f64; 25] {
     values
 }
 
-/// Sums over galaxies at one S/N, rule and λ.
+/// LambdaSums over galaxies at one S/N, rule and λ.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Sums {
+pub struct LambdaSums {
     /// Transitions that brought a neuron nearer to the truth.
     pub correct: u64,
     /// All transitions.
@@ -71,8 +71,8 @@ pub struct Sums {
     pub iterations: u64,
 }
 
-impl Sums {
-    fn add(&mut self, other: &Sums) {
+impl LambdaSums {
+    fn add(&mut self, other: &LambdaSums) {
         self.correct += other.correct;
         self.transitions += other.transitions;
         self.dsnr += other.dsnr;
@@ -111,9 +111,9 @@ impl Sums {
 #[derive(Debug, Clone)]
 pub struct Curves {
     /// `[rule][S/N of SNR_DB][λ of LOG_LAMBDA]`.
-    pub over_lambda: Vec<Vec<Vec<Sums>>>,
+    pub over_lambda: Vec<Vec<Vec<LambdaSums>>>,
     /// `[rule][S/N of CTR_SNR_DB]` at [`CTR_LOG_LAMBDA`].
-    pub over_snr: Vec<Vec<Sums>>,
+    pub over_snr: Vec<Vec<LambdaSums>>,
     /// Galaxies.
     pub galaxies: u64,
 }
@@ -121,8 +121,8 @@ pub struct Curves {
 impl Curves {
     fn new() -> Self {
         Curves {
-            over_lambda: vec![vec![vec![Sums::default(); LOG_LAMBDA.len()]; SNR_DB.len()]; 2],
-            over_snr: vec![vec![Sums::default(); CTR_SNR_DB.len()]; 2],
+            over_lambda: vec![vec![vec![LambdaSums::default(); LOG_LAMBDA.len()]; SNR_DB.len()]; 2],
+            over_snr: vec![vec![LambdaSums::default(); CTR_SNR_DB.len()]; 2],
             galaxies: 0,
         }
     }
@@ -146,7 +146,10 @@ impl Curves {
         let relative = |k: usize| -> (f64, f64) {
             let (mut value, mut variance) = (0.0, 0.0);
             for curve in &self.over_lambda[rule] {
-                let best = curve.iter().map(Sums::inverse_rmsd).fold(0.0, f64::max);
+                let best = curve
+                    .iter()
+                    .map(LambdaSums::inverse_rmsd)
+                    .fold(0.0, f64::max);
                 value += curve[k].inverse_rmsd() / best / SNR_DB.len() as f64;
                 variance += (curve[k].inverse_rmsd_error() / best / SNR_DB.len() as f64).powi(2);
             }
@@ -176,7 +179,7 @@ pub fn calibrate(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Curves, PipelineError> {
-    let planned = Study::new(submission)?;
+    let planned = LambdaStudy::new(submission)?;
     let mut curves = Curves::new();
     engine::ordered(
         threads,
@@ -206,15 +209,17 @@ pub fn calibrate(
 }
 
 /// Everything planned for one submission.
-struct Study {
-    submission: Submission,
+struct LambdaStudy {
+    n: usize,
+    p: usize,
+    settings: NetworkDeconvolution,
     networks: Vec<Network<f32>>,
     ctr_network: Network<f32>,
     acf: Autocorrelation,
     moments: ClippedMoments,
 }
 
-struct StudyScratch {
+struct LambdaScratch {
     networks: Vec<Network<f32>>,
     ctr_network: Network<f32>,
     buffers: NetworkScratch<f32>,
@@ -233,25 +238,28 @@ struct Synthetic {
     noise: Vec<f64>,
 }
 
-impl Study {
+impl LambdaStudy {
     fn new(submission: &Submission) -> Result<Self, PipelineError> {
         let (n, p) = (submission.stamp.size, submission.psf.size);
+        let method = network_of(submission)?;
         let networks = LOG_LAMBDA
             .iter()
             .map(|log| Network::plan(n, p, 10f64.powf(*log)))
             .collect::<Result<_, _>>()?;
-        Ok(Study {
+        Ok(LambdaStudy {
             networks,
             ctr_network: Network::plan(n, p, 10f64.powf(CTR_LOG_LAMBDA))?,
             acf: Autocorrelation::new(n),
-            moments: ClippedMoments::new(n, submission.shape.acf_share),
-            submission: submission.clone(),
+            moments: ClippedMoments::new(n, method.shape.acf_share),
+            settings: method.deconvolution.clone(),
+            n,
+            p,
         })
     }
 
-    fn scratch(&self) -> StudyScratch {
-        let n = self.submission.stamp.size;
-        StudyScratch {
+    fn scratch(&self) -> LambdaScratch {
+        let n = self.n;
+        LambdaScratch {
             networks: self.networks.clone(),
             ctr_network: self.ctr_network.clone(),
             buffers: self.ctr_network.scratch(),
@@ -266,7 +274,7 @@ impl Study {
         &self,
         seed: u64,
         number: u64,
-        scratch: &mut StudyScratch,
+        scratch: &mut LambdaScratch,
         curves: &mut Curves,
     ) -> Result<(), PipelineError> {
         let galaxy = self.draw(seed, number);
@@ -284,13 +292,13 @@ impl Study {
                     let networks = std::mem::take(&mut scratch.networks);
                     let sums = self.run(&networks[k], update, &galaxy, &stamp, sigma, scratch);
                     scratch.networks = networks;
-                    curves.over_lambda[rule][s][k].add(&sums);
+                    curves.over_lambda[rule][s][k].add(&sums?);
                 }
             }
             for (s, snr) in CTR_SNR_DB.into_iter().enumerate() {
                 let (stamp, sigma) = observe(&galaxy, snr);
                 let network = scratch.ctr_network.clone();
-                let sums = self.run(&network, update, &galaxy, &stamp, sigma, scratch);
+                let sums = self.run(&network, update, &galaxy, &stamp, sigma, scratch)?;
                 curves.over_snr[rule][s].add(&sums);
             }
         }
@@ -299,7 +307,7 @@ impl Study {
     }
 
     fn draw(&self, seed: u64, number: u64) -> Synthetic {
-        let n = self.submission.stamp.size;
+        let n = self.n;
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(number);
         let mut normal = |scale: f64| -> f64 {
@@ -323,7 +331,7 @@ impl Study {
         let psf_shape = Shear::new(rng.random_range(-0.05..0.05), rng.random_range(-0.05..0.05));
         let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, fwhm, psf_shape)
             .expect("the PSFs drawn here are within range");
-        let psf = functional_psf(&psf, self.submission.psf.size);
+        let psf = psf.stamp(self.p);
         // Mean over 4 × 4 points of each pixel.
         let centre = (n as f64 - 1.0) / 2.0;
         let original = Array2::from_shape_fn((n, n), |(y, x)| {
@@ -351,21 +359,23 @@ impl Study {
         galaxy: &Synthetic,
         stamp: &[f32],
         sigma: f64,
-        scratch: &mut StudyScratch,
-    ) -> Sums {
-        let mut settings = self.submission.deconvolution.clone();
-        settings.update = update;
-        let mut sums = Sums {
+        scratch: &mut LambdaScratch,
+    ) -> Result<LambdaSums, PipelineError> {
+        let settings = NetworkDeconvolution {
+            update,
+            ..self.settings.clone()
+        };
+        let mut sums = LambdaSums {
             galaxies: 1,
-            ..Sums::default()
+            ..LambdaSums::default()
         };
         let peak = stamp.iter().copied().fold(0.0f32, f32::max);
         let Some(rule) = Rule::new(&settings, f64::from(peak), sigma) else {
-            return sums;
+            return Ok(sums);
         };
         let original = &galaxy.original;
         let (mut correct, mut transitions) = (0, 0);
-        let outcome = network.trace(
+        let descent = network.trace(
             &rule,
             stamp,
             &mut scratch.buffers,
@@ -378,9 +388,9 @@ impl Study {
                     }
                 }
             },
-        );
+        )?;
         (sums.correct, sums.transitions) = (correct, transitions);
-        sums.iterations = u64::from(outcome.iterations);
+        sums.iterations = u64::from(descent.iterations);
         let distance = |image: &[f32]| -> f64 {
             image
                 .iter()
@@ -391,7 +401,7 @@ impl Study {
         sums.dsnr = 10.0 * (distance(stamp) / distance(&scratch.out)).log10();
         let light = scratch.out.iter().map(|&v| f64::from(v)).sum();
         self.acf
-            .compute(&scratch.out, &mut scratch.acf_scratch, &mut scratch.acf);
+            .compute(&scratch.out, &mut scratch.acf_scratch, &mut scratch.acf)?;
         let shape = self
             .moments
             .measure(&scratch.acf, light)
@@ -402,7 +412,7 @@ impl Study {
             sums.deviation_square = deviation * deviation;
             sums.measured = 1;
         }
-        sums
+        Ok(sums)
     }
 }
 

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_submissions::Submission;
 
-use super::bias::{Bias, biases};
+use super::bias::{ShearBias, biases};
 use super::bound::{cramer_rao, sample_limit};
 use super::reproduce::{Plan, Result, SetResult, Study};
 use super::speed;
@@ -26,7 +26,7 @@ pub struct SetBiases {
     /// Mean Q of spectra of the plan's images with a scatter at the bound.
     pub limit: Option<f64>,
     /// One per submission, in the plan's order.
-    pub biases: Vec<Bias>,
+    pub biases: Vec<ShearBias>,
 }
 
 /// Measures biases on the galaxies of `images` images of each set, keeping each set's result.

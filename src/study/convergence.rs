@@ -2,10 +2,10 @@
 
 use std::hint::black_box;
 
+use shearq_measure::parts::{Network, Rule, Step};
 use shearq_submissions::Submission;
 
-use super::speed::{Inputs, time};
-use crate::deconvolve::{Network, Rule, Step};
+use super::speed::{Inputs, network_of, time};
 use crate::pipeline::PipelineError;
 use crate::report::figure::{LinePlot, PanelGrid, Series, Style};
 use crate::report::table::{Cell, Heading, Table};
@@ -36,10 +36,10 @@ pub fn convergence(
     settings: SimulationSettings,
 ) -> Result<Convergence, PipelineError> {
     let inputs = Inputs::new(settings)?;
-    let n = submission.stamp.size;
-    let mut network =
-        Network::<f32>::plan(n, submission.psf.size, submission.deconvolution.lambda)?;
-    network.set_psf(inputs.psf(submission.psf.size).view())?;
+    let (n, p) = (submission.stamp.size, submission.psf.size);
+    let deconvolution = &network_of(submission)?.deconvolution;
+    let mut network = Network::<f32>::plan(n, p, deconvolution.lambda)?;
+    network.set_psf(inputs.psf(p).view())?;
     let mut scratch = network.scratch();
     let mut out = vec![0.0; n * n];
     let galaxies: Vec<(Vec<f32>, Rule, f64)> = inputs
@@ -47,7 +47,7 @@ pub fn convergence(
         .into_iter()
         .filter_map(|cut| {
             let peak = cut.iter().copied().fold(0.0, f32::max);
-            let rule = Rule::new(&submission.deconvolution, f64::from(peak), 1.0)?;
+            let rule = Rule::new(deconvolution, f64::from(peak), 1.0)?;
             let (Step::Adaptive(c) | Step::Accelerated(c) | Step::Constant(c)) = rule.step;
             Some((cut, rule, c))
         })
@@ -60,11 +60,10 @@ pub fn convergence(
                 max_iterations: MANY,
                 ..*rule
             };
-            network
-                .deconvolve(&rule, cut, &mut scratch, &mut out)
-                .energy
+            let descent = network.deconvolve(&rule, cut, &mut scratch, &mut out)?;
+            Ok(descent.energy)
         })
-        .collect();
+        .collect::<Result<_, PipelineError>>()?;
     let mut found = Convergence {
         submission: submission.name.clone(),
         excess: Default::default(),
@@ -80,19 +79,17 @@ pub fn convergence(
                 max_iterations,
                 ..*rule
             };
-            let excess: f64 = galaxies
-                .iter()
-                .zip(&lowest)
-                .map(|(galaxy, lowest)| {
-                    let outcome =
-                        network.deconvolve(&rule_of(galaxy), &galaxy.0, &mut scratch, &mut out);
-                    (outcome.energy - lowest) / (outcome.first_energy - lowest)
-                })
-                .sum();
+            let mut excess = 0.0;
+            for (galaxy, lowest) in galaxies.iter().zip(&lowest) {
+                let rule = rule_of(galaxy);
+                let descent = network.deconvolve(&rule, &galaxy.0, &mut scratch, &mut out)?;
+                excess += (descent.energy - lowest) / (descent.first_energy - lowest);
+            }
             found.excess[k].push(excess / galaxies.len() as f64);
             found.cost[k].push(time(|at| {
                 let galaxy = &galaxies[at % galaxies.len()];
-                black_box(network.deconvolve(&rule_of(galaxy), &galaxy.0, &mut scratch, &mut out));
+                let rule = rule_of(galaxy);
+                let _ = black_box(network.deconvolve(&rule, &galaxy.0, &mut scratch, &mut out));
             }));
         }
     }

@@ -1,10 +1,10 @@
 //! How measured ellipticities follow the true ones, galaxy by galaxy.
 
 use serde::{Deserialize, Serialize};
+use shearq_measure::Measurement;
 use shearq_scoring::Shear;
 
 use crate::io::run::nan_for_null;
-use crate::pipeline::galaxy::Measurement;
 
 /// Least squares of measured against true ellipticities, component by component:
 /// e = slope·ε + offset + noise.
@@ -12,12 +12,12 @@ use crate::pipeline::galaxy::Measurement;
 pub struct Regression {
     galaxies: u64,
     flagged: u64,
-    components: [Sums; 2],
+    components: [PairSums; 2],
 }
 
-/// Sums over galaxies of one component.
+/// PairSums over galaxies of one component.
 #[derive(Debug, Clone, Copy, Default)]
-struct Sums {
+struct PairSums {
     t: f64,
     e: f64,
     tt: f64,
@@ -54,7 +54,7 @@ impl Regression {
     /// Adds galaxies.
     pub fn add<'a>(&mut self, galaxies: impl Iterator<Item = (Shear, &'a Measurement)>) {
         for (truth, measured) in galaxies {
-            if measured.flag != 0 {
+            if !measured.flags.is_empty() {
                 self.flagged += 1;
                 continue;
             }
@@ -116,10 +116,10 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
+    use shearq_measure::{Flag, Flags};
     use shearq_scoring::Figures;
 
     use super::*;
-    use crate::pipeline::galaxy::flag;
 
     #[test]
     fn records_of_nothing_measured_can_be_read_back() {
@@ -146,10 +146,20 @@ mod tests {
         let galaxies: Vec<(Shear, Measurement)> = (0..40_000)
             .map(|k| {
                 let truth = Shear::new(normal(0.14), normal(0.14));
-                let mut measured =
-                    Measurement::flagged(if k % 10 == 0 { flag::NO_LIGHT } else { 0 });
-                measured.e1 = 0.5 * truth.e1 + 0.01 + normal(0.06);
-                measured.e2 = 0.8 * truth.e2 - 0.02 + normal(0.06);
+                let measured = Measurement {
+                    e1: 0.5 * truth.e1 + 0.01 + normal(0.06),
+                    e2: 0.8 * truth.e2 - 0.02 + normal(0.06),
+                    flags: match k % 10 {
+                        0 => Flag::NoLight.into(),
+                        _ => Flags::NONE,
+                    },
+                    response: [f64::NAN; 2],
+                    descent: None,
+                    noise: 1.0,
+                    flux: 1.0,
+                    radius: 1.0,
+                    size: 1.0,
+                };
                 (truth, measured)
             })
             .collect();

@@ -5,27 +5,27 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use ndarray::ArrayView2;
+use shearq_measure::Measurer;
+use shearq_measure::parts::{
+    AdaptiveMoments, Autocorrelation, ClippedMoments, Matrices, Network, Rule, Spectral, StampFft,
+    Step, WaveletWiener, border_noise,
+};
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
-use shearq_submissions::{DenoiseMethod, NoiseSource, Start, Submission, Update};
+use shearq_submissions::{
+    LinearMethod, Method, NetworkMethod, NoiseSource, Start, Submission, Update,
+};
 
-use crate::deconvolve::reference::Matrices;
-use crate::deconvolve::{Network, Rule, Spectral, Step};
-use crate::denoise::{WaveletWiener, border_noise};
-use crate::fft::StampFft;
 use crate::io::FileError;
 use crate::io::atomic::{self, Scratch};
 use crate::io::table::{self, Column, Format, Table as Columns};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Quiet;
-use crate::pipeline::galaxy::Measurer;
-use crate::pipeline::measure::functional_psf;
 use crate::pipeline::run::{measurers, run_set};
 use crate::pipeline::score::{COLUMNS, Reading, Screen, plain_columns, score_files};
 use crate::pipeline::simulate::simulator;
 use crate::report::figure::{LinePlot, Series, Style};
 use crate::report::table::{Cell, Heading, Table};
-use crate::shape::{AdaptiveMoments, Autocorrelation, ClippedMoments};
 use crate::simulate::render::RenderScratch;
 use crate::simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, SimulationSettings};
 
@@ -53,6 +53,24 @@ pub(super) fn time(mut call: impl FnMut(usize)) -> f64 {
     best
 }
 
+/// A full stamp.
+fn view(stamp: &[f32]) -> ArrayView2<'_, f32> {
+    ArrayView2::from_shape((STAMP, STAMP), stamp).expect("a stamp of the set's size")
+}
+
+/// Settings of a submission's network.
+///
+/// # Errors
+/// Where it has the linear method.
+pub(super) fn network_of(submission: &Submission) -> Result<&NetworkMethod, PipelineError> {
+    submission.network().ok_or_else(|| {
+        PipelineError::Request(format!(
+            "submission {} has method = \"linear\"; expected \"network\"",
+            submission.name
+        ))
+    })
+}
+
 /// Stamps of the fiducial set, and its PSF at a size.
 pub(super) struct Inputs {
     set: SetSimulator,
@@ -76,28 +94,25 @@ impl Inputs {
     }
 
     pub(super) fn psf(&self, size: usize) -> ndarray::Array2<f64> {
-        functional_psf(self.set.image_fields(1).psf.at(0, 0), size)
+        self.set.image_fields(1).psf.at(0, 0).stamp(size)
     }
 
     /// Microseconds of a whole measurement, the PSF being taken already.
     fn whole(&self, submission: &Submission) -> Result<f64, PipelineError> {
         let psf = self.psf(submission.psf.size);
-        let measurer = Measurer::new(submission, STAMP)?;
-        let mut scratch = measurer.scratch();
-        measurer.set_psf(&mut scratch, Some(psf.view()));
+        let mut worker = Measurer::new(submission, STAMP)?.worker();
+        worker.set_psf(psf.view())?;
         Ok(time(|k| {
-            let noise = Some(NOISE_SIGMA);
-            black_box(measurer.measure(&self.stamps[k], STAMP, noise, &mut scratch));
+            let _ = black_box(worker.measure(view(&self.stamps[k]), Some(NOISE_SIGMA)));
         }))
     }
 
     /// Microseconds of taking a PSF.
     fn taking_a_psf(&self, submission: &Submission) -> Result<f64, PipelineError> {
         let psf = self.psf(submission.psf.size);
-        let measurer = Measurer::new(submission, STAMP)?;
-        let mut scratch = measurer.scratch();
+        let mut worker = Measurer::new(submission, STAMP)?.worker();
         Ok(time(|_| {
-            measurer.set_psf(&mut scratch, Some(black_box(psf.view())))
+            let _ = worker.set_psf(black_box(psf.view()));
         }))
     }
 
@@ -132,23 +147,18 @@ pub fn stages(
     let mut stamp = vec![0.0; STAMP * STAMP];
     let mut rows: Vec<(&str, f64)> = Vec::new();
     let before = rows.len();
-    if submission.noise.source == NoiseSource::Border {
+    if let NoiseSource::Border { border: width } = submission.noise {
         let mut border = Vec::new();
         rows.push((
             "noise level",
             time(|k| {
                 let stamp = &inputs.stamps[k];
-                black_box(border_noise(
-                    stamp,
-                    STAMP,
-                    submission.noise.border,
-                    &mut border,
-                ));
+                black_box(border_noise(stamp, STAMP, width, &mut border));
             }),
         ));
     }
-    if submission.denoise.method == DenoiseMethod::WaveletWiener {
-        let filter = WaveletWiener::new(STAMP, &submission.denoise);
+    if let Some(settings) = submission.wavelet() {
+        let filter = WaveletWiener::new(STAMP, settings);
         let mut filter_scratch = filter.scratch();
         rows.push((
             "denoise",
@@ -162,11 +172,12 @@ pub fn stages(
     let mut notes = vec![format!(
         "One thread; fastest of several passes over {SAMPLE} galaxies."
     )];
-    let linear = submission.deconvolution.update == Update::Linear;
-    if linear {
-        linear_stages(submission, psf.view(), &cut, &mut rows)?;
-    } else {
-        notes.extend(network_stages(submission, psf.view(), &cut, &mut rows)?);
+    let linear = submission.linear().is_some();
+    match &submission.method {
+        Method::Linear(method) => linear_stages(method, n, psf.view(), &cut, &mut rows)?,
+        Method::Network(method) => {
+            notes.extend(network_stages(method, n, psf.view(), &cut, &mut rows)?);
+        }
     }
     let whole = inputs.whole(submission)?;
     let stages: f64 = rows[before..].iter().map(|(_, time)| time).sum();
@@ -212,13 +223,14 @@ pub fn stages(
 
 /// Stages of the network; returns notes.
 fn network_stages(
-    submission: &Submission,
+    method: &NetworkMethod,
+    n: usize,
     psf: ArrayView2<'_, f64>,
     cut: &[Vec<f32>],
     rows: &mut Vec<(&'static str, f64)>,
 ) -> Result<Vec<String>, PipelineError> {
-    let (n, p) = (submission.stamp.size, submission.psf.size);
-    let mut network = Network::<f32>::plan(n, p, submission.deconvolution.lambda)?;
+    let settings = &method.deconvolution;
+    let mut network = Network::<f32>::plan(n, psf.nrows(), settings.lambda)?;
     network.set_psf(psf)?;
     let mut scratch = network.scratch();
     let mut out = vec![0.0; n * n];
@@ -226,15 +238,16 @@ fn network_stages(
         .iter()
         .map(|stamp| {
             let peak = stamp.iter().copied().fold(0.0, f32::max);
-            Rule::new(&submission.deconvolution, f64::from(peak), 1.0)
+            Rule::new(settings, f64::from(peak), 1.0)
         })
         .collect();
     let mut iterations = 0;
     let network_time = time(|k| {
-        if let Some(rule) = &rules[k] {
-            iterations = network
-                .deconvolve(rule, black_box(&cut[k]), &mut scratch, &mut out)
-                .iterations;
+        if let Some(rule) = &rules[k]
+            && let Ok(descent) =
+                network.deconvolve(rule, black_box(&cut[k]), &mut scratch, &mut out)
+        {
+            iterations = descent.iterations;
         }
     });
     rows.push(("deconvolve", network_time));
@@ -243,11 +256,13 @@ fn network_stages(
     let mut lags = vec![0.0; acf.len()];
     rows.push((
         "autocorrelation",
-        time(|k| acf.compute(black_box(&cut[k]), &mut acf_scratch, &mut lags)),
+        time(|k| {
+            let _ = acf.compute(black_box(&cut[k]), &mut acf_scratch, &mut lags);
+        }),
     ));
-    acf.compute(&out, &mut acf_scratch, &mut lags);
+    acf.compute(&out, &mut acf_scratch, &mut lags)?;
     let light = out.iter().map(|&v| f64::from(v)).sum();
-    let moments = ClippedMoments::new(n, submission.shape.acf_share);
+    let moments = ClippedMoments::new(n, method.shape.acf_share);
     rows.push((
         "moments",
         time(|_| {
@@ -258,12 +273,12 @@ fn network_stages(
         "The network made {iterations} iterations of the last galaxy."
     )];
     // The reference's matrices take n⁴ numbers.
-    if n <= 32 && submission.deconvolution.update != Update::Constant {
-        let matrices = Matrices::new(n, psf, submission.deconvolution.lambda);
+    if n <= 32 && settings.update != Update::Constant {
+        let matrices = Matrices::new(n, psf, settings.lambda);
         let data: Vec<f64> = cut[0].iter().map(|&v| f64::from(v)).collect();
         if let (Some(rule), Ok(view)) = (&rules[0], ArrayView2::from_shape((n, n), &data)) {
             let start = Instant::now();
-            black_box(matrices.deconvolve(rule, view));
+            black_box(matrices.deconvolve(rule, view)?);
             let plain = start.elapsed().as_secs_f64() * 1e6;
             notes.push(format!(
                 "The plain reference (dense matrices, f64) takes {plain:.0} µs for the deconvolution, {:.0} times as long.",
@@ -276,13 +291,13 @@ fn network_stages(
 
 /// Stages of the linear network.
 fn linear_stages(
-    submission: &Submission,
+    method: &LinearMethod,
+    n: usize,
     psf: ArrayView2<'_, f64>,
     stamps: &[Vec<f32>],
     rows: &mut Vec<(&'static str, f64)>,
 ) -> Result<(), PipelineError> {
-    let n = submission.stamp.size;
-    let spectral = Spectral::new(n, submission.psf.size, &submission.deconvolution)?;
+    let spectral = Spectral::new(n, psf.nrows(), &method.deconvolution)?;
     let (mut own, mut scratch) = (spectral.psf(), spectral.scratch());
     let mut lags = spectral.lags();
     spectral.set_psf(psf, &mut scratch, &mut own)?;
@@ -290,7 +305,7 @@ fn linear_stages(
         "deconvolve and autocorrelate, with response",
         time(|k| spectral.autocorrelate(&own, black_box(&stamps[k]), 1.0, &mut scratch, &mut lags)),
     ));
-    let scale = submission.shape.weight_scale;
+    let scale = method.shape.weight_scale;
     let moments = AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach());
     let mut values = moments.scratch();
     rows.push((
@@ -336,7 +351,7 @@ pub fn operator_forms(settings: SimulationSettings) -> Result<Table, PipelineErr
                 start: Start::ClippedData,
             };
             time(|k| {
-                black_box(network.deconvolve(&rule, &cut[k], &mut scratch, &mut out));
+                let _ = black_box(network.deconvolve(&rule, &cut[k], &mut scratch, &mut out));
             })
         };
         // An iteration applies H and its transpose.

@@ -1,18 +1,27 @@
 //! Named submission configurations: how to get from a stamp to an ellipticity, in TOML files with
 //! inheritance.
 //!
-//! A [`Submission`] holds every setting, resolved. The seven variants of the paper's Table 1 are
-//! embedded ([`Registry`]); a user's own file works wherever a name does, and `extends` either a name
-//! or another file. Unknown keys, values out of range, unknown names and cycles are refused with the
-//! file and place.
+//! A [`Submission`] holds every setting of its method, resolved. The seven variants of the paper's Table 1
+//! and the linear ones are embedded ([`Registry`]); a user's own file works wherever a name does, and
+//! `extends` either a name or another file. Unknown keys, keys that the method does not use, values out of
+//! range, unknown names and cycles are refused with the file and place.
 
+mod error;
+mod file;
+pub mod limits;
 mod name;
 mod registry;
 mod settings;
+mod template;
+mod validate;
 
+pub use error::SubmissionError;
+pub use file::Published;
 pub use name::{MAX_NAME, check_name, checked_name, is_control};
-pub use registry::{Entry, Published, Registry, SubmissionError, TEMPLATE};
+pub use registry::{Entry, Registry};
 pub use settings::{
-    AcfWeight, BrightnessUnit, Calibration, Deconvolution, Denoise, DenoiseMethod, EllipticityType,
-    Noise, NoiseSource, Psf, PsfForm, Shape, Stamp, Start, StepScale, Submission, Update,
+    BrightnessUnit, Calibration, ClippedShape, Denoise, EllipticityType, LinearDeconvolution,
+    LinearMethod, Method, NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfForm, Stamp,
+    Start, StepScale, Submission, Update, Wavelet, WeightedShape,
 };
+pub use template::Template;

@@ -3,20 +3,18 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
-use thiserror::Error;
+use crate::error::SubmissionError;
+use crate::file::{File, Published, dead_keys, read};
+use crate::settings::{PartialSubmission, Submission};
 
-use crate::settings::{
-    PartialDeconvolution, PartialDenoise, PartialNoise, PartialPsf, PartialShape, PartialStamp,
-    PartialSubmission, Submission,
-};
-
-/// The commented base configuration: the defaults of every submission, and a user's template.
-pub const TEMPLATE: &str = include_str!("../named/paper.toml");
+/// The commented configuration that the submissions with the network rest on.
+pub(crate) const NETWORK: &str = include_str!("../named/paper.toml");
+/// The same of those with the linear method.
+pub(crate) const LINEAR: &str = include_str!("../named/48-linear-star.toml");
 
 /// The embedded files, in the order of the paper's Table 1.
 const EMBEDDED: [(&str, &str); 10] = [
-    ("paper.toml", TEMPLATE),
+    ("paper.toml", NETWORK),
     (
         "subm-19-den-star.toml",
         include_str!("../named/subm-19-den-star.toml"),
@@ -45,10 +43,7 @@ const EMBEDDED: [(&str, &str); 10] = [
         "29-den-func.toml",
         include_str!("../named/29-den-func.toml"),
     ),
-    (
-        "48-linear-star.toml",
-        include_str!("../named/48-linear-star.toml"),
-    ),
+    ("48-linear-star.toml", LINEAR),
     (
         "48-linear-func.toml",
         include_str!("../named/48-linear-func.toml"),
@@ -57,18 +52,6 @@ const EMBEDDED: [(&str, &str); 10] = [
 
 /// Longest chain of `extends` followed.
 const MAX_DEPTH: usize = 16;
-
-/// Figures published for a submission.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Published {
-    /// Quality factor Q.
-    pub q: f64,
-    /// Multiplicative bias M/2.
-    pub m_half: f64,
-    /// Additive bias √A in units of 10⁻⁴.
-    pub sqrt_a: f64,
-}
 
 /// A resolved submission and what was published for it.
 #[derive(Debug, Clone, PartialEq)]
@@ -79,117 +62,6 @@ pub struct Entry {
     pub published: Option<Published>,
     /// What it directly inherits from.
     pub extends: Option<String>,
-}
-
-/// What can be wrong with a submission's name or file.
-#[derive(Debug, Error)]
-pub enum SubmissionError {
-    /// Neither a known name nor a file.
-    #[error("{}there is no submission or file named `{name}`; known submissions: {known}", from.as_ref().map_or_else(String::new, |from| format!("{}: `extends`: ", from.display())))]
-    Unknown {
-        /// The file that names it, if one does.
-        from: Option<PathBuf>,
-        /// What was asked for.
-        name: String,
-        /// The names that exist.
-        known: String,
-    },
-    /// A file that cannot be read.
-    #[error("cannot read the submission file {path}")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why not.
-        source: std::io::Error,
-    },
-    /// Not TOML, an unknown key, or a value of the wrong type.
-    #[error("in the submission file {path}: {message}")]
-    Parse {
-        /// The file.
-        path: PathBuf,
-        /// Line, column and what was expected.
-        message: String,
-    },
-    /// A file that inherits from itself.
-    #[error("{path}: `extends` goes round in a circle: {chain}")]
-    Cycle {
-        /// The file asked for.
-        path: PathBuf,
-        /// The names followed.
-        chain: String,
-    },
-    /// A key that no file of the chain sets.
-    #[error(
-        "{path}: the key `{key}` is set neither here nor in what it extends; start from `extends = \"paper\"`"
-    )]
-    Missing {
-        /// The file asked for.
-        path: PathBuf,
-        /// The key.
-        key: &'static str,
-    },
-    /// A value out of range.
-    #[error("{path}: {message}")]
-    Range {
-        /// The file asked for.
-        path: PathBuf,
-        /// The key, its value and the accepted range.
-        message: String,
-    },
-}
-
-/// One file as written.
-#[derive(Debug, Clone, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct File {
-    name: Option<String>,
-    description: Option<String>,
-    extends: Option<String>,
-    #[serde(default)]
-    stamp: PartialStamp,
-    #[serde(default)]
-    psf: PartialPsf,
-    #[serde(default)]
-    noise: PartialNoise,
-    #[serde(default)]
-    denoise: PartialDenoise,
-    #[serde(default)]
-    deconvolution: PartialDeconvolution,
-    #[serde(default)]
-    shape: PartialShape,
-    published: Option<Published>,
-}
-
-impl File {
-    fn parse(path: &Path, text: &str) -> Result<File, SubmissionError> {
-        toml::from_str(text).map_err(|error| SubmissionError::Parse {
-            path: path.to_owned(),
-            message: error.to_string().trim_end().to_owned(),
-        })
-    }
-
-    fn settings(self) -> PartialSubmission {
-        let File {
-            name: _,
-            description: _,
-            extends: _,
-            stamp,
-            psf,
-            noise,
-            denoise,
-            deconvolution,
-            shape,
-            published: _,
-        } = self;
-        PartialSubmission {
-            stamp,
-            psf,
-            noise,
-            denoise,
-            deconvolution,
-            shape,
-        }
-    }
 }
 
 /// The embedded submissions, by name.
@@ -246,28 +118,11 @@ impl Registry {
     /// # Errors
     /// Where there is no such name or file, or it or what it extends is not valid.
     pub fn get(&self, name_or_path: &str) -> Result<Entry, SubmissionError> {
-        let (path, file) = self.find(name_or_path, None)?;
-        let name = own_name(&file, &path);
-        let description = file.description.clone().unwrap_or_default();
-        let (published, extends) = (file.published, file.extends.clone());
-        let mut chain = vec![name_or_path.to_owned()];
-        let mut here = path.clone();
-        let mut next = file.extends.clone();
-        let mut settings = file.settings();
-        while let Some(parent) = next {
-            let again = chain.contains(&parent);
-            chain.push(parent.clone());
-            if again || chain.len() > MAX_DEPTH {
-                return Err(SubmissionError::Cycle {
-                    path,
-                    chain: chain.join(" → "),
-                });
-            }
-            let (parent_path, parent_file) = self.find(&parent, Some(&here))?;
-            next = parent_file.extends.clone();
-            here = parent_path;
-            settings = settings.over(parent_file.settings());
-        }
+        let link = self.find(name_or_path, None)?;
+        let (published, extends) = (link.file.published, link.file.extends.clone());
+        let (path, name) = (link.path.clone(), own_name(&link.file, &link.path));
+        let description = link.file.description.clone().unwrap_or_default();
+        let settings = self.resolve(link, &mut vec![name_or_path.to_owned()])?;
         let submission =
             settings
                 .complete(name, description)
@@ -288,10 +143,48 @@ impl Registry {
         })
     }
 
+    /// The settings of a file over those of what it extends. Its own keys have to be of use.
+    fn resolve(
+        &self,
+        link: Link,
+        chain: &mut Vec<String>,
+    ) -> Result<PartialSubmission, SubmissionError> {
+        let Link { path, file, text } = link;
+        let base = match file.extends.clone() {
+            None => PartialSubmission::default(),
+            Some(parent) => {
+                let again = chain.contains(&parent);
+                chain.push(parent.clone());
+                if again || chain.len() > MAX_DEPTH {
+                    let chain = chain.join(" → ");
+                    return Err(SubmissionError::Cycle { path, chain });
+                }
+                self.resolve(self.find(&parent, Some(&path))?, chain)?
+            }
+        };
+        let settings = file.settings().over(base);
+        if let Some(text) = text
+            && let Ok(submission) = settings.complete(String::new(), String::new())
+            && let Some(dead) = dead_keys(&text, &submission).into_iter().next()
+        {
+            return Err(SubmissionError::Dead {
+                path,
+                line: dead.line,
+                key: dead.key,
+                reason: dead.reason,
+            });
+        }
+        Ok(settings)
+    }
+
     /// The file of a name or path; paths are relative to the file `from` that names them.
-    fn find(&self, name: &str, from: Option<&Path>) -> Result<(PathBuf, File), SubmissionError> {
+    fn find(&self, name: &str, from: Option<&Path>) -> Result<Link, SubmissionError> {
         if let Some((path, file)) = self.files.get(name) {
-            return Ok((path.clone(), file.clone()));
+            return Ok(Link {
+                path: path.clone(),
+                file: file.clone(),
+                text: None,
+            });
         }
         let path = match from.and_then(Path::parent) {
             Some(folder) => folder.join(name),
@@ -304,13 +197,21 @@ impl Registry {
                 known: self.names.join(", "),
             });
         }
-        let text = std::fs::read_to_string(&path).map_err(|source| SubmissionError::Read {
-            path: path.clone(),
-            source,
-        })?;
-        let file = File::parse(&path, &text)?;
-        Ok((path, file))
+        let text = read(&path)?;
+        Ok(Link {
+            file: File::parse(&path, &text)?,
+            path,
+            text: Some(text),
+        })
     }
+}
+
+/// One file of a chain.
+struct Link {
+    path: PathBuf,
+    file: File,
+    /// Text of a user's own file. Embedded ones hold values in stand-by for those who extend them.
+    text: Option<String>,
 }
 
 /// The name a file gives itself, or its own name without the ending.
@@ -324,7 +225,7 @@ fn own_name(file: &File, path: &Path) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{DenoiseMethod, PsfForm};
+    use crate::{NoiseSource, PsfForm};
 
     fn write(folder: &Path, name: &str, text: &str) -> String {
         let path = folder.join(name);
@@ -355,7 +256,7 @@ mod tests {
             let s = &entry.submission;
             assert_eq!(s.stamp.size, size, "{name}");
             assert_eq!(s.psf.size, 15, "{name}");
-            assert_eq!(s.denoise.method != DenoiseMethod::None, den, "{name}");
+            assert_eq!(s.wavelet().is_some(), den, "{name}");
             assert_eq!(s.psf.form == PsfForm::Star, star, "{name}");
             let expected = Published { q, m_half, sqrt_a };
             assert_eq!(entry.published, Some(expected), "{name}");
@@ -378,42 +279,10 @@ mod tests {
         let entry = Registry::embedded().unwrap().get(&own).unwrap();
         assert_eq!(entry.submission.name, "own");
         assert_eq!(entry.submission.stamp.size, 31);
-        assert_eq!(entry.submission.deconvolution.lambda, 0.5);
-        assert_eq!(
-            entry.submission.denoise.method,
-            DenoiseMethod::WaveletWiener
-        );
+        let network = entry.submission.network().unwrap();
+        assert_eq!(network.deconvolution.lambda, 0.5);
+        assert!(entry.submission.wavelet().is_some());
         assert_eq!(entry.published, None);
-    }
-
-    #[test]
-    fn settings_read_back_are_checked_like_those_of_a_file() {
-        let submission = Registry::embedded().unwrap().get("23/den/star").unwrap();
-        let good = toml::Table::try_from(&submission.submission).unwrap();
-        let read = |table: toml::Table| table.try_into::<Submission>().map_err(|e| e.to_string());
-        assert_eq!(read(good.clone()), Ok(submission.submission));
-        let spoilt = |section: &str, key: &str, value: toml::Value| {
-            let mut table = good.clone();
-            let place = match section {
-                "" => &mut table,
-                section => table[section].as_table_mut().unwrap(),
-            };
-            place.insert(key.into(), value);
-            read(table).unwrap_err()
-        };
-        let message = spoilt("denoise", "levels", 100_000_000.into());
-        assert!(
-            message.contains("`denoise.levels` is 100000000; expected 1 to 4"),
-            "{message}"
-        );
-        let message = spoilt("denoise", "strength", (-1.0).into());
-        assert!(
-            message.contains("`denoise.strength` is -1; expected a positive"),
-            "{message}"
-        );
-        assert!(spoilt("denoise", "levles", 2.into()).contains("unknown field `levles`"));
-        assert!(spoilt("", "name", "a\nb".into()).contains("without control characters"));
-        assert!(spoilt("", "name", "x".repeat(101).into()).contains("101 bytes"));
     }
 
     #[test]
@@ -440,6 +309,31 @@ mod tests {
             range.contains("shape.acf_share") && range.contains("1.5"),
             "{range}"
         );
+        let dead = |text: &str, expected: &str| {
+            let found = message("dead.toml", text);
+            assert!(
+                found.contains("dead.toml") && found.contains(expected),
+                "{found}"
+            );
+        };
+        dead(
+            "extends = \"48/linear/star\"\n[shape]\nacf_share = 0.5\n",
+            "line 3: `shape.acf_share` has no effect with method = \"linear\"",
+        );
+        dead(
+            "extends = \"48/linear/star\"\n[noise]\nborder = 3\n",
+            "line 3: `noise.border` has no effect with noise.source = \"header\"",
+        );
+        dead(
+            "extends = \"23/raw/star\"\ndenoise = { levels = 2 }\n",
+            "line 2: `denoise.levels` has no effect with denoise.method = \"none\"",
+        );
+        dead(
+            "extends = \"23/raw/star\"\n[shape]\ncalibration = \"response\"\n",
+            "line 3: `shape.calibration` has no effect with method = \"network\"",
+        );
+        let child = "extends = \"dead.toml\"\n[stamp]\nsize = 29\n";
+        assert!(message("child.toml", child).contains("dead.toml: line 3"));
         let missing = message("d.toml", "[stamp]\nsize = 23\n");
         assert!(missing.contains("psf.form"), "{missing}");
         let cycle = message("e.toml", "extends = \"e.toml\"\n");
@@ -448,6 +342,42 @@ mod tests {
         assert!(
             nobody.contains("f.toml") && nobody.contains("23/raw/star,"),
             "{nobody}"
+        );
+    }
+
+    #[test]
+    fn only_what_the_method_uses_is_stored_and_it_is_read_back() {
+        let registry = Registry::embedded().unwrap();
+        for name in registry.names() {
+            let submission = registry.get(name).unwrap().submission;
+            let table = toml::Table::try_from(&submission).unwrap();
+            let linear = submission.linear().is_some();
+            assert_eq!(table.contains_key("denoise"), !linear, "{name}");
+            let keys = ["target_sigma", "unit_divisor"];
+            let held = keys.map(|key| table["deconvolution"].get(key).is_some());
+            assert_eq!(held, [linear, !linear], "{name}");
+            let text = toml::to_string(&submission).unwrap();
+            assert_eq!(toml::from_str::<Submission>(&text).unwrap(), submission);
+        }
+    }
+
+    #[test]
+    fn a_file_can_change_its_method_and_where_its_noise_comes_from() {
+        let folder = tempfile::tempdir().unwrap();
+        let registry = Registry::embedded().unwrap();
+        let own = write(
+            folder.path(),
+            "own.toml",
+            "extends = \"48/linear/star\"\n[noise]\nsource = \"border\"\n",
+        );
+        let noise = registry.get(&own).unwrap().submission.noise;
+        assert_eq!(noise, NoiseSource::Border { border: 4 });
+        let text = "extends = \"23/den/star\"\nmethod = \"linear\"\n";
+        let own = write(folder.path(), "own.toml", text);
+        let message = registry.get(&own).unwrap_err().to_string();
+        assert!(
+            message.contains("`deconvolution.target_sigma` is set"),
+            "{message}"
         );
     }
 }

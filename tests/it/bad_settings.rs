@@ -8,7 +8,7 @@ use crate::support::{Small, fail, shearq, text};
 fn submissions_with_mistakes_are_refused_with_file_and_place() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("own.toml");
-    let cases: [(&str, &[&str]); 12] = [
+    let cases: [(&str, &[&str]); 14] = [
         (
             "extends = \"paper\"\n[stamp]\nsise = 3\n",
             &["line 3", "unknown field `sise`, expected `size`"],
@@ -44,6 +44,17 @@ fn submissions_with_mistakes_are_refused_with_file_and_place() {
         (
             "extends = \"paper\"\n[stamp]\nsize = 9\nsize = 10\n",
             &["line 4", "duplicate key"],
+        ),
+        (
+            "extends = \"48/linear/star\"\n[shape]\nacf_share = 0.5\n",
+            &[
+                "line 3",
+                "`shape.acf_share` has no effect with method = \"linear\"",
+            ],
+        ),
+        (
+            "extends = \"23/den/star\"\nmethod = \"linear\"\n[stamp]\nsize = 48\n",
+            &["`deconvolution.target_sigma` is set neither here nor in what it extends"],
         ),
         (
             "extends = \"papr\"\n",

@@ -198,6 +198,12 @@ fn submissions_can_be_listed_shown_and_started() {
     let base = settings(&toml::to_string(&base.submission).unwrap());
     assert_eq!(started, base);
     assert!(fail(&["submissions", "init", text(&own)]).contains("exists"));
+    let linear = root.path().join("linear.toml");
+    succeed(&["submissions", "init", text(&linear), "--method", "linear"]);
+    let started = settings(&succeed(&["submissions", "show", text(&linear)]));
+    assert!(started.contains("target_sigma = 1.5") && !started.contains("unit_divisor"));
+    let named = settings(&succeed(&["submissions", "show", "48/linear/star"]));
+    assert_eq!(started, named);
     let message = fail(&["submissions", "show", "23/raw/stars"]);
     assert!(
         message.contains("known submissions: subm/19/den/star"),

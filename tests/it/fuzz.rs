@@ -378,7 +378,7 @@ fn fuzz_others(count: u64) {
         Foreign::read(path).is_ok()
     });
     let registry = Registry::embedded().unwrap();
-    let own = shearq_submissions::TEMPLATE.to_owned();
+    let own = shearq_submissions::Template::Linear.text().unwrap();
     let extended = "extends = \"23/den/star\"\n[stamp]\nsize = 29\n";
     other(
         "own.toml",

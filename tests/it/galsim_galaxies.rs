@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use shearq::psf::functional::{FunctionalPsf, PsfProfile, PsfTransform, TransformedPsf};
 use shearq::simulate::galaxy::Galaxy;
 use shearq::simulate::render::{RenderScratch, Renderer, render_reference};
+use shearq_measure::parts::{PsfTransform, TransformedPsf};
+use shearq_measure::{FunctionalPsf, PsfProfile};
 use shearq_scoring::Shear;
 
 use crate::support::shared;

@@ -81,7 +81,7 @@ fn measured_ellipticities_follow_the_truth() {
                     "{name}, set {set}, e{}",
                     k + 1
                 );
-                if run.submission.shape.calibration == Calibration::Response {
+                if run.submission.calibration() == Calibration::Response {
                     // 512 galaxies of σ_ε = 0.14 that scatter by 0.11: slopes are good to 0.035.
                     assert!(
                         (own.slope - 1.0).abs() < 4.0 * 0.035,

@@ -11,7 +11,7 @@ use shearq::io::run::{read_record, write_record};
 use shearq::report::table::{Cell, Heading, Table, TableFormat};
 use shearq::simulate::field::ShearSpectrum;
 use shearq::simulate::set::SimulationSettings;
-use shearq_submissions::{Registry, Submission};
+use shearq_submissions::{Denoise, Method, Registry, Submission};
 
 use crate::support::{contents, succeed, text};
 
@@ -105,9 +105,14 @@ fn settings_of_all_digits_are_read_as_they_were_written() {
         .submission;
     for _ in 0..500 {
         let mut submission = base.clone();
-        submission.deconvolution.lambda = 10.0 * random.random::<f64>();
-        submission.denoise.strength = 0.1 + random.random::<f64>();
-        submission.shape.acf_share = 0.5 + 0.5 * random.random::<f64>();
+        let Method::Network(network) = &mut submission.method else {
+            panic!("a submission of the network");
+        };
+        network.deconvolution.lambda = 10.0 * random.random::<f64>();
+        if let Denoise::WaveletWiener(wavelet) = &mut network.denoise {
+            wavelet.strength = 0.1 + random.random::<f64>();
+        }
+        network.shape.acf_share = 0.5 + 0.5 * random.random::<f64>();
         let simulation = SimulationSettings {
             spectrum: ShearSpectrum {
                 amplitude: 100.0 * random.random::<f64>(),

@@ -1,13 +1,12 @@
 //! The PSF's orientation: deconvolution undoes it, and a turned or flipped PSF does not.
 
-use ndarray::Array2;
-use shearq::pipeline::galaxy::Measurer;
-use shearq::pipeline::measure::functional_psf;
-use shearq::psf::functional::{FunctionalPsf, PsfProfile, PsfTransform};
+use ndarray::{Array2, ArrayView2};
 use shearq::simulate::galaxy::Galaxy;
 use shearq::simulate::render::{RenderScratch, Renderer};
+use shearq_measure::parts::PsfTransform;
+use shearq_measure::{FunctionalPsf, Measurer, PsfProfile};
 use shearq_scoring::Shear;
-use shearq_submissions::{Registry, StepScale};
+use shearq_submissions::{Denoise, Method, Registry, StepScale};
 
 #[test]
 fn a_round_galaxy_comes_out_round_only_with_its_own_psf() {
@@ -28,19 +27,23 @@ fn a_round_galaxy_comes_out_round_only_with_its_own_psf() {
         .get("29/den/func")
         .unwrap()
         .submission;
-    submission.denoise.method = shearq_submissions::DenoiseMethod::None;
     submission.psf.size = 25;
-    submission.deconvolution.step_scale = StepScale::Fixed;
-    submission.deconvolution.step = 1.5;
-    submission.deconvolution.max_iterations = 300;
-    submission.deconvolution.unit_divisor = 1e9;
+    let Method::Network(network) = &mut submission.method else {
+        panic!("29/den/func has the network");
+    };
+    network.denoise = Denoise::None;
+    network.deconvolution.step_scale = StepScale::Fixed;
+    network.deconvolution.step = 1.5;
+    network.deconvolution.max_iterations = 300;
+    network.deconvolution.unit_divisor = 1e9;
     let measurer = Measurer::new(&submission, 48).unwrap();
-    let own = functional_psf(&psf, 25);
+    let own = psf.stamp(25);
+    let stamp = ArrayView2::from_shape((48, 48), &stamp).unwrap();
     let measure = |psf: &Array2<f64>| {
-        let mut scratch = measurer.scratch();
-        measurer.set_psf(&mut scratch, Some(psf.view()));
-        let m = measurer.measure(&stamp, 48, Some(1e-6), &mut scratch);
-        assert_eq!(m.flag, 0);
+        let mut worker = measurer.worker();
+        worker.set_psf(psf.view()).unwrap();
+        let m = worker.measure(stamp, None).unwrap();
+        assert!(m.flags.is_empty());
         (m.e1, m.e2)
     };
     let (e1, e2) = measure(&own);

@@ -6,7 +6,7 @@ use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
 use super::sets::over_sets;
 use crate::report::table::{Cell, Heading, Table};
 use crate::simulate::kinds::{ImageType, SetKind};
-use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, PAPER_LAMBDA, SNR_DB, Sums};
+use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, LambdaSums, PAPER_LAMBDA, SNR_DB};
 use crate::study::reproduce::SetResult;
 
 /// One qualitative statement of the paper and what the simulation says.
@@ -189,7 +189,7 @@ fn range(values: impl Iterator<Item = f64>, decimals: usize) -> String {
 /// The paper's qualitative findings of Sect. 4 held against `curves`.
 pub fn lambda_findings(curves: &Curves) -> Vec<Finding> {
     let [adaptive, constant] = [&curves.over_lambda[0], &curves.over_lambda[1]];
-    let over_snr = |rule: usize| curves.over_snr[rule].iter().map(Sums::ctr);
+    let over_snr = |rule: usize| curves.over_snr[rule].iter().map(LambdaSums::ctr);
     let weak = PAPER_LAMBDA;
     let rising = |values: Vec<f64>| values.windows(2).all(|pair| pair[1] > pair[0]);
     let ctr_rises = rising(adaptive.iter().map(|curve| curve[weak].ctr()).collect());
@@ -198,7 +198,7 @@ pub fn lambda_findings(curves: &Curves) -> Vec<Finding> {
     let dsnr_falls = adaptive
         .iter()
         .all(|curve| curve[strongest].mean_dsnr() < curve[weak].mean_dsnr());
-    let best = |curve: &[Sums]| {
+    let best = |curve: &[LambdaSums]| {
         let best = (0..curve.len()).max_by(|a, b| curve[*a].ctr().total_cmp(&curve[*b].ctr()));
         LOG_LAMBDA[best.unwrap_or(0)]
     };

@@ -5,7 +5,7 @@ use shearq_submissions::Submission;
 use crate::report::figure::{LinePlot, PanelGrid, Series, Style};
 use crate::report::page::Page;
 use crate::report::table::{Cell, Heading, Table};
-use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, PAPER_LAMBDA, SNR_DB, Sums};
+use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, LambdaSums, PAPER_LAMBDA, SNR_DB};
 
 /// Names of the two rules in legends, in the order of [`crate::study::calibration::UPDATES`].
 const RULES: [&str; 2] = ["adaptive", "constant"];
@@ -14,7 +14,7 @@ fn lambdas() -> Vec<f64> {
     LOG_LAMBDA.iter().map(|log| 10f64.powf(*log)).collect()
 }
 
-fn over_lambda(curve: &[Sums], value: fn(&Sums) -> f64) -> Vec<f64> {
+fn over_lambda(curve: &[LambdaSums], value: fn(&LambdaSums) -> f64) -> Vec<f64> {
     curve.iter().map(value).collect()
 }
 
@@ -53,7 +53,7 @@ fn ctr_over_snr(curves: &Curves) -> LinePlot {
         .zip(RULES)
         .enumerate()
         .map(|(k, (sums, rule))| {
-            let y = over_lambda(sums, Sums::ctr);
+            let y = over_lambda(sums, LambdaSums::ctr);
             let style = if k == 0 { Style::Dashed } else { Style::Line };
             Series::new(rule, CTR_SNR_DB.to_vec(), y, style, k)
         })
@@ -72,7 +72,7 @@ fn adaptive_over_lambda(
     curves: &Curves,
     title: &str,
     y_label: &str,
-    value: fn(&Sums) -> f64,
+    value: fn(&LambdaSums) -> f64,
 ) -> LinePlot {
     let series = SNR_DB
         .iter()
@@ -94,13 +94,13 @@ fn adaptive_over_lambda(
 
 /// Fig. 5: CTR against λ.
 fn ctr_over_lambda(curves: &Curves) -> LinePlot {
-    adaptive_over_lambda(curves, "Correct transition rate", "CTR", Sums::ctr)
+    adaptive_over_lambda(curves, "Correct transition rate", "CTR", LambdaSums::ctr)
 }
 
 /// Fig. 6: dSNR against λ.
 fn dsnr_over_lambda(curves: &Curves) -> LinePlot {
     let title = "Discriminative signal-to-noise ratio";
-    adaptive_over_lambda(curves, title, "dSNR [dB]", Sums::mean_dsnr)
+    adaptive_over_lambda(curves, title, "dSNR [dB]", LambdaSums::mean_dsnr)
 }
 
 /// Fig. 7: 1/RMSD against λ for both rules at the three S/N.
@@ -126,11 +126,11 @@ fn inverse_rmsd(curves: &Curves) -> PanelGrid {
                     Series::new(
                         name,
                         lambdas(),
-                        over_lambda(sums, Sums::inverse_rmsd),
+                        over_lambda(sums, LambdaSums::inverse_rmsd),
                         style,
                         rule,
                     )
-                    .with_errors(over_lambda(sums, Sums::inverse_rmsd_error))
+                    .with_errors(over_lambda(sums, LambdaSums::inverse_rmsd_error))
                 })
                 .collect(),
             ..LinePlot::default()
@@ -191,7 +191,7 @@ pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
                 })
                 .unwrap_or(0);
             let paper = &curve[PAPER_LAMBDA];
-            let value = |sums: &Sums| {
+            let value = |sums: &LambdaSums| {
                 Cell::with_error(sums.inverse_rmsd(), Some(sums.inverse_rmsd_error()), 3)
             };
             rows.push(vec![

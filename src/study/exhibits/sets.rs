@@ -2,7 +2,7 @@
 
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{Figures, SCORED};
-use shearq_submissions::{DenoiseMethod, PsfForm, Published, Submission};
+use shearq_submissions::{PsfForm, Published, Submission};
 
 use crate::report::figure::{
     BarGroup, BarPlot, ColourMap, HeatMap, LinePlot, PanelGrid, Series, Style,
@@ -40,7 +40,7 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
         rows.push(vec![
             Cell::text(&submission.name),
             Cell::text(format!("{0}×{0}", submission.stamp.size)),
-            yes(submission.denoise.method != DenoiseMethod::None),
+            yes(submission.wavelet().is_some()),
             Cell::text(match submission.psf.form {
                 PsfForm::Star => "Star",
                 PsfForm::Functional => "Func",

@@ -1,0 +1,565 @@
+//! The working network: planned once per stamp and PSF size, run per galaxy.
+
+use ndarray::ArrayView2;
+use shearq_submissions::Start;
+
+use super::descent::{Descent, Stop};
+use super::kernel::{Buffers, Level};
+use super::operator::Operator;
+use super::rule::Rule;
+use super::slide::Padded;
+use super::vector::Wide;
+use crate::error::{MeasureError, length};
+
+/// A network for one stamp size, PSF size and λ, holding one PSF at a time.
+///
+/// Running it needs a [`NetworkScratch`] of the caller and allocates nothing. The network itself is
+/// not changed by a run, so one can serve many threads.
+#[derive(Debug, Clone)]
+pub struct Network<T> {
+    operator: Operator<T>,
+    level: Level,
+}
+
+/// Buffers for one thread's runs. Their content between runs does not matter.
+#[derive(Debug, Clone)]
+pub struct NetworkScratch<T> {
+    n: usize,
+    p: usize,
+    buffers: Buffers<T>,
+}
+
+impl<T: Wide> Network<T> {
+    /// Plans for n×n stamps and p×p PSFs; the PSF is zero until [`Network::set_psf`].
+    ///
+    /// # Errors
+    /// Where a size is out of range.
+    pub fn plan(n: usize, p: usize, lambda: f64) -> Result<Self, MeasureError> {
+        Ok(Network {
+            operator: Operator::new(n, p, lambda)?,
+            level: Level::detect(),
+        })
+    }
+
+    /// Takes a PSF; it is used as it is, so it should sum to one.
+    ///
+    /// # Errors
+    /// Where its size is not the planned one or a pixel is not finite.
+    pub fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
+        self.operator.set_psf(psf)
+    }
+
+    /// Stamp side n.
+    pub fn stamp_size(&self) -> usize {
+        self.operator.n
+    }
+
+    /// Thresholds TH_i (Eq. 9) for a unit of brightness of one, row-major.
+    pub fn thresholds(&self) -> &[T] {
+        &self.operator.thresholds
+    }
+
+    /// Buffers that fit this network.
+    pub fn scratch(&self) -> NetworkScratch<T> {
+        let Operator { n, p, .. } = self.operator;
+        NetworkScratch {
+            n,
+            p,
+            buffers: Buffers::new(n, p),
+        }
+    }
+
+    /// Deconvolves the row-major n×n stamp `u0` into `out`.
+    ///
+    /// # Errors
+    /// Where `u0` or `out` does not have n² pixels, or the scratch is of another network's sizes.
+    pub fn deconvolve(
+        &self,
+        rule: &Rule,
+        u0: &[T],
+        scratch: &mut NetworkScratch<T>,
+        out: &mut [T],
+    ) -> Result<Descent, MeasureError> {
+        self.check(u0, scratch, out)?;
+        let n = self.operator.n;
+        let b = &mut scratch.buffers;
+        Self::start(n, rule, u0, b);
+        let descent = self.level.run(&self.operator, rule, b);
+        for (y, row) in out.chunks_exact_mut(n).enumerate() {
+            row.copy_from_slice(b.state.row(y));
+        }
+        Ok(descent)
+    }
+
+    /// Like [`Network::deconvolve`], one iteration at a time, showing `observe` the state before and
+    /// after each, row-major. The last one shown may be an update that raised the energy and is not
+    /// kept. For studies: it allocates, repeats part of the work, and an accelerated update loses its
+    /// momentum in each.
+    ///
+    /// # Errors
+    /// As [`Network::deconvolve`].
+    pub fn trace(
+        &self,
+        rule: &Rule,
+        u0: &[T],
+        scratch: &mut NetworkScratch<T>,
+        out: &mut [T],
+        mut observe: impl FnMut(&[T], &[T]),
+    ) -> Result<Descent, MeasureError> {
+        self.check(u0, scratch, out)?;
+        let n = self.operator.n;
+        let b = &mut scratch.buffers;
+        Self::start(n, rule, u0, b);
+        let one = Rule {
+            max_iterations: 1,
+            ..*rule
+        };
+        let image = |padded: &Padded<T>| -> Vec<T> {
+            (0..n).flat_map(|y| padded.row(y).iter().copied()).collect()
+        };
+        let mut total = Descent {
+            iterations: 0,
+            ..self.level.run(
+                &self.operator,
+                &Rule {
+                    max_iterations: 0,
+                    ..*rule
+                },
+                b,
+            )
+        };
+        for _ in 0..rule.max_iterations {
+            let before = image(&b.state);
+            let descent = self.level.run(&self.operator, &one, b);
+            match descent.stop {
+                Stop::Stable => {}
+                Stop::EnergyRise => observe(&before, &image(&b.next)),
+                Stop::MaxIterations => observe(&before, &image(&b.state)),
+            }
+            total = Descent {
+                iterations: total.iterations + descent.iterations,
+                first_energy: total.first_energy,
+                ..descent
+            };
+            if descent.stop != Stop::MaxIterations {
+                break;
+            }
+        }
+        for (y, row) in out.chunks_exact_mut(n).enumerate() {
+            row.copy_from_slice(b.state.row(y));
+        }
+        Ok(total)
+    }
+
+    /// Checks the sizes of a run.
+    fn check(&self, u0: &[T], scratch: &NetworkScratch<T>, out: &[T]) -> Result<(), MeasureError> {
+        let Operator { n, p, .. } = self.operator;
+        length("a stamp", u0.len(), n * n)?;
+        length("a deconvolved stamp", out.len(), n * n)?;
+        if (scratch.n, scratch.p) == (n, p) {
+            return Ok(());
+        }
+        Err(MeasureError::Shape {
+            what: "buffers for a network",
+            found: format!(
+                "{0} × {0} pixels and a PSF of {1} × {1}",
+                scratch.n, scratch.p
+            ),
+            expected: format!("{n} × {n} and {p} × {p}"),
+        })
+    }
+
+    /// Takes the stamp and sets the first state.
+    fn start(n: usize, rule: &Rule, u0: &[T], b: &mut Buffers<T>) {
+        let flat = match rule.start {
+            Start::Flat => {
+                let mean = u0.iter().map(|u| u.to_f64()).sum::<f64>() / (n * n) as f64;
+                T::from_f64(mean.max(0.0))
+            }
+            Start::ClippedData | Start::Zero => T::ZERO,
+        };
+        for (y, row) in u0.chunks_exact(n).enumerate() {
+            b.data.row_mut(y).copy_from_slice(row);
+            let state = b.state.row_mut(y);
+            match rule.start {
+                Start::ClippedData => {
+                    for (v, &u) in state.iter_mut().zip(row) {
+                        *v = if u > T::ZERO { u } else { T::ZERO };
+                    }
+                }
+                Start::Flat | Start::Zero => state.fill(flat),
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::{Array2, ArrayView2};
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use shearq_submissions::Start;
+
+    use super::*;
+    use crate::deconvolve::reference::Matrices;
+    use crate::deconvolve::rule::Step;
+
+    fn random(rng: &mut ChaCha8Rng, n: usize) -> Array2<f64> {
+        Array2::from_shape_fn((n, n), |_| rng.random_range(-1.0..1.0))
+    }
+
+    /// A lopsided PSF of sum one: an asymmetric blob and noise, so that a turned or transposed
+    /// operator shows.
+    fn psf(rng: &mut ChaCha8Rng, p: usize) -> Array2<f64> {
+        let centre = p as f64 / 2.0;
+        let blob = Array2::from_shape_fn((p, p), |(y, x)| {
+            let (dy, dx) = (y as f64 - centre, x as f64 - centre + 0.7);
+            (-(dx * dx + 0.6 * dy * dy + 0.5 * dx * dy) / 4.0).exp()
+        });
+        let psf = blob + random(rng, p).mapv(|v| 0.01 * v.abs());
+        let sum = psf.sum();
+        psf / sum
+    }
+
+    /// A galaxy-like stamp with noise of σ = 1.
+    fn stamp(rng: &mut ChaCha8Rng, n: usize) -> Array2<f64> {
+        let centre = (n as f64 - 1.0) / 2.0 + 0.3;
+        random(rng, n) * 1.7
+            + Array2::from_shape_fn((n, n), |(y, x)| {
+                let (dy, dx) = (y as f64 - centre, x as f64 - centre);
+                6.0 * (-(dx * dx + dy * dy - 0.6 * dx * dy) / 12.0).exp()
+            })
+    }
+
+    struct Case {
+        n: usize,
+        p: usize,
+        lambda: f64,
+        rule: Rule,
+    }
+
+    fn run<T: Wide>(
+        case: &Case,
+        psf: ArrayView2<'_, f64>,
+        u0: &Array2<f64>,
+    ) -> (Vec<f64>, Descent) {
+        let mut network = Network::<T>::plan(case.n, case.p, case.lambda).unwrap();
+        network.set_psf(psf).unwrap();
+        let mut scratch = network.scratch();
+        let mut out = vec![T::ZERO; case.n * case.n];
+        let data: Vec<T> = u0.iter().map(|&v| T::from_f64(v)).collect();
+        // A first run on other data leaves its traces in the scratch.
+        let dirt: Vec<T> = data
+            .iter()
+            .rev()
+            .map(|v| T::from_f64(9.0 * v.to_f64()))
+            .collect();
+        network
+            .deconvolve(&case.rule, &dirt, &mut scratch, &mut out)
+            .unwrap();
+        let descent = network
+            .deconvolve(&case.rule, &data, &mut scratch, &mut out)
+            .unwrap();
+        (out.iter().map(|v| v.to_f64()).collect(), descent)
+    }
+
+    fn largest(a: &[f64], b: &Array2<f64>) -> f64 {
+        a.iter()
+            .zip(b)
+            .map(|(x, y)| (x - y).abs())
+            .fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn matches_the_matrices_over_sizes_updates_and_regularisation() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let sizes = [
+            (5, 3),
+            (5, 4),
+            (5, 15),
+            (7, 25),
+            (11, 5),
+            (16, 15),
+            (17, 16),
+            (19, 15),
+            (23, 15),
+            (23, 25),
+            (29, 15),
+            (32, 8),
+            (33, 21),
+            (48, 15),
+            (48, 25),
+        ];
+        for (k, (n, p)) in sizes.into_iter().enumerate() {
+            let psf = psf(&mut rng, p);
+            let u0 = stamp(&mut rng, n);
+            let lambdas = if n > 30 {
+                vec![0.3]
+            } else {
+                vec![0.0, 1e-4, 1.0]
+            };
+            for lambda in lambdas {
+                let matrices = Matrices::new(n, psf.view(), lambda);
+                for step in [
+                    Step::Adaptive(0.9),
+                    Step::Adaptive(0.05),
+                    Step::Constant(0.03),
+                    Step::Accelerated(0.8),
+                ] {
+                    let start = [Start::ClippedData, Start::Flat, Start::Zero][k % 3];
+                    let rule = Rule {
+                        step,
+                        unit: 0.03,
+                        max_iterations: 12,
+                        start,
+                    };
+                    let case = Case { n, p, lambda, rule };
+                    let (expected, reference) = matrices.deconvolve(&rule, u0.view()).unwrap();
+                    let (found, descent) = run::<f64>(&case, psf.view(), &u0);
+                    let label = format!("n {n}, p {p}, λ {lambda}, {step:?}, {start:?}");
+                    assert_eq!(descent.iterations, reference.iterations, "{label}");
+                    assert_eq!(descent.stop, reference.stop, "{label}");
+                    assert_eq!(descent.updated, reference.updated, "{label}");
+                    // Same operations in another order: f64 rounding of sums of 10³ terms of
+                    // order ten, carried through twelve steps.
+                    assert!(largest(&found, &expected) < 1e-11, "{label}");
+                    let scale = reference.energy.abs().max(1.0);
+                    assert!(
+                        (descent.energy - reference.energy).abs() < 1e-10 * scale,
+                        "{label}"
+                    );
+                    assert!((descent.first_energy - reference.first_energy).abs() < 1e-10 * scale);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn thresholds_are_half_the_diagonal_of_the_weights() {
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        for (n, p) in [(5, 9), (12, 4), (13, 7)] {
+            let psf = psf(&mut rng, p);
+            let matrices = Matrices::new(n, psf.view(), 0.7);
+            let mut network = Network::<f64>::plan(n, p, 0.7).unwrap();
+            network.set_psf(psf.view()).unwrap();
+            for (a, b) in network.thresholds().iter().zip(matrices.thresholds()) {
+                assert!((a - b).abs() < 1e-14);
+            }
+        }
+    }
+
+    #[test]
+    fn single_precision_stays_within_its_rounding() {
+        // Without thresholds (a vanishing unit) no decision can flip, and the difference is the
+        // rounding of f32 (6e-8) over sums of a few hundred terms of order ten, times the steps.
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        for (n, p) in [(19, 15), (23, 15), (29, 15), (48, 25)] {
+            let psf = psf(&mut rng, p);
+            let u0 = stamp(&mut rng, n);
+            let rule = Rule {
+                step: Step::Adaptive(0.9),
+                unit: 1e-30,
+                max_iterations: 20,
+                start: Start::ClippedData,
+            };
+            let case = Case {
+                n,
+                p,
+                lambda: 1e-4,
+                rule,
+            };
+            let (double, a) = run::<f64>(&case, psf.view(), &u0);
+            let (single, b) = run::<f32>(&case, psf.view(), &u0);
+            assert_eq!((a.iterations, a.stop), (b.iterations, b.stop));
+            let peak = double.iter().copied().fold(0.0, f64::max);
+            let worst = double
+                .iter()
+                .zip(&single)
+                .map(|(x, y)| (x - y).abs())
+                .fold(0.0, f64::max);
+            assert!(worst < 3e-6 * peak, "n {n}: {worst} of {peak}");
+        }
+    }
+
+    #[test]
+    fn every_stop_occurs_and_is_reported() {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let psf = psf(&mut rng, 7);
+        let u0 = stamp(&mut rng, 15);
+        let descent = |step, unit, max_iterations| {
+            let rule = Rule {
+                step,
+                unit,
+                max_iterations,
+                start: Start::ClippedData,
+            };
+            run::<f32>(
+                &Case {
+                    n: 15,
+                    p: 7,
+                    lambda: 0.0,
+                    rule,
+                },
+                psf.view(),
+                &u0,
+            )
+            .1
+        };
+        let all = descent(Step::Adaptive(0.5), 0.01, 5);
+        assert_eq!((all.stop, all.iterations), (Stop::MaxIterations, 5));
+        assert!(all.energy < all.first_energy);
+        // A unit so large that no gradient reaches its threshold.
+        let stable = descent(Step::Adaptive(0.5), 1e6, 50);
+        assert_eq!(
+            (stable.stop, stable.iterations, stable.updated),
+            (Stop::Stable, 0, 0)
+        );
+        // A step beyond the stability limit of 2 over the largest eigenvalue.
+        let rise = descent(Step::Adaptive(50.0), 0.01, 50);
+        assert_eq!(rise.stop, Stop::EnergyRise);
+        assert!(rise.energy <= rise.first_energy);
+    }
+
+    #[test]
+    fn every_instruction_set_of_this_machine_agrees() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        for (n, p) in [(5, 15), (11, 4), (19, 15), (23, 15), (33, 3), (64, 48)] {
+            let psf = psf(&mut rng, p);
+            let u0: Vec<f32> = stamp(&mut rng, n).iter().map(|&v| v as f32).collect();
+            for (step, lambda) in [
+                (Step::Adaptive(0.9), 1e-4),
+                (Step::Adaptive(0.5), 0.0),
+                (Step::Accelerated(0.9), 1e-4),
+                (Step::Constant(0.02), 0.3),
+            ] {
+                // A vanishing unit: no neuron is near its threshold, where rounding would decide.
+                let rule = Rule {
+                    step,
+                    unit: 1e-30,
+                    max_iterations: 10,
+                    start: Start::ClippedData,
+                };
+                let mut network = Network::<f32>::plan(n, p, lambda).unwrap();
+                network.set_psf(psf.view()).unwrap();
+                let mut scratch = network.scratch();
+                let mut run = |level| {
+                    network.level = level;
+                    let mut out = vec![f32::NAN; n * n];
+                    let descent = network
+                        .deconvolve(&rule, &u0, &mut scratch, &mut out)
+                        .unwrap();
+                    (out, descent.iterations)
+                };
+                let (plain, iterations) = run(Level::Baseline);
+                for level in Level::available() {
+                    let (found, same) = run(level);
+                    let label = format!("{level:?}, n {n}, p {p}, {step:?}, λ {lambda}");
+                    assert_eq!(iterations, same, "{label}");
+                    // Fused and unfused products differ by f32 rounding; a constant step is taken
+                    // the other way where that decides on a gradient's sign.
+                    let apart = |(a, b): &(&f32, &f32)| (*a - *b).abs() > 1e-4;
+                    let flipped = found.iter().zip(&plain).filter(apart).count();
+                    let most = match step {
+                        Step::Adaptive(_) | Step::Accelerated(_) => 0,
+                        Step::Constant(_) => 1 + n * n / 200,
+                    };
+                    assert!(flipped <= most, "{label}: {flipped}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn momentum_reaches_a_lower_energy_in_as_many_iterations() {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let psf = psf(&mut rng, 15);
+        let u0 = stamp(&mut rng, 23);
+        let energy = |step, max_iterations| {
+            let rule = Rule {
+                step,
+                unit: 1e-3,
+                max_iterations,
+                start: Start::ClippedData,
+            };
+            let case = Case {
+                n: 23,
+                p: 15,
+                lambda: 1e-4,
+                rule,
+            };
+            run::<f64>(&case, psf.view(), &u0).1.energy
+        };
+        let (plain, fast) = (Step::Adaptive(1.0), Step::Accelerated(1.0));
+        assert!(energy(fast, 15) < energy(plain, 40));
+        // And both go to the same minimum: where the plain one is after 3000 iterations.
+        let (slow, quick) = (energy(plain, 3000), energy(fast, 300));
+        assert!((slow - quick).abs() < 1e-3 * slow.abs(), "{slow} {quick}");
+    }
+
+    #[test]
+    fn a_trace_shows_every_iteration_of_the_same_run() {
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        let psf = psf(&mut rng, 7);
+        let u0: Vec<f64> = stamp(&mut rng, 15).iter().copied().collect();
+        let mut network = Network::<f64>::plan(15, 7, 0.0).unwrap();
+        network.set_psf(psf.view()).unwrap();
+        let mut scratch = network.scratch();
+        for (step, unit) in [(0.5, 0.01), (0.5, 1.0), (50.0, 0.01)] {
+            let rule = Rule {
+                step: Step::Adaptive(step),
+                unit,
+                max_iterations: 30,
+                start: Start::ClippedData,
+            };
+            let (mut whole, mut traced) = (vec![0.0; 225], vec![0.0; 225]);
+            let expected = network
+                .deconvolve(&rule, &u0, &mut scratch, &mut whole)
+                .unwrap();
+            let mut shown = 0;
+            let found = network
+                .trace(&rule, &u0, &mut scratch, &mut traced, |before, after| {
+                    shown += 1;
+                    assert_ne!(before, after);
+                })
+                .unwrap();
+            assert_eq!(found, expected);
+            assert_eq!(whole, traced);
+            let attempted = u32::from(expected.stop == Stop::EnergyRise);
+            assert_eq!(shown, expected.iterations + attempted);
+        }
+    }
+
+    #[test]
+    fn unusable_psfs_are_refused() {
+        let mut network = Network::<f32>::plan(15, 5, 0.0).unwrap();
+        assert!(network.set_psf(Array2::zeros((5, 7)).view()).is_err());
+        let mut psf = Array2::from_elem((5, 5), 0.04);
+        psf[(1, 2)] = f64::NAN;
+        let message = network.set_psf(psf.view()).unwrap_err().to_string();
+        assert!(message.contains("(3, 2)"), "{message}");
+        assert!(Network::<f32>::plan(2, 5, 0.0).is_err());
+        assert!(Network::<f32>::plan(15, 49, 0.0).is_err());
+    }
+
+    #[test]
+    fn wrong_sizes_are_refused_with_what_was_expected() {
+        let network = Network::<f32>::plan(15, 5, 0.0).unwrap();
+        let other = Network::<f32>::plan(23, 5, 0.0).unwrap();
+        let rule = Rule {
+            step: Step::Adaptive(0.5),
+            unit: 1.0,
+            max_iterations: 1,
+            start: Start::Zero,
+        };
+        let run = |pixels: usize, room: usize, of: &Network<f32>| {
+            let (u0, mut out) = (vec![1.0; pixels], vec![0.0; room]);
+            let run = network.deconvolve(&rule, &u0, &mut of.scratch(), &mut out);
+            run.map_err(|error| error.to_string())
+        };
+        assert!(run(225, 225, &network).is_ok());
+        let expected = Err("a stamp of 224 values; expected 225".to_owned());
+        assert_eq!(run(224, 225, &network), expected);
+        assert!(run(225, 226, &network).is_err());
+        assert!(run(225, 225, &other).unwrap_err().contains("23 × 23"));
+    }
+}

@@ -1,0 +1,333 @@
+use ndarray::{Array2, ArrayView2};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rustfft::num_complex::Complex64;
+use shearq_submissions::{LinearDeconvolution, Registry};
+
+use super::super::reference::convolve;
+use super::*;
+
+fn settings(iterations: usize, target: f64, window: f64, lambda: f64) -> LinearDeconvolution {
+    let registry = Registry::embedded().unwrap();
+    let named = registry.get("48/linear/star").unwrap().submission;
+    LinearDeconvolution {
+        max_iterations: iterations,
+        target_sigma: target,
+        window_sigma: window,
+        lambda,
+        step: named.linear().unwrap().deconvolution.step,
+    }
+}
+
+/// A lopsided PSF of sum one, centred on its stamp.
+fn psf(p: usize) -> Array2<f64> {
+    let centre = (p as f64 - 1.0) / 2.0;
+    let psf = Array2::from_shape_fn((p, p), |(y, x)| {
+        let (dy, dx) = (y as f64 - centre, x as f64 - centre);
+        (-(dx * dx + 0.7 * dy * dy + 0.5 * dx * dy) / 3.0).exp()
+    });
+    let sum = psf.sum();
+    psf / sum
+}
+
+/// An elliptical Gaussian galaxy off the stamp's middle under a shear about the middle, before the PSF.
+fn galaxy(n: usize, g1: f64, g2: f64) -> Array2<f64> {
+    let middle = (n as f64 - 1.0) / 2.0;
+    Array2::from_shape_fn((n, n), |(y, x)| {
+        let (y, x) = (y as f64 - middle, x as f64 - middle);
+        // Position before the shear, whose matrix is (1 + γ₁, γ₂; γ₂, 1 − γ₁), of determinant
+        // one to first order.
+        let (u, v) = ((1.0 - g1) * x - g2 * y, (1.0 + g1) * y - g2 * x);
+        let (u, v) = (u + 0.3, v - 0.2);
+        (-(u * u / 7.0 + v * v / 4.0 + 0.3 * u * v / 5.0)).exp()
+    })
+}
+
+/// The galaxy as it is observed: centred PSFs of odd sides leave it where it is.
+fn observed(n: usize, h: &Array2<f64>, g1: f64, g2: f64) -> Vec<f32> {
+    let image = convolve(galaxy(n, g1, g2).view(), h.view());
+    image.iter().map(|&v| v as f32).collect()
+}
+
+fn noise(n: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    // Uniform noise of variance one.
+    let half = 3f32.sqrt();
+    (0..n * n).map(|_| rng.random_range(-half..half)).collect()
+}
+
+/// The transform of an image at wave vector (kx, ky), its first pixel at the origin: a plain sum.
+fn transform(image: ArrayView2<'_, f64>, kx: f64, ky: f64) -> Complex64 {
+    let terms = image.indexed_iter();
+    terms
+        .map(|((y, x), v)| Complex64::from_polar(*v, -(kx * x as f64 + ky * y as f64)))
+        .sum()
+}
+
+/// The autocorrelation as the module's description has it, by plain sums in f64.
+fn plain(
+    plan: &Spectral,
+    settings: &LinearDeconvolution,
+    h: &Array2<f64>,
+    stamp: &Array2<f64>,
+) -> Vec<f64> {
+    let (size, side, modes) = plan.grid();
+    let (n, p) = (stamp.nrows() as f64, h.nrows() as f64);
+    let unit = std::f64::consts::TAU / size as f64;
+    let spacing = size as f64 / side as f64;
+    let waves: Vec<f64> = (-(modes as i32)..=modes as i32)
+        .map(|j| unit * f64::from(j))
+        .collect();
+    let plane = || {
+        waves
+            .iter()
+            .flat_map(|&kx| waves.iter().map(move |&ky| (kx, ky)))
+    };
+    // v̂ of each mode.
+    let restored: Vec<Complex64> = plane()
+        .map(|(kx, ky)| {
+            let square = kx * kx + ky * ky;
+            if square > (CUT / settings.target_sigma).powi(2) {
+                return Complex64::ZERO;
+            }
+            let centre = (p - 1.0) / 2.0 * (kx + ky);
+            let h = transform(h.view(), kx, ky) * Complex64::from_polar(1.0, centre);
+            let w = h.norm_sqr() + settings.lambda * high_pass(kx, ky).powi(2);
+            let rest = (1.0 - settings.step * w).powi(settings.max_iterations as i32);
+            let gaussian = (-0.5 * settings.target_sigma.powi(2) * square).exp();
+            // cos² from three quarters of the largest wave number to it.
+            let place = (square.sqrt() * settings.target_sigma / CUT - 0.75) / 0.25;
+            let fall = (std::f64::consts::FRAC_PI_2 * place.max(0.0)).cos().powi(2);
+            let target = gaussian * fall;
+            transform(stamp.view(), kx, ky) * h.conj() * (target * (1.0 - rest) / w)
+        })
+        .collect();
+    // v at the places of the coarse grid, windowed.
+    let from_middle = |at: usize| {
+        let x = at as f64 * spacing - (n - 1.0) / 2.0;
+        x - size as f64 * (x / size as f64).round()
+    };
+    let windowed = Array2::from_shape_fn((side, side), |(y, x)| {
+        let sum: Complex64 = plane()
+            .zip(&restored)
+            .map(|((kx, ky), v)| {
+                v * Complex64::from_polar(1.0, spacing * (kx * x as f64 + ky * y as f64))
+            })
+            .sum();
+        let square = from_middle(x).powi(2) + from_middle(y).powi(2);
+        let window = (-0.5 * square / settings.window_sigma.powi(2)).exp();
+        sum.re / (size * size) as f64 * window
+    });
+    // Its power and the lags.
+    let circle = unit * modes as f64 * (1.0 + 1e-12);
+    let reach = plan.reach() as i32;
+    let powers: Vec<(f64, f64, f64)> = plane()
+        .filter(|(kx, ky)| kx.hypot(*ky) <= circle)
+        .map(|(kx, ky)| {
+            let v = transform(windowed.view(), kx * spacing, ky * spacing);
+            (
+                kx,
+                ky,
+                v.norm_sqr() * spacing.powi(4) / (size * size) as f64,
+            )
+        })
+        .collect();
+    let mut lags = Vec::new();
+    for y in 0..=reach {
+        for x in -reach..=reach {
+            let terms = powers.iter().map(|(kx, ky, power)| {
+                power * (plan.spacing() * (kx * f64::from(x) + ky * f64::from(y))).cos()
+            });
+            lags.push(terms.sum());
+        }
+    }
+    lags
+}
+
+#[test]
+fn the_autocorrelation_is_that_of_plain_sums_for_odd_and_even_sizes_and_dirty_scratch() {
+    for (n, p, iterations, lambda) in [(24, 11, 3, 0.0), (19, 8, 40, 1e-3), (13, 13, 1000, 0.0)] {
+        let settings = settings(iterations, 1.5, n as f64 / 4.0, lambda);
+        let h = psf(p);
+        let stamp = convolve(galaxy(n, 0.0, 0.0).view(), h.view());
+        let plan = Spectral::new(n, p, &settings).unwrap();
+        let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+        let data: Vec<f32> = stamp.iter().map(|&v| v as f32).collect();
+        // What another stamp left behind must not matter.
+        plan.set_psf(psf(p).t(), &mut scratch, &mut own).unwrap();
+        let other: Vec<f32> = data.iter().map(|v| 1e3 - v).collect();
+        plan.autocorrelate(&own, &other, 3.0, &mut scratch, &mut lags);
+        plan.noise_field(&own, 1, &mut scratch, &mut lags);
+        plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+        plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
+        let expected = plain(&plan, &settings, &h, &stamp);
+        let peak = expected[plan.reach()];
+        for (found, expected) in lags.acf.iter().zip(&expected) {
+            // f32 transforms; modes below `LEAST_POWER`, which are left out, have none of the light.
+            let apart = (f64::from(*found) - expected).abs();
+            assert!(apart < 1e-5 * peak, "{n} {p}: {found} {expected}");
+        }
+    }
+}
+
+#[test]
+fn pictures_show_the_stamp_whose_lags_are_measured() {
+    // The stamp's square is the autocorrelation's zero lag, on the finer grid of pixels too.
+    let (n, p) = (33, 9);
+    let settings = settings(1000, 1.5, 8.0, 0.0);
+    let h = psf(p);
+    let plan = Spectral::new(n, p, &settings).unwrap();
+    let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+    plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+    let data = observed(n, &h, 0.1, 0.0);
+    plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
+    let picture = plan.deconvolved(h.view(), &data);
+    let square: f64 = picture.iter().map(|v| f64::from(v * v)).sum();
+    let peak = f64::from(lags.acf[plan.reach()]);
+    // The window spreads a little light beyond the largest circle of modes.
+    assert!((square / peak - 1.0).abs() < 4e-3, "{square} {peak}");
+}
+
+#[test]
+fn the_response_is_that_of_a_sheared_galaxy() {
+    // The window goes through the galaxy.
+    let (n, p) = (40, 11);
+    let h = psf(p);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 3.0, 0.0)).unwrap();
+    let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+    plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+    let mut lags_of = |g1: f64, g2: f64| {
+        let mut lags = plan.lags();
+        plan.autocorrelate(&own, &observed(n, &h, g1, g2), 0.0, &mut scratch, &mut lags);
+        lags
+    };
+    let here = lags_of(0.0, 0.0);
+    let peak = here.acf[plan.reach()];
+    let step = 0.01;
+    for (derivative, plus, minus) in [
+        (&here.shear1, lags_of(step, 0.0), lags_of(-step, 0.0)),
+        (&here.shear2, lags_of(0.0, step), lags_of(0.0, -step)),
+    ] {
+        let largest = derivative.iter().fold(0.0f32, |a, b| a.max(b.abs()));
+        assert!(largest > 0.05 * peak);
+        for (found, (a, b)) in derivative.iter().zip(plus.acf.iter().zip(&minus.acf)) {
+            let expected = (a - b) / (2.0 * step as f32);
+            // f32 rounding over the step (1e-5), second order in the step (1e-4 of the size).
+            assert!((found - expected).abs() < 1e-3 * peak, "{found} {expected}");
+        }
+    }
+}
+
+#[test]
+fn a_round_galaxy_keeps_nothing_of_the_psfs_ellipticity() {
+    let (n, p) = (48, 21);
+    let centre = (n as f64 - 1.0) / 2.0;
+    let round = Array2::from_shape_fn((n, n), |(y, x)| {
+        (-((y as f64 - centre).powi(2) + (x as f64 - centre).powi(2)) / 18.0).exp()
+    });
+    let h = psf(p);
+    let stamp = convolve(round.view(), h.view());
+    let data: Vec<f32> = stamp.iter().map(|&v| v as f32).collect();
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 8.0, 0.0)).unwrap();
+    let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+    plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+    plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
+    let (reach, width) = (plan.reach(), 2 * plan.reach() + 1);
+    for lag in 1..=reach {
+        let (x, y) = (lags.acf[reach + lag], lags.acf[lag * width + reach]);
+        // 1e-5 is f32 through the division by the PSF's transform.
+        assert!((x - y).abs() < 2e-5 * lags.acf[reach], "{lag}: {x} {y}");
+    }
+}
+
+#[test]
+fn noise_is_subtracted_in_the_mean_from_the_autocorrelation_and_its_derivatives() {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let (n, p) = (32, 9);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 5.0, 1e-4)).unwrap();
+    let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+    plan.set_psf(psf(p).view(), &mut scratch, &mut own).unwrap();
+    let count = 4000;
+    let mut means = [(); 2].map(|()| [(); 3].map(|()| vec![0.0f64; lags.acf.len()]));
+    for _ in 0..count {
+        let stamp = noise(n, &mut rng);
+        for (level, sums) in [1.0, 0.0].into_iter().zip(&mut means) {
+            plan.autocorrelate(&own, &stamp, level, &mut scratch, &mut lags);
+            for (sums, lags) in sums.iter_mut().zip([&lags.acf, &lags.shear1, &lags.shear2]) {
+                for (sum, lag) in sums.iter_mut().zip(lags) {
+                    *sum += f64::from(*lag) / f64::from(count);
+                }
+            }
+        }
+    }
+    let [with, without] = means;
+    let peak = without[0][plan.reach()];
+    assert!(
+        (peak / f64::from(own.noise_peak()) - 1.0).abs() < 0.02,
+        "{peak}"
+    );
+    let largest = |lags: &[f64]| lags.iter().fold(0.0f64, |a, b| a.max(b.abs()));
+    for (kind, (with, without)) in with.iter().zip(&without).enumerate() {
+        let (left, all) = (largest(with), largest(without));
+        // Some twenty independent modes in each of 4000 stamps: 0.4 % of the peak; the shear of noise
+        // moves pixels by several of their distances, for which five times as much.
+        let tolerance = [0.012, 0.06, 0.06][kind] * peak;
+        assert!(left < tolerance, "{kind}: {left} of {all}, peak {peak}");
+        assert!(all > 3.0 * tolerance, "{kind}: {all}, peak {peak}");
+    }
+}
+
+#[test]
+fn a_field_of_noise_changes_the_autocorrelation_as_noise_on_the_stamp_does() {
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    let (n, p) = (32, 9);
+    let h = psf(p);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 5.0, 0.0)).unwrap();
+    let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+    plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+    let data = observed(n, &h, 0.0, 0.0);
+    // Products of the change of a lag with itself and with the changes under sheared noise, summed
+    // over lags: of both kinds of noise.
+    let mut sums = [[0.0f64; 3]; 2];
+    let add = |sums: &mut [f64; 3], lags: &Lags| {
+        for (sum, other) in sums.iter_mut().zip([&lags.acf, &lags.shear1, &lags.shear2]) {
+            let products = lags.acf.iter().zip(other);
+            *sum += products.map(|(a, b)| f64::from(a * b)).sum::<f64>();
+        }
+    };
+    let mut lags = plan.lags();
+    plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
+    let galaxy = scratch.stamp.clone();
+    for seed in 0..6000 {
+        plan.deconvolve(&own, &noise(n, &mut rng), &mut scratch.plane);
+        plan.changes(&galaxy, &mut scratch.plane, &mut lags);
+        add(&mut sums[0], &lags);
+        plan.noise_field(&own, seed, &mut scratch, &mut lags);
+        add(&mut sums[1], &lags);
+    }
+    let [expected, found] = sums;
+    let apart = |k: usize| (found[k] - expected[k]).abs() / expected[0];
+    // 6000 sums of some ten independent squares: 0.6 % each.
+    assert!(apart(0) < 0.04, "{found:?} {expected:?}");
+    for k in 1..3 {
+        // A shear moves the noise's pixels by several of their distances, which has no mean product but
+        // adds to its error.
+        assert!(apart(k) < 0.04, "{k}: {found:?} {expected:?}");
+        assert!(expected[k].abs() > 0.12 * expected[0], "{k}: {expected:?}");
+    }
+}
+
+#[test]
+fn unusable_sizes_and_psfs_are_refused() {
+    let settings = settings(10, 1.5, 3.0, 0.0);
+    assert!(Spectral::new(65, 15, &settings).is_err());
+    assert!(Spectral::new(32, 49, &settings).is_err());
+    let plan = Spectral::new(32, 7, &settings).unwrap();
+    let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+    let mut bad = psf(7);
+    assert!(plan.set_psf(psf(9).view(), &mut scratch, &mut own).is_err());
+    bad[(2, 3)] = f64::NAN;
+    let error = plan
+        .set_psf(bad.view(), &mut scratch, &mut own)
+        .unwrap_err();
+    assert!(error.to_string().contains("pixel (4, 3)"), "{error}");
+}

@@ -1,0 +1,355 @@
+//! A few neighbouring pixels as one value, for each instruction set.
+//!
+//! The vectors with intrinsics are only made in functions compiled for their instruction set: their
+//! operations are inlined into those, and would be wrong to call anywhere else.
+
+use super::real::Real;
+
+/// `LANES` numbers that are worked on together.
+pub trait Vector<T>: Copy {
+    /// Numbers in it.
+    const LANES: usize;
+    /// Vectors of one row that are summed together, as the number of registers allows: 1 or 2.
+    const COLUMNS: usize;
+    /// Sums of squares on their way.
+    type Squares: Copy;
+
+    /// The same number everywhere.
+    fn splat(value: T) -> Self;
+    /// The first numbers of `from`.
+    fn load(from: &[T]) -> Self;
+    /// Writes the first numbers of `to`.
+    fn store(self, to: &mut [T]);
+    /// self + a·b, fused where the hardware can.
+    fn add_product(self, a: Self, b: Self) -> Self;
+    /// self + other.
+    fn plus(self, other: Self) -> Self;
+    /// self − other.
+    fn minus(self, other: Self) -> Self;
+    /// self · other.
+    fn times(self, other: Self) -> Self;
+    /// |self|.
+    fn modulus(self) -> Self;
+    /// `yes` where a > b, else `no`.
+    fn where_greater(a: Self, b: Self, yes: Self, no: Self) -> Self;
+    /// How often a > b.
+    fn count_greater(a: Self, b: Self) -> u32;
+    /// A sum of nothing.
+    fn no_squares() -> Self::Squares;
+    /// Adds the squares, in f64.
+    fn add_squares(self, sums: Self::Squares) -> Self::Squares;
+    /// The sum of all squares added.
+    fn sum(sums: Self::Squares) -> f64;
+}
+
+/// A number type with its vectors.
+pub trait Wide: Real {
+    /// Vectors of AVX-512.
+    #[cfg(target_arch = "x86_64")]
+    #[doc(hidden)]
+    type Avx512: Vector<Self>;
+    /// Vectors of AVX2 with fused multiply-add.
+    #[cfg(target_arch = "x86_64")]
+    #[doc(hidden)]
+    type Avx2: Vector<Self>;
+}
+
+impl Wide for f32 {
+    #[cfg(target_arch = "x86_64")]
+    type Avx512 = x86::Sixteen;
+    #[cfg(target_arch = "x86_64")]
+    type Avx2 = x86::Eight;
+}
+
+// Only tests run in f64: nothing is won by intrinsics.
+impl Wide for f64 {
+    #[cfg(target_arch = "x86_64")]
+    type Avx512 = Portable<f64, 4, true>;
+    #[cfg(target_arch = "x86_64")]
+    type Avx2 = Portable<f64, 4, true>;
+}
+
+/// `N` numbers in the hands of the compiler.
+#[derive(Clone, Copy)]
+pub struct Portable<T, const N: usize, const FMA: bool>([T; N]);
+
+impl<T: Real, const N: usize, const FMA: bool> Portable<T, N, FMA> {
+    #[inline(always)]
+    fn map(self, other: Self, f: impl Fn(T, T) -> T) -> Self {
+        let mut out = self;
+        for k in 0..N {
+            out.0[k] = f(self.0[k], other.0[k]);
+        }
+        out
+    }
+}
+
+impl<T: Real, const N: usize, const FMA: bool> Vector<T> for Portable<T, N, FMA> {
+    const LANES: usize = N;
+    const COLUMNS: usize = 1;
+    type Squares = [f64; N];
+
+    #[inline(always)]
+    fn splat(value: T) -> Self {
+        Portable([value; N])
+    }
+    #[inline(always)]
+    fn load(from: &[T]) -> Self {
+        let mut out = [T::ZERO; N];
+        out.copy_from_slice(&from[..N]);
+        Portable(out)
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [T]) {
+        to[..N].copy_from_slice(&self.0);
+    }
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        let mut out = self;
+        for k in 0..N {
+            out.0[k] = self.0[k].add_product::<FMA>(a.0[k], b.0[k]);
+        }
+        out
+    }
+    #[inline(always)]
+    fn plus(self, other: Self) -> Self {
+        self.map(other, |a, b| a.minus(T::ZERO.minus(b)))
+    }
+    #[inline(always)]
+    fn minus(self, other: Self) -> Self {
+        self.map(other, |a, b| a.minus(b))
+    }
+    #[inline(always)]
+    fn times(self, other: Self) -> Self {
+        self.map(other, |a, b| T::ZERO.add_product::<FMA>(a, b))
+    }
+    #[inline(always)]
+    fn modulus(self) -> Self {
+        self.map(self, |a, _| a.modulus())
+    }
+    #[inline(always)]
+    fn where_greater(a: Self, b: Self, yes: Self, no: Self) -> Self {
+        let mut out = no;
+        for k in 0..N {
+            out.0[k] = if a.0[k] > b.0[k] { yes.0[k] } else { no.0[k] };
+        }
+        out
+    }
+    #[inline(always)]
+    fn count_greater(a: Self, b: Self) -> u32 {
+        let mut count = 0;
+        for k in 0..N {
+            count += u32::from(a.0[k] > b.0[k]);
+        }
+        count
+    }
+    #[inline(always)]
+    fn no_squares() -> Self::Squares {
+        [0.0; N]
+    }
+    #[inline(always)]
+    fn add_squares(self, mut sums: Self::Squares) -> Self::Squares {
+        for (sum, value) in sums.iter_mut().zip(self.0) {
+            let value = value.to_f64();
+            *sum += value * value;
+        }
+        sums
+    }
+    #[inline(always)]
+    fn sum(sums: Self::Squares) -> f64 {
+        sums.iter().sum()
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use std::arch::x86_64::*;
+
+    use super::Vector;
+
+    /// Sixteen f32 of AVX-512.
+    #[derive(Clone, Copy)]
+    pub struct Sixteen(__m512);
+
+    // SAFETY of the unsafe blocks below: the module's `Level` uses this type only in a function
+    // compiled for AVX-512F, entered where the machine has it; loads and stores are of slices of
+    // sixteen numbers.
+    impl Vector<f32> for Sixteen {
+        const LANES: usize = 16;
+        const COLUMNS: usize = 2;
+        type Squares = [__m512d; 2];
+
+        #[inline(always)]
+        fn splat(value: f32) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_set1_ps(value) })
+        }
+        #[inline(always)]
+        fn load(from: &[f32]) -> Self {
+            let from = &from[..16];
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_loadu_ps(from.as_ptr()) })
+        }
+        #[inline(always)]
+        fn store(self, to: &mut [f32]) {
+            let to = &mut to[..16];
+            // SAFETY: see above the implementation.
+            unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        fn add_product(self, a: Self, b: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_fmadd_ps(a.0, b.0, self.0) })
+        }
+        #[inline(always)]
+        fn plus(self, other: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_add_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn minus(self, other: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_sub_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn times(self, other: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_mul_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn modulus(self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_abs_ps(self.0) })
+        }
+        #[inline(always)]
+        fn where_greater(a: Self, b: Self, yes: Self, no: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe {
+                let greater = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(a.0, b.0);
+                _mm512_mask_blend_ps(greater, no.0, yes.0)
+            })
+        }
+        #[inline(always)]
+        fn count_greater(a: Self, b: Self) -> u32 {
+            // SAFETY: see above the implementation.
+            unsafe { _mm512_cmp_ps_mask::<_CMP_GT_OQ>(a.0, b.0) }.count_ones()
+        }
+        #[inline(always)]
+        fn no_squares() -> Self::Squares {
+            // SAFETY: see above the implementation.
+            [unsafe { _mm512_setzero_pd() }; 2]
+        }
+        #[inline(always)]
+        fn add_squares(self, sums: Self::Squares) -> Self::Squares {
+            // SAFETY: see above the implementation.
+            unsafe {
+                let bits = _mm512_castps_pd(self.0);
+                let low = _mm512_cvtps_pd(_mm512_castps512_ps256(self.0));
+                let high = _mm512_cvtps_pd(_mm256_castpd_ps(_mm512_extractf64x4_pd::<1>(bits)));
+                [
+                    _mm512_fmadd_pd(low, low, sums[0]),
+                    _mm512_fmadd_pd(high, high, sums[1]),
+                ]
+            }
+        }
+        #[inline(always)]
+        fn sum(sums: Self::Squares) -> f64 {
+            // SAFETY: see above the implementation.
+            unsafe { _mm512_reduce_add_pd(_mm512_add_pd(sums[0], sums[1])) }
+        }
+    }
+
+    /// Eight f32 of AVX2 with fused multiply-add.
+    #[derive(Clone, Copy)]
+    pub struct Eight(__m256);
+
+    // SAFETY of the unsafe blocks below: the module's `Level` uses this type only in a function
+    // compiled for AVX2 and FMA, entered where the machine has them; loads and stores are of slices
+    // of eight numbers.
+    impl Vector<f32> for Eight {
+        const LANES: usize = 8;
+        const COLUMNS: usize = 1;
+        type Squares = [__m256d; 2];
+
+        #[inline(always)]
+        fn splat(value: f32) -> Self {
+            // SAFETY: see above the implementation.
+            Eight(unsafe { _mm256_set1_ps(value) })
+        }
+        #[inline(always)]
+        fn load(from: &[f32]) -> Self {
+            let from = &from[..8];
+            // SAFETY: see above the implementation.
+            Eight(unsafe { _mm256_loadu_ps(from.as_ptr()) })
+        }
+        #[inline(always)]
+        fn store(self, to: &mut [f32]) {
+            let to = &mut to[..8];
+            // SAFETY: see above the implementation.
+            unsafe { _mm256_storeu_ps(to.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        fn add_product(self, a: Self, b: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Eight(unsafe { _mm256_fmadd_ps(a.0, b.0, self.0) })
+        }
+        #[inline(always)]
+        fn plus(self, other: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Eight(unsafe { _mm256_add_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn minus(self, other: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Eight(unsafe { _mm256_sub_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn times(self, other: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Eight(unsafe { _mm256_mul_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn modulus(self) -> Self {
+            // SAFETY: see above the implementation.
+            Eight(unsafe { _mm256_andnot_ps(_mm256_set1_ps(-0.0), self.0) })
+        }
+        #[inline(always)]
+        fn where_greater(a: Self, b: Self, yes: Self, no: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Eight(unsafe {
+                let greater = _mm256_cmp_ps::<_CMP_GT_OQ>(a.0, b.0);
+                _mm256_blendv_ps(no.0, yes.0, greater)
+            })
+        }
+        #[inline(always)]
+        fn count_greater(a: Self, b: Self) -> u32 {
+            // SAFETY: see above the implementation.
+            let bits = unsafe { _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_GT_OQ>(a.0, b.0)) };
+            bits.count_ones()
+        }
+        #[inline(always)]
+        fn no_squares() -> Self::Squares {
+            // SAFETY: see above the implementation.
+            [unsafe { _mm256_setzero_pd() }; 2]
+        }
+        #[inline(always)]
+        fn add_squares(self, sums: Self::Squares) -> Self::Squares {
+            // SAFETY: see above the implementation.
+            unsafe {
+                let low = _mm256_cvtps_pd(_mm256_castps256_ps128(self.0));
+                let high = _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(self.0));
+                [
+                    _mm256_fmadd_pd(low, low, sums[0]),
+                    _mm256_fmadd_pd(high, high, sums[1]),
+                ]
+            }
+        }
+        #[inline(always)]
+        fn sum(sums: Self::Squares) -> f64 {
+            let mut lanes = [0.0; 4];
+            // SAFETY: see above the implementation; the store is of four numbers.
+            unsafe { _mm256_storeu_pd(lanes.as_mut_ptr(), _mm256_add_pd(sums[0], sums[1])) };
+            lanes.iter().sum()
+        }
+    }
+}

@@ -1,0 +1,255 @@
+//! One galaxy: from its postage stamp and PSF to an ellipticity. Serial; allocates nothing.
+
+use std::sync::Arc;
+
+use ndarray::ArrayView2;
+use shearq_scoring::{Distortion, Shear};
+use shearq_submissions::{EllipticityType, NoiseSource, Registry, Submission};
+
+use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
+use crate::error::MeasureError;
+use crate::flag::{Flag, Flags};
+use crate::measurement::Measurement;
+use crate::method::{CutWorker, Found, MethodPlan, ResponseMatrix};
+use crate::pixel::Pixel;
+use crate::psf::cut_start;
+
+/// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
+/// away from the smallest and largest numbers there are.
+const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
+
+/// Everything planned for one submission and one size of full stamps. Not changed by measuring, so
+/// one serves all threads, each with a [`Worker`] of its own.
+pub struct Measurer {
+    plan: Arc<Plan>,
+}
+
+struct Plan {
+    submission: Submission,
+    full: usize,
+    n: usize,
+    denoise: Option<WaveletWiener>,
+    method: MethodPlan,
+}
+
+/// One thread's part in measuring: its buffers, and the PSF of the galaxies at hand. Nothing is allocated
+/// for a galaxy.
+pub struct Worker {
+    plan: Arc<Plan>,
+    pub(crate) method: Box<dyn CutWorker>,
+    denoise: Option<DenoiseScratch>,
+    /// Full stamp, denoised in place.
+    full: Vec<f32>,
+    /// Cut stamp.
+    pub(crate) cut: Vec<f32>,
+    border: Vec<f32>,
+    usable_psf: bool,
+}
+
+impl Measurer {
+    /// Plans for full stamps of `full` pixels a side.
+    ///
+    /// # Errors
+    /// Where the stamps are smaller than the submission needs, or a size is out of range.
+    pub fn new(submission: &Submission, full: usize) -> Result<Self, MeasureError> {
+        let n = submission.stamp.size;
+        if full < n {
+            let expected = format!(
+                "at least {n} × {n}, as submission {} needs",
+                submission.name
+            );
+            return Err(MeasureError::square("stamps", (full, full), expected));
+        }
+        let plan = Plan {
+            full,
+            n,
+            denoise: submission
+                .wavelet()
+                .map(|settings| WaveletWiener::new(full, settings)),
+            method: MethodPlan::new(submission, n)?,
+            submission: submission.clone(),
+        };
+        Ok(Measurer {
+            plan: Arc::new(plan),
+        })
+    }
+
+    /// The same by the name of a submission or the path of a settings file.
+    ///
+    /// # Errors
+    /// Where there is no such submission, it is not valid, or as [`Measurer::new`].
+    pub fn named(submission: &str, full: usize) -> Result<Self, MeasureError> {
+        Measurer::new(&Registry::embedded()?.get(submission)?.submission, full)
+    }
+
+    /// The submission.
+    pub fn submission(&self) -> &Submission {
+        &self.plan.submission
+    }
+
+    /// Pixels a side of the full stamps.
+    pub fn full(&self) -> usize {
+        self.plan.full
+    }
+
+    /// Buffers for one thread.
+    pub fn worker(&self) -> Worker {
+        let Plan {
+            full,
+            n,
+            denoise,
+            method,
+            ..
+        } = &*self.plan;
+        Worker {
+            method: method.worker(),
+            denoise: denoise.as_ref().map(WaveletWiener::scratch),
+            full: vec![0.0; full * full],
+            cut: vec![0.0; n * n],
+            border: Vec::with_capacity(full * full),
+            usable_psf: false,
+            plan: Arc::clone(&self.plan),
+        }
+    }
+}
+
+impl Worker {
+    /// The submission.
+    pub fn submission(&self) -> &Submission {
+        &self.plan.submission
+    }
+
+    /// Takes the PSF of the galaxies that follow, of the submission's size, centred, and of sum one. One that
+    /// is refused flags them.
+    ///
+    /// # Errors
+    /// Where its sizes are others, or a pixel is not finite.
+    pub fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
+        let taken = self.method.set_psf(psf);
+        self.usable_psf = taken.is_ok();
+        taken
+    }
+
+    /// Leaves the galaxies that follow without a PSF, which flags them.
+    pub(crate) fn lose_psf(&mut self) {
+        self.usable_psf = false;
+    }
+
+    /// Measures a galaxy on its full stamp, before any calibration. `header_noise` is the image's noise
+    /// level, without which a submission that needs it flags the galaxy.
+    ///
+    /// # Errors
+    /// Where the stamp has other sizes than planned.
+    pub fn measure<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+        header_noise: Option<f64>,
+    ) -> Result<Measurement, MeasureError> {
+        let plan = Arc::clone(&self.plan);
+        let (full, n) = (plan.full, plan.n);
+        if stamp.dim() != (full, full) {
+            let expected = format!("{full} × {full}");
+            return Err(MeasureError::square("a stamp", stamp.dim(), expected));
+        }
+        for (row, from) in self.full.chunks_exact_mut(full).zip(stamp.rows()) {
+            for (value, pixel) in row.iter_mut().zip(from) {
+                *value = pixel.to_f32();
+            }
+        }
+        if self.full.iter().any(|v| !v.is_finite()) {
+            return Ok(Measurement::flagged(Flag::NotFinite));
+        }
+        if !self.usable_psf {
+            return Ok(Measurement::flagged(Flag::BadPsf));
+        }
+        if self.full.iter().all(|v| *v == self.full[0]) {
+            return Ok(Measurement::flagged(Flag::NoScale));
+        }
+        let noise = match plan.submission.noise {
+            NoiseSource::Header => header_noise.unwrap_or(f64::NAN),
+            NoiseSource::Border { border } => {
+                border_noise(&self.full, full, border, &mut self.border).map_or(f64::NAN, f64::from)
+            }
+        };
+        if let (Some(filter), Some(buffers)) = (&plan.denoise, &mut self.denoise) {
+            filter.apply(&mut self.full, noise as f32, buffers);
+        }
+        let start = cut_start(full, n).unwrap_or(0);
+        for (y, row) in self.cut.chunks_exact_mut(n).enumerate() {
+            let from = (start + y) * full + start;
+            row.copy_from_slice(&self.full[from..from + n]);
+        }
+        let peak = self.cut.iter().copied().fold(0.0f32, f32::max);
+        let found = if PEAKS.contains(&peak) {
+            self.method.measure(&self.cut, noise)?
+        } else {
+            None
+        };
+        let Some(found) = found else {
+            return Ok(Measurement {
+                noise,
+                ..Measurement::flagged(Flag::NoScale)
+            });
+        };
+        let nothing = Measurement {
+            descent: Some(found.descent),
+            noise,
+            flux: found.flux,
+            radius: found.radius,
+            size: found.size,
+            ..Measurement::flagged(Flag::NoShear)
+        };
+        Ok(match report(plan.submission.ellipticity(), &found) {
+            Err(flag) => Measurement {
+                flags: flag.into(),
+                ..nothing
+            },
+            Ok((e1, e2, response)) => Measurement {
+                e1,
+                e2,
+                flags: Flags::NONE,
+                response,
+                ..nothing
+            },
+        })
+    }
+}
+
+/// The ellipticity of type `kind` with its response.
+fn report(kind: EllipticityType, found: &Found) -> Result<(f64, f64, [f64; 2]), Flag> {
+    let (e1, e2, mut response) =
+        reported(kind, found.distortion?, found.response).ok_or(Flag::NoShear)?;
+    if let Some(noise) = &found.sheared_noise {
+        let sides = noise.sides.map(|(chi, r)| reported(kind, chi, r));
+        if let [Some((_, _, plus)), Some((_, _, minus))] = sides {
+            for k in 0..2 {
+                response[k] -= noise.weight * (plus[k] - minus[k]);
+            }
+        }
+    }
+    Ok((e1, e2, response))
+}
+
+/// The ellipticity of type `kind` for a distortion, and the response of each of its components to the
+/// same component of shear; `None` where there is none of that type.
+fn reported(
+    kind: EllipticityType,
+    chi: Distortion,
+    r: ResponseMatrix,
+) -> Option<(f64, f64, [f64; 2])> {
+    match kind {
+        EllipticityType::Distortion => Some((chi.e1, chi.e2, [r[0][0], r[1][1]])),
+        EllipticityType::Shear => {
+            let Shear { e1, e2 } = chi.to_shear()?;
+            // ε = χ f, f = 1/(1 + s), s = √(1 − |χ|²): ∂ε_i/∂χ_j = f δ_ij + χ_i χ_j f²/s.
+            let s = (1.0 - chi.e1 * chi.e1 - chi.e2 * chi.e2).sqrt();
+            let f = 1.0 / (1.0 + s);
+            let cross = |a: f64, b: f64| a * b * f * f / s;
+            let response = [
+                (f + cross(chi.e1, chi.e1)) * r[0][0] + cross(chi.e1, chi.e2) * r[1][0],
+                (f + cross(chi.e2, chi.e2)) * r[1][1] + cross(chi.e1, chi.e2) * r[0][1],
+            ];
+            Some((e1, e2, response))
+        }
+    }
+}

@@ -1,0 +1,194 @@
+//! The linear network, and moments under an adaptive weight.
+//!
+//! # Sheared noise
+//!
+//! The response of a galaxy is worked out on its image with noise, and shears that noise along with
+//! the galaxy; what the challenge shears has none. Of the difference, the mean of what noise adds to
+//! the autocorrelation's change is subtracted there. What remains is that the ellipticity is not
+//! linear in the autocorrelation: f″(δA, δA′), with δA the change that noise makes and δA′ that of the
+//! noise's own shear. It is estimated with a second field of noise (as Sheldon & Huff 2017 do, but on
+//! both sides and as a derivative), of which response and ellipticity are taken with the field added and
+//! taken away. One galaxy in [`SHARE`] is enough.
+
+use std::sync::Arc;
+
+use ndarray::ArrayView2;
+use shearq_submissions::LinearMethod;
+
+use super::found::{CutWorker, Found, Images, ResponseMatrix, Sheared, image, whole};
+use crate::deconvolve::{Descent, Lags, Spectral, SpectralPsf, SpectralScratch, Stop};
+use crate::error::MeasureError;
+use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
+
+/// One galaxy in so many is looked at with a field of noise: what it corrects is some per cent of the
+/// response at S/N 10 and less above, and needs to be known in the mean alone.
+const SHARE: u64 = 4;
+/// Level of the field of noise, in that of the galaxy's: small, for a derivative, and large beside what
+/// single precision resolves.
+const FIELD: f32 = 0.25;
+
+/// What one submission and stamp size need.
+pub(crate) struct LinearPlan {
+    iterations: u32,
+    softening: f32,
+    spectral: Spectral,
+    moments: AdaptiveMoments,
+}
+
+impl LinearPlan {
+    pub(super) fn new(method: &LinearMethod, n: usize, p: usize) -> Result<Self, MeasureError> {
+        let settings = &method.deconvolution;
+        let spectral = Spectral::new(n, p, settings)?;
+        let scale = method.shape.weight_scale;
+        Ok(LinearPlan {
+            iterations: u32::try_from(settings.max_iterations).unwrap_or(u32::MAX),
+            softening: method.shape.softening as f32,
+            moments: AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach()),
+            spectral,
+        })
+    }
+}
+
+/// A worker for one thread.
+pub(super) fn worker(plan: Arc<LinearPlan>) -> Box<dyn CutWorker> {
+    Box::new(LinearWorker {
+        psf: plan.spectral.psf(),
+        buffers: plan.spectral.scratch(),
+        lags: plan.spectral.lags(),
+        field: plan.spectral.lags(),
+        shifted: plan.spectral.lags().acf,
+        values: plan.moments.scratch(),
+        plan,
+    })
+}
+
+struct LinearWorker {
+    plan: Arc<LinearPlan>,
+    psf: SpectralPsf,
+    buffers: SpectralScratch,
+    lags: Lags,
+    /// Of a field of noise.
+    field: Lags,
+    /// The autocorrelation with that field.
+    shifted: Vec<f32>,
+    values: AdaptiveScratch,
+}
+
+impl LinearWorker {
+    /// Response of `shape` to a change of the autocorrelation by `lags.shear1` and `lags.shear2`.
+    fn response(
+        plan: &LinearPlan,
+        shape: &AdaptiveShape,
+        lags: &Lags,
+        values: &mut AdaptiveScratch,
+    ) -> ResponseMatrix {
+        let first = plan.moments.response(shape, &lags.shear1, values);
+        let second = plan.moments.response(shape, &lags.shear2, values);
+        [[first[0], second[0]], [first[1], second[1]]]
+    }
+
+    /// The response to sheared noise; `None` if the galaxy cannot be measured with the field.
+    fn sheared_noise(&mut self, seed: u64, noise: f32, softening: f32) -> Option<Sheared> {
+        let plan = &*self.plan;
+        plan.spectral
+            .noise_field(&self.psf, seed, &mut self.buffers, &mut self.field);
+        let step = FIELD * noise;
+        let mut side = |step: f32| {
+            let terms = self.lags.acf.iter().zip(&self.field.acf);
+            for (out, (acf, change)) in self.shifted.iter_mut().zip(terms) {
+                *out = acf + step * change;
+            }
+            let moments = &plan.moments;
+            let shape = moments.measure(&self.shifted, softening, &mut self.values);
+            let shape = shape.ok()?;
+            let response = Self::response(plan, &shape, &self.field, &mut self.values);
+            Some((shape.distortion, response))
+        };
+        Some(Sheared {
+            sides: [side(step)?, side(-step)?],
+            weight: f64::from(noise * noise / (2.0 * step)) * SHARE as f64,
+        })
+    }
+}
+
+impl CutWorker for LinearWorker {
+    fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
+        self.plan
+            .spectral
+            .set_psf(psf, &mut self.buffers, &mut self.psf)
+    }
+
+    fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
+        if !(noise >= 0.0 && noise.is_finite()) {
+            return Ok(None);
+        }
+        let plan = Arc::clone(&self.plan);
+        let sigma = noise as f32;
+        let (buffers, lags) = (&mut self.buffers, &mut self.lags);
+        plan.spectral
+            .autocorrelate(&self.psf, cut, sigma, buffers, lags);
+        let softening = plan.softening * sigma * sigma * self.psf.noise_peak();
+        let shape = plan.moments.measure(&lags.acf, softening, &mut self.values);
+        let mut response = [[f64::NAN; 2]; 2];
+        let mut sheared_noise = None;
+        if let Ok(shape) = &shape {
+            response = Self::response(&plan, shape, lags, &mut self.values);
+            let seed = seed_of(cut, sigma);
+            if noise > 0.0 && seed.is_multiple_of(SHARE) {
+                sheared_noise = self.sheared_noise(seed, sigma, softening);
+            }
+        }
+        Ok(Some(Found {
+            descent: Descent {
+                iterations: plan.iterations,
+                stop: Stop::MaxIterations,
+                first_energy: f64::NAN,
+                energy: f64::NAN,
+                updated: cut.len() as u32,
+            },
+            distortion: shape.map(|s| s.distortion),
+            response,
+            sheared_noise,
+            flux: sum(cut),
+            radius: plan.spectral.reach() as f64 * plan.spectral.spacing(),
+            size: shape.map_or(f64::NAN, |s| s.size),
+        }))
+    }
+
+    fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
+        let spectral = &self.plan.spectral;
+        Images {
+            deconvolved: image(&spectral.deconvolved(psf, cut), spectral.stamp_size()),
+            acf: whole(&self.lags.acf, spectral.reach()),
+            spacing: spectral.spacing(),
+        }
+    }
+}
+
+/// A seed that is the stamp's own: whether and with which noise a galaxy is looked at depends on nothing
+/// else. Of pixels in steps of a sixteenth of the noise, so that another machine's rounding hardly ever
+/// gives another.
+fn seed_of(stamp: &[f32], noise: f32) -> u64 {
+    // Pixels along the middle: noise makes them different for every galaxy. Fowler, Noll and Vo's hash.
+    let n = stamp.len().isqrt();
+    let row = &stamp[n / 2 * n..][..n];
+    let hash = row.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, value| {
+        let step = (16.0 * value / noise).round() as i32;
+        (hash ^ u64::from(step.cast_unsigned())).wrapping_mul(0x0100_0000_01b3)
+    });
+    hash >> 16
+}
+
+/// Sum of a stamp: rows in f32 side by side, which is where the time would go otherwise.
+fn sum(stamp: &[f32]) -> f64 {
+    const LANES: usize = 16;
+    let mut lanes = [0.0f32; LANES];
+    let chunks = stamp.chunks_exact(LANES);
+    let rest: f32 = chunks.remainder().iter().sum();
+    for chunk in chunks {
+        for (lane, value) in lanes.iter_mut().zip(chunk) {
+            *lane += value;
+        }
+    }
+    lanes.iter().map(|&lane| f64::from(lane)).sum::<f64>() + f64::from(rest)
+}

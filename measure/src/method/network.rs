@@ -1,0 +1,96 @@
+//! The network, and moments of the clipped autocorrelation.
+
+use std::sync::Arc;
+
+use ndarray::ArrayView2;
+use shearq_submissions::{NetworkDeconvolution, NetworkMethod};
+
+use super::found::{CutWorker, Found, Images, image, whole};
+use crate::deconvolve::{Network, NetworkScratch, Rule};
+use crate::error::MeasureError;
+use crate::shape::{AcfScratch, Autocorrelation, ClippedMoments};
+
+/// What one submission and stamp size need.
+pub(crate) struct NetworkPlan {
+    settings: NetworkDeconvolution,
+    network: Network<f32>,
+    acf: Autocorrelation,
+    moments: ClippedMoments,
+}
+
+impl NetworkPlan {
+    pub(super) fn new(method: &NetworkMethod, n: usize, p: usize) -> Result<Self, MeasureError> {
+        let settings = method.deconvolution.clone();
+        Ok(NetworkPlan {
+            network: Network::plan(n, p, settings.lambda)?,
+            acf: Autocorrelation::new(n),
+            moments: ClippedMoments::new(n, method.shape.acf_share),
+            settings,
+        })
+    }
+}
+
+/// A worker for one thread.
+pub(super) fn worker(plan: Arc<NetworkPlan>) -> Box<dyn CutWorker> {
+    let n = plan.network.stamp_size();
+    Box::new(NetworkWorker {
+        network: plan.network.clone(),
+        buffers: plan.network.scratch(),
+        acf_buffers: plan.acf.scratch(),
+        deconvolved: vec![0.0; n * n],
+        lags: vec![0.0; plan.acf.len()],
+        plan,
+    })
+}
+
+struct NetworkWorker {
+    plan: Arc<NetworkPlan>,
+    /// With the PSF.
+    network: Network<f32>,
+    buffers: NetworkScratch<f32>,
+    acf_buffers: AcfScratch,
+    deconvolved: Vec<f32>,
+    lags: Vec<f32>,
+}
+
+impl CutWorker for NetworkWorker {
+    fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
+        self.network.set_psf(psf)
+    }
+
+    fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
+        let plan = &*self.plan;
+        let peak = cut.iter().copied().fold(0.0f32, f32::max);
+        let Some(rule) = Rule::new(&plan.settings, f64::from(peak), noise) else {
+            return Ok(None);
+        };
+        let buffers = &mut self.buffers;
+        let descent = self
+            .network
+            .deconvolve(&rule, cut, buffers, &mut self.deconvolved)?;
+        let flux = self.deconvolved.iter().map(|&v| f64::from(v)).sum();
+        plan.acf
+            .compute(&self.deconvolved, &mut self.acf_buffers, &mut self.lags)?;
+        let measured = plan.moments.measure(&self.lags, flux);
+        let (radius, size) = measured.map_or((f64::NAN, f64::NAN), |m| (m.radius, m.xx + m.yy));
+        let distortion = measured.and_then(|moments| moments.distortion());
+        Ok(Some(Found {
+            descent,
+            distortion,
+            response: [[f64::NAN; 2]; 2],
+            sheared_noise: None,
+            flux,
+            radius,
+            size,
+        }))
+    }
+
+    fn images(&mut self, _cut: &[f32], _psf: ArrayView2<'_, f64>) -> Images {
+        let n = self.network.stamp_size();
+        Images {
+            deconvolved: image(&self.deconvolved, n),
+            acf: whole(&self.lags, n - 1),
+            spacing: 1.0,
+        }
+    }
+}

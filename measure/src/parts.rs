@@ -1,0 +1,15 @@
+//! The parts of a measurement, for studies, benchmarks and simulations. Slices and buffers have to be of the
+//! sizes planned.
+
+pub use crate::deconvolve::{
+    Lags, Matrices, Network, NetworkScratch, Rule, Spectral, SpectralPsf, SpectralScratch, Step,
+    Wide, convolve,
+};
+pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
+pub use crate::fft::{FftScratch, StampFft};
+pub use crate::psf::{PsfTransform, TransformedPsf};
+pub use crate::radial::{QuadraticForm, RadialTable, SingleTable, composite_rule, gauss_legendre};
+pub use crate::shape::{
+    AcfScratch, AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Autocorrelation, ClippedMoments,
+    Moments,
+};

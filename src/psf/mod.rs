@@ -1,3 +1,0 @@
-//! Point-spread functions: star stamps and functional forms.
-pub mod functional;
-pub mod star;

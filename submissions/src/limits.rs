@@ -1,0 +1,11 @@
+//! Limits that the arithmetic of the measurement sets to settings.
+
+/// Largest side of a stamp, in pixels.
+pub const MAX_STAMP: usize = 64;
+
+/// Largest side of a PSF stamp, in pixels.
+pub const MAX_PSF: usize = 48;
+
+/// Largest eigenvalue of G = DᵀD, D being Sun's high-pass (Sect. 3.1), rounded up: the square of the kernel's
+/// transform where that is largest.
+pub const MAX_ROUGHNESS: f64 = 0.0093;
