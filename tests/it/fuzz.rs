@@ -21,8 +21,10 @@ use crate::support::{Small, fits_image, pixels_of};
 
 /// Inputs of each reader in the ordinary test.
 const INPUTS: u64 = 300;
-/// Images in the long one.
-const MANY_IMAGES: u64 = 100_000;
+/// Images of each kind in the long one.
+const MANY_IMAGES: u64 = 40_000;
+/// Files of each other kind in it.
+const MANY_OTHERS: u64 = 10_000;
 /// Longest that one input may take. It takes a millisecond; the rest is for busy machines.
 const LONGEST: Duration = Duration::from_secs(5);
 /// Most memory that one may take, in bytes, where no other test takes any at the same time.
@@ -38,7 +40,7 @@ fn mutated_files_are_read_or_refused() {
 #[ignore = "minutes of the same with other inputs"]
 fn many_mutated_files_are_read_or_refused() {
     fuzz_images(MANY_IMAGES);
-    fuzz_others(MANY_IMAGES / 10);
+    fuzz_others(MANY_OTHERS);
 }
 
 /// Feeds `count` mutations of `seeds` to `read`, which says whether it took one.
