@@ -162,18 +162,18 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
         Some(data) => {
             arguments.simulation.must_be_unused()?;
             let data = DataFolder::open(data)?;
-            let sets = match &arguments.sets {
-                Some(list) => list.0.clone(),
-                None => data.sets()?,
+            let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
+            let files = data.images(sets)?;
+            let sets = match sets {
+                [] => files.sets(),
+                sets => sets.to_vec(),
             };
-            let all = sets.into_iter().map(|set| {
-                let images = match arguments.images {
-                    Some(images) => images,
-                    None => data.images(set)?.len() as u32,
-                };
-                anyhow::Ok(Wanted { set, images })
-            });
-            let all = all.collect::<anyhow::Result<_>>()?;
+            let there = |set| files.of_set(set).len() as u32;
+            let wanted = |set| Wanted {
+                set,
+                images: arguments.images.unwrap_or_else(|| there(set)),
+            };
+            let all = sets.into_iter().map(wanted).collect();
             of_source(arguments, Source::folder(&data, folder)?, all)?
         }
     };

@@ -10,7 +10,7 @@ use shearq_scoring::units::{Degrees, Pixels};
 use super::{Findings, count, print};
 use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, MAX_SET, read_truth_rows};
 use crate::io::open::is_there;
-use crate::pipeline::score::grid_side;
+use crate::pipeline::grid;
 use crate::submit::check::{Expected, Severity, check};
 
 /// Validate a submission before it is sent: one line per finding.
@@ -33,7 +33,7 @@ pub(super) struct Arguments {
     /// Galaxies a side [default: that of the data's truth, or 100].
     #[arg(long, value_name = "N")]
     grid: Option<usize>,
-    /// Pixels a side of a grid cell [default: that of the data's layout, or 48].
+    /// Pixels a side of a grid cell [default: that of the data's images or layout, or 48].
     #[arg(long, value_name = "PX", allow_negative_numbers = true)]
     stamp: Option<f64>,
     /// Images that every set must have [default: as many as the highest number says].
@@ -62,14 +62,19 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let mut side = *grid;
     if let (None, Some(data), Some(&set)) = (side, &data, sets.first()) {
         let rows = read_truth_rows(&data.truth(set))?.len();
-        side = Some(grid_side(&data.truth(set), rows)?);
+        side = Some(grid::side(&data.truth(set), rows)?);
     }
     let layout = data
         .as_ref()
         .map_or_else(Layout::default, |data| data.layout().clone());
+    let stamp = match (*stamp, &data, sets.first()) {
+        (Some(given), ..) => given,
+        (None, Some(data), Some(&set)) => grid::stamp_of_set(data, set)? as f64,
+        _ => layout.stamp as f64,
+    };
     let grid = Grid::new(
         side.unwrap_or(100),
-        Pixels(stamp.unwrap_or(layout.stamp as f64)),
+        Pixels(stamp),
         Degrees(layout.field_degrees),
     )?;
     let mut truth = BTreeMap::new();

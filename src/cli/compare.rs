@@ -10,6 +10,7 @@ use shearq_submissions::{Published, Registry};
 use super::arguments::{Printing, ScoreSettings, Threads};
 use super::print_heat_map;
 use crate::io::layout::{DataFolder, MAX_SET};
+use crate::io::listing::Files;
 use crate::io::run::{Run, Source};
 use crate::io::store::{self, Conditions};
 use crate::pipeline::inputs;
@@ -120,7 +121,7 @@ fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)
 struct Entrant<'a> {
     name: String,
     published: Option<Published>,
-    of_set: Box<dyn Fn(u32) -> Vec<(u32, PathBuf)> + 'a>,
+    files: Files,
     foreign: Option<&'a Foreign>,
 }
 
@@ -171,25 +172,27 @@ pub(super) fn variants(
                 .filter(|entry| entry.submission == run.submission)
                 .and_then(|entry| entry.published),
             name: run.submission.name.clone(),
-            of_set: Box::new(move |set| run.catalogues(folder, set)),
+            files: run.catalogues(folder, &[])?,
             foreign: None,
         });
     }
     let data = data.context("--foreign alone needs --data DIR with the true shear")?;
-    entrants.extend(foreign.iter().map(|foreign| Entrant {
-        name: foreign.name.clone(),
-        published: None,
-        of_set: Box::new(|set| foreign.catalogues(set)),
-        foreign: Some(foreign),
-    }));
+    for foreign in &foreign {
+        entrants.push(Entrant {
+            name: foreign.name.clone(),
+            published: None,
+            files: foreign.catalogues(&[])?,
+            foreign: Some(foreign),
+        });
+    }
     for entrant in &entrants {
         anyhow::ensure!(
-            (1..=MAX_SET).any(|set| !(entrant.of_set)(set).is_empty()),
+            !entrant.files.sets().is_empty(),
             "{}: there is no catalogue to score",
             entrant.name
         );
     }
-    let common = |set: u32| entrants.iter().all(|e| !(e.of_set)(set).is_empty());
+    let common = |set: u32| entrants.iter().all(|e| e.files.sets().contains(&set));
     anyhow::ensure!(
         (1..=MAX_SET).any(common),
         "the variants have no set in common; there is nothing to compare"
@@ -204,11 +207,16 @@ pub(super) fn variants(
             }
         })
         .collect();
-    let catalogues: Vec<Catalogues<'_>> = entrants
+    let of_set: Vec<_> = entrants
+        .iter()
+        .map(|entrant| |set: u32| entrant.files.of_set(set))
+        .collect();
+    let catalogues: Vec<Catalogues<'_>> = of_set
         .iter()
         .zip(&readers)
-        .map(|(entrant, read)| Catalogues {
-            of_set: &entrant.of_set,
+        .zip(&entrants)
+        .map(|((of_set, read), entrant)| Catalogues {
+            of_set,
             read,
             choice: match entrant.foreign {
                 Some(_) => settings.choice(),
@@ -223,6 +231,7 @@ pub(super) fn variants(
     let scored = score_variants(&data, &catalogues, &[], options, threads)?;
     drop(catalogues);
     drop(readers);
+    drop(of_set);
     Ok(entrants
         .into_iter()
         .zip(scored)

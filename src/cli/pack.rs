@@ -7,10 +7,12 @@ use shearq_submissions::is_control;
 
 use super::progress::Bar;
 use super::{count, tell};
+use crate::io::layout::DataFolder;
 use crate::io::run::Run;
 use crate::submit::archive::is_archive;
+use crate::submit::foreign::Foreign;
 use crate::submit::manifest::Contents;
-use crate::submit::pack::Packing;
+use crate::submit::pack::{Origin, Packing};
 
 /// Longest name of a method, in bytes: a tar header has 100 for the file names made with it.
 const MAX_METHOD: usize = 64;
@@ -18,7 +20,7 @@ const MAX_METHOD: usize = 64;
 /// Endings of archives that are not made.
 const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"];
 
-/// Write measured catalogues as the files that the challenge takes, with a manifest.
+/// Write catalogues as the files that the challenge takes, with a manifest.
 ///
 /// Either one ASCII catalogue per image (`g10_v1_objs_{set}_{image}.{method}.dat`), or one power
 /// spectrum per set (`{method}_set{set}.dat`): of the ellipticities averaged over the images, as the
@@ -30,12 +32,19 @@ const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"]
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Folder that `measure` or `run` wrote.
-    #[arg(long, value_name = "DIR")]
-    measured: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "foreign")]
+    measured: Option<PathBuf>,
+    /// Catalogues of another program, described in a TOML file (docs/formats.md), instead of
+    /// --measured. They are packed in the signs and the type of ellipticity that are scored.
+    #[arg(long, value_name = "FILE", conflicts_with = "measured")]
+    foreign: Option<PathBuf>,
+    /// Data folder that they were measured from, which gives the grid of spectra.
+    #[arg(long, value_name = "DIR", requires = "foreign")]
+    data: Option<PathBuf>,
     /// New folder to write to, or an archive ending in .tar.gz or .tgz.
     #[arg(long, value_name = "PATH")]
     out: PathBuf,
-    /// Method's name in file names [default: the submission's, with `-` for `/`].
+    /// Method's name in file names [default: the submission's or the program's, with `-` for `/`].
     #[arg(long, value_name = "NAME")]
     method: Option<String>,
     /// Which kind of submission.
@@ -46,6 +55,8 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Arguments {
         measured,
+        foreign,
+        data,
         out,
         method,
         kind,
@@ -56,10 +67,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "--out {}: expected a folder, or an archive ending in .tar.gz or .tgz",
         out.display()
     );
-    let run = Run::require(measured)?;
-    let method = method
-        .clone()
-        .unwrap_or_else(|| run.submission.name.replace('/', "-"));
+    let run = measured.as_deref().map(Run::require).transpose()?;
+    let foreign = foreign.as_deref().map(Foreign::read).transpose()?;
+    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let (origin, name) = match (measured, &run, &foreign) {
+        (Some(folder), Some(run), _) => (Origin::Measured { folder, run }, &run.submission.name),
+        (_, _, Some(foreign)) => {
+            let data = data.as_ref();
+            (Origin::Foreign { foreign, data }, &foreign.name)
+        }
+        _ => anyhow::bail!("there is nothing to pack: give --measured DIR or --foreign FILE"),
+    };
+    let method = method.clone().unwrap_or_else(|| name.replace('/', "-"));
     anyhow::ensure!(
         (1..=MAX_METHOD).contains(&method.len())
             && !method.starts_with('.')
@@ -67,8 +86,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "the method's name is `{method}`; expected 1 to {MAX_METHOD} bytes without `/`, `\\`, `:`, blanks and a first `.`"
     );
     let packing = Packing {
-        measured,
-        run: &run,
+        origin,
         method,
         contents: *kind,
     };

@@ -13,26 +13,28 @@ use super::{print, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::store;
+use crate::pipeline::PipelineError;
 use crate::pipeline::record::{Measured, run_record};
 use crate::pipeline::score::{
-    Reading, ScoredSet, Screen, plain_columns, read_truth, reading_of, score_files, score_folder,
-    score_sets,
+    COLUMNS, ReadImage, Reading, ScoredSet, Screen, own_catalogue, plain_columns, read_truth,
+    reading_of, score_files, score_folder, score_sets,
 };
 use crate::report::scores::{SetInput, one_set_json, per_set, spectra};
 use crate::report::table::TableFormat;
 use crate::submit::challenge::{Kind, read_bandpowers};
 use crate::submit::foreign::Foreign;
 use crate::submit::manifest::Manifest;
+use crate::submit::packed::{Packed, Sent, Submission};
 
 /// Score ellipticities against the true shear: Q, Q_dn, M/2, √A.
 ///
 /// Either a folder that `measure` wrote (`--data DATA --measured OUT`), other programs' catalogues
 /// (`--data DATA --foreign FILE`), or one set from plain files (`--truth truth.csv CATALOGUE...`, one
 /// catalogue per image; CSV with a header, ASCII `x y e1 e2`, FITS or Parquet by the file's ending).
-/// Power-spectrum submissions are given by --spectra. With `--format json` and plain files everything about the
+/// Power-spectrum submissions are given by --spectra, packed submissions of either kind by --packed. With `--format json` and plain files everything about the
 /// set is printed, all eight conventions included.
 #[derive(Debug, Args)]
-#[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "spectra", "catalogues"]))]
+#[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "spectra", "packed", "catalogues"]))]
 pub(super) struct Arguments {
     /// Data folder with the true shear [default with --measured: the one measured].
     #[arg(long, value_name = "DIR", conflicts_with = "truth")]
@@ -54,6 +56,9 @@ pub(super) struct Arguments {
     /// `{method}_set{set}.dat` with --data.
     #[arg(long, value_name = "PATH", conflicts_with = "noise_var")]
     spectra: Option<PathBuf>,
+    /// Packed submission, catalogues or power spectra: the folder or the archive (.tar.gz) as it is sent.
+    #[arg(long, value_name = "PATH", requires = "data")]
+    packed: Option<PathBuf>,
     /// Sets to score [default: all that were measured].
     #[arg(long, value_name = "LIST", conflicts_with = "truth")]
     sets: Option<SetList>,
@@ -96,7 +101,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "E", requires = "truth")]
     max_modulus: Option<f64>,
     /// Record the scores in this results store, which `compare --store` reads.
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra"])]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra", "packed"])]
     store: Option<PathBuf>,
     #[command(flatten)]
     printing: Printing,
@@ -134,6 +139,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         },
     };
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
+    if let (Some(path), Some(data)) = (&arguments.packed, &data) {
+        return packed(arguments, data, path, options);
+    }
     match (&arguments.truth, &arguments.spectra, data) {
         (Some(truth), Some(spectrum), _) => spectrum_file(arguments, truth, spectrum, options),
         (Some(truth), None, _) => files(arguments, truth, options),
@@ -165,7 +173,8 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
         (None, Some(path), Some(data)) => {
             let foreign = Foreign::read(path)?;
             let read = |grid: &Grid, path: &Path| foreign.sum(grid, path);
-            let catalogues = |set| foreign.catalogues(set);
+            let files = foreign.catalogues(sets)?;
+            let catalogues = |set| files.of_set(set);
             let scored = score_sets(&data, sets, catalogues, &read, options, threads)
                 .with_context(|| path.display().to_string())?;
             if let Some(store) = &arguments.store {
@@ -199,6 +208,59 @@ pub(super) fn record(
     Ok(())
 }
 
+/// Scores a submission as it is sent.
+fn packed(
+    arguments: &Arguments,
+    data: &DataFolder,
+    path: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
+    let sent = Sent::open(path)?;
+    let submission = Submission::read(&sent)?;
+    let manifest = submission.manifest.as_ref();
+    let catalogues = match submission.packed {
+        Packed::Catalogues(catalogues) => catalogues,
+        Packed::Spectra(files) => {
+            anyhow::ensure!(
+                arguments.noise_var.is_none(),
+                "--noise-var is for catalogues; {} holds power spectra",
+                path.display()
+            );
+            return spectra_of_sets(arguments, data, files, manifest, path, options).map_err(
+                |error| {
+                    let named = |error| sent.named(error).into();
+                    error.downcast().map_or_else(|other| other, named)
+                },
+            );
+        }
+    };
+    let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
+    let of_set = |set| {
+        let images = catalogues.get(&set).into_iter().flatten();
+        images.map(|(image, path)| (*image, path.clone())).collect()
+    };
+    // What we measured is in our convention.
+    let own = manifest.is_some_and(|manifest| manifest.run.is_some());
+    let options = Options {
+        choice: match own {
+            true => arguments.settings.own_choice(),
+            false => arguments.settings.choice(),
+        },
+        ..options
+    };
+    let foreign = plain_columns(COLUMNS, Screen::default());
+    let read: ReadImage<'_> = if own { &own_catalogue } else { &foreign };
+    let threads = arguments.threads.number();
+    let scored =
+        score_sets(data, sets, of_set, read, options, threads).map_err(|error| match error {
+            PipelineError::File(error) => sent.named(error).into(),
+            other => other,
+        })?;
+    let title = format!("Scores of {}", submission.method);
+    let table = per_set(&scored, &title, options.definition);
+    arguments.printing.print(&table)
+}
+
 /// Scores the power spectra of a folder, one file per set.
 fn spectrum_folder(
     arguments: &Arguments,
@@ -226,21 +288,32 @@ fn spectrum_folder(
         "{}: there is no file named {{method}}_set{{set}}.dat",
         folder.display()
     );
+    let manifest = Manifest::read(folder)?;
+    spectra_of_sets(arguments, data, files, manifest.as_ref(), folder, options)
+}
+
+/// Scores the power spectra of `files`, by set, of a submission at `place`.
+fn spectra_of_sets(
+    arguments: &Arguments,
+    data: &DataFolder,
+    mut files: BTreeMap<u32, PathBuf>,
+    manifest: Option<&Manifest>,
+    place: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
     if let Some(wanted) = &arguments.sets {
         if let Some(set) = wanted.0.iter().find(|set| !files.contains_key(set)) {
-            bail!("{}: there is no spectrum of set {set}", folder.display());
+            bail!("{}: there is no spectrum of set {set}", place.display());
         }
         files.retain(|set, _| wanted.0.contains(set));
     }
-    let reading = reading_of(data);
-    let manifest = Manifest::read(folder)?;
     let mut scored = Vec::new();
     for (set, path) in &files {
-        let (grid, truth) = read_truth(&data.truth(*set), &reading)?;
-        let score = score_spectrum(grid, truth, path, manifest.as_ref(), options)?;
+        let (grid, truth) = read_truth(&data.truth(*set), &reading_of(data, *set)?)?;
+        let score = score_spectrum(grid, truth, path, manifest, options)?;
         scored.push((*set, score));
     }
-    print_spectra(arguments, &scored, folder, options)
+    print_spectra(arguments, &scored, place, options)
 }
 
 fn spectrum_file(

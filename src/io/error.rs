@@ -13,6 +13,18 @@ pub struct FileError {
     pub path: PathBuf,
     /// Place, what was found, what was expected.
     pub message: String,
+    /// Whether all that is wrong is that a column asked for is not there.
+    pub(crate) no_column: bool,
+}
+
+/// Most names of columns that a message lists.
+const SHOWN: usize = 40;
+
+/// Names of columns as a message lists them.
+pub(crate) fn names_of(names: &[impl AsRef<str>]) -> String {
+    let shown: Vec<&str> = names.iter().take(SHOWN).map(AsRef::as_ref).collect();
+    let more = if names.len() > SHOWN { ", …" } else { "" };
+    shown.join(", ") + more
 }
 
 impl FileError {
@@ -21,7 +33,26 @@ impl FileError {
         FileError {
             path: path.as_ref().to_owned(),
             message: message.to_string(),
+            no_column: false,
         }
+    }
+
+    /// About `path`, whose columns are `found`, without one named `wanted`.
+    pub(crate) fn no_column(path: &Path, wanted: &str, found: &[impl AsRef<str>]) -> Self {
+        let found = names_of(found);
+        let message = format!("there is no column `{wanted}`; columns found: {found}");
+        FileError {
+            no_column: true,
+            ..FileError::new(path, message)
+        }
+    }
+
+    /// With a word on where the names of columns come from, if one was not found.
+    pub(crate) fn hint_of_columns(mut self, hint: &str) -> Self {
+        if self.no_column {
+            self.message = format!("{}; {hint}", self.message);
+        }
+        self
     }
 
     /// For `map_err`: about `path`, while doing `what`.

@@ -1,14 +1,12 @@
 //! Where the files of a challenge lie, and which conventions they follow.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::ffi::OsString;
-use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
 
 use super::error::FileError;
+use super::listing::{self, Files};
 use super::open::{self, is_there};
 use super::table;
 
@@ -163,14 +161,28 @@ impl DataFolder {
         &self.layout
     }
 
-    /// The galaxy image of a set.
+    /// The galaxy image of a set, as it is called if it is not there.
     pub fn galaxies(&self, set: u32, image: u32) -> PathBuf {
-        self.root.join(fill(&self.layout.galaxies, set, image))
+        self.image(&self.layout.galaxies, set, image)
     }
 
     /// The star stamps of an image.
     pub fn psf_star(&self, set: u32, image: u32) -> PathBuf {
-        self.root.join(fill(&self.layout.psf_star, set, image))
+        self.image(&self.layout.psf_star, set, image)
+    }
+
+    /// A FITS image, which may be compressed, by the pattern of its name.
+    fn image(&self, pattern: &str, set: u32, image: u32) -> PathBuf {
+        let plain = self.root.join(fill(pattern, set, image));
+        endings(pattern)
+            .iter()
+            .map(|ending| {
+                let mut path = plain.clone().into_os_string();
+                path.push(ending);
+                PathBuf::from(path)
+            })
+            .find(|path| is_there(path))
+            .unwrap_or(plain)
     }
 
     /// The PSF parameters of an image.
@@ -189,66 +201,13 @@ impl DataFolder {
         self.root.join(fill(&self.layout.intrinsic, set, image))
     }
 
-    /// Numbers of the images of a set that are there, in order: whatever is called like one, so that
-    /// none is left out that cannot be read.
+    /// The galaxy images of `sets` (of all if empty) that are there.
     ///
     /// # Errors
-    /// Where a folder that is there cannot be read.
-    pub fn images(&self, set: u32) -> Result<Vec<u32>, FileError> {
-        let mut folders: BTreeMap<PathBuf, BTreeSet<OsString>> = BTreeMap::new();
-        let mut found = Vec::new();
-        for image in 1..=MAX_IMAGE {
-            let path = self.galaxies(set, image);
-            let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else {
-                continue;
-            };
-            if !folders.contains_key(folder) {
-                folders.insert(folder.to_owned(), self.names(folder)?);
-            }
-            if folders[folder].contains(name) {
-                found.push(image);
-            }
-        }
-        Ok(found)
-    }
-
-    /// Names of the files in a folder below this one, of which there may be none.
-    fn names(&self, folder: &Path) -> Result<BTreeSet<OsString>, FileError> {
-        let entries = match std::fs::read_dir(folder) {
-            Ok(entries) => entries,
-            Err(error) if error.kind() == ErrorKind::NotFound => {
-                // A link that leads nowhere is there.
-                let mut folders = folder.ancestors().take_while(|f| *f != self.root);
-                return match folders.find(|folder| is_there(folder)) {
-                    Some(link) if !link.is_dir() => Err(FileError::new(
-                        link,
-                        "this leads nowhere; expected a folder",
-                    )),
-                    _ => Ok(BTreeSet::new()),
-                };
-            }
-            Err(error) => {
-                return Err(FileError::doing(folder, "cannot read the folder")(error));
-            }
-        };
-        entries
-            .map(|entry| entry.map(|entry| entry.file_name()))
-            .collect::<std::io::Result<_>>()
-            .map_err(FileError::doing(folder, "cannot read the folder"))
-    }
-
-    /// Sets that have an image, in order.
-    ///
-    /// # Errors
-    /// As [`DataFolder::images`].
-    pub fn sets(&self) -> Result<Vec<u32>, FileError> {
-        let mut found = Vec::new();
-        for set in 1..=MAX_SET {
-            if !self.images(set)?.is_empty() {
-                found.push(set);
-            }
-        }
-        Ok(found)
+    /// Where a folder cannot be listed.
+    pub fn images(&self, sets: &[u32]) -> Result<Files, FileError> {
+        let pattern = &self.layout.galaxies;
+        listing::find(&self.root, pattern, endings(pattern), sets)
     }
 
     /// True shear of a set on `grid`.
@@ -263,6 +222,14 @@ impl DataFolder {
     }
 }
 
+/// Endings of the names of images by `pattern` beyond its own: those of gzip and fpack.
+fn endings(pattern: &str) -> &'static [&'static str] {
+    match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
+        true => &["", ".gz", ".fz"],
+        false => &[""],
+    }
+}
+
 /// Rows (x, y, g1, g2) of a truth file: CSV with that header, or ASCII columns in that order.
 ///
 /// # Errors
@@ -271,12 +238,15 @@ pub fn read_truth_rows(path: &Path) -> Result<Vec<Row>, FileError> {
     rows_of(path, table::read_truth(path)?, &["x", "y", "g1", "g2"])
 }
 
-/// Rows of a catalogue from four named columns.
+/// Rows of a catalogue, at most `most`, from four named columns.
 ///
 /// # Errors
 /// Where the file cannot be read or a column is absent.
-pub fn read_rows(path: &Path, names: &[&str; 4]) -> Result<Vec<Row>, FileError> {
-    rows_of(path, table::read(path, Some(names))?, names)
+pub fn read_rows(path: &Path, names: &[&str; 4], most: usize) -> Result<Vec<Row>, FileError> {
+    let hint = "`score --columns` or a description (--foreign) names others";
+    let table =
+        table::read(path, Some(names), most).map_err(|error| error.hint_of_columns(hint))?;
+    rows_of(path, table, names)
 }
 
 fn rows_of(path: &Path, mut table: table::Table, names: &[&str; 4]) -> Result<Vec<Row>, FileError> {
@@ -294,7 +264,7 @@ fn rows_of(path: &Path, mut table: table::Table, names: &[&str; 4]) -> Result<Ve
 }
 
 /// What a pattern may hold for the number of a set.
-const SET_PLACEHOLDERS: [&str; 2] = ["{set}", "{set:02}"];
+pub(super) const SET_PLACEHOLDERS: [&str; 2] = ["{set}", "{set:02}"];
 /// What a pattern may hold for the number of an image.
 pub const IMAGE_PLACEHOLDERS: [&str; 2] = ["{image}", "{image:03}"];
 const PLACEHOLDERS: [[&str; 2]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS];

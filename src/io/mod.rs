@@ -9,6 +9,7 @@ pub mod error;
 pub mod fingerprint;
 pub mod fits;
 pub mod layout;
+pub mod listing;
 pub mod open;
 #[cfg(feature = "parquet")]
 mod parquet;

@@ -58,6 +58,12 @@ pub(super) fn write(
 
 /// The crate's errors name the file already; keep the name once.
 pub(super) fn bare(path: &Path, error: &tables::TableError) -> FileError {
+    if let tables::TableError::MissingColumn {
+        wanted, present, ..
+    } = error
+    {
+        return FileError::no_column(path, wanted, present);
+    }
     let message = error.to_string();
     let prefix = format!("{}: ", path.display());
     FileError::new(path, message.strip_prefix(&prefix).unwrap_or(&message))

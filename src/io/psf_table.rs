@@ -18,13 +18,18 @@ const HEADER: &str = "x,y,profile,beta,fwhm,e1,e2";
 /// Where the file cannot be read, a row is not valid, or the rows are neither one nor one per
 /// galaxy of the grid.
 pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
-    let text = open::read_to_string(path)
-        .map_err(FileError::doing(path, "cannot read the PSF parameters"))?;
-    let mut lines = text
-        .lines()
-        .enumerate()
-        .filter(|(_, l)| !l.trim().is_empty());
-    let header = lines.next().map_or("", |(_, line)| line.trim());
+    const DOING: &str = "cannot read the PSF parameters";
+    let text = open::read_to_string(path).map_err(FileError::doing(path, DOING))?;
+    let mut reader = csv::ReaderBuilder::new()
+        .has_headers(false)
+        .flexible(true)
+        .trim(csv::Trim::All)
+        .from_reader(text.as_bytes());
+    let mut record = csv::StringRecord::new();
+    reader
+        .read_record(&mut record)
+        .map_err(FileError::doing(path, DOING))?;
+    let header = record.iter().collect::<Vec<_>>().join(",");
     if header != HEADER {
         return Err(FileError::new(
             path,
@@ -32,9 +37,19 @@ pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
         ));
     }
     let mut rows = Vec::new();
-    for (number, line) in lines {
-        let wrong = |what: String| FileError::new(path, format!("line {}: {what}", number + 1));
-        let fields: Vec<&str> = line.split(',').map(str::trim).collect();
+    while reader
+        .read_record(&mut record)
+        .map_err(FileError::doing(path, DOING))?
+    {
+        if record.len() == 1 && record[0].is_empty() {
+            continue;
+        }
+        let end = reader.position().byte() as usize;
+        let wrong = |what: String| {
+            let line = text[..end].trim_end().lines().count();
+            FileError::new(path, format!("line {line}: {what}"))
+        };
+        let fields: Vec<&str> = record.iter().collect();
         let &[x, y, profile, beta, fwhm, e1, e2] = fields.as_slice() else {
             return Err(wrong(format!("{} fields; expected 7", fields.len())));
         };

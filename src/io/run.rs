@@ -9,7 +9,8 @@ use shearq_submissions::Submission;
 
 use super::atomic;
 use super::error::FileError;
-use super::layout::{DataFolder, Layout, MAX_IMAGE};
+use super::layout::{DataFolder, Layout, fill};
+use super::listing::{self, Files};
 use super::relative;
 use super::table::Format;
 use crate::simulate::set::SimulationSettings;
@@ -139,20 +140,20 @@ impl Run {
 
     /// The catalogue of an image.
     pub fn catalogue(&self, folder: &Path, set: u32, image: u32) -> PathBuf {
-        let name = format!(
-            "set{set:02}/catalogue-{image:03}.{}",
-            self.format.extension()
-        );
-        folder.join(name)
+        folder.join(fill(&self.pattern(), set, image))
     }
 
-    /// Catalogues of a set that are there, by image number.
-    pub fn catalogues(&self, folder: &Path, set: u32) -> Vec<(u32, PathBuf)> {
-        (1..=MAX_IMAGE)
-            .map(|image| (image, self.catalogue(folder, set, image)))
-            .take_while(|(_, path)| path.parent().is_some_and(Path::is_dir))
-            .filter(|(_, path)| super::open::is_there(path))
-            .collect()
+    /// The catalogues of `sets` (of all if empty) that are there.
+    ///
+    /// # Errors
+    /// Where a folder cannot be listed.
+    pub fn catalogues(&self, folder: &Path, sets: &[u32]) -> Result<Files, FileError> {
+        listing::find(folder, &self.pattern(), &[""], sets)
+    }
+
+    fn pattern(&self) -> String {
+        let ending = self.format.extension();
+        format!("set{{set:02}}/catalogue-{{image:03}}.{ending}")
     }
 }
 

@@ -2,12 +2,14 @@
 //!
 //! | ending | format |
 //! |---|---|
-//! | `.fits`, `.fit`, `.fits.gz` | FITS binary table |
-//! | `.parquet` | Parquet |
-//! | anything else (`.csv`, `.dat`, `.txt`, `.cat`) | text: numbers between commas or blanks, as the content has them; columns `x y e1 e2` unless a header names them |
+//! | `.fits`, `.fit`, these with `.gz`, `.fits.fz` | FITS binary table |
+//! | `.parquet`, `.pq` | Parquet |
+//! | anything else (`.csv`, `.dat`, `.txt`, `.cat`, `.csv.gz`) | text, plain or compressed by gzip: numbers between commas, semicolons, tabs or blanks, as the content has them; columns `x y e1 e2` unless a header names them |
 
 use std::collections::BTreeMap;
 use std::path::Path;
+
+use shearq_scoring::Grid;
 
 use super::error::FileError;
 use super::fits;
@@ -135,11 +137,44 @@ impl Default for Format {
     }
 }
 
-/// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending.
+/// What a file is by its ending.
+enum Ending {
+    Parquet,
+    Fits,
+    Text,
+}
+
+impl Ending {
+    fn of(path: &Path) -> Self {
+        let name = path.to_string_lossy().to_ascii_lowercase();
+        let ends = |endings: &[&str]| endings.iter().any(|end| name.ends_with(end));
+        if ends(&[".parquet", ".pq"]) {
+            Ending::Parquet
+        } else if ends(&[".fits", ".fit", ".fits.gz", ".fit.gz", ".fits.fz"]) {
+            Ending::Fits
+        } else {
+            Ending::Text
+        }
+    }
+}
+
+/// Most rows of a table that may fill the largest grid.
+pub const MAX_ROWS: usize = Grid::MAX_SIDE * Grid::MAX_SIDE;
+/// Rows that a catalogue may have beyond those of its grid.
+const SPARE_ROWS: usize = 1 << 18;
+
+/// Most rows that a catalogue of galaxies on `grid` may have: more than are scored, so that it can be
+/// said how many there are.
+pub fn most_rows(grid: &Grid) -> usize {
+    grid.cells() + SPARE_ROWS
+}
+
+/// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending. A
+/// text table has at most `most_rows`.
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
-pub fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
+pub fn read(path: &Path, wanted: Option<&[&str]>, most_rows: usize) -> Result<Table, FileError> {
     if let Some(wanted) = wanted {
         for (k, column) in wanted.iter().enumerate() {
             if wanted[..k].contains(column) {
@@ -148,16 +183,15 @@ pub fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
             }
         }
     }
-    let name = path.to_string_lossy().to_ascii_lowercase();
-    if name.ends_with(".parquet") {
-        read_parquet(path, wanted)
-    } else if [".fits", ".fit", ".fits.gz"]
-        .iter()
-        .any(|end| name.ends_with(end))
-    {
-        fits::read_table(path, wanted)
-    } else {
-        text::read(path, wanted)
+    let request = text::Request {
+        wanted,
+        default_names: &text::CHALLENGE_COLUMNS,
+        most_rows,
+    };
+    match Ending::of(path) {
+        Ending::Parquet => read_parquet(path, wanted),
+        Ending::Fits => fits::read_table(path, wanted),
+        Ending::Text => text::read(path, &request),
     }
 }
 
@@ -167,14 +201,9 @@ pub fn read(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
 /// Where the file cannot be read, or lacks a column.
 pub fn read_truth(path: &Path) -> Result<Table, FileError> {
     const NAMES: [&str; 4] = ["x", "y", "g1", "g2"];
-    let name = path.to_string_lossy().to_ascii_lowercase();
-    if [".parquet", ".fits", ".fit", ".fits.gz"]
-        .iter()
-        .any(|end| name.ends_with(end))
-    {
-        read(path, Some(&NAMES))
-    } else {
-        read_text(path, &NAMES)
+    match Ending::of(path) {
+        Ending::Text => read_text(path, &NAMES),
+        Ending::Parquet | Ending::Fits => read(path, Some(&NAMES), MAX_ROWS),
     }
 }
 
@@ -183,7 +212,12 @@ pub fn read_truth(path: &Path) -> Result<Table, FileError> {
 /// # Errors
 /// Where the file cannot be read.
 pub fn read_text(path: &Path, names: &[&str]) -> Result<Table, FileError> {
-    text::read_named(path, Some(names), names)
+    let request = text::Request {
+        wanted: Some(names),
+        default_names: names,
+        most_rows: MAX_ROWS,
+    };
+    text::read(path, &request)
 }
 
 /// What is left of `metadata` in a table written as `format`: all in Parquet; in FITS what fits into a

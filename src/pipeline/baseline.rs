@@ -19,7 +19,7 @@ use crate::io::fingerprint;
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source, differences};
 use crate::io::store::SetRecord;
-use crate::io::table::{self, Format};
+use crate::io::table::{self, Format, MAX_ROWS};
 
 /// Names of the scatter of either component of the ellipticity.
 const SCATTER: [&str; 2] = ["scatter_e1", "scatter_e2"];
@@ -143,7 +143,7 @@ fn scatter(
     set: u32,
     threads: usize,
 ) -> Result<[[f64; 2]; 2], PipelineError> {
-    let catalogues = run.catalogues(out, set);
+    let catalogues = run.catalogues(out, &[set])?.of_set(set);
     let (mut squares, mut count) = ([0.0; 2], 0.0_f64);
     engine::ordered(
         threads,
@@ -157,7 +157,7 @@ fn scatter(
         },
         || (),
         |(), path| {
-            let mut table = table::read(&path, Some(&["e1", "e2"]))?;
+            let mut table = table::read(&path, Some(&["e1", "e2"]), MAX_ROWS)?;
             let (e1, e2) = (table.require("e1", &path)?, table.require("e2", &path)?);
             let mut own = ([0.0; 2], 0.0);
             for (e1, e2) in e1.iter().zip(&e2) {

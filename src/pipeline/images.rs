@@ -18,22 +18,24 @@ pub struct ImageId {
 /// Images of `sets` of a data folder (of all its sets if empty), in order.
 ///
 /// # Errors
-/// Where a set has no image, or the folder none at all.
+/// Where a set has no image, or the folder none at all, or a folder cannot be listed.
 pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, PipelineError> {
+    let files = data.images(sets)?;
     let sets = if sets.is_empty() {
-        data.sets()?
+        files.sets()
     } else {
         sets.to_vec()
     };
     let mut found = Vec::new();
     for set in sets {
-        let images = data.images(set)?;
+        let images = files.of_set(set);
         if images.is_empty() {
             let path = data.galaxies(set, 1);
             let message = format!("there is no image of set {set}; expected this file");
             return Err(FileError::new(path, message).into());
         }
-        found.extend(images.into_iter().map(|image| ImageId { set, image }));
+        let id = |(image, _)| ImageId { set, image };
+        found.extend(images.into_iter().map(id));
     }
     if found.is_empty() {
         let message = "there are no galaxy images here in the layout expected";

@@ -11,7 +11,7 @@ use super::engine;
 use super::images::ImageId;
 use crate::io::FileError;
 use crate::io::fingerprint::{of_file, of_image};
-use crate::io::layout::{DataFolder, MAX_SET};
+use crate::io::layout::DataFolder;
 use crate::io::open::is_there;
 use crate::io::run::{Run, Source};
 use crate::io::table::read_metadata;
@@ -141,12 +141,11 @@ pub fn verify(
     sets: &[u32],
     threads: usize,
 ) -> Result<(), PipelineError> {
-    let images: Vec<ImageId> = (1..=MAX_SET)
-        .filter(|set| sets.is_empty() || sets.contains(set))
-        .flat_map(|set| {
-            let images = run.catalogues(out, set).into_iter();
-            images.map(move |(image, _)| ImageId { set, image })
-        })
-        .collect();
+    let files = run.catalogues(out, sets)?;
+    let of_set = |set| {
+        let images = files.of_set(set).into_iter();
+        images.map(move |(image, _)| ImageId { set, image })
+    };
+    let images: Vec<ImageId> = files.sets().into_iter().flat_map(of_set).collect();
     Inputs::new(run, data, &images)?.verify(out, &images, threads)
 }

@@ -9,11 +9,11 @@ use shearq_measure::{
     Flag, FunctionalPsf, Measurement, Measurer, Psfs, Worker, calibrate, star_psf, strip,
 };
 use shearq_scoring::Grid;
-use shearq_scoring::units::{Degrees, Pixels};
 use shearq_submissions::{EllipticityType, NoiseSource, PsfForm, Submission};
 
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
+use super::grid::{self, whole};
 use super::images::ImageId;
 use super::inputs::Inputs;
 use crate::io::FileError;
@@ -192,23 +192,8 @@ pub(super) fn open_galaxies(
 ) -> Result<(ImageReader, Grid, usize), PipelineError> {
     let path = data.galaxies(id.set, id.image);
     let image = ImageReader::open(&path)?;
-    let stamp = whole(&image, &path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp);
-    let n = whole(&image, &path, "NGRID", image.width())?.unwrap_or(image.width() / stamp);
-    if image.width() != n * stamp || image.height() != n * stamp {
-        return Err(FileError::new(
-            &path,
-            format!(
-                "the image is {} × {} pixels; expected {n} × {n} stamps of {stamp} pixels a side",
-                image.width(),
-                image.height()
-            ),
-        )
-        .into());
-    }
-    check_strip(&path, n, stamp)?;
-    let field = Degrees(data.layout().field_degrees);
-    let grid =
-        Grid::new(n, Pixels(stamp as f64), field).map_err(|error| FileError::new(&path, error))?;
+    let (grid, stamp) = grid::of_image(data, &path, &image)?;
+    check_strip(&path, grid.n, stamp)?;
     Ok((image, grid, stamp))
 }
 
@@ -221,23 +206,6 @@ fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), FileError> {
     let message = format!(
         "a row of {n} stamps of {side} pixels a side has {pixels} pixels; expected at most {MAX_STRIP}"
     );
-    Err(FileError::new(path, message))
-}
-
-/// A header value that counts something, `None` where absent.
-fn whole(
-    image: &ImageReader,
-    path: &Path,
-    key: &str,
-    most: usize,
-) -> Result<Option<usize>, FileError> {
-    let Some(value) = image.number(key)? else {
-        return Ok(None);
-    };
-    if value.fract() == 0.0 && (1.0..=most as f64).contains(&value) {
-        return Ok(Some(value as usize));
-    }
-    let message = format!("the header key {key} is {value}; expected a whole number, 1 to {most}");
     Err(FileError::new(path, message))
 }
 

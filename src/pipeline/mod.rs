@@ -7,6 +7,7 @@
 pub mod baseline;
 pub mod complete;
 pub mod engine;
+pub mod grid;
 pub mod images;
 pub mod inputs;
 pub mod measure;

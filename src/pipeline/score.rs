@@ -10,11 +10,11 @@ use shearq_scoring::{
 };
 
 use super::PipelineError;
-use super::engine;
-use super::inputs;
+use super::{engine, grid, inputs};
 use crate::io::FileError;
 use crate::io::layout::{DataFolder, MAX_SET, read_rows, read_truth_rows};
 use crate::io::run::Run;
+use crate::io::table::most_rows;
 
 /// Columns of our catalogues that are scored.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
@@ -107,7 +107,7 @@ impl Screen {
 /// Where one cannot be read.
 pub fn own_catalogue(grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
     let mut sum = FieldSum::new(grid);
-    let counts = sum.add_image(grid, read_rows(path, &COLUMNS)?);
+    let counts = sum.add_image(grid, read_rows(path, &COLUMNS, most_rows(grid))?);
     Ok((sum, counts))
 }
 
@@ -134,7 +134,7 @@ pub fn plain_columns<'a>(
     screen: Screen,
 ) -> impl Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync + 'a {
     move |grid, path| {
-        let rows = read_rows(path, &columns)?;
+        let rows = read_rows(path, &columns, most_rows(grid))?;
         sum_foreign(grid, path, rows.into_iter().map(|row| screen.apply(row)))
     }
 }
@@ -145,22 +145,11 @@ pub fn plain_columns<'a>(
 /// Where the file cannot be read or does not fill a square grid.
 pub fn read_truth(truth: &Path, reading: &Reading) -> Result<(Grid, TrueShear), FileError> {
     let rows = read_truth_rows(truth)?;
-    let side = grid_side(truth, rows.len())?;
+    let side = grid::side(truth, rows.len())?;
     let bad = |error: shearq_scoring::ScoringError| FileError::new(truth, error);
     let grid = Grid::new(side, reading.stamp, reading.field).map_err(bad)?;
     let shear = TrueShear::from_rows(&grid, reading.sign, rows).map_err(bad)?;
     Ok((grid, shear))
-}
-
-/// Side of the grid that a file with one row per cell fills.
-///
-/// # Errors
-/// Where the number of rows is no square.
-pub fn grid_side(path: &Path, rows: usize) -> Result<usize, FileError> {
-    Grid::side_of(rows).ok_or_else(|| {
-        let message = format!("{rows} rows; expected the square of the grid's side");
-        FileError::new(path, message)
-    })
 }
 
 /// Scores one set from a truth file and one catalogue per image.
@@ -235,14 +224,16 @@ fn add_up(
     Ok((images, counts))
 }
 
-/// How the truth of a data folder is to be read.
-pub fn reading_of(data: &DataFolder) -> Reading {
-    let layout = data.layout();
-    Reading {
-        field: Degrees(layout.field_degrees),
-        stamp: Pixels(layout.stamp as f64),
-        sign: layout.truth_sign,
-    }
+/// How the truth of a set of a data folder is to be read.
+///
+/// # Errors
+/// Where the set's first image cannot be read.
+pub fn reading_of(data: &DataFolder, set: u32) -> Result<Reading, FileError> {
+    Ok(Reading {
+        field: Degrees(data.layout().field_degrees),
+        stamp: Pixels(grid::stamp_of_set(data, set)? as f64),
+        sign: data.layout().truth_sign,
+    })
 }
 
 /// Catalogues of one variant of a measurement.
@@ -361,7 +352,7 @@ fn prepare(
     options: Options,
     threads: usize,
 ) -> Result<(SetScorer, SetImages, RowCounts), PipelineError> {
-    let (grid, shear) = read_truth(&data.truth(set), &reading_of(data))?;
+    let (grid, shear) = read_truth(&data.truth(set), &reading_of(data, set)?)?;
     let scorer = SetScorer::new(grid, shear, options)
         .map_err(|source| PipelineError::Scoring { set, source })?;
     let files: Vec<PathBuf> = files.iter().map(|file| file.1.clone()).collect();
@@ -403,8 +394,9 @@ pub fn score_folder(
     options: Options,
     threads: usize,
 ) -> Result<Vec<ScoredSet>, PipelineError> {
-    let catalogues = |set| run.catalogues(out, set);
     inputs::verify(data, out, run, sets, threads)?;
+    let files = run.catalogues(out, sets)?;
+    let catalogues = |set| files.of_set(set);
     score_sets(data, sets, catalogues, &own_catalogue, options, threads).map_err(
         |error| match error {
             PipelineError::Request(message) => FileError::new(out, message).into(),

@@ -167,6 +167,14 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     for entry in archive.entries().map_err(cannot_read())?.raw(true) {
         let mut entry = entry.map_err(cannot_read())?;
         let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
+        // As `tar czf … -C folder .` packs a folder.
+        if name == "./" && entry.header().entry_type().is_dir() {
+            continue;
+        }
+        let name = match name.strip_prefix("./") {
+            Some(rest) if is_plain_name(rest) => rest.to_owned(),
+            _ => name,
+        };
         if !entry.header().entry_type().is_file() || !is_plain_name(&name) {
             let message = format!("it holds `{name}`; expected plain files without folders");
             return Err(FileError::new(path, message));

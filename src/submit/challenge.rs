@@ -5,17 +5,16 @@
 //! * Power spectrum: ASCII `index l power`, the eight bins 2 to 9, one file a set,
 //!   `{method}_set{set}.dat`; power is ℓ²C_ℓ/2π.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use shearq_scoring::{
-    Convention, FieldSum, Grid, Row, SCORED, SetImages, SpectrumCovariance, cross_spectrum,
+    Convention, Grid, Row, SCORED, ScoringError, SetImages, SpectrumCovariance, cross_spectrum,
     measured_bandpowers,
 };
 
 use crate::io::FileError;
-use crate::io::layout::read_rows;
+use crate::io::layout::{MAX_IMAGE, MAX_SET};
 use crate::io::table;
-use crate::pipeline::score::COLUMNS;
 
 /// One line of a power-spectrum file.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -50,6 +49,10 @@ pub enum Kind {
 }
 
 impl Kind {
+    /// What is wrong with a name that is not recognised.
+    pub const EXPECTED: &str =
+        "neither g10_v1_objs_{set}_{image}.{method}.dat nor {method}_set{set}.dat";
+
     /// Recognises the challenge's file names.
     pub fn of(path: &Path) -> Option<Self> {
         let name = path.file_name()?.to_str()?.strip_suffix(".dat")?;
@@ -57,14 +60,14 @@ impl Kind {
             let (numbers, method) = rest.split_once('.')?;
             let (set, image) = numbers.split_once('_')?;
             return Some(Kind::Catalogue {
-                set: number(set)?,
-                image: number(image)?,
+                set: number(set, MAX_SET)?,
+                image: number(image, MAX_IMAGE)?,
                 method: method.to_owned(),
             });
         }
         let (method, set) = name.rsplit_once("_set")?;
         Some(Kind::Spectrum {
-            set: number(set)?,
+            set: number(set, MAX_SET)?,
             method: method.to_owned(),
         })
     }
@@ -87,28 +90,24 @@ impl Kind {
     }
 }
 
-/// A number without signs or leading zeros, 1 to 999.
-fn number(text: &str) -> Option<u32> {
+/// A number without signs or leading zeros, 1 to `most`.
+fn number(text: &str, most: u32) -> Option<u32> {
     if text.starts_with('0') || !text.bytes().all(|b| b.is_ascii_digit()) {
         return None;
     }
-    text.parse().ok().filter(|number| *number <= 999)
+    text.parse().ok().filter(|number| *number <= most)
 }
 
-/// The measured galaxies of a catalogue of ours in the challenge's format, and the number of its rows.
-/// Flagged galaxies have no ellipticity and are left out, which the original scoring counts as zero.
-///
-/// # Errors
-/// Where the catalogue cannot be read.
-pub fn catalogue_text(catalogue: &Path) -> Result<(String, usize), FileError> {
-    let rows = read_rows(catalogue, &COLUMNS)?;
+/// The measured galaxies of a catalogue in the challenge's format. Those without an ellipticity are left
+/// out, which the original scoring counts as zero.
+pub fn catalogue_text(rows: &[Row]) -> String {
     let mut text = String::new();
-    for Row { x, y, e1, e2 } in &rows {
+    for Row { x, y, e1, e2 } in rows {
         if e1.is_finite() && e2.is_finite() {
             text.push_str(&format!("{x} {y} {e1:.9} {e2:.9}\n"));
         }
     }
-    Ok((text, rows.len()))
+    text
 }
 
 /// How a set's catalogues become a power spectrum.
@@ -120,37 +119,23 @@ pub enum Spectrum {
     Cross,
 }
 
-/// The power spectrum of a set's catalogues in the challenge's format, and where it is known, the
+/// The power spectrum of a set's images in the challenge's format, and where it is known, the
 /// covariance of its bandpowers.
 ///
 /// # Errors
-/// Where a catalogue cannot be read, no ellipticity falls on the grid, or there is one image and none to
-/// multiply it with.
+/// Where there is one image and none to multiply it with.
 pub fn spectrum_text(
     grid: &Grid,
-    catalogues: &[PathBuf],
+    images: &SetImages,
     spectrum: Spectrum,
-) -> Result<(String, Option<SpectrumCovariance>), FileError> {
-    let mut images = SetImages::new(grid);
-    let mut used = 0;
-    for path in catalogues {
-        let mut sum = FieldSum::new(grid);
-        used += sum.add_image(grid, read_rows(path, &COLUMNS)?).used;
-        images.add(&sum);
-    }
-    if used == 0 {
-        let message =
-            "neither this catalogue nor others of the set have an ellipticity on the grid";
-        return Err(FileError::new(&catalogues[0], message));
-    }
+) -> Result<(String, Option<SpectrumCovariance>), ScoringError> {
     let standard = Convention::STANDARD;
-    let found = match spectrum {
+    let (bins, power, covariance) = match spectrum {
         Spectrum::Averaged => measured_bandpowers(grid, images.total(), standard)
-            .map(|(bins, power)| (bins, power, None)),
-        Spectrum::Cross => cross_spectrum(grid, &images, standard)
-            .map(|cross| (cross.bins, cross.power, cross.covariance)),
+            .map(|(bins, power)| (bins, power, None))?,
+        Spectrum::Cross => cross_spectrum(grid, images, standard)
+            .map(|cross| (cross.bins, cross.power, cross.covariance))?,
     };
-    let (bins, power, covariance) = found.map_err(|error| FileError::new(&catalogues[0], error))?;
     let text = SCORED
         .map(|b| format!("{} {:.6} {:.12e}\n", b + 1, bins.l[b], power[b]))
         .collect();
@@ -223,6 +208,8 @@ mod tests {
             "g10_v1_objs_7.NN.dat",
             "NN_set1.txt",
             "NN_set01.dat",
+            "NN_set100.dat",
+            "g10_v1_objs_1_1000.NN.dat",
             "set.dat",
             "x",
         ] {

@@ -8,11 +8,11 @@ use shearq_scoring::{
     TrueShear,
 };
 
-use super::archive::{self, is_archive};
 use super::challenge::{Kind, SpectrumLine, read_spectrum};
-use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
-use crate::io::atomic::Scratch;
+use super::manifest::{FileSum, Manifest};
+use super::packed::Sent;
 use crate::io::layout::read_rows;
+use crate::io::table::most_rows;
 use crate::pipeline::score::COLUMNS;
 
 /// How bad a finding is.
@@ -53,33 +53,26 @@ const POSITION_TOLERANCE: f64 = 0.01;
 
 /// Checks a file, or all files of a folder or an archive.
 pub fn check(path: &Path, expected: &Expected) -> Vec<Finding> {
-    if !is_archive(path) {
-        return check_files(path, expected);
-    }
-    let mut report = Report::default();
-    let unpacked =
-        Scratch::new().and_then(|folder| archive::read(path, Some(folder.path())).map(|_| folder));
-    match unpacked {
-        Err(error) => report.error(&error.path, "readable", error.message),
-        Ok(folder) => {
-            report.findings = check_files(folder.path(), expected);
-            // Files are named as members of the archive.
-            for finding in &mut report.findings {
-                if let Ok(name) = finding.path.strip_prefix(folder.path()) {
-                    finding.path = match name.as_os_str().is_empty() {
-                        true => path.to_owned(),
-                        false => path.join(name),
-                    };
-                }
+    match Sent::open(path) {
+        Err(error) => {
+            let mut report = Report::default();
+            report.error(&error.path, "readable", error.message);
+            report.findings
+        }
+        Ok(sent) => {
+            let mut findings = check_files(&sent, expected);
+            for finding in &mut findings {
+                finding.path = sent.as_given(&finding.path);
             }
+            findings
         }
     }
-    report.findings
 }
 
-fn check_files(path: &Path, expected: &Expected) -> Vec<Finding> {
+fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
+    let path = sent.path();
     let mut report = Report::default();
-    let files = match files_of(path) {
+    let files = match sent.files() {
         Ok(files) => files,
         Err(error) => {
             report.error(path, "readable", error.to_string());
@@ -100,7 +93,7 @@ fn check_files(path: &Path, expected: &Expected) -> Vec<Finding> {
         match &kind {
             None => {
                 let single = files.len() == 1 && path.is_file();
-                let message = "the name is neither g10_v1_objs_{set}_{image}.{method}.dat nor {method}_set{set}.dat".to_owned();
+                let message = format!("the name is {}", Kind::EXPECTED);
                 if single {
                     report.warn(file, "name", message);
                 } else {
@@ -199,25 +192,6 @@ impl Report {
     }
 }
 
-fn files_of(path: &Path) -> std::io::Result<Vec<PathBuf>> {
-    if !path.is_dir() {
-        std::fs::metadata(path)?;
-        return Ok(vec![path.to_owned()]);
-    }
-    let mut files = Vec::new();
-    for entry in std::fs::read_dir(path)? {
-        let file = entry?.path();
-        let own = file
-            .file_name()
-            .is_some_and(|name| name == MANIFEST_FILE || name.to_string_lossy().starts_with('.'));
-        if !file.is_dir() && !own {
-            files.push(file);
-        }
-    }
-    files.sort();
-    Ok(files)
-}
-
 /// Compares the files of a folder with its manifest, if it has one.
 fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
     let manifest = match Manifest::read(folder) {
@@ -244,7 +218,7 @@ fn looks_like_spectrum(path: &Path) -> bool {
 }
 
 fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Option<FieldSum> {
-    let rows = match read_rows(path, &COLUMNS) {
+    let rows = match read_rows(path, &COLUMNS, most_rows(&expected.grid)) {
         Ok(rows) => rows,
         Err(error) => {
             report.error(path, "readable", error.message);

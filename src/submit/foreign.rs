@@ -2,13 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use shearq_scoring::{Distortion, FieldSum, Grid, Row, RowCounts, Shear};
 use shearq_submissions::{EllipticityType, checked_name};
 
 use crate::io::FileError;
-use crate::io::layout::{IMAGE_PLACEHOLDERS, MAX_IMAGE, check_pattern, fill};
-use crate::io::table;
+use crate::io::layout::{IMAGE_PLACEHOLDERS, check_pattern};
+use crate::io::listing::{self, Files};
+use crate::io::table::{self, most_rows};
 use crate::pipeline::score::sum_foreign;
 
 /// How to read another program's catalogues.
@@ -28,7 +29,7 @@ use crate::pipeline::score::sum_foreign;
 /// position_offset = 0.0           # added to x and y to make them FITS pixels (1 for 0-based ones)
 /// e2_sign = 1                     # -1 where e2 is positive along x = -y
 /// ```
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Foreign {
     /// Name in tables.
@@ -98,20 +99,33 @@ impl Foreign {
         Ok(foreign)
     }
 
-    /// The catalogues of a set that are there, by image number.
-    pub fn catalogues(&self, set: u32) -> Vec<(u32, PathBuf)> {
-        (1..=MAX_IMAGE)
-            .map(|image| (image, self.folder.join(fill(&self.catalogues, set, image))))
-            .filter(|(_, path)| crate::io::open::is_there(path))
-            .collect()
+    /// The pattern of the catalogues' names, with the folder that it is relative to.
+    pub fn pattern(&self) -> PathBuf {
+        self.folder.join(&self.catalogues)
     }
 
-    /// One image's catalogue on the grid, converted to standard signs and the reported type.
-    /// Flagged rows and distortions above 1 count as missing.
+    /// The catalogues of `sets` (of all if empty) that are there.
+    ///
+    /// # Errors
+    /// Where a folder cannot be listed.
+    pub fn catalogues(&self, sets: &[u32]) -> Result<Files, FileError> {
+        listing::find(&self.folder, &self.catalogues, &[""], sets)
+    }
+
+    /// One image's catalogue on the grid, as [`Foreign::rows`] has it.
     ///
     /// # Errors
     /// Where it cannot be read, a column is absent, or the values are no ellipticities.
     pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
+        sum_foreign(grid, path, self.rows(path, most_rows(grid))?)
+    }
+
+    /// One image's catalogue of at most `most` rows, converted to standard signs and the reported type.
+    /// Flagged rows and distortions above 1 have no ellipticity.
+    ///
+    /// # Errors
+    /// Where it cannot be read or a column is absent.
+    pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
         let mut names = vec![
             self.x.as_str(),
             self.y.as_str(),
@@ -119,12 +133,14 @@ impl Foreign {
             self.e2.as_str(),
         ];
         names.extend(self.flag.as_deref());
-        let mut table = table::read(path, Some(&names))?;
+        let mut table = table::read(path, Some(&names), most).map_err(|error| {
+            error.hint_of_columns("the description of the catalogues names them")
+        })?;
         let mut column = |name: &str| table.require(name, path);
         let flags = self.flag.as_deref().map(&mut column).transpose()?;
         let (x, y) = (column(&self.x)?, column(&self.y)?);
         let (e1, e2) = (column(&self.e1)?, column(&self.e2)?);
-        let rows = (0..x.len()).map(|k| {
+        let row = |k: usize| {
             let good = flags.as_ref().is_none_or(|flags| flags[k] == 0.0)
                 && self.missing.is_none_or(|m| e1[k] != m && e2[k] != m);
             let shape = if good {
@@ -141,8 +157,8 @@ impl Foreign {
                 e1,
                 e2,
             }
-        });
-        sum_foreign(grid, path, rows)
+        };
+        Ok((0..x.len()).map(row).collect())
     }
 
     fn convert(&self, e1: f64, e2: f64) -> Option<(f64, f64)> {

@@ -9,6 +9,7 @@ use sha2::{Digest, Sha256};
 use shearq_scoring::SpectrumCovariance;
 use shearq_submissions::checked_name;
 
+use super::foreign::Foreign;
 use crate::io::run::{Run, read_record};
 use crate::io::{FileError, open};
 
@@ -39,7 +40,11 @@ pub struct Manifest {
     /// What the files hold.
     pub contents: Contents,
     /// What the catalogues were measured from, by which settings and version.
-    pub run: Run,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub run: Option<Run>,
+    /// Description of the catalogues of another program.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub foreign: Option<Foreign>,
     /// The files by name, but for the manifest.
     pub files: BTreeMap<String, FileSum>,
     /// Covariance of the bandpowers of each cross-spectrum under noise, by the name of its file.

@@ -7,3 +7,4 @@ pub mod check;
 pub mod foreign;
 pub mod manifest;
 pub mod pack;
+pub mod packed;

@@ -3,26 +3,84 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_scoring::Grid;
-use shearq_scoring::units::{Degrees, Pixels};
+use shearq_scoring::units::Degrees;
+use shearq_scoring::{FieldSum, Grid, Row, SetImages, SpectrumCovariance};
 
 use super::archive::{ArchiveWriter, is_archive};
 use super::challenge::{Kind, Spectrum, catalogue_text, spectrum_text};
+use super::foreign::Foreign;
 use super::manifest::{Contents, FileSum, MANIFEST_FILE, Manifest};
 use crate::io::atomic::PartFolder;
-use crate::io::layout::MAX_SET;
+use crate::io::layout::{DataFolder, read_rows};
+use crate::io::listing::Files;
 use crate::io::run::Run;
-use crate::io::table;
+use crate::io::table::{MAX_ROWS, most_rows};
 use crate::io::{FileError, run::record_text};
-use crate::pipeline::Progress;
-use crate::pipeline::score::grid_side;
+use crate::pipeline::score::COLUMNS;
+use crate::pipeline::{Progress, grid};
 
-/// What is packed.
+/// The catalogues that are packed.
+pub enum Origin<'a> {
+    /// A folder that was measured.
+    Measured {
+        /// The folder.
+        folder: &'a Path,
+        /// Its record.
+        run: &'a Run,
+    },
+    /// Catalogues of another program.
+    Foreign {
+        /// Their description.
+        foreign: &'a Foreign,
+        /// What they were measured from, which gives the grid of spectra.
+        data: Option<&'a DataFolder>,
+    },
+}
+
+impl Origin<'_> {
+    fn catalogues(&self) -> Result<Files, FileError> {
+        match self {
+            Origin::Measured { folder, run } => run.catalogues(folder, &[]),
+            Origin::Foreign { foreign, .. } => {
+                let files = foreign.catalogues(&[])?;
+                if files.serve_all_sets() {
+                    let message = "the pattern of the catalogues has no {set}, by which packed files are called";
+                    return Err(FileError::new(foreign.pattern(), message));
+                }
+                Ok(files)
+            }
+        }
+    }
+
+    fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
+        match self {
+            Origin::Measured { .. } => read_rows(path, &COLUMNS, most),
+            Origin::Foreign { foreign, .. } => foreign.rows(path, most),
+        }
+    }
+
+    /// Grid of a set, of which `catalogue` is one.
+    fn grid(&self, set: u32, catalogue: &Path) -> Result<Grid, FileError> {
+        match self {
+            Origin::Measured { run, .. } => {
+                let field = Degrees(run.source.layout().field_degrees);
+                grid::of_catalogue(catalogue, &self.rows(catalogue, MAX_ROWS)?, field)
+            }
+            Origin::Foreign {
+                data: Some(data), ..
+            } => grid::of_set(data, set),
+            Origin::Foreign { data: None, .. } => {
+                let message = "the grid is not known; --data DIR gives it for spectra";
+                Err(FileError::new(catalogue, message))
+            }
+        }
+    }
+}
+
+/// What is packed, and how.
 pub struct Packing<'a> {
-    /// Folder of catalogues.
-    pub measured: &'a Path,
-    /// Its record.
-    pub run: &'a Run,
+    /// The catalogues.
+    pub origin: Origin<'a>,
     /// Method's name in file names.
     pub method: String,
     /// What the files are to hold.
@@ -30,24 +88,22 @@ pub struct Packing<'a> {
 }
 
 impl Packing<'_> {
-    /// Catalogues by set, for sets that have some.
-    fn catalogues(&self) -> impl Iterator<Item = (u32, Vec<(u32, PathBuf)>)> + '_ {
-        (1..=MAX_SET)
-            .map(|set| (set, self.run.catalogues(self.measured, set)))
-            .filter(|(_, catalogues)| !catalogues.is_empty())
-    }
-
     /// Number of galaxies to pack, for progress bars: an estimate from the first catalogue.
     ///
     /// # Errors
     /// Where there is no catalogue, or it cannot be read.
     pub fn galaxies(&self) -> Result<u64, FileError> {
-        let mut all = self.catalogues().flat_map(|(_, catalogues)| catalogues);
+        let files = self.origin.catalogues()?;
+        let mut all = files.sets().into_iter().flat_map(|set| files.of_set(set));
         let Some((_, first)) = all.next() else {
-            let message = "there is no catalogue here to pack";
-            return Err(FileError::new(self.measured, message));
+            let place = match &self.origin {
+                Origin::Measured { folder, .. } => folder.to_path_buf(),
+                Origin::Foreign { foreign, .. } => foreign.pattern(),
+            };
+            return Err(FileError::new(place, "there is no catalogue here to pack"));
         };
-        Ok(((1 + all.count()) * rows_of(&first)?) as u64)
+        let rows = self.origin.rows(&first, MAX_ROWS)?.len();
+        Ok(((1 + all.count()) * rows) as u64)
     }
 
     /// Writes the files and their manifest to `out`, a new folder or, by its ending, an archive, which
@@ -68,7 +124,9 @@ impl Packing<'_> {
             files.insert(name, sum);
             Ok(())
         };
-        for (set, catalogues) in self.catalogues() {
+        let found = self.origin.catalogues()?;
+        for set in found.sets() {
+            let catalogues = found.of_set(set);
             let method = self.method.clone();
             let spectrum = match self.contents {
                 Contents::Catalogues => None,
@@ -76,30 +134,35 @@ impl Packing<'_> {
                 Contents::CrossSpectra => Some(Spectrum::Cross),
             };
             if let Some(spectrum) = spectrum {
-                let grid = self.grid(&catalogues[0].1)?;
-                let paths: Vec<PathBuf> = catalogues.into_iter().map(|(_, path)| path).collect();
                 let kind = Kind::Spectrum { set, method };
-                let (text, covariance) = spectrum_text(&grid, &paths, spectrum)?;
+                let (text, covariance) = self.spectrum(set, &catalogues, spectrum, progress)?;
                 if let Some(covariance) = covariance {
                     covariances.insert(kind.file_name(), covariance);
                 }
                 add(kind, text)?;
-                progress.advance((paths.len() * grid.cells()) as u64);
                 continue;
             }
             for (image, path) in catalogues {
                 let method = method.clone();
-                let (text, rows) = catalogue_text(&path)?;
-                add(Kind::Catalogue { set, image, method }, text)?;
-                progress.advance(rows as u64);
+                let rows = self.origin.rows(&path, MAX_ROWS)?;
+                add(
+                    Kind::Catalogue { set, image, method },
+                    catalogue_text(&rows),
+                )?;
+                progress.advance(rows.len() as u64);
             }
         }
         let count = files.len();
+        let (run, foreign) = match self.origin {
+            Origin::Measured { run, .. } => (Some(run.clone()), None),
+            Origin::Foreign { foreign, .. } => (None, Some(foreign.clone())),
+        };
         let manifest = Manifest {
             version: crate::VERSION.into(),
             method: self.method.clone(),
             contents: self.contents,
-            run: self.run.clone(),
+            run,
+            foreign,
             files,
             covariances,
         };
@@ -108,20 +171,31 @@ impl Packing<'_> {
         Ok(count)
     }
 
-    /// Grid of a catalogue, which has a row for every cell, measured or not.
-    fn grid(&self, catalogue: &Path) -> Result<Grid, FileError> {
-        let layout = self.run.source.layout();
-        Grid::new(
-            grid_side(catalogue, rows_of(catalogue)?)?,
-            Pixels(layout.stamp as f64),
-            Degrees(layout.field_degrees),
-        )
-        .map_err(|error| FileError::new(catalogue, error))
+    fn spectrum(
+        &self,
+        set: u32,
+        catalogues: &[(u32, PathBuf)],
+        spectrum: Spectrum,
+        progress: &mut dyn Progress,
+    ) -> Result<(String, Option<SpectrumCovariance>), FileError> {
+        let first = &catalogues[0].1;
+        let grid = self.origin.grid(set, first)?;
+        let mut images = SetImages::new(&grid);
+        let mut used = 0;
+        for (_, path) in catalogues {
+            let mut sum = FieldSum::new(&grid);
+            let rows = self.origin.rows(path, most_rows(&grid))?;
+            progress.advance(rows.len() as u64);
+            used += sum.add_image(&grid, rows).used;
+            images.add(&sum);
+        }
+        if used == 0 {
+            let message =
+                "neither this catalogue nor others of the set have an ellipticity on the grid";
+            return Err(FileError::new(first, message));
+        }
+        spectrum_text(&grid, &images, spectrum).map_err(|error| FileError::new(first, error))
     }
-}
-
-fn rows_of(catalogue: &Path) -> Result<usize, FileError> {
-    Ok(table::read(catalogue, Some(&["x"]))?.rows())
 }
 
 /// Where packed files go.

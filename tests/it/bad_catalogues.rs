@@ -3,7 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use crate::support::{Small, fail, fits_image, shearq, text};
+use crate::bad_images::gzip;
+use crate::support::{Small, fail, fits_image, shearq, succeed, text};
 
 #[test]
 fn catalogues_with_mistakes_are_named_with_file_and_place() {
@@ -45,10 +46,10 @@ fn catalogues_with_mistakes_are_named_with_file_and_place() {
     );
     refuse(
         "c.csv",
-        b"x;y;e1;e2\n1;2;3;4\n",
-        "no column `x`; columns found: x;y;e1;e2",
+        b"id,x,y,g1,g2\n1,2,3,4,5\n",
+        "no column `e1`; columns found: id, x, y, g1, g2; `score --columns`",
     );
-    refuse("c.csv", b"x,y,e1,e2\n1,2,\xff,4\n", "byte 15 is not UTF-8");
+    refuse("c.csv", b"x,y,e1,e2\n1,2,\xff,4\n", "line 2 is not UTF-8");
     refuse(
         "c.csv",
         b"x,y,e1,e2\n1e9,2,3,4\n",
@@ -176,4 +177,72 @@ fn records_and_folders_that_are_not_what_they_should_be_are_refused() {
     assert!(measure(&data, &file).contains("file/run.json: cannot read the record"));
     assert!(measure(&file, &out).contains("file: there is no such folder; expected a data folder"));
     assert!(measure(&small.at("absent"), &out).contains("there is no such folder"));
+}
+
+/// Catalogues of tools that people have give the scores of the same numbers as plain as can be.
+#[test]
+fn catalogues_of_other_tools_are_scored() {
+    let small = Small::new("2");
+    small.measure(&["--submission", "23/raw/star"]);
+    let truth = small.at("data/set02/truth.csv");
+    let columns = ["x", "y", "e1", "e2"].map(|name| small.measured("02", name));
+    let write = |name: &str, text: String| {
+        let bytes = match name.ends_with(".gz") {
+            true => gzip(text.as_bytes()),
+            false => text.into_bytes(),
+        };
+        fs::write(small.at(name), bytes).unwrap();
+    };
+    let rows = |row: &dyn Fn(usize, [String; 4]) -> String| -> String {
+        (0..columns[0].len())
+            .map(|k| row(k, std::array::from_fn(|c| columns[c][k].to_string())))
+            .collect()
+    };
+    let score = |name: &str| {
+        let path = small.at(name);
+        let arguments = ["score", "--truth", text(&truth), "--truth-sign", "standard"];
+        succeed(&[&arguments[..], &["--format", "csv", text(&path)]].concat())
+    };
+    write(
+        "plain.dat",
+        rows(&|_, [x, y, e1, e2]| format!("{x} {y} {e1} {e2}\n")),
+    );
+    let plain = score("plain.dat");
+    let pandas = rows(&|k, [x, y, e1, e2]| format!("{k},\"a, b\",{x},{y},,{e1},{e2}\n"));
+    write("pandas.csv", format!(",name,x,y,class,e1,e2\n{pandas}"));
+    let pandas = rows(&|k, [x, y, e1, e2]| format!("{k},{x},{y},{e1},{e2}\r\n"));
+    write("pandas.csv.gz", format!("\u{feff},x,y,e1,e2\r\n{pandas}"));
+    let european = rows(&|_, [x, y, e1, e2]| format!("{y};{x};{e1};{e2}\n"));
+    write(
+        "semicolons.csv",
+        format!("y;x;e1;e2\n# made, by me\n{european}"),
+    );
+    let blanks = rows(&|_, [x, y, e1, e2]| format!("  {x}  {y} {e1}\t{e2}\n"));
+    write("blanks.txt", format!("# made by me, by hand\n{blanks}"));
+    for name in [
+        "pandas.csv",
+        "pandas.csv.gz",
+        "semicolons.csv",
+        "blanks.txt",
+    ] {
+        assert_eq!(score(name), plain, "{name}");
+    }
+    fs::copy(
+        small.at("out/set02/catalogue-001.parquet"),
+        small.at("catalogue.pq"),
+    )
+    .unwrap();
+    assert_eq!(score("catalogue.pq"), plain);
+    // More rows than any catalogue of this grid has, and a row that has no end.
+    write("many.csv.gz", "1,2,3,4\n".repeat(400_000));
+    let many = small.at("many.csv.gz");
+    let message = fail(&["score", "--truth", text(&truth), text(&many)]);
+    assert!(
+        message.contains("expected at most 262208 rows"),
+        "{message}"
+    );
+    write("long.csv.gz", "1".repeat(1 << 24));
+    let long = small.at("long.csv.gz");
+    let message = fail(&["score", "--truth", text(&truth), text(&long)]);
+    assert!(message.contains("more than 1048576 bytes"), "{message}");
 }

@@ -14,6 +14,7 @@ mod identity;
 mod killed;
 mod odd_files;
 mod orientation;
+mod own_images;
 mod packed;
 mod printed;
 mod reproduced;

@@ -70,6 +70,176 @@ fn archives_are_reproducible_and_unpack_to_the_folder_that_is_packed() {
     assert!(fail(&again).contains("exists already"));
 }
 
+/// What `score` prints of a submission or catalogues, as numbers by name.
+fn scores(packed: &Packed, input: &[&str]) -> serde_json::Value {
+    let data = packed.at("data");
+    let arguments = [&["score", "--data", text(&data), "--format", "json"], input];
+    let mut found: serde_json::Value = serde_json::from_str(&succeed(&arguments.concat())).unwrap();
+    found["rows"].take()
+}
+
+/// ASCII keeps nine decimals of ellipticities and thirteen digits of powers.
+fn assert_close(found: &serde_json::Value, expected: &serde_json::Value) {
+    let (found, expected) = (
+        found["q"].as_f64().unwrap(),
+        expected["q"].as_f64().unwrap(),
+    );
+    assert!((found / expected - 1.0).abs() < 1e-6, "{found} {expected}");
+}
+
+#[test]
+fn a_submission_is_scored_as_it_is_sent() {
+    let packed = Packed::new();
+    let (out, sent) = (packed.at("out"), packed.at("sent"));
+    let measured = scores(&packed, &["--measured", text(&out)]);
+    let folder = scores(&packed, &["--packed", text(&sent)]);
+    assert_close(&folder[0], &measured[0]);
+    // As `tar czf … -C folder .` packs it.
+    let archive_path = packed.at("by-tar.tgz");
+    let file = fs::File::create(&archive_path).unwrap();
+    let mut builder = tar::Builder::new(GzEncoder::new(file, Compression::fast()));
+    builder.append_dir_all(".", &sent).unwrap();
+    builder.into_inner().unwrap().finish().unwrap();
+    assert_eq!(scores(&packed, &["--packed", text(&archive_path)]), folder);
+    assert_eq!(packed.check(&archive_path), (vec![], 0));
+    let unpacked = packed.at("unpacked");
+    succeed(&[
+        "unpack",
+        text(&archive_path),
+        "--verify",
+        "--out",
+        text(&unpacked),
+    ]);
+    assert_eq!(contents(&unpacked), contents(&sent));
+    let spectra = packed.at("spectra.tar.gz");
+    let pack = ["pack", "--measured", text(&out), "--method", "NN"];
+    succeed(&[&pack[..], &["--kind", "spectra", "--out", text(&spectra)]].concat());
+    assert_close(
+        &scores(&packed, &["--packed", text(&spectra)])[0],
+        &measured[0],
+    );
+    let refused = |path: &Path, expected: &str| {
+        let data = packed.at("data");
+        let message = fail(&["score", "--data", text(&data), "--packed", text(path)]);
+        assert!(message.contains(expected), "{message}");
+    };
+    // Files of an archive are named as its members.
+    let line = b"24.5 24.5 0.1 many\n";
+    archive(&archive_path, &[("g10_v1_objs_8_1.NN.dat", line)]);
+    refused(
+        &archive_path,
+        "by-tar.tgz/g10_v1_objs_8_1.NN.dat: line 1: `many`",
+    );
+    let good = b"24.5 24.5 0.1 0.1\n";
+    for (name, expected) in [
+        ("NN_set8.dat", "catalogues and spectra; expected one kind"),
+        ("g10_v1_objs_8_2.MM.dat", "several methods: MM, NN"),
+        (
+            "g10_v1_objs_100_2.NN.dat",
+            "the name is neither g10_v1_objs_",
+        ),
+    ] {
+        archive(
+            &archive_path,
+            &[("g10_v1_objs_8_1.NN.dat", good), (name, good)],
+        );
+        refused(&archive_path, expected);
+    }
+    refused(&packed.at("absent"), "there is no such folder");
+    refused(&packed.file(1), "there is no such folder");
+    fs::write(packed.file(1), good).unwrap();
+    refused(&sent, "this is not what was packed");
+}
+
+#[test]
+fn catalogues_of_another_program_are_packed_as_they_are_scored() {
+    let packed = Packed::new();
+    let description = packed.at("other.toml");
+    // Distortions with the other sign of e2, counted from 0, of which one is flagged.
+    for image in 1..=3 {
+        let mut lines = String::from(",xpos,ypos,g1,g2,bad\n");
+        for (k, line) in fs::read_to_string(packed.file(image))
+            .unwrap()
+            .lines()
+            .enumerate()
+        {
+            let v: Vec<f64> = line.split(' ').map(|f| f.parse().unwrap()).collect();
+            let larger = 2.0 / (1.0 + v[2] * v[2] + v[3] * v[3]);
+            let (e1, e2) = (v[2] * larger, -v[3] * larger);
+            let bad = u8::from(k == 5);
+            lines += &format!("{k},{},{},{e1},{e2},{bad}\n", v[0] - 1.0, v[1] - 1.0);
+        }
+        fs::write(packed.at(&format!("other-8-{image}.csv")), lines).unwrap();
+    }
+    let text_of = |catalogues: &str| {
+        format!(
+            "name = \"their/method\"\ncatalogues = \"{catalogues}\"\nellipticity = \"distortion\"\nx = \"xpos\"\ny = \"ypos\"\ne1 = \"g1\"\ne2 = \"g2\"\nflag = \"bad\"\nposition_offset = 1.0\ne2_sign = -1\n"
+        )
+    };
+    fs::write(&description, text_of("other-{set}-{image}.csv")).unwrap();
+    let foreign = scores(&packed, &["--foreign", text(&description)]);
+    let data = packed.at("data");
+    for kind in ["catalogues", "spectra"] {
+        let out = packed.at(kind);
+        let pack = [
+            "pack",
+            "--foreign",
+            text(&description),
+            "--data",
+            text(&data),
+        ];
+        succeed(&[&pack[..], &["--kind", kind, "--out", text(&out)]].concat());
+        assert_close(&scores(&packed, &["--packed", text(&out)])[0], &foreign[0]);
+        let names: Vec<String> = contents(&out).into_iter().map(|file| file.0).collect();
+        let first = match kind {
+            "catalogues" => "g10_v1_objs_8_1.their-method.dat",
+            _ => "manifest.json",
+        };
+        assert_eq!(names[0], first);
+    }
+    let one = packed.at("catalogues/g10_v1_objs_8_1.their-method.dat");
+    let (theirs, ours) = (
+        fs::read_to_string(one).unwrap(),
+        fs::read_to_string(packed.file(1)).unwrap(),
+    );
+    assert_eq!(theirs.lines().count() + 1, ours.lines().count());
+    assert_eq!(theirs.lines().next(), ours.lines().next());
+    let (mut found, code) = packed.check(&packed.at("catalogues"));
+    found.dedup();
+    assert_eq!((found, code), (vec!["missing".to_owned()], 0));
+    let refused = |catalogues: &str, more: &[&str], expected: &str| {
+        fs::write(&description, text_of(catalogues)).unwrap();
+        let never = packed.at("never");
+        let pack = [
+            "pack",
+            "--foreign",
+            text(&description),
+            "--out",
+            text(&never),
+        ];
+        let message = fail(&[&pack[..], more].concat());
+        assert!(message.contains(expected) && !never.exists(), "{message}");
+    };
+    let pattern = "other-{set}-{image}.csv";
+    refused(
+        pattern,
+        &["--kind", "spectra"],
+        "--data DIR gives it for spectra",
+    );
+    refused(
+        "absent-{set}-{image}.csv",
+        &[],
+        "there is no catalogue here to pack",
+    );
+    refused("other-8-{image}.csv", &[], "has no {set}");
+    fs::write(packed.at("other-8-2.csv"), "xpos,ypos,e1\n1,2,3\n").unwrap();
+    refused(
+        pattern,
+        &[],
+        "no column `g1`; columns found: xpos, ypos, e1; the description",
+    );
+}
+
 #[test]
 fn a_packed_folder_is_compared_with_its_manifest() {
     let packed = Packed::new();

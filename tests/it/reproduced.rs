@@ -11,7 +11,7 @@ use shearq_submissions::Registry;
 fn agrees(findings: &[Finding], paper: &str) -> bool {
     let finding = findings.iter().find(|f| f.paper.starts_with(paper));
     let finding = finding.unwrap_or_else(|| panic!("no finding `{paper}`"));
-    println!("{paper}: {}", finding.here);
+    eprintln!("{paper}: {}", finding.here);
     finding.agrees == Some(true)
 }
 

@@ -3,7 +3,7 @@
 
 use serde_json::Value;
 
-use crate::support::{shared, succeed, text};
+use crate::support::{succeed, text};
 
 /// Every key of `expected` is in `found`, with the same numbers.
 fn compare(place: &str, found: &Value, expected: &Value, tolerance: f64, wrong: &mut Vec<String>) {
@@ -53,24 +53,23 @@ fn compare(place: &str, found: &Value, expected: &Value, tolerance: f64, wrong: 
 
 #[test]
 fn the_printed_object_holds_every_figure_of_the_public_cases() {
-    let Some(folder) = shared("scoring-cases") else {
-        return;
-    };
     let mut wrong = Vec::new();
-    for entry in std::fs::read_dir(folder).unwrap() {
+    let mut cases = 0;
+    for entry in std::fs::read_dir("scoring/tests/data").unwrap() {
         let case = entry.unwrap().path();
         let Ok(expected) = std::fs::read_to_string(case.join("expected.json")) else {
             continue;
         };
+        cases += 1;
         let expected: Value = serde_json::from_str(&expected).unwrap();
-        let truth = case.join("truth.csv");
+        let truth = case.join("truth.csv.gz");
         let noise = expected["noise_var"].to_string();
         let mut arguments = vec!["score", "--truth", text(&truth)];
         let catalogues: Vec<_> = expected["files"]["catalogues"]
             .as_array()
             .unwrap()
             .iter()
-            .map(|name| case.join(name.as_str().unwrap()))
+            .map(|name| case.join(format!("{}.gz", name.as_str().unwrap())))
             .collect();
         arguments.extend(catalogues.iter().map(|path| text(path)));
         arguments.extend(["--noise-var", &noise, "--format", "json"]);
@@ -85,5 +84,6 @@ fn the_printed_object_holds_every_figure_of_the_public_cases() {
         };
         compare(name, &found, &expected, tolerance, &mut wrong);
     }
+    assert_eq!(cases, 4);
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }

@@ -3,6 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use shearq::io::table;
+
 /// A folder of `shared` beside the project, in whose root tests run; says so and gives none where it is absent.
 pub fn shared(name: &str) -> Option<PathBuf> {
     if let Ok(folder) = Path::new("../shared").join(name).canonicalize() {
@@ -147,7 +149,7 @@ impl Small {
     /// A column of the first image's catalogue in `out`.
     pub fn measured(&self, set: &str, column: &str) -> Vec<f64> {
         let path = self.at(&format!("out/set{set}/catalogue-001.parquet"));
-        let mut table = shearq::io::table::read(&path, None).expect("a catalogue");
+        let mut table = table::read(&path, None, table::MAX_ROWS).expect("a catalogue");
         table.take_real(column).expect("a column of it")
     }
 }

@@ -1,11 +1,11 @@
 //! The leaderboard definition against figures of the challenge's own scoring program.
 //!
-//! The cases lie in `shared/scoring-cases` beside the project; each is skipped with a message where
-//! that folder is absent.
+//! The cases and what they were made from lie in `tests/data`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use flate2::read::GzDecoder;
 use serde_json::Value;
 use shearq_scoring::{
     Bias, BiasFits, ConventionClass, ConventionScore, FieldSum, Grid, Noise, Options, Row,
@@ -13,22 +13,19 @@ use shearq_scoring::{
 };
 
 fn cases() -> Vec<PathBuf> {
-    let folder = Path::new("../../shared/scoring-cases");
-    let Ok(entries) = fs::read_dir(folder) else {
-        eprintln!("skipped: there is no folder shared/scoring-cases beside the project");
-        return Vec::new();
-    };
-    let mut cases: Vec<PathBuf> = entries
-        .map(|e| e.expect("readable folder").path())
-        .filter(|p| p.join("expected.json").exists())
+    let mut cases: Vec<PathBuf> = fs::read_dir("tests/data")
+        .expect("the folder of cases")
+        .map(|entry| entry.expect("readable folder").path())
+        .filter(|path| path.is_dir())
         .collect();
     cases.sort();
-    assert!(!cases.is_empty(), "no case in {}", folder.display());
+    assert_eq!(cases.len(), 4);
     cases
 }
 
 fn rows(path: &Path) -> Vec<Row> {
-    let text = fs::read_to_string(path).expect("readable case file");
+    let file = fs::File::open(format!("{}.gz", path.display())).expect("readable case file");
+    let text = std::io::read_to_string(GzDecoder::new(file)).expect("gzip-compressed text");
     text.lines()
         .skip(1)
         .map(|line| {

@@ -177,19 +177,13 @@ pub fn read_table(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileErr
     }
     let rows = table_rows(&mut file)?;
     let descriptions = describe_columns(&file)?;
-    let known = || {
-        let names: Vec<&str> = descriptions.iter().map(|d| d.name.as_str()).collect();
-        names.join(", ")
-    };
     if let Some(missing) = wanted
         .into_iter()
         .flatten()
         .find(|name| !descriptions.iter().any(|d| d.name == **name))
     {
-        return Err(file.fault(format!(
-            "there is no column `{missing}`; columns found: {}",
-            known()
-        )));
+        let names: Vec<&str> = descriptions.iter().map(|d| d.name.as_str()).collect();
+        return Err(FileError::no_column(path, missing, &names));
     }
     let mut chosen = Vec::new();
     for description in &descriptions {

@@ -1,0 +1,123 @@
+//! Which grid galaxies lie on: decided here for measuring, scoring, packing and checking alike.
+
+use std::path::Path;
+
+use shearq_scoring::units::{Degrees, Pixels};
+use shearq_scoring::{Grid, Row};
+
+use super::score::{read_truth, reading_of};
+use crate::io::FileError;
+use crate::io::fits::ImageReader;
+use crate::io::layout::{DataFolder, MAX_STAMP};
+
+/// Pixels a side of a stamp of an image: its header's STAMP, or else that of the data's layout.
+///
+/// # Errors
+/// Where STAMP is not a whole number of pixels.
+fn stamp_of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<usize, FileError> {
+    Ok(whole(image, path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp))
+}
+
+/// Grid of an image, and the pixels a side of its stamps.
+///
+/// # Errors
+/// Where the image is not made of whole stamps, as many as its header says.
+pub(super) fn of_image(
+    data: &DataFolder,
+    path: &Path,
+    image: &ImageReader,
+) -> Result<(Grid, usize), FileError> {
+    let stamp = stamp_of_image(data, path, image)?;
+    let n = whole(image, path, "NGRID", image.width())?.unwrap_or(image.width() / stamp);
+    if image.width() != n * stamp || image.height() != n * stamp {
+        let message = format!(
+            "the image is {} × {} pixels; expected {n} × {n} stamps of {stamp} pixels a side",
+            image.width(),
+            image.height()
+        );
+        return Err(FileError::new(path, message));
+    }
+    let field = Degrees(data.layout().field_degrees);
+    let grid =
+        Grid::new(n, Pixels(stamp as f64), field).map_err(|error| FileError::new(path, error))?;
+    Ok((grid, stamp))
+}
+
+/// Pixels a side of the stamps of a set: those of its first image, or of the data's layout where there
+/// is no image.
+///
+/// # Errors
+/// Where that image cannot be read.
+pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
+    match data.images(&[set])?.of_set(set).first() {
+        Some((_, path)) => stamp_of_image(data, path, &ImageReader::open(path)?),
+        None => Ok(data.layout().stamp),
+    }
+}
+
+/// Grid of a set: that of its first image, or of its true shear where there is no image.
+///
+/// # Errors
+/// Where neither can be read.
+pub fn of_set(data: &DataFolder, set: u32) -> Result<Grid, FileError> {
+    match data.images(&[set])?.of_set(set).first() {
+        Some((_, path)) => Ok(of_image(data, path, &ImageReader::open(path)?)?.0),
+        None => Ok(read_truth(&data.truth(set), &reading_of(data, set)?)?.0),
+    }
+}
+
+/// Grid of a catalogue of ours, which has a row for every cell at its centre, measured or not.
+///
+/// # Errors
+/// Where `rows`, in order, are not those of a grid.
+pub fn of_catalogue(path: &Path, rows: &[Row], field: Degrees) -> Result<Grid, FileError> {
+    let n = side(path, rows.len())?;
+    let whole = |cell: &Row| (cell.x == cell.y).then_some(2.0 * cell.x - 1.0);
+    let stamp = rows.first().and_then(whole).unwrap_or(f64::NAN);
+    let grid = Grid::new(n, Pixels(stamp), field).map_err(|error| FileError::new(path, error))?;
+    let at = |k: usize| grid.centre(k % n, k / n);
+    match (0..rows.len()).find(|&k| (rows[k].x, rows[k].y) != at(k)) {
+        None => Ok(grid),
+        Some(k) => {
+            let (x, y) = at(k);
+            let message = format!(
+                "row {} lies at ({}, {}); expected ({x}, {y}) on a grid of {stamp} px stamps",
+                k + 1,
+                rows[k].x,
+                rows[k].y
+            );
+            Err(FileError::new(path, message))
+        }
+    }
+}
+
+/// Side of the grid that a file with one row per cell fills.
+///
+/// # Errors
+/// Where the number of rows is no square.
+pub fn side(path: &Path, rows: usize) -> Result<usize, FileError> {
+    Grid::side_of(rows).ok_or_else(|| {
+        let message = format!("{rows} rows; expected the square of the grid's side");
+        FileError::new(path, message)
+    })
+}
+
+/// A header value that counts something, `None` where absent.
+///
+/// # Errors
+/// Where it is no whole number from 1 to `most`.
+pub(super) fn whole(
+    image: &ImageReader,
+    path: &Path,
+    key: &str,
+    most: usize,
+) -> Result<Option<usize>, FileError> {
+    let Some(value) = image.number(key)? else {
+        return Ok(None);
+    };
+    if value.fract() == 0.0 && (1.0..=most as f64).contains(&value) {
+        return Ok(Some(value as usize));
+    }
+    let message = format!("the header key {key} is {value}; expected a whole number, 1 to {most}");
+    Err(FileError::new(path, message))
+}
