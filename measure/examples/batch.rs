@@ -1,4 +1,5 @@
 //! Calibrated ellipticities of many stamps.
+#![expect(clippy::print_stdout, reason = "an example shows what it finds")]
 
 use ndarray::Array3;
 use shearq_measure::{FunctionalPsf, Measurer, PsfProfile, Psfs};

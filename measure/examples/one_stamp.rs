@@ -1,4 +1,5 @@
 //! The ellipticity of one stamp.
+#![expect(clippy::print_stdout, reason = "an example shows what it finds")]
 
 use ndarray::Array2;
 use shearq_measure::{FunctionalPsf, Measurer, PsfProfile};
