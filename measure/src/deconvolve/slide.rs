@@ -102,6 +102,7 @@ impl<T: Real> Kernel<T> {
     }
 
     /// Sets the weight of row `j`, column `i`.
+    #[inline]
     pub(super) fn set(&mut self, j: usize, i: usize, weight: T) {
         let (p, height) = (self.p, Self::height(self.p));
         self.weights[i * height + BLOCK - 1 + p - 1 - j] = weight;
