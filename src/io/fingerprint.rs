@@ -67,7 +67,7 @@ pub fn of_file(path: &Path) -> Result<String, FileError> {
 /// # Errors
 /// Where it cannot be read.
 pub fn of_image(path: &Path) -> Result<String, FileError> {
-    sample(path).map_err(FileError::doing(path, "cannot read the file"))
+    sample(path).map_err(FileError::doing(path, "cannot open the file"))
 }
 
 fn sample(path: &Path) -> std::io::Result<String> {

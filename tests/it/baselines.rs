@@ -75,8 +75,8 @@ fn a_changed_digit_and_a_changed_setting_are_seen_and_an_update_keeps_the_reason
     *q = toml::Value::Float(q.as_float().unwrap() * 1.01);
     first["settings"]["deconvolution"]["lambda"] = toml::Value::Float(123.0);
     // As if this setting had come later: others than named submissions take the base's value.
-    let second = edited["submissions"][1]["settings"]["denoise"].as_table_mut();
-    second.unwrap().remove("window").unwrap();
+    let second = edited["submissions"][1]["settings"]["deconvolution"].as_table_mut();
+    second.unwrap().remove("constant_step").unwrap();
     fs::write(&path, toml::to_string(&edited).unwrap()).unwrap();
     let output = shearq(&check);
     assert_eq!(output.status.code(), Some(1));
@@ -89,7 +89,7 @@ fn a_changed_digit_and_a_changed_setting_are_seen_and_an_update_keeps_the_reason
     let xml = fs::read_to_string(&junit).unwrap();
     assert!(xml.contains("tests=\"2\" failures=\"1\""), "{xml}");
     assert!(xml.contains("deconvolution.lambda: 123.0 ≠"), "{xml}");
-    assert!(!xml.contains("window"), "{xml}");
+    assert!(!xml.contains("constant_step"), "{xml}");
 
     let mut update = check.to_vec();
     update.extend(["--update", "--reason", "λ as in the paper"]);

@@ -355,7 +355,7 @@ fn fuzz_others(count: u64) {
     table("table.parquet", &[parquet], mutate_bytes);
     let ascii = "# x y e1 e2\n24.5 24.5 0.1 -2e-3\n72.5 24.5 NaN 0\n";
     let csv = "x,y,e1,e2\n24.5,24.5,0.1,-2e-3\n72.5,24.5,NaN,0\n";
-    let index = "# note, by me\n,x;y;e1;e2\n0;24.5;24.5;0.1;\n1;72.5;24.5;\"NaN\";0\n";
+    let index = "# note, by me\n;x;y;e1;e2\n0;24.5;24.5;0.1;\n1;72.5;24.5;\"NaN\";0\n";
     let texts = [text(ascii), text(csv), text(index)].concat();
     let gzipped: Vec<Vec<u8>> = texts.iter().map(|text| gzip(text)).collect();
     table("table.csv", &texts, mutate_bytes);
