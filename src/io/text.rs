@@ -18,7 +18,7 @@ pub(super) const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 /// Most bytes of a row with the comments before it, and of all that stands before the first row.
 const MAX_RECORD: usize = 1 << 20;
 /// Bytes read at a time.
-const BUFFER: usize = 1 << 16;
+const BUFFER: usize = 1 << 15;
 /// Most characters of a damaged field that a message shows.
 const SHOWN: usize = 40;
 /// What gzip-compressed files start with.
@@ -187,7 +187,7 @@ fn read_blanks(
         let quotes = lines.contains('"');
         for line in lines.lines() {
             number += 1;
-            let line = line.trim();
+            let line = line.trim_ascii();
             if line.is_empty() || line.starts_with('#') {
                 continue;
             }
@@ -264,8 +264,9 @@ impl Separator {
                 && (header.is_none() || alike(Separator::Blanks))
         };
         let found: Vec<Separator> = [b';', b',', b'\t']
-            .map(Separator::Byte)
             .into_iter()
+            .filter(|byte| row.as_bytes().contains(byte))
+            .map(Separator::Byte)
             .filter(|separator| count(row, *separator) > 1 && !blank(*separator))
             .collect();
         let best = found.iter().find(|separator| alike(**separator));
@@ -475,10 +476,10 @@ impl<'a> Rows<'a> {
 
 /// The number in a field, NaN in an empty one.
 fn number(field: &str) -> Option<f64> {
-    match field.trim() {
+    field.parse().ok().or_else(|| match field.trim() {
         "" => Some(f64::NAN),
         field => field.parse().ok(),
-    }
+    })
 }
 
 #[cfg(test)]
