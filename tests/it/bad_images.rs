@@ -3,7 +3,7 @@
 
 use std::fs;
 
-use crate::support::{Small, fits_image, floats, pixels_of};
+use crate::support::{PACKED, Small, fits_image, floats, pixels_of};
 
 const RAW: [&str; 2] = ["--submission", "23/raw/star"];
 const FUNCTIONAL: [&str; 2] = ["--submission", "23/raw/func"];
@@ -328,15 +328,7 @@ fn what_cfitsio_would_divide_by_is_refused_however_it_is_written() {
 fn damaged_tiles_are_refused_before_they_are_unpacked() {
     let small = Small::new("2");
     let first = "data/set02/galaxies-001.fits";
-    for name in [
-        "rice",
-        "gzip",
-        "hcompress",
-        "hcompress32",
-        "plio",
-        "lossless",
-        "dithered",
-    ] {
+    for name in PACKED {
         let whole = fs::read(format!("tests/data/{name}.fits")).unwrap();
         let key = |name: &str| {
             let name = format!("{name:<8}= ");

@@ -17,7 +17,7 @@ use shearq::submit::foreign::Foreign;
 use shearq_submissions::{Registry, Submission};
 
 use crate::bad_images::gzip;
-use crate::support::{Small, fits_image, pixels_of};
+use crate::support::{PACKED, Small, fits_image, pixels_of};
 
 /// Inputs of each reader in the ordinary test.
 const INPUTS: u64 = 300;
@@ -270,16 +270,7 @@ fn fuzz_images(count: u64) {
         .flat_map(|v| f32::from(*v).to_be_bytes())
         .collect();
     let real = fits_image(-32, &[side / 2, side / 2], &stamp, &bytes);
-    let packed = [
-        "rice",
-        "gzip",
-        "hcompress",
-        "hcompress32",
-        "plio",
-        "lossless",
-        "dithered",
-    ]
-    .map(|name| fs::read(format!("tests/data/{name}.fits")).unwrap());
+    let packed = PACKED.map(|name| fs::read(format!("tests/data/{name}.fits")).unwrap());
     let submission = Registry::embedded()
         .unwrap()
         .get("23/raw/star")

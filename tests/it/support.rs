@@ -5,6 +5,17 @@ use std::process::{Command, Output};
 
 use shearq::io::table;
 
+/// The images of `tests/data` that fpack made, one for each of its ways.
+pub const PACKED: [&str; 7] = [
+    "rice",
+    "gzip",
+    "hcompress",
+    "hcompress32",
+    "plio",
+    "lossless",
+    "dithered",
+];
+
 /// A folder of `shared` beside the project, in whose root tests run; says so and gives none where it is absent.
 pub fn shared(name: &str) -> Option<PathBuf> {
     if let Ok(folder) = Path::new("../shared").join(name).canonicalize() {

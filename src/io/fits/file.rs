@@ -20,6 +20,19 @@ const VALUE_UNDEFINED: c_int = 204;
 /// Bytes of a block of a file.
 const BLOCK: u64 = 2880;
 
+/// One of cfitsio's functions that read values of a column, of bytes or of words.
+type ReadColumn<T> = unsafe extern "C" fn(
+    *mut sys::fitsfile,
+    c_int,
+    sys::LONGLONG,
+    sys::LONGLONG,
+    sys::LONGLONG,
+    T,
+    *mut T,
+    *mut c_int,
+    *mut c_int,
+) -> c_int;
+
 /// An open file, closed under the lock.
 pub struct File {
     raw: *mut sys::fitsfile,
@@ -320,29 +333,29 @@ impl File {
 
     /// The first values of an array of bytes.
     pub fn array(&self, column: c_int, row: usize, length: usize) -> Result<Vec<u8>, FileError> {
-        let mut values = vec![0; length];
-        let (row, length, mut missing) = (row as i64, length as i64, 0);
-        self.call(
-            || format!("cannot read the pixels of tile {row}"),
-            // SAFETY: the file is open, and there is room for the values asked for.
-            |raw, status| unsafe {
-                let to = values.as_mut_ptr();
-                sys::ffgcvb(raw, column, row, 1, length, 0, to, &mut missing, status);
-            },
-        )?;
-        Ok(values)
+        self.values(sys::ffgcvb, column, row, length)
     }
 
     /// The first values of an array of 16-bit integers.
     pub fn words(&self, column: c_int, row: usize, length: usize) -> Result<Vec<i16>, FileError> {
-        let mut values = vec![0; length];
+        self.values(sys::ffgcvi, column, row, length)
+    }
+
+    fn values<T: Copy + Default>(
+        &self,
+        read: ReadColumn<T>,
+        column: c_int,
+        row: usize,
+        length: usize,
+    ) -> Result<Vec<T>, FileError> {
+        let mut values = vec![T::default(); length];
         let (row, length, mut missing) = (row as i64, length as i64, 0);
         self.call(
             || format!("cannot read the pixels of tile {row}"),
             // SAFETY: the file is open, and there is room for the values asked for.
             |raw, status| unsafe {
-                let to = values.as_mut_ptr();
-                sys::ffgcvi(raw, column, row, 1, length, 0, to, &mut missing, status);
+                let (none, to) = (T::default(), values.as_mut_ptr());
+                read(raw, column, row, 1, length, none, to, &mut missing, status);
             },
         )?;
         Ok(values)
