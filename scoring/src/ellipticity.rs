@@ -115,7 +115,19 @@ mod tests {
     }
 
     #[test]
+    fn a_modulus_is_a_length_and_a_map_preserves_areas() {
+        assert_eq!(Shear::new(0.3, -0.4).modulus(), 0.5);
+        assert_eq!(Distortion::new(-0.3, 0.4).modulus(), 0.5);
+        let [[a, b], [c, d]] = Shear::new(0.3, -0.4).matrix();
+        assert!((a * d - b * c - 1.0).abs() < 1e-15);
+    }
+
+    #[test]
     fn impossible_distortion_has_no_shear() {
+        assert_eq!(
+            Distortion::new(0.0, -1.0).to_shear(),
+            Some(Shear::new(0.0, -1.0))
+        );
         assert_eq!(Distortion::new(0.8, 0.7).to_shear(), None);
         assert_eq!(Distortion::new(f64::NAN, 0.0).to_shear(), None);
     }

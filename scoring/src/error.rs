@@ -23,6 +23,16 @@ pub enum ScoringError {
         /// Its value.
         found: f64,
     },
+    /// The side of a field that is out of range.
+    #[error("the field is {found} degrees a side; expected {least} to {most}")]
+    Field {
+        /// The side in degrees.
+        found: f64,
+        /// Smallest.
+        least: f64,
+        /// Largest.
+        most: f64,
+    },
     /// The truth does not fill the grid.
     #[error(
         "the true shear covers {found} of the {expected} cells of the {side}×{side} grid; expected each exactly once"

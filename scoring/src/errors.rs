@@ -14,7 +14,8 @@
 //!
 //! M, A and the null tests are linear in bandpowers, m₁ to c₂ sums over cells. σ_sys is a sum of moduli: each
 //! term has the scatter of a folded normal number. A mean, which is the zero mode, has the E modes' power
-//! at the lowest multipoles: intrinsic ellipticities, B modes, have no mean.
+//! at the lowest multipoles: intrinsic ellipticities, B modes, have no mean. Where the true shear has no modes,
+//! nothing tells the two kinds apart, and ν and ν_B are the mean of both.
 
 use ndarray::Array2;
 use rustfft::num_complex::Complex64;
@@ -34,8 +35,8 @@ pub(crate) struct Scatter {
     ring_of: Array2<u8>,
     e: [f64; BINS],
     b: [f64; BINS],
-    /// E-mode power of the lowest rings.
-    lowest: f64,
+    /// E and B-mode power of the lowest rings.
+    lowest: [f64; 2],
 }
 
 impl Scatter {
@@ -57,7 +58,8 @@ impl Scatter {
                 count[ring] += 1.0;
             }
         }
-        let lowest = e[..LOWEST].iter().sum::<f64>() / count[..LOWEST].iter().sum::<f64>();
+        let sum = |rings: &[f64; BINS]| rings[..LOWEST].iter().sum::<f64>();
+        let lowest = [&e, &b].map(|power| sum(power) / sum(&count));
         for (ring, &count) in count.iter().enumerate() {
             if count > 0.0 {
                 e[ring] /= count;
@@ -72,10 +74,21 @@ impl Scatter {
         }
     }
 
+    /// The same for a truth without modes, which tells neither kind of mode from the other.
+    pub(crate) fn of_one_kind(self) -> Self {
+        let alike = std::array::from_fn(|ring| 0.5 * (self.e[ring] + self.b[ring]));
+        Scatter {
+            e: alike,
+            b: alike,
+            lowest: [0.5 * (self.lowest[0] + self.lowest[1]); 2],
+            ..self
+        }
+    }
+
     /// (ν, ν_B) of a mode; both are that of the lowest rings' E modes for the zero mode.
     fn at(&self, mode: (usize, usize)) -> (f64, f64) {
         match usize::from(self.ring_of[mode]) {
-            BINS => (self.lowest, self.lowest),
+            BINS => (self.lowest[0], self.lowest[0]),
             ring => (self.e[ring], self.b[ring]),
         }
     }

@@ -1,5 +1,7 @@
 //! The square grid of postage stamps, and the Fourier modes that live on it.
 
+use std::ops::RangeInclusive;
+
 use serde::{Deserialize, Serialize};
 
 use crate::error::ScoringError;
@@ -21,6 +23,9 @@ pub struct Grid {
 }
 
 impl Grid {
+    /// Sides of a field in degrees: from a thousandth to the way around the sky. (Far larger ones would have
+    /// multipoles in which the offset of frequencies shows.)
+    pub const FIELDS: RangeInclusive<f64> = 1e-3..=360.0;
     /// Smallest grid accepted. Below 12 cells a side some of the bins 2 to 9 hold no modes.
     pub const MIN_SIDE: usize = 8;
     /// Largest grid accepted (16 million cells), against absurd sizes in damaged input.
@@ -37,7 +42,7 @@ impl Grid {
     /// A grid of `n` cells a side.
     ///
     /// # Errors
-    /// Where `n` is out of range, or a length is not a positive finite number.
+    /// Where `n` or the side of the field is out of range, or the stamp's is no positive finite number.
     pub fn new(n: usize, stamp: Pixels, field: Degrees) -> Result<Self, ScoringError> {
         if !(Self::MIN_SIDE..=Self::MAX_SIDE).contains(&n) {
             return Err(ScoringError::GridSide {
@@ -52,10 +57,11 @@ impl Grid {
                 found: stamp.0,
             });
         }
-        if !(field.0.is_finite() && field.0 > 0.0) {
-            return Err(ScoringError::Length {
-                what: "field size in degrees",
+        if !Self::FIELDS.contains(&field.0) {
+            return Err(ScoringError::Field {
                 found: field.0,
+                least: *Self::FIELDS.start(),
+                most: *Self::FIELDS.end(),
             });
         }
         Ok(Grid { n, stamp, field })

@@ -56,7 +56,8 @@ pub fn mean_over_sets(values_and_errors: &[(f64, f64)]) -> (f64, f64) {
 pub struct PairedDifference {
     /// Mean over sets of (second − first).
     pub difference: f64,
-    /// Its jackknife error: noise common to both cancels in each replicate.
+    /// Its jackknife error: noise common to both cancels in each replicate. Not a number where a set has
+    /// fewer than [`MIN_REPLICATES`].
     pub error: f64,
 }
 
@@ -67,8 +68,13 @@ impl PairedDifference {
     }
 }
 
+/// Fewest replicates that tell the error of a difference. Noise of one image times noise of another is in
+/// none of a few replicates: from two images the error comes out up to ten times too small, from six by a
+/// quarter.
+pub const MIN_REPLICATES: usize = 8;
+
 /// Paired difference over sets: each item is one set's (value, replicates) of the first and of the
-/// second variant. `None` where a set's replicates are fewer than two or do not pair up.
+/// second variant. `None` where there is no set or replicates do not pair up.
 pub fn paired_difference(sets: &[PairedSet<'_>]) -> Option<PairedDifference> {
     if sets.is_empty() {
         return None;
@@ -79,10 +85,14 @@ pub fn paired_difference(sets: &[PairedSet<'_>]) -> Option<PairedDifference> {
     for set in sets {
         let pairs = set.first_replicates.iter().zip(set.second_replicates);
         let full = set.second - set.first;
-        let error = jackknife_error(full, pairs.map(|(a, b)| b - a), set.images);
-        if set.first_replicates.len() != set.second_replicates.len() || error.is_nan() {
+        let count_of = set.first_replicates.len();
+        if set.second_replicates.len() != count_of {
             return None;
         }
+        let error = match count_of >= MIN_REPLICATES {
+            true => jackknife_error(full, pairs.map(|(a, b)| b - a), set.images),
+            false => f64::NAN,
+        };
         difference += full / count;
         variance += error.powi(2);
     }
@@ -143,17 +153,23 @@ mod tests {
 
     #[test]
     fn common_noise_cancels_in_a_paired_difference() {
-        let first = [1.0, 2.0, 3.0];
+        let first = [1.0, 2.0, 3.0, 1.5, 2.5, 0.5, 3.5, 2.0];
         let second = first.map(|v| v + 0.5);
-        let paired = paired_difference(&[PairedSet {
-            images: 3,
-            first: 2.0,
-            first_replicates: &first,
-            second: 2.5,
-            second_replicates: &second,
-        }])
-        .unwrap();
+        let pair = |images: usize, second: &[f64]| {
+            paired_difference(&[PairedSet {
+                images,
+                first: 2.0,
+                first_replicates: &first[..images],
+                second: 2.5,
+                second_replicates: second,
+            }])
+        };
+        let paired = pair(8, &second).unwrap();
         assert_eq!(paired.difference, 0.5);
         assert!(paired.error < 1e-15);
+        // Too few to know, and replicates that do not pair up.
+        let few = pair(7, &second[..7]).unwrap();
+        assert!(few.difference == 0.5 && few.error.is_nan() && few.sigma().is_nan());
+        assert_eq!(pair(8, &second[..7]), None);
     }
 }

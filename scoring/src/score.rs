@@ -615,6 +615,10 @@ impl SetScorer {
             let residual = |bias: &ShearBias| bias.residual.mapv(|r| r / sum.images as f64);
             let field = Convention::STANDARD.apply(&residual(&biases[0]), &residual(&biases[1]));
             let scatter = Scatter::new(&self.grid, bins.width, &self.decomposer.decompose(field));
+            let scatter = match self.truth.constant() {
+                Some(_) => scatter.of_one_kind(),
+                None => scatter,
+            };
             let images = sum.images as f64;
             let sums = |weights: [&Array2<f64>; 2]| {
                 scatter

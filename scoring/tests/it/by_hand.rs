@@ -608,19 +608,29 @@ fn means_and_paired_differences_of_sets() {
     close(error, 0.25, "error");
     assert!(mean_over_sets(&[(1.0, 0.3), (5.0, f64::NAN)]).1.is_nan());
     let set = |first, second, a, b| PairedSet {
-        images: 2,
+        images: 8,
         first,
         first_replicates: a,
         second,
         second_replicates: b,
     };
-    // Two groups of one image: the error is half the distance of the differences.
-    let (a, b) = ([1.0, 2.0], [1.5, 3.1]);
+    // Eight groups of one image, Tukey's formula.
+    let a = [1.0, 2.0, 1.5, 1.2, 0.7, 1.9, 1.4, 1.1];
+    let b = [1.5, 3.1, 1.7, 1.9, 0.9, 2.0, 2.2, 1.6];
     let sets = [set(1.5, 2.3, &a[..], &b[..]), set(2.0, 1.6, &b[..], &a[..])];
     let found = paired_difference(&sets).unwrap();
     close(found.difference, (0.8 - 0.4) / 2.0, "difference");
-    let one = (1.1_f64 - 0.5) / 2.0;
+    let apart: Vec<f64> = a.iter().zip(b).map(|(a, b)| b - a).collect();
+    let mean = apart.iter().sum::<f64>() / 8.0;
+    let squares: f64 = apart.iter().map(|d| (d - mean).powi(2)).sum();
+    let one = (7.0 / 8.0 * squares).sqrt();
     close(found.error, (2.0 * one * one).sqrt() / 2.0, "error");
+    let few = PairedSet {
+        images: 7,
+        ..set(1.5, 2.3, &a[..7], &b[..7])
+    };
+    let few = paired_difference(&[few]).unwrap();
+    assert!(few.difference > 0.79 && few.error.is_nan());
     close(
         PairedDifference {
             difference: 3.0,
@@ -631,7 +641,6 @@ fn means_and_paired_differences_of_sets() {
         "sigma",
     );
     assert!(paired_difference(&[]).is_none());
-    assert!(paired_difference(&[set(1.0, 2.0, &a[..1], &b[..1])]).is_none());
     assert!(paired_difference(&[set(1.0, 2.0, &a[..], &b[..1])]).is_none());
 }
 

@@ -5,4 +5,5 @@ mod common;
 mod conventions;
 mod coverage;
 mod definitions;
+mod edges;
 mod great10_cases;

@@ -1,0 +1,349 @@
+//! Cases at the edges of what is scored: gaps, nothing at all, a constant shear, the fewest images.
+
+use ndarray::Array2;
+use rustfft::num_complex::Complex64;
+use shearq_scoring::modes::Decomposer;
+use shearq_scoring::quality::quality;
+use shearq_scoring::{
+    BINS, Bins, Choice, Convention, CrossSpectrum, Definition, FieldSum, Grid, Noise, Options, Row,
+    RowCounts, SCORED, SetImages, SetScore, SetScorer, TrueShear, cross_spectrum,
+};
+
+use crate::common::{Content, Normal, field, rows, truth};
+
+const STANDARD: Choice = Choice::Insist(Convention::STANDARD);
+
+/// Images of a shear with noise of their own `sigma`; cells for which `keep` says no are left out.
+fn images(
+    grid: &Grid,
+    shear: &Array2<Complex64>,
+    sigmas: &[f64],
+    keep: impl Fn(usize, usize) -> bool,
+) -> SetImages {
+    let mut normal = Normal(11);
+    let mut images = SetImages::new(grid);
+    for (image, sigma) in sigmas.iter().enumerate() {
+        let mut all = rows(grid, shear);
+        for (k, row) in all.iter_mut().enumerate() {
+            row.e1 += sigma * normal.draw();
+            row.e2 += sigma * normal.draw();
+            if !keep(image, k) {
+                (row.e1, row.e2) = (f64::NAN, f64::NAN);
+            }
+        }
+        let mut sum = FieldSum::new(grid);
+        sum.add_image(grid, all);
+        images.add(&sum);
+    }
+    images
+}
+
+fn score(grid: Grid, truth: TrueShear, images: &SetImages, options: Options) -> SetScore {
+    let scorer = SetScorer::new(grid, truth, options).unwrap();
+    scorer.score(images).unwrap()
+}
+
+fn close(found: f64, expected: f64, what: &str) {
+    assert!(
+        (found - expected).abs() <= 1e-10 * expected.abs(),
+        "{what}: {found}, expected {expected}"
+    );
+}
+
+#[test]
+fn a_cross_spectrum_and_its_covariance_are_those_of_their_formulae() {
+    let grid = Grid::great10(16).unwrap();
+    let shear = field(&grid, Content::E, 3);
+    let sigmas = [0.05, 0.1, 0.07, 0.2, 0.05, 0.12, 0.06, 0.09, 0.05];
+    let set = images(&grid, &shear, &sigmas, |_, _| true);
+    let found: CrossSpectrum = cross_spectrum(&grid, &set, Convention::STANDARD).unwrap();
+    let bins = Bins::new(&grid, Definition::Leaderboard);
+    let decomposer = Decomposer::new(grid);
+    let modes: Vec<_> = set
+        .groups()
+        .iter()
+        .map(|g| {
+            decomposer
+                .decompose(Convention::STANDARD.apply(&g.e1, &g.e2))
+                .e
+        })
+        .collect();
+    let groups = modes.len();
+    assert_eq!(groups, sigmas.len());
+    let beyond = |power: [f64; BINS]| power[SCORED.end..].iter().sum::<f64>();
+    let pair = |g: usize, h: usize| bins.power(&modes[g], &modes[h]);
+    let pairs: Vec<(usize, usize)> = (0..groups)
+        .flat_map(|h| (0..h).map(move |g| (g, h)))
+        .collect();
+    let common = pairs.iter().map(|&(g, h)| beyond(pair(g, h))).sum::<f64>() / pairs.len() as f64;
+    let inverse: Vec<f64> = (0..groups)
+        .map(|g| 1.0 / (beyond(pair(g, g)) - common))
+        .collect();
+    assert!(inverse.iter().all(|w| *w > 0.0));
+    let total: f64 = inverse.iter().sum();
+    for (found, inverse) in found.weights.iter().zip(&inverse) {
+        close(*found, inverse / total, "weight");
+    }
+    let share = |&(g, h): &(usize, usize)| inverse[g] * inverse[h];
+    let all: f64 = pairs.iter().map(share).sum();
+    let mut power = [0.0; BINS];
+    for p in &pairs {
+        for b in 0..BINS {
+            power[b] += share(p) * pair(p.0, p.1)[b] / all;
+        }
+    }
+    let covariance = found.covariance.unwrap();
+    let count = groups as f64;
+    let factor = count * (count - 1.0) / ((count - 2.0) * (count - 3.0));
+    for b in SCORED {
+        close(found.power[b], power[b], "power");
+        for c in SCORED {
+            // Pairs of pairs with a group in common.
+            let mut sum = 0.0;
+            for p in &pairs {
+                for q in &pairs {
+                    if [q.0, q.1].contains(&p.0) || [q.0, q.1].contains(&p.1) {
+                        let of = |p: &(usize, usize), b: usize| {
+                            share(p) / all * (pair(p.0, p.1)[b] - power[b])
+                        };
+                        sum += of(p, b) * of(q, c);
+                    }
+                }
+            }
+            let scale = (covariance[b][b] * covariance[c][c]).abs().sqrt();
+            assert!(
+                (covariance[b][c] - factor * sum).abs() < 1e-9 * scale,
+                "{b} {c}"
+            );
+        }
+    }
+    // Where nothing but the shear is seen, no noise tells weights.
+    let same = images(&grid, &shear, &[0.0, 0.0], |_, _| true);
+    let cross = cross_spectrum(&grid, &same, Convention::STANDARD).unwrap();
+    assert_eq!(cross.weights, [0.5, 0.5]);
+    // A galaxy that nobody measured counts as zero.
+    let gap = images(&grid, &shear, &[0.1, 0.1], |_, k| k != 7);
+    let cross = cross_spectrum(&grid, &gap, Convention::STANDARD).unwrap();
+    assert!(cross.power.iter().all(|power| power.is_finite()));
+    // Two images are one pair, whose errors nobody knows; seven are too few still.
+    for (sigmas, known) in [
+        (&sigmas[..2], false),
+        (&sigmas[..7], false),
+        (&sigmas[..8], true),
+    ] {
+        let set = images(&grid, &shear, sigmas, |_, _| true);
+        let cross = cross_spectrum(&grid, &set, Convention::STANDARD).unwrap();
+        assert_eq!(cross.covariance.is_some(), known);
+        close(cross.weights.iter().sum(), 1.0, "sum of weights");
+    }
+}
+
+#[test]
+fn noise_that_is_told_is_spread_over_gaps_in_the_corrected_definition() {
+    let grid = Grid::great10(16).unwrap();
+    let shear = field(&grid, Content::E, 5);
+    let keep = |image: usize, k: usize| !(image + k).is_multiple_of(3) && k != 7;
+    let set = images(&grid, &shear, &[0.1; 5], keep);
+    let (variance, images) = (0.01, 5.0);
+    for definition in [Definition::Leaderboard, Definition::Corrected] {
+        let options = Options {
+            definition,
+            noise: Noise::Given(variance),
+            choice: STANDARD,
+        };
+        let score = score(grid, truth(&shear), &set, options);
+        let w = set.total().count.mapv(|count| count / images);
+        let gain = match definition {
+            Definition::Leaderboard => 1.0 / images,
+            Definition::Corrected => w.mean().unwrap() / w.mapv(|w| w * w).mean().unwrap() / images,
+        };
+        let expected = Bins::new(&grid, definition).white_noise(variance * gain);
+        for (found, expected) in score.noise.unwrap().iter().zip(expected) {
+            close(*found, expected, "noise");
+        }
+        assert_eq!(score.noise_variance, Some(variance));
+    }
+}
+
+#[test]
+fn one_of_two_images_alone_has_twice_the_noise_of_both() {
+    let grid = Grid::great10(16).unwrap();
+    let shear = field(&grid, Content::E, 5);
+    let set = images(&grid, &shear, &[0.1, 0.1], |_, _| true);
+    let options = Options {
+        choice: STANDARD,
+        ..Options::default()
+    };
+    let score = score(grid, truth(&shear), &set, options);
+    let noise = score.noise.unwrap();
+    let decomposer = Decomposer::new(grid);
+    for (left_out, replicate) in score.replicates.iter().enumerate() {
+        let other = &set.groups()[1 - left_out];
+        let modes = decomposer.decompose(Convention::STANDARD.apply(&other.e1, &other.e2));
+        let power = score.bins.power(&modes.e, &modes.e);
+        let denoised = std::array::from_fn(|b| power[b] - 2.0 * noise[b]);
+        let expected = quality(&score.bins, &denoised, &score.true_ee).q;
+        close(replicate.q_dn, expected, "Q_dn of one image");
+    }
+}
+
+#[test]
+fn the_noise_of_one_image_is_not_known() {
+    let grid = Grid::great10(16).unwrap();
+    let shear = field(&grid, Content::E, 5);
+    let set = images(&grid, &shear, &[0.1], |_, _| true);
+    let score = score(grid, truth(&shear), &set, Options::default());
+    assert!(score.noise.is_none() && score.noise_variance.is_none());
+    assert!(score.figures.q_dn.is_nan() && score.replicates.is_empty());
+}
+
+#[test]
+fn the_true_spectrum_is_that_of_all_cells_in_both_definitions() {
+    let grid = Grid::great10(16).unwrap();
+    let shear = field(&grid, Content::E, 7);
+    for definition in [Definition::Leaderboard, Definition::Corrected] {
+        let options = Options {
+            definition,
+            ..Options::default()
+        };
+        let scorer = SetScorer::new(grid, truth(&shear), options).unwrap();
+        let modes = Decomposer::new(grid).decompose(shear.clone());
+        let expected = Bins::new(&grid, definition).power(&modes.e, &modes.e);
+        for b in SCORED {
+            close(scorer.true_bandpowers()[b], expected[b], "bandpower");
+        }
+    }
+}
+
+#[test]
+fn without_any_galaxy_the_leaderboard_counts_zeros_and_nothing_is_not_a_number_by_accident() {
+    let grid = Grid::great10(8).unwrap();
+    let shear = field(&grid, Content::E, 7);
+    let set = images(&grid, &shear, &[0.1, 0.1], |_, _| false);
+    let of = |definition| {
+        let options = Options {
+            definition,
+            choice: STANDARD,
+            ..Options::default()
+        };
+        score(grid, truth(&shear), &set, options)
+    };
+    let leaderboard = of(Definition::Leaderboard);
+    let nothing = [0.0; BINS];
+    let expected = quality(&leaderboard.bins, &nothing, &leaderboard.true_ee).q;
+    close(leaderboard.figures.q, expected, "Q of nothing");
+    // All conventions of nothing are the same; the first of equals wins.
+    assert_eq!(leaderboard.best.number(), 1);
+    // Seen through no galaxies, the truth has no power either.
+    let corrected = of(Definition::Corrected);
+    assert_eq!(corrected.true_ee[SCORED], nothing[SCORED]);
+    let own = corrected.conventions[Convention::STANDARD.index()].ee;
+    assert_eq!(own[SCORED], nothing[SCORED]);
+}
+
+#[test]
+fn where_the_shear_is_constant_the_mean_is_the_truth_and_c() {
+    let grid = Grid::great10(8).unwrap();
+    let of = |e1, e2| Array2::from_elem((8, 8), Complex64::new(e1, e2));
+    let measured = of(0.035, -0.024);
+    let set = images(&grid, &measured, &[0.0, 0.0], |_, _| true);
+    let options = Options {
+        choice: STANDARD,
+        ..Options::default()
+    };
+    let score = score(grid, truth(&of(0.03, -0.02)), &set, options);
+    let mean = score.constant.unwrap();
+    assert_eq!(mean.truth, [0.03, -0.02]);
+    for (found, expected) in [
+        (mean.e[0], 0.035),
+        (mean.e[1], -0.024),
+        (score.figures.c1, 0.005),
+        (score.figures.c2, -0.004),
+    ] {
+        assert!(
+            (found - expected).abs() < 1e-15,
+            "{found}, expected {expected}"
+        );
+    }
+}
+
+#[test]
+fn errors_of_a_constant_shear_do_not_depend_on_the_sign_of_a_component() {
+    let grid = Grid::great10(16).unwrap();
+    let of = |sign: f64| {
+        let shear = Array2::from_elem((16, 16), Complex64::new(0.03, -0.02 * sign));
+        let mut flipped = SetImages::new(&grid);
+        let plain = Array2::from_elem((16, 16), Complex64::new(0.03, -0.02));
+        for group in images(&grid, &plain, &[0.1; 4], |_, _| true).groups() {
+            let mut sum = group.clone();
+            sum.e2 *= sign;
+            flipped.add(&sum);
+        }
+        let options = Options {
+            choice: STANDARD,
+            ..Options::default()
+        };
+        score(grid, truth(&shear), &flipped, options)
+            .constant
+            .unwrap()
+            .error
+    };
+    let (plain, flipped) = (of(1.0), of(-1.0));
+    for (a, b) in plain.iter().zip(&flipped) {
+        close(*a, *b, "error");
+    }
+}
+
+#[test]
+fn whole_numbers_stand_for_something_else_only_where_no_ellipticity_can_be() {
+    let grid = Grid::great10(8).unwrap();
+    let counts = |e1: f64, e2: f64| -> RowCounts {
+        let (x, y) = grid.centre(0, 0);
+        FieldSum::new(&grid).add_image(&grid, [Row { x, y, e1, e2 }])
+    };
+    for (e1, e2, sentinel) in [
+        (-99.0, -99.0, 1),
+        (-9.0, 0.2, 1),
+        (0.2, 999.0, 1),
+        // Zero is whole too, beside an outlier that is not.
+        (0.0, 7.5, 0),
+        (1.0, 0.0, 0),
+    ] {
+        assert_eq!(counts(e1, e2).sentinels, sentinel, "({e1}, {e2})");
+    }
+    assert_eq!(
+        (counts(1.0, 0.0).above_one, counts(1.0, 0.1).above_one),
+        (0, 1)
+    );
+    assert_eq!((counts(5.0, 0.0).absurd, counts(5.5, 0.0).absurd), (0, 1));
+    let outliers = RowCounts {
+        used: 60,
+        absurd: 3,
+        first_absurd: Some((1, 7.5, 0.1)),
+        ..RowCounts::default()
+    };
+    // A twentieth may be outliers.
+    assert_eq!(outliers.fault(&grid), None);
+    assert!(
+        RowCounts {
+            used: 59,
+            ..outliers
+        }
+        .fault(&grid)
+        .is_some()
+    );
+}
+
+#[test]
+fn only_squares_have_a_side_and_only_fields_on_the_sky_make_a_grid() {
+    assert_eq!(
+        (Grid::side_of(64), Grid::side_of(63), Grid::side_of(65)),
+        (Some(8), None, None)
+    );
+    use shearq_scoring::units::{Degrees, Pixels};
+    let grid = |field| Grid::new(8, Pixels(48.0), Degrees(field));
+    assert!(grid(1e-3).is_ok() && grid(360.0).is_ok());
+    for field in [0.0, 9e-4, 361.0, 1e308, f64::NAN, f64::INFINITY, -10.0] {
+        assert!(grid(field).is_err(), "{field}");
+    }
+}
