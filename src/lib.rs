@@ -5,12 +5,14 @@
 //! # Where things are
 //!
 //! * [`simulate`]: GREAT10-like sets.
-//! * [`io`]: files; [`pipeline`]: the chain over many galaxies; [`report`]: tables and figures.
+//! * [`io`]: files; [`pipeline`]: the chain over many galaxies, from stamps to catalogues.
+//! * [`results`]: what happens to scores: scoring, rows, stores, comparisons, baselines; [`report`]: tables
+//!   and figures.
 //! * [`study`]: the paper's calibration of λ and its results on 24 sets; biases, bounds and speed.
-//! * [`submit`]: challenge files, other programs' catalogues, checks.
+//! * [`submit`]: challenge files and checks.
 //! * [`cli`]: the command line; nothing else knows it.
 //! * The crates `shearq-measure` (stamps and PSFs into ellipticities), `shearq-scoring` (spectra and figures
-//!   of merit), `shearq-submissions` (settings) and `shearq-tables` (Parquet) stand below this one.
+//!   of merit), `shearq-submissions` (settings) and `shearq-tables` (data frames) stand below this one.
 //!
 //! # Conventions
 //!
@@ -22,6 +24,7 @@ pub mod cli;
 pub mod io;
 pub mod pipeline;
 pub mod report;
+pub mod results;
 pub mod simulate;
 pub mod study;
 pub mod submit;

@@ -9,8 +9,9 @@ use shearq_scoring::{Choice, Convention, Definition};
 use super::{print, tell};
 use crate::io::layout::MAX_SET;
 use crate::pipeline::images::{ImageId, Shard};
-use crate::pipeline::score::OWN;
 use crate::report::table::{Table, TableFormat};
+use crate::results::compare::Way;
+use crate::results::score::OWN;
 use crate::simulate::field::ShearSpectrum;
 use crate::simulate::kinds::SETS;
 use crate::simulate::set::SimulationSettings;
@@ -238,6 +239,15 @@ impl ScoreSettings {
         }
     }
 
+    /// How variants are scored.
+    pub(super) fn way(&self) -> Way {
+        Way {
+            definition: self.definition(),
+            own: self.own_choice(),
+            foreign: self.choice(),
+        }
+    }
+
     /// The convention asked for, or that of other programs' catalogues.
     pub(super) fn choice(&self) -> Choice {
         self.convention.unwrap_or(Choice::Matched)
@@ -247,6 +257,14 @@ impl ScoreSettings {
     pub(super) fn own_choice(&self) -> Choice {
         self.convention.unwrap_or(OWN)
     }
+}
+
+/// A positive number.
+pub(super) fn positive(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok();
+    number
+        .filter(|number: &f64| number.is_finite() && *number > 0.0)
+        .ok_or_else(|| "expected a positive number".into())
 }
 
 fn parse_choice(text: &str) -> Result<Choice, String> {

@@ -2,28 +2,21 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use clap::{ArgGroup, Args, Subcommand};
 use shearq_submissions::{Registry, Submission};
 
-use super::arguments::{Form, SetList, SimulationArguments, Threads};
+use super::arguments::{Form, SetList, SimulationArguments, Threads, positive};
 use super::progress::Bar;
 use super::{print, tell};
 use crate::io::atomic;
-use crate::io::baseline::{Baseline, BaselineSet, BaselineSubmission, Change};
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::run::{Run, Source};
-use crate::pipeline::baseline::{Wanted, figures_of, measure, settings_moved, shifts};
-use crate::report::baseline::{Checked, junit, shift_table};
+use crate::report::baseline::{junit, shift_table};
 use crate::report::table::TableFormat;
-
-/// The submission that those with the method of `settings` rest on.
-fn base_of(settings: &toml::Table) -> &'static str {
-    match settings.get("method").and_then(toml::Value::as_str) {
-        Some("linear") => "48/linear/star",
-        _ => "paper",
-    }
-}
+use crate::results::baseline::{
+    self, Baseline, BaselineSet, BaselineSubmission, Change, Checked, Wanted, figures_of, measure,
+};
 
 /// Keep figures as baselines, and see later whether they moved.
 ///
@@ -95,7 +88,7 @@ struct CheckArguments {
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
     /// Standard errors by which a figure may be off on other data than the baseline's.
-    #[arg(long, value_name = "K", default_value_t = 3.0)]
+    #[arg(long, value_name = "K", default_value_t = 3.0, value_parser = positive)]
     sigma: f64,
     /// Replace what moved. The baseline keeps the reason and what moved.
     #[arg(long, requires = "reason")]
@@ -207,7 +200,7 @@ fn of_source(
         .iter()
         .map(|submission| {
             let sets = measured(&source, folder, submission, &wanted, threads)?;
-            stored(submission, sets)
+            Ok(BaselineSubmission::new(submission, sets)?)
         })
         .collect::<anyhow::Result<_>>()?;
     Ok((source, submissions))
@@ -246,17 +239,9 @@ fn of_folders(
             folder.display(),
         );
         let sets = figures_of(&run, &run.source.data(folder)?, folder, threads)?;
-        submissions.push(stored(&run.submission, sets)?);
+        submissions.push(BaselineSubmission::new(&run.submission, sets)?);
     }
     Ok((first.context("--measured names no folder")?, submissions))
-}
-
-fn stored(submission: &Submission, sets: Vec<BaselineSet>) -> anyhow::Result<BaselineSubmission> {
-    Ok(BaselineSubmission {
-        name: submission.name.clone(),
-        settings: toml::Table::try_from(submission)?,
-        sets,
-    })
 }
 
 /// Measures with a progress bar.
@@ -315,22 +300,6 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The stored settings; those that the baseline does not know are the base's.
-fn with_defaults(stored: &toml::Table, base: &Submission) -> anyhow::Result<Submission> {
-    let mut all = toml::Table::try_from(base)?;
-    for (key, value) in stored {
-        match (all.get_mut(key), value) {
-            (Some(toml::Value::Table(section)), toml::Value::Table(own)) => {
-                section.extend(own.clone());
-            }
-            _ => {
-                all.insert(key.clone(), value.clone());
-            }
-        }
-    }
-    Ok(all.try_into()?)
-}
-
 /// Measures one baseline again, and updates it where that is asked for.
 fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Result<Vec<Checked>> {
     let baseline = Baseline::read(path)?;
@@ -339,63 +308,12 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
         Some(data) => Source::folder(&DataFolder::open(data)?, beside)?,
         None => baseline.source.clone(),
     };
-    let registry = Registry::embedded()?;
-    let mut checks = Vec::new();
-    let mut submissions = Vec::new();
-    for before in &baseline.submissions {
-        let submission = if registry.names().contains(&before.name) {
-            registry.get(&before.name)?.submission
-        } else {
-            let base = registry.get(base_of(&before.settings))?.submission;
-            with_defaults(&before.settings, &base)
-                .with_context(|| format!("{}: settings of {}", path.display(), before.name))?
-        };
-        let mut check = Checked {
-            baseline: name.to_owned(),
-            submission: before.name.clone(),
-            shifts: Vec::new(),
-            settings: Vec::new(),
-            notes: Vec::new(),
-        };
-        let (moved, new) = settings_moved(before, &submission)
-            .map_err(|message| anyhow::anyhow!("{}: {message}", path.display()))?;
-        check.settings = moved;
-        check
-            .notes
-            .extend(new.iter().map(|line| format!("a setting is new: {line}")));
-        let wanted: Vec<Wanted> = before
-            .sets
-            .iter()
-            .map(|set| Wanted {
-                set: set.set,
-                images: set.images.len() as u32,
-            })
-            .collect();
-        let sets = measured(
-            &source,
-            beside,
-            &submission,
-            &wanted,
-            arguments.threads.number(),
-        )?;
-        for old in &before.sets {
-            let Some(now) = sets.iter().find(|now| now.set == old.set) else {
-                bail!("{}: set {} was not measured again", path.display(), old.set);
-            };
-            if now.data != old.data || now.images != old.images {
-                check.notes.push(format!(
-                    "the data of set {} are not the baseline's ({} images then, {} now); its figures may differ by {} σ",
-                    old.set,
-                    old.images.len(),
-                    now.images.len(),
-                    arguments.sigma
-                ));
-            }
-            check.shifts.extend(shifts(old, now, arguments.sigma));
-        }
-        submissions.push(stored(&submission, sets)?);
-        checks.push(check);
-    }
+    let threads = arguments.threads.number();
+    let measure = |submission: &Submission, wanted: &[Wanted]| {
+        measured(&source, beside, submission, wanted, threads)
+    };
+    let (checks, submissions) = baseline::check(name, &baseline, arguments.sigma, measure)
+        .with_context(|| path.display().to_string())?;
     let moved: Vec<String> = checks.iter().flat_map(Checked::moved).collect();
     if let (true, Some(reason)) = (arguments.update, &arguments.reason) {
         if moved.is_empty() && checks.iter().all(|check| check.notes.is_empty()) {

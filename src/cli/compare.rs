@@ -2,26 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
 use clap::Args;
-use shearq_scoring::{Grid, Options};
-use shearq_submissions::{Published, Registry};
 
 use super::arguments::{Printing, ScoreSettings, Threads};
 use super::print_heat_map;
-use crate::io::layout::{DataFolder, MAX_SET};
-use crate::io::listing::Files;
-use crate::io::run::{Run, Source};
-use crate::io::store::{self, Conditions};
-use crate::pipeline::inputs;
-use crate::pipeline::record::set_record;
-use crate::pipeline::score::{Catalogues, ScoredSet, own_catalogue, score_variants};
-use crate::report::comparison::{Variant, compare, q_heat_map};
+use crate::report::comparison::{compare, compare_runs, q_heat_map};
 use crate::report::figure::{Figure, HeatMap};
-use crate::report::runs::{Grouping, Order, compare_runs, runs_heat_map};
-use crate::report::scores::notes;
 use crate::report::table::{Table, TableFormat};
-use crate::submit::foreign::Foreign;
+use crate::results::compare::{Variant, score_all};
+use crate::results::conditions::Conditions;
+use crate::results::groups::{Group, Grouping, Order};
+use crate::results::store;
 
 /// Put measured submissions side by side, beside the published figures, or past runs of a store.
 ///
@@ -70,16 +61,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (table, map) = match &arguments.store {
         Some(store) => stored(arguments, store)?,
         None => {
-            let variants = variants(
+            let variants = score_all(
                 &arguments.measured,
                 &arguments.foreign,
                 arguments.data.as_deref(),
-                &arguments.settings,
+                arguments.settings.way(),
                 arguments.threads.number(),
             )?;
+            let records: Vec<_> = variants.iter().map(Variant::records).collect();
             let rows: Vec<_> = variants
                 .iter()
-                .map(|v| (v.name.clone(), v.sets.iter().collect()))
+                .zip(&records)
+                .map(|(variant, sets)| (variant.name.clone(), sets.iter().collect()))
                 .collect();
             let table = compare(&variants, arguments.settings.definition());
             (table, q_heat_map(&rows))
@@ -112,142 +105,13 @@ fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)
             None => "; `score --store` and `run --store` record them",
         }
     );
-    let mut table = compare_runs(&runs, arguments.group_by, arguments.sort.as_ref());
+    let order = arguments.sort.as_ref();
+    let groups = Group::of(&runs, arguments.group_by, order)?;
+    let mut table = compare_runs(&runs, &groups, arguments.group_by);
     table.notes.extend(notes);
-    Ok((table, runs_heat_map(&runs, arguments.sort.as_ref())))
-}
-
-/// What one variant is before it is scored.
-struct Entrant<'a> {
-    name: String,
-    published: Option<Published>,
-    files: Files,
-    foreign: Option<&'a Foreign>,
-}
-
-/// Scores of several results folders and of other programs' catalogues on the sets that all have.
-pub(super) fn variants(
-    folders: &[PathBuf],
-    foreign: &[PathBuf],
-    data: Option<&Path>,
-    settings: &ScoreSettings,
-    threads: usize,
-) -> anyhow::Result<Vec<Variant>> {
-    let foreign: Vec<Foreign> = foreign
-        .iter()
-        .map(|path| Foreign::read(path))
-        .collect::<Result<_, _>>()?;
-    let registry = Registry::embedded()?;
-    let mut data = data.map(DataFolder::open).transpose()?;
-    let given = data.is_some();
-    let mut first: Option<(&Path, Source)> = None;
-    let mut entrants = Vec::new();
-    for folder in folders {
-        let run = Run::require(folder)?;
-        if !given {
-            let (beside, source) = first.get_or_insert_with(|| (folder, run.source.clone()));
-            anyhow::ensure!(
-                *source == run.source.moved(folder, beside)?,
-                "{}: it was measured from {}, the first from {source}; give --data DIR to score both against one truth",
-                folder.display(),
-                run.source,
-            );
-        }
-        if data.is_none() {
-            data = Some(run.source.data(folder).with_context(|| {
-                format!(
-                    "the data folder of {} (--data gives another)",
-                    folder.display()
-                )
-            })?);
-        }
-        if let Some(data) = &data {
-            inputs::verify(data, folder, &run, &[], threads)?;
-        }
-        entrants.push(Entrant {
-            // Published figures belong to the embedded settings, not to a file of the same name.
-            published: registry
-                .get(&run.submission.name)
-                .ok()
-                .filter(|entry| entry.submission == run.submission)
-                .and_then(|entry| entry.published),
-            name: run.submission.name.clone(),
-            files: run.catalogues(folder, &[])?,
-            foreign: None,
-        });
-    }
-    let data = data.context("--foreign alone needs --data DIR with the true shear")?;
-    for foreign in &foreign {
-        entrants.push(Entrant {
-            name: foreign.name.clone(),
-            published: None,
-            files: foreign.catalogues(&[])?,
-            foreign: Some(foreign),
-        });
-    }
-    for entrant in &entrants {
-        anyhow::ensure!(
-            !entrant.files.sets().is_empty(),
-            "{}: there is no catalogue to score",
-            entrant.name
-        );
-    }
-    let common = |set: u32| entrants.iter().all(|e| e.files.sets().contains(&set));
-    anyhow::ensure!(
-        (1..=MAX_SET).any(common),
-        "the variants have no set in common; there is nothing to compare"
-    );
-    let readers: Vec<_> = entrants
-        .iter()
-        .map(|entrant| {
-            let foreign = entrant.foreign;
-            move |grid: &Grid, path: &Path| match foreign {
-                Some(foreign) => foreign.sum(grid, path),
-                None => own_catalogue(grid, path),
-            }
-        })
-        .collect();
-    let of_set: Vec<_> = entrants
-        .iter()
-        .map(|entrant| |set: u32| entrant.files.of_set(set))
-        .collect();
-    let catalogues: Vec<Catalogues<'_>> = of_set
-        .iter()
-        .zip(&readers)
-        .zip(&entrants)
-        .map(|((of_set, read), entrant)| Catalogues {
-            of_set,
-            read,
-            choice: match entrant.foreign {
-                Some(_) => settings.choice(),
-                None => settings.own_choice(),
-            },
-        })
-        .collect();
-    let options = Options {
-        definition: settings.definition(),
-        ..Options::default()
-    };
-    let scored = score_variants(&data, &catalogues, &[], options, threads)?;
-    drop(catalogues);
-    drop(readers);
-    drop(of_set);
-    Ok(entrants
+    let rows: Vec<_> = Group::of(&runs, None, order)?
         .into_iter()
-        .zip(scored)
-        .map(|(entrant, scored)| variant(entrant.name, entrant.published, &scored))
-        .collect())
-}
-
-fn variant(name: String, published: Option<Published>, scored: &[ScoredSet]) -> Variant {
-    Variant {
-        name,
-        published,
-        // All are scored against one truth, so their data need no fingerprint to be told apart.
-        sets: scored
-            .iter()
-            .map(|set| set_record(set, String::new()))
-            .collect(),
-        notes: notes(scored),
-    }
+        .map(|run| (run.name(), run.sets))
+        .collect();
+    Ok((table, q_heat_map(&rows)))
 }

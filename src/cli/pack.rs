@@ -9,8 +9,8 @@ use super::progress::Bar;
 use super::{count, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::Run;
+use crate::results::foreign::Foreign;
 use crate::submit::archive::is_archive;
-use crate::submit::foreign::Foreign;
 use crate::submit::manifest::Contents;
 use crate::submit::pack::{Origin, Packing};
 

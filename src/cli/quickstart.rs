@@ -7,18 +7,18 @@ use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
 use super::arguments::{ScoreSettings, Threads};
-use super::compare::variants;
 use super::progress::Bar;
 use super::{measure, print, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::Format;
 use crate::pipeline::images;
-use crate::pipeline::score::{OWN, score_folder};
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
 use crate::report::comparison::compare;
 use crate::report::scores::per_set;
 use crate::report::table::TableFormat;
+use crate::results::compare::score_all;
+use crate::results::score::{OWN, score_folder};
 use crate::simulate::set::SimulationSettings;
 
 /// The whole chain on a small simulated default: simulate, measure with three submissions, score,
@@ -81,7 +81,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         print(&format!("{}\n", table.narrow().render(TableFormat::Table)))?;
         folders.push(folder);
     }
-    let variants = variants(&folders, &[], None, &ScoreSettings::default(), threads)?;
+    let way = ScoreSettings::default().way();
+    let variants = score_all(&folders, &[], None, way, threads)?;
     let table = compare(&variants, options.definition);
     print(&table.narrow().render(TableFormat::Table))?;
     tell(format_args!(

@@ -12,14 +12,14 @@ use super::{measure, print, score, tell};
 use crate::io::atomic;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::run::{Run, Source};
-use crate::io::store;
 use crate::io::table::Format;
 use crate::pipeline::images;
-use crate::pipeline::record::Measured;
 use crate::pipeline::run::run_folder;
-use crate::pipeline::score::{OWN, score_folder};
 use crate::report::scores::{bandpowers, per_set};
 use crate::report::table::TableFormat;
+use crate::results::row::Measured;
+use crate::results::score::{OWN, score_folder};
+use crate::results::store;
 
 /// Measure and score in one go, on a data folder or on sets that are simulated on the way.
 ///

@@ -8,21 +8,21 @@ use clap::{ArgGroup, Args, ValueEnum};
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore, TrueShear, TruthSign};
 
-use super::arguments::{Printing, ScoreSettings, SetList, Threads};
+use super::arguments::{Printing, ScoreSettings, SetList, Threads, positive};
 use super::{print, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
-use crate::io::store;
 use crate::pipeline::PipelineError;
-use crate::pipeline::record::{Measured, run_record};
-use crate::pipeline::score::{
-    COLUMNS, ReadImage, Reading, ScoredSet, Screen, own_catalogue, plain_columns, read_truth,
-    reading_of, score_files, score_folder, score_sets,
-};
+use crate::pipeline::truth::{Reading, read_truth, reading_of};
 use crate::report::scores::{SetInput, one_set_json, per_set, spectra};
 use crate::report::table::TableFormat;
+use crate::results::foreign::{Foreign, Screen, plain_columns};
+use crate::results::row::{Measured, RunRecord};
+use crate::results::score::{
+    COLUMNS, ReadImage, ScoredSet, own_catalogue, score_files, score_folder, score_sets, unscored,
+};
+use crate::results::store;
 use crate::submit::challenge::{Kind, read_bandpowers};
-use crate::submit::foreign::Foreign;
 use crate::submit::manifest::Manifest;
 use crate::submit::packed::{Packed, Sent, Submission};
 
@@ -98,7 +98,7 @@ pub(super) struct Arguments {
     )]
     missing: Option<f64>,
     /// Rows with a larger |e| have no ellipticity; for --truth [default: no limit].
-    #[arg(long, value_name = "E", requires = "truth")]
+    #[arg(long, value_name = "E", requires = "truth", value_parser = positive)]
     max_modulus: Option<f64>,
     /// Record the scores in this results store, which `compare --store` reads.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra", "packed"])]
@@ -159,7 +159,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
     }
     let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
     let threads = arguments.threads.number();
-    let (name, scored) = match (&arguments.measured, &arguments.foreign, data) {
+    let (name, scored, unscored) = match (&arguments.measured, &arguments.foreign, data) {
         (Some(measured), _, data) => {
             let run = Run::require(measured)?;
             let data = data.map_or_else(|| run.source.data(measured), Ok)?;
@@ -168,7 +168,8 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
                 let made = Measured::run(&run, &data, measured)?;
                 record(store, made, &scored, options)?;
             }
-            (run.submission.name, scored)
+            let unscored = unscored(&data, &scored, sets)?;
+            (run.submission.name, scored, unscored)
         }
         (None, Some(path), Some(data)) => {
             let foreign = Foreign::read(path)?;
@@ -180,19 +181,21 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             if let Some(store) = &arguments.store {
                 let made = Measured {
                     name: &foreign.name,
-                    settings: crate::io::open::read_to_string(path)
+                    settings: crate::io::open::read_to_string(path, crate::io::open::SETTINGS)
                         .with_context(|| path.display().to_string())?,
                     source: &Source::folder(&data, path.parent().unwrap_or(path))?,
                     data: &data,
                 };
                 record(store, made, &scored, options)?;
             }
-            (foreign.name.clone(), scored)
+            let unscored = unscored(&data, &scored, sets)?;
+            (foreign.name.clone(), scored, unscored)
         }
         (None, _, _) => bail!("--foreign needs the true shear: --data DIR"),
     };
     let title = format!("Scores of {name}");
-    let table = per_set(&scored, &title, options.definition);
+    let mut table = per_set(&scored, &title, options.definition);
+    table.notes.extend(unscored);
     arguments.printing.print(&table)
 }
 
@@ -203,7 +206,7 @@ pub(super) fn record(
     scored: &[ScoredSet],
     options: Options,
 ) -> anyhow::Result<()> {
-    let path = store::write(store, &run_record(measured, scored, options)?)?;
+    let path = store::write(store, &RunRecord::new(measured, scored, options)?)?;
     tell(format_args!("recorded in {}", path.display()));
     Ok(())
 }
@@ -257,7 +260,8 @@ fn packed(
             other => other,
         })?;
     let title = format!("Scores of {}", submission.method);
-    let table = per_set(&scored, &title, options.definition);
+    let mut table = per_set(&scored, &title, options.definition);
+    table.notes.extend(unscored(data, &scored, sets)?);
     arguments.printing.print(&table)
 }
 
@@ -336,7 +340,7 @@ fn score_spectrum(
     manifest: Option<&Manifest>,
     options: Options,
 ) -> anyhow::Result<SpectrumScore> {
-    let powers = read_bandpowers(path)?;
+    let powers = read_bandpowers(path, &grid)?;
     let covariance = manifest.and_then(|manifest| {
         let name = path.file_name()?.to_str()?;
         manifest.covariances.get(name)

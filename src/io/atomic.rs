@@ -32,7 +32,7 @@ impl PartFile {
     /// # Errors
     /// Where the folder cannot be made.
     pub fn new(target: impl AsRef<Path>) -> Result<Self, FileError> {
-        let target = target.as_ref().to_owned();
+        let target = regular(target.as_ref())?;
         let part = part_of(&target)?;
         Ok(PartFile {
             part,
@@ -47,7 +47,7 @@ impl PartFile {
     /// # Errors
     /// Where either cannot be made.
     pub fn create(target: impl AsRef<Path>) -> Result<(Self, fs::File), FileError> {
-        let target = target.as_ref().to_owned();
+        let target = regular(target.as_ref())?;
         let (part, held) = held(&target, "cannot write the file", |part| {
             fs::File::create_new(part)
         })?;
@@ -250,6 +250,20 @@ fn held(
         if part.exists() {
             return Ok((part, file));
         }
+    }
+}
+
+/// The file that `target` names, which may be a link to it and need not be there.
+fn regular(target: &Path) -> Result<PathBuf, FileError> {
+    match fs::metadata(target) {
+        Ok(about) if !(about.is_file() || about.is_dir()) => {
+            let message = "this is no regular file; expected one that can be replaced";
+            Err(FileError::new(target, message))
+        }
+        Ok(_) if target.is_symlink() => {
+            fs::canonicalize(target).map_err(FileError::doing(target, "cannot follow the link"))
+        }
+        _ => Ok(target.to_owned()),
     }
 }
 

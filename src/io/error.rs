@@ -20,6 +20,9 @@ pub struct FileError {
 /// Most names of columns that a message lists.
 const SHOWN: usize = 40;
 
+/// Most characters of a message, which may quote what a file holds.
+const LONGEST: usize = 4000;
+
 /// Names of columns as a message lists them.
 pub(crate) fn names_of(names: &[impl AsRef<str>]) -> String {
     let shown: Vec<&str> = names.iter().take(SHOWN).map(AsRef::as_ref).collect();
@@ -30,9 +33,14 @@ pub(crate) fn names_of(names: &[impl AsRef<str>]) -> String {
 impl FileError {
     /// About `path`, saying `message`.
     pub fn new(path: impl AsRef<Path>, message: impl Display) -> Self {
+        let mut message = message.to_string();
+        if let Some((end, _)) = message.char_indices().nth(LONGEST) {
+            message.truncate(end);
+            message.push('…');
+        }
         FileError {
             path: path.as_ref().to_owned(),
-            message: message.to_string(),
+            message,
             no_column: false,
         }
     }

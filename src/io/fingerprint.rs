@@ -150,7 +150,7 @@ pub fn of_source(source: &Source, data: &DataFolder) -> Result<String, FileError
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, FileError> {
-    open::read(path).map_err(FileError::doing(path, "cannot read the file"))
+    open::read(path, open::DATA).map_err(FileError::doing(path, "cannot read the file"))
 }
 
 #[cfg(test)]

@@ -22,10 +22,11 @@ use fitsio::FitsFile;
 use fitsio::hdu::FitsHdu;
 use fitsio::images::{ImageDescription, ImageType};
 use fitsio::tables::{ColumnDataType, ColumnDescription};
+use shearq_tables::polars::{Column, DataFrame};
+use shearq_tables::reals;
 
 use super::atomic::PartFile;
 use super::error::FileError;
-use super::table::{Column, Table};
 
 static CFITSIO: Mutex<()> = Mutex::new(());
 
@@ -243,39 +244,71 @@ fn write_real(file: &mut FitsFile, key: &str, value: f64) -> fitsio::errors::Res
     fitsio::errors::check_status(status)
 }
 
+/// Values of a column in the types that are written.
+enum Values {
+    Real(Vec<f64>),
+    Whole(Vec<i64>),
+    Text(Vec<String>),
+}
+
+impl Values {
+    fn of(column: &Column) -> Self {
+        let series = column.as_materialized_series();
+        if let Ok(whole) = series.i64() {
+            return Values::Whole(whole.iter().flatten().collect());
+        }
+        match reals(column) {
+            Some(values) => Values::Real(values),
+            None => {
+                let words = series.str().into_iter().flat_map(|words| words.iter());
+                Values::Text(words.map(|word| word.unwrap_or("").to_owned()).collect())
+            }
+        }
+    }
+}
+
 /// Writes `table` as the only binary table of a file, with `header` keys of at most eight characters.
 ///
 /// # Errors
 /// Where the file cannot be written.
-pub fn write_table(path: &Path, table: &Table, header: &[(&str, Value)]) -> Result<(), FileError> {
+pub fn write_table(
+    path: &Path,
+    table: &DataFrame,
+    header: &[(&str, Value)],
+) -> Result<(), FileError> {
     plain_name(path)?;
     let part = PartFile::new(path)?;
     let file = {
         let _guard = lock();
         let cannot = |e| FileError::new(path, format!("cannot write the table: {}", describe(e)));
         let mut file = FitsFile::create(part.path()).open().map_err(cannot)?;
+        let columns: Vec<(&str, Values)> = table
+            .columns()
+            .iter()
+            .map(|column| (column.name().as_str(), Values::of(column)))
+            .collect();
         let mut descriptions = Vec::new();
-        for (name, column) in table.columns() {
-            let kind = match column {
-                Column::Real(_) => ColumnDataType::Double,
-                Column::Whole(_) => ColumnDataType::LongLong,
-                Column::Text(_) => ColumnDataType::String,
+        for (name, values) in &columns {
+            let mut description = ColumnDescription::new(*name);
+            let kind = match values {
+                Values::Real(_) => ColumnDataType::Double,
+                Values::Whole(_) => ColumnDataType::LongLong,
+                Values::Text(words) => {
+                    let longest = words.iter().map(String::len).max().unwrap_or(0);
+                    description.that_repeats(longest.max(1));
+                    ColumnDataType::String
+                }
             };
-            let mut description = ColumnDescription::new(name.as_str());
-            if let Column::Text(words) = column {
-                let longest = words.iter().map(String::len).max().unwrap_or(0);
-                description.that_repeats(longest.max(1));
-            }
             descriptions.push(description.with_type(kind).create().map_err(cannot)?);
         }
         let hdu = file
             .create_table("CATALOGUE", &descriptions)
             .map_err(cannot)?;
-        for (name, column) in table.columns() {
-            match column {
-                Column::Real(values) => hdu.write_col(&mut file, name.as_str(), values),
-                Column::Whole(values) => hdu.write_col(&mut file, name.as_str(), values),
-                Column::Text(values) => hdu.write_col(&mut file, name.as_str(), values),
+        for (name, values) in &columns {
+            match values {
+                Values::Real(values) => hdu.write_col(&mut file, *name, values),
+                Values::Whole(values) => hdu.write_col(&mut file, *name, values),
+                Values::Text(values) => hdu.write_col(&mut file, *name, values),
             }
             .map_err(cannot)?;
         }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
+use shearq_tables::polars::DataFrame;
 
 use super::error::FileError;
 use super::listing::{self, Files};
@@ -98,9 +99,10 @@ impl Layout {
         ] {
             check_pattern(key, pattern, &[])?;
         }
-        if !(*field_degrees > 0.0 && field_degrees.is_finite()) {
+        if !Grid::FIELDS.contains(field_degrees) {
+            let (least, most) = (Grid::FIELDS.start(), Grid::FIELDS.end());
             return Err(format!(
-                "`field_degrees` is {field_degrees}; expected a positive number"
+                "`field_degrees` is {field_degrees:?}; expected {least} to {most}"
             ));
         }
         if !(1..=MAX_STAMP).contains(stamp) {
@@ -134,7 +136,7 @@ impl DataFolder {
         }
         let path = root.join(LAYOUT_FILE);
         let layout = if is_there(&path) {
-            let text = open::read_to_string(&path)
+            let text = open::read_to_string(&path, open::SETTINGS)
                 .map_err(FileError::doing(&path, "cannot read the layout"))?;
             toml::from_str(&text).map_err(|e| FileError::new(&path, e.to_string().trim_end()))?
         } else {
@@ -235,7 +237,7 @@ fn endings(pattern: &str) -> &'static [&'static str] {
 /// # Errors
 /// Where the file cannot be read.
 pub fn read_truth_rows(path: &Path) -> Result<Vec<Row>, FileError> {
-    rows_of(path, table::read_truth(path)?, &["x", "y", "g1", "g2"])
+    rows_of(path, &table::read_truth(path)?, &["x", "y", "g1", "g2"])
 }
 
 /// Rows of a catalogue, at most `most`, from four named columns.
@@ -246,11 +248,11 @@ pub fn read_rows(path: &Path, names: &[&str; 4], most: usize) -> Result<Vec<Row>
     let hint = "`score --columns` or a description (--foreign) names others";
     let table =
         table::read(path, Some(names), most).map_err(|error| error.hint_of_columns(hint))?;
-    rows_of(path, table, names)
+    rows_of(path, &table, names)
 }
 
-fn rows_of(path: &Path, mut table: table::Table, names: &[&str; 4]) -> Result<Vec<Row>, FileError> {
-    let mut column = |name: &str| table.require(name, path);
+fn rows_of(path: &Path, table: &DataFrame, names: &[&str; 4]) -> Result<Vec<Row>, FileError> {
+    let column = |name: &str| table::numbers(table, name, path);
     let (x, y) = (column(names[0])?, column(names[1])?);
     let (e1, e2) = (column(names[2])?, column(names[3])?);
     Ok((0..x.len())

@@ -1,22 +1,18 @@
 //! Files: FITS, Parquet, ASCII and CSV, the layout of challenge data, and what made a result.
 //!
-//! [`fits`] is the only user of cfitsio and serialises its calls; `parquet` the only user of
-//! polars. Every file is written under a temporary name and renamed when whole ([`atomic`]).
+//! [`fits`] is the only user of cfitsio and serialises its calls. Every file is written under a temporary name and renamed when whole ([`atomic`]).
 
 pub mod atomic;
-pub mod baseline;
 pub mod error;
 pub mod fingerprint;
 pub mod fits;
 pub mod layout;
 pub mod listing;
 pub mod open;
-#[cfg(feature = "parquet")]
-mod parquet;
+pub(crate) mod parquet;
 pub mod psf_table;
 mod relative;
 pub mod run;
-pub mod store;
 pub mod table;
 mod text;
 

@@ -5,8 +5,11 @@ use std::fs::{File, Metadata};
 use std::io::{Error, ErrorKind, Read};
 use std::path::Path;
 
-/// Most bytes of a file that is read whole: some hundred times those of a challenge's catalogue.
-const MOST: u64 = 1 << 27;
+/// Most bytes of a file of data that is read whole: some hundred times those of a challenge's catalogue.
+pub const DATA: u64 = 1 << 27;
+/// Most bytes of a file of settings: ten times those of a run or a baseline of all sets. Once they are
+/// taken apart they need twenty times as much memory.
+pub const SETTINGS: u64 = 1 << 22;
 
 /// Opens a regular file, or a link to one.
 ///
@@ -29,13 +32,13 @@ pub fn is_there(path: &Path) -> bool {
 /// All bytes of a file.
 ///
 /// # Errors
-/// As [`open`], and where there are more than 128 MiB of them.
-pub fn read(path: &Path) -> std::io::Result<Vec<u8>> {
+/// As [`open`], and where there are more than `most` of them.
+pub fn read(path: &Path, most: u64) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
-    open(path)?.take(MOST + 1).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 > MOST {
+    open(path)?.take(most + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > most {
         let message =
-            format!("it has more than {MOST} bytes, the most that is read of such a file");
+            format!("it has more than {most} bytes, the most that is read of such a file");
         return Err(Error::new(ErrorKind::FileTooLarge, message));
     }
     Ok(bytes)
@@ -45,8 +48,8 @@ pub fn read(path: &Path) -> std::io::Result<Vec<u8>> {
 ///
 /// # Errors
 /// As [`read`], and where it is not UTF-8.
-pub fn read_to_string(path: &Path) -> std::io::Result<String> {
-    String::from_utf8(read(path)?).map_err(|error| {
+pub fn read_to_string(path: &Path, most: u64) -> std::io::Result<String> {
+    String::from_utf8(read(path, most)?).map_err(|error| {
         let message = format!("byte {} is not UTF-8", error.utf8_error().valid_up_to() + 1);
         Error::new(ErrorKind::InvalidData, message)
     })

@@ -19,7 +19,7 @@ const HEADER: &str = "x,y,profile,beta,fwhm,e1,e2";
 /// galaxy of the grid.
 pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
     const DOING: &str = "cannot read the PSF parameters";
-    let text = open::read_to_string(path).map_err(FileError::doing(path, DOING))?;
+    let text = open::read_to_string(path, open::DATA).map_err(FileError::doing(path, DOING))?;
     let mut reader = csv::ReaderBuilder::new()
         .has_headers(false)
         .flexible(true)
@@ -82,7 +82,10 @@ pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
         let (ix, iy) = grid.cell(*x, *y).ok_or_else(|| {
             FileError::new(path, format!("the position ({x}, {y}) is outside the grid"))
         })?;
-        field[iy * grid.n + ix] = Some(*psf);
+        if field[iy * grid.n + ix].replace(*psf).is_some() {
+            let message = format!("the galaxy at ({x}, {y}) has two rows; expected one");
+            return Err(FileError::new(path, message));
+        }
     }
     field
         .into_iter()

@@ -162,7 +162,7 @@ impl Run {
 /// # Errors
 /// Where it exists and cannot be read.
 pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileError> {
-    let text = match super::open::read_to_string(path) {
+    let text = match super::open::read_to_string(path, super::open::SETTINGS) {
         Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),

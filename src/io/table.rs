@@ -6,111 +6,44 @@
 //! | `.parquet`, `.pq` | Parquet |
 //! | anything else (`.csv`, `.dat`, `.txt`, `.cat`, `.csv.gz`) | text, plain or compressed by gzip: numbers between commas, semicolons, tabs or blanks, as the content has them; columns `x y e1 e2` unless a header names them |
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use shearq_scoring::Grid;
+use shearq_tables::polars::DataFrame;
+use shearq_tables::{Metadata, reals};
 
 use super::error::FileError;
-use super::fits;
-use super::text;
+use super::{fits, parquet, text};
 
-/// One column.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Column {
-    /// Real numbers; NaN is a missing value.
-    Real(Vec<f64>),
-    /// Whole numbers.
-    Whole(Vec<i64>),
-    /// Words.
-    Text(Vec<String>),
-}
-
-impl Column {
-    /// Number of rows.
-    pub fn len(&self) -> usize {
-        match self {
-            Column::Real(values) => values.len(),
-            Column::Whole(values) => values.len(),
-            Column::Text(values) => values.len(),
-        }
-    }
-
-    /// Whether there are no rows.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-}
-
-/// Columns of equal length with unique names.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Table {
-    columns: Vec<(String, Column)>,
-}
-
-impl Table {
-    /// From columns.
-    ///
-    /// # Errors
-    /// A message where lengths differ or names repeat.
-    pub fn new(columns: Vec<(String, Column)>) -> Result<Self, String> {
-        for (k, (name, column)) in columns.iter().enumerate() {
-            let (first_name, first) = &columns[0];
-            if column.len() != first.len() {
-                return Err(format!(
-                    "column `{name}` has {} rows, but `{first_name}` has {}",
-                    column.len(),
-                    first.len()
-                ));
-            }
-            if columns[..k].iter().any(|(other, _)| other == name) {
-                return Err(format!("there are two columns named `{name}`"));
-            }
-        }
-        Ok(Table { columns })
-    }
-
-    /// Names and columns, in order.
-    pub fn columns(&self) -> &[(String, Column)] {
-        &self.columns
-    }
-
-    /// Number of rows.
-    pub fn rows(&self) -> usize {
-        self.columns.first().map_or(0, |(_, column)| column.len())
-    }
-
-    /// Takes a column of `path` out as real numbers.
-    ///
-    /// # Errors
-    /// Where it is not there.
-    pub fn require(&mut self, name: &str, path: &Path) -> Result<Vec<f64>, FileError> {
-        self.take_real(name).ok_or_else(|| {
-            FileError::new(
-                path,
-                format!("there is no column `{name}` that holds numbers, or it is asked for twice"),
-            )
-        })
-    }
-
-    /// Takes a column out as real numbers.
-    pub fn take_real(&mut self, name: &str) -> Option<Vec<f64>> {
-        let at = self.columns.iter().position(|(own, _)| own == name)?;
-        match self.columns.swap_remove(at).1 {
-            Column::Real(values) => Some(values),
-            Column::Whole(values) => Some(values.into_iter().map(|v| v as f64).collect()),
-            Column::Text(_) => None,
-        }
-    }
+/// A column of numbers of the table of `path`; missing ones are NaN.
+///
+/// # Errors
+/// Where it is not there.
+pub fn numbers(table: &DataFrame, name: &str, path: &Path) -> Result<Vec<f64>, FileError> {
+    let column = table.column(name).ok();
+    column.and_then(reals).ok_or_else(|| {
+        let message = format!("there is no column `{name}` that holds numbers");
+        FileError::new(path, message)
+    })
 }
 
 /// File format of a table.
 #[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize, clap::ValueEnum,
+    Debug,
+    Clone,
+    Copy,
+    Default,
+    PartialEq,
+    Eq,
+    Hash,
+    serde::Serialize,
+    serde::Deserialize,
+    clap::ValueEnum,
 )]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
     /// Parquet.
+    #[default]
     Parquet,
     /// FITS binary table.
     Fits,
@@ -122,17 +55,6 @@ impl Format {
         match self {
             Format::Parquet => "parquet",
             Format::Fits => "fits",
-        }
-    }
-}
-
-impl Default for Format {
-    /// Parquet where this build has it, FITS elsewhere.
-    fn default() -> Self {
-        if cfg!(feature = "parquet") {
-            Format::Parquet
-        } else {
-            Format::Fits
         }
     }
 }
@@ -174,7 +96,11 @@ pub fn most_rows(grid: &Grid) -> usize {
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
-pub fn read(path: &Path, wanted: Option<&[&str]>, most_rows: usize) -> Result<Table, FileError> {
+pub fn read(
+    path: &Path,
+    wanted: Option<&[&str]>,
+    most_rows: usize,
+) -> Result<DataFrame, FileError> {
     if let Some(wanted) = wanted {
         for (k, column) in wanted.iter().enumerate() {
             if wanted[..k].contains(column) {
@@ -189,7 +115,7 @@ pub fn read(path: &Path, wanted: Option<&[&str]>, most_rows: usize) -> Result<Ta
         most_rows,
     };
     match Ending::of(path) {
-        Ending::Parquet => read_parquet(path, wanted),
+        Ending::Parquet => parquet::read(path, wanted),
         Ending::Fits => fits::read_table(path, wanted),
         Ending::Text => text::read(path, &request),
     }
@@ -199,7 +125,7 @@ pub fn read(path: &Path, wanted: Option<&[&str]>, most_rows: usize) -> Result<Ta
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
-pub fn read_truth(path: &Path) -> Result<Table, FileError> {
+pub fn read_truth(path: &Path) -> Result<DataFrame, FileError> {
     const NAMES: [&str; 4] = ["x", "y", "g1", "g2"];
     match Ending::of(path) {
         Ending::Text => read_text(path, &NAMES),
@@ -211,7 +137,7 @@ pub fn read_truth(path: &Path) -> Result<Table, FileError> {
 ///
 /// # Errors
 /// Where the file cannot be read.
-pub fn read_text(path: &Path, names: &[&str]) -> Result<Table, FileError> {
+pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
     let request = text::Request {
         wanted: Some(names),
         default_names: names,
@@ -222,7 +148,7 @@ pub fn read_text(path: &Path, names: &[&str]) -> Result<Table, FileError> {
 
 /// What is left of `metadata` in a table written as `format`: all in Parquet; in FITS what fits into a
 /// header, which is keys of at most eight characters with values of at most 68.
-pub fn kept(metadata: &BTreeMap<String, String>, format: Format) -> BTreeMap<String, String> {
+pub fn kept(metadata: &Metadata, format: Format) -> Metadata {
     let fits = |key: &str, value: &str| key.len() <= 8 && value.len() <= 68;
     metadata
         .iter()
@@ -234,15 +160,15 @@ pub fn kept(metadata: &BTreeMap<String, String>, format: Format) -> BTreeMap<Str
 /// The values of `keys` that a table written by [`write`] carries, those that it has.
 ///
 /// # Errors
-/// Where the file cannot be read, or this build lacks its format.
+/// Where the file cannot be read.
 pub fn read_metadata<'a>(
     path: &Path,
     format: Format,
     keys: impl Iterator<Item = &'a String>,
-) -> Result<BTreeMap<String, String>, FileError> {
+) -> Result<Metadata, FileError> {
     match format {
         Format::Parquet => {
-            let mut all = parquet_metadata(path)?;
+            let mut all = parquet::metadata(path)?;
             Ok(keys.filter_map(|key| all.remove_entry(key)).collect())
         }
         Format::Fits => fits::read_table_keys(path, keys),
@@ -253,15 +179,15 @@ pub fn read_metadata<'a>(
 /// they are [`kept`].
 ///
 /// # Errors
-/// Where the file cannot be written, or this build lacks the format.
+/// Where the file cannot be written.
 pub fn write(
     path: &Path,
     format: Format,
-    table: Table,
-    metadata: &BTreeMap<String, String>,
+    table: &DataFrame,
+    metadata: &Metadata,
 ) -> Result<(), FileError> {
     match format {
-        Format::Parquet => write_parquet(path, table, metadata),
+        Format::Parquet => parquet::write(path, table, metadata),
         Format::Fits => {
             let keys: Vec<(String, fits::Value)> = kept(metadata, format)
                 .into_iter()
@@ -269,33 +195,7 @@ pub fn write(
                 .collect();
             let header: Vec<(&str, fits::Value)> =
                 keys.iter().map(|(k, v)| (k.as_str(), v.clone())).collect();
-            fits::write_table(path, &table, &header)
+            fits::write_table(path, table, &header)
         }
     }
 }
-
-#[cfg(feature = "parquet")]
-use super::parquet::{metadata as parquet_metadata, read as read_parquet, write as write_parquet};
-
-#[cfg(not(feature = "parquet"))]
-fn read_parquet(path: &Path, _wanted: Option<&[&str]>) -> Result<Table, FileError> {
-    Err(FileError::new(path, WITHOUT_PARQUET))
-}
-
-#[cfg(not(feature = "parquet"))]
-fn parquet_metadata(path: &Path) -> Result<BTreeMap<String, String>, FileError> {
-    Err(FileError::new(path, WITHOUT_PARQUET))
-}
-
-#[cfg(not(feature = "parquet"))]
-fn write_parquet(
-    path: &Path,
-    _table: Table,
-    _metadata: &BTreeMap<String, String>,
-) -> Result<(), FileError> {
-    Err(FileError::new(path, WITHOUT_PARQUET))
-}
-
-#[cfg(not(feature = "parquet"))]
-pub(super) const WITHOUT_PARQUET: &str =
-    "this build of shearq has no Parquet support; rebuild with the feature `parquet` or use FITS";

@@ -8,15 +8,19 @@ use std::rc::Rc;
 use csv::{ReaderBuilder, StringRecord};
 use flate2::bufread::MultiGzDecoder;
 
+use shearq_tables::polars::{Column, DataFrame};
+
 use super::error::{FileError, names_of};
 use super::open;
-use super::table::{Column, Table};
 
 /// Columns of an ASCII table without a header: the challenge's catalogue.
 pub(super) const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 
 /// Most bytes of a row with the comments before it, and of all that stands before the first row.
 const MAX_RECORD: usize = 1 << 20;
+/// Most rows of a file of fewer bytes than that; a larger one may have one for each byte. Numbers do not
+/// compress further, and zeros are no catalogue.
+const FREE_ROWS: usize = 1 << 20;
 /// Bytes read at a time.
 const BUFFER: usize = 1 << 15;
 /// Most characters of a damaged field that a message shows.
@@ -41,12 +45,14 @@ pub(super) struct Request<'a> {
 /// columns are the default ones, and further ones are left alone. Fields are separated by the first of
 /// `;`, `,` and tabs that the first row has, as often as the header does, and by blanks if it has none.
 /// An empty field is NaN. A file without a row is a table without rows.
-pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<Table, FileError> {
+pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, FileError> {
     let mut input = Input::open(path)?;
+    let size = std::fs::metadata(path).map_or(0, |about| about.len()) as usize;
     let head = Head::read(&mut input, path)?;
     let separator = Separator::of(head.header.as_deref(), head.first.as_deref());
     let (names, named) = head.names(separator, request);
     let mut rows = Rows::new(path, request, &names, named)?;
+    rows.most = rows.most.min(FREE_ROWS.max(size));
     input.read_rows(head, separator, &mut rows)?;
     rows.table()
 }
@@ -139,8 +145,8 @@ fn read_delimited(
     let (end, after): (&[u8], u64) = if crlf { (b"\r\n", 0) } else { (b"\n", 1) };
     let mut reader = delimited(delimiter).from_reader(text.chain(end));
     let mut record = StringRecord::new();
+    left.set(MAX_RECORD);
     loop {
-        left.set(MAX_RECORD);
         let read = reader.read_record(&mut record);
         let line = before + reader.position().line() - after;
         match read {
@@ -160,6 +166,7 @@ fn read_delimited(
             continue;
         }
         rows.add(line, record.iter())?;
+        left.set(MAX_RECORD);
     }
 }
 
@@ -185,6 +192,7 @@ fn read_blanks(
             not_text(rows.path, number + 1 + lines as u64)
         })?;
         let quotes = lines.contains('"');
+        let rows_before = rows.rows;
         for line in lines.lines() {
             number += 1;
             let line = line.trim_ascii();
@@ -201,7 +209,9 @@ fn read_blanks(
             return Ok(());
         }
         bytes.drain(..end);
-        left.set(MAX_RECORD);
+        if rows.rows > rows_before {
+            left.set(MAX_RECORD);
+        }
     }
 }
 
@@ -316,6 +326,12 @@ impl Head {
                 _ => line,
             };
             let text = line.trim();
+            if text.contains('\r') {
+                let message = format!(
+                    "line {number} holds carriage returns; expected lines that end in line feeds"
+                );
+                return Err(FileError::new(path, message));
+            }
             if let Some(comment) = text.strip_prefix('#') {
                 let comment = comment.trim_start_matches('#').trim();
                 head.comments.push(comment.to_owned());
@@ -463,14 +479,14 @@ impl<'a> Rows<'a> {
         FileError::new(self.path, message)
     }
 
-    fn table(self) -> Result<Table, FileError> {
+    fn table(self) -> Result<DataFrame, FileError> {
         let columns = self
             .places
             .iter()
             .zip(self.columns)
-            .map(|(&place, values)| (self.names[place].clone(), Column::Real(values)))
+            .map(|(&place, values)| Column::new(self.names[place].as_str().into(), values))
             .collect();
-        Table::new(columns).map_err(|message| FileError::new(self.path, message))
+        shearq_tables::frame(columns).map_err(|error| FileError::new(self.path, error.to_string()))
     }
 }
 
@@ -484,13 +500,15 @@ fn number(field: &str) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
+    use shearq_tables::reals;
+
     use super::*;
 
-    fn table(text: &str, wanted: Option<&[&str]>) -> Result<Table, String> {
+    fn table(text: &str, wanted: Option<&[&str]>) -> Result<DataFrame, String> {
         table_of(text.as_bytes(), wanted)
     }
 
-    fn table_of(bytes: &[u8], wanted: Option<&[&str]>) -> Result<Table, String> {
+    fn table_of(bytes: &[u8], wanted: Option<&[&str]>) -> Result<DataFrame, String> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("t.csv");
         std::fs::write(&path, bytes).unwrap();
@@ -502,11 +520,15 @@ mod tests {
         read(&path, &request).map_err(|e| e.to_string())
     }
 
+    fn column(table: &DataFrame, name: &str) -> Vec<f64> {
+        reals(table.column(name).unwrap()).unwrap()
+    }
+
     #[test]
     fn headers_and_separators_are_recognised() {
         let columns = |text| {
-            let mut t = table(text, Some(&["y", "e1"])).unwrap();
-            (t.take_real("y").unwrap(), t.take_real("e1").unwrap())
+            let t = table(text, Some(&["y", "e1"])).unwrap();
+            (column(&t, "y"), column(&t, "e1"))
         };
         let expected = (vec![2.0, 6.0], vec![3.0, -7e-3]);
         assert_eq!(columns("x,y,e1,e2\n1,2,3,4\n5,6,-7e-3,8\n"), expected);
@@ -537,15 +559,15 @@ mod tests {
         for blank in ["", "# no galaxies\n", "x,y,e1,e2\n"] {
             assert_eq!(columns(blank), (vec![], vec![]), "{blank:?}");
         }
-        assert_eq!(table("x,y,e1,e2\n", None).unwrap().rows(), 0);
+        assert_eq!(table("x,y,e1,e2\n", None).unwrap().height(), 0);
         assert!(table("x,y,e1,e2\n1,2,NaN,nan\n", None).is_ok());
     }
 
     #[test]
     fn catalogues_of_other_programs_are_read() {
         let values = |text: &str| {
-            let mut t = table(text, Some(&["y", "e1"])).unwrap_or_else(|e| panic!("{text:?}: {e}"));
-            (t.take_real("y").unwrap(), t.take_real("e1").unwrap())
+            let t = table(text, Some(&["y", "e1"])).unwrap_or_else(|e| panic!("{text:?}: {e}"));
+            (column(&t, "y"), column(&t, "e1"))
         };
         let expected = (vec![2.0, 6.0], vec![3.0, -7e-3]);
         for text in [
@@ -569,10 +591,10 @@ mod tests {
         ] {
             assert_eq!(values(text), expected, "{text:?}");
         }
-        let mut gaps = table("x,y,e1,e2\n,2,,4\n5, ,\"\",8\n", Some(&["x", "e1", "e2"])).unwrap();
-        assert!(gaps.take_real("e1").unwrap().iter().all(|v| v.is_nan()));
-        assert!(gaps.take_real("x").unwrap()[0].is_nan());
-        assert_eq!(gaps.take_real("e2").unwrap(), [4.0, 8.0]);
+        let gaps = table("x,y,e1,e2\n,2,,4\n5, ,\"\",8\n", Some(&["x", "e1", "e2"])).unwrap();
+        assert!(column(&gaps, "e1").iter().all(|v| v.is_nan()));
+        assert!(column(&gaps, "x")[0].is_nan());
+        assert_eq!(column(&gaps, "e2"), [4.0, 8.0]);
     }
 
     #[test]
@@ -589,7 +611,7 @@ mod tests {
             bytes
         };
         let wanted: Option<&[&str]> = Some(&["x", "e2"]);
-        let of = |bytes: &[u8]| table_of(bytes, wanted).map(|t| t.rows());
+        let of = |bytes: &[u8]| table_of(bytes, wanted).map(|t| t.height());
         assert_eq!(of(&gzip(&[b"x,y,e1,e2\n1,2,", b"3,4\n5,6,7,8\n"])), Ok(2));
         let whole = gzip(&[b"x,y,e1,e2\n1,2,3,4\n5,6,7,8\n"]);
         assert!(

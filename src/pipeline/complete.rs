@@ -178,7 +178,7 @@ fn check_catalogue(
     path: &Path,
     cells: usize,
 ) -> Result<(), PipelineError> {
-    let rows = table::read(path, None, cells.saturating_add(1))?.rows();
+    let rows = table::read(path, None, cells.saturating_add(1))?.height();
     check_rows(path, rows, cells)?;
     let expected = kept(&metadata(run, id, prints)?, run.format);
     let found = read_metadata(path, run.format, expected.keys())?;
@@ -230,7 +230,7 @@ fn check_image(
     let intrinsic = data.intrinsic(id.set, id.image);
     check_rows(
         &intrinsic,
-        table::read(&intrinsic, None, most_rows(&grid))?.rows(),
+        table::read(&intrinsic, None, most_rows(&grid))?.height(),
         grid.cells(),
     )?;
     Ok(())

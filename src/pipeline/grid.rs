@@ -5,7 +5,6 @@ use std::path::Path;
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, Row};
 
-use super::score::{read_truth, reading_of};
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
 use crate::io::layout::{DataFolder, MAX_STAMP};
@@ -55,15 +54,17 @@ pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
     }
 }
 
-/// Grid of a set: that of its first image, or of its true shear where there is no image.
+/// Grid of a set's first image, `None` where there is none.
 ///
 /// # Errors
-/// Where neither can be read.
-pub fn of_set(data: &DataFolder, set: u32) -> Result<Grid, FileError> {
-    match data.images(&[set])?.of_set(set).first() {
-        Some((_, path)) => Ok(of_image(data, path, &ImageReader::open(path)?)?.0),
-        None => Ok(read_truth(&data.truth(set), &reading_of(data, set)?)?.0),
-    }
+/// Where it cannot be read.
+pub(super) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>, FileError> {
+    let images = data.images(&[set])?.of_set(set);
+    let first = images.first().map(|(_, path)| {
+        let image = ImageReader::open(path)?;
+        Ok(of_image(data, path, &image)?.0)
+    });
+    first.transpose()
 }
 
 /// Grid of a catalogue of ours, which has a row for every cell at its centre, measured or not.

@@ -11,7 +11,7 @@ use super::engine;
 use super::images::ImageId;
 use crate::io::FileError;
 use crate::io::fingerprint::{of_file, of_image};
-use crate::io::layout::DataFolder;
+use crate::io::layout::{DataFolder, LAYOUT_FILE, Layout};
 use crate::io::open::is_there;
 use crate::io::run::{Run, Source};
 use crate::io::table::read_metadata;
@@ -141,6 +141,17 @@ pub fn verify(
     sets: &[u32],
     threads: usize,
 ) -> Result<(), PipelineError> {
+    if let Source::Folder { layout, .. } = &run.source {
+        let of = |layout: &Layout| (layout.field_degrees, layout.truth_sign);
+        let (then, now) = (of(layout), of(data.layout()));
+        if then != now {
+            let message = format!(
+                "field in degrees and sign of the truth are {now:?}; {} was measured with {then:?}",
+                out.display()
+            );
+            return Err(FileError::new(data.root().join(LAYOUT_FILE), message).into());
+        }
+    }
     let files = run.catalogues(out, sets)?;
     let of_set = |set| {
         let images = files.of_set(set).into_iter();

@@ -10,6 +10,8 @@ use shearq_measure::{
 };
 use shearq_scoring::Grid;
 use shearq_submissions::{EllipticityType, NoiseSource, PsfForm, Submission};
+use shearq_tables::polars::{Column, DataFrame};
+use shearq_tables::{TableError, frame};
 
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
@@ -21,7 +23,7 @@ use crate::io::fits::ImageReader;
 use crate::io::layout::{DataFolder, MAX_STAMP};
 use crate::io::psf_table;
 use crate::io::run::{RUN_FILE, Run, claim};
-use crate::io::table::{self, Column, Table};
+use crate::io::table;
 
 /// Most pixels of a row of stamps, several of which are in memory at a time: those of the largest grid of
 /// stamps of the challenge's size and somewhat more.
@@ -476,7 +478,7 @@ fn read_images(
 }
 
 /// Catalogue of one image from its rows of stamps, in grid order.
-pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
+pub fn catalogue(rows: &[MeasuredRow]) -> Result<DataFrame, TableError> {
     let galaxies = || {
         rows.iter().flat_map(|row| {
             row.galaxies
@@ -485,50 +487,43 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<Table, String> {
                 .map(move |(ix, g)| (row, ix, g))
         })
     };
-    let real = |value: &dyn Fn(&Measurement) -> f64| {
-        Column::Real(galaxies().map(|(_, _, g)| value(g)).collect())
+    let real = |name: &str, value: &dyn Fn(&Measurement) -> f64| {
+        let values: Vec<f64> = galaxies().map(|(_, _, g)| value(g)).collect();
+        Column::new(name.into(), values)
     };
-    let whole = |value: &dyn Fn(&Measurement) -> i64| {
-        Column::Whole(galaxies().map(|(_, _, g)| value(g)).collect())
+    let whole = |name: &str, value: &dyn Fn(&Measurement) -> i64| {
+        let values: Vec<i64> = galaxies().map(|(_, _, g)| value(g)).collect();
+        Column::new(name.into(), values)
     };
     let energy = |g: &Measurement| g.descent.map_or(f64::NAN, |d| d.energy);
     let first = |g: &Measurement| g.descent.map_or(f64::NAN, |d| d.first_energy);
-    let positions: Vec<(f64, f64)> = galaxies()
+    let (x, y): (Vec<f64>, Vec<f64>) = galaxies()
         .map(|(row, ix, _)| row.grid.centre(ix, row.iy))
-        .collect();
-    Table::new(vec![
-        (
-            "x".into(),
-            Column::Real(positions.iter().map(|p| p.0).collect()),
-        ),
-        (
-            "y".into(),
-            Column::Real(positions.iter().map(|p| p.1).collect()),
-        ),
-        ("e1".into(), real(&|g| g.e1)),
-        ("e2".into(), real(&|g| g.e2)),
-        ("flag".into(), whole(&|g| i64::from(g.flags.bits()))),
-        (
-            "iterations".into(),
-            whole(&|g| g.descent.map_or(0, |d| i64::from(d.iterations))),
-        ),
-        (
-            "stop".into(),
-            // −1 where the network did not run.
-            whole(&|g| g.descent.map_or(-1, |d| i64::from(d.stop.code()))),
-        ),
-        (
-            "updated".into(),
-            whole(&|g| g.descent.map_or(0, |d| i64::from(d.updated))),
-        ),
-        ("first_energy".into(), real(&first)),
-        ("energy".into(), real(&energy)),
-        ("noise".into(), real(&|g| g.noise)),
-        ("flux".into(), real(&|g| g.flux)),
-        ("radius".into(), real(&|g| g.radius)),
-        ("size".into(), real(&|g| g.size)),
-        ("response1".into(), real(&|g| g.response[0])),
-        ("response2".into(), real(&|g| g.response[1])),
+        .unzip();
+    frame(vec![
+        Column::new("x".into(), x),
+        Column::new("y".into(), y),
+        real("e1", &|g| g.e1),
+        real("e2", &|g| g.e2),
+        whole("flag", &|g| i64::from(g.flags.bits())),
+        whole("iterations", &|g| {
+            g.descent.map_or(0, |d| i64::from(d.iterations))
+        }),
+        // −1 where the network did not run.
+        whole("stop", &|g| {
+            g.descent.map_or(-1, |d| i64::from(d.stop.code()))
+        }),
+        whole("updated", &|g| {
+            g.descent.map_or(0, |d| i64::from(d.updated))
+        }),
+        real("first_energy", &first),
+        real("energy", &energy),
+        real("noise", &|g| g.noise),
+        real("flux", &|g| g.flux),
+        real("radius", &|g| g.radius),
+        real("size", &|g| g.size),
+        real("response1", &|g| g.response[0]),
+        real("response2", &|g| g.response[1]),
     ])
 }
 
@@ -542,8 +537,8 @@ pub(super) fn write_catalogue(
 ) -> Result<(), PipelineError> {
     let id = rows[0].id;
     let path = run.catalogue(out, id.set, id.image);
-    let table = catalogue(rows).map_err(|message| FileError::new(&path, message))?;
-    table::write(&path, run.format, table, &metadata(run, id, prints)?)?;
+    let table = catalogue(rows).map_err(|error| FileError::new(&path, error.to_string()))?;
+    table::write(&path, run.format, &table, &metadata(run, id, prints)?)?;
     Ok(())
 }
 

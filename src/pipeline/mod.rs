@@ -1,20 +1,18 @@
-//! The chain over many galaxies: read or simulate, measure, write, score.
+//! The chain over many galaxies: read or simulate, measure, write.
 //!
 //! [`engine`] is the only place that starts threads. Everything below it is serial and takes its
 //! scratch from the caller; everything in it is in order, so that results do not depend on the
 //! number of threads.
 
-pub mod baseline;
 pub mod complete;
 pub mod engine;
 pub mod grid;
 pub mod images;
 pub mod inputs;
 pub mod measure;
-pub mod record;
 pub mod run;
-pub mod score;
 pub mod simulate;
+pub mod truth;
 
 pub use engine::{Progress, Quiet};
 

@@ -4,49 +4,7 @@ use std::fmt::Write;
 
 use super::escape::markup as escape;
 use super::table::{Cell, Heading, Table};
-use crate::pipeline::baseline::Shift;
-
-/// What a check found about one submission of a baseline.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Checked {
-    /// Name of the baseline.
-    pub baseline: String,
-    /// Name of the submission.
-    pub submission: String,
-    /// Every figure looked at.
-    pub shifts: Vec<Shift>,
-    /// Settings that are others now.
-    pub settings: Vec<String>,
-    /// What should be known and is no failure.
-    pub notes: Vec<String>,
-}
-
-impl Checked {
-    /// Whether anything moved.
-    pub fn failed(&self) -> bool {
-        !self.settings.is_empty() || self.shifts.iter().any(|shift| shift.moved)
-    }
-
-    /// What moved, a line each.
-    pub fn moved(&self) -> Vec<String> {
-        let settings = self
-            .settings
-            .iter()
-            .map(|line| format!("{}: setting {line}", self.submission));
-        let figures = self.shifts.iter().filter(|shift| shift.moved).map(|shift| {
-            format!(
-                "{} set {}: {} from {} to {}, {:+.2} σ",
-                self.submission,
-                shift.set,
-                shift.figure,
-                shift.before[0],
-                shift.now[0],
-                shift.sigma
-            )
-        });
-        settings.chain(figures).collect()
-    }
-}
+use crate::results::baseline::Checked;
 
 /// Every figure of every check, or only those that moved.
 pub fn shift_table(checks: &[Checked], all: bool) -> Table {
@@ -146,6 +104,7 @@ pub fn junit(checks: &[Checked]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::results::baseline::Shift;
 
     #[test]
     fn junit_counts_failures_and_escapes_names() {

@@ -1,61 +1,41 @@
-//! Submissions side by side: the means of their figures, differences in Q, and Q per set.
+//! Submissions and recorded runs side by side: the means of their figures, differences in Q, and Q per set.
 
 use std::collections::BTreeSet;
 
 use ndarray::Array2;
-use shearq_scoring::resample::{PairedDifference, PairedSet, mean_over_sets, paired_difference};
+use shearq_scoring::resample::PairedDifference;
 use shearq_scoring::{Definition, Figures};
 use shearq_submissions::Published;
+use shearq_tables::polars::AnyValue;
 
 use super::figure::{ColourMap, HeatMap};
-use super::scores::definition_note;
+use super::scores::{definition_note, notes};
 use super::table::{Cell, Heading, Table};
-use crate::io::store::SetRecord;
-
-/// One variant in a comparison.
-pub struct Variant {
-    /// Name of the submission.
-    pub name: String,
-    /// Its sets, in order.
-    pub sets: Vec<SetRecord>,
-    /// Published figures.
-    pub published: Option<Published>,
-    /// What readers of its figures should know.
-    pub notes: Vec<String>,
-}
-
-/// Mean over sets of the figure called `name`, and its error.
-pub fn mean_figure(sets: &[&SetRecord], name: &str) -> (f64, f64) {
-    let value =
-        |figures: &Figures| Figures::place(name).map_or(f64::NAN, |place| figures.values()[place]);
-    let pairs: Vec<(f64, f64)> = sets
-        .iter()
-        .map(|set| (value(&set.figures), value(&set.errors)))
-        .collect();
-    mean_over_sets(&pairs)
-}
+use crate::results::compare::{Variant, common_sets, mean_figure, q_difference};
+use crate::results::groups::{Group, Grouping};
+use crate::results::row::{RunRecord, SetRecord};
 
 /// The cell of a mean over sets of the figure called `name`.
-pub fn mean_cell(sets: &[&SetRecord], name: &str) -> Cell {
+fn mean_cell(sets: &[&SetRecord], name: &str) -> Cell {
     let (value, error) = mean_figure(sets, name);
     let decimals = Figures::place(name).map_or(0, |place| Figures::ALL[place].decimals);
     Cell::with_error(value, Some(error), decimals)
 }
 
 /// The heading of the figure called `name`.
-pub fn figure_heading(name: &'static str) -> Heading {
+fn figure_heading(name: &'static str) -> Heading {
     let label = Figures::place(name).map_or(name, |place| Figures::ALL[place].label);
     Heading::new(name, label)
 }
 
 /// The cell of the leaderboard's Q, the mean over sets.
-pub fn leaderboard_cell(sets: &[&SetRecord]) -> Cell {
+fn leaderboard_cell(sets: &[&SetRecord]) -> Cell {
     let sum: f64 = sets.iter().map(|set| set.q_leaderboard).sum();
     Cell::number(sum / sets.len() as f64, 2)
 }
 
 /// Cells of a difference in Q and of its significance.
-pub fn difference_cells(difference: Option<PairedDifference>) -> [Cell; 2] {
+fn difference_cells(difference: Option<PairedDifference>) -> [Cell; 2] {
     [
         Cell::with_error(
             difference.map_or(f64::NAN, |d| d.difference),
@@ -66,10 +46,21 @@ pub fn difference_cells(difference: Option<PairedDifference>) -> [Cell; 2] {
     ]
 }
 
+/// Why differences are absent, if any are.
+fn unpaired_note(names: &[&str]) -> Option<String> {
+    (!names.is_empty()).then(|| {
+        format!(
+            "No difference is given for {}: it needs the same images as the first, scored in one definition, and conventions that are known.",
+            names.join(", ")
+        )
+    })
+}
+
 /// Variants side by side over the sets that all of them have, with the significance of each one's
 /// difference in Q from the first, paired over the same images, and the published figures.
 pub fn compare(variants: &[Variant], definition: Definition) -> Table {
-    let common = common_sets(variants);
+    let records: Vec<Vec<SetRecord>> = variants.iter().map(Variant::records).collect();
+    let common = common_sets(&records);
     let headings = vec![
         Heading::new("submission", "Submission"),
         figure_heading("q"),
@@ -84,12 +75,19 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
         Heading::new("sqrt_a_published", "√A publ."),
         figure_heading("m_cross"),
     ];
+    let shown: Vec<&str> = headings.iter().map(|heading| heading.key).collect();
+    let others = || {
+        Figures::ALL
+            .iter()
+            .filter(|figure| !shown.contains(&figure.name))
+    };
+    let mut headings = headings.clone();
+    headings.extend(others().map(|figure| figure_heading(figure.name).detail()));
     let mut rows = Vec::new();
     let mut unpaired = Vec::new();
     let mut first: Option<Vec<&SetRecord>> = None;
-    for variant in variants {
-        let sets: Vec<&SetRecord> = variant
-            .sets
+    for (variant, records) in variants.iter().zip(&records) {
+        let sets: Vec<&SetRecord> = records
             .iter()
             .filter(|set| common.contains(&set.set))
             .collect();
@@ -101,7 +99,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             Cell::number(variant.published.as_ref().map_or(f64::NAN, value), decimals)
         };
         let [delta, sigma] = difference_cells(difference);
-        rows.push(vec![
+        let mut row = vec![
             Cell::text(&variant.name),
             mean_cell(&sets, "q"),
             delta,
@@ -114,76 +112,143 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             mean_cell(&sets, "sqrt_a"),
             published(|p| p.sqrt_a, 4),
             mean_cell(&sets, "m_cross"),
-        ]);
+        ];
+        row.extend(others().map(|figure| mean_cell(&sets, figure.name)));
+        rows.push(row);
         first.get_or_insert(sets);
     }
     let images: usize = first.iter().flatten().map(|set| set.images.len()).sum();
     let list: Vec<String> = common.iter().map(u32::to_string).collect();
-    let mut notes = vec![
+    let mut lines = vec![
         format!("Means over sets {}; {images} images in all.", list.join(", ")),
         definition_note(definition),
-        "ΔQ: jackknife of the paired difference on the same images. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
+        "ΔQ: jackknife of the paired difference on the same images, without an error where a set has fewer than eight. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
     ];
-    notes.extend(unpaired_note(&unpaired));
+    lines.extend(unpaired_note(&unpaired));
     for variant in variants {
-        for line in &variant.notes {
-            notes.push(format!("{}: {line}", variant.name));
+        for line in notes(&variant.sets).iter().chain(&variant.unscored) {
+            lines.push(format!("{}: {line}", variant.name));
         }
     }
     Table {
         title: "Comparison of submissions".into(),
         headings,
         rows,
-        notes,
+        notes: lines,
     }
 }
 
-/// Sets that all variants have.
-fn common_sets(variants: &[Variant]) -> BTreeSet<u32> {
-    let sets =
-        |variant: &Variant| -> BTreeSet<u32> { variant.sets.iter().map(|set| set.set).collect() };
-    variants
-        .iter()
-        .map(sets)
-        .reduce(|all, more| &all & &more)
-        .unwrap_or_default()
-}
-
-/// Why differences are absent, if any are.
-pub fn unpaired_note(names: &[&str]) -> Option<String> {
-    (!names.is_empty()).then(|| {
-        format!(
-            "No difference is given for {}: it needs at least two images, the same ones as the first, and conventions that are known.",
-            names.join(", ")
-        )
-    })
-}
-
-/// Paired difference in Q of `second` from `first`; `None` where they are not of the same sets, data
-/// and images, or where noise may have chosen the convention of either.
-pub fn q_difference(first: &[&SetRecord], second: &[&SetRecord]) -> Option<PairedDifference> {
-    let same = |(a, b): (&&SetRecord, &&SetRecord)| {
-        let known = a.convention_known && b.convention_known;
-        known && a.set == b.set && a.data == b.data && a.images == b.images
-    };
-    if first.len() != second.len() || !first.iter().zip(second).all(same) {
-        return None;
+/// Runs side by side: means over their sets, or over groups of them, and the difference in Q from
+/// the first row, or the first of the same group, on the same images.
+pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<Grouping>) -> Table {
+    let mut headings = vec![
+        Heading::new("submission", "Submission"),
+        Heading::new("run", "Run"),
+        Heading::new("version", "Version").detail(),
+    ];
+    headings.extend(grouping.map(|grouping| {
+        let label = match grouping {
+            Grouping::Set => "Set",
+            Grouping::SetKind => "Kind",
+            Grouping::Psf => "PSF",
+            Grouping::Snr => "S/N",
+            Grouping::Size => "Size",
+        };
+        Heading::new(grouping.column(), label)
+    }));
+    headings.extend([
+        Heading::new("sets", "Sets"),
+        Heading::new("images", "Images"),
+        figure_heading("q"),
+        Heading::new("q_difference", "ΔQ to first"),
+        Heading::new("sigma", "in σ"),
+        Heading::new("q_leaderboard", "Q leaderboard"),
+        figure_heading("q_dn"),
+        figure_heading("m_half"),
+        figure_heading("sqrt_a"),
+        figure_heading("m_cross"),
+    ]);
+    let mut rows = Vec::new();
+    let mut unpaired = Vec::new();
+    for (k, group) in groups.iter().enumerate() {
+        let first = groups[..k].iter().find(|other| other.value == group.value);
+        let difference = first
+            .filter(|first| first.run.definition == group.run.definition)
+            .and_then(|first| q_difference(&first.sets, &group.sets));
+        if first.is_some() && difference.is_none() && !unpaired.contains(&group.id.as_str()) {
+            unpaired.push(group.id.as_str());
+        }
+        let mut row = vec![
+            Cell::text(&group.run.submission),
+            Cell::text(&group.id),
+            Cell::text(&group.run.version),
+        ];
+        row.extend(group.value.clone().map(|value| match value {
+            AnyValue::Int64(number) => Cell::number(number as f64, 0),
+            words => Cell::text(words.get_str().unwrap_or_default()),
+        }));
+        row.extend([
+            Cell::text(ranges(&group.sets)),
+            Cell::number(group.images() as f64, 0),
+            mean_cell(&group.sets, "q"),
+        ]);
+        row.extend(difference_cells(difference));
+        row.extend([
+            leaderboard_cell(&group.sets),
+            mean_cell(&group.sets, "q_dn"),
+            mean_cell(&group.sets, "m_half"),
+            mean_cell(&group.sets, "sqrt_a"),
+            mean_cell(&group.sets, "m_cross"),
+        ]);
+        rows.push(row);
     }
-    let pairs: Vec<PairedSet<'_>> = first
+    Table {
+        title: "Recorded runs".into(),
+        headings,
+        rows,
+        notes: run_notes(runs, grouping, &unpaired),
+    }
+}
+
+fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[&str]) -> Vec<String> {
+    let ways: BTreeSet<String> = runs
         .iter()
-        .zip(second)
-        .map(|(a, b)| PairedSet {
-            images: a.images.len(),
-            first: a.figures.q,
-            first_replicates: &a.q_replicates,
-            second: b.figures.q,
-            second_replicates: &b.q_replicates,
+        .map(|run| {
+            format!(
+                "{} definition, {} convention, noise {}",
+                run.definition, run.choice, run.noise
+            )
         })
         .collect();
-    paired_difference(&pairs)
+    let several = ways.len() > 1;
+    let ways: Vec<String> = ways.into_iter().collect();
+    let mut notes = vec![format!(
+        "Means over the sets of each row. Figures: {}. √A in 10⁻⁴ for C_ℓ in steradian.",
+        ways.join("; ")
+    )];
+    if grouping.is_some() {
+        notes.push("ΔQ: from the first row of the same group.".into());
+    }
+    if several {
+        notes.push("Warning: these runs were scored in different ways; choose one with --where definition=... or choice=...".into());
+    }
+    notes.extend(unpaired_note(unpaired));
+    notes
 }
 
-/// Q of each set (column) and variant (row), and means over each row.
+/// Sets as `1-3,7`.
+fn ranges(sets: &[&SetRecord]) -> String {
+    let texts = sets.chunk_by(|a, b| a.set + 1 == b.set).map(|run| {
+        let (first, last) = (run[0].set, run[run.len() - 1].set);
+        match first == last {
+            true => first.to_string(),
+            false => format!("{first}-{last}"),
+        }
+    });
+    texts.collect::<Vec<_>>().join(",")
+}
+
+/// Q of each set (column) and variant or run (row), and means over each row.
 pub fn q_heat_map(variants: &[(String, Vec<&SetRecord>)]) -> HeatMap {
     let sets: BTreeSet<u32> = variants
         .iter()

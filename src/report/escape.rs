@@ -157,10 +157,11 @@ mod tests {
     use ndarray::Array2;
 
     use super::*;
-    use crate::report::baseline::{Checked, junit};
+    use crate::report::baseline::junit;
     use crate::report::figure::{Figure, Format, HeatMap};
     use crate::report::html::{Block, Report, Section};
     use crate::report::table::{Cell, Heading, Table, TableFormat};
+    use crate::results::baseline::Checked;
 
     /// Names that do something in one format or another.
     const NASTY: [&str; 24] = [

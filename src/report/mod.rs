@@ -7,7 +7,6 @@ pub mod figure;
 mod font;
 pub mod html;
 pub mod page;
-pub mod runs;
 pub mod scores;
 pub mod steps;
 pub mod table;

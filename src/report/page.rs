@@ -79,11 +79,9 @@ impl<'a> Page<'a> {
     pub fn data(&self, name: &str, exhibit: &Table) -> anyhow::Result<()> {
         let text = exhibit.render(TableFormat::Csv);
         atomic::write(self.out.join(format!("data/{name}.csv")), text.as_bytes())?;
-        if cfg!(feature = "parquet") {
-            let path = self.out.join(format!("data/{name}.parquet"));
-            let columns = exhibit.columns().map_err(anyhow::Error::msg)?;
-            table::write(&path, table::Format::Parquet, columns, &self.made_by)?;
-        }
+        let path = self.out.join(format!("data/{name}.parquet"));
+        let columns = exhibit.columns()?;
+        table::write(&path, table::Format::Parquet, &columns, &self.made_by)?;
         Ok(())
     }
 

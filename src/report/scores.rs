@@ -10,7 +10,7 @@ use shearq_scoring::{
 };
 
 use super::table::{Cell, Heading, Table};
-use crate::pipeline::score::{Basis, ScoredSet, means};
+use crate::results::score::{Basis, ScoredSet, means};
 use crate::simulate::kinds::SetKind;
 
 fn figure_cells(figures: &Figures, errors: &Figures) -> Vec<Cell> {
@@ -33,7 +33,7 @@ pub(super) fn definition_note(definition: Definition) -> String {
         Definition::Corrected => "corrected definition (azimuthal averages, fixed bins)",
     };
     format!(
-        "Figures: {definition}. Errors: from what the truth leaves unexplained, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian."
+        "Figures: {definition}. Errors: from what the truth leaves unexplained, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian; over its error it is twice as far from zero as A."
     )
 }
 
@@ -222,7 +222,7 @@ pub fn spectra(scored: &[(u32, SpectrumScore)], title: &str, definition: Definit
         Heading::new("set", "Set"),
         Heading::new("kind", "Kind"),
         Heading::new("q", "Q"),
-        Heading::new("sigma_sys", "σ_sys×10⁴"),
+        Heading::new("sigma_sys_1e4", "σ_sys×10⁴"),
         Heading::new("m_half", "M/2"),
         Heading::new("sqrt_a", "√A×10⁴"),
     ];
@@ -343,6 +343,25 @@ fn class_json(score: &SetScore, representative: &ConventionScore, class: Convent
     object
 }
 
+/// Keys of [`one_set_json`] that mean nothing where the true shear is the same everywhere.
+const OF_TRUE_POWER: [&str; 15] = [
+    "Q",
+    "sigma_sys",
+    "winner",
+    "winner_class",
+    "matched",
+    "matched_class",
+    "corr_matched",
+    "Q_matched",
+    "M",
+    "A",
+    "sqrtA",
+    "Q_dn",
+    "sigma_sys_dn",
+    "Q_per_convention",
+    "classes",
+];
+
 /// What one set's JSON says about its input.
 pub struct SetInput {
     /// Name of the case.
@@ -425,6 +444,14 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
     });
     if let (Value::Object(object), Value::Object(own)) = (&mut object, own) {
         object.extend(own);
+        if score.constant.is_some() {
+            // Nothing that needs a true power.
+            for (key, value) in object.iter_mut() {
+                if OF_TRUE_POWER.contains(&key.as_str()) {
+                    *value = Value::Null;
+                }
+            }
+        }
     }
     object
 }

@@ -3,9 +3,10 @@
 use clap::ValueEnum;
 use comfy_table::{CellAlignment, ContentArrangement, TableComponent, presets};
 use serde_json::{Map, Value, json};
+use shearq_tables::polars::{Column, DataFrame};
+use shearq_tables::{TableError, frame};
 
 use super::escape;
-use crate::io::table::{Column, Table as Columns};
 
 /// How to print a table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
@@ -259,8 +260,8 @@ impl Table {
     /// for other formats.
     ///
     /// # Errors
-    /// A message where two headings share a key.
-    pub fn columns(&self) -> Result<Columns, String> {
+    /// Where two headings share a key.
+    pub fn columns(&self) -> Result<DataFrame, TableError> {
         let mut columns = Vec::new();
         for (k, heading) in self.headings.iter().enumerate() {
             let cells = || self.rows.iter().filter_map(|row| row.get(k));
@@ -271,19 +272,20 @@ impl Table {
                     Cell::Number { value, error, .. } => Some((*value, error.unwrap_or(f64::NAN))),
                 })
                 .collect();
-            let Some((values, errors)) = numbers.map(|pairs| pairs.into_iter().unzip()) else {
-                let words = cells()
+            let unzipped = numbers.map(|pairs| pairs.into_iter().unzip());
+            let Some((values, errors)): Option<(Vec<f64>, Vec<f64>)> = unzipped else {
+                let words: Vec<String> = cells()
                     .map(|cell| cell.print(str::to_owned, false))
                     .collect();
-                columns.push((heading.key.to_owned(), Column::Text(words)));
+                columns.push(Column::new(heading.key.into(), words));
                 continue;
             };
-            columns.push((heading.key.to_owned(), Column::Real(values)));
+            columns.push(Column::new(heading.key.into(), values));
             if self.has_errors(k) {
-                columns.push((format!("{}_error", heading.key), Column::Real(errors)));
+                columns.push(Column::new(format!("{}_error", heading.key).into(), errors));
             }
         }
-        Columns::new(columns)
+        frame(columns)
     }
 
     fn csv(&self) -> String {
@@ -407,12 +409,9 @@ mod tests {
         );
         assert_eq!(escape::latex("√A×10⁴"), "$\\sqrt{A}\\times$10$^{4}$");
         let columns = table().columns().unwrap();
-        let names: Vec<&str> = columns.columns().iter().map(|(n, _)| n.as_str()).collect();
-        assert_eq!(names, ["name", "q", "q_error"]);
-        let Column::Text(words) = &columns.columns()[0].1 else {
-            panic!("words")
-        };
-        assert_eq!(words, &["a,b", "c_d"]);
+        assert_eq!(columns.get_column_names(), ["name", "q", "q_error"]);
+        let words = columns.column("name").unwrap().str().unwrap();
+        assert!(words.iter().eq([Some("a,b"), Some("c_d")]));
         let json: Value = serde_json::from_str(&table().render(TableFormat::Json)).unwrap();
         assert_eq!(json["rows"][0]["q_error"], 1.5);
         assert!(json["rows"][1]["q"].is_null());
@@ -423,9 +422,7 @@ mod tests {
         let mut whole = table();
         whole.rows.push(vec![Cell::text("mean"), Cell::Empty]);
         let columns = whole.columns().unwrap();
-        let Column::Real(values) = &columns.columns()[1].1 else {
-            panic!("numbers")
-        };
+        let values = shearq_tables::reals(columns.column("q").unwrap()).unwrap();
         assert!(values[0] == 87.125 && values[2].is_nan());
         assert!(whole.render(TableFormat::Csv).ends_with("mean,,\n"));
         assert!(whole.json()["rows"][2]["q"].is_null());

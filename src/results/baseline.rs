@@ -4,11 +4,16 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shearq_submissions::checked_name;
+use shearq_submissions::{Submission, checked_name};
 
-use super::atomic;
-use super::error::FileError;
-use super::run::Source;
+use crate::io::run::Source;
+use crate::io::{FileError, atomic};
+
+mod measured;
+mod moved;
+
+pub use measured::{Wanted, figures_of, measure};
+pub use moved::{Checked, Shift, check};
 
 /// A baseline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -37,6 +42,20 @@ pub struct BaselineSubmission {
     pub settings: toml::Table,
     /// Its sets, in order.
     pub sets: Vec<BaselineSet>,
+}
+
+impl BaselineSubmission {
+    /// A measured submission.
+    ///
+    /// # Errors
+    /// Where its settings cannot be stored.
+    pub fn new(submission: &Submission, sets: Vec<BaselineSet>) -> Result<Self, toml::ser::Error> {
+        Ok(BaselineSubmission {
+            name: submission.name.clone(),
+            settings: toml::Table::try_from(submission)?,
+            sets,
+        })
+    }
 }
 
 /// One set of a submission.
@@ -99,9 +118,17 @@ impl Baseline {
     /// # Errors
     /// Where it cannot be read or is not valid.
     pub fn read(path: &Path) -> Result<Self, FileError> {
-        let text = super::open::read_to_string(path)
+        let text = crate::io::open::read_to_string(path, crate::io::open::SETTINGS)
             .map_err(FileError::doing(path, "cannot read the baseline"))?;
-        toml::from_str(&text).map_err(|error| FileError::new(path, error.to_string().trim_end()))
+        let baseline: Baseline = toml::from_str(&text)
+            .map_err(|error| FileError::new(path, error.to_string().trim_end()))?;
+        let sets = baseline.submissions.iter().flat_map(|s| &s.sets);
+        let infinite = |set: &&BaselineSet| set.figures.values().flatten().any(|v| v.is_infinite());
+        if let Some(set) = sets.clone().find(infinite) {
+            let message = format!("set {} has an infinite figure or error", set.set);
+            return Err(FileError::new(path, message));
+        }
+        Ok(baseline)
     }
 
     /// Writes the baseline, which must be new.

@@ -2,7 +2,10 @@
 
 use std::str::FromStr;
 
-use super::{RunRecord, Value, column};
+use shearq_tables::polars::{Column, DataFrame};
+use shearq_tables::reals;
+
+use super::row::{RunRecord, table_of};
 
 /// How a column is compared with what is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,55 +64,62 @@ impl Conditions {
     ///
     /// # Errors
     /// A message where there is no such column, or a value is not of the column's type.
-    pub fn choose(&self, runs: Vec<RunRecord>) -> Result<Vec<RunRecord>, String> {
-        let mut chosen = Vec::new();
-        for mut run in runs {
-            let mut kept = Vec::new();
-            for set in std::mem::take(&mut run.sets) {
-                if self.hold(&run.row(&set))? {
-                    kept.push(set);
-                }
-            }
-            if !kept.is_empty() {
-                run.sets = kept;
-                chosen.push(run);
-            }
-        }
-        Ok(chosen)
-    }
-
-    fn hold(&self, row: &[(String, Value)]) -> Result<bool, String> {
-        let mut all = true;
+    pub fn choose(&self, mut runs: Vec<RunRecord>) -> Result<Vec<RunRecord>, String> {
+        let table = table_of(&runs).map_err(|error| error.to_string())?;
+        let mut kept = vec![true; table.height()];
         for (name, relation, wanted) in &self.0 {
-            all &= holds(column(row, name)?, name, *relation, wanted)?;
+            let held = hold(column(&table, name)?, *relation, wanted)?;
+            kept.iter_mut().zip(held).for_each(|(all, one)| *all &= one);
         }
-        Ok(all)
+        let mut kept = kept.into_iter();
+        for run in &mut runs {
+            run.sets.retain(|_| kept.next().unwrap_or(false));
+        }
+        runs.retain(|run| !run.sets.is_empty());
+        Ok(runs)
     }
 }
 
-fn holds(value: &Value, name: &str, relation: Relation, wanted: &str) -> Result<bool, String> {
-    let own = match value {
-        Value::Text(own) => {
-            return match relation {
-                Relation::Is => Ok(matches(wanted, own)),
-                Relation::IsNot => Ok(!matches(wanted, own)),
-                _ => Err(format!("`{name}` is text; expected = or != and a text")),
-            };
-        }
-        Value::Real(own) => *own,
-        Value::Count(own) => *own as f64,
-    };
+/// A column of the table of runs.
+fn column<'a>(table: &'a DataFrame, name: &str) -> Result<&'a Column, String> {
+    table.column(name).map_err(|_| {
+        let names: Vec<&str> = table
+            .get_column_names()
+            .iter()
+            .map(|n| n.as_str())
+            .collect();
+        let names = names.join(", ");
+        format!("the store has no column `{name}`; it has {names}")
+    })
+}
+
+/// Whether a condition holds, for each value of a column.
+fn hold(column: &Column, relation: Relation, wanted: &str) -> Result<Vec<bool>, String> {
+    let name = column.name();
+    if let Ok(texts) = column.str() {
+        let holds: fn(&str, &str) -> bool = match relation {
+            Relation::Is => matches,
+            Relation::IsNot => |wanted, own| !matches(wanted, own),
+            _ => return Err(format!("`{name}` is text; expected = or != and a text")),
+        };
+        return Ok(texts
+            .iter()
+            .map(|own| holds(wanted, own.unwrap_or("")))
+            .collect());
+    }
     let wanted: f64 = wanted
         .parse()
         .map_err(|_| format!("`{name}` is a number; `{wanted}` is none"))?;
-    Ok(match relation {
-        Relation::Is => own == wanted,
-        Relation::IsNot => own != wanted,
-        Relation::Below => own < wanted,
-        Relation::AtMost => own <= wanted,
-        Relation::Above => own > wanted,
-        Relation::AtLeast => own >= wanted,
-    })
+    let holds: fn(&f64, &f64) -> bool = match relation {
+        Relation::Is => f64::eq,
+        Relation::IsNot => f64::ne,
+        Relation::Below => f64::lt,
+        Relation::AtMost => f64::le,
+        Relation::Above => f64::gt,
+        Relation::AtLeast => f64::ge,
+    };
+    let values = reals(column).unwrap_or_default();
+    Ok(values.iter().map(|own| holds(own, &wanted)).collect())
 }
 
 /// Whether `text` is `pattern`, in which `*` stands for any characters.

@@ -7,10 +7,9 @@ use shearq_scoring::{Distortion, FieldSum, Grid, Row, RowCounts, Shear};
 use shearq_submissions::{EllipticityType, checked_name};
 
 use crate::io::FileError;
-use crate::io::layout::{IMAGE_PLACEHOLDERS, check_pattern};
+use crate::io::layout::{IMAGE_PLACEHOLDERS, check_pattern, read_rows};
 use crate::io::listing::{self, Files};
 use crate::io::table::{self, most_rows};
-use crate::pipeline::score::sum_foreign;
 
 /// How to read another program's catalogues.
 ///
@@ -83,14 +82,17 @@ impl Foreign {
     /// # Errors
     /// Where it cannot be read or is not valid.
     pub fn read(path: &Path) -> Result<Self, FileError> {
-        let text = crate::io::open::read_to_string(path).map_err(FileError::doing(
-            path,
-            "cannot read the description of catalogues",
-        ))?;
+        let text = crate::io::open::read_to_string(path, crate::io::open::SETTINGS).map_err(
+            FileError::doing(path, "cannot read the description of catalogues"),
+        )?;
         let mut foreign: Foreign =
             toml::from_str(&text).map_err(|e| FileError::new(path, e.to_string().trim_end()))?;
         if foreign.e2_sign.abs() != 1 {
             let message = format!("`e2_sign` is {}; expected 1 or -1", foreign.e2_sign);
+            return Err(FileError::new(path, message));
+        }
+        if let Some(most) = foreign.max_modulus.filter(|m| !(m.is_finite() && *m > 0.0)) {
+            let message = format!("`max_modulus` is {most}; expected a positive number");
             return Err(FileError::new(path, message));
         }
         check_pattern("catalogues", &foreign.catalogues, &[IMAGE_PLACEHOLDERS])
@@ -133,11 +135,11 @@ impl Foreign {
             self.e2.as_str(),
         ];
         names.extend(self.flag.as_deref());
-        let mut table = table::read(path, Some(&names), most).map_err(|error| {
+        let table = table::read(path, Some(&names), most).map_err(|error| {
             error.hint_of_columns("the description of the catalogues names them")
         })?;
-        let mut column = |name: &str| table.require(name, path);
-        let flags = self.flag.as_deref().map(&mut column).transpose()?;
+        let column = |name: &str| table::numbers(&table, name, path);
+        let flags = self.flag.as_deref().map(column).transpose()?;
         let (x, y) = (column(&self.x)?, column(&self.y)?);
         let (e1, e2) = (column(&self.e1)?, column(&self.e2)?);
         let row = |k: usize| {
@@ -173,5 +175,61 @@ impl Foreign {
             }
             _ => Some((e1, e2)),
         }
+    }
+}
+
+/// Which values of other programs' ellipticities stand for "not measured".
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Deserialize)]
+pub struct Screen {
+    /// A value of either component.
+    pub missing: Option<f64>,
+    /// The largest |e| that is one.
+    pub max_modulus: Option<f64>,
+}
+
+impl Screen {
+    /// The row, without an ellipticity where its value stands for none.
+    pub fn apply(&self, row: Row) -> Row {
+        let missing = self.missing.is_some_and(|m| row.e1 == m || row.e2 == m);
+        if missing
+            || self
+                .max_modulus
+                .is_some_and(|max| row.e1.hypot(row.e2) > max)
+        {
+            return Row {
+                e1: f64::NAN,
+                e2: f64::NAN,
+                ..row
+            };
+        }
+        row
+    }
+}
+
+/// Sums rows of another program, of the catalogue `path`.
+///
+/// # Errors
+/// Where they are not what they are taken for: values that are no ellipticities, positions in other units.
+pub fn sum_foreign(
+    grid: &Grid,
+    path: &Path,
+    rows: impl IntoIterator<Item = Row>,
+) -> Result<(FieldSum, RowCounts), FileError> {
+    let mut sum = FieldSum::new(grid);
+    let counts = sum.add_image(grid, rows);
+    match counts.fault(grid) {
+        Some(fault) => Err(FileError::new(path, fault)),
+        None => Ok((sum, counts)),
+    }
+}
+
+/// A [`ReadImage`] for other programs' catalogues with the given columns.
+pub fn plain_columns<'a>(
+    columns: [&'a str; 4],
+    screen: Screen,
+) -> impl Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync + 'a {
+    move |grid, path| {
+        let rows = read_rows(path, &columns, most_rows(grid))?;
+        sum_foreign(grid, path, rows.into_iter().map(|row| screen.apply(row)))
     }
 }

@@ -1,124 +1,328 @@
-//! Runs as Parquet files.
+//! Rows of results: what is kept of every scored set, and of what made it.
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use shearq_scoring::{Figure, Figures};
+use serde::{Deserialize, Serialize};
+use shearq_scoring::{Choice, Definition, Figure, Figures, Noise, Options};
 use shearq_submissions::check_name;
-use shearq_tables::{Column, Table, TableError, read_parquet, write_parquet};
+use shearq_tables::TableError;
+use shearq_tables::polars::{Column, DataFrame};
 
-use super::{RunRecord, SetRecord, Value};
-use crate::io::atomic;
-use crate::io::error::FileError;
-use crate::io::fingerprint;
-use crate::io::parquet::bare;
+use super::score::ScoredSet;
+use crate::io::FileError;
+use crate::io::fingerprint::{self, Fingerprint};
+use crate::io::layout::DataFolder;
+use crate::io::run::{Run, Source};
+use crate::pipeline::PipelineError;
+use crate::simulate::kinds::SetKind;
 
-/// Key and value in the footer that tell the files of a store.
-const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");
-
-pub fn prepare(store: &Path) -> Result<(), FileError> {
-    std::fs::create_dir_all(store)
-        .map_err(FileError::doing(store, "cannot make the results store"))?;
-    atomic::sweep(store);
-    Ok(())
+/// What is kept of one set's score.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SetRecord {
+    /// Set number.
+    pub set: u32,
+    /// Fingerprint of the set's data ([`fingerprint::of_set`]).
+    pub data: String,
+    /// Numbers of the images scored.
+    pub images: Vec<u32>,
+    /// Galaxies in their catalogues.
+    pub galaxies: u64,
+    /// Of these, without an ellipticity.
+    pub flagged: u64,
+    /// Figures of the chosen convention.
+    pub figures: Figures,
+    /// Their standard errors; not a number where unknown.
+    pub errors: Figures,
+    /// Q with each group of images left out in turn, for paired differences.
+    pub q_replicates: Vec<f64>,
+    /// The leaderboard's Q: the best of the eight conventions.
+    pub q_leaderboard: f64,
+    /// Number of the chosen convention.
+    pub convention: u8,
+    /// Whether it is known: told, or clearly matched to the truth, and not chosen by its Q.
+    pub convention_known: bool,
+    /// Number of the leaderboard's convention.
+    pub convention_leaderboard: u8,
 }
 
-pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
-    let failed = |error: TableError| bare(store, &error);
-    let metadata = BTreeMap::from([(SCHEMA.0.to_owned(), SCHEMA.1.to_owned())]);
-    let table = Table::new(columns(run)?, metadata).map_err(failed)?;
-    let mut bytes = Vec::new();
-    write_parquet(&mut bytes, &table).map_err(failed)?;
-    let path = store.join(file_name(run, &bytes));
-    atomic::write(&path, &bytes)?;
-    Ok(path)
+impl SetRecord {
+    /// What is kept of a scored set, of data with the fingerprint `data`.
+    pub fn new(scored: &ScoredSet, data: String) -> Self {
+        let ScoredSet {
+            set,
+            images,
+            score,
+            rows,
+            basis,
+        } = scored;
+        SetRecord {
+            set: *set,
+            data,
+            images: images.clone(),
+            galaxies: (rows.used + rows.not_finite) as u64,
+            flagged: rows.not_finite as u64,
+            figures: score.figures,
+            errors: score.errors,
+            q_replicates: score.replicates.iter().map(|r| r.q).collect(),
+            q_leaderboard: score.conventions[score.best.index()].quality.q,
+            convention: score.chosen.number(),
+            convention_known: basis.is_known(),
+            convention_leaderboard: score.best.number(),
+        }
+    }
 }
 
-/// Name of the file that holds `bytes`.
-fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
-    let words: Vec<&str> = run
-        .submission
-        .split(|c: char| !c.is_ascii_alphanumeric())
-        .filter(|word| !word.is_empty())
+/// What is kept of one scored run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RunRecord {
+    /// Name of the submission, or of another program's catalogues.
+    pub submission: String,
+    /// Version of shearq.
+    pub version: String,
+    /// All settings, as TOML.
+    pub settings: String,
+    /// Settings of the simulation as JSON, or the fingerprint of a data folder.
+    pub source: String,
+    /// Bandpower definition.
+    pub definition: String,
+    /// Convention asked for: `matched`, `best` or a number.
+    pub choice: String,
+    /// `measured`, or the noise variance given.
+    pub noise: String,
+    /// The sets, in order.
+    pub sets: Vec<SetRecord>,
+}
+
+/// What was measured, and by what.
+pub struct Measured<'a> {
+    /// Name of the submission, or of another program's catalogues.
+    pub name: &'a str,
+    /// All settings, as TOML.
+    pub settings: String,
+    /// Where the galaxies come from.
+    pub source: &'a Source,
+    /// Where the true shear is.
+    pub data: &'a DataFolder,
+}
+
+impl<'a> Measured<'a> {
+    /// A run of ours.
+    ///
+    /// # Errors
+    /// Where the settings cannot be written as TOML.
+    pub fn run(run: &'a Run, data: &'a DataFolder, folder: &Path) -> Result<Self, FileError> {
+        let settings = toml::to_string(&run.submission)
+            .map_err(FileError::doing(folder, "cannot store the settings"))?;
+        Ok(Measured {
+            name: &run.submission.name,
+            settings,
+            source: &run.source,
+            data,
+        })
+    }
+}
+
+impl RunRecord {
+    /// The record of a scored run.
+    ///
+    /// # Errors
+    /// Where the data cannot be read for their fingerprint.
+    pub fn new(
+        measured: Measured<'_>,
+        scored: &[ScoredSet],
+        options: Options,
+    ) -> Result<Self, PipelineError> {
+        let Measured {
+            name,
+            settings,
+            source,
+            data,
+        } = measured;
+        let sets = scored
+            .iter()
+            .map(|scored| {
+                let print = fingerprint::of_set(source, data, scored.set, &scored.images)?;
+                Ok(SetRecord::new(scored, print))
+            })
+            .collect::<Result<_, FileError>>()?;
+        Ok(RunRecord {
+            submission: name.to_owned(),
+            version: crate::VERSION.into(),
+            settings,
+            source: match source {
+                Source::Simulated(settings) => serde_json::to_string(settings)
+                    .map_err(FileError::doing(data.root(), "cannot store the settings"))?,
+                Source::Folder { .. } => fingerprint::of_source(source, data)?,
+            },
+            definition: match options.definition {
+                Definition::Leaderboard => "leaderboard".into(),
+                Definition::Corrected => "corrected".into(),
+            },
+            choice: match options.choice {
+                Choice::Matched => "matched".into(),
+                Choice::Best => "best".into(),
+                Choice::Insist(convention) => convention.number().to_string(),
+            },
+            noise: match options.noise {
+                Noise::Measured => "measured".into(),
+                Noise::Given(variance) => variance.to_string(),
+            },
+            sets,
+        })
+    }
+
+    /// Fingerprint of what made the run: version, settings, data and the way of scoring, but not
+    /// which sets and images. Parts of one run, from several processes, have it in common.
+    pub fn id(&self) -> String {
+        let RunRecord {
+            submission,
+            version,
+            settings,
+            source,
+            definition,
+            choice,
+            noise,
+            sets: _,
+        } = self;
+        let mut print = Fingerprint::default();
+        for part in [
+            submission, version, settings, source, definition, choice, noise,
+        ] {
+            print.add(part);
+        }
+        print.finish()
+    }
+
+    /// The run whose sets are the rows of the table `path`.
+    ///
+    /// # Errors
+    /// Where a column is absent or of another type, or the rows are not of one run.
+    pub fn from_table(table: &DataFrame, path: &Path) -> Result<Self, FileError> {
+        let rows = Rows { path, table };
+        let text = |name| rows.text(name, 0).map(str::to_owned);
+        let submission = text("submission")?;
+        check_name(&submission).map_err(|message| FileError::new(path, message))?;
+        let run = RunRecord {
+            submission,
+            version: text("version")?,
+            settings: text("settings")?,
+            source: text("source")?,
+            definition: text("definition")?,
+            choice: text("choice")?,
+            noise: text("noise")?,
+            sets: (0..table.height())
+                .map(|row| rows.set(row))
+                .collect::<Result<_, _>>()?,
+        };
+        for row in 0..table.height() {
+            let found = rows.text("run", row)?;
+            if found != run.id() {
+                let message = format!(
+                    "row {}: `run` is {found}, but what made it amounts to {}; was the file edited?",
+                    row + 1,
+                    run.id()
+                );
+                return Err(FileError::new(path, message));
+            }
+        }
+        Ok(run)
+    }
+}
+
+/// A row for every set of every run, in order: what the files of a store hold, and what conditions and
+/// groups refer to.
+///
+/// # Errors
+/// Where polars cannot make it.
+pub fn table_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
+    let ids: Vec<String> = runs.iter().map(RunRecord::id).collect();
+    let rows: Vec<(&RunRecord, &str, &SetRecord)> = runs
+        .iter()
+        .zip(&ids)
+        .flat_map(|(run, id)| run.sets.iter().map(move |set| (run, id.as_str(), set)))
         .collect();
-    let print = fingerprint::of_bytes(bytes);
-    format!("{}-{}-{print}.parquet", words.join("-"), run.id())
-}
-
-/// The rows of a run, by column.
-fn columns(run: &RunRecord) -> Result<Vec<(String, Column)>, FileError> {
-    let mut columns: Vec<(String, Column)> = Vec::new();
-    for set in &run.sets {
-        for (k, (name, value)) in run.row(set).into_iter().enumerate() {
-            if k == columns.len() {
-                let column = match value {
-                    Value::Text(_) => Column::Text(Vec::new()),
-                    Value::Real(_) => Column::F64(Vec::new()),
-                    Value::Count(_) => Column::I64(Vec::new()),
-                };
-                columns.push((name, column));
-            }
-            match (&mut columns[k].1, value) {
-                (Column::Text(values), Value::Text(value)) => values.push(value),
-                (Column::F64(values), Value::Real(value)) => values.push(value),
-                (Column::I64(values), Value::Count(value)) => values.push(value as i64),
-                // Every row has the same columns.
-                _ => {}
-            }
-        }
-    }
-    Ok(columns)
-}
-
-pub fn read(path: &Path) -> Result<RunRecord, FileError> {
-    let table = read_parquet(path, None).map_err(|error| bare(path, &error))?;
-    let found = table.metadata().get(SCHEMA.0).map(String::as_str);
-    if found != Some(SCHEMA.1) {
-        let message = format!(
-            "found {}, expected a file of a results store: `{}` = \"{}\" in its metadata",
-            found.map_or("no schema".into(), |found| format!("schema \"{found}\"")),
-            SCHEMA.0,
-            SCHEMA.1
-        );
-        return Err(FileError::new(path, message));
-    }
-    let rows = Rows {
-        path,
-        table: &table,
+    let of_run = |name: &str, value: &dyn Fn(&RunRecord) -> &str| {
+        let values: Vec<&str> = rows.iter().map(|row| value(row.0)).collect();
+        Column::new(name.into(), values)
     };
-    let text = |name| rows.text(name, 0).map(str::to_owned);
-    let submission = text("submission")?;
-    check_name(&submission).map_err(|message| FileError::new(path, message))?;
-    let run = RunRecord {
-        submission,
-        version: text("version")?,
-        settings: text("settings")?,
-        source: text("source")?,
-        definition: text("definition")?,
-        choice: text("choice")?,
-        noise: text("noise")?,
-        sets: (0..table.rows())
-            .map(|row| rows.set(row))
-            .collect::<Result<_, _>>()?,
+    let kind = |name: &str, value: &dyn Fn(&SetKind) -> &'static str| {
+        let values = rows
+            .iter()
+            .map(|row| SetKind::of(row.2.set).as_ref().map_or("", value));
+        Column::new(name.into(), values.collect::<Vec<&str>>())
     };
-    for row in 0..table.rows() {
-        let found = rows.text("run", row)?;
-        if found != run.id() {
-            let message = format!(
-                "row {}: `run` is {found}, but what made it amounts to {}; was the file edited?",
-                row + 1,
-                run.id()
-            );
-            return Err(FileError::new(path, message));
-        }
+    let text = |name: &str, value: &dyn Fn(&SetRecord) -> String| {
+        let values: Vec<String> = rows.iter().map(|row| value(row.2)).collect();
+        Column::new(name.into(), values)
+    };
+    let count = |name: &str, value: &dyn Fn(&SetRecord) -> u64| {
+        let values: Vec<i64> = rows.iter().map(|row| value(row.2) as i64).collect();
+        Column::new(name.into(), values)
+    };
+    let real = |name: &str, value: &dyn Fn(&SetRecord) -> f64| {
+        let values: Vec<f64> = rows.iter().map(|row| value(row.2)).collect();
+        Column::new(name.into(), values)
+    };
+    let run_ids: Vec<&str> = rows.iter().map(|row| row.1).collect();
+    let mut columns = vec![
+        Column::new("run".into(), run_ids),
+        of_run("submission", &|run| &run.submission),
+        of_run("version", &|run| &run.version),
+        of_run("settings", &|run| &run.settings),
+        of_run("source", &|run| &run.source),
+        of_run("definition", &|run| &run.definition),
+        of_run("choice", &|run| &run.choice),
+        of_run("noise", &|run| &run.noise),
+        count("set", &|set| u64::from(set.set)),
+        kind("set_kind", &|kind| kind.image.label()),
+        kind("psf", &|kind| kind.psf.label()),
+        kind("psf_profile", &|kind| kind.image.psf_profile()),
+        kind("ellipticity", &|kind| kind.ellipticity.label()),
+        kind("snr", &|kind| kind.image.snr_class()),
+        kind("size", &|kind| kind.image.size_class()),
+        text("data", &|set| set.data.clone()),
+        count("images", &|set| set.images.len() as u64),
+        text("image_numbers", &|set| list(&set.images)),
+        count("galaxies", &|set| set.galaxies),
+        count("flagged", &|set| set.flagged),
+    ];
+    for (k, Figure { name, .. }) in Figures::ALL.iter().enumerate() {
+        columns.push(real(name, &|set| set.figures.values()[k]));
+        columns.push(real(&error_of(name), &|set| set.errors.values()[k]));
     }
-    Ok(run)
+    columns.extend([
+        real("q_leaderboard", &|set| set.q_leaderboard),
+        count("convention", &|set| u64::from(set.convention)),
+        count("convention_known", &|set| u64::from(set.convention_known)),
+        count("convention_leaderboard", &|set| {
+            u64::from(set.convention_leaderboard)
+        }),
+        text("q_replicates", &|set| list(&set.q_replicates)),
+    ]);
+    shearq_tables::frame(columns)
 }
 
-/// Rows of a file of the store.
+/// Name of the column with a figure's standard errors.
+fn error_of(figure: &str) -> String {
+    format!("{figure}_error")
+}
+
+/// Numbers as a JSON list, with all their digits; what is not finite is null.
+fn list<T: ToString>(numbers: &[T]) -> String {
+    let texts: Vec<String> = numbers
+        .iter()
+        .map(|number| match number.to_string() {
+            text if text.contains("NaN") || text.contains("inf") => "null".into(),
+            text => text,
+        })
+        .collect();
+    format!("[{}]", texts.join(","))
+}
+
+/// Rows of the table of a file.
 struct Rows<'a> {
     path: &'a Path,
-    table: &'a Table,
+    table: &'a DataFrame,
 }
 
 impl Rows<'_> {
@@ -128,27 +332,24 @@ impl Rows<'_> {
     }
 
     fn text(&self, name: &str, row: usize) -> Result<&str, FileError> {
-        match self.table.column(name) {
-            Some(Column::Text(values)) => values.get(row).map(String::as_str),
-            _ => None,
-        }
-        .ok_or_else(|| self.wrong(name, row, "text"))
+        let column = self.table.column(name).ok();
+        column
+            .and_then(|column| column.str().ok()?.get(row))
+            .ok_or_else(|| self.wrong(name, row, "text"))
     }
 
     fn real(&self, name: &str, row: usize) -> Result<f64, FileError> {
-        match self.table.column(name) {
-            Some(Column::F64(values)) => values.get(row).copied(),
-            _ => None,
-        }
-        .ok_or_else(|| self.wrong(name, row, "real number"))
+        let column = self.table.column(name).ok();
+        column
+            .and_then(|column| column.f64().ok()?.get(row))
+            .ok_or_else(|| self.wrong(name, row, "real number"))
     }
 
     fn count<T: TryFrom<i64>>(&self, name: &str, row: usize) -> Result<T, FileError> {
-        match self.table.column(name) {
-            Some(Column::I64(values)) => values.get(row).and_then(|&v| T::try_from(v).ok()),
-            _ => None,
-        }
-        .ok_or_else(|| self.wrong(name, row, "number that can be counted to"))
+        let column = self.table.column(name).ok();
+        column
+            .and_then(|column| T::try_from(column.i64().ok()?.get(row)?).ok())
+            .ok_or_else(|| self.wrong(name, row, "number that can be counted to"))
     }
 
     /// Numbers of a JSON list; null is NaN where `T` has it.
@@ -167,10 +368,10 @@ impl Rows<'_> {
     }
 
     fn set(&self, row: usize) -> Result<SetRecord, FileError> {
-        let figures = |suffix: &str| -> Result<Figures, FileError> {
+        let figures = |column: &dyn Fn(&str) -> String| -> Result<Figures, FileError> {
             let mut values = [f64::NAN; Figures::ALL.len()];
             for (value, Figure { name, .. }) in values.iter_mut().zip(Figures::ALL) {
-                *value = self.real(&format!("{name}{suffix}"), row)?;
+                *value = self.real(&column(name), row)?;
             }
             Ok(Figures::from_values(values))
         };
@@ -180,15 +381,15 @@ impl Rows<'_> {
             images: self.list("image_numbers", row)?,
             galaxies: self.count("galaxies", row)?,
             flagged: self.count("flagged", row)?,
-            figures: figures("")?,
-            errors: figures("_error")?,
+            figures: figures(&str::to_owned)?,
+            errors: figures(&error_of)?,
             q_replicates: self.list("q_replicates", row)?,
             q_leaderboard: self.real("q_leaderboard", row)?,
             convention: self.count("convention", row)?,
             // Earlier versions let each set choose.
             convention_known: match self.table.column("convention_known") {
-                Some(_) => self.count::<u8>("convention_known", row)? > 0,
-                None => self.text("choice", row)?.parse::<u8>().is_ok(),
+                Ok(_) => self.count::<u8>("convention_known", row)? > 0,
+                Err(_) => self.text("choice", row)?.parse::<u8>().is_ok(),
             },
             convention_leaderboard: self.count("convention_leaderboard", row)?,
         })

@@ -3,18 +3,17 @@
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::resample::mean_over_sets;
-use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{
-    Choice, Convention, ConventionMatch, FieldSum, Figures, Grid, Options, Row, RowCounts,
-    SetImages, SetScore, SetScorer, TrueShear, TruthSign,
+    Choice, Convention, ConventionMatch, FieldSum, Figures, Grid, Options, RowCounts, SetImages,
+    SetScore, SetScorer,
 };
 
-use super::PipelineError;
-use super::{engine, grid, inputs};
 use crate::io::FileError;
-use crate::io::layout::{DataFolder, MAX_SET, read_rows, read_truth_rows};
+use crate::io::layout::{DataFolder, MAX_SET, read_rows};
 use crate::io::run::Run;
 use crate::io::table::most_rows;
+use crate::pipeline::truth::{Reading, read_truth, reading_of};
+use crate::pipeline::{PipelineError, engine, inputs};
 
 /// Columns of our catalogues that are scored.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
@@ -58,48 +57,9 @@ impl Basis {
     }
 }
 
-/// How a truth file is to be read.
-#[derive(Debug, Clone, Copy)]
-pub struct Reading {
-    /// Side of the field in degrees.
-    pub field: Degrees,
-    /// Pixels a side of a cell.
-    pub stamp: Pixels,
-    /// Sign of g2 in the truth.
-    pub sign: TruthSign,
-}
-
 /// Reads one catalogue onto the grid.
 pub type ReadImage<'a> =
     &'a (dyn Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync);
-
-/// Which values of other programs' ellipticities stand for "not measured".
-#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Deserialize)]
-pub struct Screen {
-    /// A value of either component.
-    pub missing: Option<f64>,
-    /// The largest |e| that is one.
-    pub max_modulus: Option<f64>,
-}
-
-impl Screen {
-    /// The row, without an ellipticity where its value stands for none.
-    pub fn apply(&self, row: Row) -> Row {
-        let missing = self.missing.is_some_and(|m| row.e1 == m || row.e2 == m);
-        if missing
-            || self
-                .max_modulus
-                .is_some_and(|max| row.e1.hypot(row.e2) > max)
-        {
-            return Row {
-                e1: f64::NAN,
-                e2: f64::NAN,
-                ..row
-            };
-        }
-        row
-    }
-}
 
 /// A [`ReadImage`] for catalogues that we wrote.
 ///
@@ -109,47 +69,6 @@ pub fn own_catalogue(grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), 
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, read_rows(path, &COLUMNS, most_rows(grid))?);
     Ok((sum, counts))
-}
-
-/// Sums rows of another program, of the catalogue `path`.
-///
-/// # Errors
-/// Where they are not what they are taken for: values that are no ellipticities, positions in other units.
-pub fn sum_foreign(
-    grid: &Grid,
-    path: &Path,
-    rows: impl IntoIterator<Item = Row>,
-) -> Result<(FieldSum, RowCounts), FileError> {
-    let mut sum = FieldSum::new(grid);
-    let counts = sum.add_image(grid, rows);
-    match counts.fault(grid) {
-        Some(fault) => Err(FileError::new(path, fault)),
-        None => Ok((sum, counts)),
-    }
-}
-
-/// A [`ReadImage`] for other programs' catalogues with the given columns.
-pub fn plain_columns<'a>(
-    columns: [&'a str; 4],
-    screen: Screen,
-) -> impl Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync + 'a {
-    move |grid, path| {
-        let rows = read_rows(path, &columns, most_rows(grid))?;
-        sum_foreign(grid, path, rows.into_iter().map(|row| screen.apply(row)))
-    }
-}
-
-/// The true shear of a file on its grid, whose side is the square root of the number of rows.
-///
-/// # Errors
-/// Where the file cannot be read or does not fill a square grid.
-pub fn read_truth(truth: &Path, reading: &Reading) -> Result<(Grid, TrueShear), FileError> {
-    let rows = read_truth_rows(truth)?;
-    let side = grid::side(truth, rows.len())?;
-    let bad = |error: shearq_scoring::ScoringError| FileError::new(truth, error);
-    let grid = Grid::new(side, reading.stamp, reading.field).map_err(bad)?;
-    let shear = TrueShear::from_rows(&grid, reading.sign, rows).map_err(bad)?;
-    Ok((grid, shear))
 }
 
 /// Scores one set from a truth file and one catalogue per image.
@@ -222,18 +141,6 @@ fn add_up(
         return Err(FileError::new(first, message).into());
     }
     Ok((images, counts))
-}
-
-/// How the truth of a set of a data folder is to be read.
-///
-/// # Errors
-/// Where the set's first image cannot be read.
-pub fn reading_of(data: &DataFolder, set: u32) -> Result<Reading, FileError> {
-    Ok(Reading {
-        field: Degrees(data.layout().field_degrees),
-        stamp: Pixels(grid::stamp_of_set(data, set)? as f64),
-        sign: data.layout().truth_sign,
-    })
 }
 
 /// Catalogues of one variant of a measurement.
@@ -403,6 +310,43 @@ pub fn score_folder(
             other => other,
         },
     )
+}
+
+/// What of the images of `data`, of `sets` (of all if empty), was not scored, a line each.
+///
+/// # Errors
+/// Where the data's folders cannot be listed.
+pub fn unscored(
+    data: &DataFolder,
+    scored: &[ScoredSet],
+    sets: &[u32],
+) -> Result<Vec<String>, FileError> {
+    let images = data.images(sets)?;
+    let (mut absent, mut lines) = (Vec::new(), Vec::new());
+    for set in images.sets() {
+        let there = images.of_set(set);
+        let Some(scored) = scored.iter().find(|scored| scored.set == set) else {
+            absent.push(set.to_string());
+            continue;
+        };
+        let lacking = there
+            .iter()
+            .filter(|(image, _)| !scored.images.contains(image));
+        match lacking.count() {
+            0 => {}
+            count => lines.push(format!(
+                "Warning: {count} of the {} images of set {set} have no catalogue; figures depend on the number of images.",
+                there.len()
+            )),
+        }
+    }
+    if !absent.is_empty() {
+        let absent = absent.join(", ");
+        lines.push(format!(
+            "Warning: there are data of sets without a catalogue: {absent}."
+        ));
+    }
+    Ok(lines)
 }
 
 /// Means over sets of the headline figures and their errors.

@@ -40,6 +40,9 @@ const SNR_RANGE: (f64, f64) = (10.0, 80.0);
 /// Galaxies a side that a simulated image may have.
 const SIDES: RangeInclusive<usize> = 8..=400;
 
+/// Tilts of a spectrum: beyond these all power lies in one mode or none.
+const TILTS: RangeInclusive<f64> = -20.0..=20.0;
+
 /// What a simulation is made from, beside the sets and images asked for. Wherever it is read from, it is
 /// checked by [`SimulationSettings::validate`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -111,17 +114,21 @@ impl SimulationSettings {
                 "the simulation has {grid} galaxies a side; expected {least} to {most}"
             ));
         }
-        for (what, value, least) in [
-            ("amplitude", amplitude, 0.0),
-            ("tilt", tilt, f64::MIN),
-            ("intrinsic_sigma", intrinsic_sigma, 0.0),
+        for (what, value) in [
+            ("amplitude", amplitude),
+            ("intrinsic_sigma", intrinsic_sigma),
         ] {
-            if !(value.is_finite() && value >= least) {
-                let sign = if least == 0.0 { ", not negative" } else { "" };
+            if !(value.is_finite() && value >= 0.0) {
                 return Err(format!(
-                    "the simulation's {what} is {value}; expected a finite number{sign}"
+                    "the simulation's {what} is {value}; expected a finite number, not negative"
                 ));
             }
+        }
+        if !TILTS.contains(&tilt) {
+            let (least, most) = (TILTS.start(), TILTS.end());
+            return Err(format!(
+                "the simulation's tilt is {tilt}; expected {least} to {most}"
+            ));
         }
         Ok(())
     }
@@ -203,7 +210,8 @@ impl SetSimulator {
             settings.spectrum.c_l(l)
         });
         let strongest = shear.iter().map(|g| g.norm()).fold(0.0, f64::max);
-        if strongest > MAX_SHEAR {
+        // What is not a number is not weak either.
+        if strongest > MAX_SHEAR || shear.iter().any(|g| !g.norm().is_finite()) {
             return Err(shearq_scoring::ScoringError::StrongShear {
                 found: strongest,
                 most: MAX_SHEAR,

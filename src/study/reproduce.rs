@@ -17,8 +17,8 @@ use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Progress;
 use crate::pipeline::measure::MeasuredRow;
 use crate::pipeline::run::{measurers, run_set};
-use crate::pipeline::score::OWN;
 use crate::pipeline::simulate::simulator;
+use crate::results::score::OWN;
 use crate::simulate::set::SimulationSettings;
 
 /// What a run is made from.

@@ -16,16 +16,21 @@ use shearq_submissions::{
     LinearMethod, Method, NetworkMethod, NoiseSource, Start, Submission, Update,
 };
 
+use shearq_tables::frame;
+use shearq_tables::polars::Column;
+
 use crate::io::FileError;
 use crate::io::atomic::{self, Scratch};
-use crate::io::table::{self, Column, Format, Table as Columns};
+use crate::io::table::{self, Format};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Quiet;
 use crate::pipeline::run::{measurers, run_set};
-use crate::pipeline::score::{COLUMNS, Reading, Screen, plain_columns, score_files};
 use crate::pipeline::simulate::simulator;
+use crate::pipeline::truth::Reading;
 use crate::report::figure::{LinePlot, Series, Style};
 use crate::report::table::{Cell, Heading, Table};
+use crate::results::foreign::{Screen, plain_columns};
+use crate::results::score::{COLUMNS, score_files};
 use crate::simulate::render::RenderScratch;
 use crate::simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, SimulationSettings};
 
@@ -542,20 +547,11 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
     let truth = folder.path().join("truth.csv");
     atomic::write(&truth, ascii("x,y,g1,g2\n", ",").as_bytes())?;
     let dat = ascii("", " ");
-    let columns = || {
-        let column = |name: &str, v: &[f64]| (name.to_owned(), Column::Real(v.to_vec()));
-        Columns::new(vec![
-            column("x", &x),
-            column("y", &y),
-            column("e1", &e1),
-            column("e2", &e2),
-        ])
-    };
+    let columns = [("x", &x), ("y", &y), ("e1", &e1), ("e2", &e2)];
+    let columns = columns.map(|(name, values)| Column::new(name.into(), values));
+    let table = frame(columns.into()).map_err(|error| FileError::new(&truth, error.to_string()))?;
     let mut rows = Vec::new();
     for (format, ending) in [("Parquet", "parquet"), ("FITS", "fits"), ("ASCII", "dat")] {
-        if ending == "parquet" && !cfg!(feature = "parquet") {
-            continue;
-        }
         let mut paths = Vec::new();
         for k in 0..images {
             let path = folder.path().join(format!("{k}.{ending}"));
@@ -567,8 +563,7 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
                     } else {
                         Format::Parquet
                     };
-                    let table = columns().map_err(|m| FileError::new(&path, m))?;
-                    table::write(&path, kind, table, &Default::default())?;
+                    table::write(&path, kind, &table, &Default::default())?;
                 }
             }
             paths.push(path);

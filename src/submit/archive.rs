@@ -16,7 +16,7 @@ use crate::io::open::open;
 use crate::io::{FileError, layout};
 
 /// Largest manifest accepted, in bytes: some four times that of 999 images of 99 sets.
-const MAX_MANIFEST: u64 = 1 << 26;
+const MAX_MANIFEST: u64 = 1 << 22;
 
 /// Most bytes that one byte of an archive may unpack to, beyond the first [`FREE`]: numbers in ASCII come
 /// to three, blank catalogues to a hundred or so.

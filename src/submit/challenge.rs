@@ -8,8 +8,8 @@
 use std::path::Path;
 
 use shearq_scoring::{
-    Convention, Grid, Row, SCORED, ScoringError, SetImages, SpectrumCovariance, cross_spectrum,
-    measured_bandpowers,
+    Bins, Convention, Definition, Grid, Row, SCORED, ScoringError, SetImages, SpectrumCovariance,
+    cross_spectrum, measured_bandpowers,
 };
 
 use crate::io::FileError;
@@ -150,8 +150,8 @@ pub fn spectrum_text(
 /// # Errors
 /// Where it cannot be read.
 pub fn read_spectrum(path: &Path) -> Result<Vec<SpectrumLine>, FileError> {
-    let mut table = table::read_text(path, &["index", "l", "power"])?;
-    let mut column = |name: &str| table.require(name, path);
+    let table = table::read_text(path, &["index", "l", "power"])?;
+    let column = |name: &str| table::numbers(&table, name, path);
     let (index, l, power) = (column("index")?, column("l")?, column("power")?);
     if let Some(odd) = index
         .iter()
@@ -171,12 +171,35 @@ pub fn read_spectrum(path: &Path) -> Result<Vec<SpectrumLine>, FileError> {
         .collect())
 }
 
-/// The eight bandpowers of a power-spectrum file, in order.
+/// The first multipole that is not that of its bin, with that bin's, and how many there are.
+pub fn wrong_multipoles<'a>(
+    lines: &'a [SpectrumLine],
+    bins: &Bins,
+) -> Option<(&'a SpectrumLine, f64, usize)> {
+    let centre = |line: &SpectrumLine| bins.l.get((line.index as usize).wrapping_sub(1)).copied();
+    let off = |line: &'a SpectrumLine| {
+        let centre = centre(line).filter(|l| !(line.l - l).abs().le(&(0.5 * bins.width)))?;
+        Some((line, centre))
+    };
+    let mut wrong = lines.iter().filter_map(off);
+    let (line, centre) = wrong.next()?;
+    Some((line, centre, 1 + wrong.count()))
+}
+
+/// The eight bandpowers of a power-spectrum file of galaxies on `grid`, in order.
 ///
 /// # Errors
-/// Where the file cannot be read, or its bins are not 2 to 9.
-pub fn read_bandpowers(path: &Path) -> Result<Vec<f64>, FileError> {
+/// Where the file cannot be read, its bins are not 2 to 9, or their multipoles those of another grid.
+pub fn read_bandpowers(path: &Path, grid: &Grid) -> Result<Vec<f64>, FileError> {
     let lines = read_spectrum(path)?;
+    let bins = Bins::new(grid, Definition::Leaderboard);
+    if let Some((SpectrumLine { index, l, .. }, centre, _)) = wrong_multipoles(&lines, &bins) {
+        let message = format!(
+            "bin {index} has l = {l}; expected {centre:.1}, as the true shear has {n} × {n} cells",
+            n = grid.n
+        );
+        return Err(FileError::new(path, message));
+    }
     let found: Vec<u32> = lines.iter().map(|line| line.index).collect();
     let expected: Vec<u32> = SCORED.map(|b| b as u32 + 1).collect();
     if found != expected {

@@ -8,12 +8,12 @@ use shearq_scoring::{
     TrueShear,
 };
 
-use super::challenge::{Kind, SpectrumLine, read_spectrum};
+use super::challenge::{Kind, SpectrumLine, read_spectrum, wrong_multipoles};
 use super::manifest::{FileSum, Manifest};
 use super::packed::Sent;
 use crate::io::layout::read_rows;
 use crate::io::table::most_rows;
-use crate::pipeline::score::COLUMNS;
+use crate::results::score::COLUMNS;
 
 /// How bad a finding is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
@@ -136,6 +136,10 @@ fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
                     check_against_truth(*set, &images, file, expected, &mut report);
                 }
             }
+            _ if !expected.truth.is_empty() => {
+                let message = "its name does not say of which set it is; it is not compared with the true shear";
+                report.warn(file, "truth", message.into());
+            }
             _ => {}
         }
     }
@@ -155,8 +159,10 @@ fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
             }
         }
     }
+    let most = sets.values().flat_map(|files| &files.numbers).max();
+    let most = most.copied().unwrap_or(0).max(expected.images.unwrap_or(0));
     for (set, files) in &mut sets {
-        check_images(*set, files, path, expected, &mut report);
+        check_images(*set, files, most, path, expected, &mut report);
         check_against_truth(*set, &files.images, &files.first, expected, &mut report);
     }
     report.findings
@@ -324,17 +330,12 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
 fn check_images(
     set: u32,
     files: &mut SetFiles,
+    last: u32,
     path: &Path,
     expected: &Expected,
     report: &mut Report,
 ) {
     files.numbers.sort_unstable();
-    let last = files
-        .numbers
-        .last()
-        .copied()
-        .unwrap_or(0)
-        .max(expected.images.unwrap_or(0));
     let missing: Vec<String> = (1..=last)
         .filter(|image| files.numbers.binary_search(image).is_err())
         .map(|image| image.to_string())
@@ -353,6 +354,7 @@ fn check_images(
         );
         report.error(path, "images", message);
     }
+    let last = files.numbers.last().copied().unwrap_or(0);
     if let Some(images) = expected.images.filter(|images| last > *images) {
         let message = format!("set {set} has an image {last}; expected {images} images");
         report.error(path, "images", message);
@@ -422,15 +424,9 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
         );
     }
     let bins = Bins::new(&expected.grid, Definition::Leaderboard);
-    let place = |line: &SpectrumLine| bins.l.get((line.index as usize).wrapping_sub(1)).copied();
-    let off = |line: &SpectrumLine| {
-        place(line).filter(|centre| !(line.l - centre).abs().le(&(0.5 * bins.width)))
-    };
-    let wrong = lines.iter().filter_map(|line| Some((line, off(line)?)));
-    if let Some((SpectrumLine { index, l, .. }, centre)) = wrong.clone().next() {
+    if let Some((SpectrumLine { index, l, .. }, centre, wrong)) = wrong_multipoles(&lines, &bins) {
         let message = format!(
-            "{} of {} multipoles are not those of {n} × {n} galaxies (--grid): bin {index} has l = {l}, expected {centre:.1}",
-            wrong.count(),
+            "{wrong} of {} multipoles are not those of {n} × {n} galaxies (--grid): bin {index} has l = {l}, expected {centre:.1}",
             lines.len(),
             n = expected.grid.n
         );

@@ -9,9 +9,9 @@ use sha2::{Digest, Sha256};
 use shearq_scoring::SpectrumCovariance;
 use shearq_submissions::checked_name;
 
-use super::foreign::Foreign;
 use crate::io::run::{Run, read_record};
 use crate::io::{FileError, open};
+use crate::results::foreign::Foreign;
 
 /// Name of the manifest beside the files.
 pub const MANIFEST_FILE: &str = "manifest.json";

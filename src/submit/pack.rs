@@ -8,7 +8,6 @@ use shearq_scoring::{FieldSum, Grid, Row, SetImages, SpectrumCovariance};
 
 use super::archive::{ArchiveWriter, is_archive};
 use super::challenge::{Kind, Spectrum, catalogue_text, spectrum_text};
-use super::foreign::Foreign;
 use super::manifest::{Contents, FileSum, MANIFEST_FILE, Manifest};
 use crate::io::atomic::PartFolder;
 use crate::io::layout::{DataFolder, read_rows};
@@ -16,8 +15,9 @@ use crate::io::listing::Files;
 use crate::io::run::Run;
 use crate::io::table::{MAX_ROWS, most_rows};
 use crate::io::{FileError, run::record_text};
-use crate::pipeline::score::COLUMNS;
-use crate::pipeline::{Progress, grid};
+use crate::pipeline::{Progress, grid, truth};
+use crate::results::foreign::Foreign;
+use crate::results::score::COLUMNS;
 
 /// The catalogues that are packed.
 pub enum Origin<'a> {
@@ -68,7 +68,7 @@ impl Origin<'_> {
             }
             Origin::Foreign {
                 data: Some(data), ..
-            } => grid::of_set(data, set),
+            } => truth::grid_of_set(data, set),
             Origin::Foreign { data: None, .. } => {
                 let message = "the grid is not known; --data DIR gives it for spectra";
                 Err(FileError::new(catalogue, message))

@@ -1,5 +1,6 @@
 //! Settings as a file has them: one link of a chain of files, or all that was stored with results.
 
+use std::io::Read;
 use std::path::Path;
 
 use serde::{Deserialize, Deserializer, Serialize};
@@ -142,10 +143,23 @@ pub(crate) fn dead_keys(text: &str, submission: &Submission) -> Vec<DeadKey> {
     dead
 }
 
+/// Most bytes of a file, a thousand times those of all settings.
+const MOST: u64 = 1 << 20;
+
 /// The text of a file.
 pub(crate) fn read(path: &Path) -> Result<String, SubmissionError> {
-    std::fs::read_to_string(path).map_err(|source| SubmissionError::Read {
-        path: path.to_owned(),
-        source,
-    })
+    let mut text = String::new();
+    std::fs::File::open(path)
+        .and_then(|file| file.take(MOST + 1).read_to_string(&mut text))
+        .map_err(|source| SubmissionError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+    if text.len() as u64 > MOST {
+        return Err(SubmissionError::Parse {
+            path: path.to_owned(),
+            message: format!("it has more than {MOST} bytes, the most that settings may have"),
+        });
+    }
+    Ok(text)
 }

@@ -37,7 +37,7 @@ pub enum TableError {
         /// The names in the file, in file order.
         present: Vec<String>,
     },
-    /// A column has a type that a [`Column`](crate::Column) cannot hold.
+    /// A column is neither of numbers nor of text.
     #[error(
         "{}: column `{column}` has type {found}; expected integers of at most 64 bits, \
          32- or 64-bit floats, booleans or text",
@@ -65,22 +65,6 @@ pub enum TableError {
         /// How many of its values are missing.
         count: usize,
     },
-    /// A 64-bit unsigned integer does not fit in the signed integers used here.
-    #[error(
-        "{}: column `{column}`, row {row}: found {value}, expected at most {}",
-        path.display(),
-        i64::MAX
-    )]
-    TooLarge {
-        /// The file.
-        path: PathBuf,
-        /// The column.
-        column: String,
-        /// The row, from 0.
-        row: usize,
-        /// The value found.
-        value: u64,
-    },
     /// Two columns of a table have one name, or one column was asked for twice.
     #[error("column `{name}` is named twice; expected every name once")]
     DuplicateColumn {
@@ -100,6 +84,12 @@ pub enum TableError {
         first: String,
         /// The first column's number of rows.
         expected: usize,
+    },
+    /// Columns that make no frame for another reason.
+    #[error("cannot make a table: {detail}")]
+    Invalid {
+        /// What polars says.
+        detail: String,
     },
     /// A metadata key is one that the file format uses for itself.
     #[error("metadata key `{key}` is reserved for the file's own schema; use another")]

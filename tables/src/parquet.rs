@@ -1,4 +1,4 @@
-//! Parquet files: the one place that calls polars.
+//! Parquet files.
 //!
 //! Writing goes through polars' frame writer. Reading takes polars' footer parser and column
 //! decoder, but fetches the bytes itself: only the column chunks that are wanted are read, nothing
@@ -6,37 +6,43 @@
 //! and 8- and 16-bit integers decode into wider ones without polars' features for them.
 
 use std::cell::Cell;
-use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{File, Metadata};
+use std::collections::BTreeSet;
+use std::fs::{self, File};
 use std::io::{Cursor, Read, Seek, SeekFrom, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
 use std::path::Path;
 use std::sync::Once;
 
 use polars::prelude::{
-    ArrowDataType, ArrowField, ChunkedArray, DataFrame, DataType, FileMetadataRef,
-    KeyValueMetadata, NamedFrom, ParquetCompression, ParquetReader, ParquetWriter, PolarsError,
-    PolarsNumericType, PolarsResult, SerReader, Series, StatisticsOptions,
+    ArrowDataType, ArrowField, ChunkFillNullValue, ChunkedArray, Column, DataFrame, DataType,
+    FileMetadataRef, IntoSeries, KeyValueMetadata, ParquetCompression, ParquetReader,
+    ParquetWriter, PolarsError, PolarsNumericType, PolarsResult, SerReader, Series,
+    StatisticsOptions,
 };
 use polars_parquet::parquet::page::CompressedPage;
 use polars_parquet::read::{
     BasicDecompressor, ColumnChunkMetadata, PageReader, column_iter_to_arrays,
 };
 
-use crate::table::SCHEMA_KEY;
-use crate::{Column, Table, TableError};
+use crate::frame::frame;
+use crate::{Metadata, TableError};
+
+/// The key under which Parquet files keep the Arrow schema.
+const SCHEMA_KEY: &str = "ARROW:schema";
 
 /// Most values read from a file of fewer bytes than that; a larger one may have one for each byte.
 const FREE_VALUES: u64 = 1 << 22;
 /// Most bytes that the pages of a column chunk, and all texts of a file, may unpack to beyond
 /// [`INFLATION`] times the file's own.
 const FREE_BYTES: u64 = 1 << 26;
+/// Most bytes of a footer: names, metadata, and some hundred bytes for each chunk of a column.
+const MAX_FOOTER: u32 = 1 << 24;
 /// Most bytes for one of the file's in a large file.
 const INFLATION: u64 = 8;
 
-/// Writes `table` as a Parquet file into `writer`.
+/// Writes `frame` as a Parquet file with `metadata` into `writer`.
 ///
-/// Equal tables give equal bytes. The metadata becomes the file's key-value metadata, in the order
+/// Equal frames give equal bytes. The metadata becomes the file's key-value metadata, in the order
 /// of the keys. The data are not compressed: measured shears and sizes are noise in most of their
 /// bits, so that compression gains a few per cent of space and costs up to half of the reading
 /// speed. Repeated values still become small, by dictionaries.
@@ -44,29 +50,30 @@ const INFLATION: u64 = 8;
 /// The file must be opened (and, to be replaced at once or not at all, renamed) by the caller.
 ///
 /// # Errors
+/// [`TableError::ReservedKey`] for a metadata key that Parquet files use for themselves, and
 /// [`TableError::Write`] if the encoder or `writer` fails.
-pub fn write_parquet<W: Write>(writer: W, table: &Table) -> Result<(), TableError> {
-    let columns = table
-        .columns()
-        .iter()
-        .map(|(name, column)| to_series(name, column).into());
-    let metadata = table
-        .metadata()
-        .iter()
-        .map(|(key, value)| (key.clone(), value.clone()));
-    DataFrame::new(table.rows(), columns.collect())
-        .and_then(|mut frame| {
-            ParquetWriter::new(writer)
-                .with_compression(ParquetCompression::Uncompressed)
-                // Nothing selects rows by minima and maxima, which cost a pass over the values.
-                .with_statistics(StatisticsOptions {
-                    null_count: true,
-                    ..StatisticsOptions::empty()
-                })
-                .with_key_value_metadata(Some(KeyValueMetadata::from_static(metadata.collect())))
-                .set_parallel(false)
-                .finish(&mut frame)
+pub fn write_parquet<W: Write>(
+    writer: W,
+    frame: &DataFrame,
+    metadata: &Metadata,
+) -> Result<(), TableError> {
+    if metadata.contains_key(SCHEMA_KEY) {
+        return Err(TableError::ReservedKey {
+            key: SCHEMA_KEY.into(),
+        });
+    }
+    let pairs = metadata.iter();
+    let pairs = pairs.map(|(key, value)| (key.clone(), value.clone()));
+    ParquetWriter::new(writer)
+        .with_compression(ParquetCompression::Uncompressed)
+        // Nothing selects rows by minima and maxima, which cost a pass over the values.
+        .with_statistics(StatisticsOptions {
+            null_count: true,
+            ..StatisticsOptions::empty()
         })
+        .with_key_value_metadata(Some(KeyValueMetadata::from_static(pairs.collect())))
+        .set_parallel(false)
+        .finish(&mut frame.clone())
         .map(drop)
         .map_err(|error| TableError::Write {
             detail: error.to_string(),
@@ -75,17 +82,19 @@ pub fn write_parquet<W: Write>(writer: W, table: &Table) -> Result<(), TableErro
 
 /// Reads the Parquet file at `path`: all columns in file order, or those in `wanted`, in that order.
 ///
-/// Signed integers become [`Column::I64`]; unsigned ones and booleans [`Column::U32`], 64-bit ones
-/// [`Column::I64`]; text with a dictionary becomes plain text. Missing values in float columns
-/// become NaN. Columns that are not wanted may be of any type. It runs on the calling thread alone,
-/// so that a caller with many files reads them in parallel.
+/// Small integers become 32-bit ones, and text with a dictionary plain text. Missing values in float
+/// columns become NaN. Columns that are not wanted may be of any type. It runs on the calling thread
+/// alone, so that a caller with many files reads them in parallel.
 ///
 /// # Errors
 /// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read;
-/// [`TableError::MissingColumn`], [`TableError::DuplicateColumn`],
-/// [`TableError::UnsupportedType`], [`TableError::MissingValues`] and [`TableError::TooLarge`] for a
-/// wanted column that is absent, named twice, or cannot be held in a [`Column`].
-pub fn read_parquet(path: impl AsRef<Path>, wanted: Option<&[&str]>) -> Result<Table, TableError> {
+/// [`TableError::MissingColumn`], [`TableError::DuplicateColumn`], [`TableError::UnsupportedType`] and
+/// [`TableError::MissingValues`] for a wanted column that is absent, named twice, or neither of
+/// numbers nor of text.
+pub fn read_parquet(
+    path: impl AsRef<Path>,
+    wanted: Option<&[&str]>,
+) -> Result<DataFrame, TableError> {
     let path = path.as_ref();
     let mut source = Source::open(path)?;
     let fields = match wanted {
@@ -93,11 +102,8 @@ pub fn read_parquet(path: impl AsRef<Path>, wanted: Option<&[&str]>) -> Result<T
         Some(names) => source.pick(names)?,
     };
     source.check_size(fields.len())?;
-    let columns = fields
-        .iter()
-        .map(|field| Ok((field.name.to_string(), source.read_column(field)?)))
-        .collect::<Result<_, TableError>>()?;
-    Table::new(columns, source.key_values())
+    let columns = fields.iter().map(|field| source.read_column(field));
+    frame(columns.collect::<Result<_, TableError>>()?)
 }
 
 /// The names of the columns of the Parquet file at `path`, in file order, from the footer alone.
@@ -112,19 +118,8 @@ pub fn parquet_columns(path: impl AsRef<Path>) -> Result<Vec<String>, TableError
 ///
 /// # Errors
 /// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read.
-pub fn parquet_metadata(path: impl AsRef<Path>) -> Result<BTreeMap<String, String>, TableError> {
+pub fn parquet_metadata(path: impl AsRef<Path>) -> Result<Metadata, TableError> {
     Ok(Source::open(path.as_ref())?.key_values())
-}
-
-/// A column in the form polars writes.
-fn to_series(name: &str, column: &Column) -> Series {
-    match column {
-        Column::F64(values) => Series::new(name.into(), values),
-        Column::F32(values) => Series::new(name.into(), values),
-        Column::I64(values) => Series::new(name.into(), values),
-        Column::U32(values) => Series::new(name.into(), values),
-        Column::Text(values) => Series::new(name.into(), values),
-    }
 }
 
 /// An open file with its parsed footer.
@@ -146,7 +141,7 @@ impl<'a> Source<'a> {
             path: path.into(),
             source,
         };
-        let length = |about: Metadata| {
+        let length = |about: fs::Metadata| {
             if about.is_file() {
                 return Ok(about.len());
             }
@@ -156,9 +151,13 @@ impl<'a> Source<'a> {
             })
         };
         // Before it is opened, which would wait for the writer of a pipe, and for what was opened.
-        std::fs::metadata(path).map_err(io).and_then(length)?;
+        fs::metadata(path).map_err(io).and_then(length)?;
         let mut file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io).and_then(length)?;
+        check_footer(&mut file, length).map_err(|detail| TableError::Damaged {
+            path: path.into(),
+            detail,
+        })?;
         let (footer, fields) = guarded(path, "footer", || {
             let mut reader = ParquetReader::new(&mut file);
             let fields = reader.schema()?.iter_values().cloned().collect();
@@ -228,7 +227,7 @@ impl<'a> Source<'a> {
     }
 
     /// The file's own key-value metadata, without the schema that Arrow keeps there.
-    fn key_values(&self) -> BTreeMap<String, String> {
+    fn key_values(&self) -> Metadata {
         let pairs = self.footer.key_value_metadata().iter().flatten();
         pairs
             .filter(|pair| pair.key != SCHEMA_KEY)
@@ -248,7 +247,7 @@ impl<'a> Source<'a> {
         };
         let field = ArrowField::new(field.name.clone(), decoded, field.is_nullable);
         let footer = self.footer.clone();
-        let mut column = empty_column(&field.dtype, footer.num_rows);
+        let mut column = Series::new_empty(field.name.clone(), &DataType::from_arrow_field(&field));
         for (number, group) in footer.row_groups.iter().enumerate() {
             let place = format!("column `{name}`, row group {number}");
             let damaged = |detail| TableError::Damaged {
@@ -286,9 +285,16 @@ impl<'a> Source<'a> {
             }
             let left = self.text_left.checked_sub(text_bytes(&series));
             self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
-            append(&mut column, path, &series)?;
+            column = match number {
+                0 => series,
+                _ => {
+                    let joined = column.append(&series);
+                    joined.map_err(|error| damaged(error.to_string()))?;
+                    column
+                }
+            };
         }
-        Ok(column)
+        with_missing(path, column)
     }
 
     /// The bytes from `start`, as many as `size`, after checking that the file has them.
@@ -311,6 +317,26 @@ impl<'a> Source<'a> {
             .and_then(|_| self.file.read_exact(&mut bytes))
             .map_err(|error| error.to_string())?;
         Ok(bytes)
+    }
+}
+
+/// Checks the length of a footer, which takes several times as much memory once it is read. The last eight
+/// bytes of a file are that length and a mark.
+fn check_footer(file: &mut File, length: u64) -> Result<(), String> {
+    let mut end = [0; 8];
+    if length >= 8 {
+        file.seek(SeekFrom::Start(length - 8))
+            .and_then(|_| file.read_exact(&mut end))
+            .map_err(|error| error.to_string())?;
+    }
+    let [a, b, c, d, mark @ ..] = end;
+    let found = u32::from_le_bytes([a, b, c, d]);
+    // Of a file without the mark the reader says what it is not.
+    match &mark == b"PAR1" && found > MAX_FOOTER {
+        true => Err(format!(
+            "found a footer of {found} bytes, expected at most {MAX_FOOTER}"
+        )),
+        false => Ok(()),
     }
 }
 
@@ -452,7 +478,7 @@ fn silently<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
     result
 }
 
-/// The type into which a column declared as `declared` is decoded, if a [`Column`] can hold it.
+/// The type into which a column declared as `declared` is decoded, if it is one that is read.
 fn decoded_type(declared: &ArrowDataType) -> Option<ArrowDataType> {
     use ArrowDataType as Type;
     match declared {
@@ -473,91 +499,31 @@ fn decoded_type(declared: &ArrowDataType) -> Option<ArrowDataType> {
     }
 }
 
-/// A column without rows for values of the type `decoded`, with room for `rows`.
-fn empty_column(decoded: &ArrowDataType, rows: usize) -> Column {
-    match decoded {
-        ArrowDataType::Float64 => Column::F64(Vec::with_capacity(rows)),
-        ArrowDataType::Float32 => Column::F32(Vec::with_capacity(rows)),
-        ArrowDataType::UInt32 | ArrowDataType::Boolean => Column::U32(Vec::with_capacity(rows)),
-        ArrowDataType::Utf8View => Column::Text(Vec::with_capacity(rows)),
-        _ => Column::I64(Vec::with_capacity(rows)),
-    }
-}
-
-/// Appends the decoded `series` to the column it belongs to.
-fn append(column: &mut Column, path: &Path, series: &Series) -> Result<(), TableError> {
-    let name = series.name().as_str();
-    if series.null_count() > 0 && !series.dtype().is_float() {
-        return Err(TableError::MissingValues {
-            path: path.into(),
-            column: name.into(),
-            count: series.null_count(),
-        });
-    }
-    let decoded = match column {
-        Column::F64(values) => series
-            .f64()
-            .map(|chunks| extend(values, chunks, f64::NAN, |v| v)),
-        Column::F32(values) => series
-            .f32()
-            .map(|chunks| extend(values, chunks, f32::NAN, |v| v)),
-        Column::U32(values) if *series.dtype() == DataType::Boolean => series
-            .bool()
-            .map(|flags| values.extend(flags.iter().flatten().map(u32::from))),
-        Column::U32(values) => series.u32().map(|chunks| extend(values, chunks, 0, |v| v)),
-        Column::I64(values) => match series.dtype() {
-            DataType::Int32 => series
-                .i32()
-                .map(|chunks| extend(values, chunks, 0, i64::from)),
-            DataType::UInt64 => {
-                let chunks = series
-                    .u64()
-                    .map_err(|error| unexpected(path, name, &error))?;
-                for value in chunks.iter().flatten() {
-                    values.push(i64::try_from(value).map_err(|_| TableError::TooLarge {
-                        path: path.into(),
-                        column: name.into(),
-                        row: values.len(),
-                        value,
-                    })?);
-                }
-                Ok(())
-            }
-            _ => series.i64().map(|chunks| extend(values, chunks, 0, |v| v)),
-        },
-        Column::Text(values) => series
-            .str()
-            .map(|texts| values.extend(texts.iter().flatten().map(str::to_owned))),
+/// The column, in which missing floats are NaN.
+fn with_missing(path: &Path, column: Series) -> Result<Column, TableError> {
+    let name = column.name().to_string();
+    let filled = match (column.null_count(), column.dtype()) {
+        (0, _) => return Ok(column.into()),
+        (_, DataType::Float64) => filled(column.f64(), f64::NAN),
+        (_, DataType::Float32) => filled(column.f32(), f32::NAN),
+        (count, _) => {
+            return Err(TableError::MissingValues {
+                path: path.into(),
+                column: name,
+                count,
+            });
+        }
     };
-    decoded.map_err(|error| unexpected(path, name, &error))
-}
-
-/// A decoder returned another type than the one asked for.
-fn unexpected(path: &Path, name: &str, error: &PolarsError) -> TableError {
-    TableError::Damaged {
+    filled.map_err(|error| TableError::Damaged {
         path: path.into(),
         detail: format!("column `{name}`: {error}"),
-    }
+    })
 }
 
-/// Appends numbers, converted by `convert`, with `missing` where there are none.
-fn extend<T, V: Copy>(
-    values: &mut Vec<V>,
-    chunks: &ChunkedArray<T>,
-    missing: V,
-    convert: impl Fn(T::Native) -> V,
-) where
+fn filled<T>(values: PolarsResult<&ChunkedArray<T>>, missing: T::Native) -> PolarsResult<Column>
+where
     T: PolarsNumericType,
+    ChunkedArray<T>: ChunkFillNullValue<T::Native> + IntoSeries,
 {
-    for chunk in chunks.downcast_iter() {
-        if chunk.validity().is_none() {
-            values.extend(chunk.values().iter().map(|&value| convert(value)));
-        } else {
-            values.extend(
-                chunk
-                    .iter()
-                    .map(|value| value.map_or(missing, |&value| convert(value))),
-            );
-        }
-    }
+    Ok(values?.fill_null_with_values(missing)?.into_series().into())
 }

@@ -3,6 +3,8 @@
 
 use std::fs;
 
+use shearq_tables::polars::df;
+
 use crate::support::{PACKED, Small, fits_image, floats, pixels_of};
 
 const RAW: [&str; 2] = ["--submission", "23/raw/star"];
@@ -113,9 +115,8 @@ fn images_of_other_shapes_and_types_work_or_are_refused() {
         refuse(&small, first, &bytes, &RAW, expected);
     }
     let table = small.at("data/set02/table.fits");
-    let columns = vec![("a".to_owned(), shearq::io::table::Column::Real(vec![1.0]))];
-    let table_of = shearq::io::table::Table::new(columns).unwrap();
-    shearq::io::fits::write_table(&table, &table_of, &[]).unwrap();
+    let columns = df!("a" => [1.0]).unwrap();
+    shearq::io::fits::write_table(&table, &columns, &[]).unwrap();
     let expected = ["the first extension is a table; expected a two-dimensional image"];
     refuse(&small, first, &fs::read(&table).unwrap(), &RAW, &expected);
 

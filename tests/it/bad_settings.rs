@@ -94,7 +94,7 @@ fn layouts_with_mistakes_are_refused_with_file_and_place() {
         ("stamp = 0\n", "`stamp` is 0; expected 1 to 1024 pixels"),
         (
             "field_degrees = 0.0\n",
-            "`field_degrees` is 0; expected a positive number",
+            "`field_degrees` is 0.0; expected 0.001 to 360",
         ),
         ("field_degrees = nan\n", "`field_degrees` is NaN"),
         (

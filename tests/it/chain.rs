@@ -73,7 +73,7 @@ fn results_are_the_same_bytes_for_any_number_of_threads_and_after_a_resumed_run(
 fn the_chain_ends_in_scores_that_every_format_carries() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
-    simulate(&at("data"), "8", "4", "2");
+    simulate(&at("data"), "8", "8", "2");
     let own = at("own.toml");
     fs::write(&own, "extends = \"23/raw/star\"\n[stamp]\nsize = 21\n").unwrap();
     for (submission, out) in [("23/raw/star", "raw"), (text(&own), "own")] {
@@ -103,7 +103,7 @@ fn the_chain_ends_in_scores_that_every_format_carries() {
     let q = row["q"].as_f64().unwrap();
     assert!(q > 0.0 && row["q_error"].as_f64().unwrap() > 0.0);
     assert_eq!(row["set"], "08");
-    assert_eq!(row["images"], 4.0);
+    assert_eq!(row["images"], 8.0);
     assert!(
         score("csv")
             .lines()

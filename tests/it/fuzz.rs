@@ -12,8 +12,8 @@ use shearq::io::run::Run;
 use shearq::io::table;
 use shearq::pipeline::images::ImageId;
 use shearq::pipeline::measure::ImageSource;
+use shearq::results::foreign::Foreign;
 use shearq::submit::challenge::{Kind, read_spectrum};
-use shearq::submit::foreign::Foreign;
 use shearq_submissions::{Registry, Submission};
 
 use crate::bad_images::gzip;

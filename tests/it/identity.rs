@@ -36,7 +36,7 @@ fn numbers(count: usize) -> Vec<f64> {
 #[test]
 fn every_number_is_read_as_it_was_written() {
     let folder = tempfile::tempdir().unwrap();
-    let numbers = numbers(100_000);
+    let numbers = numbers(40_000);
     let bits = |numbers: &[f64]| numbers.iter().map(|n| n.to_bits()).collect::<Vec<_>>();
     let path = folder.path().join("numbers.json");
     write_record(&path, &numbers).unwrap();

@@ -12,6 +12,7 @@ mod galsim_galaxies;
 mod galsim_measured;
 mod identity;
 mod killed;
+mod limits;
 mod odd_files;
 mod orientation;
 mod own_images;

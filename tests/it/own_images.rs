@@ -43,9 +43,9 @@ fn columns(small: &Small) -> Vec<Vec<u64>> {
     for image in 1..=2 {
         let path = small.at(&format!("out/set02/catalogue-{image:03}.parquet"));
         let names = ["x", "y", "e1", "e2", "flag"];
-        let mut table = table::read(&path, Some(&names), table::MAX_ROWS).unwrap();
+        let table = table::read(&path, Some(&names), table::MAX_ROWS).unwrap();
         for name in names {
-            let values = table.require(name, &path).unwrap();
+            let values = table::numbers(&table, name, &path).unwrap();
             columns.push(values.iter().map(|value| value.to_bits()).collect());
         }
     }

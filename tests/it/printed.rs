@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use shearq::io::run::Run;
-use shearq::io::store;
+use shearq::results::store;
 
 use crate::support::{Small, fail, run_simulated, shearq, succeed, text};
 

@@ -305,15 +305,15 @@ fn differences_are_given_only_for_the_same_images() {
         ]);
         serde_json::from_str(&out).unwrap()
     };
-    assert!(compare()["rows"][1]["sigma"].is_number());
+    assert!(compare()["rows"][1]["q_difference"].is_number());
     fs::remove_file(other.join("set08/catalogue-001.parquet")).unwrap();
     fs::remove_file(packed.at("out").join("set08/catalogue-003.parquet")).unwrap();
     let table = compare();
-    assert!(table["rows"][1]["sigma"].is_null(), "{table}");
+    assert!(table["rows"][1]["q_difference"].is_null(), "{table}");
     assert!(
         table["notes"]
             .to_string()
-            .contains("the same ones as the first")
+            .contains("it needs the same images as the first")
     );
 }
 

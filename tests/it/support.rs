@@ -160,8 +160,8 @@ impl Small {
     /// A column of the first image's catalogue in `out`.
     pub fn measured(&self, set: &str, column: &str) -> Vec<f64> {
         let path = self.at(&format!("out/set{set}/catalogue-001.parquet"));
-        let mut table = table::read(&path, None, table::MAX_ROWS).expect("a catalogue");
-        table.take_real(column).expect("a column of it")
+        let table = table::read(&path, None, table::MAX_ROWS).expect("a catalogue");
+        table::numbers(&table, column, &path).expect("a column of it")
     }
 }
 

@@ -11,7 +11,7 @@ use shearq_scoring::Grid;
 use super::file::File;
 use super::tiles::Tiles;
 use crate::io::error::FileError;
-use crate::io::table::{Column, Table};
+use shearq_tables::polars::{Column, DataFrame};
 
 /// Largest image side accepted, against absurd sizes in damaged headers.
 pub const MAX_SIDE: usize = 200_000;
@@ -168,7 +168,7 @@ struct Description {
 ///
 /// # Errors
 /// Where the file cannot be read, holds no table, or lacks a column.
-pub fn read_table(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileError> {
+pub fn read_table(path: &Path, wanted: Option<&[&str]>) -> Result<DataFrame, FileError> {
     let mut file = File::open(path, "table")?;
     while file.is_image()? {
         if !file.next()? {
@@ -210,10 +210,10 @@ pub fn read_table(path: &Path, wanted: Option<&[&str]>) -> Result<Table, FileErr
     }
     let columns = chosen
         .into_iter()
-        .map(|column| Ok((column.name.clone(), read_column(&file, column, rows)?)))
+        .map(|column| read_column(&file, column, rows))
         .collect::<Result<_, FileError>>()?;
     file.check_end()?;
-    Table::new(columns).map_err(|message| file.fault(message))
+    shearq_tables::frame(columns).map_err(|error| file.fault(error.to_string()))
 }
 
 /// Text values of the header of a file's first extension, of those of `keys` that are there.
@@ -307,7 +307,8 @@ fn read_column(file: &File, description: &Description, rows: usize) -> Result<Co
                 f64::from(value)
             }
         };
-        return Ok(Column::Real(values.into_iter().map(real).collect()));
+        let values: Vec<f64> = values.into_iter().map(real).collect();
+        return Ok(Column::new(description.name.as_str().into(), values));
     }
     let mut values = vec![0.0; rows];
     // SAFETY: the file is open, and there is room for all the rows.
@@ -324,5 +325,5 @@ fn read_column(file: &File, description: &Description, rows: usize) -> Result<Co
             status,
         );
     })?;
-    Ok(Column::Real(values))
+    Ok(Column::new(description.name.as_str().into(), values))
 }

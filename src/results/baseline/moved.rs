@@ -1,28 +1,10 @@
-//! Baselines: measuring what one holds, and telling what moved.
+//! What moved since a baseline.
 
-use std::collections::BTreeMap;
-use std::path::Path;
+use shearq_submissions::{Registry, Submission};
 
-use shearq_scoring::{Figures, Options};
-use shearq_submissions::Submission;
-
-use super::engine::Progress;
-use super::images::{self, ImageId};
-use super::measure::measure_folder;
-use super::record::set_record;
-use super::run::run_folder;
-use super::score::{OWN, score_folder};
-use super::{PipelineError, engine};
-use crate::io::atomic::Scratch;
-use crate::io::baseline::{BaselineSet, BaselineSubmission};
-use crate::io::fingerprint;
-use crate::io::layout::DataFolder;
-use crate::io::run::{Run, Source, differences};
-use crate::io::store::SetRecord;
-use crate::io::table::{self, Format, MAX_ROWS};
-
-/// Names of the scatter of either component of the ellipticity.
-const SCATTER: [&str; 2] = ["scatter_e1", "scatter_e2"];
+use super::measured::{SCATTER, Wanted};
+use super::{Baseline, BaselineSet, BaselineSubmission};
+use crate::io::run::differences;
 
 /// Figures that must not move.
 const CHECKED: [&str; 5] = ["q", "m_half", "sqrt_a", SCATTER[0], SCATTER[1]];
@@ -37,150 +19,6 @@ pub const TOLERANCE: f64 = 1e-4;
 
 /// The same in units of the figure's standard error, for figures that are nearly zero.
 pub const TOLERANCE_SIGMA: f64 = 1e-3;
-
-/// What a submission has of the sets and images it is to be measured on.
-pub struct Wanted {
-    /// Set number.
-    pub set: u32,
-    /// Number of images, which are numbered from 1.
-    pub images: u32,
-}
-
-/// Measures a submission into a folder that is removed again, and takes its figures. `source` is as in a
-/// record in the folder `beside`.
-///
-/// # Errors
-/// Where data are absent or damaged, or nothing can be written to the temporary folder.
-pub fn measure(
-    source: &Source,
-    beside: &Path,
-    submission: &Submission,
-    wanted: &[Wanted],
-    threads: usize,
-    progress: &mut dyn Progress,
-) -> Result<Vec<BaselineSet>, PipelineError> {
-    let folder = Scratch::new()?;
-    let out = folder.path();
-    let source = source.moved(beside, out)?;
-    let run = Run::new(source, submission.clone(), Format::default());
-    match &run.source {
-        Source::Simulated(settings) => {
-            let images: Vec<ImageId> = wanted
-                .iter()
-                .flat_map(|w| images::of_simulation(&[w.set], w.images))
-                .collect();
-            run_folder(&run, *settings, &images, out, threads, progress)?;
-        }
-        Source::Folder { .. } => {
-            let sets: Vec<u32> = wanted.iter().map(|w| w.set).collect();
-            let data = run.source.data(out)?;
-            let asked = |id: &ImageId| {
-                let mut of_set = wanted.iter().filter(|w| w.set == id.set);
-                of_set.any(|w| id.image <= w.images)
-            };
-            let mut images = images::of_folder(&data, &sets)?;
-            images.retain(asked);
-            measure_folder(&run, &data, out, &images, threads, progress)?;
-        }
-    }
-    figures_of(&run, &run.source.data(out)?, out, threads)
-}
-
-/// Figures of every set in a folder of catalogues.
-///
-/// # Errors
-/// Where a file cannot be read, or there is nothing to score.
-pub fn figures_of(
-    run: &Run,
-    data: &DataFolder,
-    out: &Path,
-    threads: usize,
-) -> Result<Vec<BaselineSet>, PipelineError> {
-    let options = Options {
-        choice: OWN,
-        ..Options::default()
-    };
-    let scored = score_folder(data, out, run, &[], options, threads)?;
-    scored
-        .iter()
-        .map(|scored| {
-            let print = fingerprint::of_set(&run.source, data, scored.set, &scored.images)?;
-            let SetRecord {
-                set,
-                data,
-                images,
-                galaxies,
-                flagged,
-                figures,
-                errors,
-                ..
-            } = set_record(scored, print);
-            let mut all: BTreeMap<String, [f64; 2]> = Figures::ALL
-                .iter()
-                .zip(figures.values().into_iter().zip(errors.values()))
-                .map(|(figure, (value, error))| (figure.name.to_owned(), [value, error]))
-                .collect();
-            for (name, value) in SCATTER.iter().zip(scatter(run, out, set, threads)?) {
-                all.insert((*name).to_owned(), value);
-            }
-            Ok(BaselineSet {
-                set,
-                data,
-                images,
-                galaxies,
-                flagged,
-                figures: all,
-            })
-        })
-        .collect()
-}
-
-/// Rms of e1 and e2 over a set's galaxies that have an ellipticity, each with its standard error
-/// rms/√(2N).
-fn scatter(
-    run: &Run,
-    out: &Path,
-    set: u32,
-    threads: usize,
-) -> Result<[[f64; 2]; 2], PipelineError> {
-    let catalogues = run.catalogues(out, &[set])?.of_set(set);
-    let (mut squares, mut count) = ([0.0; 2], 0.0_f64);
-    engine::ordered(
-        threads,
-        |feeder| {
-            for (_, path) in catalogues {
-                if !feeder.push(path) {
-                    break;
-                }
-            }
-            Ok(())
-        },
-        || (),
-        |(), path| {
-            let mut table = table::read(&path, Some(&["e1", "e2"]), MAX_ROWS)?;
-            let (e1, e2) = (table.require("e1", &path)?, table.require("e2", &path)?);
-            let mut own = ([0.0; 2], 0.0);
-            for (e1, e2) in e1.iter().zip(&e2) {
-                if e1.is_finite() && e2.is_finite() {
-                    own.0[0] += e1 * e1;
-                    own.0[1] += e2 * e2;
-                    own.1 += 1.0;
-                }
-            }
-            Ok(own)
-        },
-        |(more, galaxies): ([f64; 2], f64)| {
-            squares[0] += more[0];
-            squares[1] += more[1];
-            count += galaxies;
-            Ok(())
-        },
-    )?;
-    Ok(squares.map(|sum| {
-        let rms = (sum / count).sqrt();
-        [rms, rms / (2.0 * count).sqrt()]
-    }))
-}
 
 /// A figure of a baseline, and what it is now.
 #[derive(Debug, Clone, PartialEq)]
@@ -227,8 +65,9 @@ pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift
             } else {
                 sigmas * error
             };
-            // A figure that is lost or an error that is unknown is a change too.
-            let within = difference.abs() <= allowed;
+            // On other data nothing can be told where an error is withheld; a figure that is lost is a change.
+            let untold = !same_data && error.is_nan() && difference.is_finite();
+            let within = untold || difference.abs() <= allowed;
             let neither = old[0].is_nan() && new[0].is_nan();
             Shift {
                 set: before.set,
@@ -263,6 +102,136 @@ pub fn settings_moved(
         .partition(|line| !line.contains(": null ≠ ")))
 }
 
+/// What a check found about one submission of a baseline.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Checked {
+    /// Name of the baseline.
+    pub baseline: String,
+    /// Name of the submission.
+    pub submission: String,
+    /// Every figure looked at.
+    pub shifts: Vec<Shift>,
+    /// Settings that are others now.
+    pub settings: Vec<String>,
+    /// What should be known and is no failure.
+    pub notes: Vec<String>,
+}
+
+impl Checked {
+    /// Whether anything moved.
+    pub fn failed(&self) -> bool {
+        !self.settings.is_empty() || self.shifts.iter().any(|shift| shift.moved)
+    }
+
+    /// What moved, a line each.
+    pub fn moved(&self) -> Vec<String> {
+        let settings = self
+            .settings
+            .iter()
+            .map(|line| format!("{}: setting {line}", self.submission));
+        let figures = self.shifts.iter().filter(|shift| shift.moved).map(|shift| {
+            format!(
+                "{} set {}: {} from {} to {}, {:+.2} σ",
+                self.submission,
+                shift.set,
+                shift.figure,
+                shift.before[0],
+                shift.now[0],
+                shift.sigma
+            )
+        });
+        settings.chain(figures).collect()
+    }
+}
+
+/// The submission that those with the method of `settings` rest on.
+fn base_of(settings: &toml::Table) -> &'static str {
+    match settings.get("method").and_then(toml::Value::as_str) {
+        Some("linear") => "48/linear/star",
+        _ => "paper",
+    }
+}
+
+/// The settings by which a submission of a baseline is measured again: the present ones of a named
+/// submission; those stored of another, in which what the baseline does not know is the base's.
+fn settings_now(
+    before: &BaselineSubmission,
+    registry: &Registry,
+) -> Result<Submission, anyhow::Error> {
+    if registry.names().contains(&before.name) {
+        return Ok(registry.get(&before.name)?.submission);
+    }
+    let base = registry.get(base_of(&before.settings))?.submission;
+    let mut all = toml::Table::try_from(&base)?;
+    for (key, value) in &before.settings {
+        match (all.get_mut(key), value) {
+            (Some(toml::Value::Table(section)), toml::Value::Table(own)) => {
+                section.extend(own.clone());
+            }
+            _ => {
+                all.insert(key.clone(), value.clone());
+            }
+        }
+    }
+    Ok(all.try_into()?)
+}
+
+/// Holds the submissions of the baseline `name` against what they are as `measure` measures them now; what
+/// was found, and the submissions as they are now.
+///
+/// # Errors
+/// Where settings are not valid, or something cannot be measured.
+pub fn check(
+    name: &str,
+    baseline: &Baseline,
+    sigmas: f64,
+    mut measure: impl FnMut(&Submission, &[Wanted]) -> anyhow::Result<Vec<BaselineSet>>,
+) -> anyhow::Result<(Vec<Checked>, Vec<BaselineSubmission>)> {
+    let registry = Registry::embedded()?;
+    let (mut checks, mut submissions) = (Vec::new(), Vec::new());
+    for before in &baseline.submissions {
+        let submission = settings_now(before, &registry)
+            .map_err(|error| error.context(format!("settings of {}", before.name)))?;
+        let (settings, new) = settings_moved(before, &submission).map_err(anyhow::Error::msg)?;
+        let mut check = Checked {
+            baseline: name.to_owned(),
+            submission: before.name.clone(),
+            shifts: Vec::new(),
+            settings,
+            notes: new
+                .iter()
+                .map(|line| format!("a setting is new: {line}"))
+                .collect(),
+        };
+        let wanted: Vec<Wanted> = before
+            .sets
+            .iter()
+            .map(|set| Wanted {
+                set: set.set,
+                images: set.images.len() as u32,
+            })
+            .collect();
+        let sets = measure(&submission, &wanted)?;
+        for old in &before.sets {
+            let Some(now) = sets.iter().find(|now| now.set == old.set) else {
+                anyhow::bail!("set {} was not measured again", old.set);
+            };
+            if now.data != old.data || now.images != old.images {
+                check.notes.push(format!(
+                    "the data of set {} are not the baseline's ({} images then, {} now); its figures may differ by {sigmas} σ",
+                    old.set,
+                    old.images.len(),
+                    now.images.len(),
+                ));
+            }
+            check.shifts.extend(shifts(old, now, sigmas));
+        }
+        submissions.push(BaselineSubmission::new(&submission, sets)?);
+        checks.push(check);
+    }
+    Ok((checks, submissions))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -288,6 +257,11 @@ mod tests {
         // 3 σ of the difference of two figures with errors of 2 is 8.5.
         assert!(!moved(&set("b", 88.0)) && moved(&set("b", 89.0)));
         assert!(moved(&set("a", f64::NAN)) && moved(&set("b", f64::NAN)));
+        let mut unsure = set("b", 1e9);
+        for value in unsure.figures.values_mut() {
+            value[1] = f64::NAN;
+        }
+        assert!(!moved(&unsure));
     }
 
     #[test]
