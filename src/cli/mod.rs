@@ -21,6 +21,7 @@ mod study;
 mod submissions;
 mod unpack;
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -63,9 +64,22 @@ enum Command {
     Submissions(submissions::Arguments),
 }
 
-/// Parses the arguments, runs the command and reports its error, if any, in one place.
+/// What the command found: done.
+const DONE: u8 = 0;
+/// It failed, or found something.
+const FAILED: u8 = 1;
+/// It was called wrongly.
+const MISUSED: u8 = 2;
+
+/// Runs the command that this process was started with.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    ExitCode::from(run_with(std::env::args_os()))
+}
+
+/// Parses the arguments, of which the first is the program's name, runs the command and reports its error, if
+/// any, in one place. Returns the exit code.
+pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
+    let cli = match Cli::try_parse_from(arguments) {
         Ok(cli) => cli,
         Err(message) => return usage(&message),
     };
@@ -89,22 +103,22 @@ pub fn main() -> ExitCode {
         Command::Submissions(arguments) => submissions::run(&arguments),
     };
     match result {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) if error.is::<Findings>() => ExitCode::FAILURE,
+        Ok(()) => DONE,
+        Err(error) if error.is::<Findings>() => FAILED,
         Err(error) => {
             tell(format_args!("error: {error:#}"));
-            ExitCode::FAILURE
+            FAILED
         }
     }
 }
 
 /// Prints help, the version or what is wrong with the arguments.
-fn usage(message: &clap::Error) -> ExitCode {
+fn usage(message: &clap::Error) -> u8 {
     match written(|| message.print()) {
-        Ok(()) => ExitCode::from(u8::try_from(message.exit_code()).unwrap_or(2)),
+        Ok(()) => u8::try_from(message.exit_code()).unwrap_or(MISUSED),
         Err(error) => {
             tell(format_args!("error: {error:#}"));
-            ExitCode::FAILURE
+            FAILED
         }
     }
 }

@@ -23,7 +23,7 @@ use crate::simulate::set::{
 /// Name of the record in a simulated data folder.
 pub const SIMULATION_FILE: &str = "simulation.json";
 /// Pixels a side of each star stamp where there is one per galaxy.
-pub(super) const STAR_STAMP: usize = 32;
+pub const STAR_STAMP: usize = 32;
 
 /// Settings of a simulation, as stored with its data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -184,7 +184,7 @@ pub(crate) fn place(stamp: &[f32], side: usize, ix: usize, n: usize, strip: &mut
 }
 
 /// A noise-free star stamp with a sum of one.
-pub(super) fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
+pub fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
     psf.stamp(side).iter().map(|&v| v as f32).collect()
 }
 

@@ -118,11 +118,29 @@ impl Registry {
     /// # Errors
     /// Where there is no such name or file, or it or what it extends is not valid.
     pub fn get(&self, name_or_path: &str) -> Result<Entry, SubmissionError> {
-        let link = self.find(name_or_path, None)?;
+        self.entry(self.find(name_or_path, None)?, name_or_path)
+    }
+
+    /// The submission of a settings file with this text. Errors speak of it as `path`, after which it is named
+    /// where it does not name itself, and relative to which it finds files that it extends.
+    ///
+    /// # Errors
+    /// Where the text, or what it extends, is not valid.
+    pub fn get_text(&self, path: &Path, text: &str) -> Result<Entry, SubmissionError> {
+        let link = Link {
+            file: File::parse(path, text)?,
+            path: path.to_owned(),
+            text: Some(text.to_owned()),
+        };
+        self.entry(link, &path.to_string_lossy())
+    }
+
+    /// What a file, called `asked`, resolves to.
+    fn entry(&self, link: Link, asked: &str) -> Result<Entry, SubmissionError> {
         let (published, extends) = (link.file.published, link.file.extends.clone());
         let (path, name) = (link.path.clone(), own_name(&link.file, &link.path));
         let description = link.file.description.clone().unwrap_or_default();
-        let settings = self.resolve(link, &mut vec![name_or_path.to_owned()])?;
+        let settings = self.resolve(link, &mut vec![asked.to_owned()])?;
         let submission =
             settings
                 .complete(name, description)
@@ -283,6 +301,22 @@ mod tests {
         assert_eq!(network.deconvolution.lambda, 0.5);
         assert!(entry.submission.wavelet().is_some());
         assert_eq!(entry.published, None);
+    }
+
+    #[test]
+    fn a_text_is_read_like_the_file_that_would_hold_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let registry = Registry::embedded().unwrap();
+        let text = "extends = \"48/linear/star\"\n[noise]\nsource = \"border\"\n";
+        let path = PathBuf::from(write(folder.path(), "own.toml", text));
+        let file = registry.get(&path.to_string_lossy()).unwrap();
+        assert_eq!(registry.get_text(&path, text).unwrap(), file);
+        let wrong = registry.get_text(&path, "extends = \"paper\"\n[stamp]\nsise = 2\n");
+        let message = wrong.unwrap_err().to_string();
+        assert!(
+            message.contains("own.toml") && message.contains("line 3"),
+            "{message}"
+        );
     }
 
     #[test]
