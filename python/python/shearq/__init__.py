@@ -1,0 +1,38 @@
+"""shearq: galaxy shapes for weak lensing from postage stamps and PSFs, and the figures of merit of shear challenges.
+
+>>> import shearq
+>>> cat = shearq.measure(stamps, psf, noise=sigma)     # (n, ny, nx), (py, px) and a number
+>>> cat["e1"], cat["R11"], cat["flags"]                # a structured array, calibrated by its mean response
+>>> cat.mean_shear()                                   # g1, g2 with errors
+
+Conventions: images are indexed [y, x]; e1 > 0 is elongation along +x, e2 > 0 along x = y; noise is a standard deviation
+per pixel in the image's unit; results do not depend on the number of threads, and are those of the command line.
+"""
+
+from . import adapters
+from ._measure import Catalogue, Flag, FunctionalPsf, MeanShear, measure
+from ._score import FIGURES, Score, compare, power_spectrum, score
+from ._shearq import __version__
+from ._simulate import SimulatedImage, Simulation, simulate
+from ._submissions import Submission, submission, submissions
+
+__all__ = [
+    "FIGURES",
+    "Catalogue",
+    "Flag",
+    "FunctionalPsf",
+    "MeanShear",
+    "Score",
+    "SimulatedImage",
+    "Simulation",
+    "Submission",
+    "__version__",
+    "adapters",
+    "compare",
+    "measure",
+    "power_spectrum",
+    "score",
+    "simulate",
+    "submission",
+    "submissions",
+]

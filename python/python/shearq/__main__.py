@@ -1,0 +1,17 @@
+"""The command line: ``python -m shearq`` and the script ``shearq`` are the same as the binary."""
+
+import signal
+import sys
+
+from ._shearq import run_command
+
+
+def main() -> int:
+    """Run the command line with the arguments of this process and return its exit code."""
+    # Python would only note an interrupt, and act on it when the command is done.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    return run_command(["shearq", *sys.argv[1:]])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,394 @@
+"""Ellipticities on a grid into spectra and figures of merit."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from . import _shearq
+from ._arrays import double, flat, real, shown, whole
+from ._submissions import submissions
+
+# Pixels a side of a cell where no positions tell otherwise; it then changes no figure.
+_CELL = 48.0
+
+FIGURES: dict[str, str] = {name: meaning for name, _, meaning in _shearq.figures()}
+
+
+class Score:
+    """Figures of merit of ellipticities against their true shear.
+
+    ``score["q"]`` is a figure, ``score.errors["q"]`` its standard error, NaN where unknown. ``docs/scoring.md``
+    derives them all.
+
+    Attributes
+    ----------
+    figures, errors : dict of str to float
+        ``q``: quality factor; ``q_dn``: without the noise's power; ``m_half``: M/2; ``sqrt_a``: √A in 10⁻⁴ (C_ℓ in
+        steradian); ``m_cross``: multiplicative bias by cross-correlation; ``m1``, ``m2``, ``c1``, ``c2``: biases of
+        the components; ``b_power``, ``eb_power``: mean C_ℓ of B and EB in 10⁻⁹ steradian.
+    spectrum : structured array of shape (20,)
+        Per bin: ``l`` in rad⁻¹, ``dln_l``, ``modes``, ``scored``, bandpowers ℓ²C_ℓ/2π ``ee``, ``bb``, ``eb``,
+        ``true_ee``, ``true_bb``, ``noise`` (NaN where unknown), and ``to_c_l``, by which they become C_ℓ in steradian.
+    images : int
+        Images averaged over.
+    noise_variance : float or None
+        Variance of the ellipticities' noise per component, galaxy and image.
+    convention : int
+        The one of the challenge's eight that the figures are in; 5 is e1 along +x, e2 along x = y.
+    q_leaderboard : float
+        The highest Q of all eight, as the challenge's leaderboard took it.
+    correlation : float
+        Of the E modes with the true ones over the scored bins.
+    mean : dict or None
+        Where the true shear is the same everywhere: mean ``e``, its ``error`` and the ``truth``, two components each.
+    replicates : array of shape (groups, 11)
+        Figures with each group of images left out, in the order of ``figures``; empty with one image.
+    notes : list of str
+        What was odd about the rows.
+    """
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        self.figures: dict[str, float] = found["figures"]
+        self.errors: dict[str, float] = found["errors"]
+        self.spectrum = _table(found["spectrum"])
+        self.images: int = found["images"]
+        self.noise_variance: float | None = found["noise_variance"]
+        self.convention: int = found["convention"]
+        self.q_leaderboard: float = found["q_leaderboard"]
+        self.correlation: float = found["correlation"]
+        self.replicates: np.ndarray = found["replicates"]
+        self.notes: list[str] = list(found["warnings"])
+        constant = found["constant"]
+        self.mean = None if constant is None else dict(zip(("e", "error", "truth"), map(tuple, constant)))
+        matched, meaning = found["matched"]
+        if found["matched_clearly"] and matched != self.convention:
+            self.notes.append(
+                f"Warning: the ellipticities match the truth in convention {matched} ({meaning}), and are scored in"
+                f" {self.convention}: mind the signs of e1 and e2 and the order of the axes."
+            )
+
+    def __getitem__(self, name: str) -> float:
+        try:
+            return self.figures[name]
+        except KeyError:
+            raise KeyError(f"there is no figure {name!r}; known figures: {', '.join(self.figures)}") from None
+
+    def to_dict(self) -> dict[str, float]:
+        """Figures, and their errors with ``_error`` after their names."""
+        errors = {f"{name}_error": error for name, error in self.errors.items()}
+        return {**self.figures, **errors}
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{name} = {self[name]:.4g} ± {self.errors[name]:.2g}" for name in ("q", "m_cross"))
+        return f"<shearq.Score of {self.images} image{'s' * (self.images != 1)}: {shown}>"
+
+
+def score(
+    e1: ArrayLike,
+    e2: ArrayLike,
+    truth_g1: ArrayLike,
+    truth_g2: ArrayLike,
+    *,
+    images: int | ArrayLike | None = None,
+    positions: tuple[ArrayLike, ArrayLike] | None = None,
+    stamp: float | None = None,
+    field_degrees: float = 10.0,
+    definition: str = "leaderboard",
+    convention: int | str = 5,
+    noise_variance: float | None = None,
+    truth_sign: str = "standard",
+) -> Score:
+    """Score ellipticities against the true shear.
+
+    Parameters
+    ----------
+    e1, e2 : array of shape (n, n), (n²,), (images, n, n) or (images, n²); any with positions
+        Ellipticities on the grid, indexed [y, x], or in that order; e1 > 0 along +x, e2 > 0 along x = y. Galaxies
+        without one are NaN and count as missing.
+    truth_g1, truth_g2 : array of shape (n, n) or (n²,)
+        True shear on the grid, indexed [y, x].
+    images : int or array, optional
+        Number of images that e1 and e2 hold one after the other, or the number of its image for each value.
+    positions : tuple of two arrays, optional
+        x and y of each galaxy, of the shape of e1: FITS pixels, the first pixel's centre at 1. They fall into cells
+        of `stamp` pixels.
+    stamp : float, optional
+        Pixels a side of a cell, with positions.
+    field_degrees : float
+        Side of the whole field in degrees.
+    definition : {'leaderboard', 'corrected'}
+        Bandpowers and Q as the challenge's program has them, or true azimuthal averages.
+    convention : int or {'matched', 'best'}
+        Signs and axes of the ellipticities, 1 to 8; that which matches the truth; or that with the highest Q.
+    noise_variance : float, optional
+        Variance of the ellipticities' noise per component, galaxy and image, for q_dn. Measured from the scatter
+        between images by default.
+    truth_sign : {'standard', 'challenge'}
+        'challenge' where truth_g2 is minus the standard one, as in the challenge's files.
+
+    Returns
+    -------
+    Score
+
+    Raises
+    ------
+    ValueError, TypeError
+        Where shapes do not fit, the truth is not finite, or ellipticities are other quantities.
+
+    Warns
+    -----
+    UserWarning
+        Of missing and repeated galaxies, |e| > 1, and ellipticities that match the truth with other signs.
+    """
+    g1, g2 = flat("truth_g1", truth_g1), flat("truth_g2", truth_g2)
+    if g1.shape != g2.shape:
+        raise ValueError(f"truth_g2: found {g2.size} values; expected {g1.size}, as truth_g1 has")
+    for name, truth in (("truth_g1", truth_g1), ("truth_g2", truth_g2)):
+        shape = np.shape(truth)
+        if len(shape) == 2 and shape[0] != shape[1]:
+            raise ValueError(f"{name}: found an array of shape {shown(shape)}; expected (n, n) or (n²,)")
+    n = _side("truth_g1", g1.size)
+    cell, rows, where, lengths = _rows(e1, e2, n, images, positions, stamp)
+    if truth_sign not in ("standard", "challenge"):
+        raise ValueError(f"truth_sign: found {truth_sign!r}; expected 'standard' or 'challenge'")
+    found = Score(
+        _shearq.score(
+            n,
+            cell,
+            real("field_degrees", field_degrees, "a positive number"),
+            (g1, g2),
+            truth_sign == "challenge",
+            rows,
+            where,
+            lengths,
+            _text("definition", definition),
+            _text("convention", convention),
+            None
+            if noise_variance is None
+            else real("noise_variance", noise_variance, "a finite number, zero or more", least=0.0),
+        )
+    )
+    for note in found.notes:
+        warnings.warn(note, stacklevel=2)
+    return found
+
+
+def power_spectrum(
+    e1: ArrayLike,
+    e2: ArrayLike,
+    *,
+    field_degrees: float = 10.0,
+    images: int | ArrayLike | None = None,
+    positions: tuple[ArrayLike, ArrayLike] | None = None,
+    stamp: float | None = None,
+    cells: int | None = None,
+    definition: str = "leaderboard",
+) -> np.ndarray:
+    """E, B and EB bandpowers of the mean of images.
+
+    Parameters
+    ----------
+    e1, e2, field_degrees, images, positions, stamp, definition
+        As for :func:`score`. Galaxies without an ellipticity count as zero.
+    cells : int, optional
+        Cells a side of the grid, where the shapes of e1 and e2 do not tell it.
+
+    Returns
+    -------
+    structured array of shape (20,)
+        ``l`` in rad⁻¹, ``dln_l``, ``modes``, ``scored`` (bins 2 to 9, that Q is made of), bandpowers ℓ²C_ℓ/2π ``ee``,
+        ``bb``, ``eb``, and ``to_c_l``, by which they become C_ℓ in steradian.
+    """
+    n = _cells(np.shape(e1), images, positions) if cells is None else whole("cells", cells, 1, 1 << 16)
+    cell, rows, where, lengths = _rows(e1, e2, n, images, positions, stamp)
+    degrees = real("field_degrees", field_degrees, "a positive number")
+    return _table(_shearq.spectrum(n, cell, degrees, rows, where, lengths, _text("definition", definition)))
+
+
+def compare(
+    catalogues: Mapping[str, Any],
+    truth: Any,
+    *,
+    frame: str | None = None,
+    **options: Any,
+) -> Any:
+    """Score several catalogues of the same galaxies, side by side.
+
+    Parameters
+    ----------
+    catalogues : mapping of str to Catalogue, or to a list of one per image
+        What to compare; anything with ``["e1"]`` and ``["e2"]`` in the order of the grid will do. The first is the
+        one that others are held against.
+    truth : tuple of two arrays, or a simulation
+        True shear, as for :func:`score`, or what :func:`simulate` returned.
+    frame : {'pandas', 'polars', 'list'}, optional
+        What to return. By default pandas, or polars where that is there and pandas is not, or else a list.
+    **options
+        As for :func:`score`.
+
+    Returns
+    -------
+    pandas.DataFrame, polars.DataFrame or list of dict
+        A row each: ``submission``, figures with their errors, ``q_difference`` to the first with its error, paired
+        over the same images, and its significance ``sigma``, ``q_leaderboard``, and the figures published for a
+        submission of that name.
+    """
+    make = _frame(frame)
+    if not isinstance(catalogues, Mapping):
+        raise TypeError(f"catalogues: found {type(catalogues).__name__}; expected a mapping of names to catalogues")
+    g1, g2 = (truth.g1, truth.g2) if hasattr(truth, "g1") and hasattr(truth, "g2") else _pair("truth", truth)
+    published = {name: s.published for name, s in submissions().items()}
+    scores: dict[str, Score] = {}
+    for name, given in catalogues.items():
+        parts = [given] if isinstance(given, (np.ndarray, Mapping)) or not isinstance(given, Sequence) else given
+        try:
+            e1, e2 = (np.stack([flat(f"catalogues[{name!r}]", part[column]) for part in parts]) for column in ("e1", "e2"))
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"catalogues: {name!r} has no images of e1 and e2 of one length: {error}; expected catalogues"
+            ) from None
+        scores[name] = score(e1, e2, g1, g2, **options)
+    rows = []
+    first = next(iter(scores.values()), None)
+    for name, scored in scores.items():
+        q = list(scored.figures).index("q")
+        paired = None
+        if scored is not first:
+            paired = _shearq.difference(
+                scored.images, first["q"], list(first.replicates[:, q]), scored["q"], list(scored.replicates[:, q])
+            )
+        difference, error = (math.nan, math.nan) if paired is None else paired
+        figures = {f"{key}_published": value for key, value in (published.get(name) or {}).items()}
+        missing = {f"{key}_published": math.nan for key in ("q", "m_half", "sqrt_a")}
+        rows.append(
+            {
+                "submission": name,
+                **scored.to_dict(),
+                "q_difference": difference,
+                "q_difference_error": error,
+                "sigma": difference / error if error else math.nan,
+                "q_leaderboard": scored.q_leaderboard,
+                **missing,
+                **figures,
+            }
+        )
+    return make(rows)
+
+
+def _frame(name: str | None) -> Any:
+    if name not in (None, "pandas", "polars", "list"):
+        raise ValueError(f"frame: found {name!r}; expected 'pandas', 'polars' or 'list'")
+    for library in ("pandas", "polars") if name is None else (name,):
+        if library == "list":
+            break
+        try:
+            return importlib.import_module(library).DataFrame
+        except ImportError:
+            if name is not None:
+                raise
+    return list
+
+
+def _table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """A structured array of columns."""
+    length = len(next(iter(columns.values())))
+    table = np.empty(length, dtype=[(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        table[name] = column
+    return table
+
+
+def _text(name: str, value: Any) -> str:
+    if isinstance(value, (str, int)) and not isinstance(value, bool):
+        return str(value)
+    raise TypeError(f"{name}: found {type(value).__name__}; expected a name or a number")
+
+
+def _side(name: str, cells: int) -> int:
+    side = math.isqrt(cells)
+    if side * side != cells:
+        raise ValueError(f"{name}: found {cells} values; expected those of a square grid, n²")
+    return side
+
+
+def _pair(name: str, value: Any) -> tuple[Any, Any]:
+    try:
+        first, second = value
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: found {type(value).__name__}; expected two arrays") from None
+    return first, second
+
+
+def _cells(shape: tuple[int, ...], images: Any, positions: Any) -> int:
+    """Cells a side of the grid of an array of this shape."""
+    if positions is not None or (images is not None and np.ndim(images) != 0):
+        raise ValueError("cells: not given; expected the cells a side of the grid, which positions do not tell")
+    if images is not None:
+        number = whole("images", images, 1, 1 << 32)
+        return _side("e1", math.prod(shape) // number)
+    if len(shape) == 3 or (len(shape) == 2 and shape[0] == shape[1]):
+        return shape[-1]
+    return _side("e1", shape[-1] if shape else 1)
+
+
+_Pair = tuple[np.ndarray, np.ndarray]
+
+
+def _rows(
+    e1: ArrayLike, e2: ArrayLike, n: int, images: Any, positions: Any, stamp: float | None
+) -> tuple[float, _Pair, _Pair | None, list[int]]:
+    """Pixels a side of a cell, the ellipticities and positions image by image, and how many each image has."""
+    e1, e2 = double("e1", e1), double("e2", e2)
+    if e1.shape != e2.shape:
+        raise ValueError(f"e2: found an array of shape {shown(e2.shape)}; expected {shown(e1.shape)}, as e1 has")
+    cells, cell, where = n * n, _CELL, None
+    if positions is not None:
+        x, y = (double("positions", each) for each in _pair("positions", positions))
+        if x.shape != e1.shape or y.shape != e1.shape:
+            raise ValueError(
+                f"positions: found arrays of shapes {shown(x.shape)} and {shown(y.shape)}; expected {shown(e1.shape)}, as e1 has"
+            )
+        if stamp is None:
+            raise ValueError("stamp: not given; expected the pixels a side of a cell, with positions")
+        where = (x.reshape(-1), y.reshape(-1))
+    if stamp is not None:
+        cell = real("stamp", stamp, "a positive number of pixels")
+    rows = (e1.reshape(-1), e2.reshape(-1))
+    if images is not None and np.ndim(images) > 0:
+        labels = np.asarray(images)
+        if labels.dtype.kind not in "iu" or labels.shape != e1.shape:
+            raise ValueError(
+                f"images: found {labels.dtype} of shape {shown(labels.shape)}; expected one number, or whole numbers of shape {shown(e1.shape)}, as e1 has"
+            )
+        labels = labels.reshape(-1)
+        order = np.argsort(labels, kind="stable")
+        rows = (rows[0][order], rows[1][order])
+        where = None if where is None else (where[0][order], where[1][order])
+        lengths = np.unique(labels, return_counts=True)[1].tolist()
+    elif images is not None:
+        number = whole("images", images, 1, 1 << 32)
+        if e1.size % number != 0:
+            raise ValueError(f"images: found {number}; expected a divisor of the {e1.size} values of e1")
+        lengths = [e1.size // number] * number
+    elif where is not None:
+        lengths = [e1.shape[1]] * e1.shape[0] if e1.ndim == 2 else [e1.size]
+    elif e1.shape in ((n, n), (cells,)):
+        lengths = [cells]
+    else:
+        lengths = [cells] * (e1.size // cells if cells else 0)
+        if e1.shape not in ((len(lengths), cells), (len(lengths), n, n)):
+            raise ValueError(
+                f"e1: found an array of shape {shown(e1.shape)}; expected ({n}, {n}), ({cells},), or (images, {n}, {n}), (images, {cells}), as the grid has {n} × {n} cells"
+            )
+    if where is None and any(length != cells for length in lengths):
+        raise ValueError(
+            f"e1: found an image of {next(length for length in lengths if length != cells)} values; expected {cells}, as the grid has, or positions"
+        )
+    return cell, rows, where, lengths

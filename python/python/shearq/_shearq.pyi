@@ -1,0 +1,95 @@
+"""What the package's modules call: use the functions of :mod:`shearq` instead."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Doubles = NDArray[np.float64]
+
+__version__: str
+
+class Submission:
+    @staticmethod
+    def named(name: str) -> Submission: ...
+    @staticmethod
+    def text(text: str) -> Submission: ...
+    @staticmethod
+    def json(text: str) -> Submission: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def description(self) -> str: ...
+    @property
+    def extends(self) -> str | None: ...
+    @property
+    def published(self) -> tuple[float, float, float] | None: ...
+    @property
+    def settings(self) -> str: ...
+    @property
+    def toml(self) -> str: ...
+    @property
+    def sizes(self) -> tuple[int, int]: ...
+    @property
+    def functional(self) -> bool: ...
+    @property
+    def needs_noise(self) -> bool: ...
+    @property
+    def ellipticity(self) -> str: ...
+
+def names() -> list[str]: ...
+def run_command(arguments: Sequence[str]) -> int: ...
+def flags() -> list[tuple[str, int, str]]: ...
+def measure(
+    stamps: NDArray[Any],
+    star: _Doubles | None,
+    stars: NDArray[Any] | None,
+    formulas: _Doubles | None,
+    noise: float | None,
+    noises: _Doubles | None,
+    submission: Submission,
+    threads_asked: int | None,
+    progress: Callable[[int], object] | None,
+) -> tuple[dict[str, NDArray[Any]], list[float] | None]: ...
+def figures() -> list[tuple[str, str, str]]: ...
+def score(
+    n: int,
+    stamp: float,
+    field_degrees: float,
+    truth: tuple[_Doubles, _Doubles],
+    challenge_sign: bool,
+    e: tuple[_Doubles, _Doubles],
+    positions: tuple[_Doubles, _Doubles] | None,
+    lengths: Sequence[int],
+    definition: str,
+    convention: str,
+    noise_variance: float | None,
+) -> dict[str, Any]: ...
+def spectrum(
+    n: int,
+    stamp: float,
+    field_degrees: float,
+    e: tuple[_Doubles, _Doubles],
+    positions: tuple[_Doubles, _Doubles] | None,
+    lengths: Sequence[int],
+    definition: str,
+) -> dict[str, NDArray[Any]]: ...
+def difference(
+    images: int,
+    first: float,
+    first_replicates: Sequence[float],
+    second: float,
+    second_replicates: Sequence[float],
+) -> tuple[float, float] | None: ...
+def simulate(
+    set: int,
+    images: Sequence[int],
+    seed: int,
+    grid: int,
+    amplitude: float,
+    tilt: float,
+    intrinsic_sigma: float | None,
+    threads_asked: int | None,
+    progress: Callable[[int], object] | None,
+) -> dict[str, Any]: ...

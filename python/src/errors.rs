@@ -1,0 +1,59 @@
+//! Errors of the crates as exceptions that name the argument they are about.
+
+use pyo3::PyErr;
+use pyo3::exceptions::{PyKeyError, PyMemoryError, PyRuntimeError, PyValueError};
+use shearq::pipeline::PipelineError;
+use shearq_measure::MeasureError;
+use shearq_scoring::ScoringError;
+use shearq_submissions::SubmissionError;
+
+/// What is wrong with stamps, PSFs, the noise or the submission.
+pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
+    let argument = match &error {
+        MeasureError::Submission(_) => {
+            let MeasureError::Submission(error) = error else {
+                unreachable!("it was matched")
+            };
+            return of_submission(error);
+        }
+        MeasureError::Noise(_) => "noise",
+        MeasureError::Shape { what, .. } | MeasureError::NotFinite { what, .. }
+            if !what.contains("PSF") =>
+        {
+            "stamps"
+        }
+        _ => "psf",
+    };
+    PyValueError::new_err(format!("{argument}: {error}"))
+}
+
+/// What is wrong with a submission: its name, or its settings.
+pub(crate) fn of_submission(error: SubmissionError) -> PyErr {
+    let message = format!("submission: {error}");
+    match error {
+        SubmissionError::Unknown { .. } => PyKeyError::new_err(message),
+        _ => PyValueError::new_err(message),
+    }
+}
+
+/// What is wrong with what is to be scored.
+pub(crate) fn of_scoring(error: ScoringError) -> PyErr {
+    PyValueError::new_err(error.to_string())
+}
+
+/// What stopped the engine.
+pub(crate) fn of_pipeline(error: PipelineError) -> PyErr {
+    match error {
+        PipelineError::Measure(error) => of_measuring(error),
+        PipelineError::Scoring { source, .. } => of_scoring(source),
+        PipelineError::Request(message) => PyValueError::new_err(message),
+        other @ (PipelineError::File(_) | PipelineError::Threads(_)) => {
+            PyRuntimeError::new_err(other.to_string())
+        }
+    }
+}
+
+/// Room that there is not.
+pub(crate) fn no_memory(what: &str) -> PyErr {
+    PyMemoryError::new_err(format!("there is no memory for {what}"))
+}

@@ -1,0 +1,330 @@
+//! Stamps and PSFs into calibrated ellipticities.
+
+use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
+use numpy::{IntoPyArray, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use shearq::pipeline::engine;
+use shearq_measure::{
+    Flag, FunctionalPsf, MeasureError, Measurement, Measurer, Pixel, PsfProfile, Psfs, Worker,
+    calibrate, star_psf,
+};
+use shearq_scoring::Shear;
+
+use crate::errors::{no_memory, of_measuring};
+use crate::stamps::{Borrowed, Piece, Stamps};
+use crate::submissions::Submission;
+use crate::work::{Failure, Watch, threads};
+
+/// Stamps that a worker takes at a time: enough that handing them out costs nothing, few enough that copies
+/// of them, where they have to be made, are small.
+const PIECE: usize = 64;
+
+/// PSFs of all stamps.
+enum AllPsfs<'a> {
+    Shared(ArrayView2<'a, f64>),
+    Stars(Stamps<'a>),
+    Formulas(Vec<FunctionalPsf>),
+}
+
+/// PSFs of a piece.
+enum SomePsfs<'a> {
+    Shared(ArrayView2<'a, f64>),
+    Stars(Piece<'a>),
+    Formulas(&'a [FunctionalPsf]),
+}
+
+/// Noise levels of all stamps, or of a piece.
+#[derive(Clone, Copy)]
+enum Noise<'a> {
+    One(Option<f64>),
+    Each(&'a [f64]),
+}
+
+impl<'a> Noise<'a> {
+    fn piece(self, start: usize, end: usize) -> Self {
+        match self {
+            Noise::One(level) => Noise::One(level),
+            Noise::Each(levels) => Noise::Each(&levels[start..end]),
+        }
+    }
+}
+
+/// Some stamps with all that is needed to measure them.
+struct Job<'a> {
+    stamps: Piece<'a>,
+    psfs: SomePsfs<'a>,
+    noise: Noise<'a>,
+}
+
+/// Measures stamps `(n, ny, nx)` with a star stamp for all, star stamps one each, or formulas (FWHM, e1, e2 and
+/// β, which is not a number for Kolmogorov), one or one each; and a noise level for all or one each. Returns the
+/// catalogue's columns and the mean response that the ellipticities were divided by.
+#[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
+pub(crate) fn measure<'py>(
+    py: Python<'py>,
+    stamps: &Bound<'py, PyAny>,
+    star: Option<PyReadonlyArray2<'py, f64>>,
+    stars: Option<&Bound<'py, PyAny>>,
+    formulas: Option<PyReadonlyArray2<'py, f64>>,
+    noise: Option<f64>,
+    noises: Option<PyReadonlyArray1<'py, f64>>,
+    submission: &Bound<'py, Submission>,
+    threads_asked: Option<u16>,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<(Bound<'py, PyDict>, Option<[f64; 2]>)> {
+    let submission = &submission.get().entry.submission;
+    let stamps = Borrowed::new(stamps)?;
+    let (count, rows, columns) = stamps.dim();
+    let stamps = stamps.shared();
+    let measurer = Measurer::new(submission, rows).map_err(of_measuring)?;
+    let size = submission.psf.size;
+    let stars = stars.map(Borrowed::new).transpose()?;
+    let noise = match &noises {
+        None => Noise::One(noise),
+        Some(levels) => Noise::Each(levels.as_slice()?),
+    };
+
+    // A batch of no stamps finds all that is wrong with the request, before the work begins.
+    let none = Array3::<f64>::zeros((0, rows, columns));
+    let level = match noise {
+        Noise::One(level) => level,
+        Noise::Each(levels) => Some(worst(levels)),
+    };
+    let look = |psfs: Psfs<'_, f64>| {
+        if rows != columns {
+            return Err(MeasureError::Shape {
+                what: "stamps",
+                found: format!("{rows} × {columns} pixels"),
+                expected: "squares".into(),
+            });
+        }
+        measurer.batch(none.view(), psfs, level).map(|_| ())
+    };
+    let prepared;
+    let psfs = match (star, &stars, formulas) {
+        (Some(star), None, None) => {
+            look(Psfs::Star(star.as_array())).map_err(of_measuring)?;
+            prepared = star_psf(star.as_array(), size).map_err(of_measuring)?;
+            AllPsfs::Shared(prepared.view())
+        }
+        (None, Some(stars), None) => {
+            let (given, rows, columns) = stars.dim();
+            one_each("psf", given, count)?;
+            if rows < size || columns < size {
+                return Err(PyValueError::new_err(format!(
+                    "psf: PSF stamps of {rows} × {columns} pixels; expected at least {size} × {size}, as submission {} needs",
+                    submission.name
+                )));
+            }
+            let none = Array3::zeros((0, rows, columns));
+            look(Psfs::Stars(none.view())).map_err(of_measuring)?;
+            AllPsfs::Stars(stars.shared())
+        }
+        (None, None, Some(formulas)) => {
+            look(Psfs::Functional(&[])).map_err(of_measuring)?;
+            let formulas = self::formulas(formulas.as_array()).map_err(of_measuring)?;
+            match formulas.as_slice() {
+                [one] => {
+                    prepared = one.stamp(size);
+                    look(Psfs::Prepared(prepared.view())).map_err(of_measuring)?;
+                    AllPsfs::Shared(prepared.view())
+                }
+                _ => {
+                    one_each("psf", formulas.len(), count)?;
+                    AllPsfs::Formulas(formulas)
+                }
+            }
+        }
+        _ => return Err(PyValueError::new_err("psf: expected one kind of PSFs")),
+    };
+    if let Noise::Each(levels) = noise {
+        one_each("noise", levels.len(), count)?;
+    }
+
+    let mut galaxies = Vec::new();
+    galaxies
+        .try_reserve_exact(count)
+        .map_err(|_| no_memory("the catalogue"))?;
+    let failure = Failure::default();
+    let mut watch = Watch::new(progress, &failure);
+    let result = py.detach(|| {
+        engine::ordered(
+            threads(threads_asked),
+            |feeder| {
+                for start in (0..count).step_by(PIECE) {
+                    let end = (start + PIECE).min(count);
+                    let job = job(&stamps, &psfs, noise, start, end);
+                    if !feeder.push(job.map_err(|error| failure.keep(error))?) {
+                        break;
+                    }
+                }
+                Ok(())
+            },
+            || measurer.worker(),
+            |worker, job: Job<'_>| Ok(measure_job(worker, &job)?),
+            |measured: Vec<Measurement>| {
+                watch.advance(measured.len())?;
+                galaxies.extend(measured);
+                Ok(())
+            },
+        )
+        .and_then(|()| watch.tell())
+    });
+    failure.or(result)?;
+    let mut galaxies = [galaxies];
+    let response = calibrate(submission, &mut galaxies);
+    Ok((catalogue(py, &galaxies[0])?, response))
+}
+
+/// The first level that is none, so that it is told; any where all are.
+fn worst(levels: &[f64]) -> f64 {
+    let bad = levels
+        .iter()
+        .find(|sigma| !(sigma.is_finite() && **sigma >= 0.0));
+    bad.copied().unwrap_or(1.0)
+}
+
+/// Checks that there is one for each stamp.
+fn one_each(argument: &str, found: usize, count: usize) -> PyResult<()> {
+    if found == count {
+        return Ok(());
+    }
+    Err(PyValueError::new_err(format!(
+        "{argument}: {found} given; expected {count}, one for each stamp"
+    )))
+}
+
+/// PSFs from rows of FWHM, e1, e2 and β.
+fn formulas(rows: ArrayView2<'_, f64>) -> Result<Vec<FunctionalPsf>, MeasureError> {
+    let formula = |row: ndarray::ArrayView1<'_, f64>| {
+        let profile = match row[3] {
+            beta if beta.is_nan() => PsfProfile::Kolmogorov,
+            beta => PsfProfile::Moffat { beta },
+        };
+        FunctionalPsf::new(profile, row[0], Shear::new(row[1], row[2]))
+    };
+    rows.outer_iter().map(formula).collect()
+}
+
+fn job<'a>(
+    stamps: &Stamps<'a>,
+    psfs: &'a AllPsfs<'a>,
+    noise: Noise<'a>,
+    start: usize,
+    end: usize,
+) -> PyResult<Job<'a>> {
+    Ok(Job {
+        stamps: stamps.piece(start, end)?,
+        psfs: match psfs {
+            AllPsfs::Shared(psf) => SomePsfs::Shared(psf.view()),
+            AllPsfs::Stars(stars) => SomePsfs::Stars(stars.piece(start, end)?),
+            AllPsfs::Formulas(formulas) => SomePsfs::Formulas(&formulas[start..end]),
+        },
+        noise: noise.piece(start, end),
+    })
+}
+
+fn measure_job(worker: &mut Worker, job: &Job<'_>) -> Result<Vec<Measurement>, MeasureError> {
+    match &job.stamps {
+        Piece::Single(stamps) => with_psfs(worker, stamps.view(), job),
+        Piece::Double(stamps) => with_psfs(worker, stamps.view(), job),
+        Piece::Copied(stamps) => with_psfs(worker, stamps.view(), job),
+    }
+}
+
+fn with_psfs<T: Pixel>(
+    worker: &mut Worker,
+    stamps: ArrayView3<'_, T>,
+    job: &Job<'_>,
+) -> Result<Vec<Measurement>, MeasureError> {
+    let noise = job.noise;
+    match &job.psfs {
+        SomePsfs::Shared(psf) => each(worker, stamps, Psfs::<f64>::Prepared(psf.view()), noise),
+        SomePsfs::Stars(Piece::Single(stars)) => {
+            each(worker, stamps, Psfs::Stars(stars.view()), noise)
+        }
+        SomePsfs::Stars(Piece::Double(stars)) => {
+            each(worker, stamps, Psfs::Stars(stars.view()), noise)
+        }
+        SomePsfs::Stars(Piece::Copied(stars)) => {
+            each(worker, stamps, Psfs::Stars(stars.view()), noise)
+        }
+        SomePsfs::Formulas(formulas) => {
+            each(worker, stamps, Psfs::<f64>::Functional(formulas), noise)
+        }
+    }
+}
+
+fn each<T: Pixel, P: Pixel>(
+    worker: &mut Worker,
+    stamps: ArrayView3<'_, T>,
+    psfs: Psfs<'_, P>,
+    noise: Noise<'_>,
+) -> Result<Vec<Measurement>, MeasureError> {
+    let levels = match noise {
+        Noise::One(level) => return worker.measure_each(stamps, psfs, level),
+        Noise::Each(levels) => levels,
+    };
+    if let Psfs::Prepared(psf) = psfs {
+        // Once for all of them: a PSF costs more to prepare than a galaxy to measure.
+        worker.set_psf(psf)?;
+        let measured = stamps.outer_iter().zip(levels);
+        return measured
+            .map(|(stamp, &level)| worker.measure(stamp, Some(level)))
+            .collect();
+    }
+    let mut galaxies = Vec::with_capacity(levels.len());
+    for (k, &level) in levels.iter().enumerate() {
+        let own = match psfs {
+            Psfs::Stars(stars) => Psfs::Stars(stars.slice_move(s![k..k + 1, .., ..])),
+            Psfs::Functional(formulas) => Psfs::Functional(&formulas[k..k + 1]),
+            Psfs::Star(_) | Psfs::Prepared(_) => psfs,
+        };
+        let stamp = stamps.index_axis(Axis(0), k);
+        galaxies.extend(worker.measure_each(stamp.insert_axis(Axis(0)), own, Some(level))?);
+    }
+    Ok(galaxies)
+}
+
+/// The columns of a catalogue, by name.
+fn catalogue<'py>(py: Python<'py>, galaxies: &[Measurement]) -> PyResult<Bound<'py, PyDict>> {
+    let columns = PyDict::new(py);
+    let real = |name: &str, value: &dyn Fn(&Measurement) -> f64| {
+        let values: Vec<f64> = galaxies.iter().map(value).collect();
+        columns.set_item(name, values.into_pyarray(py))
+    };
+    let whole = |name: &str, value: &dyn Fn(&Measurement) -> i32| {
+        let values: Vec<i32> = galaxies.iter().map(value).collect();
+        columns.set_item(name, values.into_pyarray(py))
+    };
+    real("e1", &|g| g.e1)?;
+    real("e2", &|g| g.e2)?;
+    real("R11", &|g| g.response[0])?;
+    real("R22", &|g| g.response[1])?;
+    whole("flags", &|g| g.flags.bits() as i32)?;
+    real("noise", &|g| g.noise)?;
+    real("flux", &|g| g.flux)?;
+    real("radius", &|g| g.radius)?;
+    real("size", &|g| g.size)?;
+    whole("iterations", &|g| {
+        g.descent.map_or(0, |d| d.iterations as i32)
+    })?;
+    // −1 where the network did not run, as in the catalogues of the command line.
+    whole("stop", &|g| g.descent.map_or(-1, |d| d.stop.code() as i32))?;
+    whole("updated", &|g| g.descent.map_or(0, |d| d.updated as i32))?;
+    real("first_energy", &|g| {
+        g.descent.map_or(f64::NAN, |d| d.first_energy)
+    })?;
+    real("energy", &|g| g.descent.map_or(f64::NAN, |d| d.energy))?;
+    Ok(columns)
+}
+
+/// Names, bits and meanings of the flags.
+#[pyfunction]
+pub(crate) fn flags() -> Vec<(String, u32, String)> {
+    let flag = |flag: Flag| (format!("{flag:?}"), flag as u32, flag.to_string());
+    Flag::ALL.map(flag).into()
+}

@@ -1,0 +1,280 @@
+//! Ellipticities on a grid into spectra and figures of merit.
+
+use ndarray::{Array2, ArrayView1};
+use numpy::{IntoPyArray, PyReadonlyArray1, ToPyArray};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use shearq_scoring::modes::Decomposer;
+use shearq_scoring::resample::{PairedSet, paired_difference};
+use shearq_scoring::units::{Degrees, Pixels};
+use shearq_scoring::{
+    BINS, Bins, Choice, Convention, Definition, FieldSum, Figures, Grid, Noise, Options, Row,
+    RowCounts, SCORED, SetImages, SetScorer, TrueShear, TruthSign,
+};
+
+use crate::errors::of_scoring;
+
+/// Names, headings and meanings of the figures.
+#[pyfunction]
+pub(crate) fn figures() -> Vec<(&'static str, &'static str, &'static str)> {
+    Figures::ALL.map(|f| (f.name, f.label, f.meaning)).into()
+}
+
+/// A grid of `n` cells a side.
+fn grid(n: usize, stamp: f64, field_degrees: f64) -> PyResult<Grid> {
+    Grid::new(n, Pixels(stamp), Degrees(field_degrees)).map_err(of_scoring)
+}
+
+/// A bandpower definition by its name.
+fn definition(name: &str) -> PyResult<Definition> {
+    match name {
+        "leaderboard" => Ok(Definition::Leaderboard),
+        "corrected" => Ok(Definition::Corrected),
+        other => Err(PyValueError::new_err(format!(
+            "definition: {other:?}; expected \"leaderboard\" or \"corrected\""
+        ))),
+    }
+}
+
+/// A convention, or how to choose one, by its name.
+fn choice(name: &str) -> PyResult<Choice> {
+    let number = || Convention::try_from(name.parse::<u8>().ok()?).ok();
+    match name {
+        "matched" => Ok(Choice::Matched),
+        "best" => Ok(Choice::Best),
+        _ => number().map(Choice::Insist).ok_or_else(|| {
+            PyValueError::new_err(format!(
+                "convention: {name:?}; expected \"matched\", \"best\" or a number from 1 to 8"
+            ))
+        }),
+    }
+}
+
+/// Rows of images, one after the other, at positions or in the order of the grid.
+struct Rows<'a> {
+    e1: ArrayView1<'a, f64>,
+    e2: ArrayView1<'a, f64>,
+    positions: Option<(ArrayView1<'a, f64>, ArrayView1<'a, f64>)>,
+    lengths: Vec<usize>,
+}
+
+impl Rows<'_> {
+    /// Sums the images onto the grid; also how their rows were used.
+    fn sum(&self, grid: &Grid) -> PyResult<(SetImages, RowCounts)> {
+        let count = self.e1.len();
+        let fits = self
+            .lengths
+            .iter()
+            .try_fold(0usize, |sum, n| sum.checked_add(*n))
+            == Some(count)
+            && self.e2.len() == count
+            && self
+                .positions
+                .is_none_or(|(x, y)| x.len() == count && y.len() == count);
+        if !fits {
+            return Err(PyValueError::new_err(
+                "e1, e2, positions: lengths that differ",
+            ));
+        }
+        let (mut images, mut counts) = (SetImages::new(grid), RowCounts::default());
+        let mut start = 0;
+        for length in &self.lengths {
+            let mut sum = FieldSum::new(grid);
+            counts += sum.add_image(
+                grid,
+                (0..*length).map(|k| {
+                    let (x, y) = match self.positions {
+                        Some((x, y)) => (x[start + k], y[start + k]),
+                        None => grid.centre(k % grid.n, k / grid.n),
+                    };
+                    Row {
+                        x,
+                        y,
+                        e1: self.e1[start + k],
+                        e2: self.e2[start + k],
+                    }
+                }),
+            );
+            images.add(&sum);
+            start += length;
+        }
+        Ok((images, counts))
+    }
+}
+
+/// Scores images of `n` × `n` galaxies against their true shear, both in the order of the grid, x running
+/// fastest, or the images at positions. Returns all figures, spectra and counts by name.
+#[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
+pub(crate) fn score<'py>(
+    py: Python<'py>,
+    n: usize,
+    stamp: f64,
+    field_degrees: f64,
+    truth: (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>),
+    challenge_sign: bool,
+    e: (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>),
+    positions: Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>,
+    lengths: Vec<usize>,
+    definition: &str,
+    convention: &str,
+    noise_variance: Option<f64>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let grid = grid(n, stamp, field_degrees)?;
+    let options = Options {
+        definition: self::definition(definition)?,
+        noise: noise_variance.map_or(Noise::Measured, Noise::Given),
+        choice: choice(convention)?,
+    };
+    let (g1, g2) = (truth.0.as_array(), truth.1.as_array());
+    let rows = Rows {
+        e1: e.0.as_array(),
+        e2: e.1.as_array(),
+        positions: positions
+            .as_ref()
+            .map(|(x, y)| (x.as_array(), y.as_array())),
+        lengths,
+    };
+    let (scored, counts) = py.detach(|| {
+        let truth = g1.iter().zip(&g2).take(grid.cells() + 1).enumerate();
+        let truth = truth.map(|(k, (&e1, &e2))| {
+            let (x, y) = grid.centre(k % n, k / n);
+            Row { x, y, e1, e2 }
+        });
+        let sign = match challenge_sign {
+            true => TruthSign::Challenge,
+            false => TruthSign::Standard,
+        };
+        let truth = TrueShear::from_rows(&grid, sign, truth).map_err(of_scoring)?;
+        let (images, counts) = rows.sum(&grid)?;
+        if let Some(fault) = counts.fault(&grid) {
+            return Err(PyValueError::new_err(format!("e1, e2: {fault}")));
+        }
+        let scorer = SetScorer::new(grid, truth, options).map_err(of_scoring)?;
+        Ok((scorer.score(&images).map_err(of_scoring)?, counts))
+    })?;
+
+    let spectra = scored.spectra();
+    let found = PyDict::new(py);
+    let names = Figures::ALL.map(|figure| figure.name);
+    let by_name = |figures: &Figures| {
+        let values = PyDict::new(py);
+        for (name, value) in names.iter().zip(figures.values()) {
+            values.set_item(name, value)?;
+        }
+        PyResult::Ok(values)
+    };
+    found.set_item("figures", by_name(&scored.figures)?)?;
+    found.set_item("errors", by_name(&scored.errors)?)?;
+    let replicates: Vec<f64> = scored.replicates.iter().flat_map(Figures::values).collect();
+    let replicates = Array2::from_shape_vec((scored.replicates.len(), names.len()), replicates)
+        .map_err(|error| PyValueError::new_err(error.to_string()))?;
+    found.set_item("replicates", replicates.into_pyarray(py))?;
+    found.set_item("spectrum", bins(py, &scored.bins)?)?;
+    let spectrum = found.get_item("spectrum")?;
+    if let Some(spectrum) = spectrum {
+        let noise = scored.noise.unwrap_or([f64::NAN; BINS]);
+        for (name, powers) in [
+            ("ee", &spectra.ee),
+            ("bb", &spectra.bb),
+            ("eb", &spectra.eb),
+            ("true_ee", &scored.true_ee),
+            ("true_bb", &scored.true_bb),
+            ("noise", &noise),
+        ] {
+            spectrum.set_item(name, powers.to_pyarray(py))?;
+        }
+    }
+    found.set_item("noise_variance", scored.noise_variance)?;
+    found.set_item("images", scored.images)?;
+    found.set_item("convention", scored.chosen.number())?;
+    let matched = scored.matching.convention();
+    found.set_item("matched", (matched.number(), matched.describe()))?;
+    found.set_item("matched_clearly", scored.matching.is_clear())?;
+    let leaderboard = &scored.conventions[scored.best.index()];
+    found.set_item("q_leaderboard", leaderboard.quality.q)?;
+    found.set_item("correlation", spectra.correlation)?;
+    found.set_item("warnings", counts.oddities("e1, e2"))?;
+    found.set_item(
+        "constant",
+        scored.constant.map(|mean| (mean.e, mean.error, mean.truth)),
+    )?;
+    Ok(found)
+}
+
+/// What is known of the bins alone.
+fn bins<'py>(py: Python<'py>, bins: &Bins) -> PyResult<Bound<'py, PyDict>> {
+    let found = PyDict::new(py);
+    found.set_item("l", bins.l.to_pyarray(py))?;
+    found.set_item("dln_l", bins.dln_l.to_pyarray(py))?;
+    found.set_item("modes", bins.modes.map(|modes| modes as i64).to_pyarray(py))?;
+    let to_c_l: [f64; BINS] = std::array::from_fn(|bin| bins.to_c_l(bin));
+    found.set_item("to_c_l", to_c_l.to_pyarray(py))?;
+    let scored: [bool; BINS] = std::array::from_fn(|bin| SCORED.contains(&bin));
+    found.set_item("scored", scored.to_pyarray(py))?;
+    Ok(found)
+}
+
+/// E, B and EB bandpowers of the mean of images of `n` × `n` galaxies in the order of the grid, x running
+/// fastest. No truth is needed.
+#[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
+pub(crate) fn spectrum<'py>(
+    py: Python<'py>,
+    n: usize,
+    stamp: f64,
+    field_degrees: f64,
+    e: (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>),
+    positions: Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>,
+    lengths: Vec<usize>,
+    definition: &str,
+) -> PyResult<Bound<'py, PyDict>> {
+    let grid = grid(n, stamp, field_degrees)?;
+    let definition = self::definition(definition)?;
+    let rows = Rows {
+        e1: e.0.as_array(),
+        e2: e.1.as_array(),
+        positions: positions
+            .as_ref()
+            .map(|(x, y)| (x.as_array(), y.as_array())),
+        lengths,
+    };
+    let (all, modes) = py.detach(|| {
+        let (images, _) = rows.sum(&grid)?;
+        let total = images.total();
+        let scale = 1.0 / total.images.max(1) as f64;
+        let standard = Convention::STANDARD;
+        let field = standard.apply(&(&total.e1 * scale), &(&total.e2 * scale));
+        let modes = Decomposer::new(grid).decompose(field);
+        PyResult::Ok((Bins::new(&grid, definition), modes))
+    })?;
+    let found = bins(py, &all)?;
+    for (name, a, b) in [
+        ("ee", &modes.e, &modes.e),
+        ("bb", &modes.b, &modes.b),
+        ("eb", &modes.e, &modes.b),
+    ] {
+        found.set_item(name, all.power(a, b).to_pyarray(py))?;
+    }
+    Ok(found)
+}
+
+/// The difference of two figures of the same images, with its error; `None` where it has none.
+#[pyfunction]
+pub(crate) fn difference(
+    images: usize,
+    first: f64,
+    first_replicates: Vec<f64>,
+    second: f64,
+    second_replicates: Vec<f64>,
+) -> Option<(f64, f64)> {
+    let set = PairedSet {
+        images,
+        first,
+        first_replicates: &first_replicates,
+        second,
+        second_replicates: &second_replicates,
+    };
+    paired_difference(&[set]).map(|found| (found.difference, found.error))
+}

@@ -1,0 +1,91 @@
+//! Stamps as Python has them: viewed where they lie if Rust can, otherwise converted piece by piece.
+
+use ndarray::{Array3, ArrayView3, s};
+use numpy::{PyArray3, PyArrayMethods, PyReadonlyArray3, PyUntypedArray, PyUntypedArrayMethods};
+use pyo3::exceptions::PyTypeError;
+use pyo3::prelude::*;
+use pyo3::types::PySlice;
+
+/// An array `(n, ny, nx)`, borrowed for as long as it is worked on.
+pub(crate) enum Borrowed<'py> {
+    Single(PyReadonlyArray3<'py, f32>),
+    Double(PyReadonlyArray3<'py, f64>),
+    /// Of other numbers, in the other order of bytes, or not aligned, as in FITS files and records.
+    Other(Bound<'py, PyUntypedArray>),
+}
+
+impl<'py> Borrowed<'py> {
+    /// Borrows an array of three axes.
+    ///
+    /// # Errors
+    /// Where it is none.
+    pub(crate) fn new(array: &Bound<'py, PyAny>) -> PyResult<Self> {
+        let array = array.cast::<PyUntypedArray>()?;
+        if array.ndim() != 3 {
+            return Err(PyTypeError::new_err("expected an array of three axes"));
+        }
+        // Views of memory that is not aligned would be undefined.
+        if array.is_aligned() {
+            if let Ok(single) = array.cast::<PyArray3<f32>>() {
+                return Ok(Borrowed::Single(single.try_readonly()?));
+            }
+            if let Ok(double) = array.cast::<PyArray3<f64>>() {
+                return Ok(Borrowed::Double(double.try_readonly()?));
+            }
+        }
+        Ok(Borrowed::Other(array.clone()))
+    }
+
+    /// Number of stamps, rows and columns.
+    pub(crate) fn dim(&self) -> (usize, usize, usize) {
+        match self {
+            Borrowed::Single(array) => array.as_array().dim(),
+            Borrowed::Double(array) => array.as_array().dim(),
+            Borrowed::Other(array) => {
+                let shape = array.shape();
+                (shape[0], shape[1], shape[2])
+            }
+        }
+    }
+
+    /// What threads without the interpreter can share.
+    pub(crate) fn shared(&self) -> Stamps<'_> {
+        match self {
+            Borrowed::Single(array) => Stamps::Single(array.as_array()),
+            Borrowed::Double(array) => Stamps::Double(array.as_array()),
+            Borrowed::Other(array) => Stamps::Other(array.as_any().clone().unbind()),
+        }
+    }
+}
+
+/// Many stamps.
+pub(crate) enum Stamps<'a> {
+    Single(ArrayView3<'a, f32>),
+    Double(ArrayView3<'a, f64>),
+    Other(Py<PyAny>),
+}
+
+/// Some of them.
+pub(crate) enum Piece<'a> {
+    Single(ArrayView3<'a, f32>),
+    Double(ArrayView3<'a, f64>),
+    Copied(Array3<f64>),
+}
+
+impl<'a> Stamps<'a> {
+    /// Those from `start` to before `end`. Attaches to the interpreter where they have to be converted.
+    pub(crate) fn piece(&self, start: usize, end: usize) -> PyResult<Piece<'a>> {
+        // From the views themselves, which live longer than this borrow of them.
+        Ok(match self {
+            Stamps::Single(all) => Piece::Single(all.clone().slice_move(s![start..end, .., ..])),
+            Stamps::Double(all) => Piece::Double(all.clone().slice_move(s![start..end, .., ..])),
+            Stamps::Other(all) => Piece::Copied(Python::attach(|py| {
+                let range = PySlice::new(py, start as isize, end as isize, 1);
+                let part = all.bind(py).get_item(range)?;
+                let copy = part.call_method1("astype", ("=f8",))?;
+                let copy = copy.cast::<PyArray3<f64>>()?;
+                PyResult::Ok(copy.try_readonly()?.as_array().to_owned())
+            })?),
+        })
+    }
+}

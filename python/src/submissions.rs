@@ -1,0 +1,124 @@
+//! Named configurations, and those of one's own.
+
+use std::path::Path;
+
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use shearq_submissions::{EllipticityType, Entry, NoiseSource, PsfForm, Published, Registry};
+
+use crate::errors::of_submission;
+
+/// What a text of settings is called where it does not name itself.
+const OWN: &str = "own";
+
+/// Settings of a submission, resolved.
+#[pyclass(frozen)]
+pub(crate) struct Submission {
+    pub(crate) entry: Entry,
+}
+
+#[pymethods]
+impl Submission {
+    /// The submission of a name or a file.
+    #[staticmethod]
+    fn named(name: &str) -> PyResult<Self> {
+        let entry = Registry::embedded().and_then(|registry| registry.get(name));
+        Ok(Submission {
+            entry: entry.map_err(of_submission)?,
+        })
+    }
+
+    /// The submission of settings as TOML.
+    #[staticmethod]
+    fn text(text: &str) -> PyResult<Self> {
+        let entry =
+            Registry::embedded().and_then(|registry| registry.get_text(Path::new(OWN), text));
+        Ok(Submission {
+            entry: entry.map_err(of_submission)?,
+        })
+    }
+
+    /// The submission of settings as JSON.
+    #[staticmethod]
+    fn json(text: &str) -> PyResult<Self> {
+        let wrong = |error: String| {
+            PyValueError::new_err(format!("submission: settings that are none: {error}"))
+        };
+        let value: toml::Table =
+            serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
+        let text = toml::to_string(&value).map_err(|error| wrong(error.to_string()))?;
+        Self::text(&text)
+    }
+
+    #[getter]
+    fn name(&self) -> &str {
+        &self.entry.submission.name
+    }
+
+    #[getter]
+    fn description(&self) -> &str {
+        &self.entry.submission.description
+    }
+
+    #[getter]
+    fn extends(&self) -> Option<&str> {
+        self.entry.extends.as_deref()
+    }
+
+    /// Q, M/2 and √A·10⁴ as published.
+    #[getter]
+    fn published(&self) -> Option<(f64, f64, f64)> {
+        self.entry
+            .published
+            .map(|Published { q, m_half, sqrt_a }| (q, m_half, sqrt_a))
+    }
+
+    /// All settings as JSON.
+    #[getter]
+    fn settings(&self) -> PyResult<String> {
+        serde_json::to_string(&self.entry.submission)
+            .map_err(|error| PyValueError::new_err(error.to_string()))
+    }
+
+    /// All settings as TOML.
+    #[getter]
+    fn toml(&self) -> PyResult<String> {
+        toml::to_string(&self.entry.submission)
+            .map_err(|error| PyValueError::new_err(error.to_string()))
+    }
+
+    /// Pixels a side of the piece of a stamp, and of a PSF stamp, that are used.
+    #[getter]
+    fn sizes(&self) -> (usize, usize) {
+        let submission = &self.entry.submission;
+        (submission.stamp.size, submission.psf.size)
+    }
+
+    /// Whether it takes PSFs by their formula.
+    #[getter]
+    fn functional(&self) -> bool {
+        self.entry.submission.psf.form == PsfForm::Functional
+    }
+
+    /// Whether the noise level has to be given.
+    #[getter]
+    fn needs_noise(&self) -> bool {
+        self.entry.submission.noise == NoiseSource::Header
+    }
+
+    /// `shear` or `distortion`.
+    #[getter]
+    fn ellipticity(&self) -> &'static str {
+        match self.entry.submission.ellipticity() {
+            EllipticityType::Shear => "shear",
+            EllipticityType::Distortion => "distortion",
+        }
+    }
+}
+
+/// Names of the embedded submissions.
+#[pyfunction]
+pub(crate) fn names() -> PyResult<Vec<String>> {
+    let registry = Registry::embedded().map_err(of_submission)?;
+    Ok(registry.names().to_vec())
+}

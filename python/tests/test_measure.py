@@ -1,0 +1,237 @@
+"""Measuring arrays of any kind."""
+
+import pickle
+import threading
+
+import numpy as np
+import pytest
+from conftest import same_bits
+
+import shearq
+
+
+@pytest.fixture(scope="module")
+def measured(image):
+    return shearq.measure(image.stamps, image.psf, noise=image.noise)
+
+
+def again(image, stamps=None, psf=None, noise=None, **options):
+    return shearq.measure(
+        image.stamps if stamps is None else stamps,
+        image.psf if psf is None else psf,
+        noise=image.noise if noise is None else noise,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_the_number_of_threads_changes_nothing(image, measured, threads):
+    assert same_bits(again(image, threads=threads), measured)
+
+
+def layouts(stamps):
+    yield "double", stamps.astype("f8")
+    yield "big-endian", stamps.astype(">f4")
+    yield "Fortran order", np.asfortranarray(stamps)
+    yield "every other of twice as many", np.repeat(stamps, 2, axis=0)[::2]
+    yield "turned twice", np.ascontiguousarray(stamps[::-1, ::-1, ::-1])[::-1, ::-1, ::-1]
+    record = np.zeros(len(stamps), dtype=[("flag", "u1"), ("stamp", "f4", stamps.shape[1:])])
+    record["stamp"] = stamps
+    assert not record["stamp"].flags.aligned
+    yield "not aligned", record["stamp"]
+    yield "list", list(stamps)
+    yield "masked, nothing masked", np.ma.masked_array(stamps)
+
+
+@pytest.mark.parametrize("name", [name for name, _ in layouts(np.zeros((2, 3, 3), "f4"))])
+def test_strides_and_orders_of_bytes_change_nothing(image, measured, name):
+    stamps = dict(layouts(image.stamps))[name]
+    assert same_bits(again(image, stamps), measured)
+
+
+def test_read_only_arrays_and_memory_maps_are_taken(image, measured, tmp_path):
+    locked = image.stamps.copy()
+    locked.flags.writeable = False
+    assert same_bits(again(image, locked), measured)
+    np.save(tmp_path / "stamps.npy", image.stamps)
+    assert same_bits(again(image, np.load(tmp_path / "stamps.npy", mmap_mode="r")), measured)
+
+
+def test_whole_numbers_are_taken(image):
+    whole = np.rint(image.stamps * 100).astype("i2")
+    assert same_bits(again(image, whole, noise=100.0), again(image, whole.astype("f4"), noise=100.0))
+
+
+def test_psfs_and_noise_may_be_one_each(image, measured):
+    count = len(image.stamps)
+    stars = np.broadcast_to(image.psf, (count, *image.psf.shape))
+    assert same_bits(again(image, psf=stars), measured)
+    assert same_bits(again(image, psf=stars.astype(">f8")), measured)
+    assert same_bits(again(image, noise=np.full(count, image.noise)), measured)
+    assert same_bits(again(image, psf=stars, noise=np.full(count, image.noise)), measured)
+    variable = shearq.simulate(set=1, seed=3, grid=8)[0]
+    one_each = again(variable, psf=variable.functional_psf)
+    noises = np.full(len(variable.stamps), variable.noise)
+    assert same_bits(again(variable, psf=variable.functional_psf, noise=noises), one_each)
+    halves = [again(variable, variable.stamps[k:][:32], variable.psf[k:][:32])["R11"] for k in (0, 32)]
+    assert same_bits(np.concatenate(halves), again(variable)["R11"])
+
+
+def test_no_stamps_are_an_empty_catalogue(image):
+    empty = again(image, image.stamps[:0])
+    assert len(empty) == 0 and empty["e1"].shape == (0,)
+    with pytest.raises(ValueError, match="weights: no galaxy"):
+        empty.mean_shear()
+
+
+def test_galaxies_that_cannot_be_measured_are_flagged(image):
+    stamps = image.stamps.copy()
+    stamps[3, 7, 5] = np.nan
+    stamps[4] = 2.0
+    found = again(image, stamps)
+    assert found["flags"][[3, 4]].tolist() == [shearq.Flag.NotFinite, shearq.Flag.NoScale]
+    assert np.isnan(found["e1"][[3, 4]]).all() and found.good.sum() == len(stamps) - 2
+    stars = np.repeat(image.psf[np.newaxis], len(stamps), axis=0)
+    stars[7] = 0
+    assert shearq.Flag(int(again(image, psf=stars)["flags"][7])) == shearq.Flag.BadPsf
+
+
+def test_the_catalogue_knows_what_made_it_and_keeps_it(measured):
+    attrs = measured.attrs
+    assert attrs["submission"] == "48/linear/star" and attrs["version"] == shearq.__version__
+    assert attrs["response"] == pytest.approx((measured["R11"].mean(), measured["R22"].mean()))
+    assert 'method = "linear"' in attrs["settings"] and attrs["ellipticity"] == "shear"
+    assert type(measured["e1"]) is np.ndarray and type(measured[["e1", "e2"]]) is shearq.Catalogue
+    some = measured[measured["e1"] > 0]
+    assert type(some) is shearq.Catalogue and some.attrs == attrs
+    back = pickle.loads(pickle.dumps(some))
+    assert back.attrs == attrs and same_bits(back, some)
+
+
+def test_the_mean_shear_is_the_mean_ellipticity_with_weights_over_their_own_response(measured):
+    shear = measured.mean_shear()
+    assert shear.g1 == pytest.approx(measured["e1"].mean(), rel=1e-12)
+    residual = measured["e2"] - shear.g2 * measured["R22"] / measured["R22"].mean()
+    assert shear.g2_error == pytest.approx(residual.std(ddof=1) / len(measured) ** 0.5, rel=1e-2)
+    assert shear.galaxies == len(measured) and tuple(shear) == (shear.g1, shear.g2)
+    # Weights of zero and one are a choice of rows.
+    chosen = measured["flux"] > np.median(measured["flux"])
+    by_weight, by_row = measured.mean_shear(chosen), measured[chosen].mean_shear()
+    assert by_weight.g1 == pytest.approx(by_row.g1, rel=1e-12)
+    assert by_weight.g1_error == pytest.approx(by_row.g1_error, rel=1e-12)
+    assert by_row.response == pytest.approx((measured["R11"][chosen].mean(), measured["R22"][chosen].mean()))
+    for weights, message in [
+        (np.ones(3), r"weights: found an array of shape \(3,\); expected \(144,\)"),
+        (-np.ones(144), "weights: found one that is negative"),
+        (np.zeros(144), "weights: no galaxy"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            measured.mean_shear(weights)
+
+
+def test_columns_of_anacal_give_the_same_shear(measured):
+    columns = measured.columns("anacal")
+    assert sorted(columns) == ["de1_dg1", "de2_dg2", "e1", "e2", "flags"]
+    assert columns["e1"].sum() / columns["de1_dg1"].sum() == pytest.approx(measured.mean_shear().g1, rel=1e-12)
+    assert list(measured.columns()) == list(measured.dtype.names)
+
+
+def test_a_method_without_a_response_gives_a_plain_mean(image):
+    found = again(image, submission="23/raw/star", noise=0.0)
+    assert found.attrs["response"] is None and np.isnan(found["R11"]).all()
+    good = found[found.good]
+    assert found.mean_shear().g1 == pytest.approx(good["e1"].mean()) and found.mean_shear().response is None
+
+
+def test_submissions_of_ones_own_are_mappings_texts_and_files(image, tmp_path):
+    settings = {"extends": "48/linear/star", "noise": {"source": "border", "border": np.int64(4)}}
+    text = 'extends = "48/linear/star"\n[noise]\nsource = "border"\nborder = 4\n'
+    (tmp_path / "mine.toml").write_text(text)
+    found = [
+        shearq.measure(image.stamps, image.psf, submission=own)
+        for own in (settings, text, tmp_path / "mine.toml", str(tmp_path / "mine.toml"))
+    ]
+    assert all(same_bits(one, found[0]) for one in found)
+    assert not shearq.submission(settings).needs_noise
+    assert shearq.submission(tmp_path / "mine.toml").name == "mine"
+    resolved = shearq.submission(settings)
+    assert shearq.submission(resolved.toml).settings == resolved.settings == shearq.submission(resolved.settings).settings
+
+
+def test_submissions_have_settings_and_published_figures():
+    all_of_them = shearq.submissions()
+    assert list(all_of_them)[0] == "subm/19/den/star" and "48/linear/func" in all_of_them
+    assert all_of_them["23/den/star"].published == {"q": 87.06, "m_half": 0.0357, "sqrt_a": 0.0895}
+    linear = all_of_them["48/linear/star"]
+    assert linear.published is None and linear.settings["stamp"]["size"] == linear.stamp_size == 48
+    assert (linear.psf_size, linear.psf_form, linear.extends) == (32, "star", None)
+
+
+WRONG = [
+    (dict(stamps=np.zeros((48, 48))), ValueError, r"stamps: found an array of shape \(48, 48\); expected \(n, ny, nx\)"),
+    (dict(stamps=np.zeros((2, 48, 46))), ValueError, r"stamps: found an array of shape \(2, 48, 46\); expected squares"),
+    (dict(stamps=np.zeros((2, 40, 40))), ValueError, "stamps: stamps of 40 × 40 pixels; expected at least 48 × 48"),
+    (dict(stamps=np.zeros((2, 49, 49))), ValueError, "stamps: stamps of 49 × 49 pixels; expected an even number"),
+    (dict(stamps=np.zeros((2, 48, 48), "c8")), TypeError, "stamps: found numbers of type complex64"),
+    (dict(stamps=np.zeros((2, 48, 48), "O")), TypeError, "stamps: found numbers of type object"),
+    (dict(stamps="stamps.fits"), TypeError, "stamps: found numbers of type <U"),
+    (dict(stamps=[np.zeros((48, 48)), np.zeros((40, 40))]), ValueError, "stamps: no array can be made of it"),
+    (dict(stamps=np.ma.masked_all((2, 48, 48))), ValueError, "stamps: an array with masked values"),
+    (dict(psf=np.zeros((3, 32, 32))), ValueError, r"psf: found an array of shape \(3, 32, 32\); expected \(py, px\) or \(144,"),
+    (dict(psf=np.zeros((32, 32))), ValueError, "psf: the pixels of the PSF stamp sum to 0"),
+    (dict(psf=np.ones((30, 30))), ValueError, "psf: a PSF stamp of 30 × 30 pixels; expected at least 32 × 32"),
+    (dict(psf=np.ones((144, 30, 30))), ValueError, "psf: PSF stamps of 30 × 30 pixels; expected at least 32 × 32"),
+    (dict(psf=np.full((32, 32), np.nan)), ValueError, "psf: "),
+    (dict(psf=shearq.FunctionalPsf([3.0, 3.1])), ValueError, "psf: 2 given; expected 144, one for each stamp"),
+    (dict(psf=shearq.FunctionalPsf(-1.0)), ValueError, "psf: the PSF's FWHM must be a positive number"),
+    (dict(noise=-1.0), ValueError, "noise: found -1.0; expected a finite number"),
+    (dict(noise=np.nan), ValueError, "noise: found nan"),
+    (dict(noise="one"), TypeError, "noise: found str"),
+    (dict(noise=np.ones(3)), ValueError, r"noise: found an array of shape \(3,\); expected one number, or \(144,\)"),
+    (dict(noise=np.r_[-1.0, np.ones(143)]), ValueError, "noise: the noise level is -1"),
+    (dict(submission="48/linear/stra"), KeyError, "submission: there is no submission or file named"),
+    (dict(submission="a\nb"), ValueError, "submission: in the submission file own"),
+    (dict(submission={"extends": "48/linear/star", "stamp": {"sise": 4}}), ValueError, "sise"),
+    (dict(submission={"extends": "48/linear/star", "stamp": {"size": 4000}}), ValueError, "stamp.size"),
+    (dict(submission={"extends": object()}), ValueError, "submission: settings that are none"),
+    (dict(submission={"extends": None}), ValueError, "submission: settings that are none"),
+    (dict(submission=48), TypeError, "submission: found int; expected a name"),
+    (dict(threads=0), ValueError, "threads: found 0; expected a whole number from 1 to 1024"),
+    (dict(threads=1.5), TypeError, "threads: found float"),
+    (dict(progress=3), TypeError, "progress: found int"),
+]
+
+
+@pytest.mark.parametrize("arguments, error, message", WRONG)
+def test_what_is_wrong_is_told_by_the_arguments_name(image, arguments, error, message):
+    given = {"stamps": image.stamps, "psf": image.psf, "noise": image.noise, **arguments}
+    with pytest.raises(error, match=message):
+        shearq.measure(**given)
+
+
+def test_noise_that_is_needed_is_asked_for(image):
+    with pytest.raises(ValueError, match="noise: the noise level is not given"):
+        shearq.measure(image.stamps, image.psf)
+
+
+def test_progress_counts_every_galaxy_and_its_exceptions_come_through(image, measured):
+    heard = []
+    assert same_bits(again(image, progress=heard.append), measured)
+    assert sum(heard) == len(image.stamps)
+
+    def stop(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        again(image, progress=stop)
+
+
+def test_other_threads_run_meanwhile(image, measured):
+    stamps = np.broadcast_to(image.stamps[:1], (4000, 48, 48))
+    results = []
+    workers = [threading.Thread(target=lambda: results.append(again(image, stamps, threads=1))) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert len(results) == 2 and same_bits(*results)

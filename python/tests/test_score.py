@@ -1,0 +1,198 @@
+"""Scores and spectra."""
+
+import csv
+import gzip
+import json
+import pathlib
+import warnings
+
+import numpy as np
+import pytest
+from conftest import same_bits
+
+import shearq
+
+# Cases with known figures that the tests of the Rust crate are held against, too.
+CASES = pathlib.Path(__file__).parents[2] / "scoring/tests/data"
+
+
+def read(path):
+    with gzip.open(path, "rt") as file:
+        rows = list(csv.reader(file))
+    return np.array([[float(value) for value in row] for row in rows if row[0][0].isdigit() or row[0][0] in "-."])
+
+
+@pytest.mark.parametrize("case", ["p1_tiny_noise", "p2_m005_c1e3", "p3_flipped_e2", "p4_missing"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_cases_of_the_rust_tests_have_their_figures(case):
+    expected = json.loads((CASES / case / "expected.json").read_text())
+    truth = read(CASES / case / "truth.csv.gz")
+    truth = truth[np.lexsort((truth[:, 0], truth[:, 1]))]
+    paths = sorted((CASES / case).glob("catalogue_*.csv.gz"), key=lambda path: int(path.name.split("_")[1].split(".")[0]))
+    images = [read(path) for path in paths]
+    x, y, e1, e2 = np.concatenate(images).T
+    numbers = np.repeat(np.arange(len(images)), [len(rows) for rows in images])
+    scored = shearq.score(
+        e1, e2, truth[:, 2], truth[:, 3],
+        images=numbers, positions=(x, y), stamp=48, truth_sign="challenge", convention="matched", noise_variance=expected["noise_var"],
+    )  # fmt: skip
+    tolerance = 1e-8 if case == "p1_tiny_noise" else 1e-9
+    assert scored.convention == expected["matched"] and scored.images == expected["n_images"]
+    assert scored["q"] == pytest.approx(expected["Q_matched"], rel=tolerance)
+    assert scored.q_leaderboard == pytest.approx(expected["Q"], rel=tolerance)
+    assert scored.spectrum["modes"].tolist() == expected["n_modes"]
+    of_class = expected["classes"][expected["matched_class"]]
+    assert scored.spectrum["ee"] == pytest.approx(np.array(of_class["EE"]), rel=tolerance)
+    assert scored.spectrum["true_ee"] == pytest.approx(np.array(expected["truth"]["EE"]), rel=tolerance)
+
+
+@pytest.fixture(scope="module")
+def wave():
+    """A grid of 16 × 16 with a single wave of shear along x."""
+    g1 = np.broadcast_to(0.02 * np.cos(2 * np.pi * 3 * np.arange(16) / 16), (16, 16))
+    return g1, np.zeros((16, 16))
+
+
+def test_a_known_bias_is_found_in_any_arrangement(wave):
+    g1, g2 = wave
+    noise = np.random.default_rng(1).normal(0, 1e-5, (2, 3, 16, 16))
+    e1, e2 = 1.01 * g1 + noise[0], g2 + noise[1]
+    scored = shearq.score(e1, e2, g1, g2)
+    # What noise of 1e-5 does to the mean of 256 galaxies under shear of 0.02.
+    assert scored["m_cross"] == pytest.approx(0.01, abs=1e-4)
+    assert scored.images == 3 and scored.convention == 5 and scored.notes == []
+    assert scored.errors["m_cross"] < 1e-3 and scored.replicates.shape == (3, len(shearq.FIGURES))
+    x, y = np.meshgrid(48 * np.arange(16) + 24.5, 48 * np.arange(16) + 24.5)
+    order = np.random.default_rng(2).permutation(3 * 256)
+    mixed = [np.broadcast_to(a, e1.shape).reshape(-1)[order] for a in (e1, e2, x, y)]
+    labels = np.repeat([7, 8, 9], 256)[order]
+    for other in (
+        shearq.score(e1.reshape(3, 256), e2.reshape(3, 256), g1.ravel(), g2.ravel()),
+        shearq.score(e1.ravel(), e2.ravel(), g1, g2, images=3),
+        shearq.score(*mixed[:2], g1, g2, images=labels, positions=mixed[2:], stamp=48),
+        shearq.score(e1.astype(">f8"), np.asfortranarray(e2), g1, -g2, truth_sign="challenge"),
+    ):
+        assert same_bits(list(other.figures.values()), list(scored.figures.values()))
+    with pytest.raises(KeyError, match="no figure 'Q'; known figures: q, "):
+        scored["Q"]
+
+
+def test_spectra_are_those_of_the_score(wave):
+    g1, g2 = wave
+    spectrum = shearq.power_spectrum(g1, g2)
+    scored = shearq.score(g1, g2, g1, g2).spectrum
+    for name in spectrum.dtype.names:
+        assert np.array_equal(spectrum[name], scored[name]), name
+    assert np.array_equal(scored["ee"], scored["true_ee"])
+    # A wave along x of e1 is an E mode.
+    assert spectrum["ee"].max() > 1e20 * spectrum["bb"].max() and spectrum["scored"].sum() == 8
+    # 5 degrees a side: half the field, twice the multipoles.
+    smaller = shearq.power_spectrum(g1, g2, field_degrees=5)
+    filled = (spectrum["l"] > 0) & (smaller["l"] > 0)
+    assert smaller["l"][filled] == pytest.approx(2 * spectrum["l"][filled])
+    x, y = np.meshgrid(48 * np.arange(16) + 24.5, 48 * np.arange(16) + 24.5)
+    placed = shearq.power_spectrum(g1.ravel(), g2.ravel(), positions=(x.ravel(), y.ravel()), stamp=48, cells=16)
+    assert np.array_equal(placed["ee"], spectrum["ee"])
+
+
+def test_axes_and_signs_are_those_told(wave):
+    g1, g2 = wave
+    diagonal = np.random.default_rng(3).normal(0, 0.01, (16, 16))
+    with pytest.warns(UserWarning, match=r"match the truth in convention 6 \(e2 flipped\)"):
+        shearq.score(*_field(), *_field(sign=-1))
+    assert shearq.score(g1, diagonal, g1, diagonal)["m_cross"] == pytest.approx(0, abs=1e-12)
+
+
+def _field(n=32, sign=1):
+    """Shear with power on all scales."""
+    rng = np.random.default_rng(4)
+    k1, k2 = np.meshgrid(np.fft.fftfreq(n), np.fft.fftfreq(n))
+    kappa = np.fft.fft2(rng.normal(size=(n, n)))
+    k = k1 + 1j * k2
+    turn = np.where(k == 0, 0, k**2 / np.maximum(np.abs(k) ** 2, 1e-30))
+    gamma = 0.01 * np.fft.ifft2(turn * kappa)
+    return gamma.real, sign * gamma.imag
+
+
+def test_missing_galaxies_are_warned_of(wave):
+    g1, g2 = (np.array(g) for g in wave)
+    e1 = g1.copy()
+    e1[3, 8] = np.nan
+    with pytest.warns(UserWarning, match="1 of 256 galaxies of e1, e2 have no ellipticity"):
+        assert shearq.score(e1, g2, g1, g2)["m_cross"] < 0
+
+
+def test_a_constant_shear_gives_means():
+    constant = np.full((12, 12), 0.02)
+    e1 = constant + np.random.default_rng(1).normal(0, 0.1, (12, 12))
+    mean = shearq.score(e1, e1, constant, constant).mean
+    assert mean["e"][0] == pytest.approx(e1.mean()) and mean["truth"] == (0.02, 0.02)
+    assert mean["error"][0] == pytest.approx(0.1 / 12, rel=0.3)
+
+
+FIELD = np.zeros((16, 16))
+WRONG = [
+    (dict(e2=np.zeros((16, 15))), r"e2: found an array of shape \(16, 15\); expected \(16, 16\), as e1 has"),
+    (dict(truth_g2=np.zeros(9)), "truth_g2: found 9 values; expected 256, as truth_g1 has"),
+    (dict(truth_g1=np.zeros(10), truth_g2=np.zeros(10)), "truth_g1: found 10 values; expected those of a square"),
+    ({name: np.zeros((2, 2)) for name in ("e1", "e2", "truth_g1", "truth_g2")}, "the grid has 2 cells a side; expected 8 to"),
+    (dict(truth_g1=FIELD + np.nan), r"the true shear of cell \(1, 1\) is not a finite number"),
+    (dict(e1=np.zeros((3, 5)), e2=np.zeros((3, 5))), r"e1: found an array of shape \(3, 5\); expected \(16, 16\)"),
+    (dict(images=3), "images: found 3; expected a divisor of the 256 values"),
+    (dict(images=np.zeros(3, int)), r"images: found int64 of shape \(3,\)"),
+    (dict(positions=(FIELD, FIELD)), "stamp: not given; expected the pixels a side"),
+    (dict(positions=(FIELD, FIELD[0]), stamp=48), r"positions: found arrays of shapes \(16, 16\) and \(16,\)"),
+    (dict(positions=FIELD, stamp=48), "positions: found ndarray; expected two arrays"),
+    (dict(e1=FIELD - 99), "256 rows have a whole number as ellipticity"),
+    (dict(definition="mine"), 'definition: "mine"; expected "leaderboard" or "corrected"'),
+    (dict(convention=9), 'convention: "9"; expected "matched", "best" or a number'),
+    (dict(field_degrees=0), "field size in degrees is 0; expected a positive number"),
+    (dict(noise_variance=-1), "noise_variance: found -1.0; expected a finite number, zero or more"),
+    (dict(truth_sign="other"), "truth_sign: found 'other'"),
+]
+
+
+@pytest.mark.parametrize("arguments, message", WRONG)
+def test_what_is_wrong_is_told(arguments, message):
+    given = {"e1": FIELD, "e2": FIELD, "truth_g1": FIELD, "truth_g2": FIELD, **arguments}
+    with pytest.raises(ValueError, match=message), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        shearq.score(**given)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_catalogues_are_compared_over_the_same_images():
+    simulation = shearq.simulate(set=8, images=3, grid=16, seed=2)
+    linear = [shearq.measure(i.stamps, i.psf, noise=i.noise) for i in simulation]
+    raw = [shearq.measure(i.stamps, i.psf, submission="23/raw/star") for i in simulation]
+    rows = shearq.compare({"mine": raw, "48/linear/star": linear, "23/raw/star": raw}, simulation, frame="list")
+    assert [row["submission"] for row in rows] == ["mine", "48/linear/star", "23/raw/star"]
+    e1, e2 = (np.stack([c[name] for c in linear]) for name in ("e1", "e2"))
+    alone = shearq.score(e1, e2, simulation.g1, simulation.g2)
+    assert rows[1]["q"] == alone["q"] and rows[1]["q_difference"] == pytest.approx(alone["q"] - rows[0]["q"])
+    assert rows[1]["sigma"] == rows[1]["q_difference"] / rows[1]["q_difference_error"]
+    assert np.isnan(rows[0]["q_difference"]) and rows[2]["q_difference"] == 0
+    assert rows[2]["q_published"] == 80.33 and np.isnan(rows[1]["q_published"])
+    pandas = pytest.importorskip("pandas", reason="frames of pandas need it")
+    frame = shearq.compare({"mine": raw[0]}, (simulation.g1, simulation.g2), frame="pandas")
+    assert isinstance(frame, pandas.DataFrame) and frame.shape == (1, len(rows[0]))
+    with pytest.raises(ValueError, match="catalogues: 'mine' has no images"):
+        shearq.compare({"mine": 3}, simulation, frame="list")
+    with pytest.raises(ValueError, match="frame: found 'excel'"):
+        shearq.compare({}, simulation, frame="excel")
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (dict(set=25), "set: found 25; expected a whole number from 1 to 24"),
+        (dict(grid=7), "grid: found 7; expected a whole number from 8 to 400"),
+        (dict(seed=-1), "seed: found -1"),
+        (dict(images=0), "images: found 0"),
+        (dict(amplitude=np.inf), "amplitude: found inf"),
+        (dict(amplitude=1e9, grid=8), "the largest shear is"),
+    ],
+)
+def test_simulations_that_cannot_be_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        shearq.simulate(**arguments)
