@@ -1,0 +1,83 @@
+"""Shear put into galaxies by GalSim, and its own measurement of them."""
+
+import numpy as np
+import pytest
+
+import shearq
+
+galsim = pytest.importorskip("galsim", reason="drawing galaxies needs GalSim, which could not be imported")
+
+STAMP, SHEAR, COUNT, NOISE = 48, 0.02, 150, 1.0
+# S/N of 40, where a method that mistakes noise for shape does not hide behind it.
+SNR = 40
+
+
+def draw(rng, psf, shear):
+    """Noise-free stamps of galaxies, each with its companion turned by 90°, so that shapes cancel."""
+    stamps = np.empty((COUNT, 2, STAMP, STAMP), np.float32)
+    for pair in stamps:
+        modulus, angle, radius = min(rng.rayleigh(0.15), 0.5), rng.uniform(0, np.pi), rng.uniform(2.5, 4.0)
+        place = rng.uniform(-0.5, 0.5, 2)
+        for turn, stamp in enumerate(pair):
+            shape = galsim.Shear(g=modulus, beta=(angle + turn * np.pi / 2) * galsim.radians)
+            galaxy = galsim.Exponential(half_light_radius=radius, flux=1.0).shear(shape).shear(**shear).shift(*place)
+            stamp[:] = galsim.Convolve(galaxy, psf).drawImage(nx=STAMP, ny=STAMP, scale=1.0).array
+        pair *= SNR * NOISE / np.sqrt((pair**2).sum((1, 2)).mean())
+    return stamps.reshape(-1, STAMP, STAMP)
+
+
+@pytest.fixture(scope="module")
+def psf():
+    return galsim.Moffat(beta=3.0, fwhm=3.4).shear(g1=0.03, g2=-0.02)
+
+
+@pytest.fixture(scope="module")
+def star(psf):
+    return psf.drawImage(nx=STAMP, ny=STAMP, scale=1.0)
+
+
+@pytest.mark.parametrize("component", [0, 1])
+def test_shear_is_recovered_within_errors(psf, star, component):
+    means = []
+    for sign in (1, -1):
+        shear = {"g1": 0.0, "g2": 0.0, f"g{component + 1}": sign * SHEAR}
+        # The same galaxies and the same noise under both signs: what they share cancels in the difference.
+        rng = np.random.default_rng([7, component])
+        stamps = draw(rng, psf, shear)
+        stamps += rng.normal(0, NOISE, stamps.shape).astype(np.float32)
+        catalogue = shearq.measure(stamps, star, noise=NOISE)
+        assert catalogue.good.mean() > 0.99
+        pairs = np.stack([catalogue[f"e{component + 1}"][k::2] for k in (0, 1)]).mean(0)
+        means.append((catalogue.mean_shear(), pairs))
+    (plus, pairs_plus), (minus, pairs_minus) = means
+    # The scatter of pairs, whose own shapes cancel, and not that of galaxies is what errors come from here.
+    difference = (pairs_plus - pairs_minus) / 2
+    error = difference.std(ddof=1) / np.sqrt(COUNT)
+    value = [(getattr(plus, f"g{k}") - getattr(minus, f"g{k}")) / 2 for k in (1, 2)]
+    # 3σ, and half a per cent of what 300 galaxies tell of their mean response.
+    assert value[component] == pytest.approx(SHEAR, abs=3 * error + 0.015 * SHEAR)
+    assert value[1 - component] == pytest.approx(0.0, abs=3 * error + 0.001)
+    for found in (plus, minus):
+        assert abs(getattr(found, f"g{component + 1}")) < SHEAR + 5 * getattr(found, f"g{component + 1}_error")
+    assert error < 0.05 * SHEAR
+
+
+def test_ellipticities_go_with_those_of_hsm(psf, star):
+    rng = np.random.default_rng(3)
+    stamps = draw(rng, psf, {"g1": 0.0, "g2": 0.0})
+    images = [galsim.Image(np.ascontiguousarray(stamp), scale=1.0) for stamp in stamps[:100]]
+    catalogue = shearq.measure(images, star, noise=0.01)
+    results = [galsim.hsm.EstimateShear(image, star, strict=False) for image in images]
+    good = catalogue.good & np.array([result.error_message == "" for result in results])
+    assert good.mean() > 0.95
+    for name in ("e1", "e2"):
+        hsm = np.array([getattr(result, f"corrected_{name}") for result in results])[good]
+        ours = catalogue[name][good]
+        # HSM gives distortions, about twice a shear, of which the response divided ours: the same sign and order.
+        assert np.corrcoef(hsm, ours)[0, 1] > 0.98
+        assert 0.3 < (hsm * ours).sum() / (hsm**2).sum() < 0.9
+
+
+def test_a_single_image_is_told_what_is_expected(star):
+    with pytest.raises(ValueError, match=r"stamps: found an array of shape \(48, 48\); expected \(n, ny, nx\)"):
+        shearq.measure(star, star, noise=1.0)
