@@ -75,10 +75,10 @@ pub(crate) enum Piece<'a> {
 impl<'a> Stamps<'a> {
     /// Those from `start` to before `end`. Attaches to the interpreter where they have to be converted.
     pub(crate) fn piece(&self, start: usize, end: usize) -> PyResult<Piece<'a>> {
-        // From the views themselves, which live longer than this borrow of them.
+        // Of copies of the views, which live longer than this borrow of them.
         Ok(match self {
-            Stamps::Single(all) => Piece::Single(all.clone().slice_move(s![start..end, .., ..])),
-            Stamps::Double(all) => Piece::Double(all.clone().slice_move(s![start..end, .., ..])),
+            Stamps::Single(all) => Piece::Single((*all).slice_move(s![start..end, .., ..])),
+            Stamps::Double(all) => Piece::Double((*all).slice_move(s![start..end, .., ..])),
             Stamps::Other(all) => Piece::Copied(Python::attach(|py| {
                 let range = PySlice::new(py, start as isize, end as isize, 1);
                 let part = all.bind(py).get_item(range)?;

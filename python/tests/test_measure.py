@@ -1,6 +1,8 @@
 """Measuring arrays of any kind."""
 
 import pickle
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -235,3 +237,29 @@ def test_other_threads_run_meanwhile(image, measured):
     for worker in workers:
         worker.join()
     assert len(results) == 2 and same_bits(*results)
+
+
+PEAK = """
+import resource, sys
+import numpy as np
+import shearq
+
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+stamps = np.random.default_rng(1).normal(size=(10_000, 48, 48)).astype(np.float32).astype(sys.argv[1])
+psf = shearq.FunctionalPsf(3.4)
+shearq.measure(stamps[:100], psf, noise=1.0)
+# The array is in memory; so is what making it took, beside which the measurement could hide.
+with open("/proc/self/clear_refs", "w") as file:
+    file.write("5")
+before = peak()
+shearq.measure(stamps, psf, noise=1.0)
+print(peak() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory is read as Linux tells it")
+@pytest.mark.parametrize("dtype", ["f4", ">f4"])
+def test_little_memory_is_taken_beside_the_input(dtype):
+    done = subprocess.run([sys.executable, "-c", PEAK, dtype], capture_output=True, text=True, check=True)
+    # In MB; a copy of the input would be 88, twice that in double precision.
+    assert float(done.stdout) < 40

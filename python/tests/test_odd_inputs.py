@@ -15,12 +15,17 @@ from hypothesis.extra import numpy as arrays  # noqa: E402
 TOLD = (ValueError, TypeError, KeyError)
 ODD = [0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, 3e38, 1e-45, 1e17, 1e18]
 # Small pieces, so that few pixels are enough.
-SMALL = {"extends": "48/linear/star", "stamp": {"size": 16}, "psf": {"size": 8}}
+SMALL = {"extends": "48/linear/star", "stamp": {"size": 16}, "psf": {"size": 8}, "deconvolution": {"window_sigma": 3.0}}
 SUBMISSIONS = [SMALL, {**SMALL, "noise": {"source": "border", "border": 4}}]
 SUBMISSIONS += [{"extends": name, "stamp": {"size": 9}, "psf": {"size": 5}} for name in ("23/den/star", "23/raw/func")]
 thorough = settings(
-    max_examples=500, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True, database=None
+    max_examples=330, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True, database=None
 )
+
+
+def mostly(usual, odd, share=8):
+    """The usual in all but one of so many cases."""
+    return st.integers(1, share).flatmap(lambda k: odd if k == share else usual)
 
 
 def numbers(shapes):
@@ -29,15 +34,17 @@ def numbers(shapes):
     @st.composite
     def made(draw):
         shape = draw(shapes)
-        dtype = draw(st.sampled_from(["f4", "f8", ">f4", ">f8", "f2", "g", "i2", "u1", ">i8", "?", "c8", "O", "S3", "M8[s]"]))
+        real = st.sampled_from(["f4", "f8", ">f4", ">f8", "f2", "g", "i2", ">i8"])
+        dtype = draw(mostly(real, st.sampled_from(["u1", "?", "c8", "O", "S3", "M8[s]"]), 16))
         noise = np.random.default_rng(draw(st.integers(0, 99))).normal(size=shape)
         peak = np.zeros(shape)
         if all(shape) and len(shape) >= 2:
-            peak[..., shape[-2] // 2, shape[-1] // 2] = draw(st.sampled_from([0.0, 50.0, 1e6]))
-        values = draw(st.sampled_from([noise + peak, peak, np.full(shape, draw(st.sampled_from(ODD)))]))
-        values = np.array(values)
+            # A galaxy, or a star, where one should be.
+            peak[..., shape[-2] // 2, shape[-1] // 2] = draw(mostly(st.sampled_from([1e3, 1e4]), st.just(0.0)))
+        constant = st.builds(np.full, st.just(shape), st.sampled_from(ODD))
+        values = np.array(draw(mostly(st.sampled_from([noise + peak, peak]), constant)))
         if values.size:
-            for _ in range(draw(st.integers(0, 3))):
+            for _ in range(draw(mostly(st.just(0), st.integers(1, 3), 4))):
                 values.flat[draw(st.integers(0, values.size - 1))] = draw(st.sampled_from(ODD))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -61,14 +68,10 @@ def numbers(shapes):
     return made()
 
 
-def mostly(usual, odd):
-    return st.one_of(usual, usual, usual, odd)
-
-
-SIDES = st.sampled_from([16, 17, 18, 9, 20])
+SIDES = mostly(st.sampled_from([16, 18, 20]), st.sampled_from([17, 9]))
 ANY_SHAPE = arrays.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=20)
 STAMPS = mostly(st.builds(lambda n, side: (n, side, side), st.integers(0, 5), SIDES), ANY_SHAPE)
-STARS = mostly(st.builds(lambda side: (side, side), st.sampled_from([5, 8, 9, 10, 16])), ANY_SHAPE)
+STARS = mostly(st.builds(lambda side: (side, side), st.sampled_from([8, 10, 16])), ANY_SHAPE)
 SCALAR = st.one_of(st.sampled_from(ODD), st.none(), st.text(max_size=3), st.complex_numbers(), st.integers())
 
 
@@ -79,7 +82,7 @@ SCALAR = st.one_of(st.sampled_from(ODD), st.none(), st.text(max_size=3), st.comp
         numbers(STARS),
         st.one_of(numbers(STAMPS), SCALAR),
     ),
-    noise=mostly(st.floats(0, 1e3), st.one_of(SCALAR, numbers(ANY_SHAPE))),
+    noise=mostly(st.sampled_from([1.0, 0.1]), st.one_of(SCALAR, numbers(ANY_SHAPE))),
     submission=st.sampled_from(SUBMISSIONS),
     threads=mostly(st.sampled_from([None, 1, 3]), SCALAR),
 )
@@ -101,9 +104,9 @@ def test_measuring(stamps, psf, noise, submission, threads):
 
 @thorough
 @given(
-    fwhm=st.one_of(st.floats(), numbers(ANY_SHAPE)),
-    e1=st.floats(),
-    e2=mostly(st.floats(-1, 1), numbers(ANY_SHAPE)),
+    fwhm=mostly(st.floats(0.5, 8), st.one_of(st.floats(), numbers(ANY_SHAPE)), 3),
+    e1=mostly(st.floats(-0.5, 0.5), st.floats(), 4),
+    e2=mostly(st.floats(-0.5, 0.5), numbers(ANY_SHAPE), 4),
     beta=mostly(st.sampled_from([3.0, None, 1.0001, 1e3]), st.floats()),
 )
 def test_formulas_of_psfs(fwhm, e1, e2, beta):
@@ -118,14 +121,14 @@ def test_formulas_of_psfs(fwhm, e1, e2, beta):
             pass
 
 
-E_SHAPES = mostly(st.sampled_from([(8, 8), (64,), (2, 64), (3, 8, 8), (9, 9)]), ANY_SHAPE)
+E_SHAPES = mostly(st.sampled_from([(8, 8)]), st.one_of(st.sampled_from([(64,), (2, 64), (3, 8, 8), (9, 9)]), ANY_SHAPE))
 
 
 @thorough
 @given(
     e1=numbers(E_SHAPES),
     e2=numbers(E_SHAPES),
-    truth=st.tuples(*[mostly(numbers(st.just((8, 8))), numbers(E_SHAPES))] * 2),
+    truth=st.tuples(*[numbers(E_SHAPES)] * 2),
     images=mostly(st.none(), st.one_of(SCALAR, numbers(E_SHAPES))),
     positions=mostly(st.none(), st.one_of(SCALAR, st.tuples(numbers(E_SHAPES), numbers(E_SHAPES)))),
     stamp=mostly(st.sampled_from([None, 48]), SCALAR),
@@ -151,7 +154,7 @@ def test_scoring(e1, e2, truth, **options):
                 pass
 
 
-@thorough
+@settings(thorough, max_examples=100)
 @given(of=st.one_of(st.text(), st.dictionaries(st.text(), st.recursive(SCALAR, lambda s: st.lists(s) | st.dictionaries(st.text(), s))), SCALAR))
 def test_submissions(of):
     try:

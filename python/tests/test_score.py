@@ -146,7 +146,8 @@ WRONG = [
     (dict(e1=FIELD - 99), "256 rows have a whole number as ellipticity"),
     (dict(definition="mine"), 'definition: "mine"; expected "leaderboard" or "corrected"'),
     (dict(convention=9), 'convention: "9"; expected "matched", "best" or a number'),
-    (dict(field_degrees=0), "field size in degrees is 0; expected a positive number"),
+    (dict(field_degrees=0), "field_degrees: found 0.0; expected a positive number, at most 360"),
+    (dict(field_degrees=1e17), "field_degrees: found 1e"),
     (dict(noise_variance=-1), "noise_variance: found -1.0; expected a finite number, zero or more"),
     (dict(truth_sign="other"), "truth_sign: found 'other'"),
 ]

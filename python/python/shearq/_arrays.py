@@ -58,15 +58,20 @@ def flat(name: str, value: Any) -> np.ndarray:
     return double(name, value).reshape(-1)
 
 
-def real(name: str, value: Any, expected: str, *, least: float = -np.inf) -> float:
-    """One finite number, not less than ``least``."""
+def real(name: str, value: Any, expected: str, *, least: float = -np.inf, most: float = np.inf) -> float:
+    """One finite number within a range."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         raise TypeError(f"{name}: found {type(value).__name__}; expected {expected}") from None
-    if not (np.isfinite(number) and number >= least):
+    if not (np.isfinite(number) and least <= number <= most):
         raise ValueError(f"{name}: found {number}; expected {expected}")
     return number
+
+
+def degrees(value: Any) -> float:
+    """The side of a field in degrees: beyond the whole sky multipoles are no numbers to bin by."""
+    return real("field_degrees", value, "a positive number, at most 360", least=1e-9, most=360.0)
 
 
 def whole(name: str, value: Any, least: int, most: int) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import _shearq
-from ._arrays import double, flat, real, shown, whole
+from ._arrays import degrees, double, flat, real, shown, whole
 from ._submissions import submissions
 
 # Pixels a side of a cell where no positions tell otherwise; it then changes no figure.
@@ -122,7 +122,7 @@ def score(
     stamp : float, optional
         Pixels a side of a cell, with positions.
     field_degrees : float
-        Side of the whole field in degrees.
+        Side of the whole field in degrees, at most 360.
     definition : {'leaderboard', 'corrected'}
         Bandpowers and Q as the challenge's program has them, or true azimuthal averages.
     convention : int or {'matched', 'best'}
@@ -162,7 +162,7 @@ def score(
         _shearq.score(
             n,
             cell,
-            real("field_degrees", field_degrees, "a positive number"),
+            degrees(field_degrees),
             (g1, g2),
             truth_sign == "challenge",
             rows,
@@ -208,8 +208,7 @@ def power_spectrum(
     """
     n = _cells(np.shape(e1), images, positions) if cells is None else whole("cells", cells, 1, 1 << 16)
     cell, rows, where, lengths = _rows(e1, e2, n, images, positions, stamp)
-    degrees = real("field_degrees", field_degrees, "a positive number")
-    return _table(_shearq.spectrum(n, cell, degrees, rows, where, lengths, _text("definition", definition)))
+    return _table(_shearq.spectrum(n, cell, degrees(field_degrees), rows, where, lengths, _text("definition", definition)))
 
 
 def compare(
