@@ -12,12 +12,12 @@ from shearq import adapters
 
 def observation(stamp, psf, noise, jacobian=(0.2, 0.0, 0.0, 0.2)):
     """What ngmix's Observation has of what is read."""
-    names = ("dudcol", "dudrow", "dvdcol", "dvdrow")
+    names = ("get_dudcol", "get_dudrow", "get_dvdcol", "get_dvdrow")
+    ways = {name: (lambda value=value: value) for name, value in zip(names, jacobian)}
     weight = np.full(stamp.shape, noise**-2.0)
     weight[0, :5] = 0
-    return SimpleNamespace(
-        image=stamp, weight=weight, psf=SimpleNamespace(image=psf), jacobian=SimpleNamespace(**dict(zip(names, jacobian)))
-    )
+    star = SimpleNamespace(image=psf)
+    return SimpleNamespace(image=stamp, weight=weight, psf=star, jacobian=SimpleNamespace(**ways))
 
 
 def test_observations_of_ngmix_are_measured_as_their_arrays(image):
@@ -47,6 +47,10 @@ def test_observations_without_noise_or_of_several_shapes_are_refused(image):
     blind.weight = np.zeros((48, 48))
     with pytest.raises(ValueError, match="observations: no weight of observation 0 is positive"):
         adapters.from_ngmix(blind)
+    starless = observation(image.stamps[0], image.psf, 1.0)
+    del starless.psf
+    with pytest.raises(ValueError, match="observations: observation 0 has no PSF"):
+        adapters.from_ngmix(starless)
     small = observation(image.stamps[0][1:-1, 1:-1], image.psf, 1.0)
     with pytest.raises(ValueError, match="observations: images of shapes"):
         adapters.from_ngmix([small, observation(image.stamps[0], image.psf, 1.0)])

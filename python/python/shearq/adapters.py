@@ -43,9 +43,9 @@ def from_ngmix(observations: Any) -> dict[str, Any]:
     stamps, psfs, noise = [], [], []
     for k, observation in enumerate(many):
         jacobian = observation.jacobian
-        matrix = [getattr(jacobian, name) for name in ("dudcol", "dudrow", "dvdcol", "dvdrow")]
-        (xx, xy, yx, yy), scale = matrix, jacobian.dudcol
-        if not (scale > 0 and max(abs(xy), abs(yx), abs(yy - xx)) <= _SAME * scale):
+        xx, xy = jacobian.get_dudcol(), jacobian.get_dudrow()
+        yx, yy = jacobian.get_dvdcol(), jacobian.get_dvdrow()
+        if not (xx > 0 and max(abs(xy), abs(yx), abs(yy - xx)) <= _SAME * xx):
             raise ValueError(
                 f"observations: the jacobian of observation {k} is ({xx}, {xy}, {yx}, {yy}) (dudcol, dudrow, dvdcol,"
                 " dvdrow); expected square pixels along the axes, (s, 0, 0, s)"
@@ -54,8 +54,11 @@ def from_ngmix(observations: Any) -> dict[str, Any]:
         positive = weight[weight > 0]
         if positive.size == 0:
             raise ValueError(f"observations: no weight of observation {k} is positive; expected inverse variances")
+        try:
+            psfs.append(observation.psf.image)
+        except (AttributeError, RuntimeError) as error:
+            raise ValueError(f"observations: observation {k} has no PSF: {error}; expected one") from None
         stamps.append(observation.image)
-        psfs.append(observation.psf.image)
         noise.append(1 / np.sqrt(np.median(positive)))
     for name, images in (("image", stamps), ("PSF image", psfs)):
         shapes = {np.shape(image) for image in images}
