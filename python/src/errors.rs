@@ -9,13 +9,8 @@ use shearq_submissions::SubmissionError;
 
 /// What is wrong with stamps, PSFs, the noise or the submission.
 pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
-    let argument = match &error {
-        MeasureError::Submission(_) => {
-            let MeasureError::Submission(error) = error else {
-                unreachable!("it was matched")
-            };
-            return of_submission(error);
-        }
+    let argument = match error {
+        MeasureError::Submission(error) => return of_submission(error),
         MeasureError::Noise(_) => "noise",
         MeasureError::Shape { what, .. } | MeasureError::NotFinite { what, .. }
             if !what.contains("PSF") =>

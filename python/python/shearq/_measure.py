@@ -299,6 +299,8 @@ def measure(
     cent, a handful do not. Galaxies that are measured in several calls are put together by
     :meth:`Catalogue.mean_shear` of each, or by ``columns("anacal")``.
 
+    Other Python threads run meanwhile; they must not change the arrays.
+
     Examples
     --------
     >>> cat = shearq.measure(stamps, psf, noise=sigma)
