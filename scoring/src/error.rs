@@ -23,6 +23,16 @@ pub enum ScoringError {
         /// Its value.
         found: f64,
     },
+    /// An array that is not of the grid's shape.
+    #[error("{what} has the shape {found:?}; expected ({side}, {side}), index [ix, iy]")]
+    Shape {
+        /// Which array.
+        what: &'static str,
+        /// Its shape.
+        found: (usize, usize),
+        /// Cells a side of the grid.
+        side: usize,
+    },
     /// The side of a field that is out of range.
     #[error("the field is {found} degrees a side; expected {least} to {most}")]
     Field {

@@ -11,28 +11,22 @@
 //!   steradian, ℓ in rad⁻¹.
 //! * Noise variances are per component, galaxy and image.
 //!
-//! # Example
+//! # Figures of merit
 //!
 //! ```
-//! use shearq_scoring::{FieldSum, Grid, Options, Row, SetImages, SetScorer, TrueShear, TruthSign};
-//!
-//! let grid = Grid::great10(16)?;
-//! let wave = |i: usize| 0.02 * (2.0 * std::f64::consts::PI * 3.0 * i as f64 / 16.0).cos();
-//! let rows: Vec<Row> = (0..256)
-//!     .map(|k| {
-//!         let (x, y) = grid.centre(k % 16, k / 16);
-//!         Row { x, y, e1: wave(k % 16), e2: 0.0 }
-//!     })
-//!     .collect();
-//! let truth = TrueShear::from_rows(&grid, TruthSign::Standard, rows.iter().copied())?;
-//! let mut image = FieldSum::new(&grid);
-//! image.add_image(&grid, rows.iter().map(|r| Row { e1: 1.01 * r.e1, ..*r }));
-//! let mut images = SetImages::new(&grid);
-//! images.add(&image);
-//! let score = SetScorer::new(grid, truth, Options::default())?.score(&images)?;
-//! assert!((score.figures.m_cross - 0.01).abs() < 1e-12);
-//! # Ok::<(), shearq_scoring::ScoringError>(())
+#![doc = include_str!("../examples/quality.rs")]
 //! ```
+//!
+//! Catalogues with positions become [`Row`]s, which [`FieldSum::add_image`] puts onto the grid and counts.
+//! Images can be added one at a time: memory is that of some twenty grids however many there are.
+//!
+//! # A spectrum
+//!
+//! ```
+#![doc = include_str!("../examples/spectrum.rs")]
+//! ```
+//!
+//! [`cross_spectrum`] gives that of pairs of images, in which noise has no mean.
 
 pub mod bandpower;
 mod catalogue;

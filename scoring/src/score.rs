@@ -1,6 +1,6 @@
 //! Scores of one set: every convention, noise, biases, null tests, and errors of all of them.
 
-use ndarray::Array2;
+use ndarray::{Array2, ArrayView2};
 use rustfft::num_complex::Complex64;
 use serde::Serialize;
 
@@ -73,6 +73,31 @@ impl SetImages {
         }
     }
 
+    /// Images given as e₁ and e₂ on the cells `[ix, iy]`, where a value that is not finite is a galaxy
+    /// without an ellipticity.
+    ///
+    /// # Errors
+    /// Where an array is not of the grid's shape.
+    pub fn of_arrays<'a>(
+        grid: &Grid,
+        images: impl IntoIterator<Item = [ArrayView2<'a, f64>; 2]>,
+    ) -> Result<Self, ScoringError> {
+        let mut all = SetImages::new(grid);
+        for [e1, e2] in images {
+            check_shape("e1 of an image", &e1, grid)?;
+            check_shape("e2 of an image", &e2, grid)?;
+            let mut sum = FieldSum::new(grid);
+            sum.images = 1;
+            for ((cell, &e1), &e2) in e1.indexed_iter().zip(&e2) {
+                if e1.is_finite() && e2.is_finite() {
+                    (sum.e1[cell], sum.e2[cell], sum.count[cell]) = (e1, e2, 1.0);
+                }
+            }
+            all.add(&sum);
+        }
+        Ok(all)
+    }
+
     /// Adds the sum of one image (with `images` = 1).
     pub fn add(&mut self, image: &FieldSum) {
         let group = self.next % MAX_GROUPS;
@@ -93,6 +118,22 @@ impl SetImages {
     /// The sum of all images.
     pub fn total(&self) -> &FieldSum {
         &self.total
+    }
+}
+
+/// Checks that an array has a value for every cell.
+fn check_shape(
+    what: &'static str,
+    array: &ArrayView2<'_, f64>,
+    grid: &Grid,
+) -> Result<(), ScoringError> {
+    match array.dim() == (grid.n, grid.n) {
+        true => Ok(()),
+        false => Err(ScoringError::Shape {
+            what,
+            found: array.dim(),
+            side: grid.n,
+        }),
     }
 }
 
@@ -237,13 +278,15 @@ impl SetScorer {
     /// Prepares the transforms and bins.
     ///
     /// # Errors
-    /// Where a given noise variance is negative or not finite.
+    /// Where the truth is not of the grid's shape, or a given noise variance negative or not finite.
     pub fn new(grid: Grid, truth: TrueShear, options: Options) -> Result<Self, ScoringError> {
         if let Noise::Given(variance) = options.noise
             && !(variance.is_finite() && variance >= 0.0)
         {
             return Err(ScoringError::NoiseVariance(variance));
         }
+        check_shape("g1 of the truth", &truth.g1.view(), &grid)?;
+        check_shape("g2 of the truth", &truth.g2.view(), &grid)?;
         Ok(SetScorer {
             grid,
             options,
@@ -256,12 +299,13 @@ impl SetScorer {
     /// Scores the images of a submission.
     ///
     /// # Errors
-    /// Where no image was added.
+    /// Where no image was added, or images of another grid.
     pub fn score(&self, images: &SetImages) -> Result<SetScore, ScoringError> {
         let total = &images.total;
         if total.images == 0 {
             return Err(ScoringError::NoImages);
         }
+        check_shape("the sum of the images", &total.e1.view(), &self.grid)?;
         let groups: Vec<MeanPower> = match self.options.noise {
             Noise::Given(_) => Vec::new(),
             Noise::Measured => images.groups.iter().map(|g| self.mean_power(g)).collect(),

@@ -4,7 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::units::Degrees;
-use shearq_scoring::{FieldSum, Grid, Row, SetImages, SpectrumCovariance};
+use shearq_scoring::{
+    Convention, ConventionMatch, FieldSum, Grid, Options, Row, SetImages, SetScorer,
+    SpectrumCovariance,
+};
 
 use super::archive::{ArchiveWriter, is_archive};
 use super::challenge::{Kind, Spectrum, catalogue_text, spectrum_text};
@@ -12,6 +15,7 @@ use super::manifest::{Contents, FileSum, MANIFEST_FILE, Manifest};
 use crate::io::atomic::PartFolder;
 use crate::io::layout::{DataFolder, read_rows};
 use crate::io::listing::Files;
+use crate::io::open::is_there;
 use crate::io::run::Run;
 use crate::io::table::{MAX_ROWS, most_rows};
 use crate::io::{FileError, run::record_text};
@@ -56,6 +60,27 @@ impl Origin<'_> {
         match self {
             Origin::Measured { .. } => read_rows(path, &COLUMNS, most),
             Origin::Foreign { foreign, .. } => foreign.rows(path, most),
+        }
+    }
+
+    /// How well each convention goes with the true shear of a set, where another program's catalogues are
+    /// packed and it is known.
+    fn matching(
+        &self,
+        set: u32,
+        images: &SetImages,
+        grid: &Grid,
+    ) -> Result<ConventionMatch, FileError> {
+        match self {
+            Origin::Foreign {
+                data: Some(data), ..
+            } if is_there(&data.truth(set)) => {
+                let truth = data.read_truth(set, grid)?;
+                let scorer = SetScorer::new(*grid, truth, Options::default())
+                    .map_err(|error| FileError::new(data.truth(set), error))?;
+                Ok(scorer.match_convention(images))
+            }
+            _ => Ok(ConventionMatch::default()),
         }
     }
 
@@ -116,6 +141,7 @@ impl Packing<'_> {
         let mut destination = Destination::create(out)?;
         let mut files = BTreeMap::new();
         let mut covariances = BTreeMap::new();
+        let mut matching = ConventionMatch::default();
         let mut add = |kind: Kind, text: String| -> Result<(), FileError> {
             let (name, mut bytes) = (kind.file_name(), text.as_bytes());
             destination.add(&name, bytes)?;
@@ -135,7 +161,8 @@ impl Packing<'_> {
             };
             if let Some(spectrum) = spectrum {
                 let kind = Kind::Spectrum { set, method };
-                let (text, covariance) = self.spectrum(set, &catalogues, spectrum, progress)?;
+                let (text, covariance) =
+                    self.spectrum(set, &catalogues, spectrum, &mut matching, progress)?;
                 if let Some(covariance) = covariance {
                     covariances.insert(kind.file_name(), covariance);
                 }
@@ -151,6 +178,17 @@ impl Packing<'_> {
                 )?;
                 progress.advance(rows.len() as u64);
             }
+        }
+        if let (true, Origin::Foreign { foreign, .. }) = (matching.is_clear(), &self.origin)
+            && matching.convention() != Convention::STANDARD
+        {
+            let found = matching.convention();
+            let message = format!(
+                "by the true shear these catalogues are in convention {} ({}), of which no spectrum can tell; let the description exchange `x` and `y` or set `e2_sign`",
+                found.number(),
+                found.describe()
+            );
+            return Err(FileError::new(foreign.pattern(), message));
         }
         let count = files.len();
         let (run, foreign) = match self.origin {
@@ -176,6 +214,7 @@ impl Packing<'_> {
         set: u32,
         catalogues: &[(u32, PathBuf)],
         spectrum: Spectrum,
+        matching: &mut ConventionMatch,
         progress: &mut dyn Progress,
     ) -> Result<(String, Option<SpectrumCovariance>), FileError> {
         let first = &catalogues[0].1;
@@ -194,6 +233,7 @@ impl Packing<'_> {
                 "neither this catalogue nor others of the set have an ellipticity on the grid";
             return Err(FileError::new(first, message));
         }
+        matching.merge(&self.origin.matching(set, &images, &grid)?);
         spectrum_text(&grid, &images, spectrum).map_err(|error| FileError::new(first, error))
     }
 }

@@ -232,6 +232,23 @@ fn catalogues_of_another_program_are_packed_as_they_are_scored() {
         "there is no catalogue here to pack",
     );
     refused("other-8-{image}.csv", &[], "has no {set}");
+    // A spectrum cannot tell the sign of e2, but the truth can.
+    let wrong = text_of(pattern).replace("e2_sign = -1", "e2_sign = 1");
+    fs::write(&description, wrong).unwrap();
+    let pack = [
+        "pack",
+        "--foreign",
+        text(&description),
+        "--data",
+        text(&data),
+    ];
+    let never = packed.at("never");
+    let spectra = ["--kind", "spectra", "--out", text(&never)];
+    let message = fail(&[&pack[..], &spectra].concat());
+    assert!(
+        message.contains("convention 6 (e2 flipped)") && !never.exists(),
+        "{message}"
+    );
     fs::write(packed.at("other-8-2.csv"), "xpos,ypos,e1\n1,2,3\n").unwrap();
     refused(
         pattern,

@@ -188,6 +188,63 @@ fn one_of_two_images_alone_has_twice_the_noise_of_both() {
 }
 
 #[test]
+fn arrays_are_scored_like_rows_and_must_have_the_grids_shape() {
+    let grid = Grid::great10(16).unwrap();
+    let shear = field(&grid, Content::E, 5);
+    let keep = |image: usize, k: usize| k != 7 * image + 3;
+    let set = images(&grid, &shear, &[0.1, 0.2, 0.1], keep);
+    let mut arrays: Vec<[Array2<f64>; 2]> = set
+        .groups()
+        .iter()
+        .map(|g| [g.e1.clone(), g.e2.clone()])
+        .collect();
+    for (image, [e1, _]) in arrays.iter_mut().enumerate() {
+        let k = 7 * image + 3;
+        let found = set.groups()[image]
+            .count
+            .indexed_iter()
+            .find(|(_, c)| **c == 0.0);
+        e1[found.unwrap().0] = [f64::NAN, f64::INFINITY][k % 2];
+    }
+    let views = || arrays.iter().map(|[e1, e2]| [e1.view(), e2.view()]);
+    let same = SetImages::of_arrays(&grid, views()).unwrap();
+    let of = |images: &SetImages| score(grid, truth(&shear), images, Options::default());
+    assert_eq!(of(&same).figures.values(), of(&set).figures.values());
+    assert_eq!(same.total().count, set.total().count);
+
+    let message = |error: shearq_scoring::ScoringError| error.to_string();
+    let small = Array2::zeros((16, 15));
+    let whole = Array2::zeros((16, 16));
+    for pair in [[small.view(), whole.view()], [whole.view(), small.view()]] {
+        let error = message(SetImages::of_arrays(&grid, [pair]).unwrap_err());
+        assert!(error.contains("(16, 15); expected (16, 16)"), "{error}");
+    }
+    for (g1, g2) in [(&small, &whole), (&whole, &small)] {
+        let shear = TrueShear {
+            g1: g1.clone(),
+            g2: g2.clone(),
+        };
+        let error = message(
+            SetScorer::new(grid, shear, Options::default())
+                .err()
+                .unwrap(),
+        );
+        assert!(
+            error.contains("of the truth has the shape (16, 15)"),
+            "{error}"
+        );
+    }
+    let other = Grid::great10(8).unwrap();
+    let wrong = images(&other, &field(&other, Content::E, 1), &[0.1], |_, _| true);
+    let scorer = SetScorer::new(grid, truth(&shear), Options::default()).unwrap();
+    let error = message(scorer.score(&wrong).err().unwrap());
+    assert!(
+        error.contains("has the shape (8, 8); expected (16, 16)"),
+        "{error}"
+    );
+}
+
+#[test]
 fn the_noise_of_one_image_is_not_known() {
     let grid = Grid::great10(16).unwrap();
     let shear = field(&grid, Content::E, 5);
