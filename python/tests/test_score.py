@@ -163,7 +163,7 @@ def test_what_is_wrong_is_told(arguments, message):
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_catalogues_are_compared_over_the_same_images():
-    simulation = shearq.simulate(set=8, images=3, grid=16, seed=2)
+    simulation = shearq.simulate(set=8, images=8, grid=16, seed=2)
     linear = [shearq.measure(i.stamps, i.psf, noise=i.noise) for i in simulation]
     raw = [shearq.measure(i.stamps, i.psf, submission="23/raw/star") for i in simulation]
     rows = shearq.compare({"mine": raw, "48/linear/star": linear, "23/raw/star": raw}, simulation, frame="list")
@@ -174,6 +174,8 @@ def test_catalogues_are_compared_over_the_same_images():
     assert rows[1]["sigma"] == rows[1]["q_difference"] / rows[1]["q_difference_error"]
     assert np.isnan(rows[0]["q_difference"]) and rows[2]["q_difference"] == 0
     assert rows[2]["q_published"] == 80.33 and np.isnan(rows[1]["q_published"])
+    few = shearq.compare({"mine": raw[:7], "48/linear/star": linear[:7]}, simulation, frame="list")
+    assert np.isfinite(few[1]["q_difference"]) and np.isnan(few[1]["sigma"])
     pandas = pytest.importorskip("pandas", reason="frames of pandas need it")
     frame = shearq.compare({"mine": raw[0]}, (simulation.g1, simulation.g2), frame="pandas")
     assert isinstance(frame, pandas.DataFrame) and frame.shape == (1, len(rows[0]))

@@ -236,7 +236,7 @@ def compare(
     -------
     pandas.DataFrame, polars.DataFrame or list of dict
         A row each: ``submission``, figures with their errors, ``q_difference`` to the first with its error, paired
-        over the same images, and its significance ``sigma``, ``q_leaderboard``, and the figures published for a
+        over the same images, and its significance ``sigma`` (both from eight images on), ``q_leaderboard``, and the figures published for a
         submission of that name.
     """
     make = _frame(frame)
