@@ -96,9 +96,8 @@ impl Scatter {
     /// Variance of Σ_x u·e over cells for both components, `u` of the same convention as the modes.
     pub(crate) fn of_sums(&self, decomposer: &Decomposer, weights: [&Array2<f64>; 2]) -> [f64; 2] {
         let n4 = (decomposer.grid().cells() as f64).powi(2);
-        let mut component = 0;
-        weights.map(|u| {
-            let modes = decomposer.fft(u.mapv(Complex64::from));
+        std::array::from_fn(|component| {
+            let modes = decomposer.fft(weights[component].mapv(Complex64::from));
             let sum: f64 = modes
                 .indexed_iter()
                 .map(|(at, u)| {
@@ -109,7 +108,6 @@ impl Scatter {
                     u.norm_sqr() * (own * e + (1.0 - own) * b)
                 })
                 .sum();
-            component += 1;
             sum / n4
         })
     }

@@ -327,11 +327,13 @@ fn where_the_shear_is_constant_the_mean_is_the_truth_and_c() {
 #[test]
 fn errors_of_a_constant_shear_do_not_depend_on_the_sign_of_a_component() {
     let grid = Grid::great10(16).unwrap();
+    // One image has no jackknife; a gap lets all modes into a mean.
+    let keep = |_: usize, k: usize| !(40..140).contains(&k);
     let of = |sign: f64| {
         let shear = Array2::from_elem((16, 16), Complex64::new(0.03, -0.02 * sign));
         let mut flipped = SetImages::new(&grid);
         let plain = Array2::from_elem((16, 16), Complex64::new(0.03, -0.02));
-        for group in images(&grid, &plain, &[0.1; 4], |_, _| true).groups() {
+        for group in images(&grid, &plain, &[0.1], keep).groups() {
             let mut sum = group.clone();
             sum.e2 *= sign;
             flipped.add(&sum);
