@@ -55,10 +55,8 @@ pub struct Bins {
     modulus: Array2<f64>,
     /// From bandpower to C_ℓ in steradian.
     to_c_l: [f64; BINS],
-    /// n, for the scaling of powers.
-    n: usize,
-    /// Field side in radians.
-    side: f64,
+    /// What the modes are of.
+    grid: Grid,
 }
 
 impl Bins {
@@ -76,8 +74,7 @@ impl Bins {
             bin_of: Array2::from_elem((grid.n, grid.n), BINS as u8),
             modulus: Array2::zeros((grid.n, grid.n)),
             to_c_l: [0.0; BINS],
-            n: grid.n,
-            side: grid.side().0,
+            grid: *grid,
         };
         let mut sum_l2 = [0.0; BINS];
         // The order matters to the leaderboard definition: centred, first index outermost.
@@ -125,7 +122,7 @@ impl Bins {
                 }
                 for b in 0..BINS {
                     if bins.modes[b] > 0 {
-                        bins.to_c_l[b] = bins.side * bins.side / bins.mode_weight(b);
+                        bins.to_c_l[b] = bins.side() * bins.side() / bins.mode_weight(b);
                     }
                 }
             }
@@ -143,6 +140,11 @@ impl Bins {
             }
         }
         bins
+    }
+
+    /// Side of the field in radians.
+    fn side(&self) -> f64 {
+        self.grid.side().0
     }
 
     /// W_b = Σ|ℓ|/Δ: bandpower of a field with unit |FFT|²/n⁴ in every mode (leaderboard).
@@ -163,10 +165,9 @@ impl Bins {
     pub fn power(&self, a: &Array2<Complex64>, b: &Array2<Complex64>) -> [f64; BINS] {
         let mut sums = [0.0; BINS];
         // Sums run in the order in which the original visits the modes.
-        for i in 0..self.n {
-            let row = (i + self.n - self.n / 2) % self.n;
-            for j in 0..self.n {
-                let at = (row, (j + self.n - self.n / 2) % self.n);
+        for i in 0..self.grid.n {
+            for j in 0..self.grid.n {
+                let at = (self.grid.fft_index(i), self.grid.fft_index(j));
                 let bin = usize::from(self.bin_of[at]);
                 if bin < BINS {
                     let l = self.modulus[at];
@@ -178,11 +179,11 @@ impl Bins {
                 }
             }
         }
-        let n4 = (self.n as f64).powi(4);
+        let n4 = (self.grid.n as f64).powi(4);
         std::array::from_fn(|b| match self.definition {
             Definition::Leaderboard => sums[b] / (n4 * self.width),
             Definition::Corrected if self.modes[b] > 0 => {
-                sums[b] * self.side * self.side
+                sums[b] * self.side() * self.side()
                     / (2.0 * std::f64::consts::PI * n4 * self.modes[b] as f64)
             }
             Definition::Corrected => 0.0,
@@ -192,21 +193,21 @@ impl Bins {
     /// Bandpowers of white noise with variance `variance` per component and cell: the E (or B) part.
     pub fn white_noise(&self, variance: f64) -> [f64; BINS] {
         // |FFT|² of n² independent cells is n²·variance, so |FFT|²/n⁴ is variance/n².
-        let per_mode = variance / (self.n * self.n) as f64;
+        let per_mode = variance / self.grid.cells() as f64;
         std::array::from_fn(|b| {
             if self.modes[b] == 0 {
                 return 0.0;
             }
             match self.definition {
                 Definition::Leaderboard => self.mode_weight(b) * per_mode,
-                Definition::Corrected => per_mode * self.side * self.side / self.to_c_l[b],
+                Definition::Corrected => per_mode * self.side() * self.side() / self.to_c_l[b],
             }
         })
     }
 
     /// Calls with every scored mode (in FFT order), its bin, and its weight w in P_b = Σ w·Re(a b*).
     pub(crate) fn each_scored(&self, mut call: impl FnMut((usize, usize), usize, f64)) {
-        let n4 = (self.n as f64).powi(4);
+        let n4 = (self.grid.n as f64).powi(4);
         for (at, &bin) in self.bin_of.indexed_iter() {
             let bin = usize::from(bin);
             if SCORED.contains(&bin) {
@@ -215,7 +216,7 @@ impl Bins {
                     Definition::Leaderboard => l / (n4 * self.width),
                     Definition::Corrected => {
                         let modes = self.modes[bin] as f64;
-                        (l * self.side).powi(2) / (2.0 * std::f64::consts::PI * n4 * modes)
+                        (l * self.side()).powi(2) / (2.0 * std::f64::consts::PI * n4 * modes)
                     }
                 };
                 call(at, bin, weight);

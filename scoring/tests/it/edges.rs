@@ -374,6 +374,11 @@ fn whole_numbers_stand_for_something_else_only_where_no_ellipticity_can_be() {
         (counts(1.0, 0.0).above_one, counts(1.0, 0.1).above_one),
         (0, 1)
     );
+    assert_eq!(
+        counts(-0.9, -0.9).above_one + counts(0.9, -0.9).above_one,
+        2
+    );
+    assert_eq!(counts(0.9, 0.2).above_one + counts(0.2, 0.9).above_one, 0);
     assert_eq!((counts(5.0, 0.0).absurd, counts(5.5, 0.0).absurd), (0, 1));
     let outliers = RowCounts {
         used: 60,
