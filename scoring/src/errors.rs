@@ -15,7 +15,7 @@
 //! M, A and the null tests are linear in bandpowers, m₁ to c₂ sums over cells. σ_sys is a sum of moduli: each
 //! term has the scatter of a folded normal number. A mean, which is the zero mode, has the E modes' power
 //! at the lowest multipoles: intrinsic ellipticities, B modes, have no mean. Where the true shear has no modes,
-//! nothing tells the two kinds apart, and ν and ν_B are the mean of both.
+//! nothing tells the two kinds apart, and that of a mean is the mean of both.
 
 use ndarray::Array2;
 use rustfft::num_complex::Complex64;
@@ -74,12 +74,10 @@ impl Scatter {
         }
     }
 
-    /// The same for a truth without modes, which tells neither kind of mode from the other.
+    /// The same for a truth without modes, which tells neither kind from the other. Only means are asked for
+    /// then.
     pub(crate) fn of_one_kind(self) -> Self {
-        let alike = std::array::from_fn(|ring| 0.5 * (self.e[ring] + self.b[ring]));
         Scatter {
-            e: alike,
-            b: alike,
             lowest: [0.5 * (self.lowest[0] + self.lowest[1]); 2],
             ..self
         }
