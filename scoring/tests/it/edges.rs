@@ -88,8 +88,8 @@ fn a_cross_spectrum_and_its_covariance_are_those_of_their_formulae() {
     let all: f64 = pairs.iter().map(share).sum();
     let mut power = [0.0; BINS];
     for p in &pairs {
-        for b in 0..BINS {
-            power[b] += share(p) * pair(p.0, p.1)[b] / all;
+        for (sum, own) in power.iter_mut().zip(pair(p.0, p.1)) {
+            *sum += share(p) * own / all;
         }
     }
     let covariance = found.covariance.unwrap();
