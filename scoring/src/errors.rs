@@ -153,18 +153,22 @@ impl Scatter {
     }
 }
 
-/// Standard error of Q where the scored bandpowers are `apart` from the truth and have these variances.
+/// Standard error of σ_sys where the scored bandpowers are `apart` from the truth and have these variances.
 ///
 /// σ_sys is a sum of |P_b − P_b^true|. The mean of each is taken as √max(0, x² − variance), and its scatter is
-/// that of the modulus of a normal number. The error of Q ∝ 1/σ_sys is that of σ_sys to first order, damped
-/// where the two are of one size: a σ_sys that is small by chance would have Q's error without bound.
+/// that of the modulus of a normal number.
+pub(crate) fn of_sigma_sys(bins: &Bins, apart: &[f64; BINS], variance: &[f64; BINS]) -> f64 {
+    SCORED
+        .map(|b| folded_variance(apart[b], variance[b]) * bins.dln_l[b].powi(2))
+        .sum::<f64>()
+        .sqrt()
+}
+
+/// Standard error of Q ∝ 1/σ_sys: that of σ_sys to first order, damped where the two are of one size, as a
+/// σ_sys that is small by chance would have Q's error without bound.
 pub(crate) fn of_quality(bins: &Bins, q: f64, apart: &[f64; BINS], variance: &[f64; BINS]) -> f64 {
-    let (mut sigma_sys, mut total) = (0.0, 0.0);
-    for b in SCORED {
-        sigma_sys += apart[b].abs() * bins.dln_l[b];
-        total += folded_variance(apart[b], variance[b]) * bins.dln_l[b].powi(2);
-    }
-    let relative = total.sqrt() / sigma_sys;
+    let sigma_sys: f64 = SCORED.map(|b| apart[b].abs() * bins.dln_l[b]).sum();
+    let relative = of_sigma_sys(bins, apart, variance) / sigma_sys;
     q * relative / (1.0 + relative * relative)
 }
 

@@ -623,6 +623,7 @@ impl SetScorer {
             c2: second.c,
             b_power: mean_c_l(&score.bb),
             eb_power: mean_c_l(&score.eb),
+            sigma_sys_1e4: score.quality.sigma_sys * 1e4,
         };
         match self.truth.constant() {
             None => own,
@@ -721,6 +722,7 @@ impl SetScorer {
             c2,
             b_power: errors::of_mean_c_l(bins, &bb),
             eb_power: errors::of_mean_c_l(bins, &eb),
+            sigma_sys_1e4: errors::of_sigma_sys(bins, &apart, &power) * 1e4,
         }
     }
 }

@@ -32,7 +32,8 @@ class Score:
     figures, errors : dict of str to float
         ``q``: quality factor; ``q_dn``: without the noise's power; ``m_half``: M/2; ``sqrt_a``: √A in 10⁻⁴ (C_ℓ in
         steradian); ``m_cross``: multiplicative bias by cross-correlation; ``m1``, ``m2``, ``c1``, ``c2``: biases of
-        the components; ``b_power``, ``eb_power``: mean C_ℓ of B and EB in 10⁻⁹ steradian.
+        the components; ``b_power``, ``eb_power``: mean C_ℓ of B and EB in 10⁻⁹ steradian;
+        ``sigma_sys_1e4``: what Q is made of, 5·10⁻³/Q, in 10⁻⁴.
     spectrum : structured array of shape (20,)
         Per bin: ``l`` in rad⁻¹, ``dln_l``, ``modes``, ``scored``, bandpowers ℓ²C_ℓ/2π ``ee``, ``bb``, ``eb``,
         ``true_ee``, ``true_bb``, ``noise`` (NaN where unknown), and ``to_c_l``, by which they become C_ℓ in steradian.

@@ -296,7 +296,7 @@ fn a_spectrum_submission_is_scored_with_the_errors_of_its_covariance() {
     };
     let (of_m, of_a) = (gradient(&|p| fit(p).M), gradient(&|p| fit(p).A));
     let near = |found: f64, expected: f64| {
-        assert!((found / expected - 1.0).abs() < 1e-6, "{found} {expected}")
+        assert!((found / expected - 1.0).abs() < 1e-6, "{found} {expected}");
     };
     near(found.m_half_error, error(&of_m) / 2.0);
     let a = fit(&measured).A;
@@ -556,6 +556,7 @@ fn biases_of_the_galaxies_are_least_squares_with_their_weights() {
     let mean = |p: &[f64; BINS]| SCORED.map(|b| p[b] * bins.to_c_l(b)).sum::<f64>() / 8.0 * 1e9;
     close(f.b_power, mean(&score.spectra().bb), "B");
     close(f.eb_power, mean(&score.spectra().eb), "EB");
+    close(f.sigma_sys_1e4 * f.q, 5e-3 * 1e4, "σ_sys");
     // Half of the power read with the other sign of g2 is B.
     assert!(score.true_b_share() < 1e-12);
     let flipped = TrueShear {
@@ -832,6 +833,9 @@ fn errors_are_those_of_their_formulae() {
             };
             let ee = score.spectra().ee;
             near(errors.q, of_q(f.q, &|b| ee[b], &variance), "Q");
+            let relative = errors.sigma_sys_1e4 / f.sigma_sys_1e4;
+            let damped = relative / (1.0 + relative * relative);
+            close(errors.q, f.q * damped, "σ_sys");
             let noise_power = score.noise.unwrap();
             let groups = match noise {
                 Noise::Measured => 4.0 / 3.0,
