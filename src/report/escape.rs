@@ -158,7 +158,7 @@ mod tests {
 
     use super::*;
     use crate::report::baseline::junit;
-    use crate::report::figure::{Figure, Format, HeatMap};
+    use crate::report::figure::{Figure, HeatMap, PictureFormat};
     use crate::report::html::{Block, Report, Section};
     use crate::report::table::{Cell, Heading, Table, TableFormat};
     use crate::results::baseline::Checked;
@@ -314,8 +314,9 @@ mod tests {
                 values: Array2::ones((1, 1)),
                 ..HeatMap::default()
             };
-            let svg =
-                |name: &str| String::from_utf8(map(name).render(Format::Svg).unwrap()).unwrap();
+            let svg = |name: &str| {
+                String::from_utf8(map(name).render(PictureFormat::Svg).unwrap()).unwrap()
+            };
             let check = |name: &str| {
                 let check = Checked {
                     baseline: name.into(),

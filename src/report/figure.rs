@@ -6,7 +6,7 @@
 //! because of what they are, only lists that should be equally long and are not.
 //!
 //! ```
-//! # use shearq::report::figure::{Figure, Format, LinePlot, Series, Style};
+//! # use shearq::report::figure::{Figure, PictureFormat, LinePlot, Series, Style};
 //! let plot = LinePlot {
 //!     title: "Shear power".into(),
 //!     x_label: "ℓ".into(),
@@ -16,7 +16,7 @@
 //!     series: vec![Series::new("true", vec![100.0, 200.0], vec![1e-5, 2e-5], Style::Line, 0)],
 //!     ..LinePlot::default()
 //! };
-//! assert!(plot.render(Format::Svg)?.starts_with(b"<svg"));
+//! assert!(plot.render(PictureFormat::Svg)?.starts_with(b"<svg"));
 //! # Ok::<(), shearq::report::figure::FigureError>(())
 //! ```
 
@@ -29,17 +29,16 @@ mod line;
 mod scene;
 mod ticks;
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::io::{FileError, atomic};
-use plotters::backend::{BitMapBackend, DrawingBackend};
 
 pub use bar::{BarGroup, BarPlot};
 pub use colour::ColourMap;
 pub use heat::HeatMap;
 pub use image::{ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
 pub use line::{LinePlot, PanelGrid, Series, Style};
+pub(super) use scene::PIXELS_PER_POINT;
 pub use scene::Scene;
 
 /// The em of a figure's title, in points.
@@ -66,14 +65,6 @@ pub enum FigureError {
     /// The file could not be written.
     #[error(transparent)]
     File(#[from] FileError),
-    /// The temporary file through which pixels pass could not be used.
-    #[error("{}: cannot write the figure: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        source: std::io::Error,
-    },
     /// Two lists that belong together differ in length.
     #[error("figure `{figure}`, {place}: found {found} {what}, expected {expected}")]
     Lengths {
@@ -101,24 +92,24 @@ pub enum FigureError {
         /// In square points.
         largest: f64,
     },
-    /// The drawing library failed.
+    /// The pixels could not be drawn.
     #[error("cannot draw the figure: {detail}")]
     Drawing {
-        /// What it said.
+        /// Why.
         detail: String,
     },
 }
 
 /// A format of picture files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
+pub enum PictureFormat {
     /// Pixels, two per point.
     Png,
     /// Shapes and text.
     Svg,
 }
 
-impl Format {
+impl PictureFormat {
     /// The format that the extension of `path` names, in capitals or not.
     ///
     /// # Errors
@@ -150,11 +141,11 @@ pub trait Figure {
     ///
     /// # Errors
     /// Those of [`Figure::scene`], [`FigureError::TooLarge`] and [`FigureError::Drawing`].
-    fn render(&self, format: Format) -> Result<Vec<u8>, FigureError> {
+    fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError> {
         let scene = self.scene()?;
         match format {
-            Format::Svg => Ok(scene.to_svg()?.into_bytes()),
-            Format::Png => encode_png(&scene),
+            PictureFormat::Svg => Ok(scene.to_svg()?.into_bytes()),
+            PictureFormat::Png => scene.to_png(),
         }
     }
 
@@ -162,30 +153,13 @@ pub trait Figure {
     /// at once or, on failure, not at all.
     ///
     /// # Errors
-    /// Those of [`Format::of`] and [`Figure::render`], and [`FigureError::File`].
+    /// Those of [`PictureFormat::of`] and [`Figure::render`], and [`FigureError::File`].
     fn save(&self, path: impl AsRef<Path>) -> Result<(), FigureError>
     where
         Self: Sized,
     {
         let path = path.as_ref();
-        let bytes = self.render(Format::of(path)?)?;
+        let bytes = self.render(PictureFormat::of(path)?)?;
         Ok(atomic::write(path, &bytes)?)
     }
-}
-
-/// The scene as a PNG file. Plotters encodes into files only, so it passes through a temporary one.
-fn encode_png(scene: &Scene) -> Result<Vec<u8>, FigureError> {
-    let (pixels, size) = scene.to_pixels()?;
-    let folder = atomic::Scratch::new()?;
-    let path = folder.path().join("figure.png");
-    let failed = |error: &dyn std::fmt::Display| FigureError::Drawing {
-        detail: error.to_string(),
-    };
-    let mut backend = BitMapBackend::new(&path, size);
-    backend
-        .blit_bitmap((0, 0), size, &pixels)
-        .map_err(|error| failed(&error))?;
-    backend.present().map_err(|error| failed(&error))?;
-    drop(backend);
-    fs::read(&path).map_err(|source| FigureError::Io { path, source })
 }

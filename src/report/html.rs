@@ -15,14 +15,14 @@
 //! ```
 
 use std::collections::HashSet;
-use std::fmt::Write;
 use std::path::Path;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
+use maud::{DOCTYPE, Markup, PreEscaped, Render, html};
 
-use super::escape::markup as escape;
-use super::figure::{Figure, FigureError, Format};
+use super::escape::visible;
+use super::figure::{Figure, FigureError, PIXELS_PER_POINT, PictureFormat};
 use super::table::{Cell, Table, TableFormat};
 use crate::io::{FileError, atomic};
 
@@ -35,9 +35,6 @@ const LONG: usize = 16;
 /// What replaces `DARK` in the style sheet, which needs it in two places.
 const DARK: &str = "color-scheme: dark; --paper: #15171a; --ink: #dddcd8; --muted: #a0a4a9; \
      --rule: #34383d; --strong-rule: #8b9096; --link: #8fb8e0; --shade: #202327; --edge: #000a; --dim: brightness(.92);";
-
-/// Pixels of a PNG per point, as figures are drawn.
-const PIXELS_PER_POINT: f64 = 2.0;
 
 /// A report.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -100,8 +97,8 @@ pub struct Picture {
     pub alt: String,
     /// Caption, with the markup of [`Block::Text`].
     pub caption: String,
-    /// Format of `bytes`.
-    pub format: Format,
+    /// PictureFormat of `bytes`.
+    pub format: PictureFormat,
     /// The picture file. SVG is small and sharp for curves and bars, PNG is smaller for images.
     pub bytes: Vec<u8>,
     /// Labels and paths, relative to the report, of the same figure and its data in other formats.
@@ -115,7 +112,7 @@ impl Picture {
     /// Those of [`Figure::render`].
     pub fn draw(
         figure: &dyn Figure,
-        format: Format,
+        format: PictureFormat,
         stem: impl Into<String>,
         caption: impl Into<String>,
     ) -> Result<Self, FigureError> {
@@ -146,15 +143,15 @@ impl Picture {
     /// Width and height in points, where the file tells.
     fn size(&self) -> Option<(f64, f64)> {
         match self.format {
-            Format::Png => {
+            PictureFormat::Png => {
                 let number = |at: usize| {
                     let bytes = self.bytes.get(at..at + 4)?.try_into().ok()?;
-                    Some(f64::from(u32::from_be_bytes(bytes)) / PIXELS_PER_POINT)
+                    Some(f64::from(u32::from_be_bytes(bytes)) / f64::from(PIXELS_PER_POINT))
                 };
                 self.bytes.starts_with(b"\x89PNG").then_some(())?;
                 Some((number(16)?, number(20)?))
             }
-            Format::Svg => {
+            PictureFormat::Svg => {
                 let text = str::from_utf8(&self.bytes).ok()?;
                 let (_, tag) = text.split_once("<svg")?;
                 let (tag, _) = tag.split_once('>')?;
@@ -183,28 +180,46 @@ impl Report {
             .map(|(id, section)| (id.as_str(), section.heading.as_str()))
             .collect();
         if !self.settings.is_empty() {
-            contents.push((SETTINGS.0, SETTINGS.1));
+            contents.push(SETTINGS);
         }
-        page.head(&self.title, &self.subtitle);
-        page.contents(&contents);
-        page.text.push_str("<main id=\"main\">\n");
-        for (id, section) in ids.iter().zip(&self.sections) {
-            page.open_section(id, &section.heading);
-            for block in &section.blocks {
-                match block {
-                    Block::Text(text) => page.paragraphs(text),
-                    Block::Table(table) => page.table(table),
-                    Block::Figure(picture) => page.figure(picture),
-                    Block::Code(code) => page.code(code),
-                }
-            }
-            page.text.push_str("</section>\n");
-        }
-        if !self.settings.is_empty() {
-            page.settings(&self.settings);
-        }
-        page.text.push_str("</main>\n</body>\n</html>\n");
-        page.text
+        let markup = html! {
+            (DOCTYPE) "\n"
+            html lang="en" {
+                (head(&self.title))
+                body { "\n"
+                    a.skip href="#main" { "Skip the contents" } "\n"
+                    header {
+                        div {
+                            h1 { (Words(&self.title)) }
+                            @if !self.subtitle.is_empty() {
+                                p.subtitle { (Words(&self.subtitle)) }
+                            }
+                        }
+                        button #theme type="button" title="Change between light and dark" hidden { "Dark" }
+                    } "\n"
+                    @if !contents.is_empty() {
+                        nav aria-label="Contents" {
+                            ol {
+                                @for (id, heading) in contents {
+                                    li { a href={ "#" (id) } { (Words(heading)) } }
+                                }
+                            }
+                        } "\n"
+                    }
+                    main #main { "\n"
+                        @for (id, part) in ids.iter().zip(&self.sections) {
+                            (section(id, &part.heading, html! {
+                                @for block in &part.blocks { (page.block(block)) "\n" }
+                            }))
+                        }
+                        @if !self.settings.is_empty() {
+                            (section(SETTINGS.0, SETTINGS.1, settings(&self.settings)))
+                        }
+                    } "\n"
+                } "\n"
+            } "\n"
+        };
+        markup.into_string()
     }
 
     /// Writes the page, whole or not at all.
@@ -248,199 +263,176 @@ impl Ids {
     }
 }
 
-/// A page on its way.
+/// Words from elsewhere: escaped as all text is, with control characters, which no page can hold, written out.
+struct Words<'a>(&'a str);
+
+impl Render for Words<'_> {
+    fn render_to(&self, page: &mut String) {
+        visible(self.0).as_ref().render_to(page);
+    }
+}
+
+fn head(title: &str) -> Markup {
+    let policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; \
+                  script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'";
+    html! {
+        head { "\n"
+            meta charset="utf-8";
+            meta http-equiv="Content-Security-Policy" content=(policy);
+            meta name="viewport" content="width=device-width, initial-scale=1";
+            meta name="color-scheme" content="light dark";
+            meta name="generator" content={ "shearq " (crate::VERSION) };
+            link rel="icon" href="data:,"; "\n"
+            title { (Words(title)) } "\n"
+            style { (PreEscaped(STYLE.replace("DARK", DARK))) } "\n"
+            script { (PreEscaped(SCRIPT)) } "\n"
+        } "\n"
+    }
+}
+
+fn section(id: &str, heading: &str, contents: Markup) -> Markup {
+    html! {
+        section aria-labelledby=(id) { "\n"
+            h2 id=(id) {
+                (Words(heading)) " "
+                a.anchor href={ "#" (id) } aria-label="Link to this section" { "#" }
+            } "\n"
+            (contents)
+        } "\n"
+    }
+}
+
+fn code(code: &str) -> Markup {
+    // The parser drops one line break after the tag, so that the first of the code's own stays.
+    html! {
+        pre tabindex="0" { "\n" code { (Words(code.trim_end_matches('\n'))) } }
+    }
+}
+
+fn settings(settings: &[(String, String)]) -> Markup {
+    html! {
+        dl {
+            @for (name, value) in settings {
+                @let value = value.trim_end_matches('\n');
+                dt { (Words(name)) }
+                @if value.contains('\n') {
+                    dd.long { (code(value)) }
+                } @else {
+                    dd { (Words(value)) }
+                } "\n"
+            }
+        } "\n"
+    }
+}
+
+/// A page on its way: what is numbered in it, and the names that are taken.
 #[derive(Debug)]
 struct Page {
-    text: String,
     ids: Ids,
     tables: usize,
     figures: usize,
-}
-
-/// Appends formatted text to the page.
-macro_rules! put {
-    ($page:expr, $($words:tt)*) => {
-        // Writing to a string cannot fail.
-        let _ = write!($page.text, $($words)*);
-    };
 }
 
 impl Page {
     fn new() -> Self {
         let taken = ["main", "theme", SETTINGS.0];
         Page {
-            text: String::new(),
             ids: Ids(taken.map(String::from).into()),
             tables: 0,
             figures: 0,
         }
     }
 
-    fn head(&mut self, title: &str, subtitle: &str) {
-        let (title, version) = (escape(title), crate::VERSION);
-        let style = STYLE.replace("DARK", DARK);
-        put!(
-            self,
-            "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-             <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; \
-             img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; \
-             base-uri 'none'; form-action 'none'\">\n\
-             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-             <meta name=\"color-scheme\" content=\"light dark\">\n\
-             <meta name=\"generator\" content=\"shearq {version}\">\n\
-             <link rel=\"icon\" href=\"data:,\">\n<title>{title}</title>\n\
-             <style>\n{style}</style>\n<script>\n{SCRIPT}</script>\n</head>\n<body>\n\
-             <a class=\"skip\" href=\"#main\">Skip the contents</a>\n\
-             <header>\n<div>\n<h1>{title}</h1>\n"
-        );
-        if !subtitle.is_empty() {
-            put!(self, "<p class=\"subtitle\">{}</p>\n", escape(subtitle));
-        }
-        self.text.push_str(
-            "</div>\n<button id=\"theme\" type=\"button\" title=\"Change between light and dark\" \
-             hidden>Dark</button>\n</header>\n",
-        );
-    }
-
-    fn contents(&mut self, entries: &[(&str, &str)]) {
-        if entries.is_empty() {
-            return;
-        }
-        self.text.push_str("<nav aria-label=\"Contents\">\n<ol>\n");
-        for (id, heading) in entries {
-            put!(self, "<li><a href=\"#{id}\">{}</a></li>\n", escape(heading));
-        }
-        self.text.push_str("</ol>\n</nav>\n");
-    }
-
-    fn open_section(&mut self, id: &str, heading: &str) {
-        let heading = escape(heading);
-        put!(
-            self,
-            "<section aria-labelledby=\"{id}\">\n<h2 id=\"{id}\">{heading} \
-             <a class=\"anchor\" href=\"#{id}\" aria-label=\"Link to this section\">#</a></h2>\n"
-        );
-    }
-
-    fn paragraphs(&mut self, text: &str) {
-        for paragraph in paragraphs(text) {
-            put!(self, "<p>{}</p>\n", inline(&paragraph));
+    fn block(&mut self, block: &Block) -> Markup {
+        match block {
+            Block::Text(text) => html! {
+                @for paragraph in paragraphs(text) { p { (inline(&paragraph)) } }
+            },
+            Block::Table(table) => self.table(table),
+            Block::Figure(picture) => self.figure(picture),
+            Block::Code(text) => code(text),
         }
     }
 
-    fn code(&mut self, code: &str) {
-        // The parser drops one line break after the tag, so that the first of the code's own stays.
-        put!(
-            self,
-            "<pre tabindex=\"0\">\n<code>{}</code></pre>\n",
-            escape(code.trim_end_matches('\n'))
-        );
-    }
-
-    fn figure(&mut self, picture: &Picture) {
+    fn figure(&mut self, picture: &Picture) -> Markup {
         self.figures += 1;
         let id = self.ids.give(&format!("figure-{}", picture.stem));
         let mime = match picture.format {
-            Format::Png => "image/png",
-            Format::Svg => "image/svg+xml",
+            PictureFormat::Png => "image/png",
+            PictureFormat::Svg => "image/svg+xml",
         };
-        let size = picture.size().map_or_else(String::new, |(w, h)| {
-            format!(" width=\"{}\" height=\"{}\"", w.round(), h.round())
-        });
-        let alt = if picture.alt.is_empty() {
-            plain(&picture.caption)
-        } else {
-            picture.alt.clone()
+        let size = picture.size().map(|(w, h)| (w.round(), h.round()));
+        let alt = match picture.alt.is_empty() {
+            true => plain(&picture.caption),
+            false => picture.alt.clone(),
         };
         // As an image, and not as elements of the page, an SVG keeps its names and styles to itself.
-        put!(
-            self,
-            "<figure id=\"{id}\">\n<div class=\"plate\">\
-             <img src=\"data:{mime};base64,{}\" alt=\"{}\"{size}></div>\n<figcaption>\n",
-            BASE64.encode(&picture.bytes),
-            escape(&alt)
-        );
-        put!(
-            self,
-            "<p><span class=\"number\">Figure {}.</span> {}</p>\n",
-            self.figures,
-            inline(&paragraphs(&picture.caption).join(" "))
-        );
-        self.text.push_str("<p class=\"tools\">");
-        for (k, (label, path)) in picture.links.iter().enumerate() {
-            let space = if k > 0 { " " } else { "" };
-            let (url, label) = (relative_url(path), escape(label));
-            put!(self, "{space}<a href=\"{url}\">{label}</a>");
+        html! {
+            figure id=(id) {
+                div.plate {
+                    img src={ "data:" (mime) ";base64," (BASE64.encode(&picture.bytes)) } alt=(Words(&alt))
+                        width=[size.map(|s| s.0)] height=[size.map(|s| s.1)];
+                }
+                figcaption {
+                    p {
+                        span.number { "Figure " (self.figures) "." } " "
+                        (inline(&paragraphs(&picture.caption).join(" ")))
+                    }
+                    p.tools {
+                        @for (k, (label, path)) in picture.links.iter().enumerate() {
+                            @if k > 0 { " " }
+                            a href=(relative_url(path)) { (Words(label)) }
+                        }
+                    }
+                }
+            }
         }
-        self.text.push_str("</p>\n</figcaption>\n</figure>\n");
     }
 
-    fn table(&mut self, table: &Table) {
+    fn table(&mut self, table: &Table) -> Markup {
         self.tables += 1;
         let number = self.tables;
         let id = self.ids.give(&format!("table-{number}"));
         let title = self.ids.give(&format!("{id}-title"));
-        // The caption stands outside what scrolls; the table is named by it.
-        put!(
-            self,
-            "<div class=\"table\" id=\"{id}\">\n<p class=\"title\" id=\"{title}\">\
-             <span class=\"number\">Table {number}.</span> {}</p>\n\
-             <div class=\"scroll\" role=\"region\" tabindex=\"0\" aria-labelledby=\"{title}\">\n\
-             <table aria-labelledby=\"{title}\">\n<thead>\n<tr>",
-            escape(&table.title)
-        );
         let columns: Vec<Column> = (0..table.headings.len())
             .map(|k| Column::of(table, k))
             .collect();
-        for (heading, column) in table.headings.iter().zip(&columns) {
-            put!(
-                self,
-                "<th scope=\"col\"{}>{}</th>",
-                column.class(),
-                escape(&heading.label)
-            );
-        }
-        self.text.push_str("</tr>\n</thead>\n<tbody>\n");
-        for row in &table.rows {
-            self.text.push_str("<tr>");
-            for (k, column) in columns.iter().enumerate() {
-                column.cell(k, row.get(k), &mut self.text);
-            }
-            self.text.push_str("</tr>\n");
-        }
-        self.text.push_str("</tbody>\n</table>\n</div>\n");
-        if !table.notes.is_empty() {
-            self.text.push_str("<div class=\"notes\">\n");
-            for note in &table.notes {
-                put!(self, "<p>{}</p>\n", escape(note));
-            }
-            self.text.push_str("</div>\n");
-        }
-        put!(
-            self,
-            "<p class=\"tools\"><a download=\"{id}.csv\" \
-             href=\"data:text/csv;charset=utf-8;base64,{}\" \
-             aria-label=\"Table {number} as CSV\">CSV</a></p>\n</div>\n",
-            BASE64.encode(table.render(TableFormat::Csv))
-        );
-    }
-
-    fn settings(&mut self, settings: &[(String, String)]) {
-        let (id, heading) = SETTINGS;
-        self.open_section(id, heading);
-        self.text.push_str("<dl>\n");
-        for (name, value) in settings {
-            put!(self, "<dt>{}</dt>", escape(name));
-            let value = value.trim_end_matches('\n');
-            if value.contains('\n') {
-                self.text.push_str("<dd class=\"long\">");
-                self.code(value);
-                self.text.push_str("</dd>\n");
-            } else {
-                put!(self, "<dd>{}</dd>\n", escape(value));
+        let csv = BASE64.encode(table.render(TableFormat::Csv));
+        // The caption stands outside what scrolls; the table is named by it.
+        html! {
+            div.table id=(id) {
+                p.title id=(title) { span.number { "Table " (number) "." } " " (Words(&table.title)) }
+                div.scroll role="region" tabindex="0" aria-labelledby=(title) {
+                    table aria-labelledby=(title) {
+                        thead {
+                            tr {
+                                @for (heading, column) in table.headings.iter().zip(&columns) {
+                                    th scope="col" class=[column.class(false)] { (Words(&heading.label)) }
+                                }
+                            }
+                        } "\n"
+                        tbody { "\n"
+                            @for row in &table.rows {
+                                tr {
+                                    @for (k, column) in columns.iter().enumerate() {
+                                        (column.cell(k, row.get(k)))
+                                    }
+                                } "\n"
+                            }
+                        }
+                    }
+                }
+                @if !table.notes.is_empty() {
+                    div.notes {
+                        @for note in &table.notes { p { (Words(note)) } }
+                    }
+                }
+                p.tools {
+                    a download={ (id) ".csv" } href={ "data:text/csv;charset=utf-8;base64," (csv) }
+                        aria-label={ "Table " (number) " as CSV" } { "CSV" }
+                }
             }
         }
-        self.text.push_str("</dl>\n</section>\n");
     }
 }
 
@@ -468,56 +460,46 @@ impl Column {
         }
     }
 
-    fn class(self) -> &'static str {
-        match (self.numbers, self.detail) {
-            (false, false) => "",
-            (true, false) => " class=\"num\"",
-            (false, true) => " class=\"detail\"",
-            (true, true) => " class=\"num detail\"",
-        }
+    /// Classes of a cell; of one whose words may be folded on narrow screens if it is `long`.
+    fn class(self, long: bool) -> Option<String> {
+        let classes = [
+            ("long", long),
+            ("num", self.numbers),
+            ("detail", self.detail),
+        ];
+        let classes: Vec<&str> = classes
+            .iter()
+            .filter(|class| class.1)
+            .map(|class| class.0)
+            .collect();
+        (!classes.is_empty()).then(|| classes.join(" "))
     }
 
-    /// Appends a cell; words in the first column head their row.
-    fn cell(self, k: usize, cell: Option<&Cell>, text: &mut String) {
-        let class = self.class();
+    /// A cell; words in the first column head their row, and stay while others scroll.
+    fn cell(self, k: usize, cell: Option<&Cell>) -> Markup {
+        let class = self.class(false);
         match cell {
-            None | Some(Cell::Empty) => text.push_str(&format!("<td{class}></td>")),
+            None | Some(Cell::Empty) => html! { td class=[class] {} },
             Some(Cell::Text(words)) if k == 0 => {
-                // Folded on narrow screens, where this column stays while others scroll.
                 let long = words.chars().count() > LONG;
-                let class = match (long, self.detail) {
-                    (true, false) => " class=\"long\"",
-                    (true, true) => " class=\"long detail\"",
-                    (false, _) => class,
-                };
-                text.push_str(&format!("<th scope=\"row\"{class}>{}</th>", escape(words)));
+                html! { th scope="row" class=[self.class(long)] { (Words(words)) } }
             }
-            Some(Cell::Text(words)) => {
-                text.push_str(&format!("<td{class}>{}</td>", escape(words)));
-            }
+            Some(Cell::Text(words)) => html! { td class=[class] { (Words(words)) } },
             Some(
                 number @ Cell::Number {
                     value, decimals, ..
                 },
-            ) => {
-                let shown = print_number(*value, *decimals);
-                text.push_str(&format!(
-                    "<td{class} data-value=\"{}\">{shown}",
-                    sort_value(*value)
-                ));
-                if let Some(width) = self.error_width {
-                    // The space of the error is kept where there is none, so that values align.
-                    let (mark, error) = match error_text(number) {
-                        Some(error) => ("", error),
-                        None => (" style=\"visibility:hidden\"", String::new()),
-                    };
-                    text.push_str(&format!(
-                        "<span class=\"pm\"{mark}>\u{a0}±\u{a0}</span>\
-                         <span class=\"error\" style=\"min-width:{width}ch\">{error}</span>"
-                    ));
+            ) => html! {
+                td class=[class] data-value=(sort_value(*value)) {
+                    (print_number(*value, *decimals))
+                    @if let Some(width) = self.error_width {
+                        // The space of the error is kept where there is none, so that values align.
+                        @let error = error_text(number);
+                        span.pm style=[error.is_none().then_some("visibility:hidden")] { "\u{a0}±\u{a0}" }
+                        span.error style={ "min-width:" (width) "ch" } { (error.unwrap_or_default()) }
+                    }
                 }
-                text.push_str("</td>");
-            }
+            },
         }
     }
 }
@@ -626,15 +608,16 @@ fn runs(text: &str) -> Vec<Run<'_>> {
 }
 
 /// A paragraph with its markup as HTML.
-fn inline(text: &str) -> String {
-    runs(text)
-        .into_iter()
-        .map(|run| match run {
-            Run::Plain(words) => escape(words),
-            Run::Bold(words) => format!("<b>{}</b>", escape(words)),
-            Run::Code(words) => format!("<code>{}</code>", escape(words)),
-        })
-        .collect()
+fn inline(text: &str) -> Markup {
+    html! {
+        @for run in runs(text) {
+            @match run {
+                Run::Plain(words) => (Words(words)),
+                Run::Bold(words) => b { (Words(words)) },
+                Run::Code(words) => code { (Words(words)) },
+            }
+        }
+    }
 }
 
 /// A text without its markup.
@@ -673,7 +656,7 @@ mod tests {
 
     const NASTY: &str = "<script>alert(\"x\" + 'y')</script> & </style>";
 
-    fn picture(format: Format) -> Picture {
+    fn picture(format: PictureFormat) -> Picture {
         let plot = LinePlot {
             title: "Power".into(),
             series: vec![Series::new(
@@ -734,8 +717,8 @@ mod tests {
                     "scores",
                     "Again",
                     vec![
-                        Block::Figure(picture(Format::Svg)),
-                        Block::Figure(picture(Format::Png).described(NASTY)),
+                        Block::Figure(picture(PictureFormat::Svg)),
+                        Block::Figure(picture(PictureFormat::Png).described(NASTY)),
                         Block::Code(NASTY.into()),
                     ],
                 ),
@@ -861,22 +844,25 @@ mod tests {
     #[test]
     fn markup_is_code_and_bold_and_nothing_else() {
         assert_eq!(
-            inline("a `b*c` **d & e** *f* ` ** g"),
+            inline("a `b*c` **d & e** *f* ` ** g").into_string(),
             "a <code>b*c</code> <b>d &amp; e</b> *f* ` ** g"
         );
-        assert_eq!(inline("``** ** **"), "``<b> </b> **");
+        assert_eq!(inline("``** ** **").into_string(), "``<b> </b> **");
         assert_eq!(plain("the `a`\n**b**"), "the a b");
         assert_eq!(paragraphs("a\nb\n\n \nc\n"), ["a b", "c"]);
-        assert_eq!(escape("a\u{0}\r\n"), "a\\u0000\\u000d\n");
+        assert_eq!(
+            Words("a\u{0}\r\n<").render().into_string(),
+            "a\\u0000\\u000d\n&lt;"
+        );
     }
 
     #[test]
     fn pictures_know_their_size() {
-        let size = picture(Format::Svg).size().unwrap();
-        assert_eq!(picture(Format::Png).size(), Some(size));
+        let size = picture(PictureFormat::Svg).size().unwrap();
+        assert_eq!(picture(PictureFormat::Png).size(), Some(size));
         let broken = Picture {
             bytes: b"\x89PNG".to_vec(),
-            ..picture(Format::Png)
+            ..picture(PictureFormat::Png)
         };
         assert_eq!(broken.size(), None);
     }

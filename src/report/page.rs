@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::figure::{Figure, Format};
+use super::figure::{Figure, PictureFormat};
 use super::html::{Block, Picture, Report, Section};
 use super::table::{Table, TableFormat};
 use crate::io::{atomic, table};
@@ -52,13 +52,16 @@ impl<'a> Page<'a> {
     }
 
     /// Draws a figure as PNG and SVG and shows it.
+    ///
+    /// # Errors
+    /// Where it cannot be drawn or written.
     pub fn figure(
         &mut self,
         name: &str,
         figure: &impl Figure,
         caption: &str,
     ) -> anyhow::Result<()> {
-        let mut picture = Picture::draw(figure, Format::Svg, name, caption)?;
+        let mut picture = Picture::draw(figure, PictureFormat::Svg, name, caption)?;
         for ending in ["png", "svg"] {
             let path = format!("figures/{name}.{ending}");
             figure.save(self.out.join(&path))?;
@@ -69,6 +72,9 @@ impl<'a> Page<'a> {
     }
 
     /// Writes a table's data and shows it.
+    ///
+    /// # Errors
+    /// Where they cannot be written.
     pub fn table(&mut self, name: &str, exhibit: &Table) -> anyhow::Result<()> {
         self.data(name, exhibit)?;
         self.add(Block::Table(exhibit.clone()));
@@ -76,12 +82,15 @@ impl<'a> Page<'a> {
     }
 
     /// Writes a table's data beside the report.
+    ///
+    /// # Errors
+    /// Where they cannot be written.
     pub fn data(&self, name: &str, exhibit: &Table) -> anyhow::Result<()> {
         let text = exhibit.render(TableFormat::Csv);
         atomic::write(self.out.join(format!("data/{name}.csv")), text.as_bytes())?;
         let path = self.out.join(format!("data/{name}.parquet"));
         let columns = exhibit.columns()?;
-        table::write(&path, table::Format::Parquet, &columns, &self.made_by)?;
+        table::write(&path, table::FileFormat::Parquet, &columns, &self.made_by)?;
         Ok(())
     }
 

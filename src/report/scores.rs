@@ -22,8 +22,9 @@ fn figure_cells(figures: &Figures, errors: &Figures) -> Vec<Cell> {
 }
 
 /// What a set is called in tables.
-fn kind_label(set: u32) -> String {
-    SetKind::of(set).map_or_else(String::new, |kind| kind.image.label().to_owned())
+fn kind_label(set: Option<u32>) -> String {
+    set.and_then(SetKind::of)
+        .map_or_else(String::new, |kind| kind.image.label().to_owned())
 }
 
 /// One line that says what the figures are.
@@ -74,11 +75,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         set, score, rows, ..
     } in scored
     {
-        let name = if *set == 0 {
-            "this set".to_owned()
-        } else {
-            format!("set {set}")
-        };
+        let name = set.map_or_else(|| "this set".to_owned(), |set| format!("set {set}"));
         if rows.used == 0 {
             lines.push(format!(
                 "Warning: no galaxy of {name} has an ellipticity; its figures are those of an empty submission."
@@ -113,11 +110,8 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
 }
 
 /// What a set is called in a table's first column.
-fn set_cell(set: u32) -> Cell {
-    Cell::text(match set {
-        0 => "–".into(),
-        set => format!("{set:02}"),
-    })
+fn set_cell(set: Option<u32>) -> Cell {
+    Cell::text(set.map_or_else(|| "–".into(), |set| format!("{set:02}")))
 }
 
 /// Figures per set, with a row of means where there are several sets.
@@ -217,7 +211,11 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
 }
 
 /// Figures of power-spectrum submissions, one row per set and one of means.
-pub fn spectra(scored: &[(u32, SpectrumScore)], title: &str, definition: Definition) -> Table {
+pub fn spectra(
+    scored: &[(Option<u32>, SpectrumScore)],
+    title: &str,
+    definition: Definition,
+) -> Table {
     let headings = vec![
         Heading::new("set", "Set"),
         Heading::new("kind", "Kind"),
@@ -282,7 +280,7 @@ pub fn bandpowers(scored: &[ScoredSet]) -> Table {
         let measured = score.spectra();
         for b in SCORED {
             rows.push(vec![
-                Cell::number(f64::from(*set), 0),
+                set.map_or(Cell::Empty, |set| Cell::number(f64::from(set), 0)),
                 Cell::number(b as f64 + 1.0, 0),
                 Cell::number(score.bins.l[b], 1),
                 power(score.true_ee[b]),

@@ -1,6 +1,5 @@
 //! Tables for terminals, papers and programs.
 
-use clap::ValueEnum;
 use comfy_table::{CellAlignment, ContentArrangement, TableComponent, presets};
 use serde_json::{Map, Value, json};
 use shearq_tables::polars::{Column, DataFrame};
@@ -9,7 +8,7 @@ use shearq_tables::{TableError, frame};
 use super::escape;
 
 /// How to print a table.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum TableFormat {
     /// For reading on a terminal.
     #[default]

@@ -2,8 +2,8 @@
 
 use ndarray::{Array2, array};
 use shearq::report::figure::{
-    BarGroup, BarPlot, ColourMap, Figure, FigureError, Format, HeatMap, ImageGrid, ImagePanel,
-    ImageRow, LinePlot, PanelGrid, Scale, Series, Stretch, Style,
+    BarGroup, BarPlot, ColourMap, Figure, FigureError, HeatMap, ImageGrid, ImagePanel, ImageRow,
+    LinePlot, PanelGrid, PictureFormat, Scale, Series, Stretch, Style,
 };
 
 const HARD: [&[f64]; 9] = [
@@ -20,12 +20,12 @@ const HARD: [&[f64]; 9] = [
 
 /// Draws in both formats; the results must be what they claim to be.
 fn draw(figure: &impl Figure) {
-    let svg = String::from_utf8(figure.render(Format::Svg).expect("SVG")).expect("UTF-8");
+    let svg = String::from_utf8(figure.render(PictureFormat::Svg).expect("SVG")).expect("UTF-8");
     assert!(svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"));
     assert!(!svg.contains("NaN") && !svg.contains("inf"));
     assert!(
         figure
-            .render(Format::Png)
+            .render(PictureFormat::Png)
             .expect("PNG")
             .starts_with(b"\x89PNG")
     );
@@ -141,7 +141,7 @@ fn the_first_row_of_an_image_is_at_the_bottom() {
         rows,
         scale: Scale::Own,
     };
-    let svg = String::from_utf8(grid.render(Format::Svg).expect("SVG")).expect("UTF-8");
+    let svg = String::from_utf8(grid.render(PictureFormat::Svg).expect("SVG")).expect("UTF-8");
     // The two rows are the first rectangles after the background.
     let top = |line: &str| -> i32 {
         let after = line.split_once(" y=\"").expect("a y").1;
@@ -165,7 +165,7 @@ fn the_first_row_of_an_image_is_at_the_bottom() {
 #[test]
 fn equal_figures_give_equal_files() {
     let plot = lines(&[1.0, 2.0, 4.0], &[3.0, 1.0, 2.0], true);
-    for format in [Format::Png, Format::Svg] {
+    for format in [PictureFormat::Png, PictureFormat::Svg] {
         assert_eq!(
             plot.render(format).expect("drawn"),
             plot.render(format).expect("drawn")
@@ -211,7 +211,10 @@ fn errors_name_the_place_and_what_was_expected() {
     };
     uneven.series[1].y.push(2.0);
     assert_eq!(
-        uneven.render(Format::Svg).expect_err("uneven").to_string(),
+        uneven
+            .render(PictureFormat::Svg)
+            .expect_err("uneven")
+            .to_string(),
         "figure `Bias`, series `hard`: found 2 values of y, expected 1"
     );
     let table = HeatMap {
@@ -219,7 +222,7 @@ fn errors_name_the_place_and_what_was_expected() {
         ..HeatMap::default()
     };
     assert!(matches!(
-        table.render(Format::Svg),
+        table.render(PictureFormat::Svg),
         Err(FigureError::Lengths { expected: 1, .. })
     ));
     let many = PanelGrid {
@@ -228,7 +231,7 @@ fn errors_name_the_place_and_what_was_expected() {
         plots: vec![plot; 2000],
     };
     assert!(matches!(
-        many.render(Format::Svg),
+        many.render(PictureFormat::Svg),
         Err(FigureError::TooLarge { .. })
     ));
 }

@@ -1,25 +1,21 @@
-//! A drawing as a list of shapes, and its rendering by plotters.
+//! A drawing as a list of shapes, and its two renderings: an SVG file, and pixels by tiny-skia.
 //!
-//! Figures describe themselves in points, as real numbers; plotters' backends take whole pixels.
-//! A scene is therefore drawn several times larger: an SVG keeps the larger grid behind its nominal
-//! size, and a PNG is averaged down, which smooths edges.
+//! Figures describe themselves in points, as real numbers.
 
-use plotters::backend::{BitMapBackend, DrawingBackend, SVGBackend};
-use plotters::style::text_anchor::{HPos, Pos, VPos};
-use plotters::style::{
-    FontDesc, FontFamily, FontStyle, FontTransform, RGBColor, ShapeStyle, TextStyle,
+use std::fmt::Write;
+
+use tiny_skia::{
+    Color, FillRule, LineJoin, Paint, Path, PathBuilder, Pixmap, Rect, Stroke, Transform,
 };
 
 use super::FigureError;
-use super::colour::{Rgb, WHITE};
-use crate::report::escape::line;
+use super::colour::Rgb;
+use crate::report::escape::{line, markup};
 use crate::report::font;
 
-/// Backend pixels per point.
-const SCALE: u32 = 4;
-/// Backend pixels averaged into one pixel of a PNG, per side: it has two pixels per point.
-const AVERAGED: u32 = 2;
-/// The largest scene in square points, for which drawing takes about a gigabyte.
+/// Pixels of a PNG per point.
+pub(in crate::report) const PIXELS_PER_POINT: f32 = 2.0;
+/// The largest scene in square points, for which drawing takes about a third of a gigabyte.
 const LARGEST: f64 = 2e7;
 
 /// A place in points: x to the right, y downwards.
@@ -184,52 +180,37 @@ impl Scene {
 
     /// The scene as an SVG file.
     pub(super) fn to_svg(&self) -> Result<String, FigureError> {
-        let (width, height) = self.pixels()?;
-        let mut svg = String::new();
-        {
-            let mut backend = SVGBackend::with_string(&mut svg, (width, height));
-            self.draw(&mut backend, TextRules::SVG)?;
-            backend.present().map_err(drawing)?;
-        }
-        // The nominal size is that in points; the view box keeps the finer grid.
-        let fine = format!("width=\"{width}\" height=\"{height}\"");
-        let nominal = format!("width=\"{}\" height=\"{}\"", width / SCALE, height / SCALE);
-        let svg = svg.replacen(&fine, &nominal, 1);
+        let (width, height) = self.size()?;
         // Smoothed edges would show as seams between the rectangles that are pixels of an image.
-        Ok(svg.replacen('>', "><style>rect{shape-rendering:crispEdges}</style>", 1))
+        let mut svg = format!(
+            "<svg width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {width} {height}\" \
+             xmlns=\"http://www.w3.org/2000/svg\" font-family=\"{}\">\n\
+             <style>rect{{shape-rendering:crispEdges}}path{{fill:none;stroke-linejoin:round}}</style>\n\
+             <rect width=\"100%\" height=\"100%\" fill=\"#FFFFFF\"/>\n",
+            font::FAMILY
+        );
+        for shape in &self.shapes {
+            write_shape(&mut svg, shape);
+        }
+        svg.push_str("</svg>\n");
+        Ok(svg)
     }
 
-    /// The scene as red, green and blue of each pixel by rows, with the width and height.
-    pub(super) fn to_pixels(&self) -> Result<(Vec<u8>, (u32, u32)), FigureError> {
-        let (width, height) = self.pixels()?;
-        let mut fine = vec![255; width as usize * height as usize * 3];
-        {
-            let mut backend = BitMapBackend::with_buffer(&mut fine, (width, height));
-            self.draw(&mut backend, TextRules::BITMAP)?;
-            backend.present().map_err(drawing)?;
+    /// The scene as a PNG file.
+    pub(super) fn to_png(&self) -> Result<Vec<u8>, FigureError> {
+        let (width, height) = self.size()?;
+        let pixels = |points: u32| points * PIXELS_PER_POINT as u32;
+        let mut pixmap = Pixmap::new(pixels(width), pixels(height))
+            .ok_or_else(|| drawing("no memory for its pixels"))?;
+        pixmap.fill(Color::WHITE);
+        for shape in &self.shapes {
+            paint_shape(&mut pixmap, shape);
         }
-        let size = (width / AVERAGED, height / AVERAGED);
-        let row_length = width as usize * 3;
-        let mut pixels = Vec::with_capacity(size.0 as usize * size.1 as usize * 3);
-        for rows in fine.chunks_exact(row_length * AVERAGED as usize) {
-            for column in 0..size.0 as usize {
-                for channel in 0..3 {
-                    let mut sum = 0_u32;
-                    for row in rows.chunks_exact(row_length) {
-                        for part in 0..AVERAGED as usize {
-                            sum +=
-                                u32::from(row[(column * AVERAGED as usize + part) * 3 + channel]);
-                        }
-                    }
-                    pixels.push((sum / (AVERAGED * AVERAGED)) as u8);
-                }
-            }
-        }
-        Ok((pixels, size))
+        pixmap.encode_png().map_err(drawing)
     }
 
-    /// The size of the backend.
-    fn pixels(&self) -> Result<(u32, u32), FigureError> {
+    /// Width and height in whole points.
+    fn size(&self) -> Result<(u32, u32), FigureError> {
         if self.width * self.height > LARGEST {
             return Err(FigureError::TooLarge {
                 width: self.width,
@@ -237,94 +218,118 @@ impl Scene {
                 largest: LARGEST,
             });
         }
-        Ok((
-            self.width.ceil() as u32 * SCALE,
-            self.height.ceil() as u32 * SCALE,
-        ))
+        Ok((self.width.ceil() as u32, self.height.ceil() as u32))
     }
+}
 
-    fn draw<B: DrawingBackend>(
-        &self,
-        backend: &mut B,
-        rules: TextRules,
-    ) -> Result<(), FigureError> {
-        if !font::register() {
-            return Err(FigureError::Drawing {
-                detail: "the built-in font is unusable".into(),
-            });
-        }
-        let size = backend.get_size();
-        backend
-            .draw_rect(
-                (0, 0),
-                (size.0 as i32, size.1 as i32),
-                &style(WHITE, 1),
-                true,
+/// A number of points in a file: hundredths of a point are finer than any print.
+fn hundredths(x: f64) -> f64 {
+    // A negative zero would be written with its sign.
+    (x * 100.0).round() / 100.0 + 0.0
+}
+
+fn write_shape(svg: &mut String, shape: &Shape) {
+    let hex = |[r, g, b]: Rgb| format!("#{r:02X}{g:02X}{b:02X}");
+    let h = hundredths;
+    // Writing to a string cannot fail.
+    let _ = match shape {
+        Shape::Path {
+            points,
+            colour,
+            width,
+        } => {
+            let mut path = String::new();
+            for (k, (x, y)) in points.iter().enumerate() {
+                let command = if k == 0 { 'M' } else { 'L' };
+                let _ = write!(path, "{command}{} {}", h(*x), h(*y));
+            }
+            writeln!(
+                svg,
+                "<path d=\"{path}\" stroke=\"{}\" stroke-width=\"{}\"/>",
+                hex(*colour),
+                h(*width)
             )
-            .map_err(drawing)?;
-        for shape in &self.shapes {
-            draw_shape(backend, shape, rules)?;
         }
-        Ok(())
-    }
-}
-
-/// How a backend places and sizes text, in ems of what is asked of it.
-#[derive(Debug, Clone, Copy)]
-struct TextRules {
-    /// The size to ask for.
-    size: f64,
-    /// How far the baseline comes to lie below the place given.
-    baseline: f64,
-    /// Whether thick lines need discs at their corners, to be round.
-    corners: bool,
-}
-
-impl TextRules {
-    /// Glyphs are sized by the line height, and their baseline is half of it below.
-    const BITMAP: Self = Self {
-        size: font::LINE_PER_EM,
-        baseline: 0.5 * font::LINE_PER_EM,
-        corners: true,
+        Shape::Rectangle {
+            corner,
+            opposite,
+            colour,
+        } => {
+            let [left, top, right, bottom] = edges(*corner, *opposite).map(h);
+            writeln!(
+                svg,
+                "<rect x=\"{left}\" y=\"{top}\" width=\"{}\" height=\"{}\" fill=\"{}\"/>",
+                h(right - left),
+                h(bottom - top),
+                hex(*colour)
+            )
+        }
+        Shape::Disc {
+            centre: (x, y),
+            radius,
+            colour,
+        } => writeln!(
+            svg,
+            "<circle cx=\"{}\" cy=\"{}\" r=\"{}\" fill=\"{}\"/>",
+            h(*x),
+            h(*y),
+            h(*radius),
+            hex(*colour)
+        ),
+        Shape::Text {
+            baseline: (x, y),
+            text,
+            size,
+            colour,
+            anchor,
+            upwards,
+        } => {
+            let (x, y) = (h(*x), h(*y));
+            let anchor = match anchor {
+                Anchor::Start => "start",
+                Anchor::Middle => "middle",
+                Anchor::End => "end",
+            };
+            let turn = match upwards {
+                true => format!(" transform=\"rotate(-90 {x} {y})\""),
+                false => String::new(),
+            };
+            writeln!(
+                svg,
+                "<text x=\"{x}\" y=\"{y}\" font-size=\"{}\" text-anchor=\"{anchor}\" \
+                 fill=\"{}\"{turn}>{}</text>",
+                h(*size),
+                hex(*colour),
+                markup(text)
+            )
+        }
     };
-    /// The backend divides the size by 1.24 and writes `dy="0.76em"`.
-    const SVG: Self = Self {
-        size: 1.24,
-        baseline: 0.76,
-        corners: false,
-    };
 }
 
-fn draw_shape<B: DrawingBackend>(
-    backend: &mut B,
-    shape: &Shape,
-    rules: TextRules,
-) -> Result<(), FigureError> {
+/// Draws one shape; places that are not finite draw nothing.
+fn paint_shape(pixmap: &mut Pixmap, shape: &Shape) {
+    let to_pixels = Transform::from_scale(PIXELS_PER_POINT, PIXELS_PER_POINT);
+    let paint = |[r, g, b]: Rgb, anti_alias| {
+        let mut paint = Paint {
+            anti_alias,
+            ..Paint::default()
+        };
+        paint.set_color_rgba8(r, g, b, u8::MAX);
+        paint
+    };
     match shape {
         Shape::Path {
             points,
             colour,
             width,
         } => {
-            let width = (width * f64::from(SCALE)).round().max(1.0) as u32;
-            let style = style(*colour, width);
-            if !rules.corners {
-                return backend
-                    .draw_path(points.iter().copied().map(pixel), &style)
-                    .map_err(drawing);
-            }
-            for pair in points.windows(2) {
-                let (from, to) = (pixel(pair[0]), pixel(pair[1]));
-                if from != to {
-                    backend.draw_path([from, to], &style).map_err(drawing)?;
-                }
-            }
-            for corner in points.iter().skip(1).take(points.len().saturating_sub(2)) {
-                if width > 2 {
-                    backend
-                        .draw_circle(pixel(*corner), width / 2, &style, true)
-                        .map_err(drawing)?;
-                }
+            let stroke = Stroke {
+                width: *width as f32,
+                line_join: LineJoin::Round,
+                ..Stroke::default()
+            };
+            if let Some(path) = polyline(points) {
+                pixmap.stroke_path(&path, &paint(*colour, true), &stroke, to_pixels, None);
             }
         }
         Shape::Rectangle {
@@ -332,87 +337,67 @@ fn draw_shape<B: DrawingBackend>(
             opposite,
             colour,
         } => {
-            let (from, to) = (pixel(*corner), pixel(*opposite));
-            let (left, right) = (from.0.min(to.0), from.0.max(to.0));
-            let (top, bottom) = (from.1.min(to.1), from.1.max(to.1));
-            backend
-                .draw_rect((left, top), (right, bottom), &style(*colour, 1), true)
-                .map_err(drawing)?;
+            let [left, top, right, bottom] = edges(*corner, *opposite).map(|x| x as f32);
+            if let Some(area) = Rect::from_ltrb(left, top, right, bottom) {
+                pixmap.fill_rect(area, &paint(*colour, false), to_pixels, None);
+            }
         }
         Shape::Disc {
-            centre,
+            centre: (x, y),
             radius,
             colour,
         } => {
-            let radius = (radius * f64::from(SCALE)).round() as u32;
-            backend
-                .draw_circle(pixel(*centre), radius, &style(*colour, 1), true)
-                .map_err(drawing)?;
+            if let Some(path) = PathBuilder::from_circle(*x as f32, *y as f32, *radius as f32) {
+                let rule = FillRule::Winding;
+                pixmap.fill_path(&path, &paint(*colour, true), rule, to_pixels, None);
+            }
         }
         Shape::Text {
-            baseline,
+            baseline: (x, y),
             text,
             size,
             colour,
             anchor,
             upwards,
         } => {
-            let em = size * f64::from(SCALE);
-            let above = rules.baseline * size;
-            let (place, turn) = if *upwards {
-                ((baseline.0 - above, baseline.1), FontTransform::Rotate270)
-            } else {
-                ((baseline.0, baseline.1 - above), FontTransform::None)
+            let back = match anchor {
+                Anchor::Start => 0.0,
+                Anchor::Middle => 0.5,
+                Anchor::End => 1.0,
             };
-            let horizontal = match anchor {
-                Anchor::Start => HPos::Left,
-                Anchor::Middle => HPos::Center,
-                Anchor::End => HPos::Right,
-            };
-            let colour = RGBColor(colour[0], colour[1], colour[2]);
-            let style = TextStyle::from(face(rules.size * em).transform(turn))
-                .color(&colour)
-                .pos(Pos::new(horizontal, VPos::Top));
-            backend
-                .draw_text(text, &style, pixel(place))
-                .map_err(drawing)?;
+            let place = to_pixels
+                .pre_translate(*x as f32, *y as f32)
+                .pre_rotate(if *upwards { -90.0 } else { 0.0 })
+                .pre_translate((-back * text_width(text, *size)) as f32, 0.0)
+                .pre_scale(*size as f32, *size as f32);
+            if let Some(path) = font::outline(text) {
+                pixmap.fill_path(&path, &paint(*colour, true), FillRule::Winding, place, None);
+            }
         }
     }
-    Ok(())
+}
+
+/// The line through `points`, where there are two or more.
+fn polyline(points: &[Point]) -> Option<Path> {
+    let mut builder = PathBuilder::new();
+    for (k, (x, y)) in points.iter().enumerate() {
+        let (x, y) = (*x as f32, *y as f32);
+        match k {
+            0 => builder.move_to(x, y),
+            _ => builder.line_to(x, y),
+        }
+    }
+    builder.finish()
+}
+
+/// Left, top, right and bottom of a rectangle.
+fn edges((x0, y0): Point, (x1, y1): Point) -> [f64; 4] {
+    [x0.min(x1), y0.min(y1), x0.max(x1), y0.max(y1)]
 }
 
 /// The width of `text` at an em of `size`, in points.
 pub(super) fn text_width(text: &str, size: f64) -> f64 {
-    // Measured large, as the answer is in whole pixels.
-    const EM: f64 = 200.0;
-    if !font::register() {
-        return 0.0;
-    }
-    let bounds = face(EM * font::LINE_PER_EM).layout_box(text);
-    bounds.map_or(0.0, |((left, _), (right, _))| {
-        f64::from(right - left) / EM * size
-    })
-}
-
-fn face(size: f64) -> FontDesc<'static> {
-    FontDesc::new(FontFamily::SansSerif, size, FontStyle::Normal)
-}
-
-fn style(colour: Rgb, width: u32) -> ShapeStyle {
-    let colour = RGBColor(colour[0], colour[1], colour[2]);
-    ShapeStyle {
-        color: colour.into(),
-        filled: true,
-        stroke_width: width,
-    }
-}
-
-fn pixel((x, y): Point) -> (i32, i32) {
-    // The conversion saturates, so that any number gives a place.
-    (
-        (x * f64::from(SCALE)).round() as i32,
-        (y * f64::from(SCALE)).round() as i32,
-    )
+    f64::from(font::width(text)) * size
 }
 
 fn drawing(error: impl std::fmt::Display) -> FigureError {
