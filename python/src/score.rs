@@ -51,6 +51,9 @@ fn choice(name: &str) -> PyResult<Choice> {
     }
 }
 
+/// Two columns of one length.
+type Pair<'py> = (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>);
+
 /// Rows of images, one after the other, at positions or in the order of the grid.
 struct Rows<'a> {
     e1: ArrayView1<'a, f64>,
@@ -59,7 +62,16 @@ struct Rows<'a> {
     lengths: Vec<usize>,
 }
 
-impl Rows<'_> {
+impl<'a> Rows<'a> {
+    fn new(e: &'a Pair<'_>, positions: Option<&'a Pair<'_>>, lengths: Vec<usize>) -> Self {
+        Rows {
+            e1: e.0.as_array(),
+            e2: e.1.as_array(),
+            positions: positions.map(|(x, y)| (x.as_array(), y.as_array())),
+            lengths,
+        }
+    }
+
     /// Sums the images onto the grid; also how their rows were used.
     fn sum(&self, grid: &Grid) -> PyResult<(SetImages, RowCounts)> {
         let count = self.e1.len();
@@ -112,10 +124,10 @@ pub(crate) fn score<'py>(
     n: usize,
     stamp: f64,
     field_degrees: f64,
-    truth: (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>),
+    truth: Pair<'py>,
     challenge_sign: bool,
-    e: (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>),
-    positions: Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>,
+    e: Pair<'py>,
+    positions: Option<Pair<'py>>,
     lengths: Vec<usize>,
     definition: &str,
     convention: &str,
@@ -128,14 +140,7 @@ pub(crate) fn score<'py>(
         choice: choice(convention)?,
     };
     let (g1, g2) = (truth.0.as_array(), truth.1.as_array());
-    let rows = Rows {
-        e1: e.0.as_array(),
-        e2: e.1.as_array(),
-        positions: positions
-            .as_ref()
-            .map(|(x, y)| (x.as_array(), y.as_array())),
-        lengths,
-    };
+    let rows = Rows::new(&e, positions.as_ref(), lengths);
     let (scored, counts) = py.detach(|| {
         let truth = g1.iter().zip(&g2).take(grid.cells() + 1).enumerate();
         let truth = truth.map(|(k, (&e1, &e2))| {
@@ -225,21 +230,14 @@ pub(crate) fn spectrum<'py>(
     n: usize,
     stamp: f64,
     field_degrees: f64,
-    e: (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>),
-    positions: Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>,
+    e: Pair<'py>,
+    positions: Option<Pair<'py>>,
     lengths: Vec<usize>,
     definition: &str,
 ) -> PyResult<Bound<'py, PyDict>> {
     let grid = grid(n, stamp, field_degrees)?;
     let definition = self::definition(definition)?;
-    let rows = Rows {
-        e1: e.0.as_array(),
-        e2: e.1.as_array(),
-        positions: positions
-            .as_ref()
-            .map(|(x, y)| (x.as_array(), y.as_array())),
-        lengths,
-    };
+    let rows = Rows::new(&e, positions.as_ref(), lengths);
     let (all, modes) = py.detach(|| {
         let (images, _) = rows.sum(&grid)?;
         let total = images.total();

@@ -52,7 +52,9 @@ pub(crate) fn simulate<'py>(
         intrinsic_sigma: intrinsic_sigma.unwrap_or(usual.intrinsic_sigma),
         ..usual
     };
-    settings.validate().map_err(PyValueError::new_err)?;
+    settings
+        .validate()
+        .map_err(|error| PyValueError::new_err(error.to_string()))?;
     let simulator = py
         .detach(|| simulator(set, settings))
         .map_err(of_pipeline)?;

@@ -161,7 +161,7 @@ impl SimulationArguments {
             spectrum: ShearSpectrum { amplitude, tilt },
             ..SimulationSettings::new(seed, usize::from(grid))
         };
-        settings.validate().map_err(anyhow::Error::msg)?;
+        settings.validate()?;
         Ok(settings)
     }
 

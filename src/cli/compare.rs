@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use anyhow::Context;
 use clap::Args;
 
 use super::arguments::{Printing, ScoreSettings, Threads};
@@ -92,9 +93,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)> {
     let (mut runs, notes) = store::read(path)?;
     if let Some(conditions) = &arguments.conditions {
-        runs = conditions
-            .choose(runs)
-            .map_err(|message| anyhow::anyhow!("--where: {message}"))?;
+        runs = conditions.choose(runs).context("--where")?;
     }
     anyhow::ensure!(
         !runs.is_empty(),

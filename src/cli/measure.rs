@@ -12,7 +12,7 @@ use super::progress::Bar;
 use super::{count, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
-use crate::io::table::Format;
+use crate::io::table::FileFormat;
 use crate::pipeline::images::{self, ImageId};
 use crate::pipeline::measure::{Summary, galaxies_to_do, measure_folder};
 
@@ -35,9 +35,9 @@ pub(super) struct Arguments {
     /// Sets to measure [default: all there are].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
-    /// Format of the catalogues [default: parquet, or fits in a build without it].
+    /// FileFormat of the catalogues [default: parquet].
     #[arg(long, value_enum)]
-    catalogue_format: Option<Format>,
+    catalogue_format: Option<FileFormat>,
     #[command(flatten)]
     sharding: Sharding,
     #[command(flatten)]

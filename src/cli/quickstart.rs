@@ -11,7 +11,7 @@ use super::progress::Bar;
 use super::{measure, print, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
-use crate::io::table::Format;
+use crate::io::table::FileFormat;
 use crate::pipeline::images;
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
 use crate::report::comparison::compare;
@@ -72,7 +72,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let run = Run::new(
             Source::folder(&data, &folder)?,
             submission,
-            Format::default(),
+            FileFormat::default(),
         );
         measure::measure(&run, &data, &folder, &images, threads)?;
         let scored = score_folder(&data, &folder, &run, &[], options, threads)?;

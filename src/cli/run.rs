@@ -12,7 +12,7 @@ use super::{measure, print, score, tell};
 use crate::io::atomic;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::run::{Run, Source};
-use crate::io::table::Format;
+use crate::io::table::FileFormat;
 use crate::pipeline::images;
 use crate::pipeline::run::run_folder;
 use crate::report::scores::{bandpowers, per_set};
@@ -50,9 +50,9 @@ pub(super) struct Arguments {
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Format of the catalogues [default: parquet, or fits in a build without it].
+    /// FileFormat of the catalogues [default: parquet].
     #[arg(long, value_enum)]
-    catalogue_format: Option<Format>,
+    catalogue_format: Option<FileFormat>,
     /// Record the scores in this results store, which `compare --store` reads.
     #[arg(long, value_name = "DIR")]
     store: Option<PathBuf>,

@@ -315,7 +315,7 @@ fn spectra_of_sets(
     for (set, path) in &files {
         let (grid, truth) = read_truth(&data.truth(*set), &reading_of(data, *set)?)?;
         let score = score_spectrum(grid, truth, path, manifest, options)?;
-        scored.push((*set, score));
+        scored.push((Some(*set), score));
     }
     print_spectra(arguments, &scored, place, options)
 }
@@ -329,7 +329,7 @@ fn spectrum_file(
     let (grid, shear) = read_truth(truth, &plain_reading(arguments))?;
     let manifest = Manifest::read(spectrum.parent().unwrap_or(Path::new("")))?;
     let score = score_spectrum(grid, shear, spectrum, manifest.as_ref(), options)?;
-    let scored = [(0, score)];
+    let scored = [(None, score)];
     print_spectra(arguments, &scored, spectrum, options)
 }
 
@@ -350,7 +350,7 @@ fn score_spectrum(
 
 fn print_spectra(
     arguments: &Arguments,
-    scored: &[(u32, SpectrumScore)],
+    scored: &[(Option<u32>, SpectrumScore)],
     path: &Path,
     options: Options,
 ) -> anyhow::Result<()> {

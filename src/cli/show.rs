@@ -13,7 +13,7 @@ use super::{print, tell};
 use crate::io::layout::DataFolder;
 use crate::pipeline::images::ImageId;
 use crate::pipeline::measure::{ImageSource, psf_of};
-use crate::report::figure::{Figure, Format};
+use crate::report::figure::{Figure, PictureFormat};
 use crate::report::steps::{steps_figure, steps_row};
 
 /// Draw the steps of galaxies like the paper's Fig. 3: stamp, PSF, deconvolved, residual, ACF,
@@ -66,7 +66,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         galaxy,
         out,
     } = arguments;
-    Format::of(out)?;
+    PictureFormat::of(out)?;
     let submission = Registry::embedded()?.get(submission)?.submission;
     let data = DataFolder::open(data)?;
     let mut rows = Vec::new();

@@ -258,7 +258,7 @@ impl Values {
             return Values::Whole(whole.iter().flatten().collect());
         }
         match reals(column) {
-            Some(values) => Values::Real(values),
+            Some(values) => Values::Real(values.into_owned()),
             None => {
                 let words = series.str().into_iter().flat_map(|words| words.iter());
                 Values::Text(words.map(|word| word.unwrap_or("").to_owned()).collect())

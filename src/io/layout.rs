@@ -286,7 +286,7 @@ pub fn fill(pattern: &str, set: u32, image: u32) -> String {
 ///
 /// # Errors
 /// What is wrong with it.
-pub fn check_pattern(key: &str, pattern: &str, needed: &[[&str; 2]]) -> Result<(), String> {
+pub(crate) fn check_pattern(key: &str, pattern: &str, needed: &[[&str; 2]]) -> Result<(), String> {
     for one_of in needed {
         if !one_of.iter().any(|name| pattern.contains(name)) {
             return Err(format!(

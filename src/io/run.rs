@@ -12,7 +12,7 @@ use super::error::FileError;
 use super::layout::{DataFolder, Layout, fill};
 use super::listing::{self, Files};
 use super::relative;
-use super::table::Format;
+use super::table::FileFormat;
 use crate::simulate::set::SimulationSettings;
 
 /// Name of the record in a folder of results.
@@ -102,8 +102,8 @@ pub struct Run {
     pub source: Source,
     /// All settings of the submission.
     pub submission: Submission,
-    /// Format of the catalogues.
-    pub format: Format,
+    /// FileFormat of the catalogues.
+    pub format: FileFormat,
 }
 
 impl Run {
@@ -116,7 +116,7 @@ impl Run {
     }
 
     /// What this version makes of `source`.
-    pub fn new(source: Source, submission: Submission, format: Format) -> Self {
+    pub fn new(source: Source, submission: Submission, format: FileFormat) -> Self {
         Run {
             version: crate::VERSION.into(),
             source,

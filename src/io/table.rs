@@ -6,6 +6,7 @@
 //! | `.parquet`, `.pq` | Parquet |
 //! | anything else (`.csv`, `.dat`, `.txt`, `.cat`, `.csv.gz`) | text, plain or compressed by gzip: numbers between commas, semicolons, tabs or blanks, as the content has them; columns `x y e1 e2` unless a header names them |
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use shearq_scoring::Grid;
@@ -19,7 +20,11 @@ use super::{fits, parquet, text};
 ///
 /// # Errors
 /// Where it is not there.
-pub fn numbers(table: &DataFrame, name: &str, path: &Path) -> Result<Vec<f64>, FileError> {
+pub fn numbers<'t>(
+    table: &'t DataFrame,
+    name: &str,
+    path: &Path,
+) -> Result<Cow<'t, [f64]>, FileError> {
     let column = table.column(name).ok();
     column.and_then(reals).ok_or_else(|| {
         let message = format!("there is no column `{name}` that holds numbers");
@@ -29,19 +34,10 @@ pub fn numbers(table: &DataFrame, name: &str, path: &Path) -> Result<Vec<f64>, F
 
 /// File format of a table.
 #[derive(
-    Debug,
-    Clone,
-    Copy,
-    Default,
-    PartialEq,
-    Eq,
-    Hash,
-    serde::Serialize,
-    serde::Deserialize,
-    clap::ValueEnum,
+    Debug, Clone, Copy, Default, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize,
 )]
 #[serde(rename_all = "lowercase")]
-pub enum Format {
+pub enum FileFormat {
     /// Parquet.
     #[default]
     Parquet,
@@ -49,12 +45,12 @@ pub enum Format {
     Fits,
 }
 
-impl Format {
+impl FileFormat {
     /// Ending of file names.
     pub fn extension(self) -> &'static str {
         match self {
-            Format::Parquet => "parquet",
-            Format::Fits => "fits",
+            FileFormat::Parquet => "parquet",
+            FileFormat::Fits => "fits",
         }
     }
 }
@@ -148,11 +144,11 @@ pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
 
 /// What is left of `metadata` in a table written as `format`: all in Parquet; in FITS what fits into a
 /// header, which is keys of at most eight characters with values of at most 68.
-pub fn kept(metadata: &Metadata, format: Format) -> Metadata {
+pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
     let fits = |key: &str, value: &str| key.len() <= 8 && value.len() <= 68;
     metadata
         .iter()
-        .filter(|(key, value)| format == Format::Parquet || fits(key, value))
+        .filter(|(key, value)| format == FileFormat::Parquet || fits(key, value))
         .map(|(key, value)| (key.clone(), value.clone()))
         .collect()
 }
@@ -163,15 +159,15 @@ pub fn kept(metadata: &Metadata, format: Format) -> Metadata {
 /// Where the file cannot be read.
 pub fn read_metadata<'a>(
     path: &Path,
-    format: Format,
+    format: FileFormat,
     keys: impl Iterator<Item = &'a String>,
 ) -> Result<Metadata, FileError> {
     match format {
-        Format::Parquet => {
+        FileFormat::Parquet => {
             let mut all = parquet::metadata(path)?;
             Ok(keys.filter_map(|key| all.remove_entry(key)).collect())
         }
-        Format::Fits => fits::read_table_keys(path, keys),
+        FileFormat::Fits => fits::read_table_keys(path, keys),
     }
 }
 
@@ -182,13 +178,13 @@ pub fn read_metadata<'a>(
 /// Where the file cannot be written.
 pub fn write(
     path: &Path,
-    format: Format,
+    format: FileFormat,
     table: &DataFrame,
     metadata: &Metadata,
 ) -> Result<(), FileError> {
     match format {
-        Format::Parquet => parquet::write(path, table, metadata),
-        Format::Fits => {
+        FileFormat::Parquet => parquet::write(path, table, metadata),
+        FileFormat::Fits => {
             let keys: Vec<(String, fits::Value)> = kept(metadata, format)
                 .into_iter()
                 .map(|(key, value)| (key.to_ascii_uppercase(), fits::Value::Text(value)))

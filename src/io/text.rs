@@ -521,7 +521,7 @@ mod tests {
     }
 
     fn column(table: &DataFrame, name: &str) -> Vec<f64> {
-        reals(table.column(name).unwrap()).unwrap()
+        reals(table.column(name).unwrap()).unwrap().into_owned()
     }
 
     #[test]

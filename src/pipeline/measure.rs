@@ -478,6 +478,9 @@ fn read_images(
 }
 
 /// Catalogue of one image from its rows of stamps, in grid order.
+///
+/// # Errors
+/// Where polars cannot make it.
 pub fn catalogue(rows: &[MeasuredRow]) -> Result<DataFrame, TableError> {
     let galaxies = || {
         rows.iter().flat_map(|row| {

@@ -58,7 +58,10 @@ pub fn simulator(set: u32, settings: SimulationSettings) -> Result<SetSimulator,
     let kind = SetKind::of(set).ok_or_else(|| {
         PipelineError::Request(format!("there is no set {set}; expected 1 to {SETS}"))
     })?;
-    SetSimulator::new(kind, settings).map_err(|source| PipelineError::Scoring { set, source })
+    SetSimulator::new(kind, settings).map_err(|source| PipelineError::Scoring {
+        set: Some(set),
+        source,
+    })
 }
 
 /// Simulates `images`, which are in the order of their sets, into `data`; returns how many were made

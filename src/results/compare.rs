@@ -32,8 +32,8 @@ impl Variant {
     /// What is kept of its sets.
     pub fn records(&self) -> Vec<SetRecord> {
         // All are scored against one truth, so their data need no fingerprint to be told apart.
-        let record = |set| SetRecord::new(set, String::new());
-        self.sets.iter().map(record).collect()
+        let record = |scored: &ScoredSet| Some(SetRecord::new(scored.set?, scored, String::new()));
+        self.sets.iter().filter_map(record).collect()
     }
 }
 
@@ -129,7 +129,7 @@ pub fn score_all(
         .iter()
         .zip(scored)
         .map(|(entrant, sets)| {
-            let numbers: Vec<u32> = sets.iter().map(|set| set.set).collect();
+            let numbers: Vec<u32> = sets.iter().filter_map(|set| set.set).collect();
             Ok(Variant {
                 name: entrant.name.clone(),
                 published: entrant.published,

@@ -6,6 +6,7 @@ use shearq_tables::polars::{Column, DataFrame};
 use shearq_tables::reals;
 
 use super::row::{RunRecord, table_of};
+use crate::pipeline::PipelineError;
 
 /// How a column is compared with what is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,9 +64,9 @@ impl Conditions {
     /// Leaves of each run the sets for which all conditions hold, and drops runs without any.
     ///
     /// # Errors
-    /// A message where there is no such column, or a value is not of the column's type.
-    pub fn choose(&self, mut runs: Vec<RunRecord>) -> Result<Vec<RunRecord>, String> {
-        let table = table_of(&runs).map_err(|error| error.to_string())?;
+    /// Where there is no such column, or a value is not of the column's type.
+    pub fn choose(&self, mut runs: Vec<RunRecord>) -> Result<Vec<RunRecord>, PipelineError> {
+        let table = table_of(&runs).map_err(|error| PipelineError::Request(error.to_string()))?;
         let mut kept = vec![true; table.height()];
         for (name, relation, wanted) in &self.0 {
             let held = hold(column(&table, name)?, *relation, wanted)?;
@@ -81,7 +82,7 @@ impl Conditions {
 }
 
 /// A column of the table of runs.
-fn column<'a>(table: &'a DataFrame, name: &str) -> Result<&'a Column, String> {
+fn column<'a>(table: &'a DataFrame, name: &str) -> Result<&'a Column, PipelineError> {
     table.column(name).map_err(|_| {
         let names: Vec<&str> = table
             .get_column_names()
@@ -89,18 +90,21 @@ fn column<'a>(table: &'a DataFrame, name: &str) -> Result<&'a Column, String> {
             .map(|n| n.as_str())
             .collect();
         let names = names.join(", ");
-        format!("the store has no column `{name}`; it has {names}")
+        PipelineError::Request(format!("the store has no column `{name}`; it has {names}"))
     })
 }
 
 /// Whether a condition holds, for each value of a column.
-fn hold(column: &Column, relation: Relation, wanted: &str) -> Result<Vec<bool>, String> {
+fn hold(column: &Column, relation: Relation, wanted: &str) -> Result<Vec<bool>, PipelineError> {
     let name = column.name();
     if let Ok(texts) = column.str() {
         let holds: fn(&str, &str) -> bool = match relation {
             Relation::Is => matches,
             Relation::IsNot => |wanted, own| !matches(wanted, own),
-            _ => return Err(format!("`{name}` is text; expected = or != and a text")),
+            _ => {
+                let message = format!("`{name}` is text; expected = or != and a text");
+                return Err(PipelineError::Request(message));
+            }
         };
         return Ok(texts
             .iter()
@@ -109,7 +113,7 @@ fn hold(column: &Column, relation: Relation, wanted: &str) -> Result<Vec<bool>, 
     }
     let wanted: f64 = wanted
         .parse()
-        .map_err(|_| format!("`{name}` is a number; `{wanted}` is none"))?;
+        .map_err(|_| PipelineError::Request(format!("`{name}` is a number; `{wanted}` is none")))?;
     let holds: fn(&f64, &f64) -> bool = match relation {
         Relation::Is => f64::eq,
         Relation::IsNot => f64::ne,

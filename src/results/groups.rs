@@ -14,7 +14,7 @@ use super::row::{RunRecord, SetRecord, table_of};
 const ID_DIGITS: usize = 8;
 
 /// What the sets of a run are put together by.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Grouping {
     /// Each set alone.
     Set,

@@ -46,17 +46,17 @@ pub struct SetRecord {
 }
 
 impl SetRecord {
-    /// What is kept of a scored set, of data with the fingerprint `data`.
-    pub fn new(scored: &ScoredSet, data: String) -> Self {
+    /// What is kept of the scored set `set`, of data with the fingerprint `data`.
+    pub fn new(set: u32, scored: &ScoredSet, data: String) -> Self {
         let ScoredSet {
-            set,
+            set: _,
             images,
             score,
             rows,
             basis,
         } = scored;
         SetRecord {
-            set: *set,
+            set,
             data,
             images: images.clone(),
             galaxies: (rows.used + rows.not_finite) as u64,
@@ -140,9 +140,11 @@ impl RunRecord {
         } = measured;
         let sets = scored
             .iter()
-            .map(|scored| {
-                let print = fingerprint::of_set(source, data, scored.set, &scored.images)?;
-                Ok(SetRecord::new(scored, print))
+            // One without a number is of no challenge.
+            .filter_map(|scored| Some((scored.set?, scored)))
+            .map(|(set, scored)| {
+                let print = fingerprint::of_set(source, data, set, &scored.images)?;
+                Ok(SetRecord::new(set, scored, print))
             })
             .collect::<Result<_, FileError>>()?;
         Ok(RunRecord {
@@ -201,7 +203,7 @@ impl RunRecord {
         let rows = Rows { path, table };
         let text = |name| rows.text(name, 0).map(str::to_owned);
         let submission = text("submission")?;
-        check_name(&submission).map_err(|message| FileError::new(path, message))?;
+        check_name(&submission).map_err(|error| FileError::new(path, error.to_string()))?;
         let run = RunRecord {
             submission,
             version: text("version")?,
@@ -371,7 +373,11 @@ impl Rows<'_> {
         let figures = |column: &dyn Fn(&str) -> String| -> Result<Figures, FileError> {
             let mut values = [f64::NAN; Figures::ALL.len()];
             for (value, Figure { name, .. }) in values.iter_mut().zip(Figures::ALL) {
-                *value = self.real(&column(name), row)?;
+                let name = column(name);
+                // What was recorded before a figure was thought of lacks it; Q was there from the first.
+                if name == column("q") || self.table.column(&name).is_ok() {
+                    *value = self.real(&name, row)?;
+                }
             }
             Ok(Figures::from_values(values))
         };

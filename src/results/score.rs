@@ -23,8 +23,8 @@ pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
 
 /// The score of one set and where its rows went.
 pub struct ScoredSet {
-    /// Set number; 0 for a set given as plain files.
-    pub set: u32,
+    /// Its number; a set given as plain files has none.
+    pub set: Option<u32>,
     /// Numbers of the images scored.
     pub images: Vec<u32>,
     /// The score.
@@ -84,12 +84,12 @@ pub fn score_files(
     threads: usize,
 ) -> Result<ScoredSet, PipelineError> {
     let (grid, shear) = read_truth(truth, reading)?;
-    let scoring = |source| PipelineError::Scoring { set: 0, source };
+    let scoring = |source| PipelineError::Scoring { set: None, source };
     let scorer = SetScorer::new(grid, shear, options).map_err(scoring)?;
     let (images, rows) = add_up(&grid, catalogues, read, threads)?;
     let score = scorer.score(&images).map_err(scoring)?;
     Ok(ScoredSet {
-        set: 0,
+        set: None,
         images: (1..=catalogues.len() as u32).collect(),
         basis: match options.choice {
             Choice::Matched => Basis::Matched(score.matching),
@@ -186,11 +186,14 @@ pub fn score_variants(
         };
         let mut own = Vec::new();
         for (set, files) in &sets {
-            let scoring = |source| PipelineError::Scoring { set: *set, source };
+            let scoring = |source| PipelineError::Scoring {
+                set: Some(*set),
+                source,
+            };
             let (scorer, images, rows) =
                 prepare(data, *set, &files[k], variant.read, options, threads)?;
             own.push(ScoredSet {
-                set: *set,
+                set: Some(*set),
                 images: files[k].iter().map(|file| file.0).collect(),
                 score: scorer.score(&images).map_err(scoring)?,
                 rows,
@@ -260,8 +263,10 @@ fn prepare(
     threads: usize,
 ) -> Result<(SetScorer, SetImages, RowCounts), PipelineError> {
     let (grid, shear) = read_truth(&data.truth(set), &reading_of(data, set)?)?;
-    let scorer = SetScorer::new(grid, shear, options)
-        .map_err(|source| PipelineError::Scoring { set, source })?;
+    let scorer = SetScorer::new(grid, shear, options).map_err(|source| PipelineError::Scoring {
+        set: Some(set),
+        source,
+    })?;
     let files: Vec<PathBuf> = files.iter().map(|file| file.1.clone()).collect();
     let (images, rows) = add_up(&grid, &files, read, threads)?;
     Ok((scorer, images, rows))
@@ -325,7 +330,7 @@ pub fn unscored(
     let (mut absent, mut lines) = (Vec::new(), Vec::new());
     for set in images.sets() {
         let there = images.of_set(set);
-        let Some(scored) = scored.iter().find(|scored| scored.set == set) else {
+        let Some(scored) = scored.iter().find(|scored| scored.set == Some(set)) else {
             absent.push(set.to_string());
             continue;
         };

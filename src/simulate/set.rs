@@ -22,6 +22,11 @@ use super::galaxy::Galaxy;
 use super::kinds::{ImageType, SetKind, Variability};
 use super::render::{RenderScratch, Renderer};
 
+/// A setting of a simulation out of its range.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct SettingsError(String);
+
 /// Pixels a side of a postage stamp.
 pub const STAMP: usize = 48;
 /// Noise per pixel; images are scaled so that it is one.
@@ -100,8 +105,8 @@ impl SimulationSettings {
     /// Checks every value against its range.
     ///
     /// # Errors
-    /// A message with what was found and what was expected.
-    pub fn validate(&self) -> Result<(), String> {
+    /// What was found and what was expected.
+    pub fn validate(&self) -> Result<(), SettingsError> {
         let &SimulationSettings {
             seed: _,
             grid,
@@ -110,25 +115,25 @@ impl SimulationSettings {
         } = self;
         if !SIDES.contains(&grid) {
             let (least, most) = (SIDES.start(), SIDES.end());
-            return Err(format!(
+            return Err(SettingsError(format!(
                 "the simulation has {grid} galaxies a side; expected {least} to {most}"
-            ));
+            )));
         }
         for (what, value) in [
             ("amplitude", amplitude),
             ("intrinsic_sigma", intrinsic_sigma),
         ] {
             if !(value.is_finite() && value >= 0.0) {
-                return Err(format!(
+                return Err(SettingsError(format!(
                     "the simulation's {what} is {value}; expected a finite number, not negative"
-                ));
+                )));
             }
         }
         if !TILTS.contains(&tilt) {
             let (least, most) = (TILTS.start(), TILTS.end());
-            return Err(format!(
+            return Err(SettingsError(format!(
                 "the simulation's tilt is {tilt}; expected {least} to {most}"
-            ));
+            )));
         }
         Ok(())
     }

@@ -131,7 +131,10 @@ pub fn run_sets(
             results.push(result);
             continue;
         }
-        let scoring = |source| PipelineError::Scoring { set, source };
+        let scoring = |source| PipelineError::Scoring {
+            set: Some(set),
+            source,
+        };
         let simulator = simulator(set, plan.simulation)?;
         let grid = simulator.grid();
         let images: Vec<u32> = (1..=plan.images).collect();

@@ -21,7 +21,7 @@ use shearq_tables::polars::Column;
 
 use crate::io::FileError;
 use crate::io::atomic::{self, Scratch};
-use crate::io::table::{self, Format};
+use crate::io::table::{self, FileFormat};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Quiet;
 use crate::pipeline::run::{measurers, run_set};
@@ -559,9 +559,9 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
                 "dat" => atomic::write(&path, dat.as_bytes())?,
                 _ => {
                     let kind = if ending == "fits" {
-                        Format::Fits
+                        FileFormat::Fits
                     } else {
-                        Format::Parquet
+                        FileFormat::Parquet
                     };
                     table::write(&path, kind, &table, &Default::default())?;
                 }
@@ -578,7 +578,7 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
     Ok(Table {
         title: format!("Scoring {images} catalogues of 10,000 rows, {threads} thread(s)"),
         headings: vec![
-            Heading::new("format", "Format"),
+            Heading::new("format", "FileFormat"),
             Heading::new("seconds", "seconds"),
             Heading::new("million_rows_per_second", "million rows a second"),
         ],

@@ -17,7 +17,7 @@ use crate::results::foreign::Foreign;
 pub const MANIFEST_FILE: &str = "manifest.json";
 
 /// What the files of a submission hold.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Contents {
     /// Ellipticity catalogues.

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+use crate::name::EXPECTED;
+
 /// What can be wrong with a submission's name or file.
 #[derive(Debug, Error)]
 pub enum SubmissionError {
@@ -50,6 +52,12 @@ pub enum SubmissionError {
         path: PathBuf,
         /// The key.
         key: &'static str,
+    },
+    /// A name that cannot be one.
+    #[error("the name is {found}; expected {EXPECTED}")]
+    Name {
+        /// Its beginning and length.
+        found: String,
     },
     /// A value out of range.
     #[error("{path}: {message}")]

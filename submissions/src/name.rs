@@ -3,18 +3,20 @@
 
 use serde::{Deserialize, Deserializer};
 
+use crate::error::SubmissionError;
+
 /// Longest name, in bytes: file names are made with it.
 pub const MAX_NAME: usize = 100;
 
 /// Checks a name: 1 to [`MAX_NAME`] bytes, none of them of a control character.
 ///
 /// # Errors
-/// A message with what was found and what was expected.
-pub fn check_name(name: &str) -> Result<(), String> {
+/// [`SubmissionError::Name`].
+pub fn check_name(name: &str) -> Result<(), SubmissionError> {
     if (1..=MAX_NAME).contains(&name.len()) && !name.contains(is_control) {
         return Ok(());
     }
-    Err(format!("the name is {}; expected {EXPECTED}", shown(name)))
+    Err(SubmissionError::Name { found: shown(name) })
 }
 
 /// The beginning of a name, with its control characters written out.
@@ -63,7 +65,7 @@ mod tests {
             "λ ≥ 2 | <b> \\ $x$",
             &"x".repeat(MAX_NAME),
         ] {
-            assert_eq!(check_name(good), Ok(()), "{good}");
+            assert!(check_name(good).is_ok(), "{good}");
         }
         let long = "x".repeat(MAX_NAME + 1);
         for bad in [
@@ -75,7 +77,7 @@ mod tests {
             "a\u{7f}",
             &long,
         ] {
-            let message = check_name(bad).unwrap_err();
+            let message = check_name(bad).unwrap_err().to_string();
             assert!(!message.contains(is_control), "{message:?}");
         }
     }

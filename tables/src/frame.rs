@@ -1,5 +1,6 @@
 //! Frames in memory: columns of equal length with names of their own.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 
 use polars::prelude::{ChunkedArray, Column, DataFrame, DataType, PolarsNumericType};
@@ -37,10 +38,16 @@ pub fn frame(columns: Vec<Column>) -> Result<DataFrame, TableError> {
 }
 
 /// The values of a column of numbers as 64-bit floats, NaN where one is missing; true is 1, false 0, and
-/// integers beyond ±2⁵³ are rounded. `None` for a column of anything else.
-pub fn reals(column: &Column) -> Option<Vec<f64>> {
+/// integers beyond ±2⁵³ are rounded. `None` for a column of anything else. What the column holds as such
+/// floats in one piece is lent, not copied.
+pub fn reals(column: &Column) -> Option<Cow<'_, [f64]>> {
     let series = column.as_materialized_series();
-    match series.dtype() {
+    if let Ok(all) = series.f64()
+        && let Ok(whole) = all.cont_slice()
+    {
+        return Some(Cow::Borrowed(whole));
+    }
+    let values = match series.dtype() {
         DataType::Float64 => series.f64().ok().map(|all| list(all, |v| v)),
         DataType::Float32 => series.f32().ok().map(|all| list(all, f64::from)),
         DataType::Int64 => series.i64().ok().map(|all| list(all, |v| v as f64)),
@@ -52,7 +59,8 @@ pub fn reals(column: &Column) -> Option<Vec<f64>> {
             all.iter().map(value).collect()
         }),
         _ => None,
-    }
+    };
+    values.map(Cow::Owned)
 }
 
 fn list<T>(chunks: &ChunkedArray<T>, convert: impl Fn(T::Native) -> f64) -> Vec<f64>

@@ -254,12 +254,11 @@ impl<'a> Source<'a> {
                 path: path.into(),
                 detail: format!("{place}: {detail}"),
             };
-            let chunk = match group
+            let found = group
                 .columns_under_root_iter(name)
-                .map(|mut all| (all.len(), all.next()))
-            {
-                Some((1, Some(chunk))) => chunk,
-                _ => return Err(damaged("found no single column chunk".into())),
+                .map(|mut all| (all.len(), all.next()));
+            let Some((1, Some(chunk))) = found else {
+                return Err(damaged("found no single column chunk".into()));
             };
             if usize::try_from(chunk.num_values()) != Ok(group.num_rows()) {
                 return Err(damaged(format!(

@@ -261,7 +261,8 @@ fn files_of_other_writers_are_converted() {
     ];
     let column = |name: &str| table.column(name).expect("a column");
     for (name, expected) in names.iter().zip(&expected) {
-        assert_eq!(reals(column(name)).expect("numbers"), expected, "{name}");
+        let found = reals(column(name)).expect("numbers");
+        assert_eq!(&*found, expected, "{name}");
     }
     let words = column("category").str().expect("text");
     assert!(words.iter().eq([Some("disc"), Some("bulge")]) && reals(column("category")).is_none());

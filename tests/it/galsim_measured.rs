@@ -2,7 +2,7 @@
 
 use shearq::io::layout::DataFolder;
 use shearq::io::run::{Run, Source};
-use shearq::io::table::{self, Format};
+use shearq::io::table::{self, FileFormat};
 use shearq::pipeline::Quiet;
 use shearq::pipeline::images;
 use shearq::pipeline::measure::measure_folder;
@@ -48,7 +48,7 @@ fn measured_ellipticities_follow_the_truth() {
             version: "test".into(),
             source: Source::folder(&data, out.path()).unwrap(),
             submission: registry.get(name).unwrap().submission,
-            format: Format::Fits,
+            format: FileFormat::Fits,
         };
         let results = out.path().join(name.replace('/', "-"));
         let images = images::of_folder(&data, &[]).unwrap();
@@ -67,7 +67,7 @@ fn measured_ellipticities_follow_the_truth() {
                 );
                 let columns = csv(&data.intrinsic(set, image), &["observed_e1", "observed_e2"]);
                 for (k, name) in ["e1", "e2"].into_iter().enumerate() {
-                    measured[k].extend(column(name));
+                    measured[k].extend(column(name).iter());
                     truth[k].extend_from_slice(&columns[k]);
                 }
             }

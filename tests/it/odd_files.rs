@@ -125,7 +125,7 @@ fn images_and_folders_that_cannot_be_read_are_named_and_missed() {
     let raw = ["--submission", "23/raw/star"];
     let merge = ["merge", text(&out)];
     let things: [&dyn Fn(); 2] = [&|| symlink("/nowhere", &second).expect("a link"), &|| {
-        fs::create_dir(&second).expect("a folder")
+        fs::create_dir(&second).expect("a folder");
     }];
     for make in things {
         remove(&second);

@@ -16,7 +16,7 @@ fn compare(place: &str, found: &Value, expected: &Value, tolerance: f64, wrong: 
                 }
                 match found.get(key) {
                     Some(inner) => {
-                        compare(&format!("{place}.{key}"), inner, value, tolerance, wrong)
+                        compare(&format!("{place}.{key}"), inner, value, tolerance, wrong);
                     }
                     None => wrong.push(format!("{place}.{key} is missing")),
                 }

@@ -161,7 +161,9 @@ impl Small {
     pub fn measured(&self, set: &str, column: &str) -> Vec<f64> {
         let path = self.at(&format!("out/set{set}/catalogue-001.parquet"));
         let table = table::read(&path, None, table::MAX_ROWS).expect("a catalogue");
-        table::numbers(&table, column, &path).expect("a column of it")
+        table::numbers(&table, column, &path)
+            .expect("a column of it")
+            .into_owned()
     }
 }
 

@@ -11,7 +11,7 @@ use crate::io::atomic::Scratch;
 use crate::io::fingerprint;
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
-use crate::io::table::{self, Format, MAX_ROWS};
+use crate::io::table::{self, FileFormat, MAX_ROWS};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::{self, Progress};
 use crate::pipeline::images::{self, ImageId};
@@ -47,7 +47,7 @@ pub fn measure(
     let folder = Scratch::new()?;
     let out = folder.path();
     let source = source.moved(beside, out)?;
-    let run = Run::new(source, submission.clone(), Format::default());
+    let run = Run::new(source, submission.clone(), FileFormat::default());
     match &run.source {
         Source::Simulated(settings) => {
             let images: Vec<ImageId> = wanted
@@ -88,8 +88,9 @@ pub fn figures_of(
     let scored = score_folder(data, out, run, &[], options, threads)?;
     scored
         .iter()
-        .map(|scored| {
-            let print = fingerprint::of_set(&run.source, data, scored.set, &scored.images)?;
+        .filter_map(|scored| Some((scored.set?, scored)))
+        .map(|(set, scored)| {
+            let print = fingerprint::of_set(&run.source, data, set, &scored.images)?;
             let SetRecord {
                 set,
                 data,
@@ -99,7 +100,7 @@ pub fn figures_of(
                 figures,
                 errors,
                 ..
-            } = SetRecord::new(scored, print);
+            } = SetRecord::new(set, scored, print);
             let mut all: BTreeMap<String, [f64; 2]> = Figures::ALL
                 .iter()
                 .zip(figures.values().into_iter().zip(errors.values()))
@@ -148,7 +149,7 @@ fn scatter(
                 table::numbers(&table, "e2", &path)?,
             );
             let mut own = ([0.0; 2], 0.0);
-            for (e1, e2) in e1.iter().zip(&e2) {
+            for (e1, e2) in e1.iter().zip(e2.iter()) {
                 if e1.is_finite() && e2.is_finite() {
                     own.0[0] += e1 * e1;
                     own.0[1] += e2 * e2;

@@ -86,17 +86,17 @@ pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift
 ///
 /// # Errors
 /// Where settings cannot be compared.
-pub fn settings_moved(
+fn settings_moved(
     before: &BaselineSubmission,
     now: &Submission,
-) -> Result<(Vec<String>, Vec<String>), String> {
-    let mut current = toml::Table::try_from(now).map_err(|error| error.to_string())?;
+) -> anyhow::Result<(Vec<String>, Vec<String>)> {
+    let mut current = toml::Table::try_from(now)?;
     let mut earlier = before.settings.clone();
     // Words do not change results.
     for table in [&mut current, &mut earlier] {
         table.remove("description");
     }
-    let found = differences(&earlier, &current).map_err(|error| error.to_string())?;
+    let found = differences(&earlier, &current)?;
     Ok(found
         .into_iter()
         .partition(|line| !line.contains(": null ≠ ")))
@@ -192,7 +192,7 @@ pub fn check(
     for before in &baseline.submissions {
         let submission = settings_now(before, &registry)
             .map_err(|error| error.context(format!("settings of {}", before.name)))?;
-        let (settings, new) = settings_moved(before, &submission).map_err(anyhow::Error::msg)?;
+        let (settings, new) = settings_moved(before, &submission)?;
         let mut check = Checked {
             baseline: name.to_owned(),
             submission: before.name.clone(),

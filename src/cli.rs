@@ -6,6 +6,7 @@ mod baseline;
 mod bench;
 mod calibrate;
 mod check;
+mod choices;
 mod compare;
 mod measure;
 mod merge;

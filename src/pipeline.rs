@@ -31,10 +31,10 @@ pub enum PipelineError {
     #[error(transparent)]
     Measure(#[from] MeasureError),
     /// Scores.
-    #[error("{}", if *set == 0 { "this set cannot be scored".to_owned() } else { format!("set {set}") })]
+    #[error("{}", set.map_or_else(|| "this set cannot be scored".into(), |set| format!("set {set}")))]
     Scoring {
-        /// The set.
-        set: u32,
+        /// The set's number, where it has one.
+        set: Option<u32>,
         /// Why it cannot be scored.
         source: shearq_scoring::ScoringError,
     },

@@ -1,0 +1,12 @@
+//! Tables, figures and pages of both.
+
+pub mod baseline;
+pub mod comparison;
+pub mod escape;
+pub mod figure;
+mod font;
+pub mod html;
+pub mod page;
+pub mod scores;
+pub mod steps;
+pub mod table;
