@@ -29,6 +29,8 @@ use clap::{Parser, Subcommand};
 
 use crate::report::escape::visible;
 use crate::report::figure::HeatMap;
+use crate::report::table::Table;
+use crate::report::terminal::fitted;
 
 /// Score and submit weak-lensing shape measurements, and measure them by Hopfield-network
 /// deconvolution.
@@ -74,6 +76,7 @@ const MISUSED: u8 = 2;
 
 /// Runs the command that this process was started with.
 pub fn main() -> ExitCode {
+    progress::end_at_interrupt();
     ExitCode::from(run_with(std::env::args_os()))
 }
 
@@ -155,6 +158,23 @@ fn tell(line: std::fmt::Arguments<'_>) {
 fn count(number: usize, thing: &str) -> String {
     let ending = if number == 1 { "" } else { "s" };
     format!("{number} {thing}{ending}")
+}
+
+/// Columns of the terminal that results are printed on; where they go elsewhere, those that `COLUMNS`
+/// names, or 80.
+fn width() -> usize {
+    let told = || std::env::var("COLUMNS").ok()?.parse().ok();
+    let terminal = terminal_size::terminal_size_of(std::io::stdout());
+    terminal
+        .map(|(width, _)| usize::from(width.0))
+        .or_else(told)
+        .filter(|width| *width > 0)
+        .unwrap_or(80)
+}
+
+/// Prints a table for reading, without its columns of detail and cut to the terminal's width.
+fn print_table(table: &Table) -> anyhow::Result<()> {
+    print(&fitted(&table.narrow(), Some(width())))
 }
 
 /// Prints results to standard output; a reader that has gone away is no error.

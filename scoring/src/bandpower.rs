@@ -224,6 +224,17 @@ impl Bins {
         }
     }
 
+    /// Variance, relative to its square, of the scored power of one field of white noise, opposite modes being
+    /// conjugates: 2 Σw²/(Σw)².
+    pub(crate) fn variance_of_white_power(&self) -> f64 {
+        let (mut sum, mut squares) = (0.0, 0.0);
+        self.each_scored(|_, _, w| {
+            sum += w;
+            squares += w * w;
+        });
+        2.0 * squares / (sum * sum)
+    }
+
     /// Plain sums over scored modes of Re(a·b*), each mode counting once.
     pub(crate) fn scored_product(&self, a: &Array2<Complex64>, b: &Array2<Complex64>) -> f64 {
         self.bin_of

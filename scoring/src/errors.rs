@@ -9,6 +9,8 @@
 //! ```text
 //! var P_b      = Σ 2w²(2|s|²ν + ν²)          bandpowers; ν²·G/(G − 1) once noise is removed that G groups tell
 //! var m_cross  = Σ |T|²ν / (Σ|T|²)²
+//! cov(P_b/r², P_c/r²) = δ_bc Σ 2w²(2|T|²ν/r² + ν²/r⁴) + g_b g_c var m − g_b k_c − g_c k_b
+//!                r = 1 + m as measured, g_b = 2P_b/r³, k_b = Σ_b 2w|T|²ν / (r Σ|T|²)
 //! var Σ_x u e₁ = n⁻⁴ Σ |U|²(cos²2φ ν + sin²2φ ν_B)   any sum over cells, U = FFT(u); sin and cos exchanged for e₂
 //! ```
 //!
@@ -137,6 +139,43 @@ impl Scatter {
         variance
     }
 
+    /// Standard error of Q of the bandpowers `ee` divided by `response`², the response being measured on these
+    /// modes, which moves all of them together.
+    pub(crate) fn of_calibrated_quality(
+        &self,
+        bins: &Bins,
+        truth: &Array2<Complex64>,
+        response: f64,
+        ee: &[f64; BINS],
+        true_power: &[f64; BINS],
+        q: f64,
+    ) -> f64 {
+        let (mut own, mut with_m, mut power) = ([0.0; BINS], [0.0; BINS], 0.0);
+        bins.each_scored(|mode, bin, w| {
+            let (nu, t) = (self.at(mode).0, truth[mode].norm_sqr());
+            own[bin] += 2.0 * w * w * nu * (2.0 * t + nu / response.powi(2)) / response.powi(2);
+            with_m[bin] += 2.0 * w * t * nu / response;
+            power += t;
+        });
+        let of_m = self.of_cross(bins, truth);
+        // Of each bin alone, with what m adds to it and takes away; and of pairs of bins, which m joins.
+        let (mut sigma_sys, mut alone, mut own_of_m, mut slopes, mut shared) =
+            (0.0, 0.0, 0.0, 0.0, 0.0);
+        for b in SCORED {
+            let apart = ee[b] / response.powi(2) - true_power[b];
+            let u = apart.signum() * bins.dln_l[b];
+            let (slope, with_m) = (2.0 * ee[b] / response.powi(3), with_m[b] / power);
+            let by_m = slope * (slope * of_m - 2.0 * with_m);
+            sigma_sys += apart.abs() * bins.dln_l[b];
+            alone += u * u * folded_variance(apart, own[b] + by_m);
+            own_of_m += u * u * by_m;
+            slopes += u * slope;
+            shared += u * with_m;
+        }
+        let variance = alone + slopes * (slopes * of_m - 2.0 * shared) - own_of_m;
+        damped(q, variance.max(0.0).sqrt() / sigma_sys)
+    }
+
     /// Variances of the scored bandpowers of B modes, and of EB.
     pub(crate) fn of_null_tests(
         &self,
@@ -168,7 +207,11 @@ pub(crate) fn of_sigma_sys(bins: &Bins, apart: &[f64; BINS], variance: &[f64; BI
 /// σ_sys that is small by chance would have Q's error without bound.
 pub(crate) fn of_quality(bins: &Bins, q: f64, apart: &[f64; BINS], variance: &[f64; BINS]) -> f64 {
     let sigma_sys: f64 = SCORED.map(|b| apart[b].abs() * bins.dln_l[b]).sum();
-    let relative = of_sigma_sys(bins, apart, variance) / sigma_sys;
+    damped(q, of_sigma_sys(bins, apart, variance) / sigma_sys)
+}
+
+/// Standard error of Q where σ_sys has the error `relative` to itself.
+fn damped(q: f64, relative: f64) -> f64 {
     q * relative / (1.0 + relative * relative)
 }
 

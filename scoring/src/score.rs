@@ -18,6 +18,8 @@ use crate::resample::jackknife_error;
 
 /// Most groups of images that the jackknife leaves out in turn.
 pub const MAX_GROUPS: usize = 20;
+/// Errors of its own by which the response must be above zero for anything to be divided by it.
+const CLEAR_RESPONSE: f64 = 3.0;
 
 /// Which convention the figures of a table are taken from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -155,6 +157,8 @@ pub struct ConventionScore {
     pub m_cross: f64,
     /// Q and σ_sys.
     pub quality: Quality,
+    /// Q of the spectrum divided by (1 + m)², m by cross-correlation.
+    pub quality_calibrated: Quality,
     /// The same after removing the noise power; `None` where the noise is not known.
     pub quality_dn: Option<Quality>,
     /// E-mode bandpowers less those of noise; the former where noise is not known.
@@ -325,7 +329,7 @@ impl SetScorer {
             Choice::Best => best,
             Choice::Insist(k) => k,
         };
-        let figures = self.figures(total, &conventions[chosen.index()]);
+        let mut figures = self.figures(total, &conventions[chosen.index()]);
         let replicates: Vec<Figures> = match images.groups.len() {
             0 | 1 => Vec::new(),
             _ => (0..images.groups.len())
@@ -338,19 +342,22 @@ impl SetScorer {
                 })
                 .collect(),
         };
-        let errors = self.errors(images, &conventions[chosen.index()], &figures, &replicates);
+        let mut errors = self.errors(images, &conventions[chosen.index()], &figures, &replicates);
+        // By a response that may as well be zero nothing can be divided.
+        if 1.0 + figures.m_cross < CLEAR_RESPONSE * errors.m_cross {
+            for of in [&mut figures, &mut errors] {
+                (of.q_calibrated, of.noise) = (f64::NAN, f64::NAN);
+            }
+        }
         let constant = self.truth.constant().map(|truth| MeanShear {
             e: [truth[0] + figures.c1, truth[1] + figures.c2],
             error: [errors.c1, errors.c2],
             truth,
         });
         let noise = noise.map(|power| power[chosen.class().index()]);
-        let noise_variance = noise.as_ref().map(|power| match self.options.noise {
+        let noise_variance = noise.as_ref().map(|_| match self.options.noise {
             Noise::Given(variance) => variance,
-            Noise::Measured => {
-                let unit = self.bins.white_noise(self.noise_gain(total));
-                SCORED.map(|b| power[b]).sum::<f64>() / SCORED.map(|b| unit[b]).sum::<f64>()
-            }
+            Noise::Measured => self.noise_variance(total, &conventions[chosen.index()]),
         });
         let true_modes = self.true_modes(total, Convention::STANDARD);
         Ok(SetScore {
@@ -559,6 +566,8 @@ impl SetScorer {
         let true_ee = self.bins.power(&truth.e, &truth.e);
         let cross = self.bins.scored_product(&truth.e, &modes.e);
         let true_power = self.bins.scored_product(&truth.e, &truth.e);
+        let m_cross = cross / true_power - 1.0;
+        let calibrated = ee.map(|power| power / (1.0 + m_cross).powi(2));
         let denoised = noise.map(|n| {
             let n = &n[convention.class().index()];
             std::array::from_fn::<f64, BINS, _>(|b| ee[b] - n[b])
@@ -569,8 +578,9 @@ impl SetScorer {
             bb: self.bins.power(&modes.b, &modes.b),
             eb: self.bins.power(&modes.e, &modes.b),
             correlation: self.correlation(modes, truth),
-            m_cross: cross / true_power - 1.0,
+            m_cross,
             quality: quality(&self.bins, &ee, &true_ee),
+            quality_calibrated: quality(&self.bins, &calibrated, &true_ee),
             quality_dn: denoised
                 .as_ref()
                 .map(|ee| quality(&self.bins, ee, &true_ee)),
@@ -614,9 +624,11 @@ impl SetScorer {
         let own = Figures {
             q: score.quality.q,
             q_dn: score.quality_dn.map_or(f64::NAN, |quality| quality.q),
+            q_calibrated: score.quality_calibrated.q,
             m_half: score.fit.cl.m,
             sqrt_a: score.fit.cl.sqrtA * 1e4,
             m_cross: score.m_cross,
+            noise: self.noise_variance(sum, score).sqrt() / (1.0 + score.m_cross).abs(),
             m1: first.m,
             m2: second.m,
             c1: first.c,
@@ -632,6 +644,19 @@ impl SetScorer {
                 c2: own.c2,
                 ..Figures::unknown()
             },
+        }
+    }
+
+    /// Noise variance of one galaxy per component: that of white noise with the power that was removed from
+    /// the scored bandpowers. Not a number where none was.
+    fn noise_variance(&self, sum: &FieldSum, score: &ConventionScore) -> f64 {
+        let unit = self.bins.white_noise(self.noise_gain(sum));
+        let removed = SCORED
+            .map(|b| score.ee[b] - score.noise_free[b])
+            .sum::<f64>();
+        match score.quality_dn {
+            Some(_) => removed / SCORED.map(|b| unit[b]).sum::<f64>(),
+            None => f64::NAN,
         }
     }
 
@@ -708,14 +733,33 @@ impl SetScorer {
         let independent =
             std::array::from_fn(|i| std::array::from_fn(|j| if i == j { power[i] } else { 0.0 }));
         let (m, a) = errors::of_biases(bins, &true_ee, &independent);
+        let m_cross = scatter.of_cross(bins, &truth.e).sqrt();
+        let response = 1.0 + score.m_cross;
+        let q_calibrated = scatter.of_calibrated_quality(
+            bins,
+            &truth.e,
+            response,
+            &score.ee,
+            &true_ee,
+            figures.q_calibrated,
+        );
+        let noise = {
+            let own = match (self.options.noise, images.groups.len() as f64) {
+                (Noise::Given(_), _) => 0.0,
+                (Noise::Measured, groups) => bins.variance_of_white_power() / (groups - 1.0) / 4.0,
+            };
+            figures.noise * (own + (m_cross / response).powi(2)).sqrt()
+        };
         let fit = &score.fit.cl;
         let [bb, eb] = scatter.of_null_tests(bins, &signal);
         Figures {
             q: errors::of_quality(bins, figures.q, &apart, &power),
             q_dn,
+            q_calibrated,
             m_half: m / 2.0,
             sqrt_a: errors::of_sqrt_a(fit.A, a),
-            m_cross: scatter.of_cross(bins, &truth.e).sqrt(),
+            m_cross,
+            noise,
             m1: v1.0,
             m2: v2.0,
             c1,

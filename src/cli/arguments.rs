@@ -6,10 +6,11 @@ use std::str::FromStr;
 use clap::{Args, ValueEnum};
 use shearq_scoring::{Choice, Convention, Definition};
 
-use super::{print, tell};
+use super::{print, print_table, tell};
 use crate::io::layout::MAX_SET;
 use crate::pipeline::images::{ImageId, Shard};
 use crate::report::table::{Table, TableFormat};
+use crate::report::terminal::fitted;
 use crate::results::compare::Way;
 use crate::results::score::OWN;
 use crate::simulate::field::ShearSpectrum;
@@ -76,7 +77,8 @@ impl SetList {
 pub(super) struct Printing {
     #[command(flatten)]
     form: Form,
-    /// Print the columns of detail (c, m per component, null tests) in the other formats too.
+    /// Print the columns of detail (c, m per component, null tests) in the other formats too, and tables
+    /// wider than the terminal.
     #[arg(long)]
     wide: bool,
 }
@@ -88,11 +90,20 @@ impl Printing {
 
     /// Prints a table.
     pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
-        let people = !matches!(self.form.format, TableFormat::Csv | TableFormat::Json);
-        if people && !self.wide {
-            self.form.print(&table.narrow())
-        } else {
-            self.form.print(table)
+        match (self.form.format, self.wide) {
+            (TableFormat::Table, true) => print(&fitted(table, None)),
+            (TableFormat::Table, false) => {
+                let mut narrow = table.narrow();
+                let details = table.headings.iter().filter(|heading| heading.detail);
+                let details: Vec<&str> = details.map(|heading| heading.label.as_str()).collect();
+                if !details.is_empty() {
+                    let note = format!("Left out, with --wide: {}.", details.join(", "));
+                    narrow.notes.push(note);
+                }
+                self.form.print(&narrow)
+            }
+            (TableFormat::Markdown | TableFormat::Latex, false) => self.form.print(&table.narrow()),
+            _ => self.form.print(table),
         }
     }
 }
@@ -113,7 +124,10 @@ impl Form {
                 tell(format_args!("{note}"));
             }
         }
-        print(&table.render(self.format))
+        match self.format {
+            TableFormat::Table => print_table(table),
+            format => print(&table.render(format)),
+        }
     }
 }
 

@@ -8,7 +8,7 @@ use shearq_measure::Flag;
 use shearq_submissions::Registry;
 
 use super::arguments::{SetList, Sharding, Threads};
-use super::progress::Bar;
+use super::progress::{Bar, goes_on};
 use super::{count, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
@@ -45,6 +45,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
     let Arguments {
         submission,
         data,

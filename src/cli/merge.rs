@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::Args;
 
 use super::arguments::{SetList, Threads};
-use super::progress::Bar;
+use super::progress::{Bar, goes_on};
 use super::{Findings, count, print, run, tell};
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::open::is_there;
@@ -48,6 +48,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
     let out = &arguments.out;
     if let Some(run) = Run::read(out)? {
         return merge_run(arguments, &run);

@@ -7,8 +7,8 @@ use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
 use super::arguments::{ScoreSettings, Threads};
-use super::progress::Bar;
-use super::{measure, print, tell};
+use super::progress::{Bar, goes_on};
+use super::{measure, print, print_table, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::FileFormat;
@@ -16,7 +16,6 @@ use crate::pipeline::images;
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
 use crate::report::comparison::compare;
 use crate::report::scores::per_set;
-use crate::report::table::TableFormat;
 use crate::results::compare::score_all;
 use crate::results::score::{OWN, score_folder};
 use crate::simulate::set::SimulationSettings;
@@ -44,6 +43,7 @@ const SEED: u64 = 2013;
 const SUBMISSIONS: [&str; 3] = ["23/raw/star", "23/den/star", "48/linear/star"];
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
     let Arguments { out, threads } = arguments;
     let threads = threads.number();
     let data = DataFolder::new(out.join("data"));
@@ -78,13 +78,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let scored = score_folder(&data, &folder, &run, &[], options, threads)?;
         let title = format!("Scores of {name} (simulated data)");
         let table = per_set(&scored, &title, options.definition);
-        print(&format!("{}\n", table.narrow().render(TableFormat::Table)))?;
+        print_table(&table)?;
+        print("\n")?;
         folders.push(folder);
     }
     let way = ScoreSettings::default().way();
     let variants = score_all(&folders, &[], None, way, threads)?;
     let table = compare(&variants, options.definition);
-    print(&table.narrow().render(TableFormat::Table))?;
+    print_table(&table)?;
     tell(format_args!(
         "\nWith few images Q rewards submissions that shrink noise and shear alike: compare m (cross) too, which\nis zero for an unbiased one.\n\nNext: {}",
         next_step(out)

@@ -6,14 +6,13 @@ use clap::Args;
 use shearq_submissions::{Published, Registry, Submission};
 
 use super::arguments::{SetList, Threads};
-use super::progress::Bar;
-use super::{print, tell};
+use super::progress::{Bar, goes_on};
+use super::{print, print_table, tell};
 use crate::io::layout::MAX_IMAGE;
 use crate::pipeline::run::{measurers, simulated_steps};
 use crate::pipeline::simulate::simulator;
 use crate::report::page::Page;
 use crate::report::steps::{steps_figure, steps_row};
-use crate::report::table::TableFormat;
 use crate::simulate::set::SimulationSettings;
 use crate::study::calibration::calibrate;
 use crate::study::exhibits;
@@ -51,6 +50,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
     let Arguments {
         out,
         images,
@@ -116,13 +116,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.data("fig5-7-lambda", &exhibits::curves_table(&curves))?;
     sect_five(&mut page, &results, &submissions)?;
     page.save()?;
-    print(&format!(
-        "{}\n{}\n{}",
-        exhibits::table_one(&results, &submissions).render(TableFormat::Table),
-        exhibits::findings_table(&exhibits::findings(&results, &names(&submissions)))
-            .render(TableFormat::Table),
-        exhibits::calibration_table(&curves, &base).render(TableFormat::Table),
-    ))?;
+    print_table(&exhibits::table_one(&results, &submissions))?;
+    for table in [
+        exhibits::findings_table(&exhibits::findings(&results, &names(&submissions))),
+        exhibits::calibration_table(&curves, &base),
+    ] {
+        print("\n")?;
+        print_table(&table)?;
+    }
     tell(format_args!(
         "report, figures and data in {}",
         out.display()

@@ -7,8 +7,8 @@ use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
 use super::arguments::{SetList, Sharding, SimulationArguments, Threads};
-use super::progress::Bar;
-use super::{measure, print, score, tell};
+use super::progress::{Bar, goes_on};
+use super::{measure, print_table, score, tell};
 use crate::io::atomic;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::run::{Run, Source};
@@ -63,6 +63,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
     let Arguments {
         submission,
         data,
@@ -152,5 +153,5 @@ pub(super) fn score(
         let text = table.render(TableFormat::Csv);
         atomic::write(out.join(format!("{name}.csv")), text.as_bytes())?;
     }
-    print(&table.narrow().render(TableFormat::Table))
+    print_table(&table)
 }

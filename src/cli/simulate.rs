@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::arguments::{SetList, Sharding, SimulationArguments, Threads};
-use super::progress::Bar;
+use super::progress::{Bar, goes_on};
 use super::tell;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::pipeline::images;
@@ -35,6 +35,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
     let Arguments {
         sets,
         images,

@@ -7,7 +7,7 @@ use shearq_submissions::{Registry, Submission};
 
 use super::arguments::{Form, SetList, SimulationArguments, Threads};
 use super::print;
-use super::progress::Bar;
+use super::progress::{Bar, goes_on};
 use crate::io::layout::MAX_IMAGE;
 use crate::report::page::Page;
 use crate::report::table::TableFormat;
@@ -50,6 +50,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
     let Arguments {
         submission,
         sets,

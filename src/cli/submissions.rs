@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand, ValueEnum};
 use shearq_submissions::{PsfForm, Registry, Template};
 
+use super::arguments::Form;
 use super::{print, tell};
 use crate::io::atomic;
-use crate::report::table::{Cell, Heading, Table, TableFormat};
+use crate::report::table::{Cell, Heading, Table};
 
 /// List, show and start submission configurations.
 #[derive(Debug, Args)]
@@ -20,9 +21,8 @@ pub(super) struct Arguments {
 enum Command {
     /// The embedded submissions with their published figures.
     List {
-        /// How to print.
-        #[arg(long, value_enum, default_value_t)]
-        format: TableFormat,
+        #[command(flatten)]
+        form: Form,
     },
     /// All settings of a submission, resolved, as TOML.
     Show {
@@ -52,7 +52,7 @@ enum Method {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     match &arguments.command {
-        Command::List { format } => print(&list()?.render(*format)),
+        Command::List { form } => form.print(&list()?),
         Command::Show { name } => {
             let entry = Registry::embedded()?.get(name)?;
             let mut text = toml::to_string(&entry.submission)?;

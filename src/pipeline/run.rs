@@ -83,7 +83,7 @@ pub fn run_folder(
         already: done.len(),
         ..Summary::default()
     };
-    progress.advance((summary.already * settings.grid * settings.grid) as u64);
+    progress.skip((summary.already * settings.grid * settings.grid) as u64);
     for of_set in todo.chunk_by(|a, b| a.set == b.set) {
         let set = of_set[0].set;
         let todo: Vec<u32> = of_set.iter().map(|id| id.image).collect();

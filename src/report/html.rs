@@ -485,13 +485,9 @@ impl Column {
                 html! { th scope="row" class=[self.class(long)] { (Words(words)) } }
             }
             Some(Cell::Text(words)) => html! { td class=[class] { (Words(words)) } },
-            Some(
-                number @ Cell::Number {
-                    value, decimals, ..
-                },
-            ) => html! {
+            Some(number @ Cell::Number { value, .. }) => html! {
                 td class=[class] data-value=(sort_value(*value)) {
-                    (print_number(*value, *decimals))
+                    (number.figures().map_or_else(String::new, |shown| shown.0.replace('-', "−")))
                     @if let Some(width) = self.error_width {
                         // The space of the error is kept where there is none, so that values align.
                         @let error = error_text(number);
@@ -506,31 +502,13 @@ impl Column {
 
 /// The error of a cell as printed, where it has one.
 fn error_text(cell: &Cell) -> Option<String> {
-    match cell {
-        Cell::Number {
-            value,
-            error: Some(error),
-            decimals,
-        } if error.is_finite() && !value.is_nan() => Some(format!("{error:.decimals$}")),
-        _ => None,
-    }
+    cell.figures()?.1
 }
 
 /// The width of a number without sign, in digits; a decimal point takes about half of one.
 fn width_in_digits(number: &str) -> f64 {
     let points = number.matches('.').count();
     number.len() as f64 - 0.5 * points as f64
-}
-
-/// A number for people.
-fn print_number(value: f64, decimals: usize) -> String {
-    if value.is_nan() {
-        return "–".into();
-    }
-    if value.is_infinite() {
-        return if value > 0.0 { "∞" } else { "−∞" }.into();
-    }
-    format!("{value:.decimals$}").replace('-', "−")
 }
 
 /// A number as scripts read it.

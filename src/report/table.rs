@@ -1,11 +1,11 @@
 //! Tables for terminals, papers and programs.
 
-use comfy_table::{CellAlignment, ContentArrangement, TableComponent, presets};
+use comfy_table::{CellAlignment, ContentArrangement, presets};
 use serde_json::{Map, Value, json};
 use shearq_tables::polars::{Column, DataFrame};
 use shearq_tables::{TableError, frame};
 
-use super::escape;
+use super::{escape, terminal};
 
 /// How to print a table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -66,26 +66,64 @@ impl Cell {
         }
     }
 
+    /// A number and its error as people read them: where there is an error, both with as many decimals as
+    /// give it two significant digits. `None` where the cell holds no number.
+    pub fn figures(&self) -> Option<(String, Option<String>)> {
+        let Cell::Number {
+            value,
+            error,
+            decimals,
+        } = self
+        else {
+            return None;
+        };
+        if value.is_nan() {
+            return Some(("–".into(), None));
+        }
+        if value.is_infinite() {
+            return Some((if *value > 0.0 { "∞" } else { "-∞" }.into(), None));
+        }
+        let error = error.filter(|error| error.is_finite());
+        let decimals = error.map_or(*decimals, |error| decimals_of(error, *decimals));
+        let shown = |number: f64| match format!("{number:.decimals$}") {
+            // What rounds to nothing has no sign.
+            zero if zero.starts_with('-') && !zero.contains(|c: char| ('1'..='9').contains(&c)) => {
+                zero[1..].to_owned()
+            }
+            number => number,
+        };
+        Some((shown(*value), error.map(shown)))
+    }
+
     /// For people, words by `escape`; `latex` wraps numbers in mathematics.
     fn print(&self, escape: fn(&str) -> String, latex: bool) -> String {
-        match self {
-            Cell::Empty => String::new(),
-            Cell::Text(words) => escape(words),
-            Cell::Number { value, .. } if value.is_nan() => "–".into(),
-            Cell::Number {
-                value,
-                error,
-                decimals,
-            } => {
-                let number = format!("{value:.decimals$}");
-                match (error.filter(|e| e.is_finite()), latex) {
-                    (None, false) => number,
-                    (None, true) => format!("${number}$"),
-                    (Some(e), false) => format!("{number} ± {e:.decimals$}"),
-                    (Some(e), true) => format!("${number} \\pm {e:.decimals$}$"),
-                }
-            }
+        match (self, self.figures()) {
+            (Cell::Text(words), _) => escape(words),
+            (_, None) => String::new(),
+            (_, Some((number, None))) if number == "–" => number,
+            (_, Some((number, None))) if latex => format!("${}$", number.replace('∞', "\\infty")),
+            (_, Some((number, None))) => number,
+            (_, Some((number, Some(error)))) if latex => format!("${number} \\pm {error}$"),
+            (_, Some((number, Some(error)))) => format!("{number} ± {error}"),
         }
+    }
+}
+
+/// The most decimals that are printed for the sake of an error.
+const MOST_DECIMALS: usize = 12;
+
+/// Decimals that give `error` two significant digits; `otherwise` for an error of zero.
+fn decimals_of(error: f64, otherwise: usize) -> usize {
+    // Rounding can lengthen a number: 0.0996 is 0.10.
+    let rounded = format!("{error:.1e}");
+    match rounded
+        .split_once('e')
+        .map(|(_, exponent)| exponent.parse::<i32>())
+    {
+        Some(Ok(exponent)) if error > 0.0 => usize::try_from(1 - exponent)
+            .unwrap_or(0)
+            .min(MOST_DECIMALS),
+        _ => otherwise,
     }
 }
 
@@ -167,8 +205,8 @@ impl Table {
     /// The table in a format, ending in a line break.
     pub fn render(&self, format: TableFormat) -> String {
         match format {
-            TableFormat::Table => self.people(presets::UTF8_HORIZONTAL_ONLY, "", escape::line),
-            TableFormat::Markdown => self.people(presets::ASCII_MARKDOWN, "\n", escape::markdown),
+            TableFormat::Table => terminal::fitted(self, None),
+            TableFormat::Markdown => self.markdown(),
             TableFormat::Latex => self.latex(),
             TableFormat::Csv => self.csv(),
             TableFormat::Json => {
@@ -179,48 +217,34 @@ impl Table {
         }
     }
 
-    fn people(&self, preset: &str, gap: &str, escape: fn(&str) -> String) -> String {
+    fn markdown(&self) -> String {
         let mut table = comfy_table::Table::new();
         table
-            .load_preset(preset)
-            .remove_style(TableComponent::HorizontalLines)
-            .remove_style(TableComponent::MiddleIntersections)
-            .remove_style(TableComponent::LeftBorderIntersections)
-            .remove_style(TableComponent::RightBorderIntersections)
+            .load_preset(presets::ASCII_MARKDOWN)
             .set_content_arrangement(ContentArrangement::Disabled)
-            .set_header(self.headings.iter().map(|h| escape(&h.label)));
+            .set_header(self.headings.iter().map(|h| escape::markdown(&h.label)));
         for row in &self.rows {
-            table.add_row(row.iter().map(|cell| cell.print(escape, false)));
+            table.add_row(row.iter().map(|cell| cell.print(escape::markdown, false)));
         }
         for (k, column) in table.column_iter_mut().enumerate() {
-            let numbers = self
-                .rows
-                .iter()
-                .any(|row| matches!(row.get(k), Some(Cell::Number { .. })));
-            if numbers {
+            if self.holds_numbers(k) {
                 column.set_cell_alignment(CellAlignment::Right);
             }
         }
         let mut text = String::new();
         if !self.title.is_empty() {
-            text.push_str(&format!("{}\n{gap}", escape(&self.title)));
+            text.push_str(&format!("{}\n\n", escape::markdown(&self.title)));
         }
         text.push_str(&format!("{table}\n"));
         for note in &self.notes {
-            text.push_str(&format!("{gap}{}\n", escape(note)));
+            text.push_str(&format!("\n{}\n", escape::markdown(note)));
         }
         text
     }
 
     fn latex(&self) -> String {
         let columns: String = (0..self.headings.len())
-            .map(|k| {
-                let numbers = self
-                    .rows
-                    .iter()
-                    .any(|row| matches!(row.get(k), Some(Cell::Number { .. })));
-                if numbers { 'r' } else { 'l' }
-            })
+            .map(|k| if self.holds_numbers(k) { 'r' } else { 'l' })
             .collect();
         let line = |cells: Vec<String>| format!("{} \\\\\n", cells.join(" & "));
         let mut text = format!(
@@ -246,6 +270,12 @@ impl Table {
             text.push_str(&format!("% {}\n", escape::line(note)));
         }
         text
+    }
+
+    /// Whether a column holds numbers, and stands on the right.
+    pub(super) fn holds_numbers(&self, k: usize) -> bool {
+        let mut cells = self.rows.iter().filter_map(|row| row.get(k));
+        cells.any(|cell| matches!(cell, Cell::Number { .. }))
     }
 
     /// Whether a column holds errors, and needs a second column in CSV.

@@ -48,7 +48,7 @@ pub fn bias_sets(
         let path = folder.join(format!("bias/set{set:02}-{images}.json"));
         if let Some(result) = read_record::<SetBiases>(&path)? {
             found.push(result);
-            progress.advance(u64::from(images) * (plan.simulation.grid as u64).pow(2));
+            progress.skip(u64::from(images) * (plan.simulation.grid as u64).pow(2));
             continue;
         }
         let simulator = simulator(set, plan.simulation)?;

@@ -127,7 +127,7 @@ pub fn run_sets(
     for &set in sets {
         let path = result_path(folder, set);
         if let Some(result) = read_record::<SetResult>(&path)? {
-            progress.advance(u64::from(plan.images) * (plan.simulation.grid as u64).pow(2));
+            progress.skip(u64::from(plan.images) * (plan.simulation.grid as u64).pow(2));
             results.push(result);
             continue;
         }

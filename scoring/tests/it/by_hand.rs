@@ -800,26 +800,27 @@ fn errors_are_those_of_their_formulae() {
             }
             // Q: a sum of moduli, whose scatter is found by drawing.
             let true_power = score.bins.power(&t, &t);
+            let folded = |apart: f64, variance: f64| {
+                let (centre, spread) =
+                    ((apart * apart - variance).max(0.0).sqrt(), variance.sqrt());
+                // Moments of |centre + spread·z| by sums over z.
+                let (mut first, mut second, mut norm) = (0.0, 0.0, 0.0);
+                for step in -4000..4000 {
+                    let z = (f64::from(step) + 0.5) * 2e-3;
+                    let density = (-z * z / 2.0).exp();
+                    let value = (centre + spread * z).abs();
+                    first += density * value;
+                    second += density * value * value;
+                    norm += density;
+                }
+                second / norm - (first / norm).powi(2)
+            };
             let of_q = |q: f64, measured: &dyn Fn(usize) -> f64, variance: &[f64]| {
                 let (mut sigma, mut total) = (0.0, 0.0);
                 for (k, b) in SCORED.enumerate() {
                     let apart = measured(b) - true_power[b];
                     sigma += apart.abs() * score.bins.dln_l[b];
-                    let (centre, spread) = (
-                        (apart * apart - variance[k]).max(0.0).sqrt(),
-                        variance[k].sqrt(),
-                    );
-                    // Moments of |centre + spread·z| by sums over z.
-                    let (mut first, mut second, mut norm) = (0.0, 0.0, 0.0);
-                    for step in -4000..4000 {
-                        let z = (f64::from(step) + 0.5) * 2e-3;
-                        let density = (-z * z / 2.0).exp();
-                        let value = (centre + spread * z).abs();
-                        first += density * value;
-                        second += density * value * value;
-                        norm += density;
-                    }
-                    total += (second / norm - (first / norm).powi(2)) * score.bins.dln_l[b].powi(2);
+                    total += folded(apart, variance[k]) * score.bins.dln_l[b].powi(2);
                 }
                 let relative = total.sqrt() / sigma;
                 q * relative / (1.0 + relative * relative)
@@ -833,6 +834,42 @@ fn errors_are_those_of_their_formulae() {
             };
             let ee = score.spectra().ee;
             near(errors.q, of_q(f.q, &|b| ee[b], &variance), "Q");
+            // The same with the response divided out, which moves all bandpowers together.
+            let r = 1.0 + f.m_cross;
+            assert!(r > 3.0 * errors.m_cross, "a response that is known");
+            let of_bin =
+                |b: usize, of: &dyn Fn(&Mode) -> f64| -> f64 { bins[b].iter().map(of).sum() };
+            let apart = |b: usize| ee[b] / r.powi(2) - true_power[b];
+            let covariance = |b: usize, c: usize| {
+                let g = |b: usize| 2.0 * ee[b] / r.powi(3);
+                let k = |b: usize| {
+                    of_bin(b, &|mode| {
+                        2.0 * w(b, mode) * t[mode.at].norm_sqr() * nu[mode.at].0 / (r * power)
+                    })
+                };
+                let own = of_bin(b, &|mode| {
+                    let (nu, t2) = (nu[mode.at].0, t[mode.at].norm_sqr());
+                    2.0 * w(b, mode).powi(2) * (2.0 * t2 * nu / r.powi(2) + nu * nu / r.powi(4))
+                });
+                f64::from(b == c) * own + g(b) * g(c) * cross / power.powi(2)
+                    - g(b) * k(c)
+                    - g(c) * k(b)
+            };
+            let (mut sigma, mut variance) = (0.0, 0.0);
+            for b in SCORED {
+                sigma += apart(b).abs() * score.bins.dln_l[b];
+                for c in SCORED {
+                    let lengths = score.bins.dln_l[b] * score.bins.dln_l[c];
+                    variance += lengths
+                        * match b == c {
+                            true => folded(apart(b), covariance(b, b)),
+                            false => apart(b).signum() * apart(c).signum() * covariance(b, c),
+                        };
+                }
+            }
+            let relative = variance.sqrt() / sigma;
+            let expected = f.q_calibrated * relative / (1.0 + relative * relative);
+            near(errors.q_calibrated, expected, "Q calibrated");
             let relative = errors.sigma_sys_1e4 / f.sigma_sys_1e4;
             let damped = relative / (1.0 + relative * relative);
             close(errors.q, f.q * damped, "σ_sys");

@@ -98,9 +98,16 @@ fn errors_are_the_scatter_of_repeated_trials() {
         (Definition::Leaderboard, kind(10, 0.107, true, -0.4)),
         (Definition::Leaderboard, kind(4, 0.054, true, 0.0)),
         (Definition::Leaderboard, kind(2, 0.107, true, 0.0)),
+        (Definition::Leaderboard, kind(10, 0.03, false, 0.0)),
         (Definition::Corrected, kind(4, 0.054, true, 0.0)),
     ] {
         for (name, ratio, share) in coverage(&grid, &kind, definition) {
+            let calibrated = ["q_calibrated", "noise"].contains(&name);
+            if calibrated && share < 0.95 {
+                // A response that is often not told from zero: those that are known are the high ones.
+                assert!(kind.noise > 0.1 || kind.shared, "{kind:?}: {name} {share}");
+                continue;
+            }
             // A scatter from 200 trials is good to 5 %; errors to first order, of squares and moduli, are
             // not exact.
             assert!(
@@ -122,10 +129,13 @@ fn errors_of_one_image_are_known_but_for_its_noise() {
         m: 0.0,
     };
     for (name, ratio, share) in coverage(&grid, &kind, Definition::Leaderboard) {
-        if name == "q_dn" {
+        if ["q_dn", "noise"].contains(&name) {
             assert_eq!(share, 0.0);
         } else {
-            assert!((0.8..1.25).contains(&ratio), "{name} {ratio}");
+            // Nothing but noise is left of σ_sys once the response is divided out: it is of the size of its
+            // error, which is then up to half too large.
+            let least = if name == "q_calibrated" { 0.6 } else { 0.8 };
+            assert!((least..1.25).contains(&ratio), "{name} {ratio}");
         }
     }
 }
