@@ -7,6 +7,7 @@ pub mod figure;
 mod font;
 pub mod html;
 pub mod page;
+pub mod pages;
 pub mod scores;
 pub mod steps;
 pub mod table;

@@ -1,6 +1,7 @@
 //! Arguments that several subcommands share.
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::{Args, ValueEnum};
@@ -9,6 +10,9 @@ use shearq_scoring::{Choice, Convention, Definition};
 use super::{print, print_table, tell};
 use crate::io::layout::MAX_SET;
 use crate::pipeline::images::{ImageId, Shard};
+use crate::report::figure::FigureError;
+use crate::report::html::Section;
+use crate::report::pages;
 use crate::report::table::{Table, TableFormat};
 use crate::report::terminal::fitted;
 use crate::results::compare::Way;
@@ -105,6 +109,29 @@ impl Printing {
             (TableFormat::Markdown | TableFormat::Latex, false) => self.form.print(&table.narrow()),
             _ => self.form.print(table),
         }
+    }
+}
+
+/// A page to be written.
+#[derive(Debug, Clone, Args)]
+pub(super) struct ReportFile {
+    /// Write the results as one HTML page with figures, which needs nothing else.
+    #[arg(long = "report", value_name = "FILE")]
+    path: Option<PathBuf>,
+}
+
+impl ReportFile {
+    /// Writes the page, if one was asked for.
+    pub(super) fn save(
+        &self,
+        title: &str,
+        sections: impl FnOnce() -> Result<Vec<Section>, FigureError>,
+        settings: Vec<(String, String)>,
+    ) -> anyhow::Result<()> {
+        if let Some(path) = &self.path {
+            pages::save(path, title, sections()?, settings)?;
+        }
+        Ok(())
     }
 }
 

@@ -5,10 +5,11 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use clap::Args;
 
-use super::arguments::{Printing, ScoreSettings, Threads};
+use super::arguments::{Printing, ReportFile, ScoreSettings, Threads};
 use super::print_heat_map;
 use crate::report::comparison::{compare, compare_runs, q_heat_map};
 use crate::report::figure::{Figure, HeatMap};
+use crate::report::pages;
 use crate::report::table::{Table, TableFormat};
 use crate::results::compare::{Variant, score_all};
 use crate::results::conditions::Conditions;
@@ -53,6 +54,8 @@ pub(super) struct Arguments {
     #[command(flatten)]
     printing: Printing,
     #[command(flatten)]
+    report: ReportFile,
+    #[command(flatten)]
     settings: ScoreSettings,
     #[command(flatten)]
     threads: Threads,
@@ -83,6 +86,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         map.save(path)?;
     }
     arguments.printing.print(&table)?;
+    let paths = arguments.store.iter().chain(&arguments.measured);
+    let made_by = paths.chain(&arguments.foreign).chain(&arguments.data);
+    let made_by = made_by.map(|path| ("Input".to_owned(), path.display().to_string()));
+    let sections = || Ok(vec![pages::comparison(table, &map)?]);
+    let title = "Comparison of submissions";
+    arguments.report.save(title, sections, made_by.collect())?;
     if arguments.printing.format() == TableFormat::Table {
         print_heat_map(map)?;
     }

@@ -35,7 +35,7 @@ pub(super) struct Arguments {
     /// Sets to measure [default: all there are].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
-    /// FileFormat of the catalogues [default: parquet].
+    /// Format of the catalogues [default: parquet].
     #[arg(long, value_enum)]
     catalogue_format: Option<FileFormat>,
     #[command(flatten)]

@@ -92,7 +92,8 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
     };
     require_complete(arguments, &results, &images)?;
     if images.iter().any(|id| is_there(&data.truth(id.set))) {
-        return run::score(run, out, sets, None, arguments.threads.number());
+        run::score(run, out, sets, None, arguments.threads.number())?;
+        return Ok(());
     }
     tell(format_args!(
         "not scored: {} has no true shear",

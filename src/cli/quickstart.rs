@@ -8,24 +8,28 @@ use shearq_submissions::Registry;
 
 use super::arguments::{ScoreSettings, Threads};
 use super::progress::{Bar, goes_on};
-use super::{measure, print, print_table, tell};
+use super::{measure, print, print_table, tell, width};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::FileFormat;
 use crate::pipeline::images;
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
-use crate::report::comparison::compare;
+use crate::report::comparison::{compare, q_heat_map};
+use crate::report::pages;
 use crate::report::scores::per_set;
-use crate::results::compare::score_all;
+use crate::report::table::Cell;
+use crate::report::terminal::wrapped;
+use crate::results::compare::{Variant, mean_figure, score_all};
+use crate::results::row::SetRecord;
 use crate::results::score::{OWN, score_folder};
 use crate::simulate::set::SimulationSettings;
 
 /// The whole chain on a small simulated default: simulate, measure with three submissions, score,
 /// compare. Takes well under two minutes.
 ///
-/// It runs what these commands would: `simulate --sets 2,8 --images 10 --grid 40 --seed 2013`, then
+/// It runs what these commands would: `simulate --sets 2,8 --images 10 --grid 60 --seed 2013`, then
 /// `measure` and `score --convention 5` with 23/raw/star, 23/den/star and 48/linear/star, then
-/// `compare --convention 5`. The data are simulated,
+/// `compare --convention 5`, and writes report.html. The data are simulated,
 /// and few: the errors printed are what tells whether a difference is one.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -38,7 +42,7 @@ pub(super) struct Arguments {
 
 const SETS: [u32; 2] = [2, 8];
 const IMAGES: u32 = 10;
-const GRID: usize = 40;
+const GRID: usize = 60;
 const SEED: u64 = 2013;
 const SUBMISSIONS: [&str; 3] = ["23/raw/star", "23/den/star", "48/linear/star"];
 
@@ -65,7 +69,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         choice: OWN,
         ..Options::default()
     };
-    let mut folders = Vec::new();
+    let (mut folders, mut sections) = (Vec::new(), Vec::new());
+    let mut made_by = vec![(
+        "Simulation".to_owned(),
+        serde_json::to_string(&record.settings)?,
+    )];
     for name in SUBMISSIONS {
         let folder = out.join(name.replace('/', "-"));
         let submission = registry.get(name)?.submission;
@@ -80,17 +88,71 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let table = per_set(&scored, &title, options.definition);
         print_table(&table)?;
         print("\n")?;
+        sections.push(pages::scores(name, &scored, table)?);
+        made_by.push((name.to_owned(), toml::to_string(&run.submission)?));
         folders.push(folder);
     }
     let way = ScoreSettings::default().way();
     let variants = score_all(&folders, &[], None, way, threads)?;
     let table = compare(&variants, options.definition);
     print_table(&table)?;
+    let records: Vec<_> = variants.iter().map(Variant::records).collect();
+    let rows: Vec<(String, Vec<&SetRecord>)> = variants
+        .iter()
+        .zip(&records)
+        .map(|(variant, sets)| (variant.name.clone(), sets.iter().collect()))
+        .collect();
+    print(&format!("\n{}", wrapped(&verdict(&rows), Some(width()))))?;
+    sections.insert(0, pages::comparison(table, &q_heat_map(&rows))?);
+    let report = out.join("report.html");
+    pages::save(&report, "Quickstart (simulated data)", sections, made_by)?;
     tell(format_args!(
-        "\nWith few images Q rewards submissions that shrink noise and shear alike: compare m (cross) too, which\nis zero for an unbiased one.\n\nNext: {}",
+        "\nreport in {}\nNext: {}",
+        report.display(),
         next_step(out)
     ));
     Ok(())
+}
+
+/// Which submission to use, and the figures that say so.
+fn verdict(submissions: &[(String, Vec<&SetRecord>)]) -> String {
+    let of = |sets: &[&SetRecord], name: &str| mean_figure(sets, name);
+    let known = submissions
+        .iter()
+        .filter(|(_, sets)| of(sets, "q_calibrated").0.is_finite());
+    let best = known.max_by(|a, b| {
+        of(&a.1, "q_calibrated")
+            .0
+            .total_cmp(&of(&b.1, "q_calibrated").0)
+    });
+    let Some((name, sets)) = best else {
+        return "So few data tell no submission from another.".into();
+    };
+    let shown = |sets: &[&SetRecord], name: &str, decimals: usize| {
+        let (value, error) = of(sets, name);
+        match Cell::with_error(value, Some(error), decimals).figures() {
+            Some((value, Some(error))) => format!("{value} ± {error}"),
+            _ => "unknown".into(),
+        }
+    };
+    let others: Vec<String> = submissions
+        .iter()
+        .filter(|(other, _)| other != name)
+        .map(|(other, sets)| {
+            format!(
+                "{other} has m = {} and Q calibrated = {}",
+                shown(sets, "m_cross", 2),
+                shown(sets, "q_calibrated", 1)
+            )
+        })
+        .collect();
+    format!(
+        "Use {name}: m = {}, noise {} a galaxy once calibrated, and Q calibrated = {}; {}. Q itself is raised here by losing shear and noise alike (m below zero), which real analyses cannot use.",
+        shown(sets, "m_cross", 2),
+        shown(sets, "noise", 3),
+        shown(sets, "q_calibrated", 1),
+        others.join(", ")
+    )
 }
 
 fn next_step(out: &Path) -> String {

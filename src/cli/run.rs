@@ -6,7 +6,7 @@ use clap::Args;
 use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
-use super::arguments::{SetList, Sharding, SimulationArguments, Threads};
+use super::arguments::{ReportFile, SetList, Sharding, SimulationArguments, Threads};
 use super::progress::{Bar, goes_on};
 use super::{measure, print_table, score, tell};
 use crate::io::atomic;
@@ -15,10 +15,11 @@ use crate::io::run::{Run, Source};
 use crate::io::table::FileFormat;
 use crate::pipeline::images;
 use crate::pipeline::run::run_folder;
+use crate::report::pages;
 use crate::report::scores::{bandpowers, per_set};
-use crate::report::table::TableFormat;
+use crate::report::table::{Table, TableFormat};
 use crate::results::row::Measured;
-use crate::results::score::{OWN, score_folder};
+use crate::results::score::{OWN, ScoredSet, score_folder};
 use crate::results::store;
 
 /// Measure and score in one go, on a data folder or on sets that are simulated on the way.
@@ -50,12 +51,14 @@ pub(super) struct Arguments {
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// FileFormat of the catalogues [default: parquet].
+    /// Format of the catalogues [default: parquet].
     #[arg(long, value_enum)]
     catalogue_format: Option<FileFormat>,
     /// Record the scores in this results store, which `compare --store` reads.
     #[arg(long, value_name = "DIR")]
     store: Option<PathBuf>,
+    #[command(flatten)]
+    report: ReportFile,
     #[command(flatten)]
     sharding: Sharding,
     #[command(flatten)]
@@ -74,6 +77,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         out,
         catalogue_format,
         store,
+        report,
         sharding,
         threads,
     } = arguments;
@@ -125,7 +129,16 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ));
         return Ok(());
     }
-    score(&run, out, wanted, store.as_deref(), threads)
+    let scored = score(&run, out, wanted, store.as_deref(), threads)?;
+    let title = format!("Scores of {}", run.submission.name);
+    let sections = || {
+        Ok(vec![pages::scores(
+            &run.submission.name,
+            &scored.0,
+            scored.1,
+        )?])
+    };
+    report.save(&title, sections, score::made_by(&run, out)?)
 }
 
 /// Scores a folder of catalogues (those of `sets`, or all), prints the scores and keeps them and the
@@ -136,7 +149,7 @@ pub(super) fn score(
     sets: &[u32],
     store: Option<&Path>,
     threads: usize,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<(Vec<ScoredSet>, Table)> {
     let options = Options {
         choice: OWN,
         ..Options::default()
@@ -153,5 +166,6 @@ pub(super) fn score(
         let text = table.render(TableFormat::Csv);
         atomic::write(out.join(format!("{name}.csv")), text.as_bytes())?;
     }
-    print_table(&table)
+    print_table(&table)?;
+    Ok((scored, table))
 }

@@ -8,12 +8,13 @@ use clap::{ArgGroup, Args, ValueEnum};
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore, TrueShear, TruthSign};
 
-use super::arguments::{Printing, ScoreSettings, SetList, Threads, positive};
+use super::arguments::{Printing, ReportFile, ScoreSettings, SetList, Threads, positive};
 use super::{print, tell};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::pipeline::PipelineError;
 use crate::pipeline::truth::{Reading, read_truth, reading_of};
+use crate::report::pages;
 use crate::report::scores::{SetInput, one_set_json, per_set, spectra};
 use crate::report::table::TableFormat;
 use crate::results::foreign::{Foreign, Screen, plain_columns};
@@ -106,6 +107,8 @@ pub(super) struct Arguments {
     #[command(flatten)]
     printing: Printing,
     #[command(flatten)]
+    report: ReportFile,
+    #[command(flatten)]
     settings: ScoreSettings,
     #[command(flatten)]
     threads: Threads,
@@ -159,7 +162,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
     }
     let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
     let threads = arguments.threads.number();
-    let (name, scored, unscored) = match (&arguments.measured, &arguments.foreign, data) {
+    let (name, made_by, scored, unscored) = match (&arguments.measured, &arguments.foreign, data) {
         (Some(measured), _, data) => {
             let run = Run::require(measured)?;
             let data = data.map_or_else(|| run.source.data(measured), Ok)?;
@@ -169,7 +172,8 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
                 record(store, made, &scored, options)?;
             }
             let unscored = unscored(&data, &scored, sets)?;
-            (run.submission.name, scored, unscored)
+            let made_by = made_by(&run, measured)?;
+            (run.submission.name, made_by, scored, unscored)
         }
         (None, Some(path), Some(data)) => {
             let foreign = Foreign::read(path)?;
@@ -189,14 +193,30 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
                 record(store, made, &scored, options)?;
             }
             let unscored = unscored(&data, &scored, sets)?;
-            (foreign.name.clone(), scored, unscored)
+            let made_by = [("Catalogues", path.as_path()), ("Data", data.root())]
+                .map(|(what, path)| (what.to_owned(), path.display().to_string()));
+            (foreign.name.clone(), made_by.into(), scored, unscored)
         }
         (None, _, _) => bail!("--foreign needs the true shear: --data DIR"),
     };
     let title = format!("Scores of {name}");
     let mut table = per_set(&scored, &title, options.definition);
     table.notes.extend(unscored);
-    arguments.printing.print(&table)
+    arguments.printing.print(&table)?;
+    let sections = || Ok(vec![pages::scores(&name, &scored, table)?]);
+    arguments.report.save(&title, sections, made_by)
+}
+
+/// What made the catalogues of a run, for reports.
+pub(super) fn made_by(run: &Run, out: &Path) -> anyhow::Result<Vec<(String, String)>> {
+    Ok(vec![
+        ("Catalogues".into(), out.display().to_string()),
+        ("Source".into(), serde_json::to_string(&run.source)?),
+        (
+            run.submission.name.clone(),
+            toml::to_string(&run.submission)?,
+        ),
+    ])
 }
 
 /// Records a scored run in a results store and says where.
@@ -406,6 +426,17 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         return print(&text);
     }
     let title = format!("Scores against {}", truth.display());
-    let table = per_set(&[scored], &title, options.definition);
-    arguments.printing.print(&table)
+    let scored = [scored];
+    let table = per_set(&scored, &title, options.definition);
+    arguments.printing.print(&table)?;
+    let mut made_by = vec![("Truth".to_owned(), truth.display().to_string())];
+    made_by.extend(
+        arguments
+            .catalogues
+            .iter()
+            .enumerate()
+            .map(|(k, path)| (format!("Catalogue {}", k + 1), path.display().to_string())),
+    );
+    let sections = || Ok(vec![pages::scores("catalogues", &scored, table)?]);
+    arguments.report.save(&title, sections, made_by)
 }

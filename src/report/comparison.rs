@@ -66,14 +66,16 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
         figure_heading("q"),
         Heading::new("q_difference", "ΔQ to first"),
         Heading::new("sigma", "in σ"),
+        figure_heading("q_calibrated"),
+        figure_heading("noise"),
+        figure_heading("m_cross"),
         Heading::new("q_leaderboard", "Q leaderboard"),
-        Heading::new("q_published", "Q publ."),
         figure_heading("q_dn"),
         figure_heading("m_half"),
-        Heading::new("m_half_published", "M/2 publ."),
         figure_heading("sqrt_a"),
+        Heading::new("q_published", "Q publ."),
+        Heading::new("m_half_published", "M/2 publ."),
         Heading::new("sqrt_a_published", "√A publ."),
-        figure_heading("m_cross"),
     ];
     let shown: Vec<&str> = headings.iter().map(|heading| heading.key).collect();
     let others = || {
@@ -104,14 +106,16 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             mean_cell(&sets, "q"),
             delta,
             sigma,
+            mean_cell(&sets, "q_calibrated"),
+            mean_cell(&sets, "noise"),
+            mean_cell(&sets, "m_cross"),
             leaderboard_cell(&sets),
-            published(|p| p.q, 2),
             mean_cell(&sets, "q_dn"),
             mean_cell(&sets, "m_half"),
-            published(|p| p.m_half, 4),
             mean_cell(&sets, "sqrt_a"),
+            published(|p| p.q, 2),
+            published(|p| p.m_half, 4),
             published(|p| p.sqrt_a, 4),
-            mean_cell(&sets, "m_cross"),
         ];
         row.extend(others().map(|figure| mean_cell(&sets, figure.name)));
         rows.push(row);
@@ -162,11 +166,13 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
         figure_heading("q"),
         Heading::new("q_difference", "ΔQ to first"),
         Heading::new("sigma", "in σ"),
+        figure_heading("q_calibrated"),
+        figure_heading("noise"),
+        figure_heading("m_cross"),
         Heading::new("q_leaderboard", "Q leaderboard"),
         figure_heading("q_dn"),
         figure_heading("m_half"),
         figure_heading("sqrt_a"),
-        figure_heading("m_cross"),
     ]);
     let mut rows = Vec::new();
     let mut unpaired = Vec::new();
@@ -194,11 +200,13 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
         ]);
         row.extend(difference_cells(difference));
         row.extend([
+            mean_cell(&group.sets, "q_calibrated"),
+            mean_cell(&group.sets, "noise"),
+            mean_cell(&group.sets, "m_cross"),
             leaderboard_cell(&group.sets),
             mean_cell(&group.sets, "q_dn"),
             mean_cell(&group.sets, "m_half"),
             mean_cell(&group.sets, "sqrt_a"),
-            mean_cell(&group.sets, "m_cross"),
         ]);
         rows.push(row);
     }
