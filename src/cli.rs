@@ -8,6 +8,7 @@ mod calibrate;
 mod check;
 mod choices;
 mod compare;
+mod help_files;
 mod measure;
 mod merge;
 mod pack;
@@ -48,23 +49,66 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    #[command(after_help = "Example:\n  shearq quickstart --out first")]
     Quickstart(quickstart::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq simulate --sets 1,2,7-9 --images 10 --seed 1 --out data"
+    )]
     Simulate(simulate::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq measure --submission 48/linear/star --data data --out linear"
+    )]
     Measure(measure::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq run --simulate --sets all --images 200 --submission 48/linear/star --out run"
+    )]
     Run(run::Arguments),
+    #[command(after_help = "Example:\n  shearq merge run --sets all --images 200 --shards 8")]
     Merge(merge::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq score --measured linear --wide\n  shearq score --truth truth.csv catalogue-1.csv catalogue-2.csv"
+    )]
     Score(score::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq compare raw den linear --format latex\n  shearq compare --store results --where 'snr=high,submission=23/*' --sort q:desc"
+    )]
     Compare(compare::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq baseline record mine --measured raw den\n  shearq baseline check mine"
+    )]
     Baseline(baseline::Arguments),
+    #[command(after_help = "Example:\n  shearq check to-send.tar.gz --data data")]
     Check(check::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq pack --measured linear --method MINE --out to-send.tar.gz"
+    )]
     Pack(pack::Arguments),
+    #[command(after_help = "Example:\n  shearq unpack to-send.tar.gz --out sent")]
     Unpack(unpack::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq show --submission 48/linear/star --data data --galaxy 7/1/42 --out galaxy.png"
+    )]
     Show(show::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq calibrate --submission 23/den/star --out calibration"
+    )]
     Calibrate(calibrate::Arguments),
+    #[command(after_help = "Example:\n  shearq reproduce --images 4 --out paper")]
     Reproduce(reproduce::Arguments),
+    #[command(after_help = "Example:\n  shearq study --sets 2,8 --images 10 --pairs 4 --out study")]
     Study(study::Arguments),
+    #[command(after_help = "Example:\n  shearq bench --submission 48/linear/star")]
     Bench(bench::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq submissions show 48/linear/star\n  shearq submissions init own.toml --method linear"
+    )]
     Submissions(submissions::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq completions bash > ~/.local/share/bash-completion/completions/shearq"
+    )]
+    Completions(help_files::Completions),
+    #[command(after_help = "Example:\n  shearq manual ~/.local/share/man/man1")]
+    Manual(help_files::Manual),
 }
 
 /// What the command found: done.
@@ -105,6 +149,8 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Study(arguments) => study::run(&arguments),
         Command::Bench(arguments) => bench::run(&arguments),
         Command::Submissions(arguments) => submissions::run(&arguments),
+        Command::Completions(arguments) => help_files::completions(&arguments),
+        Command::Manual(arguments) => help_files::manual(&arguments),
     };
     match result {
         Ok(()) => DONE,
@@ -196,5 +242,40 @@ fn written(write: impl FnOnce() -> std::io::Result<()>) -> anyhow::Result<()> {
             Err(anyhow::Error::new(error).context("standard output"))
         }
         _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    /// The words of a line of a shell, of which quotes and redirections are understood.
+    fn words(line: &str) -> Vec<String> {
+        let line = line.split(" > ").next().unwrap_or(line);
+        line.split_whitespace()
+            .map(|word| word.trim_matches('\'').to_owned())
+            .collect()
+    }
+
+    #[test]
+    fn every_command_has_an_example_that_it_understands() {
+        for command in Cli::command().get_subcommands() {
+            let help = command
+                .get_after_help()
+                .map(ToString::to_string)
+                .unwrap_or_default();
+            let start = format!("  shearq {}", command.get_name());
+            let examples: Vec<&str> = help
+                .lines()
+                .filter(|line| line.starts_with(&start))
+                .collect();
+            assert!(!examples.is_empty(), "{}: {help}", command.get_name());
+            for example in examples {
+                let parsed = Cli::try_parse_from(words(example));
+                assert!(parsed.is_ok(), "{example}: {}", parsed.unwrap_err());
+            }
+        }
     }
 }

@@ -153,7 +153,7 @@ fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {
     page.figure(
         "fig3-steps",
         &steps_figure(name, rows),
-        "Fig. 3: from a stamp to its clipped autocorrelation, for a galaxy at S/N 10, 20 and 40.",
+        "As Fig. 3 of the paper: from a stamp to its clipped autocorrelation, for a galaxy at S/N 10, 20 and 40.",
     )
 }
 
@@ -176,7 +176,7 @@ fn sect_five(
     page.figure(
         "fig8-q-per-set",
         &exhibits::q_per_set(results, &names),
-        "Fig. 8: quality factor per set and submission.",
+        "As Fig. 8 of the paper: quality factor per set and submission.",
     )?;
     let place = |name: &str| names.iter().position(|n| n == name);
     if let (Some(raw), Some(den)) = (place("23/raw/star"), place("23/den/star")) {
@@ -187,7 +187,7 @@ fn sect_five(
         page.figure(
             "fig9-power-spectra",
             &exhibits::power_spectra(results, den, "23/den/star"),
-            "Fig. 9: true and measured shear power spectra of 23/den/star. The measured ones hold the noise of few images.",
+            "As Fig. 9 of the paper: true and measured shear power spectra of 23/den/star. The measured ones hold the noise of few images.",
         )?;
         page.data(
             "fig9-power-spectra",
@@ -203,7 +203,7 @@ fn sect_five(
                 "Multiplicative bias per set",
                 "M/2",
             ),
-            "Fig. 10: multiplicative bias per set.",
+            "As Fig. 10 of the paper: multiplicative bias per set.",
         )?;
         page.figure(
             "fig11-additive",
@@ -214,7 +214,7 @@ fn sect_five(
                 "Additive bias per set",
                 "√A × 10⁴",
             ),
-            "Fig. 11: additive bias per set.",
+            "As Fig. 11 of the paper: additive bias per set.",
         )?;
     }
     page.section("Every set", "The data of Figs 8, 10 and 11.");

@@ -152,6 +152,7 @@ fn bars(table: &Table, key: &str) -> Option<BarPlot> {
     bars.errors = Some(errors);
     (!names.is_empty()).then(|| BarPlot {
         title: table.headings[k].label.clone(),
+        x_label: String::new(),
         y_label: table.headings[k].label.clone(),
         categories: names,
         groups: vec![bars],

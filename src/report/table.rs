@@ -248,7 +248,7 @@ impl Table {
             .collect();
         let line = |cells: Vec<String>| format!("{} \\\\\n", cells.join(" & "));
         let mut text = format!(
-            "% {}\n\\begin{{tabular}}{{{columns}}}\n\\hline\n",
+            "% {}\n% needs \\usepackage{{booktabs}}\n\\begin{{tabular}}{{@{{}}{columns}@{{}}}}\n\\toprule\n",
             escape::line(&self.title)
         );
         text.push_str(&line(
@@ -257,7 +257,7 @@ impl Table {
                 .map(|h| escape::latex(&h.label))
                 .collect(),
         ));
-        text.push_str("\\hline\n");
+        text.push_str("\\midrule\n");
         for row in &self.rows {
             text.push_str(&line(
                 row.iter()
@@ -265,7 +265,7 @@ impl Table {
                     .collect(),
             ));
         }
-        text.push_str("\\hline\n\\end{tabular}\n");
+        text.push_str("\\bottomrule\n\\end{tabular}\n");
         for note in &self.notes {
             text.push_str(&format!("% {}\n", escape::line(note)));
         }

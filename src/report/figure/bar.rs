@@ -23,6 +23,8 @@ pub struct BarGroup {
 pub struct BarPlot {
     /// Above the plot.
     pub title: String,
+    /// Below the names of the categories.
+    pub x_label: String,
     /// Beside the vertical axis, with the unit.
     pub y_label: String,
     /// Below the bars.
@@ -109,6 +111,7 @@ impl Figure for BarPlot {
             .groups
             .iter()
             .enumerate()
+            .filter(|(_, group)| !group.label.is_empty())
             .map(|(number, group)| Entry {
                 label: group.label.clone(),
                 colour: series_colour(number),
@@ -141,7 +144,13 @@ impl Figure for BarPlot {
             right: left + width,
             bottom: top + height,
         };
-        let mut scene = Scene::new(total_width, frame.bottom + 10.0 + names_height + MARGIN);
+        let below = if self.x_label.is_empty() {
+            0.0
+        } else {
+            LABEL_SIZE + 6.0
+        };
+        let names_end = frame.bottom + 10.0 + names_height;
+        let mut scene = Scene::new(total_width, names_end + below + MARGIN);
 
         let middle = 0.5 * (frame.left + frame.right);
         scene.text(
@@ -155,6 +164,8 @@ impl Figure for BarPlot {
         frame.draw_vertical_axis(&mut scene, &axis);
         let label = (MARGIN + LABEL_SIZE, 0.5 * (frame.top + frame.bottom));
         scene.text_upwards(&self.y_label, label, LABEL_SIZE, INK, Anchor::Middle);
+        let label = (middle, names_end + LABEL_SIZE);
+        scene.text(&self.x_label, label, LABEL_SIZE, INK, Anchor::Middle);
 
         let up = |value: f64| frame.bottom - axis.fraction(value) * height;
         for (number, name) in self.categories.iter().enumerate() {

@@ -285,21 +285,21 @@ pub fn findings_table(findings: &[Finding]) -> Table {
     Table {
         title: "The paper's findings".into(),
         headings: vec![
+            Heading::new("agrees", "Agrees"),
             Heading::new("paper", "The paper"),
             Heading::new("here", "Here"),
-            Heading::new("agrees", "Agrees"),
         ],
         rows: findings
             .iter()
             .map(|f| {
                 vec![
-                    Cell::text(f.paper),
-                    Cell::text(&f.here),
                     Cell::text(match f.agrees {
                         Some(true) => "yes",
                         Some(false) => "no",
-                        None => "errors do not tell",
+                        None => "not told",
                     }),
+                    Cell::text(f.paper),
+                    Cell::text(&f.here),
                 ]
             })
             .collect(),

@@ -26,22 +26,22 @@ pub fn calibration_figures(page: &mut Page<'_>, curves: &Curves) -> anyhow::Resu
     page.figure(
         "fig4-ctr-snr",
         &ctr_over_snr(curves),
-        "Fig. 4: correct transition rate against S/N for the adaptive and the constant update.",
+        "As Fig. 4 of the paper: correct transition rate against S/N for the adaptive and the constant update.",
     )?;
     page.figure(
         "fig5-ctr-lambda",
         &ctr_over_lambda(curves),
-        "Fig. 5: correct transition rate against λ, adaptive update.",
+        "As Fig. 5 of the paper: correct transition rate against λ, adaptive update.",
     )?;
     page.figure(
         "fig6-dsnr-lambda",
         &dsnr_over_lambda(curves),
-        "Fig. 6: discriminative signal-to-noise ratio against λ, adaptive update.",
+        "As Fig. 6 of the paper: discriminative signal-to-noise ratio against λ, adaptive update.",
     )?;
     page.figure(
         "fig7-rmsd-lambda",
         &inverse_rmsd(curves),
-        "Fig. 7: 1/RMSD of the ellipticities against λ for both updates.",
+        "As Fig. 7 of the paper: 1/RMSD of the ellipticities against λ for both updates.",
     )
 }
 

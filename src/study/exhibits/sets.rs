@@ -274,6 +274,7 @@ pub fn bias_per_set(
         .collect();
     BarPlot {
         title: title.into(),
+        x_label: "set".into(),
         y_label: y_label.into(),
         categories: set_labels(results),
         groups,
