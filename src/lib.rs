@@ -25,7 +25,7 @@ pub mod io;
 pub mod pipeline;
 pub mod report;
 pub mod results;
-pub mod simulate;
+pub use shearq_simulate as simulate;
 pub mod study;
 pub mod submit;
 
