@@ -30,3 +30,4 @@ mod shards;
 mod stored;
 mod submitted;
 mod support;
+mod terminal;
