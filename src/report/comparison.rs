@@ -28,6 +28,17 @@ fn figure_heading(name: &'static str) -> Heading {
     Heading::new(name, label)
 }
 
+/// Heading of the leaderboard's Q, a detail where it is Q itself.
+fn leaderboard_heading<'a>(sets: impl Iterator<Item = &'a SetRecord>) -> Heading {
+    let apart = sets
+        .into_iter()
+        .any(|set| set.q_leaderboard != set.figures.q);
+    Heading {
+        detail: !apart,
+        ..Heading::new("q_leaderboard", "Q leaderboard")
+    }
+}
+
 /// The cell of the leaderboard's Q, the mean over sets.
 fn leaderboard_cell(sets: &[&SetRecord]) -> Cell {
     let sum: f64 = sets.iter().map(|set| set.q_leaderboard).sum();
@@ -69,7 +80,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
         figure_heading("q_calibrated"),
         figure_heading("noise"),
         figure_heading("m_cross"),
-        Heading::new("q_leaderboard", "Q leaderboard"),
+        leaderboard_heading(records.iter().flatten()),
         figure_heading("q_dn"),
         figure_heading("m_half"),
         figure_heading("sqrt_a"),
@@ -169,7 +180,7 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
         figure_heading("q_calibrated"),
         figure_heading("noise"),
         figure_heading("m_cross"),
-        Heading::new("q_leaderboard", "Q leaderboard"),
+        leaderboard_heading(groups.iter().flat_map(|group| group.sets.iter().copied())),
         figure_heading("q_dn"),
         figure_heading("m_half"),
         figure_heading("sqrt_a"),

@@ -1,6 +1,6 @@
 //! Scores as tables and as JSON.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
 use shearq_scoring::resample::mean_over_sets;
@@ -122,14 +122,20 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     let mut headings = vec![
         Heading::new("set", "Set"),
         Heading::new("kind", "Kind"),
-        Heading::new("images", "Images"),
+        Heading::new("images", "Images").detail(),
     ];
     headings.extend(Figures::ALL.iter().map(|figure| Heading {
         detail: figure.detail,
         ..Heading::new(figure.name, figure.label)
     }));
-    headings.push(Heading::new("convention", "Conv."));
-    headings.push(Heading::new("q_leaderboard", "Q leaderboard"));
+    headings.push(Heading::new("convention", "Conv.").detail());
+    let apart = scored
+        .iter()
+        .any(|set| q_leaderboard(&set.score) != set.score.figures.q);
+    headings.push(Heading {
+        detail: !apart,
+        ..Heading::new("q_leaderboard", "Q leaderboard")
+    });
     let mut rows = Vec::new();
     for ScoredSet { set, score, .. } in scored {
         let mut row = vec![
@@ -155,7 +161,12 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
         row.push(Cell::number(best / scored.len() as f64, 2));
         rows.push(row);
     }
-    let mut lines = vec![definition_note(definition)];
+    let counts: BTreeSet<usize> = scored.iter().map(|set| set.score.images).collect();
+    let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
+    let mut lines = vec![
+        format!("Images a set: {}.", counts.join(", ")),
+        definition_note(definition),
+    ];
     lines.extend(notes(scored));
     Table {
         title: title.to_owned(),

@@ -13,7 +13,10 @@ fn assert_narrow(arguments: &[&str]) -> String {
         let width = line.width();
         // A name or a path stands whole.
         let words = line.split_whitespace().count();
-        assert!(width <= 80 || words == 1, "{arguments:?}: {width} columns: {line}");
+        assert!(
+            width <= 80 || words == 1,
+            "{arguments:?}: {width} columns: {line}"
+        );
     }
     printed
 }
@@ -23,7 +26,12 @@ fn tables_fit_eighty_columns_and_wide_ones_are_asked_for() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
     for (submission, out) in [("23/den/star", "den"), ("48/linear/star", "linear")] {
-        run_simulated("2,8", submission, &at(out), &["--store", text(&at("store"))]);
+        run_simulated(
+            "2,8",
+            submission,
+            &at(out),
+            &["--store", text(&at("store"))],
+        );
     }
     let (den, linear, store) = (at("den"), at("linear"), at("store"));
     let scored = assert_narrow(&["score", "--measured", text(&den)]);
@@ -33,8 +41,33 @@ fn tables_fit_eighty_columns_and_wide_ones_are_asked_for() {
         &["compare", "--store", text(&store)],
         &["compare", "--store", text(&store), "--group-by", "snr"],
         &["submissions", "list"],
-        &["study", "--sets", "2", "--images", "2", "--pairs", "1", "--grid", "8", "--out", text(&at("study"))],
-        &["run", "--simulate", "--sets", "2", "--images", "2", "--grid", "8", "--submission", "23/raw/star", "--out", text(&at("run"))],
+        &[
+            "study",
+            "--sets",
+            "2",
+            "--images",
+            "2",
+            "--pairs",
+            "1",
+            "--grid",
+            "8",
+            "--out",
+            text(&at("study")),
+        ],
+        &[
+            "run",
+            "--simulate",
+            "--sets",
+            "2",
+            "--images",
+            "2",
+            "--grid",
+            "8",
+            "--submission",
+            "23/raw/star",
+            "--out",
+            text(&at("run")),
+        ],
     ] {
         assert_narrow(arguments);
     }
@@ -56,7 +89,14 @@ fn errors_have_two_digits_and_values_as_many_decimals() {
     let root = tempfile::tempdir().unwrap();
     let out = root.path().join("out");
     run_simulated("2,8", "23/den/star", &out, &[]);
-    let markdown = succeed(&["score", "--measured", text(&out), "--format", "markdown", "--wide"]);
+    let markdown = succeed(&[
+        "score",
+        "--measured",
+        text(&out),
+        "--format",
+        "markdown",
+        "--wide",
+    ]);
     let mut seen = 0;
     for cell in markdown.split('|') {
         let Some((value, error)) = cell.trim().split_once(" ± ") else {
@@ -86,8 +126,14 @@ fn pages_hold_the_table_the_figures_and_what_made_them() {
     assert_eq!(page("score.html"), made);
     succeed(&["compare", text(&out), "--report", text(&second)]);
     let compared = page("compare.html");
-    assert!(compared.contains("Q calibrated") && compared.contains(text(&out)));
+    assert!(compared.contains("Q cal.") && compared.contains(text(&out)));
     let nowhere = at("out/run.json/page.html");
-    let failed = shearq(&["score", "--measured", text(&out), "--report", text(&nowhere)]);
+    let failed = shearq(&[
+        "score",
+        "--measured",
+        text(&out),
+        "--report",
+        text(&nowhere),
+    ]);
     assert_eq!(failed.status.code(), Some(1));
 }
