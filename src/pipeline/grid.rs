@@ -30,7 +30,7 @@ pub(super) fn of_image(
     let n = whole(image, path, "NGRID", image.width())?.unwrap_or(image.width() / stamp);
     if image.width() != n * stamp || image.height() != n * stamp {
         let message = format!(
-            "the image is {} × {} pixels; expected {n} × {n} stamps of {stamp} pixels a side",
+            "the image is {} × {} pixels; expected {n} × {n} stamps of {stamp} pixels a side (the header key STAMP, or `stamp` in layout.toml, says how large they are)",
             image.width(),
             image.height()
         );

@@ -133,7 +133,7 @@ impl ImageSource {
         {
             let found = header_noise.map_or("absent".into(), |sigma| sigma.to_string());
             let message = format!(
-                "the header key NOISESIG is {found}; expected a positive number, as submission {} takes the noise from it",
+                "the header key NOISESIG is {found}; expected a positive number, as submission {} takes the noise from it (noise.source = \"border\" would measure it)",
                 submission.name
             );
             return Err(FileError::new(data.galaxies(id.set, id.image), message).into());
