@@ -10,7 +10,7 @@ use shearq_measure::parts::{
 };
 use shearq_measure::{FunctionalPsf, Measurer, PsfProfile};
 use shearq_scoring::Shear;
-use shearq_submissions::Start;
+use shearq_submissions::{Clipping, Kept, Start};
 
 fn moffat(size: usize) -> ndarray::Array2<f64> {
     let profile = PsfProfile::Moffat { beta: 3.0 };
@@ -28,6 +28,8 @@ fn network(c: &mut Criterion) {
             unit: 1e-3,
             max_iterations: 10,
             start: Start::ClippedData,
+            clipping: Clipping::BeforeTest,
+            kept: Kept::Lowest,
         };
         let mut scratch = network.scratch();
         let (data, mut out) = (stamp(n), vec![0.0; n * n]);

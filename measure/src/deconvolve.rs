@@ -36,7 +36,7 @@ mod sun;
 mod vector;
 
 pub use descent::{Descent, Stop};
-pub use network::{Network, NetworkScratch};
+pub use network::{Network, NetworkScratch, psf_factor};
 pub use reference::{Matrices, convolve};
 pub use rule::{Rule, Step};
 pub use spectral::{Lags, Spectral, SpectralPsf, SpectralScratch};

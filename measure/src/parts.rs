@@ -3,13 +3,13 @@
 
 pub use crate::deconvolve::{
     Lags, Matrices, Network, NetworkScratch, Rule, Spectral, SpectralPsf, SpectralScratch, Step,
-    Wide, convolve,
+    Wide, convolve, psf_factor,
 };
 pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 pub use crate::fft::{FftScratch, StampFft};
 pub use crate::psf::{PsfTransform, TransformedPsf};
 pub use crate::radial::{QuadraticForm, RadialTable, SingleTable, composite_rule, gauss_legendre};
 pub use crate::shape::{
-    AcfScratch, AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Autocorrelation, ClippedMoments,
-    Moments,
+    AcfScratch, AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Autocorrelation, ClippedAcf,
+    ClippedAcfScratch, ClippedMoments, Moments,
 };

@@ -16,7 +16,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::parts::{
-    AcfScratch, Autocorrelation, ClippedMoments, Network, NetworkScratch, Rule, convolve,
+    ClippedAcf, ClippedAcfScratch, Network, NetworkScratch, Rule, convolve, psf_factor,
 };
 use shearq_measure::{FunctionalPsf, PsfProfile};
 use shearq_scoring::{Distortion, Shear};
@@ -215,16 +215,14 @@ struct LambdaStudy {
     settings: NetworkDeconvolution,
     networks: Vec<Network<f32>>,
     ctr_network: Network<f32>,
-    acf: Autocorrelation,
-    moments: ClippedMoments,
+    acf: ClippedAcf,
 }
 
 struct LambdaScratch {
     networks: Vec<Network<f32>>,
     ctr_network: Network<f32>,
     buffers: NetworkScratch<f32>,
-    acf_scratch: AcfScratch,
-    acf: Vec<f32>,
+    acf_scratch: ClippedAcfScratch,
     out: Vec<f32>,
 }
 
@@ -232,6 +230,7 @@ struct LambdaScratch {
 struct Synthetic {
     original: Vec<f32>,
     convolved: Vec<f64>,
+    /// Of the sum or peak that the submission asks for.
     psf: Array2<f64>,
     shape: Distortion,
     /// White noise of unit variance.
@@ -242,16 +241,17 @@ impl LambdaStudy {
     fn new(submission: &Submission) -> Result<Self, PipelineError> {
         let (n, p) = (submission.stamp.size, submission.psf.size);
         let method = network_of(submission)?;
+        let settings = method.deconvolution.clone();
+        let plan = |log: f64| Network::plan(n, p, settings.printed_lambda(10f64.powf(log)));
         let networks = LOG_LAMBDA
             .iter()
-            .map(|log| Network::plan(n, p, 10f64.powf(*log)))
+            .map(|log| plan(*log))
             .collect::<Result<_, _>>()?;
         Ok(LambdaStudy {
             networks,
-            ctr_network: Network::plan(n, p, 10f64.powf(CTR_LOG_LAMBDA))?,
-            acf: Autocorrelation::new(n),
-            moments: ClippedMoments::new(n, method.shape.acf_share),
-            settings: method.deconvolution.clone(),
+            ctr_network: plan(CTR_LOG_LAMBDA)?,
+            acf: ClippedAcf::new(n, &method.shape),
+            settings,
             n,
             p,
         })
@@ -264,7 +264,6 @@ impl LambdaStudy {
             ctr_network: self.ctr_network.clone(),
             buffers: self.ctr_network.scratch(),
             acf_scratch: self.acf.scratch(),
-            acf: vec![0.0; self.acf.len()],
             out: vec![0.0; n * n],
         }
     }
@@ -277,7 +276,7 @@ impl LambdaStudy {
         scratch: &mut LambdaScratch,
         curves: &mut Curves,
     ) -> Result<(), PipelineError> {
-        let galaxy = self.draw(seed, number);
+        let galaxy = self.draw(seed, number)?;
         for network in scratch
             .networks
             .iter_mut()
@@ -306,7 +305,7 @@ impl LambdaStudy {
         Ok(())
     }
 
-    fn draw(&self, seed: u64, number: u64) -> Synthetic {
+    fn draw(&self, seed: u64, number: u64) -> Result<Synthetic, PipelineError> {
         let n = self.n;
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(number);
@@ -332,6 +331,9 @@ impl LambdaStudy {
         let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, fwhm, psf_shape)
             .expect("the PSFs drawn here are within range");
         let psf = psf.stamp(self.p);
+        // u₀ = Hu for the H that deconvolves, so that states compare with u.
+        let factor = psf_factor(psf.view(), self.settings.psf_scale)?;
+        let psf = psf.mapv(|value| value * factor);
         // Mean over 4 × 4 points of each pixel.
         let centre = (n as f64 - 1.0) / 2.0;
         let original = Array2::from_shape_fn((n, n), |(y, x)| {
@@ -343,13 +345,13 @@ impl LambdaStudy {
             points.sum::<f64>() / 16.0
         });
         let convolved = convolve(original.view(), psf.view());
-        Synthetic {
+        Ok(Synthetic {
             original: original.iter().map(|&v| v as f32).collect(),
             convolved: convolved.into_iter().collect(),
             psf,
             shape: shape.to_distortion(),
             noise,
-        }
+        })
     }
 
     fn run(
@@ -400,11 +402,9 @@ impl LambdaStudy {
         };
         sums.dsnr = 10.0 * (distance(stamp) / distance(&scratch.out)).log10();
         let light = scratch.out.iter().map(|&v| f64::from(v)).sum();
-        self.acf
-            .compute(&scratch.out, &mut scratch.acf_scratch, &mut scratch.acf)?;
         let shape = self
-            .moments
-            .measure(&scratch.acf, light)
+            .acf
+            .measure(&scratch.out, light, &mut scratch.acf_scratch)?
             .and_then(|moments| moments.distortion());
         if let Ok(Distortion { e1, e2 }) = shape {
             let deviation = (e1 - galaxy.shape.e1).powi(2) + (e2 - galaxy.shape.e2).powi(2);

@@ -38,8 +38,9 @@ pub fn convergence(
     let inputs = Inputs::new(settings)?;
     let (n, p) = (submission.stamp.size, submission.psf.size);
     let deconvolution = &network_of(submission)?.deconvolution;
-    let mut network = Network::<f32>::plan(n, p, deconvolution.lambda)?;
-    network.set_psf(inputs.psf(p).view())?;
+    let lambda = deconvolution.printed_lambda(deconvolution.lambda);
+    let mut network = Network::<f32>::plan(n, p, lambda)?;
+    network.set_scaled_psf(inputs.psf(p).view(), deconvolution.psf_scale)?;
     let mut scratch = network.scratch();
     let mut out = vec![0.0; n * n];
     let galaxies: Vec<(Vec<f32>, Rule, f64)> = inputs

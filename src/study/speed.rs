@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 use ndarray::ArrayView2;
 use shearq_measure::Measurer;
 use shearq_measure::parts::{
-    AdaptiveMoments, Autocorrelation, ClippedMoments, Matrices, Network, Rule, Spectral, StampFft,
-    Step, WaveletWiener, border_noise,
+    AdaptiveMoments, ClippedAcf, Matrices, Network, Rule, Spectral, StampFft, Step, WaveletWiener,
+    border_noise,
 };
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::{
-    LinearMethod, Method, NetworkMethod, NoiseSource, Start, Submission, Update,
+    Clipping, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, Start, Submission, Update,
 };
 
 use shearq_tables::frame;
@@ -235,8 +235,9 @@ fn network_stages(
     rows: &mut Vec<(&'static str, f64)>,
 ) -> Result<Vec<String>, PipelineError> {
     let settings = &method.deconvolution;
-    let mut network = Network::<f32>::plan(n, psf.nrows(), settings.lambda)?;
-    network.set_psf(psf)?;
+    let lambda = settings.printed_lambda(settings.lambda);
+    let mut network = Network::<f32>::plan(n, psf.nrows(), lambda)?;
+    let factor = network.set_scaled_psf(psf, settings.psf_scale)?;
     let mut scratch = network.scratch();
     let mut out = vec![0.0; n * n];
     let rules: Vec<Option<Rule>> = cut
@@ -256,7 +257,8 @@ fn network_stages(
         }
     });
     rows.push(("deconvolve", network_time));
-    let acf = Autocorrelation::new(n);
+    let shape = ClippedAcf::new(n, &method.shape);
+    let acf = shape.autocorrelation();
     let mut acf_scratch = acf.scratch();
     let mut lags = vec![0.0; acf.len()];
     rows.push((
@@ -267,7 +269,7 @@ fn network_stages(
     ));
     acf.compute(&out, &mut acf_scratch, &mut lags)?;
     let light = out.iter().map(|&v| f64::from(v)).sum();
-    let moments = ClippedMoments::new(n, method.shape.acf_share);
+    let moments = shape.moments();
     rows.push((
         "moments",
         time(|_| {
@@ -279,7 +281,8 @@ fn network_stages(
     )];
     // The reference's matrices take n⁴ numbers.
     if n <= 32 && settings.update != Update::Constant {
-        let matrices = Matrices::new(n, psf, settings.lambda);
+        let scaled = psf.mapv(|value| value * factor);
+        let matrices = Matrices::new(n, scaled.view(), lambda);
         let data: Vec<f64> = cut[0].iter().map(|&v| f64::from(v)).collect();
         if let (Some(rule), Ok(view)) = (&rules[0], ArrayView2::from_shape((n, n), &data)) {
             let start = Instant::now();
@@ -354,6 +357,8 @@ pub fn operator_forms(settings: SimulationSettings) -> Result<Table, PipelineErr
                 unit: 1e-6,
                 max_iterations,
                 start: Start::ClippedData,
+                clipping: Clipping::BeforeTest,
+                kept: Kept::Lowest,
             };
             time(|k| {
                 let _ = black_box(network.deconvolve(&rule, &cut[k], &mut scratch, &mut out));

@@ -20,8 +20,9 @@ pub use file::Published;
 pub use name::{MAX_NAME, check_name, checked_name, is_control};
 pub use registry::{Entry, Registry};
 pub use settings::{
-    BrightnessUnit, Calibration, ClippedShape, Denoise, EllipticityType, LinearDeconvolution,
-    LinearMethod, Method, NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfForm, Stamp,
-    Start, StepScale, Submission, Update, Wavelet, WeightedShape,
+    AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Denoise,
+    EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method, NetworkDeconvolution,
+    NetworkMethod, NoiseSource, Psf, PsfForm, PsfScale, ShareOf, Stamp, Start, StepScale,
+    Submission, Update, Wavelet, WeightedShape,
 };
 pub use template::Template;

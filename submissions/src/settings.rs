@@ -159,8 +159,12 @@ partial! {
         lambda: f64,
         max_iterations: usize,
         start: Start,
+        clipping: Clipping,
+        kept: Kept,
         brightness_unit: BrightnessUnit,
         unit_divisor: f64,
+        psf_scale: PsfScale,
+        high_pass_divisor: f64,
         target_sigma: f64,
         window_sigma: f64,
     }
@@ -184,12 +188,31 @@ section! {
         max_iterations: usize,
         /// State of the neurons before the first iteration.
         start: Start,
+        /// When negative neurons are set to zero (Eq. 12).
+        clipping: Clipping,
+        /// Which state is kept where the energy rises.
+        kept: Kept,
         /// What one unit of brightness is, to which the thresholds (Eq. 9) refer.
         brightness_unit: BrightnessUnit,
         /// The unit is `brightness_unit` divided by this.
         unit_divisor: f64,
+        /// What the PSF is divided by before H is made of it.
+        psf_scale: PsfScale,
+        /// Divisor of the high-pass kernel d (Sect. 3.1), printed as 100. λ acts through G = DᵀD, so that
+        /// a divisor of 1 moves its axis by 10⁴.
+        high_pass_divisor: f64,
     }
 }
+
+impl NetworkDeconvolution {
+    /// The λ that has with the printed d, divided by 100, the effect of `lambda` with this one.
+    pub fn printed_lambda(&self, lambda: f64) -> f64 {
+        lambda * (PRINTED_DIVISOR / self.high_pass_divisor).powi(2)
+    }
+}
+
+/// Divisor of d as Sect. 3.1 prints it.
+const PRINTED_DIVISOR: f64 = 100.0;
 
 section! {
     /// The linear network: the adaptive rule without thresholds (Eq. 9) and clipping (Eq. 12), from zero
@@ -211,7 +234,10 @@ section! {
 
 partial! {
     PartialShape {
+        acf: AcfKind,
+        background: Background,
         acf_share: f64,
+        share_of: ShareOf,
         weight_scale: f64,
         softening: f64,
         ellipticity: EllipticityType,
@@ -222,8 +248,14 @@ partial! {
 section! {
     /// Shape from the autocorrelation of the deconvolved stamp, clipped at a radius (Sect. 3.2).
     ClippedShape, PartialShape, "shape" {
+        /// What the autocorrelation takes to lie outside the stamp.
+        acf: AcfKind,
+        /// What is subtracted before the light is counted.
+        background: Background,
         /// Share of the ACF's light inside the radius at which it is clipped; above 0, at most 1.
         acf_share: f64,
+        /// What it is a share of.
+        share_of: ShareOf,
         /// Which ellipticity the catalogue reports as e1, e2.
         ellipticity: EllipticityType,
     }
@@ -277,17 +309,87 @@ pub enum StepScale {
     Peak,
 }
 
-/// First state of the network. All are non-negative: with a negative start the first clipping at
-/// zero raises the energy and stops the network.
+/// First state of the network. All but the first are non-negative.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Start {
+    /// The observed stamp as it is, as "X(0) = Y" (Sect. 3.1) says. Where it has negative pixels, the first
+    /// clipping at zero raises the energy and stops the network.
+    Data,
     /// The observed stamp, negative pixels set to zero.
     ClippedData,
     /// The mean of the observed stamp everywhere (zero if it is negative).
     Flat,
     /// Zero everywhere.
     Zero,
+}
+
+/// When neurons below zero are set to zero (Eq. 12).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Clipping {
+    /// Before the energy is compared, in the order of steps 4 and 5 of Sect. 3.1.
+    BeforeTest,
+    /// After it: the energy of the update as it is has to be lower than that of the state before, which has
+    /// been clipped.
+    AfterTest,
+    /// Not at all.
+    Never,
+}
+
+/// Which state is kept where an update raises the energy and the network stops ("otherwise break the
+/// iteration loop", step 5 of Sect. 3.1).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Kept {
+    /// The last of falling energy.
+    Lowest,
+    /// The one that raised it, as a loop leaves its variable.
+    Last,
+}
+
+/// What the PSF is divided by. The paper has "known PSF image" (Sect. 2.1) and no more. Thresholds, c and λ
+/// refer to W = HᵀH, which a PSF of peak one makes some three hundred times larger.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PsfScale {
+    /// Its sum.
+    Sum,
+    /// Its brightest pixel.
+    Peak,
+}
+
+/// What the autocorrelation takes to lie outside the n×n pixels of the stamp.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AcfKind {
+    /// Zero: lags up to n − 1.
+    Full,
+    /// The stamp again, as a transform without padding has it: lags up to n/2.
+    Circular,
+}
+
+/// What is subtracted before the ACF's light is counted. The paper speaks of "the total light" (Sect. 3.2) and
+/// of no background; the pedestal of noise clipped at zero takes half of that light at S/N 20.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Background {
+    /// Nothing.
+    None,
+    /// From the ACF, the mean of its outermost lags.
+    AcfEdge,
+    /// From the deconvolved stamp, the mean of the 3 px frame at its edge.
+    StampFrame,
+}
+
+/// What light the share of the ACF refers to (Sect. 3.2: "the radius that encloses 90 % of the total light").
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ShareOf {
+    /// The sum over all lags.
+    Total,
+    /// The most that any radius encloses, which is more where a background was subtracted.
+    Maximum,
 }
 
 /// What a unit of brightness is derived from.

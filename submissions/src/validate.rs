@@ -6,8 +6,8 @@ use thiserror::Error;
 use crate::limits::{MAX_PSF, MAX_ROUGHNESS, MAX_STAMP};
 use crate::name;
 use crate::settings::{
-    Denoise, LinearDeconvolution, LinearMethod, Method, NetworkDeconvolution, NetworkMethod,
-    NoiseSource, Submission,
+    Clipping, Denoise, LinearDeconvolution, LinearMethod, Method, NetworkDeconvolution,
+    NetworkMethod, NoiseSource, Submission, Update,
 };
 
 /// A value that is out of range.
@@ -120,15 +120,19 @@ impl NetworkMethod {
             real(k > 0.0, "denoise.strength", k, "a positive number")?;
         }
         let NetworkDeconvolution {
-            update: _,
+            update,
             step: c,
             step_scale: _,
             constant_step,
             lambda: l,
             max_iterations,
             start: _,
+            clipping,
+            kept: _,
             brightness_unit: _,
             unit_divisor,
+            psf_scale: _,
+            high_pass_divisor,
         } = deconvolution;
         step(*c)?;
         let (key, c) = ("deconvolution.constant_step", *constant_step);
@@ -137,6 +141,16 @@ impl NetworkMethod {
         iterations(*max_iterations)?;
         let (key, u) = ("deconvolution.unit_divisor", *unit_divisor);
         real(u > 0.0, key, u, "a positive number")?;
+        let (key, d) = ("deconvolution.high_pass_divisor", *high_pass_divisor);
+        let good = (1e-3..=1e6).contains(&d);
+        real(good, key, d, "0.001 to 1e6")?;
+        // Momentum goes on from a state of its own, which nothing would clip.
+        need(
+            !(*clipping == Clipping::AfterTest && *update == Update::Accelerated),
+            "deconvolution.clipping",
+            clipping,
+            "\"before-test\" or \"never\" with update = \"accelerated\"",
+        )?;
         let a = shape.acf_share;
         let good = a > 0.0 && a <= 1.0;
         real(good, "shape.acf_share", a, "above 0 and at most 1")

@@ -8,7 +8,7 @@ use crate::support::{Small, fail, shearq, text};
 fn submissions_with_mistakes_are_refused_with_file_and_place() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("own.toml");
-    let cases: [(&str, &[&str]); 14] = [
+    let cases: [(&str, &[&str]); 17] = [
         (
             "extends = \"paper\"\n[stamp]\nsise = 3\n",
             &["line 3", "unknown field `sise`, expected `size`"],
@@ -55,6 +55,24 @@ fn submissions_with_mistakes_are_refused_with_file_and_place() {
         (
             "extends = \"23/den/star\"\nmethod = \"linear\"\n[stamp]\nsize = 48\n",
             &["`deconvolution.target_sigma` is set neither here nor in what it extends"],
+        ),
+        (
+            "extends = \"paper\"\n[deconvolution]\nhigh_pass_divisor = 0.0\n",
+            &[
+                "`deconvolution.high_pass_divisor` is 0",
+                "expected 0.001 to 1e6",
+            ],
+        ),
+        (
+            "extends = \"paper\"\n[deconvolution]\nupdate = \"accelerated\"\nclipping = \"after-test\"\n",
+            &[
+                "`deconvolution.clipping` is \"after-test\"",
+                "with update = \"accelerated\"",
+            ],
+        ),
+        (
+            "extends = \"paper\"\n[shape]\nacf = \"round\"\n",
+            &["line 3", "`round`, expected `full` or `circular`"],
         ),
         (
             "extends = \"papr\"\n",

@@ -5,7 +5,7 @@
 pub enum Stop {
     /// No neuron exceeds its threshold.
     Stable,
-    /// The next state would not have had a lower energy; the last lower one is kept.
+    /// The next state would not have had a lower energy; which one is kept is a setting.
     EnergyRise,
     /// M iterations were made.
     MaxIterations,
@@ -25,7 +25,7 @@ impl Stop {
 /// How the network went down in energy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Descent {
-    /// Iterations whose state was accepted.
+    /// Iterations whose state was accepted, or kept at the end.
     pub iterations: u32,
     /// Why it stopped.
     pub stop: Stop,

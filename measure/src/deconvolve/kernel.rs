@@ -5,6 +5,8 @@
 //! found out when a network is planned. Instruction sets with fused multiply-add round differently
 //! from those without, so last digits differ between machines, never between threads.
 
+use shearq_submissions::{Clipping, Kept};
+
 use super::descent::{Descent, Stop};
 use super::operator::Operator;
 use super::real::Real;
@@ -87,7 +89,7 @@ fn residual<T: Real, V: Vector<T>>(operator: &Operator<T>, b: &mut Buffers<T>) -
 }
 
 /// Takes f = Hᵀ(u₀ − Hv) − λD(Dv) (Eq. 11; D is symmetric), updates every neuron beyond its
-/// threshold (Eq. 6) and clips at zero (Eq. 12); returns how many were beyond.
+/// threshold (Eq. 6) and clips at zero (Eq. 12) where that comes first; returns how many were beyond.
 #[inline(always)]
 fn update<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> u32 {
     let n = operator.n;
@@ -96,6 +98,7 @@ fn update<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Bu
     let zero = V::splat(T::ZERO);
     let minus_lambda = V::splat(T::ZERO.minus(operator.lambda));
     let unit = V::splat(T::from_f64(rule.unit));
+    let floor = V::splat(floor::<T>(rule));
     let (adaptive, step) = match rule.step {
         Step::Adaptive(c) | Step::Accelerated(c) => (true, V::splat(T::from_f64(c))),
         Step::Constant(delta) => (false, V::splat(T::from_f64(delta))),
@@ -125,12 +128,37 @@ fn update<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Bu
                 };
                 let size = f.modulus();
                 let value = V::where_greater(size, threshold, moved, from);
-                V::where_greater(value, zero, value, zero).store(&mut to[x..]);
+                V::where_greater(value, floor, value, floor).store(&mut to[x..]);
                 updated += V::count_greater(size, threshold);
             }
         }
     }
     updated
+}
+
+/// What an update clips at.
+#[inline(always)]
+fn floor<T: Real>(rule: &Rule) -> T {
+    match rule.clipping {
+        Clipping::BeforeTest => T::ZERO,
+        Clipping::AfterTest | Clipping::Never => T::from_f64(f64::NEG_INFINITY),
+    }
+}
+
+/// Sets negative neurons of the candidate to zero (Eq. 12); returns whether there were any.
+#[inline(always)]
+fn clip<T: Real, V: Vector<T>>(n: usize, b: &mut Buffers<T>) -> bool {
+    let zero = V::splat(T::ZERO);
+    let mut negative = 0;
+    for y in 0..n {
+        let row = b.next.wide_mut(y);
+        for x in (0..n).step_by(V::LANES) {
+            let value = V::load(&row[x..]);
+            negative += V::count_greater(zero, value);
+            V::where_greater(value, zero, value, zero).store(&mut row[x..]);
+        }
+    }
+    negative > 0
 }
 
 /// Adds momentum to an update from `b.state` to `b.next`: `b.moved` takes the update and `b.next` goes
@@ -140,11 +168,12 @@ fn update<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Bu
 #[inline(always)]
 fn extrapolate<T: Real, V: Vector<T>>(
     operator: &Operator<T>,
+    rule: &Rule,
     b: &mut Buffers<T>,
     momentum: &mut f64,
 ) -> bool {
     let n = operator.n;
-    let zero = V::splat(T::ZERO);
+    let floor = V::splat(floor::<T>(rule));
     // (from − moved)·(moved − last) > 0 by the squares of sum and difference.
     let (mut sum, mut difference) = (V::no_squares(), V::no_squares());
     b.moved.copy_from(&b.next);
@@ -173,7 +202,7 @@ fn extrapolate<T: Real, V: Vector<T>>(
         for x in (0..n).step_by(V::LANES) {
             let moved = V::load(&moved[x..]);
             let value = moved.add_product(beta, moved.minus(V::load(&last[x..])));
-            V::where_greater(value, zero, value, zero).store(&mut to[x..]);
+            V::where_greater(value, floor, value, floor).store(&mut to[x..]);
         }
     }
     true
@@ -203,6 +232,8 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
     }
     let (mut momentum, mut extrapolated) = (1.0, false);
     let mut cost = None;
+    // Whether the candidate has passed the test and been clipped since.
+    let mut clipped = false;
     // `residual` looks at the candidate, which the first state is too. It stands here once, because
     // it is inlined and by far the largest part of the code.
     std::mem::swap(&mut b.state, &mut b.next);
@@ -213,7 +244,12 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
                 std::mem::swap(&mut b.state, &mut b.next);
                 descent.first_energy = next - constant;
             }
-            Some(cost) if next < cost => {
+            Some(cost) if clipped || next < cost => {
+                if !clipped && rule.clipping == Clipping::AfterTest && clip::<T, V>(operator.n, b) {
+                    clipped = true;
+                    continue;
+                }
+                clipped = false;
                 std::mem::swap(&mut b.state, &mut b.next);
                 std::mem::swap(&mut b.last, &mut b.moved);
                 descent.iterations += 1;
@@ -226,6 +262,11 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
             }
             Some(_) => {
                 descent.stop = Stop::EnergyRise;
+                if rule.kept == Kept::Last {
+                    std::mem::swap(&mut b.state, &mut b.next);
+                    descent.energy = next - constant;
+                    descent.iterations += 1;
+                }
                 break;
             }
         }
@@ -239,7 +280,7 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
             descent.stop = Stop::Stable;
             break;
         }
-        extrapolated = accelerated && extrapolate::<T, V>(operator, b, &mut momentum);
+        extrapolated = accelerated && extrapolate::<T, V>(operator, rule, b, &mut momentum);
     }
     descent
 }

@@ -1,7 +1,7 @@
 //! The working network: planned once per stamp and PSF size, run per galaxy.
 
 use ndarray::ArrayView2;
-use shearq_submissions::Start;
+use shearq_submissions::{Kept, PsfScale, Start};
 
 use super::descent::{Descent, Stop};
 use super::kernel::{Buffers, Level};
@@ -46,7 +46,22 @@ impl<T: Wide> Network<T> {
     /// # Errors
     /// Where its size is not the planned one or a pixel is not finite.
     pub fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
-        self.operator.set_psf(psf)
+        self.operator.set_psf(psf, 1.0)
+    }
+
+    /// Takes a PSF of sum one, scaled. Returns the factor on it, which is also that from the network's
+    /// states to the light of the galaxy.
+    ///
+    /// # Errors
+    /// As [`Network::set_psf`], and where no pixel is positive.
+    pub fn set_scaled_psf(
+        &mut self,
+        psf: ArrayView2<'_, f64>,
+        scale: PsfScale,
+    ) -> Result<f64, MeasureError> {
+        let factor = psf_factor(psf, scale)?;
+        self.operator.set_psf(psf, factor)?;
+        Ok(factor)
     }
 
     /// Stamp side n.
@@ -133,8 +148,8 @@ impl<T: Wide> Network<T> {
             let descent = self.level.run(&self.operator, &one, b);
             match descent.stop {
                 Stop::Stable => {}
-                Stop::EnergyRise => observe(&before, &image(&b.next)),
-                Stop::MaxIterations => observe(&before, &image(&b.state)),
+                Stop::EnergyRise if rule.kept == Kept::Lowest => observe(&before, &image(&b.next)),
+                Stop::EnergyRise | Stop::MaxIterations => observe(&before, &image(&b.state)),
             }
             total = Descent {
                 iterations: total.iterations + descent.iterations,
@@ -176,12 +191,13 @@ impl<T: Wide> Network<T> {
                 let mean = u0.iter().map(|u| u.to_f64()).sum::<f64>() / (n * n) as f64;
                 T::from_f64(mean.max(0.0))
             }
-            Start::ClippedData | Start::Zero => T::ZERO,
+            Start::Data | Start::ClippedData | Start::Zero => T::ZERO,
         };
         for (y, row) in u0.chunks_exact(n).enumerate() {
             b.data.row_mut(y).copy_from_slice(row);
             let state = b.state.row_mut(y);
             match rule.start {
+                Start::Data => state.copy_from_slice(row),
                 Start::ClippedData => {
                     for (v, &u) in state.iter_mut().zip(row) {
                         *v = if u > T::ZERO { u } else { T::ZERO };
@@ -193,12 +209,30 @@ impl<T: Wide> Network<T> {
     }
 }
 
+/// The factor that gives a PSF of sum one the scale `scale`.
+///
+/// # Errors
+/// Where no pixel is positive.
+pub fn psf_factor(psf: ArrayView2<'_, f64>, scale: PsfScale) -> Result<f64, MeasureError> {
+    match scale {
+        PsfScale::Sum => Ok(1.0),
+        PsfScale::Peak => {
+            let peak = psf.iter().copied().fold(0.0, f64::max);
+            if peak > 0.0 {
+                Ok(1.0 / peak)
+            } else {
+                Err(MeasureError::DarkPsf(psf.sum()))
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use ndarray::{Array2, ArrayView2};
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
-    use shearq_submissions::Start;
+    use shearq_submissions::{Clipping, Start};
 
     use super::*;
     use crate::deconvolve::reference::Matrices;
@@ -300,23 +334,38 @@ mod tests {
             };
             for lambda in lambdas {
                 let matrices = Matrices::new(n, psf.view(), lambda);
-                for step in [
+                for (j, step) in [
                     Step::Adaptive(0.9),
                     Step::Adaptive(0.05),
                     Step::Constant(0.03),
                     Step::Accelerated(0.8),
-                ] {
-                    let start = [Start::ClippedData, Start::Flat, Start::Zero][k % 3];
+                    Step::Adaptive(0.9),
+                    Step::Constant(0.4),
+                    Step::Adaptive(3.0),
+                ]
+                .into_iter()
+                .enumerate()
+                {
+                    let start = [Start::ClippedData, Start::Flat, Start::Zero, Start::Data][k % 4];
+                    // The first four are the paper's; all readings come with each of the others.
+                    let clipping = match (j < 4, (j + k) % 3) {
+                        (true, _) | (_, 0) => Clipping::BeforeTest,
+                        (_, 1) => Clipping::AfterTest,
+                        _ => Clipping::Never,
+                    };
+                    let kept = [Kept::Lowest, Kept::Last][usize::from(j >= 4) * (k % 2)];
                     let rule = Rule {
                         step,
                         unit: 0.03,
                         max_iterations: 12,
                         start,
+                        clipping,
+                        kept,
                     };
                     let case = Case { n, p, lambda, rule };
                     let (expected, reference) = matrices.deconvolve(&rule, u0.view()).unwrap();
                     let (found, descent) = run::<f64>(&case, psf.view(), &u0);
-                    let label = format!("n {n}, p {p}, λ {lambda}, {step:?}, {start:?}");
+                    let label = format!("n {n}, p {p}, λ {lambda}, {rule:?}");
                     assert_eq!(descent.iterations, reference.iterations, "{label}");
                     assert_eq!(descent.stop, reference.stop, "{label}");
                     assert_eq!(descent.updated, reference.updated, "{label}");
@@ -361,6 +410,8 @@ mod tests {
                 unit: 1e-30,
                 max_iterations: 20,
                 start: Start::ClippedData,
+                clipping: Clipping::BeforeTest,
+                kept: Kept::Lowest,
             };
             let case = Case {
                 n,
@@ -389,6 +440,8 @@ mod tests {
                 unit,
                 max_iterations,
                 start: Start::ClippedData,
+                clipping: Clipping::BeforeTest,
+                kept: Kept::Lowest,
             };
             run::<f32>(
                 &Case {
@@ -435,6 +488,8 @@ mod tests {
                     unit: 1e-30,
                     max_iterations: 10,
                     start: Start::ClippedData,
+                    clipping: Clipping::BeforeTest,
+                    kept: Kept::Lowest,
                 };
                 let mut network = Network::<f32>::plan(n, p, lambda).unwrap();
                 network.set_psf(psf.view()).unwrap();
@@ -477,6 +532,8 @@ mod tests {
                 unit: 1e-3,
                 max_iterations,
                 start: Start::ClippedData,
+                clipping: Clipping::BeforeTest,
+                kept: Kept::Lowest,
             };
             let case = Case {
                 n: 23,
@@ -501,12 +558,21 @@ mod tests {
         let mut network = Network::<f64>::plan(15, 7, 0.0).unwrap();
         network.set_psf(psf.view()).unwrap();
         let mut scratch = network.scratch();
-        for (step, unit) in [(0.5, 0.01), (0.5, 1.0), (50.0, 0.01)] {
+        for (step, unit, clipping, kept) in [
+            (0.5, 0.01, Clipping::BeforeTest, Kept::Lowest),
+            (0.5, 1.0, Clipping::BeforeTest, Kept::Lowest),
+            (50.0, 0.01, Clipping::BeforeTest, Kept::Lowest),
+            (50.0, 0.01, Clipping::BeforeTest, Kept::Last),
+            (0.5, 0.01, Clipping::AfterTest, Kept::Last),
+            (2.6, 0.01, Clipping::Never, Kept::Last),
+        ] {
             let rule = Rule {
                 step: Step::Adaptive(step),
                 unit,
                 max_iterations: 30,
                 start: Start::ClippedData,
+                clipping,
+                kept,
             };
             let (mut whole, mut traced) = (vec![0.0; 225], vec![0.0; 225]);
             let expected = network
@@ -521,9 +587,50 @@ mod tests {
                 .unwrap();
             assert_eq!(found, expected);
             assert_eq!(whole, traced);
-            let attempted = u32::from(expected.stop == Stop::EnergyRise);
+            let left = expected.stop == Stop::EnergyRise && kept == Kept::Lowest;
+            let attempted = u32::from(left);
             assert_eq!(shown, expected.iterations + attempted);
         }
+    }
+
+    #[test]
+    fn a_psf_of_peak_one_is_a_larger_unit_and_step() {
+        // H/p: with states p times as large, thresholds 1/p² and c p² give the same run.
+        let mut rng = ChaCha8Rng::seed_from_u64(8);
+        let psf = psf(&mut rng, 7);
+        let u0: Vec<f64> = stamp(&mut rng, 15).iter().copied().collect();
+        let mut network = Network::<f64>::plan(15, 7, 0.0).unwrap();
+        let factor = network.set_scaled_psf(psf.view(), PsfScale::Peak).unwrap();
+        let peak = psf.iter().copied().fold(0.0, f64::max);
+        assert!((factor * peak - 1.0).abs() < 1e-15);
+        let run = |network: &Network<f64>, step, unit| {
+            let rule = Rule {
+                step: Step::Adaptive(step),
+                unit,
+                max_iterations: 9,
+                start: Start::Zero,
+                clipping: Clipping::BeforeTest,
+                kept: Kept::Lowest,
+            };
+            let mut out = vec![0.0; 225];
+            let descent = network
+                .deconvolve(&rule, &u0, &mut network.scratch(), &mut out)
+                .unwrap();
+            (out, descent)
+        };
+        let (scaled, a) = run(&network, 0.8 * peak * peak, 0.1 * peak);
+        let factor_of_sum = network.set_scaled_psf(psf.view(), PsfScale::Sum);
+        assert_eq!(factor_of_sum.unwrap(), 1.0);
+        let (plain, b) = run(&network, 0.8, 0.1);
+        assert_eq!(
+            (a.iterations, a.stop, a.updated),
+            (b.iterations, b.stop, b.updated)
+        );
+        for (a, b) in scaled.iter().zip(&plain) {
+            assert!((a * factor - b).abs() < 1e-12);
+        }
+        let dark = Array2::zeros((7, 7));
+        assert!(network.set_scaled_psf(dark.view(), PsfScale::Peak).is_err());
     }
 
     #[test]
@@ -547,6 +654,8 @@ mod tests {
             unit: 1.0,
             max_iterations: 1,
             start: Start::Zero,
+            clipping: Clipping::BeforeTest,
+            kept: Kept::Lowest,
         };
         let run = |pixels: usize, room: usize, of: &Network<f32>| {
             let (u0, mut out) = (vec![1.0; pixels], vec![0.0; room]);

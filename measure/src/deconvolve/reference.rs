@@ -4,7 +4,7 @@
 //! elements.
 
 use ndarray::{Array1, Array2, ArrayView2, arr2};
-use shearq_submissions::Start;
+use shearq_submissions::{Clipping, Kept, Start};
 
 use super::descent::{Descent, Stop};
 use super::rule::{Rule, Step};
@@ -104,6 +104,7 @@ impl Matrices {
         let u0: Array1<f64> = u0.iter().copied().collect();
         let q = self.h.t().dot(&u0);
         let mut v = match rule.start {
+            Start::Data => u0.clone(),
             Start::ClippedData => u0.mapv(|u| u.max(0.0)),
             Start::Flat => Array1::from_elem(n * n, (u0.sum() / (n * n) as f64).max(0.0)),
             Start::Zero => Array1::zeros(n * n),
@@ -139,7 +140,9 @@ impl Matrices {
                     descent.updated += 1;
                 }
                 // Eq. 12.
-                moved[i] = moved[i].max(0.0);
+                if rule.clipping == Clipping::BeforeTest {
+                    moved[i] = moved[i].max(0.0);
+                }
             }
             if descent.updated == 0 {
                 descent.stop = Stop::Stable;
@@ -155,7 +158,10 @@ impl Matrices {
                 let grown = 0.5 * (1.0 + (1.0 + 4.0 * momentum * momentum).sqrt());
                 beta = (momentum - 1.0) / grown;
                 momentum = grown;
-                next = (&moved + &(on * beta)).mapv(|v| v.max(0.0));
+                next = &moved + &(on * beta);
+                if rule.clipping == Clipping::BeforeTest {
+                    next.mapv_inplace(|v| v.max(0.0));
+                }
             }
             let mut energy = self.energy(&q, &next);
             if beta > 0.0 && (energy.is_nan() || energy >= descent.energy) {
@@ -165,7 +171,16 @@ impl Matrices {
             }
             if energy.is_nan() || energy >= descent.energy {
                 descent.stop = Stop::EnergyRise;
+                if rule.kept == Kept::Last {
+                    v = next;
+                    descent.energy = energy;
+                    descent.iterations += 1;
+                }
                 break;
+            }
+            if rule.clipping == Clipping::AfterTest {
+                next.mapv_inplace(|v| v.max(0.0));
+                energy = self.energy(&q, &next);
             }
             v = next;
             last = moved;

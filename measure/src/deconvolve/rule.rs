@@ -1,6 +1,8 @@
 //! A submission's settings turned into the numbers that one stamp needs.
 
-use shearq_submissions::{BrightnessUnit, NetworkDeconvolution, Start, StepScale, Update};
+use shearq_submissions::{
+    BrightnessUnit, Clipping, Kept, NetworkDeconvolution, Start, StepScale, Update,
+};
 
 /// How far an updated neuron moves.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,6 +26,10 @@ pub struct Rule {
     pub max_iterations: usize,
     /// First state.
     pub start: Start,
+    /// When negative neurons are set to zero.
+    pub clipping: Clipping,
+    /// Which state is kept where the energy rises.
+    pub kept: Kept,
 }
 
 impl Rule {
@@ -53,6 +59,8 @@ impl Rule {
             unit,
             max_iterations: settings.max_iterations,
             start: settings.start,
+            clipping: settings.clipping,
+            kept: settings.kept,
         })
     }
 }

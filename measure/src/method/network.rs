@@ -8,23 +8,21 @@ use shearq_submissions::{NetworkDeconvolution, NetworkMethod};
 use super::found::{CutWorker, Found, Images, image, whole};
 use crate::deconvolve::{Network, NetworkScratch, Rule};
 use crate::error::MeasureError;
-use crate::shape::{AcfScratch, Autocorrelation, ClippedMoments};
+use crate::shape::{ClippedAcf, ClippedAcfScratch};
 
 /// What one submission and stamp size need.
 pub(crate) struct NetworkPlan {
     settings: NetworkDeconvolution,
     network: Network<f32>,
-    acf: Autocorrelation,
-    moments: ClippedMoments,
+    acf: ClippedAcf,
 }
 
 impl NetworkPlan {
     pub(super) fn new(method: &NetworkMethod, n: usize, p: usize) -> Result<Self, MeasureError> {
         let settings = method.deconvolution.clone();
         Ok(NetworkPlan {
-            network: Network::plan(n, p, settings.lambda)?,
-            acf: Autocorrelation::new(n),
-            moments: ClippedMoments::new(n, method.shape.acf_share),
+            network: Network::plan(n, p, settings.printed_lambda(settings.lambda))?,
+            acf: ClippedAcf::new(n, &method.shape),
             settings,
         })
     }
@@ -36,9 +34,9 @@ pub(super) fn worker(plan: Arc<NetworkPlan>) -> Box<dyn CutWorker> {
     Box::new(NetworkWorker {
         network: plan.network.clone(),
         buffers: plan.network.scratch(),
+        light: 1.0,
         acf_buffers: plan.acf.scratch(),
         deconvolved: vec![0.0; n * n],
-        lags: vec![0.0; plan.acf.len()],
         plan,
     })
 }
@@ -48,14 +46,17 @@ struct NetworkWorker {
     /// With the PSF.
     network: Network<f32>,
     buffers: NetworkScratch<f32>,
-    acf_buffers: AcfScratch,
+    /// Light of a state in units of its pixels.
+    light: f64,
+    acf_buffers: ClippedAcfScratch,
     deconvolved: Vec<f32>,
-    lags: Vec<f32>,
 }
 
 impl CutWorker for NetworkWorker {
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
-        self.network.set_psf(psf)
+        let scale = self.plan.settings.psf_scale;
+        self.light = self.network.set_scaled_psf(psf, scale)?;
+        Ok(())
     }
 
     fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
@@ -68,10 +69,11 @@ impl CutWorker for NetworkWorker {
         let descent = self
             .network
             .deconvolve(&rule, cut, buffers, &mut self.deconvolved)?;
-        let flux = self.deconvolved.iter().map(|&v| f64::from(v)).sum();
-        plan.acf
-            .compute(&self.deconvolved, &mut self.acf_buffers, &mut self.lags)?;
-        let measured = plan.moments.measure(&self.lags, flux);
+        let sum: f64 = self.deconvolved.iter().map(|&v| f64::from(v)).sum();
+        let flux = sum * self.light;
+        let measured = plan
+            .acf
+            .measure(&self.deconvolved, sum, &mut self.acf_buffers)?;
         let (radius, size) = measured.map_or((f64::NAN, f64::NAN), |m| (m.radius, m.xx + m.yy));
         let distortion = measured.and_then(|moments| moments.distortion());
         Ok(Some(Found {
@@ -89,7 +91,7 @@ impl CutWorker for NetworkWorker {
         let n = self.network.stamp_size();
         Images {
             deconvolved: image(&self.deconvolved, n),
-            acf: whole(&self.lags, n - 1),
+            acf: whole(self.acf_buffers.lags(), n - 1),
             spacing: 1.0,
         }
     }

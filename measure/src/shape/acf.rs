@@ -5,7 +5,8 @@ use rustfft::num_complex::Complex32;
 use crate::error::{MeasureError, length};
 use crate::fft::{FftScratch, StampFft};
 
-/// Autocorrelation of n×n stamps: A(dx, dy) = Σ v(x, y)·v(x + dx, y + dy), zero outside the stamp.
+/// Autocorrelation of n×n stamps: A(dx, dy) = Σ v(x, y)·v(x + dx, y + dy), zero outside the stamp, or
+/// the stamp again.
 ///
 /// Lags are kept for dy = 0…n−1 and dx = −(n−1)…n−1; the other half follows from
 /// A(−dx, −dy) = A(dx, dy).
@@ -13,6 +14,7 @@ pub struct Autocorrelation {
     n: usize,
     /// At least 2n − 1 a side, so that no lag wraps onto another.
     fft: StampFft,
+    circular: bool,
 }
 
 /// Buffers for one thread. Their content between calls does not matter.
@@ -20,6 +22,8 @@ pub struct Autocorrelation {
 pub struct AcfScratch {
     spectrum: Vec<Complex32>,
     fft: FftScratch,
+    /// Lags without wrapping, where they are wrapped afterwards.
+    plain: Vec<f32>,
 }
 
 impl Autocorrelation {
@@ -28,6 +32,16 @@ impl Autocorrelation {
         Autocorrelation {
             n,
             fft: StampFft::new(2 * n - 1),
+            circular: false,
+        }
+    }
+
+    /// Plans for n×n stamps that go on beyond their edges as they begin: what a transform without padding
+    /// gives, on lags up to n/2.
+    pub fn circular(n: usize) -> Self {
+        Autocorrelation {
+            circular: true,
+            ..Autocorrelation::new(n)
         }
     }
 
@@ -36,6 +50,7 @@ impl Autocorrelation {
         AcfScratch {
             spectrum: self.fft.spectrum(),
             fft: self.fft.scratch(),
+            plain: vec![0.0; if self.circular { self.len() } else { 0 }],
         }
     }
 
@@ -49,12 +64,24 @@ impl Autocorrelation {
         self.len() == 0
     }
 
-    /// Writes A(dx, dy) of the row-major `stamp` to `out[dy·(2n−1) + dx + n−1]`.
+    /// Writes A(dx, dy) of the row-major `stamp` to `out[dy·(2n−1) + dx + n−1]`; zero at lags beyond n/2
+    /// where it is circular.
     ///
     /// # Errors
     /// Where a length is not that of the plan.
     pub fn compute(
         &self,
+        stamp: &[f32],
+        scratch: &mut AcfScratch,
+        out: &mut [f32],
+    ) -> Result<(), MeasureError> {
+        self.compute_above(0.0, stamp, scratch, out)
+    }
+
+    /// The same of the stamp less `level` in every pixel.
+    pub(super) fn compute_above(
+        &self,
+        level: f32,
         stamp: &[f32],
         scratch: &mut AcfScratch,
         out: &mut [f32],
@@ -68,8 +95,20 @@ impl Autocorrelation {
             scratch.spectrum.len(),
             room,
         )?;
-        let AcfScratch { spectrum, fft } = scratch;
-        let rows = stamp.chunks_exact(n).map(|row| row.iter().copied());
+        let wrapped = if self.circular { self.len() } else { 0 };
+        length(
+            "buffers for an autocorrelation",
+            scratch.plain.len(),
+            wrapped,
+        )?;
+        let AcfScratch {
+            spectrum,
+            fft,
+            plain,
+        } = scratch;
+        let rows = stamp
+            .chunks_exact(n)
+            .map(|row| row.iter().map(|value| value - level));
         self.fft.rows(rows, fft, spectrum);
         self.fft.columns(fft, spectrum);
         for value in spectrum.iter_mut() {
@@ -77,7 +116,8 @@ impl Autocorrelation {
         }
         self.fft.columns_back(fft, spectrum);
         let scale = 1.0 / (size * size) as f32;
-        for (dy, lags) in out.chunks_exact_mut(2 * n - 1).enumerate() {
+        let unwrapped: &mut [f32] = if self.circular { plain } else { out };
+        for (dy, lags) in unwrapped.chunks_exact_mut(2 * n - 1).enumerate() {
             let line = self.fft.row_back(spectrum, dy, fft);
             // lag = dx + n − 1; negative dx lie at the end of the line.
             let negative = line[size + 1 - n..].iter().chain(&line[..n]);
@@ -85,7 +125,34 @@ impl Autocorrelation {
                 *value = lag * scale;
             }
         }
+        if self.circular {
+            wrap(n, plain, out);
+        }
         Ok(())
+    }
+}
+
+/// Adds up the lags that a period of n pixels makes one: A(dx, dy) and its neighbours n pixels off along
+/// either axis, those with dy < 0 from A(−dx, −dy) = A(dx, dy).
+fn wrap(n: usize, plain: &[f32], out: &mut [f32]) {
+    let (side, half) = (2 * n - 1, n / 2);
+    out.fill(0.0);
+    for dy in 0..=half {
+        for at in n - 1 - half..=n - 1 + half {
+            // Place of dx − n or dx + n; there is none at zero lag, n pixels off.
+            let other = if at >= n {
+                Some(at - n)
+            } else {
+                (at < n - 1).then_some(at + n)
+            };
+            let mut sum = plain[dy * side + at] + other.map_or(0.0, |x| plain[dy * side + x]);
+            if dy > 0 {
+                let opposite = &plain[(n - dy) * side..][..side];
+                let turned = |x: usize| opposite[side - 1 - x];
+                sum += turned(at) + other.map_or(0.0, turned);
+            }
+            out[dy * side + at] = sum;
+        }
     }
 }
 

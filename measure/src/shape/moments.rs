@@ -1,6 +1,7 @@
 //! Clipping of the autocorrelation and its quadrupole moments.
 
 use shearq_scoring::Distortion;
+use shearq_submissions::{AcfKind, Background, ClippedShape, ShareOf};
 
 use crate::flag::Flag;
 
@@ -43,8 +44,17 @@ struct Lag {
     dy: i32,
     /// dx² + dy².
     square: i32,
-    /// 2 for a lag that stands for its opposite too, 1 for zero lag.
+    /// 2 for a lag that stands for its opposite too, 1 for zero lag; half of it for each component of n/2
+    /// where lags wrap around, of which −n/2 is the same.
     weight: f32,
+}
+
+/// How the light of the ACF is read.
+#[derive(Clone, Copy)]
+struct ReadAs {
+    acf: AcfKind,
+    background: Background,
+    share_of: ShareOf,
 }
 
 /// Moments of the ACF of n×n stamps inside the radius that encloses a share of its light.
@@ -54,30 +64,102 @@ struct Lag {
 #[derive(Debug, Clone)]
 pub struct ClippedMoments {
     share: f64,
+    share_of: ShareOf,
     lags: Vec<Lag>,
+    /// Number of lags, of both half planes.
+    count: f64,
+    /// Largest component of a lag whose mean is subtracted from all, where it is.
+    edge: Option<i32>,
 }
 
 impl ClippedMoments {
-    /// Plans for n×n stamps and a `share` above 0 and at most 1.
+    /// Plans for n×n stamps and a `share`, above 0 and at most 1, of all the light of the full ACF.
     pub fn new(n: usize, share: f64) -> Self {
+        let full = ReadAs {
+            acf: AcfKind::Full,
+            background: Background::None,
+            share_of: ShareOf::Total,
+        };
+        Self::read(n, share, full)
+    }
+
+    /// Plans for n×n stamps and a submission's settings.
+    pub(super) fn of(n: usize, settings: &ClippedShape) -> Self {
+        let &ClippedShape {
+            acf,
+            background,
+            acf_share,
+            share_of,
+            ellipticity: _,
+        } = settings;
+        let reading = ReadAs {
+            acf,
+            background,
+            share_of,
+        };
+        Self::read(n, acf_share, reading)
+    }
+
+    fn read(n: usize, share: f64, reading: ReadAs) -> Self {
         let side = n as i32;
+        let circular = reading.acf == AcfKind::Circular;
+        let reach = if circular { side / 2 } else { side - 1 };
         let mut lags = Vec::with_capacity(n * (2 * n - 1));
-        for dy in 0..side {
-            for dx in 1 - side..side {
+        for dy in 0..=reach {
+            for dx in -reach..=reach {
                 if dy == 0 && dx < 0 {
                     continue;
                 }
+                let half = |d: i32| {
+                    if circular && 2 * d.abs() == side {
+                        0.5
+                    } else {
+                        1.0
+                    }
+                };
+                let both = if dx == 0 && dy == 0 { 1.0 } else { 2.0 };
                 lags.push(Lag {
                     at: (dy * (2 * side - 1) + dx + side - 1) as u32,
                     dx,
                     dy,
                     square: dx * dx + dy * dy,
-                    weight: if dx == 0 && dy == 0 { 1.0 } else { 2.0 },
+                    weight: both * half(dx) * half(dy),
                 });
             }
         }
         lags.sort_by_key(|lag| (lag.square, lag.dy, lag.dx));
-        ClippedMoments { share, lags }
+        ClippedMoments {
+            share,
+            share_of: reading.share_of,
+            count: lags.iter().map(|lag| f64::from(lag.weight)).sum(),
+            edge: (reading.background == Background::AcfEdge).then_some(reach),
+            lags,
+        }
+    }
+
+    /// Mean of the outermost lags, where it is to be subtracted.
+    fn background(&self, acf: &[f32]) -> f64 {
+        let Some(edge) = self.edge else { return 0.0 };
+        let (mut sum, mut count) = (0.0, 0.0);
+        for lag in &self.lags {
+            if lag.dx.abs().max(lag.dy) == edge {
+                sum += f64::from(acf[lag.at as usize] * lag.weight);
+                count += f64::from(lag.weight);
+            }
+        }
+        sum / count
+    }
+
+    /// The most light that any radius encloses.
+    fn most_enclosed(&self, acf: &[f32], background: f64) -> f64 {
+        let (mut sum, mut most) = (0.0, 0.0f64);
+        for ring in self.lags.chunk_by(|a, b| a.square == b.square) {
+            for lag in ring {
+                sum += f64::from(lag.weight) * (f64::from(acf[lag.at as usize]) - background);
+            }
+            most = most.max(sum);
+        }
+        most
     }
 
     /// Moments of `acf`, laid out as [`super::Autocorrelation`] writes it; `light` is the sum of the
@@ -89,7 +171,11 @@ impl ClippedMoments {
         if !(light > 0.0 && light.is_finite()) {
             return Err(Flag::NoLight);
         }
-        let wanted = self.share * light * light;
+        let background = self.background(acf);
+        let wanted = match self.share_of {
+            ShareOf::Total => self.share * light * light - self.share * background * self.count,
+            ShareOf::Maximum => self.share * self.most_enclosed(acf, background),
+        };
         let mut sum = 0.0;
         let mut radius_square = None;
         let mut q = [0.0f64; 3];
@@ -99,6 +185,7 @@ impl ClippedMoments {
                 _ => {}
             }
             let value = f64::from(acf[lag.at as usize] * lag.weight);
+            let value = value - background * f64::from(lag.weight);
             sum += value;
             q[0] += value * f64::from(lag.dx * lag.dx);
             q[1] += value * f64::from(lag.dy * lag.dy);
