@@ -79,12 +79,13 @@ fn linear(c: &mut Criterion) {
     let mut group = c.benchmark_group("linear");
     for n in [32, 40, 48] {
         let plan = Spectral::new(n, n, settings).expect("valid sizes");
+        let white = plan.noise(&shearq_measure::StampNoise::white(1.0));
         let (mut psf, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
         let moffat = moffat(n);
         group.bench_function(BenchmarkId::new("take a PSF", n), |b| {
-            b.iter(|| plan.set_psf(black_box(moffat.view()), &mut scratch, &mut psf));
+            b.iter(|| plan.set_psf(black_box(moffat.view()), &white, &mut scratch, &mut psf));
         });
-        plan.set_psf(moffat.view(), &mut scratch, &mut psf)
+        plan.set_psf(moffat.view(), &white, &mut scratch, &mut psf)
             .expect("a valid PSF");
         let data = stamp(n);
         group.bench_function(BenchmarkId::new("autocorrelate", n), |b| {

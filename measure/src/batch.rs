@@ -1,5 +1,7 @@
 //! One stamp, and many.
 
+use std::sync::Arc;
+
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 use shearq_submissions::{Method, NoiseSource, Submission};
 
@@ -7,6 +9,7 @@ use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
 use crate::galaxy::{Measurer, Worker};
 use crate::measurement::Measurement;
+use crate::noise::StampNoise;
 use crate::pixel::Pixel;
 use crate::psf::{FunctionalPsf, star_psf};
 
@@ -37,7 +40,7 @@ pub struct Batch {
 
 impl Measurer {
     /// Measures one stamp with its star stamp and noise level, which may be `None` where the submission
-    /// measures it on the stamp.
+    /// measures it on the border of the stamp.
     ///
     /// The response is the galaxy's own. The ellipticity is **not calibrated**: dividing it by its own
     /// response would be noisy and biased. Divide it by [`Batch::response`] of galaxies like this one.
@@ -52,6 +55,9 @@ impl Measurer {
         noise: Option<f64>,
     ) -> Result<Measurement, MeasureError> {
         check(self.submission(), stamp.dim(), Some(psf.dim()), noise)?;
+        if noise.is_none() && self.noise_plan().is_some() {
+            return Err(MeasureError::Noise("not given".into()));
+        }
         let finite = |pixel: T| pixel.to_f32().is_finite();
         if let Some(((y, x), _)) = stamp.indexed_iter().find(|(_, pixel)| !finite(**pixel)) {
             return Err(MeasureError::NotFinite {
@@ -66,7 +72,8 @@ impl Measurer {
     }
 
     /// Measures stamps, one each along the first axis, of one noise level, and calibrates their
-    /// ellipticities by their mean response, as the submission asks. Several thousand galaxies tell the
+    /// ellipticities by their mean response, as the submission asks. A noise level that is given is that of white
+    /// noise; where none is, a submission that asks for it measures the noise on the stamps. Several thousand galaxies tell the
     /// response to a per cent.
     ///
     /// # Errors
@@ -86,10 +93,40 @@ impl Measurer {
         };
         check(self.submission(), (rows, columns), star, noise)?;
         let mut worker = self.worker();
+        if noise.is_none() {
+            worker.set_noise(self.survey(stamps)?.as_ref());
+        }
         let mut galaxies = [worker.measure_each(stamps, psfs, noise)?];
         let response = calibrate(self.submission(), &mut galaxies);
         let [galaxies] = galaxies;
         Ok(Batch { galaxies, response })
+    }
+
+    /// The noise of `stamps`, one each along the first axis, where the submission asks for it to be measured on
+    /// them.
+    ///
+    /// # Errors
+    /// Where there is no stamp, stamps have other sizes than planned, or too few of them have a frame of noise
+    /// alone.
+    pub fn survey<T: Pixel>(
+        &self,
+        stamps: ArrayView3<'_, T>,
+    ) -> Result<Option<Arc<StampNoise>>, MeasureError> {
+        let count = stamps.len_of(Axis(0));
+        let Some(plan) = self.noise_plan() else {
+            return Ok(None);
+        };
+        if count == 0 {
+            return Err(MeasureError::Noise("not given".into()));
+        }
+        let mut survey = plan.survey();
+        for at in plan.rows(count) {
+            survey.add(stamps.index_axis(Axis(0), at))?;
+        }
+        let noise = survey.noise();
+        let noise = noise
+            .ok_or_else(|| MeasureError::Noise("not to be seen on the stamps' frames".into()))?;
+        Ok(Some(Arc::new(noise)))
     }
 }
 
@@ -177,7 +214,7 @@ fn check(
     let given = match (noise, submission.noise) {
         (Some(sigma), _) => (!(sigma >= 0.0 && sigma.is_finite())).then(|| sigma.to_string()),
         (None, NoiseSource::Header) => Some("not given".to_owned()),
-        (None, NoiseSource::Border { .. }) => None,
+        (None, NoiseSource::Border { .. } | NoiseSource::Image { .. }) => None,
     };
     if let Some(found) = given {
         return Err(MeasureError::Noise(found));

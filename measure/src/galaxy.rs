@@ -11,6 +11,7 @@ use crate::error::MeasureError;
 use crate::flag::{Flag, Flags};
 use crate::measurement::Measurement;
 use crate::method::{CutWorker, Found, MethodPlan, ResponseMatrix};
+use crate::noise::{NoisePlan, StampNoise};
 use crate::pixel::Pixel;
 use crate::psf::cut_start;
 
@@ -30,6 +31,7 @@ struct Plan {
     n: usize,
     denoise: Option<WaveletWiener>,
     method: MethodPlan,
+    noise: Option<NoisePlan>,
 }
 
 /// One thread's part in measuring: its buffers, and the PSF of the galaxies at hand. Nothing is allocated
@@ -43,6 +45,8 @@ pub struct Worker {
     /// Cut stamp.
     pub(crate) cut: Vec<f32>,
     border: Vec<f32>,
+    /// That of the galaxies at hand, where it was given.
+    noise: Option<Arc<StampNoise>>,
     usable_psf: bool,
 }
 
@@ -67,6 +71,10 @@ impl Measurer {
                 .wavelet()
                 .map(|settings| WaveletWiener::new(full, settings)),
             method: MethodPlan::new(submission, n)?,
+            noise: match submission.noise {
+                NoiseSource::Image { correlation } => Some(NoisePlan::new(full, correlation)?),
+                NoiseSource::Header | NoiseSource::Border { .. } => None,
+            },
             submission: submission.clone(),
         };
         Ok(Measurer {
@@ -85,6 +93,11 @@ impl Measurer {
     /// The submission.
     pub fn submission(&self) -> &Submission {
         &self.plan.submission
+    }
+
+    /// How the noise of an image is measured on its stamps, where the submission asks for that.
+    pub fn noise_plan(&self) -> Option<&NoisePlan> {
+        self.plan.noise.as_ref()
     }
 
     /// Pixels a side of the full stamps.
@@ -108,6 +121,7 @@ impl Measurer {
             cut: vec![0.0; n * n],
             border: Vec::with_capacity(full * full),
             usable_psf: false,
+            noise: None,
             plan: Arc::clone(&self.plan),
         }
     }
@@ -117,6 +131,22 @@ impl Worker {
     /// The submission.
     pub fn submission(&self) -> &Submission {
         &self.plan.submission
+    }
+
+    /// Takes the noise of the galaxies that follow, as [`NoiseSurvey`](crate::NoiseSurvey) found it on their
+    /// image: level and correlation; one that is correlated no more than chance would have it is taken as
+    /// white. `None` leaves them with the level that they are given one by one, and white noise. The PSF has to
+    /// be taken after it, without which galaxies are flagged.
+    pub fn set_noise(&mut self, noise: Option<&Arc<StampNoise>>) {
+        if self.noise.as_ref() == noise {
+            return;
+        }
+        self.usable_psf = false;
+        self.noise = noise.cloned();
+        match noise {
+            Some(noise) if noise.is_correlated() => self.method.set_noise(noise),
+            Some(_) | None => self.method.set_noise(&StampNoise::white(1.0)),
+        }
     }
 
     /// Takes the PSF of the galaxies that follow, of the submission's size, centred, and of sum one. One that
@@ -136,7 +166,7 @@ impl Worker {
     }
 
     /// Measures a galaxy on its full stamp, before any calibration. `header_noise` is the image's noise
-    /// level, without which a submission that needs it flags the galaxy.
+    /// level, where none was taken before; without either a submission that needs it flags the galaxy.
     ///
     /// # Errors
     /// Where the stamp has other sizes than planned.
@@ -166,7 +196,10 @@ impl Worker {
             return Ok(Measurement::flagged(Flag::NoScale));
         }
         let noise = match plan.submission.noise {
-            NoiseSource::Header => header_noise.unwrap_or(f64::NAN),
+            NoiseSource::Header | NoiseSource::Image { .. } => match &self.noise {
+                Some(noise) => noise.sigma(),
+                None => header_noise.unwrap_or(f64::NAN),
+            },
             NoiseSource::Border { border } => {
                 border_noise(&self.full, full, border, &mut self.border).map_or(f64::NAN, f64::from)
             }

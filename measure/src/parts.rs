@@ -2,8 +2,8 @@
 //! sizes planned.
 
 pub use crate::deconvolve::{
-    Lags, Matrices, Network, NetworkScratch, Rule, Spectral, SpectralPsf, SpectralScratch, Step,
-    Wide, convolve, psf_factor,
+    Lags, Matrices, ModeNoise, Network, NetworkScratch, Rule, Spectral, SpectralPsf,
+    SpectralScratch, Step, Wide, convolve, psf_factor,
 };
 pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 pub use crate::fft::{FftScratch, StampFft};

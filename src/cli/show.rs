@@ -72,6 +72,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let mut rows = Vec::new();
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
+        let measurer = Measurer::new(&submission, source.stamp())?;
+        if let Some(plan) = measurer.noise_plan() {
+            source.measure_noise(&data, plan)?;
+        }
         let grid = source.grid();
         anyhow::ensure!(
             index <= grid.cells(),
@@ -91,7 +95,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         };
         let psf = psf_of(&row, ix, submission.psf.size)
             .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
-        let mut worker = Measurer::new(&submission, row.stamp)?.worker();
+        let mut worker = measurer.worker();
+        worker.set_noise(row.noise.as_ref());
         worker.set_psf(psf.view())?;
         let stamps = strip(&row.pixels, grid.n, row.stamp)?;
         let stamp = stamps.index_axis(Axis(0), ix);

@@ -6,7 +6,8 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis};
 use shearq_measure::{
-    Flag, FunctionalPsf, Measurement, Measurer, Psfs, Worker, calibrate, star_psf, strip,
+    Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, StampNoise, Worker, calibrate,
+    star_psf, strip,
 };
 use shearq_scoring::Grid;
 use shearq_submissions::{EllipticityType, NoiseSource, PsfForm, Submission};
@@ -28,6 +29,12 @@ use crate::io::table;
 /// Most pixels of a row of stamps, several of which are in memory at a time: those of the largest grid of
 /// stamps of the challenge's size and somewhat more.
 const MAX_STRIP: usize = 1 << 24;
+
+/// Largest distance along each axis of pixels that are looked at for correlated noise where a submission takes
+/// noise as white.
+const CORRELATION: usize = 2;
+/// Least difference between a header's noise level and the measured one, in units of either, that is told.
+const LEAST_DOUBT: f64 = 0.01;
 
 /// PSFs of one row of stamps.
 pub enum RowPsf {
@@ -58,6 +65,8 @@ pub struct StampRow {
     pub stamp: usize,
     /// NOISESIG.
     pub header_noise: Option<f64>,
+    /// The noise as measured on the image, where the submission asks for that.
+    pub noise: Option<Arc<StampNoise>>,
     /// PSFs.
     pub psf: RowPsf,
 }
@@ -93,6 +102,7 @@ pub struct ImageSource {
     grid: Grid,
     stamp: usize,
     header_noise: Option<f64>,
+    noise: Option<Arc<StampNoise>>,
     psf: PsfSource,
     next: usize,
 }
@@ -145,13 +155,50 @@ impl ImageSource {
             grid,
             stamp,
             header_noise,
+            noise: None,
             next: 0,
         })
+    }
+
+    /// Pixels a side of a stamp.
+    pub fn stamp(&self) -> usize {
+        self.stamp
     }
 
     /// The image's grid.
     pub fn grid(&self) -> Grid {
         self.grid
+    }
+
+    /// Measures the noise of the image on its stamps, for the rows that follow and for the caller.
+    ///
+    /// # Errors
+    /// Where they cannot be read, or hold no frame of noise alone.
+    pub fn measure_noise(
+        &mut self,
+        data: &DataFolder,
+        plan: &NoisePlan,
+    ) -> Result<Arc<StampNoise>, PipelineError> {
+        let path = data.galaxies(self.id.set, self.id.image);
+        let mut image = ImageReader::open(&path)?;
+        let n = self.grid.n;
+        let mut survey = plan.survey();
+        let mut next = 0;
+        for row in plan.rows(n) {
+            image.skip_rows((row - next) * self.stamp);
+            next = row + 1;
+            let pixels = image.read_rows(self.stamp)?;
+            for stamp in strip(&pixels, n, self.stamp)?.outer_iter() {
+                survey.add(stamp)?;
+            }
+        }
+        let Some(noise) = survey.noise() else {
+            let message = "the frames of the stamps hold too little noise to measure it; set noise.source to \"header\" where NOISESIG is known";
+            return Err(FileError::new(&path, message).into());
+        };
+        let noise = Arc::new(noise);
+        self.noise = Some(Arc::clone(&noise));
+        Ok(noise)
     }
 
     /// The next row of stamps, `None` after the last.
@@ -172,6 +219,7 @@ impl ImageSource {
             pixels: self.image.read_rows(self.stamp)?,
             stamp: self.stamp,
             header_noise: self.header_noise,
+            noise: self.noise.clone(),
             psf: match &mut self.psf {
                 PsfSource::Shared(psf) => RowPsf::Shared(Arc::clone(psf)),
                 PsfSource::Stars { image, side } => RowPsf::Stars {
@@ -296,6 +344,7 @@ fn open_psf(
 /// Where the row's stamps have other sizes than planned.
 pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, PipelineError> {
     let (n, noise) = (row.grid.n, row.header_noise);
+    worker.set_noise(row.noise.as_ref());
     let stamps = strip(&row.pixels, n, row.stamp)?;
     let galaxies = match &row.psf {
         RowPsf::Shared(psf) => {
@@ -390,6 +439,9 @@ pub fn measure_folder(
     // All images of a folder have stamps of one size; each is checked when it is opened.
     let stamp = ImageSource::open(data, first, &run.submission)?.stamp;
     let measurer = Measurer::new(&run.submission, stamp)?;
+    for doubt in noise_doubts(data, first, &measurer)? {
+        progress.note(&doubt);
+    }
     let mut rows = Vec::new();
     // Of each image as it was when it was opened, in the images' order.
     let (send, receive) = std::sync::mpsc::channel();
@@ -401,7 +453,7 @@ pub fn measure_folder(
                 let _ = send.send(inputs.prints(id)?);
                 Ok(())
             };
-            read_images(data, &todo, &run.submission, stamp, print, feeder)
+            read_images(data, &todo, &measurer, print, feeder)
         },
         || measurer.worker(),
         |worker, row: StampRow| measure_row(worker, &row),
@@ -421,6 +473,63 @@ pub fn measure_folder(
         },
     )?;
     Ok(summary)
+}
+
+/// What the noise of the first image to be measured with the linear method, which needs to know it, says against
+/// its header and against what the submission takes it for.
+fn noise_doubts(
+    data: &DataFolder,
+    first: ImageId,
+    measurer: &Measurer,
+) -> Result<Vec<String>, PipelineError> {
+    let submission = measurer.submission();
+    if submission.linear().is_none() {
+        return Ok(Vec::new());
+    }
+    let own;
+    let plan = match measurer.noise_plan() {
+        Some(plan) => plan,
+        // Small stamps have no frame to look at.
+        None => match NoisePlan::new(measurer.full(), CORRELATION) {
+            Ok(plan) => {
+                own = plan;
+                &own
+            }
+            Err(_) => return Ok(Vec::new()),
+        },
+    };
+    let mut source = ImageSource::open(data, first, submission)?;
+    let asked = measurer.noise_plan().is_some();
+    let noise = match source.measure_noise(data, plan) {
+        Ok(noise) => noise,
+        Err(error) if asked => return Err(error),
+        Err(_) => return Ok(Vec::new()),
+    };
+    let image = format!("set {:02} image {:03}", first.set, first.image);
+    let mut doubts = Vec::new();
+    if let Some(header) = source.header_noise {
+        let apart = noise.sigma() / header - 1.0;
+        if !(apart.abs() <= (5.0 * noise.error()).max(LEAST_DOUBT)) {
+            let taken = if asked {
+                "the measured one is used"
+            } else {
+                "NOISESIG is not what is there"
+            };
+            doubts.push(format!(
+                "warning: {image}: NOISESIG is {header}, the noise of the stamps' frames {:.4}: {taken}",
+                noise.sigma()
+            ));
+        }
+    }
+    let white = !matches!(submission.noise, NoiseSource::Image { correlation } if correlation > 0);
+    if white && noise.is_correlated() {
+        doubts.push(format!(
+            "warning: {image}: neighbouring pixels have noise correlated by {:.2} along x and {:.2} along y, which is taken as white; set noise.source to \"image\" and noise.correlation above 0",
+            noise.correlation(1, 0),
+            noise.correlation(0, 1)
+        ));
+    }
+    Ok(doubts)
 }
 
 /// Number of galaxies that `measure_folder` will measure, for progress bars: an estimate from the
@@ -452,14 +561,14 @@ pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> (Vec<ImageId>,
 fn read_images(
     data: &DataFolder,
     todo: &[ImageId],
-    submission: &Submission,
-    stamp: usize,
+    measurer: &Measurer,
     mut opened: impl FnMut(ImageId) -> Result<(), FileError>,
     feeder: &mut Feeder<'_, StampRow>,
 ) -> Result<(), PipelineError> {
     for &id in todo {
         opened(id)?;
-        let mut source = ImageSource::open(data, id, submission)?;
+        let mut source = ImageSource::open(data, id, measurer.submission())?;
+        let stamp = measurer.full();
         if source.stamp != stamp {
             let path = data.galaxies(id.set, id.image);
             let message = format!(
@@ -467,6 +576,9 @@ fn read_images(
                 source.stamp
             );
             return Err(FileError::new(path, message).into());
+        }
+        if let Some(plan) = measurer.noise_plan() {
+            source.measure_noise(data, plan)?;
         }
         while let Some(row) = source.next_row()? {
             if !feeder.push(row) {

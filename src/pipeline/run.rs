@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis};
-use shearq_measure::{Measurer, Steps, Worker, calibrate, star_psf, strip};
+use shearq_measure::{Measurer, NoisePlan, StampNoise, Steps, Worker, calibrate, star_psf, strip};
 use shearq_scoring::Shear;
 use shearq_submissions::{PsfForm, Submission};
 
@@ -24,6 +24,8 @@ use crate::simulate::set::{
 pub(crate) struct RowJob {
     pub(crate) fields: Arc<ImageFields>,
     pub(crate) iy: usize,
+    /// The noise of the image for each measurer that measures it.
+    pub(crate) noises: Arc<[Option<Arc<StampNoise>>]>,
 }
 
 /// A row of stamps, measured by each measurer.
@@ -120,10 +122,7 @@ pub fn run_set(
     let mut observed = Vec::with_capacity(n * n);
     engine::ordered(
         threads,
-        |feeder| {
-            feed(set, images, feeder);
-            Ok(())
-        },
+        |feeder| feed(set, images, measurers, feeder),
         || Scratch {
             render: RenderScratch::new(),
             workers: measurers.iter().map(Measurer::worker).collect(),
@@ -153,17 +152,58 @@ pub fn run_set(
     )
 }
 
-/// Hands out the rows of images of a set, in order.
-pub(crate) fn feed(set: &SetSimulator, images: &[u32], feeder: &mut Feeder<'_, RowJob>) {
+/// Hands out the rows of images of a set, in order, with the noise that `measurers` measure on them.
+///
+/// # Errors
+/// Where a measurer is for stamps of another size.
+pub(crate) fn feed(
+    set: &SetSimulator,
+    images: &[u32],
+    measurers: &[Measurer],
+    feeder: &mut Feeder<'_, RowJob>,
+) -> Result<(), PipelineError> {
     for &image in images {
         let fields = Arc::new(set.image_fields(image));
+        let noises: Arc<[_]> = noises(set, &fields, measurers)?.into();
         for iy in 0..set.grid().n {
             let fields = Arc::clone(&fields);
-            if !feeder.push(RowJob { fields, iy }) {
-                return;
+            let noises = Arc::clone(&noises);
+            if !feeder.push(RowJob { fields, iy, noises }) {
+                return Ok(());
             }
         }
     }
+    Ok(())
+}
+
+/// The noise of a simulated image for each measurer that measures it, from the rows that it would look at.
+fn noises(
+    set: &SetSimulator,
+    fields: &ImageFields,
+    measurers: &[Measurer],
+) -> Result<Vec<Option<Arc<StampNoise>>>, PipelineError> {
+    let n = set.grid().n;
+    let mut surveys: Vec<_> = measurers
+        .iter()
+        .map(|measurer| measurer.noise_plan().map(NoisePlan::survey))
+        .collect();
+    let Some(plan) = measurers.iter().find_map(Measurer::noise_plan) else {
+        return Ok(vec![None; measurers.len()]);
+    };
+    let mut render = RenderScratch::new();
+    // Plans differ in their lags alone.
+    for iy in plan.rows(n) {
+        let (pixels, _) = simulate::draw_stamps(set, fields, iy, &mut render);
+        for stamp in strip(&pixels, n, STAMP)?.outer_iter() {
+            for survey in surveys.iter_mut().flatten() {
+                survey.add(stamp)?;
+            }
+        }
+    }
+    let found = surveys
+        .iter()
+        .map(|survey| survey.as_ref()?.noise().map(Arc::new));
+    Ok(found.collect())
 }
 
 fn draw_and_measure(
@@ -172,7 +212,14 @@ fn draw_and_measure(
     job: &RowJob,
 ) -> Result<MeasuredJob, PipelineError> {
     let (pixels, observed) = simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render);
-    let rows = measure_strip(set, &job.fields, job.iy, pixels, &mut scratch.workers)?;
+    let rows = measure_strip(
+        set,
+        &job.fields,
+        job.iy,
+        pixels,
+        &mut scratch.workers,
+        &job.noises,
+    )?;
     Ok(MeasuredJob { observed, rows })
 }
 
@@ -203,13 +250,15 @@ pub fn simulated_steps(
     Ok(Some((psf, steps)))
 }
 
-/// Measures a strip of simulated stamps by each worker.
+/// Measures a strip of simulated stamps by each worker, with the noise that was measured for it: without one
+/// the noise that was drawn.
 pub(crate) fn measure_strip(
     set: &SetSimulator,
     fields: &ImageFields,
     iy: usize,
     pixels: Vec<f32>,
     workers: &mut [Worker],
+    noises: &[Option<Arc<StampNoise>>],
 ) -> Result<Vec<MeasuredRow>, PipelineError> {
     let mut row = StampRow {
         id: ImageId {
@@ -221,10 +270,12 @@ pub(crate) fn measure_strip(
         pixels,
         stamp: STAMP,
         header_noise: Some(NOISE_SIGMA),
+        noise: None,
         psf: RowPsf::Functional(Vec::new()),
     };
     let mut measured = Vec::with_capacity(workers.len());
-    for worker in workers {
+    for (k, worker) in workers.iter_mut().enumerate() {
+        row.noise = noises.get(k).cloned().flatten();
         row.psf = row_psf(set, fields, iy, worker.submission());
         measured.push(measure_row(worker, &row)?);
     }

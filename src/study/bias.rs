@@ -89,18 +89,18 @@ pub fn biases(
     engine::ordered(
         threads,
         |feeder| {
-            feed(set, images, feeder);
-            Ok(())
+            // Of strips drawn several times, whose noise is known.
+            feed(set, images, &[], feeder)
         },
         || {
             let workers: Vec<Worker> = measurers.iter().map(Measurer::worker).collect();
             (RenderScratch::new(), workers)
         },
-        |(render, workers), RowJob { fields, iy }| {
+        |(render, workers), RowJob { fields, iy, .. }| {
             let mut versions = Vec::with_capacity(VERSIONS.len());
             for version in VERSIONS {
                 let strip = draw(set, &fields, iy, version, render);
-                versions.push(measure_strip(set, &fields, iy, strip, workers)?);
+                versions.push(measure_strip(set, &fields, iy, strip, workers, &[])?);
             }
             let found = (0..measurers.len()).map(|k| {
                 let mut sums = BiasSums::default();

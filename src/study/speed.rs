@@ -5,11 +5,11 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use ndarray::ArrayView2;
-use shearq_measure::Measurer;
 use shearq_measure::parts::{
     AdaptiveMoments, ClippedAcf, Matrices, Network, Rule, Spectral, StampFft, Step, WaveletWiener,
     border_noise,
 };
+use shearq_measure::{Measurer, StampNoise};
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::{
@@ -308,7 +308,8 @@ fn linear_stages(
     let spectral = Spectral::new(n, psf.nrows(), &method.deconvolution)?;
     let (mut own, mut scratch) = (spectral.psf(), spectral.scratch());
     let mut lags = spectral.lags();
-    spectral.set_psf(psf, &mut scratch, &mut own)?;
+    let white = spectral.noise(&StampNoise::white(1.0));
+    spectral.set_psf(psf, &white, &mut scratch, &mut own)?;
     rows.push((
         "deconvolve and autocorrelate, with response",
         time(|k| spectral.autocorrelate(&own, black_box(&stamps[k]), 1.0, &mut scratch, &mut lags)),

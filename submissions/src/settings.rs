@@ -68,9 +68,9 @@ section! {
     }
 }
 
-partial! { PartialNoise { source: Source, border: usize, } }
+partial! { PartialNoise { source: Source, border: usize, correlation: usize, } }
 
-/// Where the noise level σ of a stamp comes from.
+/// Where the noise of a stamp is known from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(tag = "source", rename_all = "kebab-case")]
 pub enum NoiseSource {
@@ -81,6 +81,11 @@ pub enum NoiseSource {
     },
     /// The image header's NOISESIG.
     Header,
+    /// The frames of many of the image's stamps: the level, and how pixels are correlated.
+    Image {
+        /// Largest distance in pixels, along each axis, of pixels that may be correlated; 0 for white noise.
+        correlation: usize,
+    },
 }
 
 /// [`NoiseSource`] as a file names it.
@@ -89,6 +94,7 @@ pub enum NoiseSource {
 enum Source {
     Border,
     Header,
+    Image,
 }
 
 impl NoiseSource {
@@ -98,6 +104,9 @@ impl NoiseSource {
                 border: partial.border.ok_or("noise.border")?,
             },
             Source::Header => NoiseSource::Header,
+            Source::Image => NoiseSource::Image {
+                correlation: partial.correlation.ok_or("noise.correlation")?,
+            },
         })
     }
 }

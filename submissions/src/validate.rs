@@ -83,6 +83,10 @@ impl Submission {
             let good = (1..=16).contains(border);
             need(good, "noise.border", border, "1 to 16 pixels")?;
         }
+        if let NoiseSource::Image { correlation } = noise {
+            let good = *correlation <= 4;
+            need(good, "noise.correlation", correlation, "0 to 4 pixels")?;
+        }
         match method {
             Method::Network(network) => network.validate(),
             Method::Linear(linear) => linear.validate(n, p),

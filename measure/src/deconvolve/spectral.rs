@@ -14,8 +14,8 @@
 //!
 //! The result is multiplied by a round Gaussian window, which keeps out most of the noise, before its
 //! autocorrelation is taken. (A window on the stamp itself would cut into the PSF, and what was then
-//! deconvolved would have the opposite of its ellipticity.) White noise of level σ adds to the mean of the power of
-//! each mode what the window brings there of σ²Γ²[…]²|p|²/w², which is subtracted. So few modes are
+//! deconvolved would have the opposite of its ellipticity.) Noise of level σ and power σ²S adds to the mean of the power of
+//! each mode what the window brings there of σ²SΓ²[…]²|p|²/w², which is subtracted. So few modes are
 //! left that images are sampled on a coarse grid.
 //!
 //! # Response to shear
@@ -37,6 +37,7 @@ use self::plane::{Plane, PlaneScratch};
 use super::sun::high_pass;
 use crate::error::MeasureError;
 use crate::fft::StampFft;
+use crate::noise::StampNoise;
 use crate::sizes::{check_psf, check_sizes};
 
 /// Pixels by which the deconvolved stamp may spread beyond the stamp before it wraps around. The window
@@ -78,18 +79,32 @@ pub struct Spectral {
     centre: Vec<Complex32>,
 }
 
+/// Noise as the linear network uses it: of level one, and white but for its power.
+#[derive(Debug, Clone)]
+pub struct ModeNoise {
+    /// Power S of each mode; one for white noise.
+    power: Vec<f32>,
+    /// ½(k_x ∂_x − k_y ∂_y) ln S and ½(k_y ∂_x + k_x ∂_y) ln S: what a shear adds to a mode of noise, in units
+    /// of it and in the mean.
+    tilts: Vec<[f32; 2]>,
+}
+
 /// A PSF as the linear network uses it.
 #[derive(Debug, Clone)]
 pub struct SpectralPsf {
     /// v̂/û.
     restore: Vec<Complex32>,
-    /// Mean power of windowed white noise, in units of σ².
+    /// What a field of noise of σ = 1 becomes of one that is white: v̂/û times √S.
+    field: Vec<Complex32>,
+    /// Change of a mode of the field with the components of shear, in units of it and in the mean.
+    field_tilts: Vec<[f32; 2]>,
+    /// Mean power of windowed noise, in units of σ².
     floor: Vec<f32>,
     /// Mean of the autocorrelation of noise of σ = 1 at zero lag.
     noise_peak: f32,
     /// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p.
     tilts: Vec<[Complex32; 2]>,
-    /// Mean of −Re(conj(û)·δû) of windowed white noise, in units of σ².
+    /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ².
     noise_tilts: Vec<[f32; 2]>,
 }
 
@@ -227,11 +242,26 @@ impl Spectral {
         let modes = self.waves.len();
         SpectralPsf {
             restore: vec![Complex32::ZERO; modes],
+            field: vec![Complex32::ZERO; modes],
+            field_tilts: vec![[0.0; 2]; modes],
             floor: vec![0.0; modes],
             noise_peak: 0.0,
             tilts: vec![[Complex32::ZERO; 2]; modes],
             noise_tilts: vec![[0.0; 2]; modes],
         }
+    }
+
+    /// Noise of level one with the correlation of `noise`.
+    pub fn noise(&self, noise: &StampNoise) -> ModeNoise {
+        let modes = self.waves.iter().map(|k| {
+            let (power, slopes) = noise.power(k.map(f64::from));
+            (
+                power as f32,
+                slopes.map(|slope| (0.5 * slope / power) as f32),
+            )
+        });
+        let (power, tilts) = modes.unzip();
+        ModeNoise { power, tilts }
     }
 
     /// Room for the lags.
@@ -244,7 +274,7 @@ impl Spectral {
         }
     }
 
-    /// Takes a PSF; it is used as it is, so it should sum to one and be centred on the middle of its
+    /// Takes a PSF, for images with `noise`; it is used as it is, so it should sum to one and be centred on the middle of its
     /// stamp, (p − 1)/2 on both axes: the window is where the galaxy is left by deconvolution.
     ///
     /// # Errors
@@ -252,6 +282,7 @@ impl Spectral {
     pub fn set_psf(
         &self,
         psf: ArrayView2<'_, f64>,
+        noise: &ModeNoise,
         scratch: &mut SpectralScratch,
         out: &mut SpectralPsf,
     ) -> Result<(), MeasureError> {
@@ -276,8 +307,11 @@ impl Spectral {
             };
         }
         let [tilt, along, smooth] = real;
-        for (value, restore) in tilt.iter_mut().zip(&out.restore) {
-            *value = restore.norm_sqr();
+        for (at, value) in tilt.iter_mut().enumerate() {
+            out.field[at] = out.restore[at] * noise.power[at].sqrt();
+            let tilts = [0, 1].map(|k| noise.tilts[at][k] - out.tilts[at][k].re);
+            out.field_tilts[at] = tilts;
+            *value = out.field[at].norm_sqr();
         }
         spread(self.plane.side, &self.leak, tilt, along, &mut out.floor);
         let terms = out.floor.iter().zip(&self.scale).enumerate();
@@ -285,9 +319,9 @@ impl Spectral {
         let twice = |at| if at < self.plane.side { 1.0 } else { 2.0 };
         out.noise_peak = terms.map(|(at, (a, b))| twice(at) * a * b).sum();
         for component in 0..2 {
-            let modes = out.tilts.iter().zip(&out.restore);
-            for (value, (tilts, restore)) in tilt.iter_mut().zip(modes) {
-                *value = tilts[component].re * restore.norm_sqr();
+            let modes = out.field_tilts.iter().zip(&out.field);
+            for (value, (tilts, field)) in tilt.iter_mut().zip(modes) {
+                *value = -tilts[component] * field.norm_sqr();
             }
             spread(self.plane.side, &self.leak, tilt, along, smooth);
             for (out, value) in out.noise_tilts.iter_mut().zip(&*smooth) {
@@ -314,7 +348,7 @@ impl Spectral {
         self.target[at] * (1.0 - left) as f32 / w
     }
 
-    /// Deconvolves a row-major `stamp` with white noise of level `noise` and writes the
+    /// Deconvolves a row-major `stamp` with noise of level `noise` and writes the
     /// autocorrelation with its derivatives.
     pub fn autocorrelate(
         &self,
@@ -359,11 +393,12 @@ impl Spectral {
         self.plane.window(&self.window, plane);
     }
 
-    /// Writes how the autocorrelation of the stamp last given changes with a field of white noise of σ = 1
+    /// Writes how the autocorrelation of the stamp last given changes with a field of noise of σ = 1
     /// that is added to it, and with what a shear makes of that field: in `acf` the one, in `shear1` and
     /// `shear2` the other.
     ///
-    /// Of the change of noise under shear only the symmetric part is taken, −Re(tilt) of each mode: of
+    /// Of the change of noise under shear only the symmetric part is taken, −Re(tilt) of each mode (and what
+    /// the slope of its own power adds): of
     /// the rest, which moves pixels about, the mean is zero. Modes have random signs.
     pub fn noise_field(
         &self,
@@ -376,10 +411,10 @@ impl Spectral {
         self.signs(seed, &mut plane.half[0]);
         let [u, x, y] = &mut plane.half;
         for (at, value) in u.iter_mut().enumerate() {
-            *value *= psf.restore[at];
-            let [first, second] = psf.tilts[at];
-            x[at] = -*value * first.re;
-            y[at] = -*value * second.re;
+            *value *= psf.field[at];
+            let [first, second] = psf.field_tilts[at];
+            x[at] = *value * first;
+            y[at] = *value * second;
         }
         self.plane.window(&self.window, plane);
         self.changes(stamp, plane, out);

@@ -6,9 +6,14 @@ use shearq_scoring::Distortion;
 use crate::deconvolve::Descent;
 use crate::error::MeasureError;
 use crate::flag::Flag;
+use crate::noise::StampNoise;
 
 /// One thread's part in a method: its plan, PSF and buffers.
 pub(crate) trait CutWorker {
+    /// Takes the noise of the galaxies that follow, in units of its level; white at first. The PSF has to be
+    /// taken after it.
+    fn set_noise(&mut self, _noise: &StampNoise) {}
+
     /// Takes a PSF.
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;
 

@@ -16,8 +16,9 @@ use ndarray::ArrayView2;
 use shearq_submissions::LinearMethod;
 
 use super::found::{CutWorker, Found, Images, ResponseMatrix, Sheared, image, whole};
-use crate::deconvolve::{Descent, Lags, Spectral, SpectralPsf, SpectralScratch, Stop};
+use crate::deconvolve::{Descent, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop};
 use crate::error::MeasureError;
+use crate::noise::StampNoise;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
 
 /// One galaxy in so many is looked at with a field of noise: what it corrects is some per cent of the
@@ -52,6 +53,7 @@ impl LinearPlan {
 /// A worker for one thread.
 pub(super) fn worker(plan: Arc<LinearPlan>) -> Box<dyn CutWorker> {
     Box::new(LinearWorker {
+        noise: plan.spectral.noise(&StampNoise::white(1.0)),
         psf: plan.spectral.psf(),
         buffers: plan.spectral.scratch(),
         lags: plan.spectral.lags(),
@@ -64,6 +66,7 @@ pub(super) fn worker(plan: Arc<LinearPlan>) -> Box<dyn CutWorker> {
 
 struct LinearWorker {
     plan: Arc<LinearPlan>,
+    noise: ModeNoise,
     psf: SpectralPsf,
     buffers: SpectralScratch,
     lags: Lags,
@@ -112,10 +115,14 @@ impl LinearWorker {
 }
 
 impl CutWorker for LinearWorker {
+    fn set_noise(&mut self, noise: &StampNoise) {
+        self.noise = self.plan.spectral.noise(noise);
+    }
+
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
         self.plan
             .spectral
-            .set_psf(psf, &mut self.buffers, &mut self.psf)
+            .set_psf(psf, &self.noise, &mut self.buffers, &mut self.psf)
     }
 
     fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {

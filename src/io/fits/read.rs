@@ -113,6 +113,11 @@ impl ImageReader {
         self.file.number(key)
     }
 
+    /// Leaves the next `rows` rows out.
+    pub fn skip_rows(&mut self, rows: usize) {
+        self.next_row = (self.next_row + rows).min(self.height);
+    }
+
     /// The next `rows` rows, or fewer at the end of the image. Pixels that are not finite or, in an
     /// image of integers, have the value of its key BLANK, are NaN.
     ///

@@ -19,6 +19,11 @@ fn settings(iterations: usize, target: f64, window: f64, lambda: f64) -> LinearD
     }
 }
 
+/// White noise.
+fn white(plan: &Spectral) -> ModeNoise {
+    plan.noise(&StampNoise::white(1.0))
+}
+
 /// A lopsided PSF of sum one, centred on its stamp.
 fn psf(p: usize) -> Array2<f64> {
     let centre = (p as f64 - 1.0) / 2.0;
@@ -153,11 +158,13 @@ fn the_autocorrelation_is_that_of_plain_sums_for_odd_and_even_sizes_and_dirty_sc
         let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
         let data: Vec<f32> = stamp.iter().map(|&v| v as f32).collect();
         // What another stamp left behind must not matter.
-        plan.set_psf(psf(p).t(), &mut scratch, &mut own).unwrap();
+        plan.set_psf(psf(p).t(), &white(&plan), &mut scratch, &mut own)
+            .unwrap();
         let other: Vec<f32> = data.iter().map(|v| 1e3 - v).collect();
         plan.autocorrelate(&own, &other, 3.0, &mut scratch, &mut lags);
         plan.noise_field(&own, 1, &mut scratch, &mut lags);
-        plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+        plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+            .unwrap();
         plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
         let expected = plain(&plan, &settings, &h, &stamp);
         let peak = expected[plan.reach()];
@@ -177,7 +184,8 @@ fn pictures_show_the_stamp_whose_lags_are_measured() {
     let h = psf(p);
     let plan = Spectral::new(n, p, &settings).unwrap();
     let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
-    plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
     let data = observed(n, &h, 0.1, 0.0);
     plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
     let picture = plan.deconvolved(h.view(), &data);
@@ -194,7 +202,8 @@ fn the_response_is_that_of_a_sheared_galaxy() {
     let h = psf(p);
     let plan = Spectral::new(n, p, &settings(1000, 1.5, 3.0, 0.0)).unwrap();
     let (mut own, mut scratch) = (plan.psf(), plan.scratch());
-    plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
     let mut lags_of = |g1: f64, g2: f64| {
         let mut lags = plan.lags();
         plan.autocorrelate(&own, &observed(n, &h, g1, g2), 0.0, &mut scratch, &mut lags);
@@ -229,7 +238,8 @@ fn a_round_galaxy_keeps_nothing_of_the_psfs_ellipticity() {
     let data: Vec<f32> = stamp.iter().map(|&v| v as f32).collect();
     let plan = Spectral::new(n, p, &settings(1000, 1.5, 8.0, 0.0)).unwrap();
     let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
-    plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
     plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
     let (reach, width) = (plan.reach(), 2 * plan.reach() + 1);
     for lag in 1..=reach {
@@ -239,18 +249,55 @@ fn a_round_galaxy_keeps_nothing_of_the_psfs_ellipticity() {
     }
 }
 
+/// Sum of 2 × 2 pixels of white noise, halved: of variance one, and power (1 + cos k_x)(1 + cos k_y).
+fn summed(n: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    let white = noise(n + 1, rng);
+    let sum = |x: usize, y: usize| {
+        let at = y * (n + 1) + x;
+        0.5 * (white[at] + white[at + 1] + white[at + n + 1] + white[at + n + 2])
+    };
+    (0..n * n).map(|at| sum(at % n, at / n)).collect()
+}
+
+/// The noise of [`summed`], as it is known from many frames of it.
+fn of_summed(rng: &mut ChaCha8Rng) -> StampNoise {
+    let mut survey = crate::noise::NoisePlan::new(48, 1).unwrap().survey();
+    for _ in 0..2000 {
+        let stamp = Array2::from_shape_vec((48, 48), summed(48, rng)).unwrap();
+        survey.add(stamp.view()).unwrap();
+    }
+    survey.noise().unwrap()
+}
+
 #[test]
 fn noise_is_subtracted_in_the_mean_from_the_autocorrelation_and_its_derivatives() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let correlated = of_summed(&mut rng);
+    for own in [StampNoise::white(1.0), correlated] {
+        subtracted_in_the_mean(&own, &mut rng);
+    }
+}
+
+fn subtracted_in_the_mean(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
     let (n, p) = (32, 9);
     let plan = Spectral::new(n, p, &settings(1000, 1.5, 5.0, 1e-4)).unwrap();
     let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
-    plan.set_psf(psf(p).view(), &mut scratch, &mut own).unwrap();
+    plan.set_psf(
+        psf(p).view(),
+        &plan.noise(own_noise),
+        &mut scratch,
+        &mut own,
+    )
+    .unwrap();
     let count = 4000;
     let mut means = [(); 2].map(|()| [(); 3].map(|()| vec![0.0f64; lags.acf.len()]));
     for _ in 0..count {
-        let stamp = noise(n, &mut rng);
-        for (level, sums) in [1.0, 0.0].into_iter().zip(&mut means) {
+        let stamp = if own_noise.is_correlated() {
+            summed(n, rng)
+        } else {
+            noise(n, rng)
+        };
+        for (level, sums) in [own_noise.sigma() as f32, 0.0].into_iter().zip(&mut means) {
             plan.autocorrelate(&own, &stamp, level, &mut scratch, &mut lags);
             for (sums, lags) in sums.iter_mut().zip([&lags.acf, &lags.shear1, &lags.shear2]) {
                 for (sum, lag) in sums.iter_mut().zip(lags) {
@@ -279,11 +326,19 @@ fn noise_is_subtracted_in_the_mean_from_the_autocorrelation_and_its_derivatives(
 #[test]
 fn a_field_of_noise_changes_the_autocorrelation_as_noise_on_the_stamp_does() {
     let mut rng = ChaCha8Rng::seed_from_u64(2);
+    let correlated = of_summed(&mut rng);
+    for own in [StampNoise::white(1.0), correlated] {
+        changed_as_by_noise(&own, &mut rng);
+    }
+}
+
+fn changed_as_by_noise(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
     let (n, p) = (32, 9);
     let h = psf(p);
     let plan = Spectral::new(n, p, &settings(1000, 1.5, 5.0, 0.0)).unwrap();
     let (mut own, mut scratch) = (plan.psf(), plan.scratch());
-    plan.set_psf(h.view(), &mut scratch, &mut own).unwrap();
+    plan.set_psf(h.view(), &plan.noise(own_noise), &mut scratch, &mut own)
+        .unwrap();
     let data = observed(n, &h, 0.0, 0.0);
     // Products of the change of a lag with itself and with the changes under sheared noise, summed
     // over lags: of both kinds of noise.
@@ -298,7 +353,12 @@ fn a_field_of_noise_changes_the_autocorrelation_as_noise_on_the_stamp_does() {
     plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
     let galaxy = scratch.stamp.clone();
     for seed in 0..6000 {
-        plan.deconvolve(&own, &noise(n, &mut rng), &mut scratch.plane);
+        let stamp = if own_noise.is_correlated() {
+            summed(n, rng)
+        } else {
+            noise(n, rng)
+        };
+        plan.deconvolve(&own, &stamp, &mut scratch.plane);
         plan.changes(&galaxy, &mut scratch.plane, &mut lags);
         add(&mut sums[0], &lags);
         plan.noise_field(&own, seed, &mut scratch, &mut lags);
@@ -324,10 +384,13 @@ fn unusable_sizes_and_psfs_are_refused() {
     let plan = Spectral::new(32, 7, &settings).unwrap();
     let (mut own, mut scratch) = (plan.psf(), plan.scratch());
     let mut bad = psf(7);
-    assert!(plan.set_psf(psf(9).view(), &mut scratch, &mut own).is_err());
+    assert!(
+        plan.set_psf(psf(9).view(), &white(&plan), &mut scratch, &mut own)
+            .is_err()
+    );
     bad[(2, 3)] = f64::NAN;
     let error = plan
-        .set_psf(bad.view(), &mut scratch, &mut own)
+        .set_psf(bad.view(), &white(&plan), &mut scratch, &mut own)
         .unwrap_err();
     assert!(error.to_string().contains("pixel (4, 3)"), "{error}");
 }
