@@ -96,6 +96,14 @@ def table_one(rows, amplitude):
     return found
 
 
+def better(adaptive, constant):
+    """1/RMSD of the one over that of the other, between a half and two. An update that leaves no galaxy with a
+    shape is as bad as that; one where neither does tells nothing and is as good as the other."""
+    a, c = np.nan_to_num(adaptive), np.nan_to_num(constant)
+    ratio = np.divide(a, c, out=np.where(a > 0, 2.0, 1.0), where=c > 0)
+    return np.clip(ratio, 0.5, 2.0)
+
+
 def calibration(curves):
     """Figures of Sect. 4 by name. `curves[update][snr]` has lists over λ."""
     lam = np.array(curves["log_lambda"])
@@ -107,7 +115,7 @@ def calibration(curves):
     at = lambda value: int(np.argmin(np.abs(lam - value)))
     # The mean over S/N, whose maxima need not be at one λ.
     ctr = np.mean([adaptive[snr]["ctr"] for snr in adaptive], axis=0)
-    ratio = {snr: adaptive[snr]["inverse_rmsd"] / constant[snr]["inverse_rmsd"] for snr in adaptive}
+    ratio = {snr: better(adaptive[snr]["inverse_rmsd"], constant[snr]["inverse_rmsd"]) for snr in adaptive}
     dsnr = np.array([adaptive[snr]["dsnr_db"] for snr in ("10", "20", "40")])
     return {
         "log lambda of ctr": lam[np.nanargmax(ctr)] if np.isfinite(ctr).any() else np.nan,
