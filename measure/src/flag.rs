@@ -21,11 +21,13 @@ pub enum Flag {
     NoShear = 32,
     /// The response by which the ellipticities were to be divided is not positive.
     NoResponse = 64,
+    /// Another galaxy is so near that its light cannot be told from this one's.
+    Neighbour = 128,
 }
 
 impl Flag {
     /// All, in the order of their bits.
-    pub const ALL: [Flag; 7] = [
+    pub const ALL: [Flag; 8] = [
         Flag::NotFinite,
         Flag::BadPsf,
         Flag::NoScale,
@@ -33,6 +35,7 @@ impl Flag {
         Flag::NoExtent,
         Flag::NoShear,
         Flag::NoResponse,
+        Flag::Neighbour,
     ];
 }
 
@@ -46,6 +49,7 @@ impl fmt::Display for Flag {
             Flag::NoExtent => "moments without extent",
             Flag::NoShear => "distortion above 1",
             Flag::NoResponse => "no response to shear to divide by",
+            Flag::Neighbour => "a second peak near the galaxy",
         })
     }
 }

@@ -3,6 +3,7 @@
 mod found;
 mod linear;
 mod network;
+mod surroundings;
 
 use std::sync::Arc;
 

@@ -356,7 +356,7 @@ mod tests {
         );
         dead(
             "extends = \"48/linear/star\"\n[noise]\nborder = 3\n",
-            "line 3: `noise.border` has no effect with noise.source = \"header\"",
+            "line 3: `noise.border` has no effect with noise.source = \"image\"",
         );
         dead(
             "extends = \"23/raw/star\"\ndenoise = { levels = 2 }\n",

@@ -126,6 +126,9 @@ pub struct SpectralScratch {
     stamp: Vec<Complex32>,
     /// A real half spectrum on its way through the window.
     real: [Vec<f32>; 3],
+    /// Where the window is, (x, y) in pixels from the middle of the stamp, and the window along both axes there.
+    centre: [f32; 2],
+    windows: [Vec<f32>; 2],
 }
 
 /// Autocorrelations on lags dy = 0…R, dx = −R…R, in steps of [`Spectral::spacing`]:
@@ -234,6 +237,31 @@ impl Spectral {
             image: vec![0.0; most * most],
             stamp: self.plane.spectrum(),
             real: std::array::from_fn(|_| vec![0.0; self.waves.len()]),
+            centre: [0.0; 2],
+            windows: [self.window.clone(), self.window.clone()],
+        }
+    }
+
+    /// Puts the window at `centre`, (x, y) in pixels from the middle of the stamp, for the stamps that follow.
+    /// Their shear is about this place: the window is where the galaxy is, sheared or not.
+    pub fn place_window(&self, centre: [f32; 2], scratch: &mut SpectralScratch) {
+        for (k, window) in scratch.windows.iter_mut().enumerate() {
+            if scratch.centre[k] == centre[k] {
+                continue;
+            }
+            scratch.centre[k] = centre[k];
+            if centre[k] == 0.0 {
+                window.copy_from_slice(&self.window);
+                continue;
+            }
+            let (middle, period) = ((self.n as f32 - 1.0) / 2.0, self.plane.size as f32);
+            let (spacing, side) = (self.plane.spacing() as f32, self.plane.side as f32);
+            let sigma = self.window_sigma as f32;
+            for (at, value) in window.iter_mut().enumerate() {
+                let x = at as f32 * spacing - middle - centre[k];
+                let x = (x - period * (x / period).round()) / sigma;
+                *value = (-0.5 * x * x).exp() / side;
+            }
         }
     }
 
@@ -358,7 +386,7 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut Lags,
     ) {
-        self.deconvolve(psf, stamp, &mut scratch.plane);
+        self.deconvolve(psf, stamp, scratch);
         let plane = &mut scratch.plane;
         let [u, x, y] = &mut plane.half;
         scratch.stamp.copy_from_slice(u);
@@ -378,19 +406,27 @@ impl Spectral {
     }
 
     /// v̂ of a stamp and its changes with the components of shear, windowed, to `plane.half`.
-    fn deconvolve(&self, psf: &SpectralPsf, stamp: &[f32], plane: &mut PlaneScratch) {
+    fn deconvolve(&self, psf: &SpectralPsf, stamp: &[f32], scratch: &mut SpectralScratch) {
+        let SpectralScratch {
+            plane,
+            centre,
+            windows: [across, down],
+            ..
+        } = scratch;
         self.plane.transform(stamp, self.n, plane);
         let [u, x, y] = &mut plane.half;
         // The changes are v̂/û times p·(k_x ∂_x − k_y ∂_y)(û/p), and the other's.
         for (at, (x, y)) in x.iter_mut().zip(y).enumerate() {
             let [first, second] = psf.tilts[at];
-            let [along, across] = sheared(*x, *y, self.waves[at]);
+            // About the window's place.
+            let (x0, y0) = (*x - u[at] * centre[0], *y - u[at] * centre[1]);
+            let [plus, cross] = sheared(x0, y0, self.waves[at]);
             let restore = psf.restore[at];
-            *x = restore * (along - first * u[at]);
-            *y = restore * (across - second * u[at]);
+            *x = restore * (plus - first * u[at]);
+            *y = restore * (cross - second * u[at]);
             u[at] *= restore;
         }
-        self.plane.window(&self.window, plane);
+        self.plane.window(across, down, plane);
     }
 
     /// Writes how the autocorrelation of the stamp last given changes with a field of noise of σ = 1
@@ -407,7 +443,12 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut Lags,
     ) {
-        let SpectralScratch { plane, stamp, .. } = scratch;
+        let SpectralScratch {
+            plane,
+            stamp,
+            windows: [across, down],
+            ..
+        } = scratch;
         self.signs(seed, &mut plane.half[0]);
         let [u, x, y] = &mut plane.half;
         for (at, value) in u.iter_mut().enumerate() {
@@ -416,7 +457,7 @@ impl Spectral {
             x[at] = *value * first;
             y[at] = *value * second;
         }
-        self.plane.window(&self.window, plane);
+        self.plane.window(across, down, plane);
         self.changes(stamp, plane, out);
     }
 

@@ -16,6 +16,7 @@ use ndarray::ArrayView2;
 use shearq_submissions::LinearMethod;
 
 use super::found::{CutWorker, Found, Images, ResponseMatrix, Sheared, image, whole};
+use super::surroundings::{Surroundings, followed};
 use crate::deconvolve::{Descent, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop};
 use crate::error::MeasureError;
 use crate::noise::StampNoise;
@@ -56,6 +57,8 @@ pub(super) fn worker(plan: Arc<LinearPlan>) -> Box<dyn CutWorker> {
         noise: plan.spectral.noise(&StampNoise::white(1.0)),
         psf: plan.spectral.psf(),
         buffers: plan.spectral.scratch(),
+        surroundings: Surroundings::new(plan.spectral.stamp_size()),
+        grain: 1.0,
         lags: plan.spectral.lags(),
         field: plan.spectral.lags(),
         shifted: plan.spectral.lags().acf,
@@ -67,6 +70,9 @@ pub(super) fn worker(plan: Arc<LinearPlan>) -> Box<dyn CutWorker> {
 struct LinearWorker {
     plan: Arc<LinearPlan>,
     noise: ModeNoise,
+    /// Noise of sums over many pixels, in units of that of white noise.
+    grain: f32,
+    surroundings: Surroundings,
     psf: SpectralPsf,
     buffers: SpectralScratch,
     lags: Lags,
@@ -117,6 +123,7 @@ impl LinearWorker {
 impl CutWorker for LinearWorker {
     fn set_noise(&mut self, noise: &StampNoise) {
         self.noise = self.plan.spectral.noise(noise);
+        self.grain = noise.power([0.0; 2]).0.sqrt() as f32;
     }
 
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
@@ -131,16 +138,26 @@ impl CutWorker for LinearWorker {
         }
         let plan = Arc::clone(&self.plan);
         let sigma = noise as f32;
+        let found = self.surroundings.centre(cut);
+        let cleared = self.surroundings.clear(cut, found, self.grain * sigma);
+        let whole = cut;
+        let cut = if cleared == Ok(true) {
+            &self.surroundings.filled
+        } else {
+            cut
+        };
         let (buffers, lags) = (&mut self.buffers, &mut self.lags);
+        plan.spectral.place_window(followed(found), buffers);
         plan.spectral
             .autocorrelate(&self.psf, cut, sigma, buffers, lags);
         let softening = plan.softening * sigma * sigma * self.psf.noise_peak();
-        let shape = plan.moments.measure(&lags.acf, softening, &mut self.values);
+        let shape =
+            cleared.and_then(|_| plan.moments.measure(&lags.acf, softening, &mut self.values));
         let mut response = [[f64::NAN; 2]; 2];
         let mut sheared_noise = None;
         if let Ok(shape) = &shape {
             response = Self::response(&plan, shape, lags, &mut self.values);
-            let seed = seed_of(cut, sigma);
+            let seed = seed_of(whole, sigma);
             if noise > 0.0 && seed.is_multiple_of(SHARE) {
                 sheared_noise = self.sheared_noise(seed, sigma, softening);
             }
@@ -151,12 +168,12 @@ impl CutWorker for LinearWorker {
                 stop: Stop::MaxIterations,
                 first_energy: f64::NAN,
                 energy: f64::NAN,
-                updated: cut.len() as u32,
+                updated: whole.len() as u32,
             },
             distortion: shape.map(|s| s.distortion),
             response,
             sheared_noise,
-            flux: sum(cut),
+            flux: sum(whole),
             radius: plan.spectral.reach() as f64 * plan.spectral.spacing(),
             size: shape.map_or(f64::NAN, |s| s.size),
         }))

@@ -162,9 +162,9 @@ impl Plane {
         }
     }
 
-    /// Multiplies the images of the half spectra by `window` along each axis, and transforms again:
+    /// Multiplies the images of the half spectra by `along` x and `down` y, and transforms again:
     /// `side²` times too large.
-    pub(super) fn window(&self, window: &[f32], scratch: &mut PlaneScratch) {
+    pub(super) fn window(&self, along: &[f32], down: &[f32], scratch: &mut PlaneScratch) {
         let PlaneScratch {
             half, pairs, fft, ..
         } = scratch;
@@ -178,8 +178,8 @@ impl Plane {
             }
             self.backward.process_with_scratch(pairs, fft);
             for (y, line) in pairs.chunks_exact_mut(side).enumerate() {
-                let (first, second) = (window[y], window[y + lower]);
-                for (value, x) in line.iter_mut().zip(window) {
+                let (first, second) = (down[y], down[y + lower]);
+                for (value, x) in line.iter_mut().zip(along) {
                     *value = Complex32::new(value.re * (first * x), value.im * (second * x));
                 }
             }

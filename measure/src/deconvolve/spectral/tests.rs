@@ -227,6 +227,43 @@ fn the_response_is_that_of_a_sheared_galaxy() {
 }
 
 #[test]
+fn a_window_that_follows_the_galaxy_sees_what_one_in_the_middle_sees() {
+    let (n, p) = (48, 11);
+    let h = psf(p);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 6.0, 0.0)).unwrap();
+    let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
+    let middle = observed(n, &h, 0.05, -0.03);
+    // Three pixels along x and minus two along y.
+    let moved: Vec<f32> = (0..n * n)
+        .map(|at| {
+            let (x, y) = ((at % n) as i32 - 3, (at / n) as i32 + 2);
+            let side = 0..n as i32;
+            if side.contains(&x) && side.contains(&y) {
+                middle[y as usize * n + x as usize]
+            } else {
+                0.0
+            }
+        })
+        .collect();
+    let (mut there, mut here) = (plan.lags(), plan.lags());
+    plan.place_window([3.0, -2.0], &mut scratch);
+    plan.autocorrelate(&own, &moved, 0.0, &mut scratch, &mut there);
+    plan.place_window([0.0; 2], &mut scratch);
+    plan.autocorrelate(&own, &middle, 0.0, &mut scratch, &mut here);
+    let peak = here.acf[plan.reach()];
+    let pairs = |a: &[f32], b: &[f32]| {
+        let apart = a.iter().zip(b).map(|(a, b)| (a - b).abs());
+        apart.fold(0.0, f32::max)
+    };
+    // f32 through the division by the PSF's transform.
+    assert!(pairs(&there.acf, &here.acf) < 1e-4 * peak);
+    assert!(pairs(&there.shear1, &here.shear1) < 1e-3 * peak);
+    assert!(pairs(&there.shear2, &here.shear2) < 1e-3 * peak);
+}
+
+#[test]
 fn a_round_galaxy_keeps_nothing_of_the_psfs_ellipticity() {
     let (n, p) = (48, 21);
     let centre = (n as f64 - 1.0) / 2.0;
@@ -358,7 +395,7 @@ fn changed_as_by_noise(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
         } else {
             noise(n, rng)
         };
-        plan.deconvolve(&own, &stamp, &mut scratch.plane);
+        plan.deconvolve(&own, &stamp, &mut scratch);
         plan.changes(&galaxy, &mut scratch.plane, &mut lags);
         add(&mut sums[0], &lags);
         plan.noise_field(&own, seed, &mut scratch, &mut lags);
