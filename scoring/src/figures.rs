@@ -58,7 +58,7 @@ figures! {
     m_half: "M/2", 4, false, "Multiplicative bias of the power spectrum, halved.";
     sqrt_a: "√A×10⁴", 4, false, "Additive bias of the power spectrum: sign(A)·√|A| in 10⁻⁴, C_ℓ in steradian.";
     m_cross: "m (cross)", 4, false, "Multiplicative bias by cross-correlation of E modes with the truth.";
-    noise: "noise", 4, false, "Noise of one galaxy's ellipticity per component, divided by the response 1 + m.";
+    galaxy_noise: "noise", 4, false, "Noise of one galaxy's ellipticity per component, divided by the response 1 + m.";
     m1: "m1", 4, true, "Multiplicative bias of component 1, from the galaxies.";
     m2: "m2", 4, true, "Multiplicative bias of component 2, from the galaxies.";
     c1: "c1", 5, true, "Additive bias of component 1, from the galaxies.";

@@ -346,7 +346,7 @@ impl SetScorer {
         // By a response that may as well be zero nothing can be divided.
         if 1.0 + figures.m_cross < CLEAR_RESPONSE * errors.m_cross {
             for of in [&mut figures, &mut errors] {
-                (of.q_calibrated, of.noise) = (f64::NAN, f64::NAN);
+                (of.q_calibrated, of.galaxy_noise) = (f64::NAN, f64::NAN);
             }
         }
         let constant = self.truth.constant().map(|truth| MeanShear {
@@ -628,7 +628,7 @@ impl SetScorer {
             m_half: score.fit.cl.m,
             sqrt_a: score.fit.cl.sqrtA * 1e4,
             m_cross: score.m_cross,
-            noise: self.noise_variance(sum, score).sqrt() / (1.0 + score.m_cross).abs(),
+            galaxy_noise: self.noise_variance(sum, score).sqrt() / (1.0 + score.m_cross).abs(),
             m1: first.m,
             m2: second.m,
             c1: first.c,
@@ -743,12 +743,12 @@ impl SetScorer {
             &true_ee,
             figures.q_calibrated,
         );
-        let noise = {
+        let galaxy_noise = {
             let own = match (self.options.noise, images.groups.len() as f64) {
                 (Noise::Given(_), _) => 0.0,
                 (Noise::Measured, groups) => bins.variance_of_white_power() / (groups - 1.0) / 4.0,
             };
-            figures.noise * (own + (m_cross / response).powi(2)).sqrt()
+            figures.galaxy_noise * (own + (m_cross / response).powi(2)).sqrt()
         };
         let fit = &score.fit.cl;
         let [bb, eb] = scatter.of_null_tests(bins, &signal);
@@ -759,7 +759,7 @@ impl SetScorer {
             m_half: m / 2.0,
             sqrt_a: errors::of_sqrt_a(fit.A, a),
             m_cross,
-            noise,
+            galaxy_noise,
             m1: v1.0,
             m2: v2.0,
             c1,

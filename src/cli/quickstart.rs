@@ -149,7 +149,7 @@ fn verdict(submissions: &[(String, Vec<&SetRecord>)]) -> String {
     format!(
         "Use {name}: m = {}, noise {} a galaxy once calibrated, and Q calibrated = {}; {}. Q itself is raised here by losing shear and noise alike (m below zero), which real analyses cannot use.",
         shown(sets, "m_cross", 2),
-        shown(sets, "noise", 3),
+        shown(sets, "galaxy_noise", 3),
         shown(sets, "q_calibrated", 1),
         others.join(", ")
     )

@@ -509,7 +509,9 @@ fn noise_doubts(
     let mut doubts = Vec::new();
     if let Some(header) = source.header_noise {
         let apart = noise.sigma() / header - 1.0;
-        if !(apart.abs() <= (5.0 * noise.error()).max(LEAST_DOUBT)) {
+        let doubtful = apart.abs() > (5.0 * noise.error()).max(LEAST_DOUBT);
+        // A header of zero or of no number.
+        if doubtful || apart.is_nan() {
             let taken = if asked {
                 "the measured one is used"
             } else {

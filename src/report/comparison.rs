@@ -9,7 +9,7 @@ use shearq_submissions::Published;
 use shearq_tables::polars::AnyValue;
 
 use super::figure::{ColourMap, HeatMap};
-use super::scores::{definition_note, notes};
+use super::scores::{best_is_another, definition_note, notes};
 use super::table::{Cell, Heading, Table};
 use crate::results::compare::{Variant, common_sets, mean_figure, q_difference};
 use crate::results::groups::{Group, Grouping};
@@ -32,7 +32,7 @@ fn figure_heading(name: &'static str) -> Heading {
 fn leaderboard_heading<'a>(sets: impl Iterator<Item = &'a SetRecord>) -> Heading {
     let apart = sets
         .into_iter()
-        .any(|set| set.q_leaderboard != set.figures.q);
+        .any(|set| best_is_another(set.q_leaderboard, set.figures.q));
     Heading {
         detail: !apart,
         ..Heading::new("q_leaderboard", "Q leaderboard")
@@ -78,7 +78,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
         Heading::new("q_difference", "ΔQ to first"),
         Heading::new("sigma", "in σ"),
         figure_heading("q_calibrated"),
-        figure_heading("noise"),
+        figure_heading("galaxy_noise"),
         figure_heading("m_cross"),
         leaderboard_heading(records.iter().flatten()),
         figure_heading("q_dn"),
@@ -118,7 +118,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             delta,
             sigma,
             mean_cell(&sets, "q_calibrated"),
-            mean_cell(&sets, "noise"),
+            mean_cell(&sets, "galaxy_noise"),
             mean_cell(&sets, "m_cross"),
             leaderboard_cell(&sets),
             mean_cell(&sets, "q_dn"),
@@ -178,7 +178,7 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
         Heading::new("q_difference", "ΔQ to first"),
         Heading::new("sigma", "in σ"),
         figure_heading("q_calibrated"),
-        figure_heading("noise"),
+        figure_heading("galaxy_noise"),
         figure_heading("m_cross"),
         leaderboard_heading(groups.iter().flat_map(|group| group.sets.iter().copied())),
         figure_heading("q_dn"),
@@ -212,7 +212,7 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
         row.extend(difference_cells(difference));
         row.extend([
             mean_cell(&group.sets, "q_calibrated"),
-            mean_cell(&group.sets, "noise"),
+            mean_cell(&group.sets, "galaxy_noise"),
             mean_cell(&group.sets, "m_cross"),
             leaderboard_cell(&group.sets),
             mean_cell(&group.sets, "q_dn"),

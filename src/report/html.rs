@@ -663,7 +663,7 @@ mod tests {
             rows: vec![
                 vec![
                     Cell::text(NASTY),
-                    Cell::with_error(-87.125, Some(12.5), 1),
+                    Cell::with_error(-87.125, Some(1.5), 2),
                     Cell::number(f64::INFINITY, 2),
                 ],
                 vec![
@@ -810,7 +810,7 @@ mod tests {
         let page = report().render();
         assert!(page.contains(
             "<td class=\"num\" data-value=\"-87.125\">−87.1<span class=\"pm\">\u{a0}±\u{a0}</span>\
-             <span class=\"error\" style=\"min-width:3.5ch\">12.5</span></td>"
+             <span class=\"error\" style=\"min-width:2.5ch\">1.5</span></td>"
         ));
         assert!(page.contains("data-value=\"0.00000095\">0.0<"));
         assert!(page.contains("data-value=\"NaN\">–<"));

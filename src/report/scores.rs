@@ -131,7 +131,7 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     headings.push(Heading::new("convention", "Conv.").detail());
     let apart = scored
         .iter()
-        .any(|set| q_leaderboard(&set.score) != set.score.figures.q);
+        .any(|set| best_is_another(q_leaderboard(&set.score), set.score.figures.q));
     headings.push(Heading {
         detail: !apart,
         ..Heading::new("q_leaderboard", "Q leaderboard")
@@ -174,6 +174,12 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
         rows,
         notes: lines,
     }
+}
+
+/// Whether the leaderboard's Q is of another class of conventions than the figures: within a class it is the
+/// same but for rounding, by 1e-7 at most.
+pub(super) fn best_is_another(q_leaderboard: f64, q: f64) -> bool {
+    (q_leaderboard / q - 1.0).abs() > 1e-6
 }
 
 /// Q of the best of the eight conventions; not a number where the truth has no power.

@@ -8,7 +8,7 @@ use unicode_width::UnicodeWidthStr;
 use super::escape;
 use super::table::{Cell, Table};
 
-/// Blanks beside a column's contents.
+/// Blanks after a column's contents: one of its own, and one between columns.
 const PADDING: usize = 2;
 /// Words longer than this may be broken.
 const LONGEST_WORD: usize = 16;
@@ -125,7 +125,6 @@ fn block(columns: &[&Column], width: usize) -> String {
     table
         .load_preset(presets::UTF8_HORIZONTAL_ONLY)
         .remove_style(TableComponent::HorizontalLines)
-        .remove_style(TableComponent::VerticalLines)
         .remove_style(TableComponent::MiddleIntersections)
         .remove_style(TableComponent::LeftBorderIntersections)
         .remove_style(TableComponent::RightBorderIntersections)
@@ -141,7 +140,8 @@ fn block(columns: &[&Column], width: usize) -> String {
         );
     }
     for ((place, own), column) in table.column_iter_mut().zip(widths).zip(columns) {
-        let whole = u16::try_from(own + PADDING).unwrap_or(u16::MAX);
+        let whole = u16::try_from(own + 1).unwrap_or(u16::MAX);
+        place.set_padding((0, 1));
         place.set_constraint(ColumnConstraint::Absolute(Width::Fixed(whole)));
         if column.numbers {
             place.set_cell_alignment(CellAlignment::Right);
@@ -219,6 +219,6 @@ mod tests {
         assert!(text.contains("-1234.5 ± 3.2"), "{text}");
         let narrow = fitted(&table(3), Some(40));
         assert!(narrow.contains("-1234.5 ") && narrow.lines().count() > text.lines().count());
-        assert_eq!(fitted(&table(30), None).lines().count(), 3 + 2 + 3);
+        assert_eq!(fitted(&table(30), None).lines().count(), 1 + 4 + 3 + 1);
     }
 }

@@ -103,7 +103,9 @@ fn a_changed_digit_and_a_changed_setting_are_seen_and_an_update_keeps_the_reason
     // Apart from its history it is what was recorded.
     let mut updated: toml::Table = updated.parse().unwrap();
     updated.remove("history").unwrap();
-    assert_eq!(updated, baseline.parse::<toml::Table>().unwrap());
+    // As text, in which what is unknown is like itself.
+    let recorded: toml::Table = baseline.parse().unwrap();
+    assert_eq!(updated.to_string(), recorded.to_string());
 
     // Other data of the same kind agree within noise, and say so.
     let data = at("data");

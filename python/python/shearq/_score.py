@@ -31,8 +31,8 @@ class Score:
     ----------
     figures, errors : dict of str to float
         ``q``: quality factor; ``q_dn``: without the noise's power;
-        ``q_calibrated``: after dividing by the measured response squared; ``noise``: of a calibrated ellipticity; ``m_half``: M/2; ``sqrt_a``: √A in 10⁻⁴ (C_ℓ in
-        steradian); ``m_cross``: multiplicative bias by cross-correlation; ``m1``, ``m2``, ``c1``, ``c2``: biases of
+        ``q_calibrated``: after dividing by the measured response squared; ``m_half``: M/2;
+        ``sqrt_a``: √A in 10⁻⁴ (C_ℓ in steradian); ``galaxy_noise``: noise of a calibrated ellipticity; ``m_cross``: multiplicative bias by cross-correlation; ``m1``, ``m2``, ``c1``, ``c2``: biases of
         the components; ``b_power``, ``eb_power``: mean C_ℓ of B and EB in 10⁻⁹ steradian;
         ``sigma_sys_1e4``: what Q is made of, 5·10⁻³/Q, in 10⁻⁴.
     spectrum : structured array of shape (20,)

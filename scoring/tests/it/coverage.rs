@@ -102,7 +102,7 @@ fn errors_are_the_scatter_of_repeated_trials() {
         (Definition::Corrected, kind(4, 0.054, true, 0.0)),
     ] {
         for (name, ratio, share) in coverage(&grid, &kind, definition) {
-            let calibrated = ["q_calibrated", "noise"].contains(&name);
+            let calibrated = ["q_calibrated", "galaxy_noise"].contains(&name);
             if calibrated && share < 0.95 {
                 // A response that is often not told from zero: those that are known are the high ones.
                 assert!(kind.noise > 0.1 || kind.shared, "{kind:?}: {name} {share}");
@@ -129,7 +129,7 @@ fn errors_of_one_image_are_known_but_for_its_noise() {
         m: 0.0,
     };
     for (name, ratio, share) in coverage(&grid, &kind, Definition::Leaderboard) {
-        if ["q_dn", "noise"].contains(&name) {
+        if ["q_dn", "galaxy_noise"].contains(&name) {
             assert_eq!(share, 0.0);
         } else {
             // Nothing but noise is left of σ_sys once the response is divided out: it is of the size of its
