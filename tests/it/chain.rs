@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use serde_json::Value;
+use shearq::report::table::Cell;
 
 use crate::support::{contents, fail, succeed, text};
 
@@ -111,8 +112,10 @@ fn the_chain_ends_in_scores_that_every_format_carries() {
             .unwrap()
             .contains(&q.to_string())
     );
+    let shown = Cell::with_error(q, row["q_error"].as_f64(), 2);
+    let (shown, _) = shown.figures().unwrap();
     for format in ["table", "markdown", "latex"] {
-        assert!(score(format).contains(&format!("{q:.2}")), "{format}");
+        assert!(score(format).contains(&shown), "{format}: {shown}");
     }
     let compared = succeed(&[
         "compare",
