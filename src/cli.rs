@@ -218,9 +218,9 @@ fn width() -> usize {
         .unwrap_or(80)
 }
 
-/// Prints a table for reading, without its columns of detail and cut to the terminal's width.
+/// Prints a table for reading, within the terminal's width.
 fn print_table(table: &Table) -> anyhow::Result<()> {
-    print(&fitted(&table.narrow(), Some(width())))
+    print(&fitted(table, Some(width())))
 }
 
 /// Prints results to standard output; a reader that has gone away is no error.

@@ -89,16 +89,6 @@ impl StampNoise {
         square > freedom + 5.0 * (2.0 * freedom).sqrt()
     }
 
-    /// The same level without correlation.
-    #[must_use]
-    pub fn whitened(&self) -> Self {
-        StampNoise {
-            reach: 0,
-            correlation: vec![1.0],
-            ..self.clone()
-        }
-    }
-
     /// Power at wave vector (kx, ky), in radians per pixel, in units of that of white noise of the same
     /// level, and its derivatives (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y).
     pub(crate) fn power(&self, [kx, ky]: [f64; 2]) -> (f64, [f64; 2]) {

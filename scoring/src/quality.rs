@@ -27,6 +27,17 @@ pub fn quality(bins: &Bins, measured: &[f64; BINS], truth: &[f64; BINS]) -> Qual
     }
 }
 
+/// The same with the measured bandpowers divided by `response`²: what is left once a known response is
+/// divided out of the ellipticities.
+pub fn calibrated_quality(
+    bins: &Bins,
+    measured: &[f64; BINS],
+    truth: &[f64; BINS],
+    response: f64,
+) -> Quality {
+    quality(bins, &measured.map(|power| power / response.powi(2)), truth)
+}
+
 /// Standard error of Q, to first order, where the bandpowers have the covariance `covariance`: that of
 /// σ_sys in units of it, with each term keeping its sign. Where a bin's deviation is of the size of its
 /// own error, so is Q's, and this is a rough guide. Not a number where an estimated covariance gives σ_sys a

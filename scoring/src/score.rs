@@ -13,7 +13,7 @@ use crate::figures::Figures;
 use crate::grid::Grid;
 use crate::matching::ConventionMatch;
 use crate::modes::{Decomposer, Modes};
-use crate::quality::{BiasFits, Quality, bias_fits, quality, quality_error};
+use crate::quality::{BiasFits, Quality, bias_fits, calibrated_quality, quality, quality_error};
 use crate::resample::jackknife_error;
 
 /// Most groups of images that the jackknife leaves out in turn.
@@ -567,7 +567,6 @@ impl SetScorer {
         let cross = self.bins.scored_product(&truth.e, &modes.e);
         let true_power = self.bins.scored_product(&truth.e, &truth.e);
         let m_cross = cross / true_power - 1.0;
-        let calibrated = ee.map(|power| power / (1.0 + m_cross).powi(2));
         let denoised = noise.map(|n| {
             let n = &n[convention.class().index()];
             std::array::from_fn::<f64, BINS, _>(|b| ee[b] - n[b])
@@ -580,7 +579,7 @@ impl SetScorer {
             correlation: self.correlation(modes, truth),
             m_cross,
             quality: quality(&self.bins, &ee, &true_ee),
-            quality_calibrated: quality(&self.bins, &calibrated, &true_ee),
+            quality_calibrated: calibrated_quality(&self.bins, &ee, &true_ee, 1.0 + m_cross),
             quality_dn: denoised
                 .as_ref()
                 .map(|ee| quality(&self.bins, ee, &true_ee)),

@@ -11,7 +11,7 @@ use crate::report::comparison::{compare, compare_runs, q_heat_map};
 use crate::report::figure::{Figure, HeatMap};
 use crate::report::pages;
 use crate::report::table::{Table, TableFormat};
-use crate::results::compare::{Variant, score_all};
+use crate::results::compare::{by_name, score_all};
 use crate::results::conditions::Conditions;
 use crate::results::groups::{Group, Grouping, Order};
 use crate::results::store;
@@ -72,14 +72,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 arguments.settings.way(),
                 arguments.threads.number(),
             )?;
-            let records: Vec<_> = variants.iter().map(Variant::records).collect();
-            let rows: Vec<_> = variants
-                .iter()
-                .zip(&records)
-                .map(|(variant, sets)| (variant.name.clone(), sets.iter().collect()))
-                .collect();
             let table = compare(&variants, arguments.settings.definition());
-            (table, q_heat_map(&rows))
+            (table, q_heat_map(&by_name(&variants)))
         }
     };
     if let Some(path) = &arguments.heat_map {

@@ -19,7 +19,7 @@ use crate::report::pages;
 use crate::report::scores::per_set;
 use crate::report::table::Cell;
 use crate::report::terminal::wrapped;
-use crate::results::compare::{Variant, mean_figure, score_all};
+use crate::results::compare::{by_name, mean_figure, score_all};
 use crate::results::row::SetRecord;
 use crate::results::score::{OWN, score_folder};
 use crate::simulate::set::SimulationSettings;
@@ -86,7 +86,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let scored = score_folder(&data, &folder, &run, &[], options, threads)?;
         let title = format!("Scores of {name} (simulated data)");
         let table = per_set(&scored, &title, options.definition);
-        print_table(&table)?;
+        print_table(&table.narrow())?;
         print("\n")?;
         sections.push(pages::scores(name, &scored, table)?);
         made_by.push((name.to_owned(), toml::to_string(&run.submission)?));
@@ -95,15 +95,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let way = ScoreSettings::default().way();
     let variants = score_all(&folders, &[], None, way, threads)?;
     let table = compare(&variants, options.definition);
-    print_table(&table)?;
-    let records: Vec<_> = variants.iter().map(Variant::records).collect();
-    let rows: Vec<(String, Vec<&SetRecord>)> = variants
-        .iter()
-        .zip(&records)
-        .map(|(variant, sets)| (variant.name.clone(), sets.iter().collect()))
-        .collect();
-    print(&format!("\n{}", wrapped(&verdict(&rows), Some(width()))))?;
-    sections.insert(0, pages::comparison(table, &q_heat_map(&rows))?);
+    print_table(&table.narrow())?;
+    let records = by_name(&variants);
+    print(&format!("\n{}", wrapped(&verdict(&records), Some(width()))))?;
+    sections.insert(0, pages::comparison(table, &q_heat_map(&records))?);
     let report = out.join("report.html");
     pages::save(&report, "Quickstart (simulated data)", sections, made_by)?;
     tell(format_args!(
@@ -115,21 +110,17 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 }
 
 /// Which submission to use, and the figures that say so.
-fn verdict(submissions: &[(String, Vec<&SetRecord>)]) -> String {
-    let of = |sets: &[&SetRecord], name: &str| mean_figure(sets, name);
+fn verdict(submissions: &[(String, Vec<SetRecord>)]) -> String {
+    let calibrated = |sets: &[SetRecord]| mean_figure(sets, "q_calibrated").0;
     let known = submissions
         .iter()
-        .filter(|(_, sets)| of(sets, "q_calibrated").0.is_finite());
-    let best = known.max_by(|a, b| {
-        of(&a.1, "q_calibrated")
-            .0
-            .total_cmp(&of(&b.1, "q_calibrated").0)
-    });
+        .filter(|(_, sets)| calibrated(sets).is_finite());
+    let best = known.max_by(|a, b| calibrated(&a.1).total_cmp(&calibrated(&b.1)));
     let Some((name, sets)) = best else {
         return "So few data tell no submission from another.".into();
     };
-    let shown = |sets: &[&SetRecord], name: &str, decimals: usize| {
-        let (value, error) = of(sets, name);
+    let shown = |sets: &[SetRecord], name: &str, decimals: usize| {
+        let (value, error) = mean_figure(sets, name);
         match Cell::with_error(value, Some(error), decimals).figures() {
             Some((value, Some(error))) => format!("{value} ± {error}"),
             _ => "unknown".into(),

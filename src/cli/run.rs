@@ -166,6 +166,6 @@ pub(super) fn score(
         let text = table.render(TableFormat::Csv);
         atomic::write(out.join(format!("{name}.csv")), text.as_bytes())?;
     }
-    print_table(&table)?;
+    print_table(&table.narrow())?;
     Ok((scored, table))
 }

@@ -1,5 +1,6 @@
 //! Submissions and recorded runs side by side: the means of their figures, differences in Q, and Q per set.
 
+use std::borrow::Borrow;
 use std::collections::BTreeSet;
 
 use ndarray::Array2;
@@ -268,10 +269,10 @@ fn ranges(sets: &[&SetRecord]) -> String {
 }
 
 /// Q of each set (column) and variant or run (row), and means over each row.
-pub fn q_heat_map(variants: &[(String, Vec<&SetRecord>)]) -> HeatMap {
+pub fn q_heat_map<R: Borrow<SetRecord>>(variants: &[(String, Vec<R>)]) -> HeatMap {
     let sets: BTreeSet<u32> = variants
         .iter()
-        .flat_map(|(_, sets)| sets.iter().map(|set| set.set))
+        .flat_map(|(_, sets)| sets.iter().map(|set| set.borrow().set))
         .collect();
     let mut columns: Vec<String> = sets.iter().map(u32::to_string).collect();
     columns.push("mean".into());
@@ -280,6 +281,7 @@ pub fn q_heat_map(variants: &[(String, Vec<&SetRecord>)]) -> HeatMap {
         for (value, set) in row.iter_mut().zip(&sets) {
             *value = own
                 .iter()
+                .map(Borrow::borrow)
                 .find(|own| own.set == *set)
                 .map_or(f64::NAN, |own| own.figures.q);
         }

@@ -5,8 +5,7 @@ use std::path::Path;
 use shearq_scoring::SCORED;
 
 use super::figure::{
-    BarGroup, BarPlot, Figure, FigureError, HeatMap, LinePlot, PanelGrid, PictureFormat, Series,
-    Style,
+    BarGroup, BarPlot, FigureError, HeatMap, LinePlot, PanelGrid, PictureFormat, Series, Style,
 };
 use super::html::{Block, Picture, Report, Section};
 use super::table::{Cell, Table};
@@ -16,7 +15,7 @@ use crate::simulate::kinds::SetKind;
 /// Scores of one submission, with its spectra beside the true ones.
 ///
 /// # Errors
-/// Those of [`Figure::render`].
+/// Those of [`Picture::draw`].
 pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section, FigureError> {
     let mut blocks = vec![Block::Table(table)];
     let with_power: Vec<&ScoredSet> = scored
@@ -25,10 +24,10 @@ pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section,
         .collect();
     if !with_power.is_empty() {
         blocks.push(Block::Figure(
-            draw(
+            Picture::draw(
                 &spectra(name, &with_power),
                 PictureFormat::Svg,
-                &format!("spectra-{name}"),
+                format!("spectra-{name}"),
                 "True and measured E-mode bandpowers of the scored bins, noise included. Where the measured ones keep their distance at high ℓ, it is noise; where they run below, shear is lost.",
             )?,
         ));
@@ -39,7 +38,7 @@ pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section,
 /// Submissions side by side.
 ///
 /// # Errors
-/// Those of [`Figure::render`].
+/// Those of [`Picture::draw`].
 pub fn comparison(table: Table, map: &HeatMap) -> Result<Section, FigureError> {
     let mut blocks = Vec::new();
     for (key, caption) in [
@@ -53,7 +52,7 @@ pub fn comparison(table: Table, map: &HeatMap) -> Result<Section, FigureError> {
         ),
     ] {
         if let Some(bars) = bars(&table, key) {
-            blocks.push(Block::Figure(draw(
+            blocks.push(Block::Figure(Picture::draw(
                 &bars,
                 PictureFormat::Svg,
                 key,
@@ -62,7 +61,7 @@ pub fn comparison(table: Table, map: &HeatMap) -> Result<Section, FigureError> {
         }
     }
     let caption = "Q of each set as the leaderboard has it, and the mean.";
-    blocks.push(Block::Figure(draw(
+    blocks.push(Block::Figure(Picture::draw(
         map,
         PictureFormat::Svg,
         "q-per-set",
@@ -91,15 +90,6 @@ pub fn save(
         settings: made_by,
     }
     .save(path)
-}
-
-fn draw(
-    figure: &dyn Figure,
-    format: PictureFormat,
-    stem: &str,
-    caption: &str,
-) -> Result<Picture, FigureError> {
-    Picture::draw(figure, format, stem, caption)
 }
 
 fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {

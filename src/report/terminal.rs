@@ -73,37 +73,28 @@ pub fn fitted(table: &Table, width: Option<usize>) -> String {
             .map(|k| Column::of(table, k, folded))
             .collect()
     };
-    let total = |columns: &[Column], of: fn(&Column) -> usize| -> usize {
-        columns.iter().map(|column| of(column) + PADDING).sum()
-    };
     let width = width.unwrap_or(usize::MAX);
+    let least = |column: &Column| column.least() + PADDING;
     let mut all = columns(false);
-    if total(&all, Column::least) > width {
+    if all.iter().map(least).sum::<usize>() > width {
         all = columns(true);
     }
-    let mut rest = all.as_slice();
-    if let Some((first, others)) = all.split_first()
-        && total(&all, Column::least) > width
-    {
-        // A part at a time, each with the first column.
-        rest = others;
-        while !rest.is_empty() {
-            let mut taken = 0;
-            let mut used = first.least() + PADDING;
-            while let Some(column) = rest.get(taken)
-                && (taken == 0 || used + column.least() + PADDING <= width)
+    if let Some((first, mut rest)) = all.split_first() {
+        // As many as fit at a time, one at least, each time with the first column.
+        loop {
+            let (mut part, mut used) = (vec![first], least(first));
+            while let Some((next, after)) = rest.split_first()
+                && (part.len() == 1 || used + least(next) <= width)
             {
-                used += column.least() + PADDING;
-                taken += 1;
+                part.push(next);
+                used += least(next);
+                rest = after;
             }
-            let (part, after) = rest.split_at(taken);
-            let part: Vec<&Column> = std::iter::once(first).chain(part).collect();
             text.push_str(&block(&part, width));
-            rest = after;
+            if rest.is_empty() {
+                break;
+            }
         }
-    } else {
-        let part: Vec<&Column> = rest.iter().collect();
-        text.push_str(&block(&part, width));
     }
     for note in &table.notes {
         text.push_str(&wrapped(&escape::line(note), Some(width)));

@@ -1,5 +1,6 @@
 //! Results held against each other: which sets they share, means over them, and paired differences in Q.
 
+use std::borrow::Borrow;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -35,6 +36,12 @@ impl Variant {
         let record = |scored: &ScoredSet| Some(SetRecord::new(scored.set?, scored, String::new()));
         self.sets.iter().filter_map(record).collect()
     }
+}
+
+/// Variants by name with what is kept of their sets, as pictures of several of them take it.
+pub fn by_name(variants: &[Variant]) -> Vec<(String, Vec<SetRecord>)> {
+    let named = |variant: &Variant| (variant.name.clone(), variant.records());
+    variants.iter().map(named).collect()
 }
 
 /// What one variant is before it is scored.
@@ -198,11 +205,12 @@ pub fn common_sets(all: &[Vec<SetRecord>]) -> BTreeSet<u32> {
 }
 
 /// Mean over sets of the figure called `name`, and its error.
-pub fn mean_figure(sets: &[&SetRecord], name: &str) -> (f64, f64) {
+pub fn mean_figure<R: Borrow<SetRecord>>(sets: &[R], name: &str) -> (f64, f64) {
     let value =
         |figures: &Figures| Figures::place(name).map_or(f64::NAN, |place| figures.values()[place]);
     let pairs: Vec<(f64, f64)> = sets
         .iter()
+        .map(Borrow::borrow)
         .map(|set| (value(&set.figures), value(&set.errors)))
         .collect();
     mean_over_sets(&pairs)

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shearq_scoring::quality::{quality, quality_error};
+use shearq_scoring::quality::{calibrated_quality, quality, quality_error};
 use shearq_scoring::{
     BINS, Convention, FieldSum, Figures, Noise, Options, Row, SetImages, SetScore, SetScorer,
     cross_spectrum,
@@ -208,8 +208,7 @@ pub fn run_sets(
 /// which they follow the true ones.
 fn calibrated_q(score: &SetScore, response: &Response) -> f64 {
     let slope = response.slope.iter().sum::<f64>() / 2.0;
-    let calibrated = score.spectra().ee.map(|power| power / (slope * slope));
-    quality(&score.bins, &calibrated, &score.true_ee).q
+    calibrated_quality(&score.bins, &score.spectra().ee, &score.true_ee, slope).q
 }
 
 /// Q of the cross-spectrum of `images`, with its error where that is known.
