@@ -8,7 +8,9 @@ mod calibrate;
 mod check;
 mod choices;
 mod compare;
+mod gather;
 mod help_files;
+mod mean;
 mod measure;
 mod merge;
 mod pack;
@@ -36,10 +38,10 @@ use crate::report::terminal::fitted;
 /// Score and submit weak-lensing shape measurements, and measure them by Hopfield-network
 /// deconvolution.
 ///
-/// Start with `shearq quickstart`. The chain in steps: `simulate` writes GREAT10-like sets (or bring
-/// your own), `measure` turns images into catalogues by a named submission, `score` turns catalogues
+/// Start with `shearq quickstart`. The chain in steps: `simulate` writes GREAT10-like sets (or `gather` takes
+/// stamps of your own), `measure` turns images into catalogues by a named submission, `score` turns catalogues
 /// into Q, M/2 and √A, `compare` puts variants side by side, `pack` and `check` prepare what is sent.
-/// `run` measures and scores in one go; `merge` completes what parts of it on a cluster left.
+/// `mean` ends a field of constant shear. `run` measures and scores in one go; `merge` completes what parts of it on a cluster left.
 #[derive(Debug, Parser)]
 #[command(name = "shearq", version, propagate_version = true)]
 struct Cli {
@@ -56,6 +58,10 @@ enum Command {
     )]
     Simulate(simulate::Arguments),
     #[command(
+        after_help = "Examples:\n  shearq gather --stamps cube.fits --psf star.fits --out data\n  shearq gather --exposure field.fits --positions galaxies.csv --psf stars.fits --out data"
+    )]
+    Gather(gather::Arguments),
+    #[command(
         after_help = "Example:\n  shearq measure --submission 48/linear/star --data data --out linear"
     )]
     Measure(measure::Arguments),
@@ -65,6 +71,8 @@ enum Command {
     Run(run::Arguments),
     #[command(after_help = "Example:\n  shearq merge run --sets all --images 200 --shards 8")]
     Merge(merge::Arguments),
+    #[command(after_help = "Example:\n  shearq mean --measured linear")]
+    Mean(mean::Arguments),
     #[command(
         after_help = "Examples:\n  shearq score --measured linear --wide\n  shearq score --truth truth.csv catalogue-1.csv catalogue-2.csv"
     )]
@@ -134,8 +142,10 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let result = match cli.command {
         Command::Quickstart(arguments) => quickstart::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
+        Command::Gather(arguments) => gather::run(&arguments),
         Command::Measure(arguments) => measure::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
+        Command::Mean(arguments) => mean::run(&arguments),
         Command::Merge(arguments) => merge::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),

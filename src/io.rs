@@ -8,6 +8,7 @@ pub mod fingerprint;
 pub mod fits;
 pub mod layout;
 pub mod listing;
+pub mod mosaic;
 pub mod open;
 pub(crate) mod parquet;
 pub mod psf_table;

@@ -6,6 +6,7 @@
 
 pub mod complete;
 pub mod engine;
+pub mod gather;
 pub mod grid;
 pub mod images;
 pub mod inputs;

@@ -1,7 +1,7 @@
 //! What happens to scores: catalogues become [`score::ScoredSet`]s, of which [`row`] keeps what tables, stores
 //! and comparisons need.
 //!
-//! [`foreign`] reads other programs' catalogues; [`store`] keeps rows in Parquet files, [`conditions`] and
+//! [`mean`] takes means of catalogues, [`foreign`] reads other programs' catalogues; [`store`] keeps rows in Parquet files, [`conditions`] and
 //! [`groups`] choose among them and put them together; [`compare`] holds results against each other, and
 //! [`baseline`] against what they were. Rendering is `report`'s.
 
@@ -10,6 +10,7 @@ pub mod compare;
 pub mod conditions;
 pub mod foreign;
 pub mod groups;
+pub mod mean;
 pub mod row;
 pub mod score;
 pub mod store;

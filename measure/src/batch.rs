@@ -120,7 +120,7 @@ impl Measurer {
             return Err(MeasureError::Noise("not given".into()));
         }
         let mut survey = plan.survey();
-        for at in plan.rows(count) {
+        for at in plan.rows(1, count) {
             survey.add(stamps.index_axis(Axis(0), at))?;
         }
         let noise = survey.noise();

@@ -182,8 +182,10 @@ impl Worker {
             return Err(MeasureError::square("a stamp", stamp.dim(), expected));
         }
         for (row, from) in self.full.chunks_exact_mut(full).zip(stamp.rows()) {
-            for (value, pixel) in row.iter_mut().zip(from) {
-                *value = pixel.to_f32();
+            // Pixels that lie side by side, as those of an image do, are taken several at a time.
+            match from.as_slice() {
+                Some(from) => taken(row, from.iter()),
+                None => taken(row, from.iter()),
             }
         }
         if self.full.iter().any(|v| !v.is_finite()) {
@@ -245,6 +247,12 @@ impl Worker {
                 ..nothing
             },
         })
+    }
+}
+
+fn taken<'a, T: Pixel + 'a>(row: &mut [f32], from: impl Iterator<Item = &'a T>) {
+    for (value, pixel) in row.iter_mut().zip(from) {
+        *value = pixel.to_f32();
     }
 }
 

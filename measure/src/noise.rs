@@ -149,11 +149,13 @@ impl NoisePlan {
         })
     }
 
-    /// The rows of a grid of n × n stamps that are looked at, evenly spread: enough for a thousand stamps,
+    /// Which of `rows` rows of `columns` stamps are looked at, evenly spread: enough for a thousand stamps,
     /// or all.
-    pub fn rows(&self, n: usize) -> Vec<usize> {
-        let count = ENOUGH.div_ceil(n.max(1)).min(n);
-        (0..count).map(|k| (2 * k + 1) * n / (2 * count)).collect()
+    pub fn rows(&self, columns: usize, rows: usize) -> Vec<usize> {
+        let count = ENOUGH.div_ceil(columns.max(1)).min(rows);
+        (0..count)
+            .map(|k| (2 * k + 1) * rows / (2 * count))
+            .collect()
     }
 
     /// A survey of no stamps.
@@ -577,8 +579,11 @@ mod tests {
         assert_eq!((odd.len(), odd[0], odd[5]), (20, (0, 0), (0, 43)));
         assert!(NoisePlan::new(23, 2).is_err());
         let plan = NoisePlan::new(48, 3).unwrap();
-        assert_eq!(plan.rows(3), [0, 1, 2]);
-        assert_eq!(plan.rows(100), [5, 15, 25, 35, 45, 55, 65, 75, 85, 95]);
+        assert_eq!(plan.rows(3, 3), [0, 1, 2]);
+        // Stamps one by one, as in a batch: a thousand of them, not one.
+        assert_eq!(plan.rows(1, 10_000).len(), 1000);
+        assert_eq!(plan.rows(1000, 7), [3]);
+        assert_eq!(plan.rows(100, 100), [5, 15, 25, 35, 45, 55, 65, 75, 85, 95]);
         assert!(plan.survey().noise().is_none());
     }
 }

@@ -11,6 +11,19 @@ use crate::units::{Degrees, Multipole, Pixels, Radians};
 /// the zero mode has a direction. It decides which of the modes at exactly ℓ_min are counted.
 pub(crate) const MODE_OFFSET: f64 = 1e-10;
 
+/// 0-based place along an axis of the stamp that holds the FITS pixel position `position`, `None` before the first.
+///
+/// The 1-based index is round(x/stamp + ½), halves away from zero, as the original takes it.
+pub fn cell_at(position: f64, stamp: Pixels) -> Option<usize> {
+    let index = (position / stamp.0 + 0.5).round();
+    (index >= 1.0).then(|| index as usize - 1)
+}
+
+/// FITS pixel position along an axis of the centre of the stamp at `index`, from 0.
+pub fn centre_of(index: usize, stamp: Pixels) -> f64 {
+    index as f64 * stamp.0 + (stamp.0 + 1.0) / 2.0
+}
+
 /// A square grid of galaxies: `n` × `n` stamps of `stamp` pixels over `field` degrees a side.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Grid {
@@ -79,21 +92,15 @@ impl Grid {
     }
 
     /// 0-based cell `(ix, iy)` of the FITS pixel position `(x, y)`, `None` outside the grid.
-    ///
-    /// The 1-based index is round(x/stamp + ½), halves away from zero, as the original takes it.
     pub fn cell(&self, x: f64, y: f64) -> Option<(usize, usize)> {
-        let index = |v: f64| {
-            let i = (v / self.stamp.0 + 0.5).round();
-            (i >= 1.0 && i <= self.n as f64).then(|| i as usize - 1)
-        };
+        let index = |v: f64| cell_at(v, self.stamp).filter(|&i| i < self.n);
         Some((index(x)?, index(y)?))
     }
 
     /// FITS pixel position (1-based) of the centre of cell `(ix, iy)`: the corner shared by the
     /// four central pixels for an even stamp.
     pub fn centre(&self, ix: usize, iy: usize) -> (f64, f64) {
-        let position = |i: usize| i as f64 * self.stamp.0 + (self.stamp.0 + 1.0) / 2.0;
-        (position(ix), position(iy))
+        (centre_of(ix, self.stamp), centre_of(iy, self.stamp))
     }
 
     /// Side of the field in radians.

@@ -36,7 +36,7 @@ mod ellipticity;
 mod error;
 mod errors;
 mod figures;
-mod grid;
+pub mod grid;
 mod matching;
 pub mod modes;
 pub mod quality;

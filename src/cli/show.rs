@@ -11,6 +11,7 @@ use shearq_submissions::Registry;
 
 use super::{print, tell};
 use crate::io::layout::DataFolder;
+use crate::io::mosaic::Mosaic;
 use crate::pipeline::images::ImageId;
 use crate::pipeline::measure::{ImageSource, psf_of};
 use crate::report::figure::{Figure, PictureFormat};
@@ -72,19 +73,22 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let mut rows = Vec::new();
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
-        let measurer = Measurer::new(&submission, source.stamp())?;
+        let measurer = Measurer::new(&submission, source.mosaic().stamp)?;
         if let Some(plan) = measurer.noise_plan() {
             source.measure_noise(&data, plan)?;
         }
-        let grid = source.grid();
+        let Mosaic {
+            columns,
+            galaxies,
+            stamp: side,
+        } = source.mosaic();
         anyhow::ensure!(
-            index <= grid.cells(),
-            "set {} image {} has {} galaxies; galaxy {index} was asked for",
+            index <= galaxies,
+            "set {} image {} has {galaxies} galaxies; galaxy {index} was asked for",
             image.set,
-            image.image,
-            grid.cells()
+            image.image
         );
-        let (ix, iy) = ((index - 1) % grid.n, (index - 1) / grid.n);
+        let (ix, iy) = ((index - 1) % columns, (index - 1) / columns);
         let row = loop {
             let row = source
                 .next_row()?
@@ -98,7 +102,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let mut worker = measurer.worker();
         worker.set_noise(row.noise.as_ref());
         worker.set_psf(psf.view())?;
-        let stamps = strip(&row.pixels, grid.n, row.stamp)?;
+        let stamps = strip(&row.pixels, columns, side)?;
         let stamp = stamps.index_axis(Axis(0), ix);
         let measured = worker.measure(stamp, row.header_noise)?;
         anyhow::ensure!(

@@ -22,6 +22,9 @@ pub const MAX_STAMP: usize = 1024;
 /// Name of the layout file inside a data folder.
 pub const LAYOUT_FILE: &str = "layout.toml";
 
+/// Name of the table that says which stamp of a gathered image is which.
+const STAMPS: &str = "set{set:02}/stamps-{image:03}.csv";
+
 /// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for the plain
 /// numbers, `{set:02}` and `{image:03}` for zero-padded ones. Wherever it is read from, it is checked.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -191,6 +194,11 @@ impl DataFolder {
     pub fn psf_functional(&self, set: u32, image: u32) -> PathBuf {
         self.root
             .join(fill(&self.layout.psf_functional, set, image))
+    }
+
+    /// Which stamp of an image gathered from others is which.
+    pub fn stamps(&self, set: u32, image: u32) -> PathBuf {
+        self.root.join(fill(STAMPS, set, image))
     }
 
     /// The true shear of a set.

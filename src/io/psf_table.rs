@@ -3,21 +3,59 @@
 use std::path::Path;
 
 use shearq_measure::{FunctionalPsf, PsfProfile};
-use shearq_scoring::{Grid, Shear};
+use shearq_scoring::Shear;
 
 use super::atomic;
 use super::error::FileError;
+use super::mosaic::Mosaic;
 use super::open;
+
+/// A PSF and the position it belongs to.
+pub type Placed = ((f64, f64), FunctionalPsf);
 
 /// Header of the table.
 const HEADER: &str = "x,y,profile,beta,fwhm,e1,e2";
 
-/// PSFs of an image: one, or one per galaxy in the order `iy·n + ix`.
+/// PSFs of an image: one, or one per galaxy along the rows of the mosaic.
 ///
 /// # Errors
 /// Where the file cannot be read, a row is not valid, or the rows are neither one nor one per
-/// galaxy of the grid.
-pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
+/// galaxy.
+pub fn read(path: &Path, mosaic: &Mosaic) -> Result<Vec<FunctionalPsf>, FileError> {
+    let rows = read_all(path)?;
+    if let [(_, psf)] = rows.as_slice() {
+        return Ok(vec![*psf]);
+    }
+    let mut field = vec![None; mosaic.galaxies];
+    for ((x, y), psf) in &rows {
+        let place = mosaic.place(*x, *y).ok_or_else(|| {
+            FileError::new(path, format!("the position ({x}, {y}) is outside the grid"))
+        })?;
+        if field[place].replace(*psf).is_some() {
+            let message = format!("the galaxy at ({x}, {y}) has two rows; expected one");
+            return Err(FileError::new(path, message));
+        }
+    }
+    field
+        .into_iter()
+        .collect::<Option<Vec<_>>>()
+        .ok_or_else(|| {
+            FileError::new(
+                path,
+                format!(
+                    "{} rows; expected one, or one for each of the {} galaxies",
+                    rows.len(),
+                    mosaic.galaxies
+                ),
+            )
+        })
+}
+
+/// PSFs of a table, with their positions, in its order.
+///
+/// # Errors
+/// Where the file cannot be read, or a row is not valid.
+pub fn read_all(path: &Path) -> Result<Vec<Placed>, FileError> {
     const DOING: &str = "cannot read the PSF parameters";
     let text = open::read_to_string(path, open::DATA).map_err(FileError::doing(path, DOING))?;
     let mut reader = csv::ReaderBuilder::new()
@@ -74,39 +112,14 @@ pub fn read(path: &Path, grid: &Grid) -> Result<Vec<FunctionalPsf>, FileError> {
             .map_err(|error| wrong(error.to_string()))?;
         rows.push(((parse("x", x)?, parse("y", y)?), psf));
     }
-    if let [(_, psf)] = rows.as_slice() {
-        return Ok(vec![*psf]);
-    }
-    let mut field = vec![None; grid.cells()];
-    for ((x, y), psf) in &rows {
-        let (ix, iy) = grid.cell(*x, *y).ok_or_else(|| {
-            FileError::new(path, format!("the position ({x}, {y}) is outside the grid"))
-        })?;
-        if field[iy * grid.n + ix].replace(*psf).is_some() {
-            let message = format!("the galaxy at ({x}, {y}) has two rows; expected one");
-            return Err(FileError::new(path, message));
-        }
-    }
-    field
-        .into_iter()
-        .collect::<Option<Vec<_>>>()
-        .ok_or_else(|| {
-            FileError::new(
-                path,
-                format!(
-                    "{} rows; expected one, or one for each of the {} galaxies",
-                    rows.len(),
-                    grid.cells()
-                ),
-            )
-        })
+    Ok(rows)
 }
 
 /// Writes PSFs with their positions.
 ///
 /// # Errors
 /// Where the file cannot be written.
-pub fn write(path: &Path, rows: &[((f64, f64), FunctionalPsf)]) -> Result<(), FileError> {
+pub fn write(path: &Path, rows: &[Placed]) -> Result<(), FileError> {
     let mut text = format!("{HEADER}\n");
     for ((x, y), psf) in rows {
         // A Kolmogorov PSF has no β; the column keeps the place with that of a Moffat.

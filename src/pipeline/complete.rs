@@ -15,6 +15,7 @@ use super::simulate::SimulationRecord;
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
 use crate::io::layout::{DataFolder, read_truth_rows};
+use crate::io::mosaic::Mosaic;
 use crate::io::psf_table;
 use crate::io::run::{Run, Source};
 use crate::io::table::{self, kept, most_rows, read_metadata};
@@ -128,7 +129,7 @@ impl Results<'_> {
     fn cells(&self, id: ImageId) -> Result<usize, PipelineError> {
         let settings = match self {
             Results::Catalogues { run, data, .. } => match &run.source {
-                Source::Folder { .. } => return Ok(open_galaxies(data, id)?.1.cells()),
+                Source::Folder { .. } => return Ok(open_galaxies(data, id)?.1.galaxies),
                 Source::Simulated(settings) => settings,
             },
             Results::Images { record, .. } => &record.settings,
@@ -226,7 +227,10 @@ fn check_image(
     let field = Degrees(data.layout().field_degrees);
     let grid =
         Grid::new(n, Pixels(STAMP as f64), field).map_err(|error| FileError::new(&path, error))?;
-    psf_table::read(&data.psf_functional(id.set, id.image), &grid)?;
+    psf_table::read(
+        &data.psf_functional(id.set, id.image),
+        &Mosaic::square(n, STAMP),
+    )?;
     let intrinsic = data.intrinsic(id.set, id.image);
     check_rows(
         &intrinsic,

@@ -8,6 +8,7 @@ use shearq_scoring::{Grid, Row};
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
 use crate::io::layout::{DataFolder, MAX_STAMP};
+use crate::io::mosaic::Mosaic;
 
 /// Pixels a side of a stamp of an image: its header's STAMP, or else that of the data's layout.
 ///
@@ -17,7 +18,8 @@ fn stamp_of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result
     Ok(whole(image, path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp))
 }
 
-/// Grid of an image, and the pixels a side of its stamps.
+/// The stamps of an image: n × n of them where its header has NGRID, NSTAMPS along rows as wide as the image is
+/// where it has that, and as many as there is room for otherwise.
 ///
 /// # Errors
 /// Where the image is not made of whole stamps, as many as its header says.
@@ -25,21 +27,52 @@ pub(super) fn of_image(
     data: &DataFolder,
     path: &Path,
     image: &ImageReader,
-) -> Result<(Grid, usize), FileError> {
+) -> Result<Mosaic, FileError> {
     let stamp = stamp_of_image(data, path, image)?;
-    let n = whole(image, path, "NGRID", image.width())?.unwrap_or(image.width() / stamp);
-    if image.width() != n * stamp || image.height() != n * stamp {
+    let (width, height) = (image.width(), image.height());
+    let (columns, rows) = match whole(image, path, "NGRID", width)? {
+        Some(n) => (n, n),
+        None => (width / stamp, height / stamp),
+    };
+    if columns == 0 || rows == 0 || (width, height) != (columns * stamp, rows * stamp) {
+        let (columns, rows) = (columns.max(1), rows.max(1));
         let message = format!(
-            "the image is {} × {} pixels; expected {n} × {n} stamps of {stamp} pixels a side (the header key STAMP, or `stamp` in layout.toml, says how large they are)",
-            image.width(),
-            image.height()
+            "the image is {width} × {height} pixels; expected {columns} × {rows} stamps of {stamp} pixels a side (the header key STAMP, or `stamp` in layout.toml, says how large they are)"
+        );
+        return Err(FileError::new(path, message));
+    }
+    let most = columns * rows;
+    let galaxies = whole(image, path, "NSTAMPS", most)?.unwrap_or(most);
+    let mosaic = Mosaic {
+        columns,
+        galaxies,
+        stamp,
+    };
+    if mosaic.rows() != rows {
+        let message = format!(
+            "the header key NSTAMPS is {galaxies}; expected more than {}, as there are {rows} rows of {columns} stamps",
+            most - columns
+        );
+        return Err(FileError::new(path, message));
+    }
+    Ok(mosaic)
+}
+
+/// The grid that an image's stamps are on, for scoring.
+///
+/// # Errors
+/// Where they are not as many in a row as there are rows, or too few or many.
+fn square(data: &DataFolder, path: &Path, mosaic: &Mosaic) -> Result<Grid, FileError> {
+    let (n, rows) = (mosaic.columns, mosaic.rows());
+    if mosaic.galaxies != n * n {
+        let message = format!(
+            "there are {} stamps in {rows} rows of {n}; scoring expects as many rows as columns, all of them full",
+            mosaic.galaxies
         );
         return Err(FileError::new(path, message));
     }
     let field = Degrees(data.layout().field_degrees);
-    let grid =
-        Grid::new(n, Pixels(stamp as f64), field).map_err(|error| FileError::new(path, error))?;
-    Ok((grid, stamp))
+    Grid::new(n, Pixels(mosaic.stamp as f64), field).map_err(|error| FileError::new(path, error))
 }
 
 /// Pixels a side of the stamps of a set: those of its first image, or of the data's layout where there
@@ -62,7 +95,7 @@ pub(super) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>
     let images = data.images(&[set])?.of_set(set);
     let first = images.first().map(|(_, path)| {
         let image = ImageReader::open(path)?;
-        Ok(of_image(data, path, &image)?.0)
+        square(data, path, &of_image(data, path, &image)?)
     });
     first.transpose()
 }

@@ -4,12 +4,11 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2, Axis};
+use ndarray::{Array2, ArrayView2, Axis, Slice};
 use shearq_measure::{
     Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, StampNoise, Worker, calibrate,
     star_psf, strip,
 };
-use shearq_scoring::Grid;
 use shearq_submissions::{EllipticityType, NoiseSource, PsfForm, Submission};
 use shearq_tables::polars::{Column, DataFrame};
 use shearq_tables::{TableError, frame};
@@ -22,6 +21,7 @@ use super::inputs::Inputs;
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
 use crate::io::layout::{DataFolder, MAX_STAMP};
+use crate::io::mosaic::Mosaic;
 use crate::io::psf_table;
 use crate::io::run::{RUN_FILE, Run, claim};
 use crate::io::table;
@@ -55,14 +55,12 @@ pub enum RowPsf {
 pub struct StampRow {
     /// The image.
     pub id: ImageId,
-    /// Row on the grid, from 0.
+    /// Row of the mosaic, from 0.
     pub iy: usize,
-    /// The image's grid.
-    pub grid: Grid,
-    /// `stamp` rows of pixels of the image.
+    /// The image's stamps.
+    pub mosaic: Mosaic,
+    /// The rows of pixels of the image that hold them.
     pub pixels: Vec<f32>,
-    /// Pixels a side of a stamp.
-    pub stamp: usize,
     /// NOISESIG.
     pub header_noise: Option<f64>,
     /// The noise as measured on the image, where the submission asks for that.
@@ -75,10 +73,10 @@ pub struct StampRow {
 pub struct MeasuredRow {
     /// The image.
     pub id: ImageId,
-    /// Row on the grid, from 0.
+    /// Row of the mosaic, from 0.
     pub iy: usize,
-    /// The image's grid.
-    pub grid: Grid,
+    /// The image's stamps.
+    pub mosaic: Mosaic,
     /// One per galaxy.
     pub galaxies: Vec<Measurement>,
 }
@@ -99,8 +97,7 @@ impl AsMut<[Measurement]> for MeasuredRow {
 pub struct ImageSource {
     id: ImageId,
     image: ImageReader,
-    grid: Grid,
-    stamp: usize,
+    mosaic: Mosaic,
     header_noise: Option<f64>,
     noise: Option<Arc<StampNoise>>,
     psf: PsfSource,
@@ -126,7 +123,8 @@ impl ImageSource {
         id: ImageId,
         submission: &Submission,
     ) -> Result<Self, PipelineError> {
-        let (image, grid, stamp) = open_galaxies(data, id)?;
+        let (image, mosaic) = open_galaxies(data, id)?;
+        let stamp = mosaic.stamp;
         if stamp < submission.stamp.size {
             return Err(FileError::new(
                 data.galaxies(id.set, id.image),
@@ -149,25 +147,19 @@ impl ImageSource {
             return Err(FileError::new(data.galaxies(id.set, id.image), message).into());
         }
         Ok(ImageSource {
-            psf: open_psf(data, id, submission, &grid)?,
+            psf: open_psf(data, id, submission, &mosaic)?,
             id,
             image,
-            grid,
-            stamp,
+            mosaic,
             header_noise,
             noise: None,
             next: 0,
         })
     }
 
-    /// Pixels a side of a stamp.
-    pub fn stamp(&self) -> usize {
-        self.stamp
-    }
-
-    /// The image's grid.
-    pub fn grid(&self) -> Grid {
-        self.grid
+    /// The image's stamps.
+    pub fn mosaic(&self) -> Mosaic {
+        self.mosaic
     }
 
     /// Measures the noise of the image on its stamps, for the rows that follow and for the caller.
@@ -181,14 +173,15 @@ impl ImageSource {
     ) -> Result<Arc<StampNoise>, PipelineError> {
         let path = data.galaxies(self.id.set, self.id.image);
         let mut image = ImageReader::open(&path)?;
-        let n = self.grid.n;
+        let Mosaic { columns, stamp, .. } = self.mosaic;
         let mut survey = plan.survey();
         let mut next = 0;
-        for row in plan.rows(n) {
-            image.skip_rows((row - next) * self.stamp);
+        for row in plan.rows(columns, self.mosaic.rows()) {
+            image.skip_rows((row - next) * stamp);
             next = row + 1;
-            let pixels = image.read_rows(self.stamp)?;
-            for stamp in strip(&pixels, n, self.stamp)?.outer_iter() {
+            let pixels = image.read_rows(stamp)?;
+            let stamps = strip(&pixels, columns, stamp)?;
+            for stamp in stamps.outer_iter().take(self.mosaic.of_row(row)) {
                 survey.add(stamp)?;
             }
         }
@@ -206,18 +199,18 @@ impl ImageSource {
     /// # Errors
     /// Where it cannot be read.
     pub fn next_row(&mut self) -> Result<Option<StampRow>, PipelineError> {
-        if self.next == self.grid.n {
+        let mosaic = self.mosaic;
+        if self.next == mosaic.rows() {
             return Ok(None);
         }
         let iy = self.next;
         self.next += 1;
-        let n = self.grid.n;
+        let first = iy * mosaic.columns;
         Ok(Some(StampRow {
             id: self.id,
             iy,
-            grid: self.grid,
-            pixels: self.image.read_rows(self.stamp)?,
-            stamp: self.stamp,
+            mosaic,
+            pixels: self.image.read_rows(mosaic.stamp)?,
             header_noise: self.header_noise,
             noise: self.noise.clone(),
             psf: match &mut self.psf {
@@ -227,24 +220,23 @@ impl ImageSource {
                     side: *side,
                 },
                 PsfSource::Functional(field) => {
-                    RowPsf::Functional(field[iy * n..(iy + 1) * n].to_vec())
+                    RowPsf::Functional(field[first..first + mosaic.of_row(iy)].to_vec())
                 }
             },
         }))
     }
 }
 
-/// Opens the galaxies of an image; their grid and the side of a stamp are those of its header, or of
-/// the data's layout.
+/// Opens the galaxies of an image, whose stamps are those of its header, or of the data's layout.
 pub(super) fn open_galaxies(
     data: &DataFolder,
     id: ImageId,
-) -> Result<(ImageReader, Grid, usize), PipelineError> {
+) -> Result<(ImageReader, Mosaic), PipelineError> {
     let path = data.galaxies(id.set, id.image);
     let image = ImageReader::open(&path)?;
-    let (grid, stamp) = grid::of_image(data, &path, &image)?;
-    check_strip(&path, grid.n, stamp)?;
-    Ok((image, grid, stamp))
+    let mosaic = grid::of_image(data, &path, &image)?;
+    check_strip(&path, mosaic.columns, mosaic.stamp)?;
+    Ok((image, mosaic))
 }
 
 /// Checks that a row of `n` stamps of `side` pixels a side is one that can be held in memory.
@@ -263,13 +255,13 @@ fn open_psf(
     data: &DataFolder,
     id: ImageId,
     submission: &Submission,
-    grid: &Grid,
+    mosaic: &Mosaic,
 ) -> Result<PsfSource, PipelineError> {
     let size = submission.psf.size;
     match submission.psf.form {
         PsfForm::Functional => {
             let path = data.psf_functional(id.set, id.image);
-            let rows = psf_table::read(&path, grid)?;
+            let rows = psf_table::read(&path, mosaic)?;
             if let Some(wide) = rows.iter().find(|psf| psf.fwhm > size as f64) {
                 let message = format!(
                     "a PSF has a FWHM of {} px; expected at most the {size} pixels a side of the submission's PSF stamp",
@@ -296,18 +288,16 @@ fn open_psf(
             let path = data.psf_star(id.set, id.image);
             let mut image = ImageReader::open(&path)?;
             let (width, height) = (image.width(), image.height());
-            if width != height {
-                return Err(FileError::new(
-                    &path,
-                    format!("the star image is {width} × {height} pixels; expected a square"),
-                )
-                .into());
-            }
-            let n = grid.n;
+            let (columns, rows) = (mosaic.columns, mosaic.rows());
             let side = match whole(&image, &path, "STAMP", MAX_STAMP)? {
                 Some(side) => side,
-                // One star is never as large as a grid of the smallest PSF stamps that could be cut.
-                None if width >= n * size && width.is_multiple_of(n) => width / n,
+                // One star is never as large as a mosaic of the smallest PSF stamps that could be cut.
+                None if width >= columns * size
+                    && width.is_multiple_of(columns)
+                    && height == rows * (width / columns) =>
+                {
+                    width / columns
+                }
                 None => width,
             };
             if side < size {
@@ -315,16 +305,17 @@ fn open_psf(
                     format!("the PSF stamp has {side} pixels a side; the submission needs {size}");
                 return Err(FileError::new(&path, message).into());
             }
-            if side != width && side * n == width {
-                check_strip(&path, n, side)?;
+            let one = (width, height) == (side, side);
+            if mosaic.galaxies > 1 && (width, height) == (columns * side, rows * side) {
+                check_strip(&path, columns, side)?;
                 return Ok(PsfSource::Stars {
                     image: Box::new(image),
                     side,
                 });
             }
-            if side != width || side > MAX_STAMP {
+            if !one || side > MAX_STAMP {
                 let message = format!(
-                    "the star image is {width} pixels a side; expected one stamp, or {n} × {n} as there are galaxies, of {} pixels",
+                    "the star image is {width} × {height} pixels; expected one stamp, or {columns} × {rows} as there are galaxies, of {0} × {0} pixels",
                     side.min(MAX_STAMP)
                 );
                 return Err(FileError::new(&path, message).into());
@@ -343,15 +334,21 @@ fn open_psf(
 /// # Errors
 /// Where the row's stamps have other sizes than planned.
 pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, PipelineError> {
-    let (n, noise) = (row.grid.n, row.header_noise);
+    let Mosaic { columns, stamp, .. } = row.mosaic;
+    let noise = row.header_noise;
     worker.set_noise(row.noise.as_ref());
-    let stamps = strip(&row.pixels, n, row.stamp)?;
+    // Behind the last galaxy there is nothing to measure.
+    let here = Slice::from(..row.mosaic.of_row(row.iy));
+    let stamps = strip(&row.pixels, columns, stamp)?;
+    let stamps = stamps.slice_axis(Axis(0), here);
     let galaxies = match &row.psf {
         RowPsf::Shared(psf) => {
             worker.measure_each(stamps, Psfs::<f32>::Prepared(psf.view()), noise)
         }
         RowPsf::Stars { pixels, side } => {
-            worker.measure_each(stamps, Psfs::Stars(strip(pixels, n, *side)?), noise)
+            let stars = strip(pixels, columns, *side)?;
+            let stars = stars.slice_axis(Axis(0), here);
+            worker.measure_each(stamps, Psfs::Stars(stars), noise)
         }
         RowPsf::Functional(field) => {
             worker.measure_each(stamps, Psfs::<f32>::Functional(field), noise)
@@ -360,7 +357,7 @@ pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, P
     Ok(MeasuredRow {
         id: row.id,
         iy: row.iy,
-        grid: row.grid,
+        mosaic: row.mosaic,
         galaxies: galaxies?,
     })
 }
@@ -373,7 +370,7 @@ pub fn psf_of(row: &StampRow, ix: usize, size: usize) -> Result<Array2<f64>, Pip
     Ok(match &row.psf {
         RowPsf::Shared(psf) => psf.as_ref().clone(),
         RowPsf::Stars { pixels, side } => {
-            let stars = strip(pixels, row.grid.n, *side)?;
+            let stars = strip(pixels, row.mosaic.columns, *side)?;
             star_psf(stars.index_axis(Axis(0), ix), size)?
         }
         RowPsf::Functional(field) => field[ix].stamp(size),
@@ -437,7 +434,9 @@ pub fn measure_folder(
         return Ok(summary);
     };
     // All images of a folder have stamps of one size; each is checked when it is opened.
-    let stamp = ImageSource::open(data, first, &run.submission)?.stamp;
+    let stamp = ImageSource::open(data, first, &run.submission)?
+        .mosaic
+        .stamp;
     let measurer = Measurer::new(&run.submission, stamp)?;
     for doubt in noise_doubts(data, first, &measurer)? {
         progress.note(&doubt);
@@ -459,9 +458,9 @@ pub fn measure_folder(
         |worker, row: StampRow| measure_row(worker, &row),
         |row: MeasuredRow| {
             progress.advance(row.galaxies.len() as u64);
-            let (id, grid) = (row.id, row.grid);
+            let (id, mosaic) = (row.id, row.mosaic);
             rows.push(row);
-            if rows.len() == grid.n {
+            if rows.len() == mosaic.rows() {
                 calibrate(&run.submission, &mut rows);
                 let prints = receive.recv().unwrap_or_default();
                 write_catalogue(run, out, &rows, prints)?;
@@ -549,8 +548,8 @@ pub fn galaxies_to_do(
     let Some(&first) = todo.first() else {
         return Ok(0);
     };
-    let grid = ImageSource::open(data, first, &run.submission)?.grid();
-    Ok((todo.len() * grid.cells()) as u64)
+    let mosaic = ImageSource::open(data, first, &run.submission)?.mosaic;
+    Ok((todo.len() * mosaic.galaxies) as u64)
 }
 
 /// Those of `images` that have no catalogue yet, and those that have one.
@@ -571,11 +570,11 @@ fn read_images(
         opened(id)?;
         let mut source = ImageSource::open(data, id, measurer.submission())?;
         let stamp = measurer.full();
-        if source.stamp != stamp {
+        let found = source.mosaic.stamp;
+        if found != stamp {
             let path = data.galaxies(id.set, id.image);
             let message = format!(
-                "the stamps have {} pixels a side; those of the images before have {stamp}",
-                source.stamp
+                "the stamps have {found} pixels a side; those of the images before have {stamp}"
             );
             return Err(FileError::new(path, message).into());
         }
@@ -591,7 +590,7 @@ fn read_images(
     Ok(())
 }
 
-/// Catalogue of one image from its rows of stamps, in grid order.
+/// Catalogue of one image from its rows of stamps, in order.
 ///
 /// # Errors
 /// Where polars cannot make it.
@@ -615,7 +614,7 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<DataFrame, TableError> {
     let energy = |g: &Measurement| g.descent.map_or(f64::NAN, |d| d.energy);
     let first = |g: &Measurement| g.descent.map_or(f64::NAN, |d| d.first_energy);
     let (x, y): (Vec<f64>, Vec<f64>) = galaxies()
-        .map(|(row, ix, _)| row.grid.centre(ix, row.iy))
+        .map(|(row, ix, _)| row.mosaic.centre(ix, row.iy))
         .unzip();
     frame(vec![
         Column::new("x".into(), x),
@@ -644,7 +643,7 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<DataFrame, TableError> {
     ])
 }
 
-/// Writes the catalogue of one image from its rows of stamps, in grid order; `prints` are the
+/// Writes the catalogue of one image from its rows of stamps, in order; `prints` are the
 /// fingerprints of what they were measured from.
 pub(super) fn write_catalogue(
     run: &Run,

@@ -14,6 +14,7 @@ use super::images::ImageId;
 use super::measure::{MeasuredRow, RowPsf, StampRow, Summary, measure_row, to_do, write_catalogue};
 use super::{PipelineError, simulate};
 use crate::io::layout::DataFolder;
+use crate::io::mosaic::Mosaic;
 use crate::io::run::{RUN_FILE, Run, claim};
 use crate::simulate::render::RenderScratch;
 use crate::simulate::set::{
@@ -192,7 +193,7 @@ fn noises(
     };
     let mut render = RenderScratch::new();
     // Plans differ in their lags alone.
-    for iy in plan.rows(n) {
+    for iy in plan.rows(n, n) {
         let (pixels, _) = simulate::draw_stamps(set, fields, iy, &mut render);
         for stamp in strip(&pixels, n, STAMP)?.outer_iter() {
             for survey in surveys.iter_mut().flatten() {
@@ -266,9 +267,8 @@ pub(crate) fn measure_strip(
             image: fields.image,
         },
         iy,
-        grid: set.grid(),
+        mosaic: Mosaic::square(set.grid().n, STAMP),
         pixels,
-        stamp: STAMP,
         header_noise: Some(NOISE_SIGMA),
         noise: None,
         psf: RowPsf::Functional(Vec::new()),

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use shearq_scoring::quality::{calibrated_quality, quality, quality_error};
 use shearq_scoring::{
-    BINS, Convention, FieldSum, Figures, Noise, Options, Row, SetImages, SetScore, SetScorer,
+    BINS, Convention, FieldSum, Figures, Grid, Noise, Options, Row, SetImages, SetScore, SetScorer,
     cross_spectrum,
 };
 use shearq_submissions::{Submission, checked_name};
@@ -149,7 +149,7 @@ pub fn run_sets(
             |image| {
                 let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
                 for ((sum, regression), rows) in each {
-                    sum.add(&field_sum(rows));
+                    sum.add(&field_sum(&grid, rows));
                     let measured = rows.iter().flat_map(|row| &row.galaxies);
                     regression.add(image.observed.iter().copied().zip(measured));
                 }
@@ -243,12 +243,11 @@ fn distinct(submissions: &[Submission]) -> (Vec<Submission>, Vec<usize>) {
 }
 
 /// One image's measurements on the grid; flagged galaxies count as missing.
-pub fn field_sum(rows: &[MeasuredRow]) -> FieldSum {
-    let grid = rows[0].grid;
-    let mut sum = FieldSum::new(&grid);
+pub fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> FieldSum {
+    let mut sum = FieldSum::new(grid);
     let galaxies = rows.iter().flat_map(|row| {
         row.galaxies.iter().enumerate().map(|(ix, galaxy)| {
-            let (x, y) = row.grid.centre(ix, row.iy);
+            let (x, y) = row.mosaic.centre(ix, row.iy);
             Row {
                 x,
                 y,
@@ -257,6 +256,6 @@ pub fn field_sum(rows: &[MeasuredRow]) -> FieldSum {
             }
         })
     });
-    sum.add_image(&grid, galaxies);
+    sum.add_image(grid, galaxies);
     sum
 }

@@ -238,6 +238,7 @@ def main():
     parse = argparse.ArgumentParser(description=__doc__)
     parse.add_argument("--binary", default="target/release/shearq", help="shearq")
     parse.add_argument("--galaxies", type=int, default=50_000, help="stamps of a cell (a kind of set, a row)")
+    parse.add_argument("--seen", type=int, help="stamps of a cell in the first look at all readings (default: a tenth of --galaxies)")
     parse.add_argument("--calibration", type=int, default=200, help="galaxies of Sect. 4's curves; 0 leaves them out")
     parse.add_argument("--readings", type=Path, default=HERE / "readings.toml")
     parse.add_argument("--statements", type=Path, default=HERE / "statements.toml")
@@ -272,16 +273,17 @@ def main():
         order = sorted(results, key=lambda name: results[name]["marginal"])
         return order[:most] + [name for name in ("R0",) if name in order[most:]]
 
-    seen = look("seen", found, FIRST_ROWS, max(given.galaxies // 10, 1), tune)
+    first = given.seen or max(given.galaxies // 10, 1)
+    seen = look("seen", found, FIRST_ROWS, first, tune)
     tuned = look("tuned", best(seen, 2 * given.keep), FIRST_ROWS, given.galaxies, tune)
     judged = look("judged", best(tuned, given.keep), list(ROWS), given.galaxies, last)
     final = sorted(judged, key=lambda name: judged[name]["marginal"])
     free = len(score.NUISANCES)
-    parts = [table(seen, found, f"Seen on seed {tune} with a tenth of the galaxies: {len(found)} readings")]
+    parts = [table(seen, found, f"Seen on seed {tune} with {first} stamps a cell: {len(found)} readings")]
     if judged:
         parts += [
-            table(tuned, found, f"Tuned on seed {tune}"),
-            table(judged, found, f"Judged on seed {last}"),
+            table(tuned, found, f"Tuned on seed {tune} with {given.galaxies} stamps a cell"),
+            table(judged, found, f"Judged on seed {last} with {given.galaxies} stamps a cell"),
             statement_table(judged, statements, final),
             f"Best: **{final[0]}**, with {found[final[0]]['choices']} settings read otherwise than by the named "
             f"submissions and {free} nuisances, on {len(judged[final[0]]['statements'])} statements.\n",

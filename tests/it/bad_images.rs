@@ -549,7 +549,7 @@ fn stars_that_cannot_be_used_are_refused_with_the_reason() {
         ),
         (
             fits_image(-32, &[side, 40], &[], &floats(&pixels[..side * 40])),
-            &["48 × 40 pixels; expected a square"],
+            &["48 × 40 pixels; expected one stamp, or 8 × 8"],
         ),
         (
             fits_image(

@@ -16,6 +16,7 @@ mod figures;
 mod fuzz;
 mod galsim_galaxies;
 mod galsim_measured;
+mod gathered;
 mod identity;
 mod killed;
 mod limits;

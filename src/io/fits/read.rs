@@ -27,11 +27,15 @@ const TFLOAT: c_int = 42;
 /// TUINT, TINT, TULONG, TLONG, TFLOAT, TULONGLONG, TLONGLONG, TDOUBLE.
 const NUMBERS: [c_int; 12] = [11, 12, 20, 21, 30, 31, 40, 41, 42, 80, 81, 82];
 
-/// An image open for reading.
+/// An image, or a cube of several of one size, open for reading.
 pub struct ImageReader {
     file: File,
     width: usize,
     height: usize,
+    /// Images of a cube, one of a plain image.
+    planes: usize,
+    /// Whether nothing is read after it, so that a compressed file has to end well.
+    last: bool,
     next_row: usize,
     pixels: Pixels,
 }
@@ -42,6 +46,13 @@ enum Pixels {
     Plain(u64),
     /// By tiles.
     Tiles(Tiles),
+}
+
+/// Dimensions that an image may have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Dimensions {
+    Two,
+    TwoOrThree,
 }
 
 impl ImageReader {
@@ -62,12 +73,60 @@ impl ImageReader {
                 )));
             }
         }
+        ImageReader::here(file, place, Dimensions::Two)
+    }
+
+    /// Opens the first image or cube of a file of which more may follow. The planes of a cube are read as if
+    /// their rows were those of one image.
+    ///
+    /// # Errors
+    /// Where the file cannot be read, holds no image, or one of other dimensions, of no sensible size, or not
+    /// all of it.
+    pub fn open_stack(path: impl AsRef<Path>) -> Result<Self, FileError> {
+        let path = path.as_ref();
+        let file = File::open(path, "image")?;
+        if !file.sides()?.is_empty() {
+            return ImageReader::here(file, "primary", Dimensions::TwoOrThree);
+        }
+        ImageReader::after(file)?
+            .ok_or_else(|| FileError::new(path, "there is no image in this file"))
+    }
+
+    /// The next image or cube of the file, `None` after the last. Tables are passed over.
+    ///
+    /// # Errors
+    /// As [`ImageReader::open_stack`].
+    pub fn next_stack(self) -> Result<Option<Self>, FileError> {
+        ImageReader::after(self.file)
+    }
+
+    fn after(mut file: File) -> Result<Option<Self>, FileError> {
+        while file.next()? {
+            if file.is_image()? && !file.sides()?.is_empty() {
+                return ImageReader::here(file, "next", Dimensions::TwoOrThree).map(Some);
+            }
+        }
+        Ok(None)
+    }
+
+    /// The image that `file` is at.
+    fn here(mut file: File, place: &str, dimensions: Dimensions) -> Result<Self, FileError> {
         let sides = file.sides()?;
-        let &[x, y] = sides.as_slice() else {
-            return Err(file.fault(format!(
-                "the {place} image has {} dimensions; expected 2",
-                sides.len()
-            )));
+        let (x, y, z) = match (sides.as_slice(), dimensions) {
+            (&[x, y], _) => (x, y, 1),
+            (&[x, y, z], Dimensions::TwoOrThree) => (x, y, z),
+            (_, Dimensions::Two) => {
+                return Err(file.fault(format!(
+                    "the {place} image has {} dimensions; expected 2",
+                    sides.len()
+                )));
+            }
+            (_, Dimensions::TwoOrThree) => {
+                return Err(file.fault(format!(
+                    "the {place} image has {} dimensions; expected 2, or 3 of a cube",
+                    sides.len()
+                )));
+            }
         };
         let side = |found: i64| {
             usize::try_from(found)
@@ -79,17 +138,24 @@ impl ImageReader {
                 "the image is {x} × {y} pixels; expected 1 to {MAX_SIDE} a side"
             )));
         };
+        let planes = usize::try_from(z).ok();
+        let Some(planes) = planes.filter(|planes| (1..=MAX_ROWS).contains(planes)) else {
+            return Err(file.fault(format!("the cube has {z} planes; expected 1 to {MAX_ROWS}")));
+        };
         let pixels = match file.take_tiling()? {
             Some(tiling) => Pixels::Tiles(Tiles::open(&file, tiling)?),
             None => Pixels::Plain(file.pixel_bytes()?),
         };
         if let Pixels::Plain(bytes) = pixels {
-            file.expect(width as u64 * height as u64 * bytes)?;
+            let pixels = (width as u64 * height as u64).saturating_mul(planes as u64);
+            file.expect(pixels.saturating_mul(bytes))?;
         }
         Ok(ImageReader {
             file,
             width,
             height,
+            planes,
+            last: dimensions == Dimensions::Two,
             next_row: 0,
             pixels,
         })
@@ -100,9 +166,19 @@ impl ImageReader {
         self.width
     }
 
-    /// Rows.
+    /// Rows, of one plane of a cube.
     pub fn height(&self) -> usize {
         self.height
+    }
+
+    /// Planes of a cube, 1 of an image.
+    pub fn planes(&self) -> usize {
+        self.planes
+    }
+
+    /// Rows of all planes.
+    fn rows(&self) -> usize {
+        self.height * self.planes
     }
 
     /// A numeric header value, `None` where absent.
@@ -115,7 +191,7 @@ impl ImageReader {
 
     /// Leaves the next `rows` rows out.
     pub fn skip_rows(&mut self, rows: usize) {
-        self.next_row = (self.next_row + rows).min(self.height);
+        self.next_row = (self.next_row + rows).min(self.rows());
     }
 
     /// The next `rows` rows, or fewer at the end of the image. Pixels that are not finite or, in an
@@ -125,20 +201,61 @@ impl ImageReader {
     /// Where the pixels cannot be read, as in a damaged file.
     pub fn read_rows(&mut self, rows: usize) -> Result<Vec<f32>, FileError> {
         let first = self.next_row;
-        let last = (first + rows).min(self.height);
-        match &mut self.pixels {
-            Pixels::Plain(bytes) => self.file.need((last * self.width) as u64 * *bytes)?,
-            Pixels::Tiles(tiles) => tiles.check(&mut self.file, last)?,
-        }
+        let last = (first + rows).min(self.rows());
+        self.need(last)?;
         let mut pixels = vec![0f32; (last - first) * self.width];
+        self.fill(first * self.width, &mut pixels)?;
+        self.next_row = last;
+        if self.last && last == self.rows() {
+            self.file.check_end()?;
+        }
+        Ok(pixels)
+    }
+
+    /// A square of `side` pixels a side, row-major, of which the lower left pixel is column `x` and row `y` of the
+    /// image, both from 0. Beyond the image it is NaN.
+    ///
+    /// # Errors
+    /// As [`ImageReader::read_rows`].
+    pub fn read_square(&mut self, x: i64, y: i64, side: usize) -> Result<Vec<f32>, FileError> {
+        let mut pixels = vec![f32::NAN; side * side];
+        let inside = |at: i64, most: usize| at.clamp(0, most as i64) as usize;
+        let (from, to) = (inside(x, self.width), inside(x + side as i64, self.width));
+        if from == to {
+            return Ok(pixels);
+        }
+        for (k, line) in pixels.chunks_exact_mut(side).enumerate() {
+            let row = y + k as i64;
+            if (0..self.height as i64).contains(&row) {
+                let row = row as usize;
+                self.need(row + 1)?;
+                let skipped = (from as i64 - x) as usize;
+                self.fill(
+                    row * self.width + from,
+                    &mut line[skipped..skipped + to - from],
+                )?;
+            }
+        }
+        Ok(pixels)
+    }
+
+    /// Makes sure that the first `rows` rows are there.
+    fn need(&mut self, rows: usize) -> Result<(), FileError> {
+        match &mut self.pixels {
+            Pixels::Plain(bytes) => self.file.need((rows * self.width) as u64 * *bytes),
+            Pixels::Tiles(tiles) => tiles.check(&mut self.file, rows),
+        }
+    }
+
+    /// Reads as many pixels as there is room for, from the one at `first`, from 0.
+    fn fill(&mut self, first: usize, pixels: &mut [f32]) -> Result<(), FileError> {
         // cfitsio writes to the second unasked.
         let (mut blank, mut some_blank) = (f32::NAN, 0);
-        let start = (first * self.width + 1) as i64;
+        let start = (first + 1) as i64;
+        let (width, rows) = (self.width, self.rows());
+        let last = (first + pixels.len()).div_ceil(width);
         self.file.call(
-            || {
-                let height = self.height;
-                format!("cannot read rows {} to {last} of {height}", first + 1)
-            },
+            || format!("cannot read rows {} to {last} of {rows}", first / width + 1),
             // SAFETY: the file is open, and there is room for all the pixels asked for.
             |raw, status| unsafe {
                 sys::ffgpv(
@@ -152,12 +269,7 @@ impl ImageReader {
                     status,
                 );
             },
-        )?;
-        self.next_row = last;
-        if last == self.height {
-            self.file.check_end()?;
-        }
-        Ok(pixels)
+        )
     }
 }
 

@@ -1,0 +1,90 @@
+//! The postage stamps of an image side by side.
+
+use shearq_scoring::grid::{cell_at, centre_of};
+use shearq_scoring::units::Pixels;
+
+/// Stamps in rows of `columns`, the last of which may be shorter.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Mosaic {
+    /// Stamps of a full row; more than none.
+    pub columns: usize,
+    /// Stamps in all; more than none.
+    pub galaxies: usize,
+    /// Pixels a side of a stamp.
+    pub stamp: usize,
+}
+
+impl Mosaic {
+    /// n × n stamps.
+    pub fn square(n: usize, stamp: usize) -> Self {
+        Mosaic {
+            columns: n,
+            galaxies: n * n,
+            stamp,
+        }
+    }
+
+    /// As near to a square as `galaxies` stamps can lie.
+    pub fn of(galaxies: usize, stamp: usize) -> Self {
+        let root = galaxies.isqrt();
+        Mosaic {
+            columns: (root + usize::from(root * root < galaxies)).max(1),
+            galaxies,
+            stamp,
+        }
+    }
+
+    /// Rows of stamps.
+    pub fn rows(&self) -> usize {
+        self.galaxies.div_ceil(self.columns)
+    }
+
+    /// Stamps of row `iy`, from 0.
+    pub fn of_row(&self, iy: usize) -> usize {
+        self.galaxies
+            .saturating_sub(iy * self.columns)
+            .min(self.columns)
+    }
+
+    /// FITS pixel position of the centre of stamp `ix` of row `iy`, both from 0.
+    pub fn centre(&self, ix: usize, iy: usize) -> (f64, f64) {
+        let stamp = Pixels(self.stamp as f64);
+        (centre_of(ix, stamp), centre_of(iy, stamp))
+    }
+
+    /// Number, from 0 along the rows, of the stamp that holds the FITS pixel position (x, y).
+    pub fn place(&self, x: f64, y: f64) -> Option<usize> {
+        let stamp = Pixels(self.stamp as f64);
+        let (ix, iy) = (cell_at(x, stamp)?, cell_at(y, stamp)?);
+        (iy < self.rows() && ix < self.of_row(iy)).then_some(iy * self.columns + ix)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stamps_fill_rows_of_which_the_last_is_shorter() {
+        for (galaxies, columns, rows, last) in [
+            (1, 1, 1, 1),
+            (2, 2, 1, 2),
+            (3, 2, 2, 1),
+            (16, 4, 4, 4),
+            (17, 5, 4, 2),
+        ] {
+            let mosaic = Mosaic::of(galaxies, 48);
+            assert_eq!((mosaic.columns, mosaic.rows()), (columns, rows));
+            assert_eq!(mosaic.of_row(rows - 1), last);
+            assert_eq!(mosaic.of_row(rows), 0);
+            for place in 0..galaxies {
+                let (x, y) = mosaic.centre(place % columns, place / columns);
+                assert_eq!(mosaic.place(x, y), Some(place));
+            }
+        }
+        let mosaic = Mosaic::of(17, 48);
+        assert_eq!(mosaic.place(24.5 + 2.0 * 48.0, 24.5 + 3.0 * 48.0), None);
+        assert_eq!(mosaic.place(24.5 + 5.0 * 48.0, 24.5), None);
+        assert_eq!(mosaic.place(f64::NAN, 24.5), None);
+    }
+}

@@ -1,0 +1,394 @@
+//! Stamps that people have, gathered into the image of a data folder: cubes, files of one or several images each, and
+//! cut-outs of an exposure.
+
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use shearq_measure::FunctionalPsf;
+
+use super::PipelineError;
+use super::images::ImageId;
+use crate::io::FileError;
+use crate::io::atomic;
+use crate::io::fits::{ImageReader, ImageWriter, Value};
+use crate::io::layout::{DataFolder, MAX_STAMP};
+use crate::io::mosaic::Mosaic;
+use crate::io::open::is_there;
+use crate::io::{psf_table, table};
+
+/// Most stamps of one image: one for each galaxy of the largest grid.
+const MAX_STAMPS: usize = table::MAX_ROWS;
+/// Share of a star's light on the frame of its stamp, were it all as bright as the frame, that is told: a background
+/// of that size changes a deconvolved galaxy.
+const PEDESTAL: f64 = 0.02;
+/// Pixels that the frame of a star is wide.
+const FRAME: usize = 2;
+
+/// Where stamps come from.
+pub enum Stamps<'a> {
+    /// FITS files, each with one stamp, a cube of them, or several extensions with either.
+    Files(&'a [PathBuf]),
+    /// Squares of an exposure around positions.
+    Cutouts {
+        /// The exposure.
+        exposure: &'a Path,
+        /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
+        positions: &'a Path,
+        /// Names of its columns for x and y.
+        columns: [&'a str; 2],
+        /// Pixels a side of a stamp.
+        side: usize,
+    },
+}
+
+/// What was gathered.
+#[derive(Debug)]
+pub struct Gathered {
+    /// How the stamps lie in the image.
+    pub mosaic: Mosaic,
+    /// Of the stamps, those with pixels that are not finite: beyond the exposure, or missing in their file. They
+    /// will be flagged.
+    pub incomplete: usize,
+    /// What is worth a second look.
+    pub doubts: Vec<String>,
+}
+
+/// Where a stamp was found.
+#[derive(Debug, Clone, Copy)]
+struct Origin<'a> {
+    file: &'a Path,
+    /// Image of the file, from 1.
+    image: usize,
+    /// Plane of the image, from 1.
+    plane: usize,
+    /// Its galaxy's position.
+    position: Option<(f64, f64)>,
+}
+
+impl Origin<'_> {
+    fn fault(&self, what: &str) -> FileError {
+        let Origin { image, plane, .. } = self;
+        FileError::new(self.file, format!("image {image}, plane {plane}: {what}"))
+    }
+}
+
+/// A row of the table that says which stamp is which.
+#[derive(Serialize)]
+struct Place<'a> {
+    x: f64,
+    y: f64,
+    file: &'a Path,
+    image: usize,
+    plane: usize,
+    position_x: Option<f64>,
+    position_y: Option<f64>,
+}
+
+/// Gathers stamps and their PSFs into image `id` of `data`: PSFs, the table of which stamp is which, and last the
+/// image. `noise` is written as its NOISESIG.
+///
+/// # Errors
+/// Where a file cannot be read, stamps are not square or of different sizes, there are neither one PSF nor as many as
+/// stamps, or the image is there already.
+pub fn gather(
+    data: &DataFolder,
+    id: ImageId,
+    stamps: &Stamps<'_>,
+    psfs: &[PathBuf],
+    noise: Option<f64>,
+) -> Result<Gathered, PipelineError> {
+    let target = data.galaxies(id.set, id.image);
+    if is_there(&target) {
+        let message =
+            "this image is there already; expected a new one (--set and --image number it)";
+        return Err(FileError::new(target, message).into());
+    }
+    let mut doubts = Vec::new();
+    let positions = match stamps {
+        Stamps::Files(_) => Vec::new(),
+        Stamps::Cutouts {
+            positions, columns, ..
+        } => read_positions(positions, *columns)?,
+    };
+    let (count, side) = match stamps {
+        Stamps::Files(files) => survey(files)?,
+        Stamps::Cutouts { side, .. } => (positions.len(), *side),
+    };
+    let mosaic = Mosaic::of(count, side);
+    gather_psfs(data, id, psfs, &mosaic, &mut doubts)?;
+    let mut keys = Vec::new();
+    keys.extend(noise.map(|sigma| ("NOISESIG", Value::Real(sigma))));
+    let mut image = Rows::create(&target, mosaic, &keys)?;
+    let mut incomplete = 0;
+    let mut places = csv::Writer::from_writer(Vec::new());
+    let mut take = |origin: &Origin<'_>, pixels: &[f32]| -> Result<(), FileError> {
+        incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
+        let (x, y) = mosaic.centre(image.next % mosaic.columns, image.next / mosaic.columns);
+        let place = Place {
+            x,
+            y,
+            file: origin.file,
+            image: origin.image,
+            plane: origin.plane,
+            position_x: origin.position.map(|(x, _)| x),
+            position_y: origin.position.map(|(_, y)| y),
+        };
+        places.serialize(place).map_err(FileError::doing(
+            &target,
+            "cannot tell which stamp is which",
+        ))?;
+        image.add(pixels)
+    };
+    match stamps {
+        Stamps::Files(files) => each_stamp(files, &mut take)?,
+        Stamps::Cutouts { exposure, .. } => {
+            let mut reader = ImageReader::open(exposure)?;
+            for &(x, y) in &positions {
+                let origin = Origin {
+                    file: exposure,
+                    image: 1,
+                    plane: 1,
+                    position: Some((x, y)),
+                };
+                // The first pixel, from 0, of the square whose centre is nearest.
+                let first = |at: f64| (at - (side as f64 + 1.0) / 2.0).round() as i64;
+                take(&origin, &reader.read_square(first(x), first(y), side)?)?;
+            }
+        }
+    }
+    let which = data.stamps(id.set, id.image);
+    let text = places
+        .into_inner()
+        .map_err(|error| FileError::new(&which, error.to_string()))?;
+    atomic::write(&which, &text)?;
+    image.finish()?;
+    Ok(Gathered {
+        mosaic,
+        incomplete,
+        doubts,
+    })
+}
+
+/// Positions of galaxies on an exposure.
+fn read_positions(path: &Path, columns: [&str; 2]) -> Result<Vec<(f64, f64)>, FileError> {
+    let read = table::read(path, Some(&columns), MAX_STAMPS)
+        .map_err(|error| error.hint_of_columns("--columns names others"))?;
+    let of = |name| table::numbers(&read, name, path);
+    let (xs, ys) = (of(columns[0])?, of(columns[1])?);
+    let positions: Vec<_> = xs.iter().copied().zip(ys.iter().copied()).collect();
+    if positions.is_empty() {
+        return Err(FileError::new(
+            path,
+            "there is no position; expected one a row",
+        ));
+    }
+    let most = f64::from(i32::MAX);
+    match positions
+        .iter()
+        .position(|(x, y)| !(x.abs() < most && y.abs() < most))
+    {
+        None => Ok(positions),
+        Some(row) => {
+            let (x, y) = positions[row];
+            let message = format!(
+                "row {}: the position is ({x}, {y}); expected pixels of the exposure",
+                row + 1
+            );
+            Err(FileError::new(path, message))
+        }
+    }
+}
+
+/// Number of stamps in files, and the pixels a side that all of them have.
+fn survey(files: &[PathBuf]) -> Result<(usize, usize), FileError> {
+    let (mut count, mut first) = (0usize, None);
+    each_image(files, |origin, image| {
+        let (width, height) = (image.width(), image.height());
+        if width != height || width > MAX_STAMP {
+            let message = format!(
+                "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP} (--exposure with --positions cuts stamps out of a large image)"
+            );
+            return Err(origin.fault(&message));
+        }
+        let side = *first.get_or_insert(width);
+        if width != side {
+            let message =
+                format!("the stamp is {width} × {height} pixels; the first has {side} × {side}");
+            return Err(origin.fault(&message));
+        }
+        count += image.planes();
+        if count > MAX_STAMPS {
+            return Err(origin.fault(&format!("there are more than {MAX_STAMPS} stamps")));
+        }
+        Ok(())
+    })?;
+    // No list of files is empty.
+    Ok((count, first.unwrap_or(1)))
+}
+
+/// Every image of files, in order.
+fn each_image(
+    files: &[PathBuf],
+    mut visit: impl FnMut(Origin<'_>, &mut ImageReader) -> Result<(), FileError>,
+) -> Result<(), FileError> {
+    for file in files {
+        let mut next = Some(ImageReader::open_stack(file)?);
+        let mut origin = Origin {
+            file,
+            image: 1,
+            plane: 1,
+            position: None,
+        };
+        while let Some(mut image) = next {
+            visit(origin, &mut image)?;
+            origin.image += 1;
+            next = image.next_stack()?;
+        }
+    }
+    Ok(())
+}
+
+/// Every stamp of files, in order.
+fn each_stamp(
+    files: &[PathBuf],
+    mut take: impl FnMut(&Origin<'_>, &[f32]) -> Result<(), FileError>,
+) -> Result<(), FileError> {
+    each_image(files, |origin, image| {
+        for plane in 1..=image.planes() {
+            let pixels = image.read_rows(image.height())?;
+            take(&Origin { plane, ..origin }, &pixels)?;
+        }
+        Ok(())
+    })
+}
+
+/// Writes the PSFs of an image: functional ones of a table, or stars.
+fn gather_psfs(
+    data: &DataFolder,
+    id: ImageId,
+    files: &[PathBuf],
+    mosaic: &Mosaic,
+    doubts: &mut Vec<String>,
+) -> Result<(), FileError> {
+    let wrong = |path: &Path, found: usize| {
+        let message = format!(
+            "there are {found} PSFs; expected one, or one for each of the {} stamps",
+            mosaic.galaxies
+        );
+        FileError::new(path, message)
+    };
+    if let [table] = files
+        && table.extension().is_some_and(|ending| ending == "csv")
+    {
+        let psfs: Vec<FunctionalPsf> = psf_table::read_all(table)?
+            .into_iter()
+            .map(|(_, psf)| psf)
+            .collect();
+        if psfs.len() != 1 && psfs.len() != mosaic.galaxies {
+            return Err(wrong(table, psfs.len()));
+        }
+        let centre = |k| mosaic.centre(k % mosaic.columns, k / mosaic.columns);
+        let rows: Vec<_> = psfs
+            .into_iter()
+            .enumerate()
+            .map(|(k, psf)| (centre(k), psf))
+            .collect();
+        return psf_table::write(&data.psf_functional(id.set, id.image), &rows);
+    }
+    let (count, side) = survey(files)?;
+    let stars = match count {
+        1 => Mosaic::of(1, side),
+        _ if count == mosaic.galaxies => Mosaic {
+            stamp: side,
+            ..*mosaic
+        },
+        // No list of files is empty.
+        _ => return Err(wrong(&files[0], count)),
+    };
+    let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
+    each_stamp(files, |origin, pixels| {
+        let pedestal = pedestal(pixels, side);
+        if image.next == 0 && pedestal.abs() > PEDESTAL {
+            doubts.push(format!(
+                "warning: {}: the frame of the first PSF is as bright as {:.0} % of its light would make it if all of the stamp were: is a background left in it?",
+                origin.file.display(),
+                100.0 * pedestal
+            ));
+        }
+        image.add(pixels)
+    })?;
+    image.finish()
+}
+
+/// The light of a star's stamp if all of it were as bright as its frame, in units of the light that it has.
+fn pedestal(pixels: &[f32], side: usize) -> f64 {
+    let inside = FRAME..side.saturating_sub(FRAME);
+    let (mut frame, mut count, mut sum) = (0.0, 0, 0.0);
+    for (k, &value) in pixels.iter().enumerate() {
+        let value = f64::from(value);
+        sum += value;
+        if !(inside.contains(&(k % side)) && inside.contains(&(k / side))) {
+            frame += value;
+            count += 1;
+        }
+    }
+    frame / f64::from(count.max(1)) * pixels.len() as f64 / sum
+}
+
+/// A mosaic that is written a row of stamps at a time.
+struct Rows {
+    writer: ImageWriter,
+    mosaic: Mosaic,
+    /// Number of stamps that are there.
+    next: usize,
+    /// The row at hand.
+    pixels: Vec<f32>,
+}
+
+impl Rows {
+    fn create(path: &Path, mosaic: Mosaic, more: &[(&str, Value)]) -> Result<Self, FileError> {
+        let Mosaic {
+            columns,
+            galaxies,
+            stamp,
+        } = mosaic;
+        let mut keys = vec![
+            ("STAMP", Value::Int(stamp as i64)),
+            ("NSTAMPS", Value::Int(galaxies as i64)),
+        ];
+        keys.extend_from_slice(more);
+        if let Some(folder) = path.parent() {
+            std::fs::create_dir_all(folder)
+                .map_err(FileError::doing(folder, "cannot make the folder"))?;
+        }
+        Ok(Rows {
+            writer: ImageWriter::create(path, columns * stamp, mosaic.rows() * stamp, &keys)?,
+            pixels: vec![0.0; columns * stamp * stamp],
+            mosaic,
+            next: 0,
+        })
+    }
+
+    fn add(&mut self, stamp: &[f32]) -> Result<(), FileError> {
+        let Mosaic {
+            columns,
+            stamp: side,
+            galaxies,
+        } = self.mosaic;
+        let start = self.next % columns * side;
+        let lines = self.pixels.chunks_exact_mut(columns * side);
+        for (line, from) in lines.zip(stamp.chunks_exact(side)) {
+            line[start..start + side].copy_from_slice(from);
+        }
+        self.next += 1;
+        if self.next.is_multiple_of(columns) || self.next == galaxies {
+            self.writer.write_rows(&self.pixels)?;
+            self.pixels.fill(0.0);
+        }
+        Ok(())
+    }
+
+    fn finish(self) -> Result<(), FileError> {
+        self.writer.finish()
+    }
+}

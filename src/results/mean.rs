@@ -1,0 +1,112 @@
+//! Mean ellipticities: the shear of a field that has one.
+
+use std::path::{Path, PathBuf};
+
+use crate::io::FileError;
+use crate::io::run::Run;
+use crate::io::table;
+
+/// The mean over the galaxies of a set.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MeanShear {
+    /// The set.
+    pub set: u32,
+    /// Galaxies with an ellipticity.
+    pub galaxies: usize,
+    /// Galaxies without one.
+    pub flagged: usize,
+    /// Mean of e1 and e2.
+    pub mean: [f64; 2],
+    /// Standard error of the means, of galaxies that know nothing of one another.
+    pub error: [f64; 2],
+    /// Standard deviation of one galaxy.
+    pub scatter: [f64; 2],
+}
+
+/// Sums of a component about its first value, which keeps digits that a large mean would cost.
+#[derive(Debug, Clone, Copy, Default)]
+struct Moments {
+    count: usize,
+    mean: f64,
+    squares: f64,
+}
+
+impl Moments {
+    fn add(&mut self, value: f64) {
+        self.count += 1;
+        let off = value - self.mean;
+        self.mean += off / self.count as f64;
+        self.squares += off * (value - self.mean);
+    }
+
+    /// Unbiased; not a number of fewer than two.
+    fn deviation(&self) -> f64 {
+        if self.count < 2 {
+            return f64::NAN;
+        }
+        (self.squares / (self.count - 1) as f64).sqrt()
+    }
+}
+
+/// The means over the catalogues of each set of the results folder `out` (of `sets`, if there are some).
+///
+/// # Errors
+/// Where a catalogue cannot be read, or there is none.
+pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<MeanShear>, FileError> {
+    let files = run.catalogues(out, sets)?;
+    let wanted = if sets.is_empty() {
+        files.sets()
+    } else {
+        sets.to_vec()
+    };
+    let mut means = Vec::new();
+    for set in wanted {
+        let catalogues: Vec<PathBuf> = files
+            .of_set(set)
+            .into_iter()
+            .map(|(_, path)| path)
+            .collect();
+        if catalogues.is_empty() {
+            let message = format!("there is no catalogue of set {set}");
+            return Err(FileError::new(out, message));
+        }
+        means.push(mean_of(set, &catalogues)?);
+    }
+    if means.is_empty() {
+        return Err(FileError::new(
+            out,
+            "there is no catalogue; expected those of `measure`",
+        ));
+    }
+    Ok(means)
+}
+
+fn mean_of(set: u32, catalogues: &[PathBuf]) -> Result<MeanShear, FileError> {
+    let (mut moments, mut flagged) = ([Moments::default(); 2], 0);
+    for path in catalogues {
+        let read = table::read(path, Some(&["e1", "e2"]), table::MAX_ROWS)?;
+        let (e1, e2) = (
+            table::numbers(&read, "e1", path)?,
+            table::numbers(&read, "e2", path)?,
+        );
+        for (&first, &second) in e1.iter().zip(e2.iter()) {
+            if first.is_finite() && second.is_finite() {
+                moments[0].add(first);
+                moments[1].add(second);
+            } else {
+                flagged += 1;
+            }
+        }
+    }
+    let galaxies = moments[0].count;
+    let scatter = moments.map(|m| m.deviation());
+    let mean = |m: Moments| if m.count == 0 { f64::NAN } else { m.mean };
+    Ok(MeanShear {
+        set,
+        galaxies,
+        flagged,
+        mean: moments.map(mean),
+        error: scatter.map(|deviation| deviation / (galaxies as f64).sqrt()),
+        scatter,
+    })
+}

@@ -1,0 +1,274 @@
+//! Stamps that lie otherwise than a challenge's: gathered from cubes, extensions, single files and exposures, they are
+//! measured as they were.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+
+use crate::support::{Small, fail, fits_image, floats, pixels_of, shearq, succeed, text};
+
+const LINEAR: &str = "48/linear/star";
+
+/// The stamps of a mosaic, along its rows.
+fn stamps_of(path: &Path, side: usize) -> Vec<Vec<f32>> {
+    let (pixels, width) = pixels_of(path);
+    let n = width / side;
+    (0..n * n)
+        .map(|k| {
+            let (x, y) = (k % n * side, k / n * side);
+            let rows = (y..y + side).map(|row| &pixels[row * width + x..row * width + x + side]);
+            rows.flatten().copied().collect()
+        })
+        .collect()
+}
+
+fn cube(stamps: &[Vec<f32>], side: usize) -> Vec<u8> {
+    fits_image(
+        -32,
+        &[side, side, stamps.len()],
+        &[],
+        &floats(&stamps.concat()),
+    )
+}
+
+/// A file of an empty primary header and one extension a stamp.
+fn extensions(stamps: &[Vec<f32>], side: usize) -> Vec<u8> {
+    let mut file = fits_image(8, &[], &["EXTEND  =                    T"], &[]);
+    let counts = [
+        "PCOUNT  =                    0",
+        "GCOUNT  =                    1",
+    ];
+    for stamp in stamps {
+        let mut image = fits_image(-32, &[side, side], &counts, &floats(stamp));
+        image[..80].copy_from_slice(format!("{:<80}", "XTENSION= 'IMAGE   '").as_bytes());
+        file.extend(image);
+    }
+    file
+}
+
+/// Bits of e1, e2 and the flags of the first catalogue of set 1 or 19.
+fn measured(small: &Small, data: &Path, set: &str) -> Vec<Vec<u64>> {
+    let out = small.at("out");
+    let _ = fs::remove_dir_all(&out);
+    let measure = ["measure", "--submission", LINEAR, "--out", text(&out)];
+    succeed(&[&measure[..], &["--data", text(data)]].concat());
+    ["e1", "e2", "flag"]
+        .map(|column| {
+            let values = small.measured(set, column);
+            values.iter().map(|value| value.to_bits()).collect()
+        })
+        .into()
+}
+
+#[test]
+fn stamps_of_all_kinds_of_files_are_measured_alike() {
+    let small = Small::new("19");
+    let at = |name: &str| small.at(name);
+    let set = at("data/set19");
+    fs::remove_file(set.join("galaxies-002.fits")).unwrap();
+    let expected = measured(&small, &at("data"), "19");
+    assert_eq!(expected[0].len(), 64);
+    let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
+    let stars = stamps_of(
+        &set.join("psf-001.fits"),
+        pixels_of(&set.join("psf-001.fits")).1 / 8,
+    );
+    let side = stars[0].len().isqrt();
+
+    fs::write(at("cube.fits"), cube(&galaxies, 48)).unwrap();
+    fs::write(at("parts.fits"), extensions(&galaxies[1..], 48)).unwrap();
+    let one = fits_image(-32, &[48, 48], &[], &floats(&galaxies[0]));
+    fs::write(at("first.fits"), one).unwrap();
+    fs::write(at("stars.fits"), cube(&stars, side)).unwrap();
+    fs::write(at("stars-parts.fits"), extensions(&stars, side)).unwrap();
+    let mut positions = String::from("id,ra_pixel,dec_pixel\n");
+    for k in 0..64 {
+        let centre = |index: usize| index as f64 * 48.0 + 24.5;
+        // A position within half a pixel of the centre has the same stamp.
+        let (x, y) = (centre(k % 8) + 0.4, centre(k / 8) - 0.4);
+        positions += &format!("{k},{x},{y}\n");
+    }
+    fs::write(at("positions.csv"), positions).unwrap();
+
+    let (cube, parts, first) = (at("cube.fits"), at("parts.fits"), at("first.fits"));
+    let (exposure, positions) = (set.join("galaxies-001.fits"), at("positions.csv"));
+    let ways: [(&str, Vec<&str>, PathBuf); 3] = [
+        ("cube", vec!["--stamps", text(&cube)], at("stars.fits")),
+        (
+            "files",
+            vec!["--stamps", text(&first), text(&parts)],
+            at("stars-parts.fits"),
+        ),
+        (
+            "exposure",
+            vec![
+                "--exposure",
+                text(&exposure),
+                "--positions",
+                text(&positions),
+                "--columns",
+                "ra_pixel,dec_pixel",
+            ],
+            at("stars.fits"),
+        ),
+    ];
+    for (name, from, psf) in &ways {
+        let data = at(name);
+        let rest = ["--psf", text(psf), "--out", text(&data)];
+        succeed(&[&["gather"][..], from, &rest].concat());
+        assert_eq!(measured(&small, &data, "01"), expected, "{name}");
+        let table = fs::read_to_string(data.join("set01/stamps-001.csv")).unwrap();
+        assert_eq!(table.lines().count(), 65);
+    }
+    let table = fs::read_to_string(at("files").join("set01/stamps-001.csv")).unwrap();
+    let third = format!("120.5,24.5,{},2,1,,", parts.display());
+    assert_eq!(table.lines().nth(3), Some(third.as_str()));
+    let table = fs::read_to_string(at("exposure").join("set01/stamps-001.csv")).unwrap();
+    assert!(table.lines().nth(1).unwrap().ends_with("1,1,24.9,24.1"));
+
+    // As many as do not fill a square, and one PSF by its parameters.
+    fs::write(at("few.fits"), self::cube(&galaxies[..5], 48)).unwrap();
+    let formula = "x,y,profile,beta,fwhm,e1,e2\n0,0,moffat,3,3,0.01,0.02\n";
+    fs::write(at("psf.csv"), formula).unwrap();
+    let (few, psf, data) = (at("few.fits"), at("psf.csv"), at("five"));
+    let gather = ["gather", "--stamps", text(&few), "--psf", text(&psf)];
+    let more = ["--noise", "1", "--out", text(&data)];
+    succeed(&[&gather[..], &more].concat());
+    let out = at("out");
+    let _ = fs::remove_dir_all(&out);
+    let measure = [
+        "measure",
+        "--submission",
+        "23/raw/func",
+        "--out",
+        text(&out),
+    ];
+    succeed(&[&measure[..], &["--data", text(&data)]].concat());
+    assert_eq!(small.measured("01", "x"), [24.5, 72.5, 120.5, 24.5, 72.5]);
+    let again = fail(&[&gather[..], &more].concat());
+    assert!(again.contains("this image is there already"), "{again}");
+    // They are no grid that has a spectrum.
+    let sent = at("sent");
+    let pack = ["pack", "--measured", text(&out), "--kind", "spectra"];
+    let message = fail(&[&pack[..], &["--out", text(&sent)]].concat());
+    assert!(
+        message.contains("5 rows; expected the square of the grid's side"),
+        "{message}"
+    );
+}
+
+#[test]
+fn the_mean_of_a_field_is_that_of_its_catalogue() {
+    let small = Small::new("2");
+    small.measure(&["--submission", LINEAR]);
+    let out = small.at("out");
+    let mean = ["mean", "--measured", text(&out), "--format", "json"];
+    let table: Value = serde_json::from_str(&succeed(&mean)).unwrap();
+    let row = &table["rows"][0];
+    let value = |key: &str| row[key].as_f64().unwrap();
+    let mut all = Vec::new();
+    for image in ["001", "002"] {
+        let from = out.join(format!("set02/catalogue-{image}.parquet"));
+        fs::rename(&from, out.join("set02/catalogue-001.parquet")).unwrap();
+        all.extend(small.measured("02", "e2"));
+    }
+    let known: Vec<f64> = all.iter().copied().filter(|e| e.is_finite()).collect();
+    let n = known.len() as f64;
+    let expected = known.iter().sum::<f64>() / n;
+    let square: f64 = known.iter().map(|e| (e - expected).powi(2)).sum();
+    // Sums in another order.
+    let near = |found: f64, expected: f64| (found - expected).abs() < 1e-12;
+    assert!(near(value("g2"), expected));
+    assert!(near(value("g2_error"), (square / (n - 1.0) / n).sqrt()));
+    assert!(near(value("scatter2"), (square / (n - 1.0)).sqrt()));
+    assert_eq!(value("galaxies"), n);
+    assert_eq!(value("flagged"), all.len() as f64 - n);
+}
+
+#[test]
+fn what_cannot_be_gathered_is_named() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let stamps = vec![vec![1.0f32; 48 * 48]; 3];
+    fs::write(at("three.fits"), cube(&stamps, 48)).unwrap();
+    fs::write(at("two.fits"), cube(&stamps[..2], 48)).unwrap();
+    fs::write(at("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
+    let wide = fits_image(-32, &[48, 40], &[], &floats(&stamps[0][..48 * 40]));
+    fs::write(at("wide.fits"), wide).unwrap();
+    fs::write(
+        at("four.fits"),
+        fits_image(-32, &[2, 2, 2, 2], &[], &[0; 64]),
+    )
+    .unwrap();
+    let short = cube(&stamps, 48);
+    fs::write(at("short.fits"), &short[..short.len() - 5760]).unwrap();
+    fs::write(at("empty.fits"), fits_image(8, &[], &[], &[])).unwrap();
+    fs::write(at("nowhere.csv"), "x,y\n1,2\n3,nan\n").unwrap();
+    fs::write(at("none.csv"), "x,y\n").unwrap();
+    let gather = |from: &[&str], psf: &str| {
+        let (psf, out) = (at(psf), at("data"));
+        let rest = ["--psf", text(&psf), "--out", text(&out)];
+        let message = fail(&[&["gather"][..], from, &rest].concat());
+        assert!(!out.join("set01/galaxies-001.fits").exists());
+        message
+    };
+    for (stamps, psf, expected) in [
+        (
+            "three.fits",
+            "two.fits",
+            "two.fits: there are 2 PSFs; expected one, or one for each of the 3",
+        ),
+        (
+            "three.fits",
+            "wide.fits",
+            "wide.fits: image 1, plane 1: the stamp is 48 × 40",
+        ),
+        ("wide.fits", "psf.fits", "--exposure with --positions"),
+        ("four.fits", "psf.fits", "has 4 dimensions"),
+        (
+            "short.fits",
+            "psf.fits",
+            "short.fits: the file is truncated",
+        ),
+        ("empty.fits", "psf.fits", "there is no image in this file"),
+        ("absent.fits", "psf.fits", "absent.fits"),
+    ] {
+        let stamps = at(stamps);
+        let message = gather(&["--stamps", text(&stamps)], psf);
+        assert!(message.contains(expected), "{message}");
+    }
+    let exposure = at("wide.fits");
+    for (positions, expected) in [
+        ("nowhere.csv", "row 2: the position is (3, NaN)"),
+        ("none.csv", "none.csv"),
+        ("absent.csv", "absent.csv"),
+    ] {
+        let positions = at(positions);
+        let from = [
+            "--exposure",
+            text(&exposure),
+            "--positions",
+            text(&positions),
+        ];
+        let message = gather(&from, "psf.fits");
+        assert!(message.contains(expected), "{message}");
+    }
+    // What reaches beyond an exposure is kept and said; a background in a star is noticed.
+    fs::write(at("edge.csv"), "x,y\n24.5,20.5\n2,2\n").unwrap();
+    let (positions, psf, out) = (at("edge.csv"), at("psf.fits"), at("data"));
+    let from = [
+        "--exposure",
+        text(&exposure),
+        "--positions",
+        text(&positions),
+    ];
+    let rest = ["--size", "20", "--psf", text(&psf), "--out", text(&out)];
+    let done = shearq(&[&["gather"][..], &from, &rest].concat());
+    let said = String::from_utf8(done.stderr).unwrap();
+    assert!(
+        said.contains("1 stamp with pixels that are missing"),
+        "{said}"
+    );
+    assert!(said.contains("is a background left in it?"), "{said}");
+}
