@@ -269,6 +269,42 @@ mod tests {
             .collect()
     }
 
+    /// The commands in the documents, a backslash at the end of a line putting two together.
+    fn documented() -> Vec<(String, String)> {
+        let mut found = Vec::new();
+        let mut pages = vec!["README.md".into(), "CONTRIBUTING.md".into()];
+        pages.extend(
+            std::fs::read_dir("docs")
+                .unwrap()
+                .map(|entry| entry.unwrap().path())
+                .filter(|path| path.extension().is_some_and(|ending| ending == "md")),
+        );
+        for page in pages {
+            let text = std::fs::read_to_string(&page).unwrap();
+            let text = text.replace("\\\n", " ");
+            let mut inside = false;
+            for line in text.lines() {
+                if line.starts_with("```") {
+                    inside = !inside;
+                } else if inside && line.starts_with("shearq ") {
+                    found.push((page.display().to_string(), line.to_owned()));
+                }
+            }
+        }
+        found
+    }
+
+    #[test]
+    fn every_command_in_the_documents_is_understood() {
+        let commands = documented();
+        assert!(commands.len() > 20);
+        for (page, line) in commands {
+            let line = line.split(" #").next().unwrap_or(&line);
+            let parsed = Cli::try_parse_from(words(line));
+            assert!(parsed.is_ok(), "{page}: {line}: {}", parsed.unwrap_err());
+        }
+    }
+
     #[test]
     fn every_command_has_an_example_that_it_understands() {
         for command in Cli::command().get_subcommands() {

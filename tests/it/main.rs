@@ -11,6 +11,7 @@ mod bad_images;
 mod bad_settings;
 mod baselines;
 mod chain;
+mod documents;
 mod examined;
 mod figures;
 mod fuzz;

@@ -1,0 +1,106 @@
+//! What the documents promise: links that lead somewhere, and a tutorial that can be followed.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::support::{fits_image, floats, pixels_of, shared, succeed, text};
+
+/// The documents.
+fn pages() -> Vec<PathBuf> {
+    let mut pages: Vec<PathBuf> = fs::read_dir("docs")
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|ending| ending == "md"))
+        .collect();
+    pages.extend(["README.md", "CONTRIBUTING.md", "CHANGELOG.md"].map(PathBuf::from));
+    pages
+}
+
+/// What a page links to within the project.
+fn links(page: &Path) -> Vec<String> {
+    let text = fs::read_to_string(page).unwrap();
+    let targets = text.split("](").skip(1);
+    targets
+        .filter_map(|rest| rest.split(')').next())
+        .filter(|target| !target.contains("://") && !target.starts_with('#'))
+        .map(|target| target.split('#').next().unwrap_or(target).to_owned())
+        .collect()
+}
+
+#[test]
+fn links_lead_to_files_and_the_summary_has_every_page() {
+    let mut count = 0;
+    for page in pages() {
+        for target in links(&page) {
+            let path = page.parent().unwrap().join(&target);
+            assert!(path.exists(), "{}: {target}", page.display());
+            count += 1;
+        }
+    }
+    assert!(count > 20, "{count} links");
+    let listed = links(Path::new("docs/SUMMARY.md"));
+    for page in pages() {
+        let name = page.file_name().unwrap().to_string_lossy().into_owned();
+        let listed = listed.contains(&name);
+        let expected = page.starts_with("docs") && name != "SUMMARY.md";
+        assert_eq!(listed, expected, "{name}");
+    }
+}
+
+/// Images in place of those that the tutorial's script renders: of GalSim's where they are, or simulated.
+fn images(folder: &Path) {
+    let challenge = folder.join("challenge");
+    let set = challenge.join("set02");
+    if let Some(sets) = shared("galsim-sets") {
+        fs::create_dir_all(&set).unwrap();
+        for entry in fs::read_dir(sets.join("set02")).unwrap() {
+            let from = entry.unwrap().path();
+            fs::copy(&from, set.join(from.file_name().unwrap())).unwrap();
+        }
+    } else {
+        let simulate = ["simulate", "--sets", "2", "--images", "2", "--grid", "16"];
+        succeed(&[&simulate[..], &["--out", text(&challenge)]].concat());
+    }
+    let (pixels, width) = pixels_of(&set.join("galaxies-001.fits"));
+    let stamps: Vec<f32> = (0..100)
+        .flat_map(|k| {
+            let (x, y) = (k % 16 * 48, k / 16 * 48);
+            (y..y + 48).flat_map(move |row| row * width + x..row * width + x + 48)
+        })
+        .map(|pixel| pixels[pixel])
+        .collect();
+    let cube = fits_image(-32, &[48, 48, 100], &[], &floats(&stamps));
+    fs::write(folder.join("field.fits"), cube).unwrap();
+    fs::copy(set.join("psf-001.fits"), folder.join("star.fits")).unwrap();
+}
+
+#[test]
+fn the_tutorial_can_be_followed() {
+    let root = tempfile::tempdir().unwrap();
+    images(root.path());
+    let tutorial = fs::read_to_string("docs/tutorial.md").unwrap();
+    let blocks = tutorial.split("```sh\n").skip(1);
+    let lines = blocks.flat_map(|block| block.split("```").next().unwrap_or("").lines());
+    let mut commands = 0;
+    for line in lines.filter(|line| line.starts_with("shearq ")) {
+        let done = Command::new(env!("CARGO_BIN_EXE_shearq"))
+            .args(line.split_whitespace().skip(1))
+            .current_dir(root.path())
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&done.stderr);
+        assert!(done.status.success(), "{line}: {said}");
+        commands += 1;
+    }
+    assert_eq!(commands, 10);
+    for file in [
+        "galaxy.png",
+        "linear.html",
+        "compare.html",
+        "to-send.tar.gz",
+    ] {
+        let size = fs::metadata(root.path().join(file)).unwrap().len();
+        assert!(size > 1000, "{file}: {size} bytes");
+    }
+}
