@@ -111,11 +111,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             measured.flags
         );
         let steps = worker.steps(stamp, psf.view(), &measured)?;
-        let label = format!("{}/{}/{index}", image.set, image.image);
+        let label = format!(
+            "{}/{}/{index}: {:+.3}, {:+.3}",
+            image.set, image.image, measured.e1, measured.e2
+        );
         rows.push(steps_row(&label, psf, steps));
         print(&format!("{}\n", describe(image, index, &measured)))?;
     }
-    steps_figure(&submission.name, rows).save(out)?;
+    let title = format!(
+        "{}; set/image/galaxy: e1, e2 before calibration",
+        submission.name
+    );
+    steps_figure(&title, rows).save(out)?;
     tell(format_args!("wrote {}", out.display()));
     Ok(())
 }

@@ -10,6 +10,7 @@ use super::print;
 use super::progress::{Bar, goes_on};
 use crate::io::layout::MAX_IMAGE;
 use crate::report::page::Page;
+use crate::report::pages;
 use crate::report::table::TableFormat;
 use crate::study::contest::{bias_sets, contest_parts, contest_table};
 use crate::study::reproduce::{Plan, Study, run_sets};
@@ -107,6 +108,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let mut page = Page::new(out, "Submissions compared", "Simulated data", made_by);
     let [shapes, quality] = contest_parts(&table);
     page.section("Ellipticities", "Scatter and biases on every kind of set.");
+    page.figure(
+        "study",
+        &pages::contest(&table),
+        "Each submission on each set, with errors. Dashed: the Cramér–Rao bound, m of ± 0.002, no additive bias, and Q of noise at the bound beside a perfect spectrum.",
+    )?;
     page.table("biases", &shapes)?;
     page.section("Spectra", "Quality on every kind of set, and cost.");
     page.table("quality", &quality)?;

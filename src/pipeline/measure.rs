@@ -438,7 +438,8 @@ pub fn measure_folder(
         .mosaic
         .stamp;
     let measurer = Measurer::new(&run.submission, stamp)?;
-    for doubt in noise_doubts(data, first, &measurer)? {
+    let (noise, doubts) = first_noise(data, first, &measurer)?;
+    for doubt in doubts {
         progress.note(&doubt);
     }
     let mut rows = Vec::new();
@@ -452,7 +453,7 @@ pub fn measure_folder(
                 let _ = send.send(inputs.prints(id)?);
                 Ok(())
             };
-            read_images(data, &todo, &measurer, print, feeder)
+            read_images(data, &todo, &measurer, noise, print, feeder)
         },
         || measurer.worker(),
         |worker, row: StampRow| measure_row(worker, &row),
@@ -474,16 +475,17 @@ pub fn measure_folder(
     Ok(summary)
 }
 
-/// What the noise of the first image to be measured with the linear method, which needs to know it, says against
-/// its header and against what the submission takes it for.
-fn noise_doubts(
+/// The noise of the first image to be measured with the linear method, which needs to know it, where the submission
+/// measures it; and what it says against the header and against what the submission takes it for.
+fn first_noise(
     data: &DataFolder,
     first: ImageId,
     measurer: &Measurer,
-) -> Result<Vec<String>, PipelineError> {
+) -> Result<(Option<Arc<StampNoise>>, Vec<String>), PipelineError> {
     let submission = measurer.submission();
+    let nothing = (None, Vec::new());
     if submission.linear().is_none() {
-        return Ok(Vec::new());
+        return Ok(nothing);
     }
     let own;
     let plan = match measurer.noise_plan() {
@@ -494,7 +496,7 @@ fn noise_doubts(
                 own = plan;
                 &own
             }
-            Err(_) => return Ok(Vec::new()),
+            Err(_) => return Ok(nothing),
         },
     };
     let mut source = ImageSource::open(data, first, submission)?;
@@ -502,7 +504,7 @@ fn noise_doubts(
     let noise = match source.measure_noise(data, plan) {
         Ok(noise) => noise,
         Err(error) if asked => return Err(error),
-        Err(_) => return Ok(Vec::new()),
+        Err(_) => return Ok(nothing),
     };
     let image = format!("set {:02} image {:03}", first.set, first.image);
     let mut doubts = Vec::new();
@@ -530,7 +532,7 @@ fn noise_doubts(
             noise.correlation(0, 1)
         ));
     }
-    Ok(doubts)
+    Ok((asked.then_some(noise), doubts))
 }
 
 /// Number of galaxies that `measure_folder` will measure, for progress bars: an estimate from the
@@ -563,6 +565,7 @@ fn read_images(
     data: &DataFolder,
     todo: &[ImageId],
     measurer: &Measurer,
+    mut first: Option<Arc<StampNoise>>,
     mut opened: impl FnMut(ImageId) -> Result<(), FileError>,
     feeder: &mut Feeder<'_, StampRow>,
 ) -> Result<(), PipelineError> {
@@ -579,7 +582,12 @@ fn read_images(
             return Err(FileError::new(path, message).into());
         }
         if let Some(plan) = measurer.noise_plan() {
-            source.measure_noise(data, plan)?;
+            match first.take() {
+                Some(noise) => source.noise = Some(noise),
+                None => {
+                    source.measure_noise(data, plan)?;
+                }
+            }
         }
         while let Some(row) = source.next_row()? {
             if !feeder.push(row) {

@@ -122,6 +122,86 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
     }
 }
 
+/// Bands of what surveys to come ask of shear, in the units of the table of [`contest`]: |m| of two in a thousand.
+const BAND: f64 = 2.0;
+
+/// Submissions held against each other on every kind of set: scatter over its bound, biases and Q, each beside
+/// what is to be reached. `table` is that of a study, one row a set and submission.
+pub fn contest(table: &Table) -> PanelGrid {
+    let place = |key: &str| table.headings.iter().position(|heading| heading.key == key);
+    let text = |row: &[Cell], key: &str| match place(key).and_then(|k| row.get(k)) {
+        Some(Cell::Text(words)) => words.clone(),
+        _ => String::new(),
+    };
+    let number = |row: &[Cell], key: &str| match place(key).and_then(|k| row.get(k)) {
+        Some(&Cell::Number { value, error, .. }) => (value, error.unwrap_or(f64::NAN)),
+        _ => (f64::NAN, f64::NAN),
+    };
+    // Rows of means have no number of a set.
+    let rows: Vec<(f64, &[Cell])> = table
+        .rows
+        .iter()
+        .filter_map(|row| Some((text(row, "set").parse().ok()?, row.as_slice())))
+        .collect();
+    let mut names: Vec<String> = Vec::new();
+    for (_, row) in &rows {
+        let name = text(row, "submission");
+        if !names.contains(&name) {
+            names.push(name);
+        }
+    }
+    let ends = || {
+        let sets = || rows.iter().map(|(set, _)| *set);
+        let (least, most) = (
+            sets().fold(f64::INFINITY, f64::min),
+            sets().fold(f64::NEG_INFINITY, f64::max),
+        );
+        vec![least - 0.5, most + 0.5]
+    };
+    let plot = |key: &str, label: &str, levels: &[f64]| {
+        let level = |&value: &f64| Series::new("", ends(), vec![value; 2], Style::Dashed, 7);
+        let mut series: Vec<Series> = levels.iter().map(level).collect();
+        for (k, name) in names.iter().enumerate() {
+            // Beside each other, for all of them to be seen.
+            let aside = (k as f64 - (names.len() as f64 - 1.0) / 2.0) * 0.2;
+            let own = || {
+                rows.iter()
+                    .filter(|(_, row)| text(row, "submission") == *name)
+            };
+            let (y, errors) = own().map(|(_, row)| number(row, key)).unzip();
+            let x = own().map(|(set, _)| set + aside).collect();
+            series.push(Series::new(name, x, y, Style::Points, k).with_errors(errors));
+        }
+        LinePlot {
+            title: label.into(),
+            x_label: "set".into(),
+            y_label: label.into(),
+            series,
+            ..LinePlot::default()
+        }
+    };
+    let mut q = plot("q_spectrum", "Q of cross-spectra", &[]);
+    let limit = rows
+        .iter()
+        .map(|(_, row)| number(row, "q_limit").0)
+        .collect();
+    let sets = rows.iter().map(|(set, _)| *set).collect();
+    q.series
+        .insert(0, Series::new("limit", sets, limit, Style::Dashed, 7));
+    PanelGrid {
+        title: "Submissions against each other and what can be reached".into(),
+        columns: 2,
+        plots: vec![
+            plot("scatter_over_bound", "scatter / bound", &[1.0]),
+            plot("m1", "m1×10³", &[-BAND, BAND]),
+            plot("m2", "m2×10³", &[-BAND, BAND]),
+            plot("c1", "c1×10⁴", &[0.0]),
+            plot("leakage", "PSF leakage", &[0.0]),
+            q,
+        ],
+    }
+}
+
 /// A column of the table as bars, one a row; `None` where no row has a value.
 fn bars(table: &Table, key: &str) -> Option<BarPlot> {
     let k = table

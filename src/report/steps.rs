@@ -28,10 +28,10 @@ pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
     }
 }
 
-/// Several galaxies measured by a submission.
-pub fn steps_figure(submission: &str, rows: Vec<ImageRow>) -> ImageGrid {
+/// Several galaxies, under a title to which the version is added.
+pub fn steps_figure(title: &str, rows: Vec<ImageRow>) -> ImageGrid {
     ImageGrid {
-        title: format!("{submission} (shearq {})", crate::VERSION),
+        title: format!("{title} (shearq {})", crate::VERSION),
         rows,
         scale: Scale::Own,
     }

@@ -1,0 +1,62 @@
+#!/usr/bin/env bash
+# Makes what is published of a release, in the folder named: an archive with the binary, a Debian package where
+# dpkg-deb is there, and their checksums. Reproducible: the same commit and compiler give the same bytes.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+out=${1:?usage: release/archive.sh FOLDER}
+mkdir -p "$out"
+out=$(cd "$out" && pwd)
+version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
+host=$(rustc -vV | sed -n 's/^host: //p')
+export SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
+# No path of this machine in the binary.
+export RUSTFLAGS="--remap-path-prefix=$PWD=. --remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=cargo ${RUSTFLAGS:-}"
+[ -n "${SHEARQ:-}" ] || cargo build --release --locked
+binary=${SHEARQ:-${CARGO_TARGET_DIR:-target}/release/shearq}
+
+stage=$(mktemp -d)
+trap 'rm -rf "$stage"' EXIT
+name=shearq-$version-$host
+tree=$stage/$name
+mkdir -p "$tree"/{completions,man}
+install -m 755 "$binary" "$tree/shearq"
+strip "$tree/shearq"
+cp README.md CHANGELOG.md CITATION.cff LICENSE-MIT LICENSE-APACHE "$tree"
+cp -r docs "$tree/docs"
+python3 release/licences.py > "$tree/LICENCES-OF-DEPENDENCIES.txt"
+for shell in bash zsh fish; do
+    "$binary" completions "$shell" > "$tree/completions/shearq.$shell"
+done
+"$binary" manual "$tree/man"
+packed() { tar --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" "$@"; }
+packed -C "$stage" -c "$name" | gzip -n -9 > "$out/$name.tar.gz"
+
+made=("$name.tar.gz")
+if command -v dpkg-deb > /dev/null; then
+    root=$stage/debian
+    doc=$root/usr/share/doc/shearq
+    mkdir -p "$root"/{DEBIAN,usr/bin,usr/share/man/man1,usr/share/bash-completion/completions} "$doc"
+    install -m 755 "$tree/shearq" "$root/usr/bin/shearq"
+    cp "$tree"/man/*.1 "$root/usr/share/man/man1"
+    gzip -n -9 "$root"/usr/share/man/man1/*.1
+    cp "$tree/completions/shearq.bash" "$root/usr/share/bash-completion/completions/shearq"
+    cp -r README.md CHANGELOG.md docs "$doc"
+    cat LICENSE-MIT "$tree/LICENCES-OF-DEPENDENCIES.txt" > "$doc/copyright"
+    cat > "$root/DEBIAN/control" << CONTROL
+Package: shearq
+Version: $version
+Architecture: $(dpkg --print-architecture)
+Maintainer: the authors of shearq <shearq@users.noreply.github.com>
+Depends: libc6, libgcc-s1
+Section: science
+Priority: optional
+Homepage: https://github.com/shearq/shearq
+Description: score weak-lensing shape measurements as challenges do
+ Measures galaxy shapes by Hopfield-network deconvolution, estimates shear
+ power spectra, computes Q, M/2 and sqrt(A), and packs submissions.
+CONTROL
+    find "$root" -exec touch -h -d "@$SOURCE_DATE_EPOCH" {} +
+    dpkg-deb --root-owner-group --build "$root" "$out/shearq_${version}.deb" > /dev/null
+    made+=("shearq_${version}.deb")
+fi
+(cd "$out" && sha256sum "${made[@]}" > "shearq-$version.sha256" && cat "shearq-$version.sha256")
