@@ -158,16 +158,18 @@ impl Scatter {
             power += t;
         });
         let of_m = self.of_cross(bins, truth);
-        // Of each bin alone, with what m adds to it and takes away; and of pairs of bins, which m joins.
+        // Of each bin alone, with what m adds to it and takes away; and of pairs of bins, which m joins as far as
+        // the modulus follows its number.
         let (mut sigma_sys, mut alone, mut own_of_m, mut slopes, mut shared) =
             (0.0, 0.0, 0.0, 0.0, 0.0);
         for b in SCORED {
             let apart = ee[b] / response.powi(2) - true_power[b];
-            let u = apart.signum() * bins.dln_l[b];
             let (slope, with_m) = (2.0 * ee[b] / response.powi(3), with_m[b] / power);
             let by_m = slope * (slope * of_m - 2.0 * with_m);
+            let modulus = Folded::of(apart, own[b] + by_m);
+            let u = modulus.slope * bins.dln_l[b];
             sigma_sys += apart.abs() * bins.dln_l[b];
-            alone += u * u * folded_variance(apart, own[b] + by_m);
+            alone += modulus.variance * bins.dln_l[b].powi(2);
             own_of_m += u * u * by_m;
             slopes += u * slope;
             shared += u * with_m;
@@ -198,7 +200,7 @@ impl Scatter {
 /// that of the modulus of a normal number.
 pub(crate) fn of_sigma_sys(bins: &Bins, apart: &[f64; BINS], variance: &[f64; BINS]) -> f64 {
     SCORED
-        .map(|b| folded_variance(apart[b], variance[b]) * bins.dln_l[b].powi(2))
+        .map(|b| Folded::of(apart[b], variance[b]).variance * bins.dln_l[b].powi(2))
         .sum::<f64>()
         .sqrt()
 }
@@ -215,16 +217,32 @@ fn damped(q: f64, relative: f64) -> f64 {
     q * relative / (1.0 + relative * relative)
 }
 
-/// Variance of |x| where x is normal with variance `variance` and was found to be `found`.
-fn folded_variance(found: f64, variance: f64) -> f64 {
-    if variance <= 0.0 {
-        return 0.0;
+/// |x| of a normal number x.
+struct Folded {
+    variance: f64,
+    /// How its mean changes with that of x: covariances with other numbers are as many times those of x.
+    slope: f64,
+}
+
+impl Folded {
+    /// Where x has the variance `variance` and was found to be `found`.
+    fn of(found: f64, variance: f64) -> Self {
+        if variance <= 0.0 {
+            return Folded {
+                variance: 0.0,
+                slope: found.signum(),
+            };
+        }
+        let mean2 = (found * found - variance).max(0.0);
+        let t = (mean2 / (2.0 * variance)).sqrt();
+        let slope = libm::erf(t);
+        let folded =
+            (2.0 * variance / std::f64::consts::PI).sqrt() * (-t * t).exp() + mean2.sqrt() * slope;
+        Folded {
+            variance: mean2 + variance - folded * folded,
+            slope: slope * found.signum(),
+        }
     }
-    let mean2 = (found * found - variance).max(0.0);
-    let t = (mean2 / (2.0 * variance)).sqrt();
-    let folded = (2.0 * variance / std::f64::consts::PI).sqrt() * (-t * t).exp()
-        + mean2.sqrt() * libm::erf(t);
-    mean2 + variance - folded * folded
 }
 
 /// Standard errors of M and A in units of C_ℓ, for bandpowers of a covariance.
@@ -267,9 +285,9 @@ mod tests {
     fn a_modulus_scatters_less_near_zero_and_like_its_number_far_from_it() {
         // Of |x| with mean zero: 1 − 2/π.
         let half = 1.0 - 2.0 / std::f64::consts::PI;
-        assert!((folded_variance(0.5, 1.0) - half).abs() < 1e-12);
-        assert!((folded_variance(-1.0, 4.0) - 4.0 * half).abs() < 1e-12);
-        assert!((folded_variance(30.0, 1.0) - 1.0).abs() < 1e-9);
+        assert!((Folded::of(0.5, 1.0).variance - half).abs() < 1e-12);
+        assert!((Folded::of(-1.0, 4.0).variance - 4.0 * half).abs() < 1e-12);
+        assert!((Folded::of(30.0, 1.0).variance - 1.0).abs() < 1e-9);
         // Mean 1, variance 1: by sums over the density.
         let (mut mean, mut square) = (0.0, 0.0);
         for k in -80_000..80_000 {
@@ -280,7 +298,20 @@ mod tests {
             square += x * x * p;
         }
         let expected = square - mean * mean;
-        assert!((folded_variance(2.0_f64.sqrt(), 1.0) - expected).abs() < 1e-6);
-        assert_eq!(folded_variance(1.0, 0.0), 0.0);
+        assert!((Folded::of(2.0_f64.sqrt(), 1.0).variance - expected).abs() < 1e-6);
+        assert_eq!(Folded::of(1.0, 0.0).variance, 0.0);
+        // It follows a number far from zero, and does not one at zero.
+        let slope = |found, variance| Folded::of(found, variance).slope;
+        assert_eq!(slope(0.5, 1.0), 0.0);
+        assert_eq!((slope(-30.0, 1.0), slope(30.0, 1.0)), (-1.0, 1.0));
+        assert_eq!((slope(-1.0, 0.0), slope(1.0, 0.0)), (-1.0, 1.0));
+        // The mean of |x| for means of x of 1 ± h.
+        let mean = |m: f64| {
+            let density = |x: f64| (-(x - m).powi(2) / 2.0).exp();
+            let sum = (-80_000..80_000).map(|k| f64::from(k).abs() * density(f64::from(k) * 1e-4));
+            sum.sum::<f64>() * 1e-8 / (2.0 * std::f64::consts::PI).sqrt()
+        };
+        let expected = (mean(1.001) - mean(0.999)) / 0.002;
+        assert!((slope(2.0_f64.sqrt(), 1.0) - expected).abs() < 1e-6);
     }
 }

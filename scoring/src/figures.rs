@@ -69,6 +69,9 @@ figures! {
 }
 
 impl Figures {
+    /// The figure that all records have. Others are unknown to those that were written before they were thought of.
+    pub const ALWAYS: &str = "q";
+
     /// The place in [`Figures::values`] of the figure called `name`.
     pub fn place(name: &str) -> Option<usize> {
         Self::ALL.iter().position(|figure| figure.name == name)
@@ -80,13 +83,12 @@ impl Figures {
     }
 }
 
-/// JSON has no NaN: what was written as null is read as that. So is a figure that is not there, because
-/// what was written before it was thought of lacks it; Q was there from the first.
+/// JSON has no NaN: what was written as null is read as that, and so is a figure that is not there.
 impl<'de> Deserialize<'de> for Figures {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let found = BTreeMap::<String, Option<f64>>::deserialize(deserializer)?;
-        if !found.contains_key("q") {
-            return Err(serde::de::Error::missing_field("q"));
+        if !found.contains_key(Self::ALWAYS) {
+            return Err(serde::de::Error::missing_field(Self::ALWAYS));
         }
         Ok(Self::from_values(Self::ALL.map(
             |Figure { name, .. }| found.get(name).copied().flatten().unwrap_or(f64::NAN),

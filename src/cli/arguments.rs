@@ -101,7 +101,7 @@ impl Printing {
                 let details = table.headings.iter().filter(|heading| heading.detail);
                 let details: Vec<&str> = details.map(|heading| heading.label.as_str()).collect();
                 if !details.is_empty() {
-                    let note = format!("Left out, with --wide: {}.", details.join(", "));
+                    let note = format!("More with --wide: {}", details.join(", "));
                     narrow.notes.push(note);
                 }
                 self.form.print(&narrow)

@@ -11,7 +11,7 @@ use crate::pipeline::images::ImageId;
 
 /// Gather stamps of your own into a data folder that `measure` takes.
 ///
-/// Stamps come as FITS files of one stamp, a cube, or several extensions each, or are cut out of an exposure around
+/// The sky has to be subtracted. Stamps come as FITS files of one stamp, a cube, or several extensions each, or are cut out of an exposure around
 /// positions; those that reach beyond it are flagged when they are measured. The PSF is one star stamp for all, one
 /// for each galaxy in the same order, or a table of functional PSFs (x,y,profile,beta,fwhm,e1,e2; docs/formats.md),
 /// of which the positions do not matter. Beside the image a table tells which stamp is which, in the order of the
@@ -21,7 +21,7 @@ pub(super) struct Arguments {
     /// FITS files of stamps, in the order of the galaxies.
     #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with = "exposure")]
     stamps: Vec<PathBuf>,
-    /// Image to cut stamps out of.
+    /// Image to cut stamps out of: the first of its file.
     #[arg(long, value_name = "FILE", requires = "positions")]
     exposure: Option<PathBuf>,
     /// Table of the galaxies' positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the
@@ -90,7 +90,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ),
         (None, ..) => Stamps::Files(stamps),
     };
-    let data = DataFolder::new(out);
+    let data = if out.is_dir() {
+        DataFolder::open(out)?
+    } else {
+        DataFolder::new(out)
+    };
     let id = ImageId {
         set: *set,
         image: *image,

@@ -5,15 +5,17 @@ use std::path::PathBuf;
 use clap::Args;
 use shearq_submissions::{Calibration, EllipticityType};
 
-use super::arguments::{Form, SetList};
-use crate::io::run::Run;
+use super::arguments::{Form, SetList, Threads};
+use crate::io::run::{Run, Source};
+use crate::pipeline::inputs;
 use crate::report::table::{Cell, Heading, Table};
 use crate::results::mean::mean_shears;
+use crate::results::score::without_catalogue;
 
 /// Mean ellipticity of each set: the shear, where a set has one shear.
 ///
 /// The ellipticities are those of the catalogues, divided by their response where the submission does so. Each
-/// galaxy with an ellipticity counts alike. The error is the scatter over the root of their number, which holds
+/// galaxy with an ellipticity counts alike, flagged ones have none. The error is the scatter over the root of their number, which holds
 /// for galaxies that are independent of one another; of pairs turned by 90 degrees it is too large.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -25,6 +27,8 @@ pub(super) struct Arguments {
     sets: Option<SetList>,
     #[command(flatten)]
     form: Form,
+    #[command(flatten)]
+    threads: Threads,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -32,9 +36,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         measured,
         sets,
         form,
+        threads,
     } = arguments;
     let run = Run::require(measured)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
+    // The data need not be there any more.
+    let data = match &run.source {
+        Source::Folder { .. } => run.source.data(measured).ok(),
+        Source::Simulated(_) => None,
+    };
+    if let Some(data) = &data {
+        inputs::verify(data, measured, &run, sets, threads.number())?;
+    }
     let means = mean_shears(&run, measured, sets)?;
     let headings = [
         ("set", "Set"),
@@ -68,6 +81,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         );
     } else if submission.ellipticity() == EllipticityType::Distortion {
         notes.push("Of distortions, divided by their response to shear.".into());
+    }
+    if let Some(data) = &data {
+        let used = means.iter().map(|mean| (mean.set, mean.images.as_slice()));
+        notes.extend(without_catalogue(data, &used.collect(), sets)?);
     }
     form.print(&Table {
         title: "Mean shear".into(),

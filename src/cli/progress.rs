@@ -74,6 +74,10 @@ impl Progress for Bar {
     fn note(&mut self, line: &str) {
         self.bar.set_message(format!("  {line}"));
     }
+
+    fn warn(&mut self, line: &str) {
+        self.bar.suspend(|| tell(format_args!("{line}")));
+    }
 }
 
 impl Drop for Bar {

@@ -15,6 +15,7 @@ use crate::io::table::FileFormat;
 use crate::pipeline::images;
 use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
 use crate::report::comparison::{compare, q_heat_map};
+use crate::report::html::Block;
 use crate::report::pages;
 use crate::report::scores::per_set;
 use crate::report::table::Cell;
@@ -97,8 +98,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let table = compare(&variants, options.definition);
     print_table(&table.narrow())?;
     let records = by_name(&variants);
-    print(&format!("\n{}", wrapped(&verdict(&records), Some(width()))))?;
-    sections.insert(0, pages::comparison(table, &q_heat_map(&records))?);
+    let verdict = verdict(&records);
+    print(&format!("\n{}", wrapped(&verdict, Some(width()))))?;
+    let mut comparison = pages::comparison(table, &q_heat_map(&records))?;
+    comparison.blocks.insert(0, Block::Text(verdict));
+    sections.insert(0, comparison);
     let report = out.join("report.html");
     pages::save(&report, "Quickstart (simulated data)", sections, made_by)?;
     tell(format_args!(

@@ -139,7 +139,7 @@ fn describe(id: ImageId, index: usize, m: &Measurement) -> String {
         format!("{} iterations ({ended})", d.iterations)
     });
     format!(
-        "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4}, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",
+        "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4} before calibration, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",
         id.set,
         id.image,
         m.e1,

@@ -63,6 +63,13 @@ impl PartFile {
         Ok((part, file))
     }
 
+    /// Locks the file, which another library has made, so that no process takes it for a leftover.
+    pub fn hold(&mut self) {
+        // File systems without locks have none that could be taken by others.
+        let file = fs::File::open(&self.part);
+        self._held = file.ok().filter(|file| file.lock().is_ok());
+    }
+
     /// Where to write.
     pub fn path(&self) -> &Path {
         &self.part

@@ -114,7 +114,7 @@ impl ImageWriter {
     ) -> Result<Self, FileError> {
         let path = path.as_ref();
         plain_name(path)?;
-        let part = PartFile::new(path)?;
+        let mut part = PartFile::new(path)?;
         let _guard = lock();
         let cannot = |e| FileError::new(path, format!("cannot write the image: {}", describe(e)));
         let description = ImageDescription {
@@ -125,6 +125,7 @@ impl ImageWriter {
             .with_custom_primary(&description)
             .open()
             .map_err(cannot)?;
+        part.hold();
         let hdu = file.primary_hdu().map_err(cannot)?;
         write_header(&mut file, &hdu, header).map_err(cannot)?;
         Ok(ImageWriter {
@@ -171,6 +172,19 @@ impl ImageWriter {
     /// # Errors
     /// Where rows are missing or the file cannot be closed.
     pub fn finish(self) -> Result<(), FileError> {
+        self.closed()?.finish()
+    }
+
+    /// The same unless a file has its name by now, of which nothing changes then. Returns whether this is the file
+    /// of that name.
+    ///
+    /// # Errors
+    /// As [`ImageWriter::finish`].
+    pub fn finish_if_absent(self) -> Result<bool, FileError> {
+        self.closed()?.finish_if_absent()
+    }
+
+    fn closed(self) -> Result<PartFile, FileError> {
         let ImageWriter {
             file,
             part,
@@ -185,7 +199,7 @@ impl ImageWriter {
             ));
         }
         close(file, part.target())?;
-        part.finish()
+        Ok(part)
     }
 }
 

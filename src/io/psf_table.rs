@@ -120,6 +120,11 @@ pub fn read_all(path: &Path) -> Result<Vec<Placed>, FileError> {
 /// # Errors
 /// Where the file cannot be written.
 pub fn write(path: &Path, rows: &[Placed]) -> Result<(), FileError> {
+    atomic::write(path, text(rows).as_bytes())
+}
+
+/// The same table as text.
+pub fn text(rows: &[Placed]) -> String {
     let mut text = format!("{HEADER}\n");
     for ((x, y), psf) in rows {
         // A Kolmogorov PSF has no β; the column keeps the place with that of a Moffat.
@@ -130,5 +135,5 @@ pub fn write(path: &Path, rows: &[Placed]) -> Result<(), FileError> {
         let (fwhm, e1, e2) = (psf.fwhm, psf.shape.e1, psf.shape.e2);
         text.push_str(&format!("{x},{y},{profile},{beta},{fwhm},{e1},{e2}\n"));
     }
-    atomic::write(path, text.as_bytes())
+    text
 }

@@ -117,15 +117,23 @@ pub fn read(
     }
 }
 
-/// Reads a truth file's x, y, g1, g2: a text table, which needs no header, or another format.
+/// Reads a truth file's x, y, g1, g2.
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
 pub fn read_truth(path: &Path) -> Result<DataFrame, FileError> {
-    const NAMES: [&str; 4] = ["x", "y", "g1", "g2"];
+    read_columns(path, &["x", "y", "g1", "g2"])
+}
+
+/// Reads the columns `names`: of a text table, which has these and no others where it has no header, or of another
+/// format.
+///
+/// # Errors
+/// Where the file cannot be read, or lacks a column.
+pub fn read_columns(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
     match Ending::of(path) {
-        Ending::Text => read_text(path, &NAMES),
-        Ending::Parquet | Ending::Fits => read(path, Some(&NAMES), MAX_ROWS),
+        Ending::Text => read_text(path, names),
+        Ending::Parquet | Ending::Fits => read(path, Some(names), MAX_ROWS),
     }
 }
 

@@ -25,6 +25,8 @@ pub trait Progress {
     }
     /// A line worth showing.
     fn note(&mut self, line: &str);
+    /// A line that must not be missed.
+    fn warn(&mut self, line: &str);
 }
 
 /// Hears nothing.
@@ -33,6 +35,7 @@ pub struct Quiet;
 impl Progress for Quiet {
     fn advance(&mut self, _galaxies: u64) {}
     fn note(&mut self, _line: &str) {}
+    fn warn(&mut self, _line: &str) {}
 }
 
 /// Hands items to the workers; false once the work has been given up.

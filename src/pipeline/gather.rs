@@ -8,6 +8,7 @@ use shearq_measure::FunctionalPsf;
 
 use super::PipelineError;
 use super::images::ImageId;
+use super::measure::check_strip;
 use crate::io::FileError;
 use crate::io::atomic;
 use crate::io::fits::{ImageReader, ImageWriter, Value};
@@ -21,7 +22,10 @@ const MAX_STAMPS: usize = table::MAX_ROWS;
 /// Share of a star's light on the frame of its stamp, were it all as bright as the frame, that is told: a background
 /// of that size changes a deconvolved galaxy.
 const PEDESTAL: f64 = 0.02;
-/// Pixels that the frame of a star is wide.
+/// Mean of the stamps' frames, in units of the scatter of their pixels, that is told: more than the wings of galaxies
+/// leave.
+const SKY: f64 = 1.0;
+/// Pixels that the frame of a star or a stamp is wide.
 const FRAME: usize = 2;
 
 /// Where stamps come from.
@@ -98,10 +102,15 @@ pub fn gather(
     noise: Option<f64>,
 ) -> Result<Gathered, PipelineError> {
     let target = data.galaxies(id.set, id.image);
-    if is_there(&target) {
-        let message =
-            "this image is there already; expected a new one (--set and --image number it)";
-        return Err(FileError::new(target, message).into());
+    let which = data.stamps(id.set, id.image);
+    let own = [
+        target.clone(),
+        data.psf_star(id.set, id.image),
+        data.psf_functional(id.set, id.image),
+        which.clone(),
+    ];
+    if let Some(path) = own.into_iter().find(|path| is_there(path)) {
+        return Err(already(path).into());
     }
     let mut doubts = Vec::new();
     let positions = match stamps {
@@ -115,14 +124,16 @@ pub fn gather(
         Stamps::Cutouts { side, .. } => (positions.len(), *side),
     };
     let mosaic = Mosaic::of(count, side);
-    gather_psfs(data, id, psfs, &mosaic, &mut doubts)?;
+    check_strip(&target, mosaic.columns, side)?;
+    let psf = gather_psfs(data, id, psfs, &mosaic, &mut doubts)?;
     let mut keys = Vec::new();
     keys.extend(noise.map(|sigma| ("NOISESIG", Value::Real(sigma))));
     let mut image = Rows::create(&target, mosaic, &keys)?;
-    let mut incomplete = 0;
+    let (mut incomplete, mut frames) = (0, Level::default());
     let mut places = csv::Writer::from_writer(Vec::new());
     let mut take = |origin: &Origin<'_>, pixels: &[f32]| -> Result<(), FileError> {
         incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
+        frames.add(frame_of(pixels, side));
         let (x, y) = mosaic.centre(image.next % mosaic.columns, image.next / mosaic.columns);
         let place = Place {
             x,
@@ -156,10 +167,18 @@ pub fn gather(
             }
         }
     }
-    let which = data.stamps(id.set, id.image);
+    if frames.mean().abs() > SKY * frames.deviation() {
+        doubts.push(format!(
+            "warning: the frames of the stamps have a mean of {:.3} where a pixel scatters by {:.3}: is sky left in them? It takes shear away",
+            frames.mean(),
+            frames.deviation()
+        ));
+    }
     let text = places
         .into_inner()
         .map_err(|error| FileError::new(&which, error.to_string()))?;
+    // Whoever is the first to have the PSF has the image.
+    psf.finish()?;
     atomic::write(&which, &text)?;
     image.finish()?;
     Ok(Gathered {
@@ -169,9 +188,51 @@ pub fn gather(
     })
 }
 
+fn already(path: PathBuf) -> FileError {
+    let message =
+        "this is there already; expected an image with a number of its own (--set and --image)";
+    FileError::new(path, message)
+}
+
+/// Mean and scatter of pixels.
+#[derive(Debug, Default)]
+struct Level {
+    count: usize,
+    sum: f64,
+    squares: f64,
+}
+
+impl Level {
+    fn add(&mut self, pixels: impl Iterator<Item = f64>) {
+        for value in pixels.filter(|value| value.is_finite()) {
+            self.count += 1;
+            self.sum += value;
+            self.squares += value * value;
+        }
+    }
+
+    fn mean(&self) -> f64 {
+        self.sum / self.count as f64
+    }
+
+    fn deviation(&self) -> f64 {
+        let variance = self.squares / self.count as f64 - self.mean().powi(2);
+        variance.max(0.0).sqrt()
+    }
+}
+
+/// The pixels of a stamp's frame.
+fn frame_of(pixels: &[f32], side: usize) -> impl Iterator<Item = f64> + '_ {
+    let inside = FRAME..side.saturating_sub(FRAME);
+    let framed = move |k: usize| !(inside.contains(&(k % side)) && inside.contains(&(k / side)));
+    let all = pixels.iter().enumerate();
+    all.filter(move |(k, _)| framed(*k))
+        .map(|(_, &value)| f64::from(value))
+}
+
 /// Positions of galaxies on an exposure.
 fn read_positions(path: &Path, columns: [&str; 2]) -> Result<Vec<(f64, f64)>, FileError> {
-    let read = table::read(path, Some(&columns), MAX_STAMPS)
+    let read = table::read_columns(path, &columns)
         .map_err(|error| error.hint_of_columns("--columns names others"))?;
     let of = |name| table::numbers(&read, name, path);
     let (xs, ys) = (of(columns[0])?, of(columns[1])?);
@@ -269,7 +330,7 @@ fn gather_psfs(
     files: &[PathBuf],
     mosaic: &Mosaic,
     doubts: &mut Vec<String>,
-) -> Result<(), FileError> {
+) -> Result<PsfFile, FileError> {
     let wrong = |path: &Path, found: usize| {
         let message = format!(
             "there are {found} PSFs; expected one, or one for each of the {} stamps",
@@ -278,7 +339,9 @@ fn gather_psfs(
         FileError::new(path, message)
     };
     if let [table] = files
-        && table.extension().is_some_and(|ending| ending == "csv")
+        && table
+            .extension()
+            .is_some_and(|ending| ending.eq_ignore_ascii_case("csv"))
     {
         let psfs: Vec<FunctionalPsf> = psf_table::read_all(table)?
             .into_iter()
@@ -293,7 +356,8 @@ fn gather_psfs(
             .enumerate()
             .map(|(k, psf)| (centre(k), psf))
             .collect();
-        return psf_table::write(&data.psf_functional(id.set, id.image), &rows);
+        let path = data.psf_functional(id.set, id.image);
+        return Ok(PsfFile::Table(path, psf_table::text(&rows)));
     }
     let (count, side) = survey(files)?;
     let stars = match count {
@@ -308,7 +372,8 @@ fn gather_psfs(
     let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
     each_stamp(files, |origin, pixels| {
         let pedestal = pedestal(pixels, side);
-        if image.next == 0 && pedestal.abs() > PEDESTAL {
+        // Of a star without light it is no number.
+        if image.next == 0 && (pedestal.abs() > PEDESTAL || pedestal.is_nan()) {
             doubts.push(format!(
                 "warning: {}: the frame of the first PSF is as bright as {:.0} % of its light would make it if all of the stamp were: is a background left in it?",
                 origin.file.display(),
@@ -317,26 +382,38 @@ fn gather_psfs(
         }
         image.add(pixels)
     })?;
-    image.finish()
+    Ok(PsfFile::Stars(Box::new(image)))
+}
+
+/// PSFs that are about to be written.
+enum PsfFile {
+    Stars(Box<Rows>),
+    Table(PathBuf, String),
+}
+
+impl PsfFile {
+    fn finish(self) -> Result<(), FileError> {
+        match self {
+            PsfFile::Stars(image) => image.finish(),
+            PsfFile::Table(path, text) => match atomic::write_if_absent(&path, text.as_bytes())? {
+                true => Ok(()),
+                false => Err(already(path)),
+            },
+        }
+    }
 }
 
 /// The light of a star's stamp if all of it were as bright as its frame, in units of the light that it has.
 fn pedestal(pixels: &[f32], side: usize) -> f64 {
-    let inside = FRAME..side.saturating_sub(FRAME);
-    let (mut frame, mut count, mut sum) = (0.0, 0, 0.0);
-    for (k, &value) in pixels.iter().enumerate() {
-        let value = f64::from(value);
-        sum += value;
-        if !(inside.contains(&(k % side)) && inside.contains(&(k / side))) {
-            frame += value;
-            count += 1;
-        }
-    }
-    frame / f64::from(count.max(1)) * pixels.len() as f64 / sum
+    let mut frame = Level::default();
+    frame.add(frame_of(pixels, side));
+    let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
+    frame.mean() * pixels.len() as f64 / light
 }
 
 /// A mosaic that is written a row of stamps at a time.
 struct Rows {
+    path: PathBuf,
     writer: ImageWriter,
     mosaic: Mosaic,
     /// Number of stamps that are there.
@@ -357,11 +434,9 @@ impl Rows {
             ("NSTAMPS", Value::Int(galaxies as i64)),
         ];
         keys.extend_from_slice(more);
-        if let Some(folder) = path.parent() {
-            std::fs::create_dir_all(folder)
-                .map_err(FileError::doing(folder, "cannot make the folder"))?;
-        }
+        atomic::sweep_beside(path);
         Ok(Rows {
+            path: path.to_owned(),
             writer: ImageWriter::create(path, columns * stamp, mosaic.rows() * stamp, &keys)?,
             pixels: vec![0.0; columns * stamp * stamp],
             mosaic,
@@ -389,6 +464,9 @@ impl Rows {
     }
 
     fn finish(self) -> Result<(), FileError> {
-        self.writer.finish()
+        match self.writer.finish_if_absent()? {
+            true => Ok(()),
+            false => Err(already(self.path)),
+        }
     }
 }

@@ -129,7 +129,7 @@ impl ImageSource {
             return Err(FileError::new(
                 data.galaxies(id.set, id.image),
                 format!(
-                    "the stamps have {stamp} pixels a side; submission {} needs {}",
+                    "the stamps have {stamp} pixels a side; submission {} needs {} (`[stamp] size` of one of your own says otherwise)",
                     submission.name, submission.stamp.size
                 ),
             )
@@ -240,7 +240,7 @@ pub(super) fn open_galaxies(
 }
 
 /// Checks that a row of `n` stamps of `side` pixels a side is one that can be held in memory.
-fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), FileError> {
+pub(super) fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), FileError> {
     let pixels = n * side * side;
     if pixels <= MAX_STRIP {
         return Ok(());
@@ -303,6 +303,14 @@ fn open_psf(
             if side < size {
                 let message =
                     format!("the PSF stamp has {side} pixels a side; the submission needs {size}");
+                return Err(FileError::new(&path, message).into());
+            }
+            let stars = whole(&image, &path, "NSTAMPS", mosaic.columns * mosaic.rows())?;
+            if let Some(stars) = stars.filter(|stars| *stars != 1 && *stars != mosaic.galaxies) {
+                let message = format!(
+                    "the header key NSTAMPS is {stars}; expected 1, or {} as there are galaxies",
+                    mosaic.galaxies
+                );
                 return Err(FileError::new(&path, message).into());
             }
             let one = (width, height) == (side, side);
@@ -440,7 +448,7 @@ pub fn measure_folder(
     let measurer = Measurer::new(&run.submission, stamp)?;
     let (noise, doubts) = first_noise(data, first, &measurer)?;
     for doubt in doubts {
-        progress.note(&doubt);
+        progress.warn(&doubt);
     }
     let mut rows = Vec::new();
     // Of each image as it was when it was opened, in the images' order.

@@ -124,6 +124,8 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
 
 /// Bands of what surveys to come ask of shear, in the units of the table of [`contest`]: |m| of two in a thousand.
 const BAND: f64 = 2.0;
+/// Largest m in a picture that has smaller ones too.
+const SEEN: f64 = 20.0;
 
 /// Submissions held against each other on every kind of set: scatter over its bound, biases and Q, each beside
 /// what is to be reached. `table` is that of a study, one row a set and submission.
@@ -180,6 +182,17 @@ pub fn contest(table: &Table) -> PanelGrid {
             ..LinePlot::default()
         }
     };
+    // Uncalibrated submissions would leave nothing to be seen of the others: they are beyond the picture.
+    let near = |key: &str, label: &str| {
+        let plot = plot(key, label, &[-BAND, BAND]);
+        let beyond = |value: f64| value.abs() > SEEN;
+        let all = || plot.series.iter().flat_map(|series| &series.y).copied();
+        let some = all().any(beyond) && all().any(|value| !beyond(value) && value.abs() != BAND);
+        LinePlot {
+            y_range: some.then_some((-SEEN, SEEN)),
+            ..plot
+        }
+    };
     let mut q = plot("q_spectrum", "Q of cross-spectra", &[]);
     let limit = rows
         .iter()
@@ -193,8 +206,8 @@ pub fn contest(table: &Table) -> PanelGrid {
         columns: 2,
         plots: vec![
             plot("scatter_over_bound", "scatter / bound", &[1.0]),
-            plot("m1", "m1×10³", &[-BAND, BAND]),
-            plot("m2", "m2×10³", &[-BAND, BAND]),
+            near("m1", "m1×10³"),
+            near("m2", "m2×10³"),
             plot("c1", "c1×10⁴", &[0.0]),
             plot("leakage", "PSF leakage", &[0.0]),
             q,

@@ -62,7 +62,7 @@ impl Column {
 }
 
 /// The table in lines of at most `width` columns, if any: errors go below their values, words are folded,
-/// and what is wider still is continued below, with the first column again.
+/// and what is wider still is continued below, with the columns of words that it starts with again, or the first.
 pub fn fitted(table: &Table, width: Option<usize>) -> String {
     let mut text = String::new();
     if !table.title.is_empty() {
@@ -79,12 +79,18 @@ pub fn fitted(table: &Table, width: Option<usize>) -> String {
     if all.iter().map(least).sum::<usize>() > width {
         all = columns(true);
     }
-    if let Some((first, mut rest)) = all.split_first() {
-        // As many as fit at a time, one at least, each time with the first column.
+    if !all.is_empty() {
+        let words = all.iter().take_while(|column| !column.numbers).count();
+        let room: usize = all.iter().take(words).map(least).sum();
+        // Where they leave little room for anything else, the first has to do.
+        let names = if 2 * room > width { 1 } else { words.max(1) };
+        let (names, mut rest) = all.split_at(names);
+        // As many as fit at a time, one at least.
         loop {
-            let (mut part, mut used) = (vec![first], least(first));
+            let mut part: Vec<&Column> = names.iter().collect();
+            let mut used: usize = names.iter().map(least).sum();
             while let Some((next, after)) = rest.split_first()
-                && (part.len() == 1 || used + least(next) <= width)
+                && (part.len() == names.len() || used + least(next) <= width)
             {
                 part.push(next);
                 used += least(next);

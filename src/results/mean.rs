@@ -11,6 +11,8 @@ use crate::io::table;
 pub struct MeanShear {
     /// The set.
     pub set: u32,
+    /// Images that there is a catalogue of.
+    pub images: Vec<u32>,
     /// Galaxies with an ellipticity.
     pub galaxies: usize,
     /// Galaxies without one.
@@ -61,11 +63,7 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<MeanShear>
     };
     let mut means = Vec::new();
     for set in wanted {
-        let catalogues: Vec<PathBuf> = files
-            .of_set(set)
-            .into_iter()
-            .map(|(_, path)| path)
-            .collect();
+        let catalogues = files.of_set(set);
         if catalogues.is_empty() {
             let message = format!("there is no catalogue of set {set}");
             return Err(FileError::new(out, message));
@@ -81,9 +79,9 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<MeanShear>
     Ok(means)
 }
 
-fn mean_of(set: u32, catalogues: &[PathBuf]) -> Result<MeanShear, FileError> {
+fn mean_of(set: u32, catalogues: &[(u32, PathBuf)]) -> Result<MeanShear, FileError> {
     let (mut moments, mut flagged) = ([Moments::default(); 2], 0);
-    for path in catalogues {
+    for (_, path) in catalogues {
         let read = table::read(path, Some(&["e1", "e2"]), table::MAX_ROWS)?;
         let (e1, e2) = (
             table::numbers(&read, "e1", path)?,
@@ -103,6 +101,7 @@ fn mean_of(set: u32, catalogues: &[PathBuf]) -> Result<MeanShear, FileError> {
     let mean = |m: Moments| if m.count == 0 { f64::NAN } else { m.mean };
     Ok(MeanShear {
         set,
+        images: catalogues.iter().map(|(image, _)| *image).collect(),
         galaxies,
         flagged,
         mean: moments.map(mean),

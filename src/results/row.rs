@@ -374,8 +374,7 @@ impl Rows<'_> {
             let mut values = [f64::NAN; Figures::ALL.len()];
             for (value, Figure { name, .. }) in values.iter_mut().zip(Figures::ALL) {
                 let name = column(name);
-                // What was recorded before a figure was thought of lacks it; Q was there from the first.
-                if name == column("q") || self.table.column(&name).is_ok() {
+                if name == column(Figures::ALWAYS) || self.table.column(&name).is_ok() {
                     *value = self.real(&name, row)?;
                 }
             }

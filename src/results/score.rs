@@ -1,5 +1,6 @@
 //! Scoring catalogues: read in parallel, added up in order.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::resample::mean_over_sets;
@@ -326,17 +327,30 @@ pub fn unscored(
     scored: &[ScoredSet],
     sets: &[u32],
 ) -> Result<Vec<String>, FileError> {
+    let numbered = scored
+        .iter()
+        .filter_map(|scored| Some((scored.set?, scored.images.as_slice())));
+    without_catalogue(data, &numbered.collect(), sets)
+}
+
+/// The same where `used` has the images of each set that there is a catalogue of.
+///
+/// # Errors
+/// As [`unscored`].
+pub fn without_catalogue(
+    data: &DataFolder,
+    used: &BTreeMap<u32, &[u32]>,
+    sets: &[u32],
+) -> Result<Vec<String>, FileError> {
     let images = data.images(sets)?;
     let (mut absent, mut lines) = (Vec::new(), Vec::new());
     for set in images.sets() {
         let there = images.of_set(set);
-        let Some(scored) = scored.iter().find(|scored| scored.set == Some(set)) else {
+        let Some(used) = used.get(&set) else {
             absent.push(set.to_string());
             continue;
         };
-        let lacking = there
-            .iter()
-            .filter(|(image, _)| !scored.images.contains(image));
+        let lacking = there.iter().filter(|(image, _)| !used.contains(image));
         match lacking.count() {
             0 => {}
             count => lines.push(format!(

@@ -57,8 +57,13 @@ pub struct LambdaSums {
     pub correct: u64,
     /// All transitions.
     pub transitions: u64,
+    /// Sums over galaxies of the squares of their correct transitions and of all their transitions, and of the
+    /// product of both, for the error of CTR.
+    pub transition_squares: [f64; 3],
     /// Σ dSNR in dB.
     pub dsnr: f64,
+    /// Σ dSNR², for its error.
+    pub dsnr_square: f64,
     /// Galaxies.
     pub galaxies: u64,
     /// Σ |e − e*|².
@@ -75,7 +80,15 @@ impl LambdaSums {
     fn add(&mut self, other: &LambdaSums) {
         self.correct += other.correct;
         self.transitions += other.transitions;
+        for (sum, more) in self
+            .transition_squares
+            .iter_mut()
+            .zip(other.transition_squares)
+        {
+            *sum += more;
+        }
         self.dsnr += other.dsnr;
+        self.dsnr_square += other.dsnr_square;
         self.galaxies += other.galaxies;
         self.deviation += other.deviation;
         self.deviation_square += other.deviation_square;
@@ -88,9 +101,23 @@ impl LambdaSums {
         self.correct as f64 / self.transitions as f64
     }
 
+    /// Standard error of CTR, which is a ratio of sums over galaxies: pixels of one galaxy go together.
+    pub fn ctr_error(&self) -> f64 {
+        let ctr = self.ctr();
+        let [correct, all, both] = self.transition_squares;
+        let square = correct - 2.0 * ctr * both + ctr * ctr * all;
+        square.max(0.0).sqrt() / self.transitions as f64
+    }
+
     /// Mean dSNR in dB.
     pub fn mean_dsnr(&self) -> f64 {
         self.dsnr / self.galaxies as f64
+    }
+
+    /// Standard error of the mean dSNR, from its scatter.
+    pub fn mean_dsnr_error(&self) -> f64 {
+        let (n, mean) = (self.galaxies as f64, self.mean_dsnr());
+        ((self.dsnr_square / n - mean * mean).max(0.0) / n).sqrt()
     }
 
     /// 1/RMSD.
@@ -392,6 +419,8 @@ impl LambdaStudy {
             },
         )?;
         (sums.correct, sums.transitions) = (correct, transitions);
+        let [c, t] = [correct as f64, transitions as f64];
+        sums.transition_squares = [c * c, t * t, c * t];
         sums.iterations = u64::from(descent.iterations);
         let distance = |image: &[f32]| -> f64 {
             image
@@ -401,6 +430,7 @@ impl LambdaStudy {
                 .sum()
         };
         sums.dsnr = 10.0 * (distance(stamp) / distance(&scratch.out)).log10();
+        sums.dsnr_square = sums.dsnr * sums.dsnr;
         let light = scratch.out.iter().map(|&v| f64::from(v)).sum();
         let shape = self
             .acf
@@ -429,4 +459,32 @@ fn observe(galaxy: &Synthetic, snr_db: f64) -> (Vec<f32>, f64) {
         .map(|(v, n)| (v + sigma * n) as f32)
         .collect();
     (stamp, sigma)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_are_those_of_ratios_and_means_over_galaxies() {
+        let mut sums = LambdaSums::default();
+        // Correct of all transitions, and dSNR, of two galaxies.
+        for (correct, all, dsnr) in [(1u64, 2u64, 3.0f64), (3, 4, 5.0)] {
+            let [c, t] = [correct as f64, all as f64];
+            sums.add(&LambdaSums {
+                correct,
+                transitions: all,
+                transition_squares: [c * c, t * t, c * t],
+                dsnr,
+                dsnr_square: dsnr * dsnr,
+                galaxies: 1,
+                ..LambdaSums::default()
+            });
+        }
+        // 4/6, from which they are (1 − 4/3) and (3 − 8/3) off.
+        let expected = (2.0f64 / 9.0).sqrt() / 6.0;
+        assert!((sums.ctr_error() - expected).abs() < 1e-12);
+        assert_eq!(sums.mean_dsnr(), 4.0);
+        assert!((sums.mean_dsnr_error() - 0.5f64.sqrt()).abs() < 1e-12);
+    }
 }

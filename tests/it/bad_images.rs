@@ -102,8 +102,8 @@ fn images_of_other_shapes_and_types_work_or_are_refused() {
             &["3 dimensions; expected 2"],
         ),
         (
-            fits_image(-32, &[side, side - 48], stamp, &float),
-            &["384 × 336 pixels; expected 8 × 8"],
+            fits_image(-32, &[side, side - 40], stamp, &float),
+            &["384 × 344 pixels; expected 8 × 7"],
         ),
         (
             fits_image(-32, &[0, side], stamp, &[]),
@@ -558,7 +558,7 @@ fn stars_that_cannot_be_used_are_refused_with_the_reason() {
                 &["STAMP   =                   20"],
                 &floats(&pixels),
             ),
-            &["48 pixels a side; expected one stamp, or 8 × 8"],
+            &["48 × 48 pixels; expected one stamp, or 8 × 8"],
         ),
     ];
     for (bytes, expected) in cases {

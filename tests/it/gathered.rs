@@ -147,7 +147,7 @@ fn stamps_of_all_kinds_of_files_are_measured_alike() {
     succeed(&[&measure[..], &["--data", text(&data)]].concat());
     assert_eq!(small.measured("01", "x"), [24.5, 72.5, 120.5, 24.5, 72.5]);
     let again = fail(&[&gather[..], &more].concat());
-    assert!(again.contains("this image is there already"), "{again}");
+    assert!(again.contains("this is there already"), "{again}");
     // They are no grid that has a spectrum.
     let sent = at("sent");
     let pack = ["pack", "--measured", text(&out), "--kind", "spectra"];
@@ -271,4 +271,98 @@ fn what_cannot_be_gathered_is_named() {
         "{said}"
     );
     assert!(said.contains("is a background left in it?"), "{said}");
+}
+
+#[test]
+fn a_gathered_image_goes_where_the_layout_says_and_is_of_one_run() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let stamps = vec![vec![1.0f32; 48 * 48]; 3];
+    fs::write(at("three.fits"), cube(&stamps, 48)).unwrap();
+    let mut star = vec![0.0f32; 400];
+    star[210] = 1.0;
+    fs::write(at("psf.fits"), cube(&[star], 20)).unwrap();
+    fs::write(
+        at("psf.csv"),
+        "x,y,profile,beta,fwhm,e1,e2\n0,0,moffat,3,3,0,0\n",
+    )
+    .unwrap();
+    let (three, psf, formula, out) = (at("three.fits"), at("psf.fits"), at("psf.csv"), at("data"));
+    fs::create_dir(&out).unwrap();
+    fs::write(
+        out.join("layout.toml"),
+        "galaxies = \"g-{set}-{image}.fits\"\npsf_star = \"p-{set}-{image}.fits\"\n",
+    )
+    .unwrap();
+    // What a stopped run leaves in the folder is removed by the next.
+    fs::write(out.join(".g-1-1.fits.0123456789abcdef.part"), "half").unwrap();
+    let gather = ["gather", "--stamps", text(&three), "--out", text(&out)];
+    let absent = at("absent.fits");
+    fail(&[&gather[..], &["--psf", text(&absent)]].concat());
+    succeed(&[&gather[..], &["--psf", text(&psf)]].concat());
+    let mut names: Vec<_> = fs::read_dir(&out)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    assert_eq!(names, ["g-1-1.fits", "layout.toml", "p-1-1.fits", "set01"]);
+    // A PSF of either form that is there belongs to another image.
+    fs::remove_file(out.join("g-1-1.fits")).unwrap();
+    for psf in [&psf, &formula] {
+        let message = fail(&[&gather[..], &["--psf", text(psf)]].concat());
+        assert!(
+            message.contains("p-1-1.fits: this is there already"),
+            "{message}"
+        );
+    }
+    assert!(!out.join("set01/psf-001.csv").exists());
+}
+
+#[test]
+fn sky_and_noise_that_is_another_are_told_where_they_are_seen() {
+    let small = Small::new("2");
+    let set = small.at("data/set02");
+    let mut galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
+    fs::write(small.at("dark.fits"), cube(&galaxies, 48)).unwrap();
+    galaxies
+        .iter_mut()
+        .flatten()
+        .for_each(|value| *value += 20.0);
+    fs::write(small.at("bright.fits"), cube(&galaxies, 48)).unwrap();
+    let psf = set.join("psf-001.fits");
+    let said = |stamps: &str| {
+        let (stamps, out) = (small.at(&format!("{stamps}.fits")), small.at(stamps));
+        let gather = ["gather", "--stamps", text(&stamps), "--psf", text(&psf)];
+        let rest = ["--noise", "5", "--out", text(&out)];
+        let done = shearq(&[&gather[..], &rest].concat());
+        assert!(done.status.success());
+        String::from_utf8(done.stderr).unwrap()
+    };
+    assert!(!said("dark").contains("warning"));
+    assert!(said("bright").contains("is sky left in them?"));
+    let (data, out) = (small.at("dark"), small.at("out"));
+    let measure = ["measure", "--submission", LINEAR, "--data", text(&data)];
+    let done = shearq(&[&measure[..], &["--out", text(&out)]].concat());
+    let said = String::from_utf8(done.stderr).unwrap();
+    assert!(said.contains("NOISESIG is 5"), "{said}");
+}
+
+#[test]
+fn a_tilde_is_a_letter_of_a_name() {
+    let root = tempfile::tempdir().unwrap();
+    let run = |arguments: &[&str]| {
+        let done = std::process::Command::new(env!("CARGO_BIN_EXE_shearq"))
+            .args(arguments)
+            .current_dir(root.path())
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&done.stderr).into_owned();
+        assert!(done.status.success(), "{arguments:?}: {said}");
+    };
+    let simulate = ["simulate", "--sets", "2", "--images", "1", "--grid", "8"];
+    run(&[&simulate[..], &["--out", "~sim"]].concat());
+    let measure = ["measure", "--submission", LINEAR, "--data", "~sim"];
+    let rest = ["--out", "~out", "--catalogue-format", "fits"];
+    run(&[&measure[..], &rest].concat());
+    run(&["mean", "--measured", "~out"]);
 }

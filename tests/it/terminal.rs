@@ -35,7 +35,7 @@ fn tables_fit_eighty_columns_and_wide_ones_are_asked_for() {
     }
     let (den, linear, store) = (at("den"), at("linear"), at("store"));
     let scored = assert_narrow(&["score", "--measured", text(&den)]);
-    assert!(scored.contains("Left out, with --wide:") && scored.contains("Fiducial"));
+    assert!(scored.contains("More with --wide:") && scored.contains("Fiducial"));
     for arguments in [
         &["compare", text(&den), text(&linear)][..],
         &["compare", "--store", text(&store)],

@@ -855,6 +855,12 @@ fn errors_are_those_of_their_formulae() {
                     - g(b) * k(c)
                     - g(c) * k(b)
             };
+            // How the mean of a modulus follows that of its number.
+            let follows = |b: usize| {
+                let (x, own) = (apart(b), covariance(b, b));
+                let mean = (x * x - own).max(0.0).sqrt();
+                x.signum() * libm::erf(mean / (2.0 * own).sqrt())
+            };
             let (mut sigma, mut variance) = (0.0, 0.0);
             for b in SCORED {
                 sigma += apart(b).abs() * score.bins.dln_l[b];
@@ -863,7 +869,7 @@ fn errors_are_those_of_their_formulae() {
                     variance += lengths
                         * match b == c {
                             true => folded(apart(b), covariance(b, b)),
-                            false => apart(b).signum() * apart(c).signum() * covariance(b, c),
+                            false => follows(b) * follows(c) * covariance(b, c),
                         };
                 }
             }

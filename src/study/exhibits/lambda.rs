@@ -56,6 +56,7 @@ fn ctr_over_snr(curves: &Curves) -> LinePlot {
             let y = over_lambda(sums, LambdaSums::ctr);
             let style = if k == 0 { Style::Dashed } else { Style::Line };
             Series::new(rule, CTR_SNR_DB.to_vec(), y, style, k)
+                .with_errors(over_lambda(sums, LambdaSums::ctr_error))
         })
         .collect();
     LinePlot {
@@ -73,13 +74,16 @@ fn adaptive_over_lambda(
     title: &str,
     y_label: &str,
     value: fn(&LambdaSums) -> f64,
+    error: fn(&LambdaSums) -> f64,
 ) -> LinePlot {
     let series = SNR_DB
         .iter()
         .enumerate()
         .map(|(s, snr)| {
-            let y = over_lambda(&curves.over_lambda[0][s], value);
+            let sums = &curves.over_lambda[0][s];
+            let y = over_lambda(sums, value);
             Series::new(&format!("SNR {snr} dB"), lambdas(), y, Style::Line, s)
+                .with_errors(over_lambda(sums, error))
         })
         .collect();
     LinePlot {
@@ -94,13 +98,25 @@ fn adaptive_over_lambda(
 
 /// Fig. 5: CTR against λ.
 fn ctr_over_lambda(curves: &Curves) -> LinePlot {
-    adaptive_over_lambda(curves, "Correct transition rate", "CTR", LambdaSums::ctr)
+    adaptive_over_lambda(
+        curves,
+        "Correct transition rate",
+        "CTR",
+        LambdaSums::ctr,
+        LambdaSums::ctr_error,
+    )
 }
 
 /// Fig. 6: dSNR against λ.
 fn dsnr_over_lambda(curves: &Curves) -> LinePlot {
     let title = "Discriminative signal-to-noise ratio";
-    adaptive_over_lambda(curves, title, "dSNR [dB]", LambdaSums::mean_dsnr)
+    adaptive_over_lambda(
+        curves,
+        title,
+        "dSNR [dB]",
+        LambdaSums::mean_dsnr,
+        LambdaSums::mean_dsnr_error,
+    )
 }
 
 /// Fig. 7: 1/RMSD against λ for both rules at the three S/N.
@@ -153,8 +169,8 @@ pub fn curves_table(curves: &Curves) -> Table {
                     Cell::text(*name),
                     Cell::number(*snr, 0),
                     Cell::number(LOG_LAMBDA[k], 1),
-                    Cell::number(sums.ctr(), 4),
-                    Cell::number(sums.mean_dsnr(), 3),
+                    Cell::with_error(sums.ctr(), Some(sums.ctr_error()), 4),
+                    Cell::with_error(sums.mean_dsnr(), Some(sums.mean_dsnr_error()), 3),
                     Cell::with_error(sums.inverse_rmsd(), Some(sums.inverse_rmsd_error()), 3),
                     Cell::number(sums.iterations as f64 / sums.galaxies as f64, 1),
                 ]);
@@ -200,8 +216,8 @@ pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
                 Cell::number(LOG_LAMBDA[best], 1),
                 value(&curve[best]),
                 value(paper),
-                Cell::number(paper.ctr(), 4),
-                Cell::number(paper.mean_dsnr(), 2),
+                Cell::with_error(paper.ctr(), Some(paper.ctr_error()), 4),
+                Cell::with_error(paper.mean_dsnr(), Some(paper.mean_dsnr_error()), 2),
             ]);
         }
     }
