@@ -111,7 +111,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.figure(
         "study",
         &pages::contest(&table),
-        "Each submission on each set, with errors. Dashed: the Cramér–Rao bound, m of ± 0.002, no additive bias, and Q of noise at the bound beside a perfect spectrum.",
+        "Each submission on each set, with errors. Dashed: the Cramér–Rao bound, m of ± 0.002, no additive bias. The limit of Q is that of noise at the bound beside a perfect spectrum; shear that is lost together with noise can lead beyond it.",
     )?;
     page.table("biases", &shapes)?;
     page.section("Spectra", "Quality on every kind of set, and cost.");

@@ -124,6 +124,8 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
 
 /// Bands of what surveys to come ask of shear, in the units of the table of [`contest`]: |m| of two in a thousand.
 const BAND: f64 = 2.0;
+/// Colour of what is to be reached.
+const AIM: usize = 6;
 /// Largest m in a picture that has smaller ones too.
 const SEEN: f64 = 20.0;
 
@@ -161,7 +163,7 @@ pub fn contest(table: &Table) -> PanelGrid {
         vec![least - 0.5, most + 0.5]
     };
     let plot = |key: &str, label: &str, levels: &[f64]| {
-        let level = |&value: &f64| Series::new("", ends(), vec![value; 2], Style::Dashed, 7);
+        let level = |&value: &f64| Series::new("", ends(), vec![value; 2], Style::Dashed, AIM);
         let mut series: Vec<Series> = levels.iter().map(level).collect();
         for (k, name) in names.iter().enumerate() {
             // Beside each other, for all of them to be seen.
@@ -188,8 +190,12 @@ pub fn contest(table: &Table) -> PanelGrid {
         let beyond = |value: f64| value.abs() > SEEN;
         let all = || plot.series.iter().flat_map(|series| &series.y).copied();
         let some = all().any(beyond) && all().any(|value| !beyond(value) && value.abs() != BAND);
+        if !some {
+            return plot;
+        }
         LinePlot {
-            y_range: some.then_some((-SEEN, SEEN)),
+            title: format!("{label}, beyond ± {SEEN} left out"),
+            y_range: Some((-SEEN, SEEN)),
             ..plot
         }
     };
@@ -199,8 +205,10 @@ pub fn contest(table: &Table) -> PanelGrid {
         .map(|(_, row)| number(row, "q_limit").0)
         .collect();
     let sets = rows.iter().map(|(set, _)| *set).collect();
-    q.series
-        .insert(0, Series::new("limit", sets, limit, Style::Dashed, 7));
+    q.series.insert(
+        0,
+        Series::new("limit of Q", sets, limit, Style::Points, AIM),
+    );
     PanelGrid {
         title: "Submissions against each other and what can be reached".into(),
         columns: 2,
