@@ -6,6 +6,7 @@ pub mod escape;
 pub mod figure;
 mod font;
 pub mod html;
+pub mod mean;
 pub mod page;
 pub mod pages;
 pub mod scores;

@@ -36,7 +36,7 @@ mod ellipticity;
 mod error;
 mod errors;
 mod figures;
-pub mod grid;
+mod grid;
 mod matching;
 pub mod modes;
 pub mod quality;
@@ -51,7 +51,7 @@ pub use cross::{CrossSpectrum, cross_spectrum};
 pub use ellipticity::{Distortion, Shear};
 pub use error::ScoringError;
 pub use figures::{Figure, Figures};
-pub use grid::Grid;
+pub use grid::{Grid, cell_at, centre_of};
 pub use matching::ConventionMatch;
 pub use quality::{Bias, BiasFits, Quality};
 pub use score::{

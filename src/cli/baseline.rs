@@ -157,16 +157,12 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
             let data = DataFolder::open(data)?;
             let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
             let files = data.images(sets)?;
-            let sets = match sets {
-                [] => files.sets(),
-                sets => sets.to_vec(),
-            };
             let there = |set| files.of_set(set).len() as u32;
             let wanted = |set| Wanted {
                 set,
                 images: arguments.images.unwrap_or_else(|| there(set)),
             };
-            let all = sets.into_iter().map(wanted).collect();
+            let all = files.wanted(sets).into_iter().map(wanted).collect();
             of_source(arguments, Source::folder(&data, folder)?, all)?
         }
     };

@@ -42,6 +42,14 @@ impl Files {
         self.by_set.keys().copied().flatten().collect()
     }
 
+    /// Those of `sets`, or the sets that have a file where there are none of them.
+    pub fn wanted(&self, sets: &[u32]) -> Vec<u32> {
+        match sets {
+            [] => self.sets(),
+            sets => sets.to_vec(),
+        }
+    }
+
     /// Whether the files belong to every set, as their pattern has no number of one.
     pub fn serve_all_sets(&self) -> bool {
         self.by_set.contains_key(&None)

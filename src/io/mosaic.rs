@@ -1,7 +1,7 @@
 //! The postage stamps of an image side by side.
 
-use shearq_scoring::grid::{cell_at, centre_of};
 use shearq_scoring::units::Pixels;
+use shearq_scoring::{cell_at, centre_of};
 
 /// Stamps in rows of `columns`, the last of which may be shorter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,6 +52,11 @@ impl Mosaic {
         (centre_of(ix, stamp), centre_of(iy, stamp))
     }
 
+    /// The same of stamp `place`, from 0 along the rows.
+    pub fn position(&self, place: usize) -> (f64, f64) {
+        self.centre(place % self.columns, place / self.columns)
+    }
+
     /// Number, from 0 along the rows, of the stamp that holds the FITS pixel position (x, y).
     pub fn place(&self, x: f64, y: f64) -> Option<usize> {
         let stamp = Pixels(self.stamp as f64);
@@ -80,6 +85,7 @@ mod tests {
             for place in 0..galaxies {
                 let (x, y) = mosaic.centre(place % columns, place / columns);
                 assert_eq!(mosaic.place(x, y), Some(place));
+                assert_eq!(mosaic.position(place), (x, y));
             }
         }
         let mosaic = Mosaic::of(17, 48);

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use shearq_measure::FunctionalPsf;
+use shearq_scoring::resample::RunningMean;
 
 use super::PipelineError;
 use super::images::ImageId;
@@ -129,12 +129,12 @@ pub fn gather(
     let mut keys = Vec::new();
     keys.extend(noise.map(|sigma| ("NOISESIG", Value::Real(sigma))));
     let mut image = Rows::create(&target, mosaic, &keys)?;
-    let (mut incomplete, mut frames) = (0, Level::default());
+    let (mut incomplete, mut frames) = (0, RunningMean::default());
     let mut places = csv::Writer::from_writer(Vec::new());
     let mut take = |origin: &Origin<'_>, pixels: &[f32]| -> Result<(), FileError> {
         incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
-        frames.add(frame_of(pixels, side));
-        let (x, y) = mosaic.centre(image.next % mosaic.columns, image.next / mosaic.columns);
+        frame_of(pixels, side).for_each(|value| frames.add(value));
+        let (x, y) = mosaic.position(image.next);
         let place = Place {
             x,
             y,
@@ -194,39 +194,20 @@ fn already(path: PathBuf) -> FileError {
     FileError::new(path, message)
 }
 
-/// Mean and scatter of pixels.
-#[derive(Debug, Default)]
-struct Level {
-    count: usize,
-    sum: f64,
-    squares: f64,
-}
-
-impl Level {
-    fn add(&mut self, pixels: impl Iterator<Item = f64>) {
-        for value in pixels.filter(|value| value.is_finite()) {
-            self.count += 1;
-            self.sum += value;
-            self.squares += value * value;
-        }
-    }
-
-    fn mean(&self) -> f64 {
-        self.sum / self.count as f64
-    }
-
-    fn deviation(&self) -> f64 {
-        let variance = self.squares / self.count as f64 - self.mean().powi(2);
-        variance.max(0.0).sqrt()
+/// Whether a file was `named`, as none had the name of `path`.
+fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
+    match named {
+        true => Ok(()),
+        false => Err(already(path)),
     }
 }
 
-/// The pixels of a stamp's frame.
+/// The pixels of a stamp's frame, as far as they are finite.
 fn frame_of(pixels: &[f32], side: usize) -> impl Iterator<Item = f64> + '_ {
     let inside = FRAME..side.saturating_sub(FRAME);
     let framed = move |k: usize| !(inside.contains(&(k % side)) && inside.contains(&(k / side)));
     let all = pixels.iter().enumerate();
-    all.filter(move |(k, _)| framed(*k))
+    all.filter(move |(k, value)| framed(*k) && value.is_finite())
         .map(|(_, &value)| f64::from(value))
 }
 
@@ -331,44 +312,34 @@ fn gather_psfs(
     mosaic: &Mosaic,
     doubts: &mut Vec<String>,
 ) -> Result<PsfFile, FileError> {
-    let wrong = |path: &Path, found: usize| {
+    let check = |path: &Path, found: usize| {
+        if found == 1 || found == mosaic.galaxies {
+            return Ok(());
+        }
         let message = format!(
             "there are {found} PSFs; expected one, or one for each of the {} stamps",
             mosaic.galaxies
         );
-        FileError::new(path, message)
+        Err(FileError::new(path, message))
     };
     if let [table] = files
         && table
             .extension()
             .is_some_and(|ending| ending.eq_ignore_ascii_case("csv"))
     {
-        let psfs: Vec<FunctionalPsf> = psf_table::read_all(table)?
-            .into_iter()
-            .map(|(_, psf)| psf)
-            .collect();
-        if psfs.len() != 1 && psfs.len() != mosaic.galaxies {
-            return Err(wrong(table, psfs.len()));
+        let mut rows = psf_table::read_all(table)?;
+        check(table, rows.len())?;
+        for (place, (position, _)) in rows.iter_mut().enumerate() {
+            *position = mosaic.position(place);
         }
-        let centre = |k| mosaic.centre(k % mosaic.columns, k / mosaic.columns);
-        let rows: Vec<_> = psfs
-            .into_iter()
-            .enumerate()
-            .map(|(k, psf)| (centre(k), psf))
-            .collect();
         let path = data.psf_functional(id.set, id.image);
         return Ok(PsfFile::Table(path, psf_table::text(&rows)));
     }
     let (count, side) = survey(files)?;
-    let stars = match count {
-        1 => Mosaic::of(1, side),
-        _ if count == mosaic.galaxies => Mosaic {
-            stamp: side,
-            ..*mosaic
-        },
-        // No list of files is empty.
-        _ => return Err(wrong(&files[0], count)),
-    };
+    // No list of files is empty.
+    check(&files[0], count)?;
+    // One, or as many as galaxies, which lie as these do.
+    let stars = Mosaic::of(count, side);
     let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
     each_stamp(files, |origin, pixels| {
         let pedestal = pedestal(pixels, side);
@@ -395,18 +366,17 @@ impl PsfFile {
     fn finish(self) -> Result<(), FileError> {
         match self {
             PsfFile::Stars(image) => image.finish(),
-            PsfFile::Table(path, text) => match atomic::write_if_absent(&path, text.as_bytes())? {
-                true => Ok(()),
-                false => Err(already(path)),
-            },
+            PsfFile::Table(path, text) => {
+                first(atomic::write_if_absent(&path, text.as_bytes())?, path)
+            }
         }
     }
 }
 
 /// The light of a star's stamp if all of it were as bright as its frame, in units of the light that it has.
 fn pedestal(pixels: &[f32], side: usize) -> f64 {
-    let mut frame = Level::default();
-    frame.add(frame_of(pixels, side));
+    let mut frame = RunningMean::default();
+    frame_of(pixels, side).for_each(|value| frame.add(value));
     let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
     frame.mean() * pixels.len() as f64 / light
 }
@@ -464,9 +434,6 @@ impl Rows {
     }
 
     fn finish(self) -> Result<(), FileError> {
-        match self.writer.finish_if_absent()? {
-            true => Ok(()),
-            false => Err(already(self.path)),
-        }
+        first(self.writer.finish_if_absent()?, self.path)
     }
 }

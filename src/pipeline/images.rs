@@ -21,13 +21,8 @@ pub struct ImageId {
 /// Where a set has no image, or the folder none at all, or a folder cannot be listed.
 pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, PipelineError> {
     let files = data.images(sets)?;
-    let sets = if sets.is_empty() {
-        files.sets()
-    } else {
-        sets.to_vec()
-    };
     let mut found = Vec::new();
-    for set in sets {
+    for set in files.wanted(sets) {
         let images = files.of_set(set);
         if images.is_empty() {
             let path = data.galaxies(set, 1);

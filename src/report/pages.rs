@@ -132,12 +132,11 @@ const SEEN: f64 = 20.0;
 /// Submissions held against each other on every kind of set: scatter over its bound, biases and Q, each beside
 /// what is to be reached. `table` is that of a study, one row a set and submission.
 pub fn contest(table: &Table) -> PanelGrid {
-    let place = |key: &str| table.headings.iter().position(|heading| heading.key == key);
-    let text = |row: &[Cell], key: &str| match place(key).and_then(|k| row.get(k)) {
+    let text = |row: &[Cell], key: &str| match table.place(key).and_then(|k| row.get(k)) {
         Some(Cell::Text(words)) => words.clone(),
         _ => String::new(),
     };
-    let number = |row: &[Cell], key: &str| match place(key).and_then(|k| row.get(k)) {
+    let number = |row: &[Cell], key: &str| match table.place(key).and_then(|k| row.get(k)) {
         Some(&Cell::Number { value, error, .. }) => (value, error.unwrap_or(f64::NAN)),
         _ => (f64::NAN, f64::NAN),
     };
@@ -187,10 +186,11 @@ pub fn contest(table: &Table) -> PanelGrid {
     // Uncalibrated submissions would leave nothing to be seen of the others: they are beyond the picture.
     let near = |key: &str, label: &str| {
         let plot = plot(key, label, &[-BAND, BAND]);
-        let beyond = |value: f64| value.abs() > SEEN;
-        let all = || plot.series.iter().flat_map(|series| &series.y).copied();
-        let some = all().any(beyond) && all().any(|value| !beyond(value) && value.abs() != BAND);
-        if !some {
+        let beyond: Vec<bool> = rows
+            .iter()
+            .map(|(_, row)| number(row, key).0.abs() > SEEN)
+            .collect();
+        if !(beyond.contains(&true) && beyond.contains(&false)) {
             return plot;
         }
         LinePlot {
@@ -225,10 +225,7 @@ pub fn contest(table: &Table) -> PanelGrid {
 
 /// A column of the table as bars, one a row; `None` where no row has a value.
 fn bars(table: &Table, key: &str) -> Option<BarPlot> {
-    let k = table
-        .headings
-        .iter()
-        .position(|heading| heading.key == key)?;
+    let k = table.place(key)?;
     let mut bars = BarGroup::default();
     let (mut names, mut errors) = (Vec::new(), Vec::new());
     for row in &table.rows {

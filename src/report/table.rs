@@ -184,6 +184,11 @@ impl Table {
         table
     }
 
+    /// Place of the column called `key`.
+    pub fn place(&self, key: &str) -> Option<usize> {
+        self.headings.iter().position(|heading| heading.key == key)
+    }
+
     /// The columns of `keys`, of rows that have something in the last of them, under another title and
     /// with some of the notes.
     pub fn part(&self, keys: &[&str], title: &str, notes: &[String]) -> Self {

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use shearq_scoring::resample::RunningMean;
+
 use crate::io::FileError;
 use crate::io::run::Run;
 use crate::io::table;
@@ -25,44 +27,14 @@ pub struct MeanShear {
     pub scatter: [f64; 2],
 }
 
-/// Sums of a component about its first value, which keeps digits that a large mean would cost.
-#[derive(Debug, Clone, Copy, Default)]
-struct Moments {
-    count: usize,
-    mean: f64,
-    squares: f64,
-}
-
-impl Moments {
-    fn add(&mut self, value: f64) {
-        self.count += 1;
-        let off = value - self.mean;
-        self.mean += off / self.count as f64;
-        self.squares += off * (value - self.mean);
-    }
-
-    /// Unbiased; not a number of fewer than two.
-    fn deviation(&self) -> f64 {
-        if self.count < 2 {
-            return f64::NAN;
-        }
-        (self.squares / (self.count - 1) as f64).sqrt()
-    }
-}
-
 /// The means over the catalogues of each set of the results folder `out` (of `sets`, if there are some).
 ///
 /// # Errors
 /// Where a catalogue cannot be read, or there is none.
 pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<MeanShear>, FileError> {
     let files = run.catalogues(out, sets)?;
-    let wanted = if sets.is_empty() {
-        files.sets()
-    } else {
-        sets.to_vec()
-    };
     let mut means = Vec::new();
-    for set in wanted {
+    for set in files.wanted(sets) {
         let catalogues = files.of_set(set);
         if catalogues.is_empty() {
             let message = format!("there is no catalogue of set {set}");
@@ -80,7 +52,7 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<MeanShear>
 }
 
 fn mean_of(set: u32, catalogues: &[(u32, PathBuf)]) -> Result<MeanShear, FileError> {
-    let (mut moments, mut flagged) = ([Moments::default(); 2], 0);
+    let (mut moments, mut flagged) = ([RunningMean::default(); 2], 0);
     for (_, path) in catalogues {
         let read = table::read(path, Some(&["e1", "e2"]), table::MAX_ROWS)?;
         let (e1, e2) = (
@@ -96,15 +68,14 @@ fn mean_of(set: u32, catalogues: &[(u32, PathBuf)]) -> Result<MeanShear, FileErr
             }
         }
     }
-    let galaxies = moments[0].count;
+    let galaxies = moments[0].count();
     let scatter = moments.map(|m| m.deviation());
-    let mean = |m: Moments| if m.count == 0 { f64::NAN } else { m.mean };
     Ok(MeanShear {
         set,
         images: catalogues.iter().map(|(image, _)| *image).collect(),
         galaxies,
         flagged,
-        mean: moments.map(mean),
+        mean: moments.map(|m| m.mean()),
         error: scatter.map(|deviation| deviation / (galaxies as f64).sqrt()),
         scatter,
     })

@@ -115,15 +115,13 @@ impl ImageReader {
         let (x, y, z) = match (sides.as_slice(), dimensions) {
             (&[x, y], _) => (x, y, 1),
             (&[x, y, z], Dimensions::TwoOrThree) => (x, y, z),
-            (_, Dimensions::Two) => {
+            (sides, _) => {
+                let or_cube = match dimensions {
+                    Dimensions::Two => "",
+                    Dimensions::TwoOrThree => ", or 3 of a cube",
+                };
                 return Err(file.fault(format!(
-                    "the {place} image has {} dimensions; expected 2",
-                    sides.len()
-                )));
-            }
-            (_, Dimensions::TwoOrThree) => {
-                return Err(file.fault(format!(
-                    "the {place} image has {} dimensions; expected 2, or 3 of a cube",
+                    "the {place} image has {} dimensions; expected 2{or_cube}",
                     sides.len()
                 )));
             }
@@ -220,21 +218,17 @@ impl ImageReader {
     pub fn read_square(&mut self, x: i64, y: i64, side: usize) -> Result<Vec<f32>, FileError> {
         let mut pixels = vec![f32::NAN; side * side];
         let inside = |at: i64, most: usize| at.clamp(0, most as i64) as usize;
-        let (from, to) = (inside(x, self.width), inside(x + side as i64, self.width));
-        if from == to {
+        let across = |first: i64, most| inside(first, most)..inside(first + side as i64, most);
+        let (columns, rows) = (across(x, self.width), across(y, self.height));
+        if columns.is_empty() || rows.is_empty() {
             return Ok(pixels);
         }
-        for (k, line) in pixels.chunks_exact_mut(side).enumerate() {
-            let row = y + k as i64;
-            if (0..self.height as i64).contains(&row) {
-                let row = row as usize;
-                self.need(row + 1)?;
-                let skipped = (from as i64 - x) as usize;
-                self.fill(
-                    row * self.width + from,
-                    &mut line[skipped..skipped + to - from],
-                )?;
-            }
+        self.need(rows.end)?;
+        let skipped = (columns.start as i64 - x) as usize;
+        for row in rows {
+            let line = &mut pixels[(row as i64 - y) as usize * side..][..side];
+            let first = row * self.width + columns.start;
+            self.fill(first, &mut line[skipped..skipped + columns.len()])?;
         }
         Ok(pixels)
     }

@@ -74,7 +74,7 @@ impl Source {
     /// The name under which cfitsio opens it.
     pub fn name(&self) -> Result<CString, FileError> {
         let name = match self.packed {
-            None => plain(self.path.as_os_str().as_encoded_bytes()),
+            None => literal(self.path.as_os_str().as_encoded_bytes()),
             Some(_) => open_file_name(&self.file),
         };
         CString::new(name).map_err(FileError::doing(&self.path, "cannot open the file"))
@@ -165,7 +165,7 @@ fn open_file_name(file: &File) -> Vec<u8> {
 }
 
 /// A file's name as cfitsio leaves it: one that starts with a tilde would be looked for in somebody's home.
-pub fn plain(name: &[u8]) -> Vec<u8> {
+fn literal(name: &[u8]) -> Vec<u8> {
     let here: &[u8] = if name.starts_with(b"~") { b"./" } else { b"" };
     [here, name].concat()
 }
