@@ -10,6 +10,7 @@ pub mod mean;
 pub mod page;
 pub mod pages;
 pub mod scores;
+pub mod spectrum;
 pub mod steps;
 pub mod table;
 pub mod terminal;

@@ -144,6 +144,7 @@ impl Worker {
         header_noise: Option<f64>,
     ) -> Result<Vec<Measurement>, MeasureError> {
         let (size, count) = (self.submission().psf.size, stamps.len_of(Axis(0)));
+        let side = stamps.len_of(Axis(1));
         let given = match psfs {
             Psfs::Star(_) | Psfs::Prepared(_) => count,
             Psfs::Stars(stars) => stars.len_of(Axis(0)),
@@ -166,7 +167,7 @@ impl Worker {
             match psfs {
                 Psfs::Star(_) | Psfs::Prepared(_) => {}
                 Psfs::Stars(stars) => self.take(star_psf(stars.index_axis(Axis(0), k), size)),
-                Psfs::Functional(formulas) => self.take(formulas[k].checked_stamp(size)),
+                Psfs::Functional(formulas) => self.take(formulas[k].checked_stamp(size, side)),
             }
             self.measure(stamp, header_noise)
         });
@@ -303,9 +304,9 @@ mod tests {
         let measurer = Measurer::named("23/raw/star", 48).unwrap();
         let stamps = stamps(3, 48);
         let formulas = [0.0, 0.1, -0.1].map(moffat);
-        let mut stars = Array3::<f32>::zeros((3, 25, 25));
+        let mut stars = Array3::<f32>::zeros((3, 26, 26));
         for (formula, mut star) in formulas.iter().zip(stars.outer_iter_mut()) {
-            star.assign(&formula.stamp(25).mapv(|v| v as f32));
+            star.assign(&formula.stamp(26).mapv(|v| v as f32));
         }
         let batch = measurer
             .batch(stamps.view(), Psfs::Stars(stars.view()), None)

@@ -128,7 +128,7 @@ pub(crate) fn measure<'py>(
             let formulas = self::formulas(formulas.as_array()).map_err(of_measuring)?;
             match formulas.as_slice() {
                 [one] => {
-                    prepared = one.stamp(size);
+                    prepared = one.stamp_beside(size, rows);
                     look(Psfs::Prepared(prepared.view())).map_err(of_measuring)?;
                     AllPsfs::Shared(prepared.view())
                 }

@@ -182,6 +182,7 @@ pub(crate) fn score<'py>(
         let noise = scored.noise.unwrap_or([f64::NAN; BINS]);
         for (name, powers) in [
             ("ee", &spectra.ee),
+            ("ee_error", &scored.ee_error),
             ("bb", &spectra.bb),
             ("eb", &spectra.eb),
             ("true_ee", &scored.true_ee),

@@ -194,6 +194,9 @@ pub struct SetScore {
     pub true_ee: [f64; BINS],
     /// Bandpowers of the true shear's B modes: nonzero where the sign of g₂ is misread.
     pub true_bb: [f64; BINS],
+    /// Standard errors of the chosen convention's scored E-mode bandpowers, for the truth as it is; not numbers elsewhere
+    /// and where unknown.
+    pub ee_error: [f64; BINS],
     /// Noise bandpowers of the averaged E modes, where known.
     pub noise: Option<[f64; BINS]>,
     /// Noise variance per component, galaxy and image that `noise` amounts to.
@@ -342,7 +345,8 @@ impl SetScorer {
                 })
                 .collect(),
         };
-        let mut errors = self.errors(images, &conventions[chosen.index()], &figures, &replicates);
+        let chosen_one = &conventions[chosen.index()];
+        let (mut errors, ee_error) = self.errors(images, chosen_one, &figures, &replicates);
         // By a response that may as well be zero nothing can be divided.
         if 1.0 + figures.m_cross < CLEAR_RESPONSE * errors.m_cross {
             for of in [&mut figures, &mut errors] {
@@ -366,6 +370,7 @@ impl SetScorer {
             images: total.images,
             true_ee: self.bins.power(&true_modes.e, &true_modes.e),
             true_bb: self.bins.power(&true_modes.b, &true_modes.b),
+            ee_error,
             noise,
             noise_variance,
             conventions: conventions.into(),
@@ -677,7 +682,7 @@ impl SetScorer {
         score: &ConventionScore,
         figures: &Figures,
         replicates: &[Figures],
-    ) -> Figures {
+    ) -> (Figures, [f64; BINS]) {
         let (sum, bins, k) = (&images.total, &self.bins, score.convention);
         let biases = self.biases(sum, k);
         let [v1, v2] = {
@@ -704,11 +709,12 @@ impl SetScorer {
         let c1 = v1.1.max(jackknife(|f| f.c1));
         let c2 = v2.1.max(jackknife(|f| f.c2));
         if self.truth.constant().is_some() {
-            return Figures {
+            let means = Figures {
                 c1,
                 c2,
                 ..Figures::unknown()
             };
+            return (means, [f64::NAN; BINS]);
         }
         let (mut modes, truth) = (self.modes(sum, k), self.true_modes(sum, k));
         let signal = &truth.e * Complex64::from(1.0 + score.m_cross);
@@ -751,7 +757,7 @@ impl SetScorer {
         };
         let fit = &score.fit.cl;
         let [bb, eb] = scatter.of_null_tests(bins, &signal);
-        Figures {
+        let figures = Figures {
             q: errors::of_quality(bins, figures.q, &apart, &power),
             q_dn,
             q_calibrated,
@@ -766,7 +772,12 @@ impl SetScorer {
             b_power: errors::of_mean_c_l(bins, &bb),
             eb_power: errors::of_mean_c_l(bins, &eb),
             sigma_sys_1e4: errors::of_sigma_sys(bins, &apart, &power) * 1e4,
+        };
+        let mut ee_error = [f64::NAN; BINS];
+        for b in SCORED {
+            ee_error[b] = power[b].sqrt();
         }
+        (figures, ee_error)
     }
 }
 

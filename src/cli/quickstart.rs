@@ -141,8 +141,22 @@ fn verdict(submissions: &[(String, Vec<SetRecord>)]) -> String {
             )
         })
         .collect();
+    // Where images are few, Q itself can rank otherwise.
+    let q = |sets: &[SetRecord]| mean_figure(sets, "q").0;
+    let raised = submissions
+        .iter()
+        .filter(|(_, others)| q(others) > q(sets) && mean_figure(others, "m_cross").0 < 0.0)
+        .map(|(other, _)| other.as_str())
+        .collect::<Vec<_>>();
+    let warning = match raised.is_empty() {
+        true => String::new(),
+        false => format!(
+            " Q itself is higher for {}, which lose shear and noise alike (m below zero): real analyses cannot use that.",
+            raised.join(" and ")
+        ),
+    };
     format!(
-        "Use {name}: m = {}, noise {} a galaxy once calibrated, and Q calibrated = {}; {}. Q itself is raised here by losing shear and noise alike (m below zero), which real analyses cannot use.",
+        "Use {name}: m = {}, noise {} a galaxy once calibrated, and Q calibrated = {}; {}.{warning}",
         shown(sets, "m_cross", 2),
         shown(sets, "galaxy_noise", 3),
         shown(sets, "q_calibrated", 1),

@@ -226,6 +226,10 @@ impl DataFolder {
     /// Where the file cannot be read or does not cover the grid.
     pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
         let path = self.truth(set);
+        if !path.exists() {
+            let message = "there is no true shear to score against; `shearq mean` gives the mean shear of a field";
+            return Err(FileError::new(&path, message));
+        }
         let rows = read_truth_rows(&path)?;
         TrueShear::from_rows(grid, self.layout.truth_sign, rows)
             .map_err(|error| FileError::new(&path, error))

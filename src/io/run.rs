@@ -206,9 +206,12 @@ impl Numbers for f64 {
     }
 }
 
-impl Numbers for [f64; 2] {
-    type Form = [Option<f64>; 2];
-    fn from_form(form: [Option<f64>; 2]) -> Self {
+impl<const N: usize> Numbers for [f64; N]
+where
+    [Option<f64>; N]: DeserializeOwned,
+{
+    type Form = [Option<f64>; N];
+    fn from_form(form: [Option<f64>; N]) -> Self {
         form.map(f64::from_form)
     }
 }

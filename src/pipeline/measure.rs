@@ -271,7 +271,7 @@ fn open_psf(
             }
             Ok(match rows.as_slice() {
                 [psf] => {
-                    let stamp = psf.stamp(size);
+                    let stamp = psf.stamp_beside(size, mosaic.stamp);
                     if stamp.iter().any(|value| !value.is_finite()) {
                         let message = format!(
                             "a PSF with a FWHM of {} px has no light on its stamp; expected a width of about a pixel or more",
@@ -381,7 +381,7 @@ pub fn psf_of(row: &StampRow, ix: usize, size: usize) -> Result<Array2<f64>, Pip
             let stars = strip(pixels, row.mosaic.columns, *side)?;
             star_psf(stars.index_axis(Axis(0), ix), size)?
         }
-        RowPsf::Functional(field) => field[ix].stamp(size),
+        RowPsf::Functional(field) => field[ix].stamp_beside(size, row.mosaic.stamp),
     })
 }
 

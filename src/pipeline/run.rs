@@ -240,7 +240,8 @@ pub fn simulated_steps(
     set.draw(&fields, ix, iy, &mut RenderScratch::new(), &mut pixels);
     let stamps = strip(&pixels, 1, STAMP)?;
     let stamp = stamps.index_axis(Axis(0), 0);
-    let psf = fields.psf.at(ix, iy).stamp(measurer.submission().psf.size);
+    let size = measurer.submission().psf.size;
+    let psf = fields.psf.at(ix, iy).stamp_beside(size, STAMP);
     let mut worker = measurer.worker();
     worker.set_psf(psf.view())?;
     let measured = worker.measure(stamp, Some(NOISE_SIGMA))?;
@@ -287,7 +288,9 @@ fn row_psf(set: &SetSimulator, fields: &ImageFields, iy: usize, submission: &Sub
     let n = set.grid().n;
     let size = submission.psf.size;
     match (&fields.psf, submission.psf.form) {
-        (PsfField::One(psf), PsfForm::Functional) => RowPsf::Shared(Arc::new(psf.stamp(size))),
+        (PsfField::One(psf), PsfForm::Functional) => {
+            RowPsf::Shared(Arc::new(psf.stamp_beside(size, STAMP)))
+        }
         (PsfField::One(psf), PsfForm::Star) => {
             let star = simulate::star(psf, STAMP);
             let cut = ArrayView2::from_shape((STAMP, STAMP), &star)

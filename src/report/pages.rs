@@ -2,15 +2,13 @@
 
 use std::path::Path;
 
-use shearq_scoring::SCORED;
-
 use super::figure::{
     BarGroup, BarPlot, FigureError, HeatMap, LinePlot, PanelGrid, PictureFormat, Series, Style,
 };
 use super::html::{Block, Picture, Report, Section};
+use super::spectrum;
 use super::table::{Cell, Table};
 use crate::results::score::ScoredSet;
-use crate::simulate::kinds::SetKind;
 
 /// Scores of one submission, with its spectra beside the true ones.
 ///
@@ -95,25 +93,13 @@ pub fn save(
 fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
     let plot = |set: &&ScoredSet| {
         let score = &set.score;
-        let of = |values: &[f64]| SCORED.map(|b| values[b]).collect::<Vec<f64>>();
-        let kind = set.set.and_then(SetKind::of);
-        let title = set.set.map(|number| {
-            let kind = kind.map_or("", |kind| kind.image.label());
-            format!("Set {number} {kind}")
-        });
-        let l = of(&score.bins.l);
-        LinePlot {
-            title: title.unwrap_or_default(),
-            x_label: "ℓ".into(),
-            y_label: "ℓ²C_ℓ/2π".into(),
-            x_log: true,
-            y_log: true,
-            series: vec![
-                Series::new("true", l.clone(), of(&score.true_ee), Style::Line, 2),
-                Series::new("measured", l, of(&score.spectra().ee), Style::Points, 5),
-            ],
-            ..LinePlot::default()
-        }
+        let powers = [
+            &score.bins.l,
+            &score.true_ee,
+            &score.spectra().ee,
+            &score.ee_error,
+        ];
+        spectrum::panel(set.set, powers)
     };
     PanelGrid {
         title: format!("Shear power of {name}"),

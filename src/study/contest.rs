@@ -6,7 +6,7 @@ use shearq_submissions::Submission;
 
 use super::bias::{ShearBias, biases};
 use super::bound::{cramer_rao, sample_limit};
-use super::reproduce::{Plan, Result, SetResult, Study};
+use super::reproduce::{Plan, SetResult, Study, SubmissionResult};
 use super::speed;
 use crate::io::run::{read_record, write_record};
 use crate::pipeline::PipelineError;
@@ -39,7 +39,7 @@ pub fn bias_sets(
     images: u32,
     threads: usize,
     progress: &mut dyn Progress,
-) -> std::result::Result<Vec<SetBiases>, PipelineError> {
+) -> Result<Vec<SetBiases>, PipelineError> {
     let &Study { plan, folder, .. } = study;
     let measurers = measurers(&plan.submissions)?;
     let numbers: Vec<u32> = (1..=images).collect();
@@ -74,12 +74,12 @@ pub fn contest_table(
     plan: &Plan,
     results: &[SetResult],
     biases: &[SetBiases],
-) -> std::result::Result<Table, PipelineError> {
+) -> Result<Table, PipelineError> {
     let costs = plan
         .submissions
         .iter()
         .map(|submission| speed::whole(submission, plan.simulation))
-        .collect::<std::result::Result<Vec<f64>, _>>()?;
+        .collect::<Result<Vec<f64>, _>>()?;
     let mut rows = Vec::new();
     for (result, bias) in results.iter().zip(biases) {
         for (k, submission) in plan.submissions.iter().enumerate() {
@@ -90,7 +90,7 @@ pub fn contest_table(
         let limits: Vec<f64> = biases.iter().filter_map(|b| b.limit).collect();
         let limit = limits.iter().sum::<f64>() / limits.len() as f64;
         for (k, submission) in plan.submissions.iter().enumerate() {
-            let mean = |value: &dyn Fn(&Result) -> (f64, f64), decimals: usize| {
+            let mean = |value: &dyn Fn(&SubmissionResult) -> (f64, f64), decimals: usize| {
                 let all: Vec<_> = results.iter().map(|r| value(&r.results[k])).collect();
                 let (mean, error) = mean_over_sets(&all);
                 Cell::with_error(mean, Some(error), decimals)
@@ -101,7 +101,7 @@ pub fn contest_table(
                 Cell::text(&submission.name),
             ];
             row.extend((0..8).map(|_| Cell::Empty));
-            row.push(mean(&|r| (r.figures.q, r.errors.q), 1));
+            row.push(mean(&|r| (r.score.figures.q, r.score.errors.q), 1));
             row.push(mean(&spectrum, 0));
             row.push(Cell::number(limit, 0));
             row.push(Cell::number(costs[k], 0));
@@ -193,7 +193,7 @@ fn row(
         scaled(biases.c[1], biases.c_error[1], 1e4),
         Cell::with_error(biases.leakage, Some(biases.leakage_error), 3),
         Cell::number((own.response.flagged + biases.dropped) as f64, 0),
-        Cell::with_error(own.figures.q, Some(own.errors.q), 1),
+        Cell::with_error(own.score.figures.q, Some(own.score.errors.q), 1),
         Cell::with_error(q_spectrum, Some(q_spectrum_error), 0),
         Cell::number(bias.limit.unwrap_or(f64::NAN), 0),
         Cell::number(cost, 0),
@@ -201,7 +201,7 @@ fn row(
 }
 
 /// Q of a submission's cross-spectrum and its error.
-fn spectrum(result: &Result) -> (f64, f64) {
+fn spectrum(result: &SubmissionResult) -> (f64, f64) {
     (
         result.q_spectrum.unwrap_or(f64::NAN),
         result.q_spectrum_error.unwrap_or(f64::NAN),

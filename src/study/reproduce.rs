@@ -5,20 +5,21 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use shearq_scoring::quality::{calibrated_quality, quality, quality_error};
 use shearq_scoring::{
-    BINS, Convention, FieldSum, Figures, Grid, Noise, Options, Row, SetImages, SetScore, SetScorer,
-    cross_spectrum,
+    BINS, Convention, FieldSum, Grid, Noise, Options, Row, RowCounts, SetImages, SetScore,
+    SetScorer, cross_spectrum,
 };
 use shearq_submissions::{Submission, checked_name};
 
 use super::response::{Regression, Response};
 use crate::io::FileError;
-use crate::io::run::{Claim, claim, read_record, write_record};
+use crate::io::run::{Claim, claim, nan_for_null, read_record, write_record};
 use crate::pipeline::PipelineError;
 use crate::pipeline::engine::Progress;
 use crate::pipeline::measure::MeasuredRow;
 use crate::pipeline::run::{measurers, run_set};
 use crate::pipeline::simulate::simulator;
-use crate::results::score::OWN;
+use crate::results::row::SetRecord;
+use crate::results::score::{Basis, OWN, ScoredSet};
 use crate::simulate::set::SimulationSettings;
 
 /// What a run is made from.
@@ -49,7 +50,7 @@ impl<'a> Study<'a> {
     ///
     /// # Errors
     /// Where it holds results of another plan, or cannot be written to.
-    pub fn open(plan: &'a Plan, folder: &'a Path) -> std::result::Result<Self, FileError> {
+    pub fn open(plan: &'a Plan, folder: &'a Path) -> Result<Self, FileError> {
         Ok(Study {
             plan,
             folder,
@@ -60,24 +61,20 @@ impl<'a> Study<'a> {
 
 /// One submission on one set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Result {
+pub struct SubmissionResult {
     /// Submission's name.
     #[serde(deserialize_with = "checked_name")]
     pub submission: String,
-    /// Headline figures in the standard convention, leaderboard definition.
-    pub figures: Figures,
-    /// Their standard errors.
-    pub errors: Figures,
-    /// Q of the delete-one replicates, for paired differences.
-    pub q_replicates: Vec<f64>,
-    /// The leaderboard's Q.
-    pub q_leaderboard: f64,
-    /// The leaderboard's convention.
-    pub best: Convention,
-    /// The matched convention.
-    pub matched: Convention,
+    /// Its score in the standard convention, leaderboard definition.
+    #[serde(flatten)]
+    pub score: SetRecord,
+    /// Number of the convention that the truth would tell.
+    pub convention_matched: u8,
     /// E-mode bandpowers.
     pub ee: [f64; BINS],
+    /// Their standard errors, for the truth as it is; not numbers beyond the scored bins.
+    #[serde(deserialize_with = "nan_for_null")]
+    pub ee_error: [f64; BINS],
     /// Q of those bandpowers over the square of the response's mean slope.
     pub q_calibrated: f64,
     /// Q of the cross-spectrum of the images' groups, `None` for a single image.
@@ -100,7 +97,7 @@ pub struct SetResult {
     /// Bandpowers of the true shear.
     pub true_ee: [f64; BINS],
     /// One per submission, in the plan's order.
-    pub results: Vec<Result>,
+    pub results: Vec<SubmissionResult>,
 }
 
 /// Where a set's result is kept.
@@ -118,7 +115,7 @@ pub fn run_sets(
     sets: &[u32],
     threads: usize,
     progress: &mut dyn Progress,
-) -> std::result::Result<Vec<SetResult>, PipelineError> {
+) -> Result<Vec<SetResult>, PipelineError> {
     let &Study { plan, folder, .. } = study;
     // Submissions that differ in name alone are measured once.
     let (distinct, place) = distinct(&plan.submissions);
@@ -138,7 +135,10 @@ pub fn run_sets(
         let simulator = simulator(set, plan.simulation)?;
         let grid = simulator.grid();
         let images: Vec<u32> = (1..=plan.images).collect();
-        let mut sums: Vec<SetImages> = distinct.iter().map(|_| SetImages::new(&grid)).collect();
+        let mut sums: Vec<(SetImages, RowCounts)> = distinct
+            .iter()
+            .map(|_| (SetImages::new(&grid), RowCounts::default()))
+            .collect();
         let mut regressions = vec![Regression::default(); distinct.len()];
         run_set(
             &simulator,
@@ -148,8 +148,10 @@ pub fn run_sets(
             progress,
             |image| {
                 let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
-                for ((sum, regression), rows) in each {
-                    sum.add(&field_sum(&grid, rows));
+                for (((sum, counts), regression), rows) in each {
+                    let (field, used) = field_sum(&grid, rows);
+                    sum.add(&field);
+                    *counts += used;
                     let measured = rows.iter().flat_map(|row| &row.galaxies);
                     regression.add(image.observed.iter().copied().zip(measured));
                 }
@@ -163,33 +165,40 @@ pub fn run_sets(
             ..Options::default()
         };
         let scorer = SetScorer::new(grid, simulator.truth(), options).map_err(scoring)?;
-        let scores: Vec<SetScore> = sums
+        let scored = |(sum, rows): &(SetImages, RowCounts)| {
+            Ok(ScoredSet {
+                set: Some(set),
+                images: images.clone(),
+                score: scorer.score(sum)?,
+                rows: *rows,
+                basis: Basis::Told,
+            })
+        };
+        let scored: Vec<ScoredSet> = sums
             .iter()
-            .map(|images| scorer.score(images))
-            .collect::<std::result::Result<_, _>>()
+            .map(scored)
+            .collect::<Result<_, _>>()
             .map_err(scoring)?;
         let responses: Vec<Response> = regressions.iter().map(Regression::response).collect();
         let result = SetResult {
             set,
             images: plan.images,
-            l: scores[0].bins.l,
-            true_ee: scores[0].true_ee,
+            l: scored[0].score.bins.l,
+            true_ee: scored[0].score.true_ee,
             results: plan
                 .submissions
                 .iter()
                 .zip(&place)
                 .map(|(submission, &at)| {
-                    let score = &scores[at];
-                    let spectrum = spectrum_quality(score, &sums[at]);
-                    Result {
+                    let score = &scored[at].score;
+                    let spectrum = spectrum_quality(score, &sums[at].0);
+                    SubmissionResult {
                         submission: submission.name.clone(),
-                        figures: score.figures,
-                        errors: score.errors,
-                        q_replicates: score.replicates.iter().map(|r| r.q).collect(),
-                        q_leaderboard: score.conventions[score.best.index()].quality.q,
-                        best: score.best,
-                        matched: score.matching.best(),
+                        // Of what is simulated the settings are the fingerprint: those of the plan.
+                        score: SetRecord::new(set, &scored[at], String::new()),
+                        convention_matched: score.matching.best().number(),
                         ee: score.spectra().ee,
+                        ee_error: score.ee_error,
                         q_calibrated: calibrated_q(score, &responses[at]),
                         q_spectrum: spectrum.map(|(q, _)| q),
                         q_spectrum_error: spectrum.and_then(|(_, error)| error),
@@ -242,8 +251,8 @@ fn distinct(submissions: &[Submission]) -> (Vec<Submission>, Vec<usize>) {
     (kept, place)
 }
 
-/// One image's measurements on the grid; flagged galaxies count as missing.
-pub fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> FieldSum {
+/// One image's measurements on the grid, and how they were used; flagged galaxies count as missing.
+fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> (FieldSum, RowCounts) {
     let mut sum = FieldSum::new(grid);
     let galaxies = rows.iter().flat_map(|row| {
         row.galaxies.iter().enumerate().map(|(ix, galaxy)| {
@@ -256,6 +265,6 @@ pub fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> FieldSum {
             }
         })
     });
-    sum.add_image(grid, galaxies);
-    sum
+    let counts = sum.add_image(grid, galaxies);
+    (sum, counts)
 }

@@ -99,7 +99,8 @@ impl Inputs {
     }
 
     pub(super) fn psf(&self, size: usize) -> ndarray::Array2<f64> {
-        self.set.image_fields(1).psf.at(0, 0).stamp(size)
+        let fields = self.set.image_fields(1);
+        fields.psf.at(0, 0).stamp_beside(size, STAMP)
     }
 
     /// Microseconds of a whole measurement, the PSF being taken already.

@@ -499,7 +499,7 @@ fn stamps_without_a_galaxy_are_flagged_and_noise_is_measured() {
         fits_image(-32, &[side, side], &cards, &floats(&pixels)),
     )
     .unwrap();
-    for (submission, noise) in [("23/raw/star", 0.0), ("23/den/star", 4.0)] {
+    for (submission, noise) in [("23/raw/star", 0.0), ("as-printed/23/den/star", 4.0)] {
         let said = small.measure(&["--submission", submission]);
         assert!(
             said.contains("nothing to scale the brightness by"),

@@ -10,7 +10,7 @@ use crate::support::{fail, run_simulated, shearq, succeed, text};
 #[test]
 fn the_named_submissions_have_not_moved_from_the_projects_baselines() {
     let folder = Path::new("submissions/baselines");
-    for name in ["named", "linear"] {
+    for name in ["named", "linear", "printed"] {
         let output = shearq(&["baseline", "check", name, "--folder", text(folder)]);
         assert!(
             output.status.success(),

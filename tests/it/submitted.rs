@@ -34,7 +34,7 @@ impl Packed {
         succeed(&[
             "measure",
             "--submission",
-            "23/den/star",
+            "as-printed/23/den/star",
             "--data",
             text(&at("data")),
             "--out",

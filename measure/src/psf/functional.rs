@@ -134,16 +134,32 @@ impl FunctionalPsf {
     /// The PSF on a stamp of `size` pixels a side, centred on the pixel (odd side) or corner (even side) in
     /// the middle, normalised to a sum of one.
     pub fn stamp(&self, size: usize) -> Array2<f64> {
+        self.stamp_beside(size, size)
+    }
+
+    /// The central `size` pixels a side of a star like this on a stamp of `side` pixels a side, normalised to a sum of
+    /// one.
+    ///
+    /// With `side` that of the galaxies, galaxy and PSF are off the middle of what is cut of them by the same: half
+    /// a pixel where one side is even and the other odd. What is left of the galaxy is on a pixel then, and
+    /// is where a star's stamp of that side would leave it.
+    pub fn stamp_beside(&self, size: usize, side: usize) -> Array2<f64> {
         let mut stamp = Array2::zeros((size, size));
-        let centre = (size as f64 - 1.0) / 2.0;
+        let off = if side % 2 == size % 2 { 0.0 } else { 0.5 };
+        let centre = (size as f64 - 1.0) / 2.0 + off;
         self.draw_into(centre, centre, stamp.view_mut());
         let sum = stamp.sum();
         stamp / sum
     }
 
     /// The same for a PSF that may have been assembled with values that [`FunctionalPsf::new`] refuses.
-    pub(crate) fn checked_stamp(&self, size: usize) -> Result<Array2<f64>, MeasureError> {
-        Ok(FunctionalPsf::new(self.profile, self.fwhm, self.shape)?.stamp(size))
+    pub(crate) fn checked_stamp(
+        &self,
+        size: usize,
+        side: usize,
+    ) -> Result<Array2<f64>, MeasureError> {
+        let checked = FunctionalPsf::new(self.profile, self.fwhm, self.shape)?;
+        Ok(checked.stamp_beside(size, side))
     }
 
     fn brightness(&self) -> Brightness {

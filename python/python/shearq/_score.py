@@ -36,7 +36,7 @@ class Score:
         the components; ``b_power``, ``eb_power``: mean C_ℓ of B and EB in 10⁻⁹ steradian;
         ``sigma_sys_1e4``: what Q is made of, 5·10⁻³/Q, in 10⁻⁴.
     spectrum : structured array of shape (20,)
-        Per bin: ``l`` in rad⁻¹, ``dln_l``, ``modes``, ``scored``, bandpowers ℓ²C_ℓ/2π ``ee``, ``bb``, ``eb``,
+        Per bin: ``l`` in rad⁻¹, ``dln_l``, ``modes``, ``scored``, bandpowers ℓ²C_ℓ/2π ``ee`` (with ``ee_error``), ``bb``, ``eb``,
         ``true_ee``, ``true_bb``, ``noise`` (NaN where unknown), and ``to_c_l``, by which they become C_ℓ in steradian.
     images : int
         Images averaged over.

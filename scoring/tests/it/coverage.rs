@@ -4,7 +4,7 @@ use ndarray::Array2;
 use rustfft::num_complex::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Choice, Convention, Definition, FieldSum, Figures, Grid, Options, SetImages, SetScorer,
+    Choice, Convention, Definition, FieldSum, Figures, Grid, Options, SCORED, SetImages, SetScorer,
 };
 
 use crate::common::{Content, Normal, field, rows, truth};
@@ -36,9 +36,9 @@ struct Kind {
     m: f64,
 }
 
-/// Scatter over trials of each figure that has an error, over the mean of its error, and the share of
-/// trials that have one.
-fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(&'static str, f64, f64)> {
+/// Scatter over trials of each figure that has an error and of each scored bandpower, over the mean of its error, and the
+/// share of trials that have one.
+fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(String, f64, f64)> {
     const TRIALS: usize = 200;
     let shear = field(grid, Content::E, 5);
     let options = Options {
@@ -48,7 +48,7 @@ fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(&'static s
     };
     let scorer = SetScorer::new(*grid, truth(&shear), options).unwrap();
     let mut normal = Normal(77);
-    let mut found: Vec<([f64; Figures::ALL.len()], [f64; Figures::ALL.len()])> = Vec::new();
+    let mut found: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();
     for _ in 0..TRIALS {
         let mut common = shapes(grid, &mut normal);
         let mut images = SetImages::new(grid);
@@ -65,10 +65,18 @@ fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(&'static s
             images.add(&sum);
         }
         let score = scorer.score(&images).unwrap();
-        found.push((score.figures.values(), score.errors.values()));
+        let with_power =
+            |figures: Figures, power: &[f64]| [&figures.values(), &power[SCORED]].concat();
+        found.push((
+            with_power(score.figures, &score.spectra().ee),
+            with_power(score.errors, &score.ee_error),
+        ));
     }
-    (0..Figures::ALL.len())
-        .map(|k| {
+    let figures = Figures::ALL.iter().map(|figure| figure.name.to_owned());
+    let names = figures.chain(SCORED.map(|bin| format!("EE of bin {bin}")));
+    names
+        .enumerate()
+        .map(|(k, name)| {
             let known: Vec<(f64, f64)> = found
                 .iter()
                 .map(|(values, errors)| (values[k], errors[k]))
@@ -79,7 +87,7 @@ fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(&'static s
             let centre = mean(&|v| v.0);
             let scatter = mean(&|v| (v.0 - centre).powi(2)).sqrt();
             let ratio = scatter / mean(&|v| v.1);
-            (Figures::ALL[k].name, ratio, count / TRIALS as f64)
+            (name, ratio, count / TRIALS as f64)
         })
         .collect()
 }
@@ -102,7 +110,7 @@ fn errors_are_the_scatter_of_repeated_trials() {
         (Definition::Corrected, kind(4, 0.054, true, 0.0)),
     ] {
         for (name, ratio, share) in coverage(&grid, &kind, definition) {
-            let calibrated = ["q_calibrated", "galaxy_noise"].contains(&name);
+            let calibrated = ["q_calibrated", "galaxy_noise"].contains(&name.as_str());
             if calibrated && share < 0.95 {
                 // A response that is often not told from zero: those that are known are the high ones.
                 assert!(kind.noise > 0.1 || kind.shared, "{kind:?}: {name} {share}");
@@ -129,7 +137,7 @@ fn errors_of_one_image_are_known_but_for_its_noise() {
         m: 0.0,
     };
     for (name, ratio, share) in coverage(&grid, &kind, Definition::Leaderboard) {
-        if ["q_dn", "galaxy_noise"].contains(&name) {
+        if ["q_dn", "galaxy_noise"].contains(&name.as_str()) {
             assert_eq!(share, 0.0);
         } else {
             // Nothing but noise is left of σ_sys once the response is divided out: it is of the size of its

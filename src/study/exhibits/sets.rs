@@ -1,12 +1,10 @@
 //! Sect. 5: Table 1, Figs 8 to 11, and what denoising does to ellipticities.
 
-use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{Figures, SCORED};
 use shearq_submissions::{PsfForm, Published, Submission};
 
-use crate::report::figure::{
-    BarGroup, BarPlot, ColourMap, HeatMap, LinePlot, PanelGrid, Series, Style,
-};
+use crate::report::figure::{BarGroup, BarPlot, ColourMap, HeatMap, PanelGrid};
+use crate::report::spectrum;
 use crate::report::table::{Cell, Heading, Table};
 use crate::simulate::kinds::{ImageType, SetKind};
 use crate::study::reproduce::SetResult;
@@ -20,9 +18,43 @@ pub(super) fn over_sets(
 ) -> Vec<(f64, f64)> {
     results
         .iter()
-        .map(|set| &set.results[place])
-        .map(|result| (figure(&result.figures), figure(&result.errors)))
+        .map(|set| &set.results[place].score)
+        .map(|score| (figure(&score.figures), figure(&score.errors)))
         .collect()
+}
+
+/// Share of each set in a mean in which every kind of image counts as it does among the challenge's 24 sets,
+/// however many of the kind there are.
+fn shares(results: &[SetResult]) -> Vec<f64> {
+    let image = |set: u32| SetKind::of(set).map(|kind| kind.image);
+    let share = |set: &SetResult| {
+        let same = |other: &u32| image(*other) == image(set.set);
+        let challenge = (1..=24).filter(same).count();
+        let here = results.iter().map(|r| r.set).filter(same).count();
+        challenge as f64 / here as f64
+    };
+    let all: Vec<f64> = results.iter().map(share).collect();
+    let sum: f64 = all.iter().sum();
+    all.iter().map(|share| share / sum).collect()
+}
+
+/// Mean of a submission's figure over the challenge's 24 sets, and its error.
+pub(super) fn mean_of_24(
+    results: &[SetResult],
+    place: usize,
+    figure: fn(&Figures) -> f64,
+) -> (f64, f64) {
+    let over = over_sets(results, place, figure);
+    let shares = shares(results);
+    let weighted = over.iter().zip(&shares);
+    let mean = weighted
+        .clone()
+        .map(|((value, _), share)| share * value)
+        .sum();
+    let variance: f64 = weighted
+        .map(|((_, error), share)| (share * error).powi(2))
+        .sum();
+    (mean, variance.sqrt())
 }
 
 /// Table 1: our figures beside the published ones.
@@ -30,11 +62,15 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
     let mut rows = Vec::new();
     for (place, (submission, published)) in submissions.iter().enumerate() {
         let mean = |figure: fn(&Figures) -> f64, decimals: usize| {
-            let (value, error) = mean_over_sets(&over_sets(results, place, figure));
+            let (value, error) = mean_of_24(results, place, figure);
             Cell::with_error(value, Some(error), decimals)
         };
         let given = |value: fn(&Published) -> f64, decimals: usize| {
             Cell::number(value(published), decimals)
+        };
+        let apart = |figure: fn(&Figures) -> f64, value: fn(&Published) -> f64| {
+            let (mean, error) = mean_of_24(results, place, figure);
+            Cell::number((mean - value(published)) / error, 1)
         };
         let yes = |yes: bool| Cell::text(if yes { "Y" } else { "N" });
         rows.push(vec![
@@ -47,16 +83,19 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
             }),
             mean(|f| f.m_half, 4),
             given(|p| p.m_half, 4),
+            apart(|f| f.m_half, |p| p.m_half),
             mean(|f| f.sqrt_a, 4),
             given(|p| p.sqrt_a, 4),
+            apart(|f| f.sqrt_a, |p| p.sqrt_a),
             mean(|f| f.q, 2),
             given(|p| p.q, 2),
+            apart(|f| f.q, |p| p.q),
             Cell::number(
                 results
                     .iter()
-                    .map(|set| set.results[place].q_calibrated)
-                    .sum::<f64>()
-                    / results.len() as f64,
+                    .zip(shares(results))
+                    .map(|(set, share)| share * set.results[place].q_calibrated)
+                    .sum(),
                 2,
             ),
             mean(|f| f.q_dn, 1),
@@ -72,10 +111,13 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
             Heading::new("psf", "PSF"),
             Heading::new("m_half", "M/2"),
             Heading::new("m_half_published", "M/2 publ."),
+            Heading::new("m_half_apart", "M/2 apart"),
             Heading::new("sqrt_a", "√A×10⁴"),
             Heading::new("sqrt_a_published", "√A publ."),
+            Heading::new("sqrt_a_apart", "√A apart"),
             Heading::new("q", "Q"),
             Heading::new("q_published", "Q publ."),
+            Heading::new("q_apart", "Q apart"),
             Heading::new("q_calibrated", "Q calibrated"),
             Heading::new("q_dn", "Q_dn"),
             Heading::new("m_cross", "m (cross)"),
@@ -83,7 +125,9 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
         rows,
         notes: vec![
             "Q calibrated: after dividing the ellipticities by the mean slope at which they follow the true ones.".into(),
-            "Standard convention, leaderboard definition, jackknife errors. Published figures are of the challenge's own images, 200 per set.".into(),
+            "Apart: ours less the published one, in standard errors of ours.".into(),
+            "Means over sets, each kind of image counting as often as among the challenge's 24; kinds that are absent do not count.".into(),
+            "Standard convention, leaderboard definition; errors from what the truth leaves unexplained. Published figures are of the challenge's own images, 200 per set.".into(),
         ],
     }
 }
@@ -99,7 +143,7 @@ pub fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
     let values = ndarray::Array2::from_shape_fn((names.len(), columns.len()), |(place, k)| {
         let over = over_sets(results, place, |f| f.q);
         over.get(k)
-            .map_or_else(|| mean_over_sets(&over).0, |value| value.0)
+            .map_or_else(|| mean_of_24(results, place, |f| f.q).0, |value| value.0)
     });
     HeatMap {
         title: "Quality factor per set".into(),
@@ -121,8 +165,8 @@ pub fn per_set_table(results: &[SetResult]) -> Table {
         for result in &set.results {
             let cell = |figure: fn(&Figures) -> f64, decimals: usize| {
                 Cell::with_error(
-                    figure(&result.figures),
-                    Some(figure(&result.errors)),
+                    figure(&result.score.figures),
+                    Some(figure(&result.score.errors)),
                     decimals,
                 )
             };
@@ -131,15 +175,14 @@ pub fn per_set_table(results: &[SetResult]) -> Table {
                 Cell::text(SetKind::of(set.set).map_or("", |kind| kind.image.label())),
                 Cell::text(&result.submission),
                 cell(|f| f.q, 2),
-                Cell::number(result.q_leaderboard, 2),
+                Cell::number(result.score.q_leaderboard, 2),
                 cell(|f| f.q_dn, 1),
                 cell(|f| f.m_half, 4),
                 cell(|f| f.sqrt_a, 4),
                 cell(|f| f.m_cross, 4),
                 Cell::text(format!(
                     "{}/{}",
-                    result.matched.number(),
-                    result.best.number()
+                    result.convention_matched, result.score.convention_leaderboard
                 )),
                 Cell::number(result.q_calibrated, 2),
                 Cell::with_error(
@@ -190,29 +233,9 @@ pub fn power_spectra(results: &[SetResult], place: usize, name: &str) -> PanelGr
     let plots = results
         .iter()
         .map(|set| {
-            let scored = |values: &[f64]| SCORED.map(|b| values[b]).collect::<Vec<f64>>();
-            LinePlot {
-                title: format!(
-                    "Set {} {}",
-                    set.set,
-                    SetKind::of(set.set).map_or("", |kind| kind.image.label())
-                ),
-                x_label: "ℓ".into(),
-                y_label: "ℓ²C_ℓ/2π".into(),
-                x_log: true,
-                y_log: true,
-                series: vec![
-                    Series::new("true", scored(&set.l), scored(&set.true_ee), Style::Line, 2),
-                    Series::new(
-                        "measured",
-                        scored(&set.l),
-                        scored(&set.results[place].ee),
-                        Style::Line,
-                        5,
-                    ),
-                ],
-                ..LinePlot::default()
-            }
+            let own = &set.results[place];
+            let powers = [&set.l, &set.true_ee, &own.ee, &own.ee_error];
+            spectrum::panel(Some(set.set), powers)
         })
         .collect();
     PanelGrid {
@@ -232,7 +255,11 @@ pub fn power_spectra_table(results: &[SetResult], place: usize) -> Table {
                 Cell::number(b as f64 + 1.0, 0),
                 Cell::number(set.l[b], 1),
                 Cell::number(set.true_ee[b], 9),
-                Cell::number(set.results[place].ee[b], 9),
+                Cell::with_error(
+                    set.results[place].ee[b],
+                    Some(set.results[place].ee_error[b]),
+                    9,
+                ),
             ]);
         }
     }
@@ -338,5 +365,33 @@ pub fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table
         notes: vec![
             "Reported ellipticity against the true shear-type one of each galaxy; scatter per component about the line, divided by the slope.".into(),
         ],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_kind_counts_as_among_the_24_sets() {
+        let set = |set| SetResult {
+            set,
+            images: 1,
+            l: [0.0; shearq_scoring::BINS],
+            true_ee: [0.0; shearq_scoring::BINS],
+            results: Vec::new(),
+        };
+        // Two of three fiducial sets, one of two with small galaxies.
+        let some = [set(1), set(2), set(14)];
+        let expected = [1.5, 1.5, 2.0].map(|share| share / 5.0);
+        for (share, expected) in shares(&some).into_iter().zip(expected) {
+            assert!((share - expected).abs() < 1e-15, "{share} {expected}");
+        }
+        let all: Vec<SetResult> = (1..=24).map(set).collect();
+        assert!(
+            shares(&all)
+                .iter()
+                .all(|share| (share - 1.0 / 24.0).abs() < 1e-15)
+        );
     }
 }

@@ -1,0 +1,31 @@
+//! The picture of a set's shear power spectrum.
+
+use shearq_scoring::{BINS, SCORED};
+
+use super::figure::{LinePlot, Series, Style};
+use crate::simulate::kinds::SetKind;
+
+/// E-mode bandpowers of a set: (multipoles, truth, measured, standard errors).
+pub type Powers<'a> = [&'a [f64; BINS]; 4];
+
+/// The scored bandpowers of the true and of the measured shear.
+pub fn panel(set: Option<u32>, [l, truth, measured, errors]: Powers<'_>) -> LinePlot {
+    let scored = |values: &[f64; BINS]| values[SCORED].to_vec();
+    let title = set.map(|number| {
+        let kind = SetKind::of(number).map_or("", |kind| kind.image.label());
+        format!("Set {number} {kind}")
+    });
+    LinePlot {
+        title: title.unwrap_or_default(),
+        x_label: "ℓ".into(),
+        y_label: "ℓ²C_ℓ/2π".into(),
+        x_log: true,
+        y_log: true,
+        series: vec![
+            Series::new("true", scored(l), scored(truth), Style::Line, 2),
+            Series::new("measured", scored(l), scored(measured), Style::Points, 5)
+                .with_errors(scored(errors)),
+        ],
+        ..LinePlot::default()
+    }
+}
