@@ -1,14 +1,14 @@
 //! Sizes that a measurement can work with.
 
 use ndarray::ArrayView2;
-use shearq_submissions::limits::{MAX_PSF, MAX_STAMP};
+use shearq_submissions::limits::{MAX_CUT, MAX_PSF};
 
 use crate::error::MeasureError;
 
 /// Checks the sides of a stamp and a PSF that are planned for.
 pub(crate) fn check_sizes(n: usize, p: usize) -> Result<(), MeasureError> {
-    if !(3..=MAX_STAMP).contains(&n) {
-        let expected = format!("a side of 3 to {MAX_STAMP} pixels");
+    if !(3..=MAX_CUT).contains(&n) {
+        let expected = format!("a side of 3 to {MAX_CUT} pixels");
         return Err(MeasureError::square("a stamp", (n, n), expected));
     }
     if !(2..=MAX_PSF).contains(&p) {

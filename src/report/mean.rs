@@ -3,10 +3,10 @@
 use shearq_submissions::{Calibration, EllipticityType, Submission};
 
 use super::table::{Cell, Heading, Table};
-use crate::results::mean::MeanShear;
+use crate::results::mean::SetMean;
 
 /// Means of sets measured by `submission`, of catalogues that are called `name`.
-pub fn mean_table(means: &[MeanShear], submission: &Submission, name: &str) -> Table {
+pub fn mean_table(means: &[SetMean], submission: &Submission, name: &str) -> Table {
     let headings = [
         ("set", "Set"),
         ("galaxies", "Galaxies"),

@@ -10,7 +10,7 @@ use crate::io::table;
 
 /// The mean over the galaxies of a set.
 #[derive(Debug, Clone, PartialEq)]
-pub struct MeanShear {
+pub struct SetMean {
     /// The set.
     pub set: u32,
     /// Images that there is a catalogue of.
@@ -31,7 +31,7 @@ pub struct MeanShear {
 ///
 /// # Errors
 /// Where a catalogue cannot be read, or there is none.
-pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<MeanShear>, FileError> {
+pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<SetMean>, FileError> {
     let files = run.catalogues(out, sets)?;
     let mut means = Vec::new();
     for set in files.wanted(sets) {
@@ -51,7 +51,7 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<MeanShear>
     Ok(means)
 }
 
-fn mean_of(set: u32, catalogues: &[(u32, PathBuf)]) -> Result<MeanShear, FileError> {
+fn mean_of(set: u32, catalogues: &[(u32, PathBuf)]) -> Result<SetMean, FileError> {
     let (mut moments, mut flagged) = ([RunningMean::default(); 2], 0);
     for (_, path) in catalogues {
         let read = table::read(path, Some(&["e1", "e2"]), table::MAX_ROWS)?;
@@ -70,7 +70,7 @@ fn mean_of(set: u32, catalogues: &[(u32, PathBuf)]) -> Result<MeanShear, FileErr
     }
     let galaxies = moments[0].count();
     let scatter = moments.map(|m| m.deviation());
-    Ok(MeanShear {
+    Ok(SetMean {
         set,
         images: catalogues.iter().map(|(image, _)| *image).collect(),
         galaxies,

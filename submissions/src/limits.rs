@@ -1,7 +1,7 @@
 //! Limits that the arithmetic of the measurement sets to settings.
 
-/// Largest side of a stamp, in pixels.
-pub const MAX_STAMP: usize = 64;
+/// Largest side of what is cut of a stamp, in pixels.
+pub const MAX_CUT: usize = 64;
 
 /// Largest side of a PSF stamp, in pixels.
 pub const MAX_PSF: usize = 48;

@@ -3,7 +3,7 @@
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::limits::{MAX_PSF, MAX_ROUGHNESS, MAX_STAMP};
+use crate::limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS};
 use crate::name;
 use crate::settings::{
     Clipping, Denoise, LinearDeconvolution, LinearMethod, Method, NetworkDeconvolution,
@@ -74,7 +74,7 @@ impl Submission {
             });
         }
         let n = stamp.size;
-        let good = (5..=MAX_STAMP).contains(&n);
+        let good = (5..=MAX_CUT).contains(&n);
         need(good, "stamp.size", &n, "5 to 64 pixels")?;
         let p = psf.size;
         let good = (3..=MAX_PSF).contains(&p);

@@ -23,6 +23,9 @@ pub(super) fn over_sets(
         .collect()
 }
 
+/// Images of a set of the challenge, of which figures are published. With fewer, noise is another part of them.
+const PUBLISHED_IMAGES: u32 = 200;
+
 /// Share of each set in a mean in which every kind of image counts as it does among the challenge's 24 sets,
 /// however many of the kind there are.
 fn shares(results: &[SetResult]) -> Vec<f64> {
@@ -69,6 +72,9 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
             Cell::number(value(published), decimals)
         };
         let apart = |figure: fn(&Figures) -> f64, value: fn(&Published) -> f64| {
+            if results.iter().any(|set| set.images != PUBLISHED_IMAGES) {
+                return Cell::Empty;
+            }
             let (mean, error) = mean_of_24(results, place, figure);
             Cell::number((mean - value(published)) / error, 1)
         };
@@ -125,7 +131,7 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
         rows,
         notes: vec![
             "Q calibrated: after dividing the ellipticities by the mean slope at which they follow the true ones.".into(),
-            "Apart: ours less the published one, in standard errors of ours.".into(),
+            format!("Apart: ours less the published one, in standard errors of ours, where sets have {PUBLISHED_IMAGES} images as there."),
             "Means over sets, each kind of image counting as often as among the challenge's 24; kinds that are absent do not count.".into(),
             "Standard convention, leaderboard definition; errors from what the truth leaves unexplained. Published figures are of the challenge's own images, 200 per set.".into(),
         ],
