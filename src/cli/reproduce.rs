@@ -124,8 +124,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     print_table(&exhibits::table_one(&results, &submissions))?;
     for table in [
         exhibits::findings_table(&exhibits::findings(&results, &names(&submissions))),
+        exhibits::findings_table(&exhibits::lambda_findings(&curves)),
         exhibits::calibration_table(&curves, &base),
     ] {
+        if table.rows.is_empty() {
+            continue;
+        }
         print("\n")?;
         print_table(&table)?;
     }
@@ -149,7 +153,7 @@ fn of_table_one(
     let known = names(&all);
     if let Some(name) = wanted.iter().find(|name| !known.contains(name)) {
         bail!(
-            "{name} is not in Table 1: found there are {}",
+            "`{name}` is not in Table 1, which has {}; `study` and `run` take any other",
             known.join(", ")
         );
     }
@@ -191,10 +195,10 @@ fn sect_five(
     let names = names(submissions);
     page.section("Submissions (Sect. 5)", SECT_FIVE);
     page.table("table1", &exhibits::table_one(results, submissions))?;
-    page.table(
-        "findings",
-        &exhibits::findings_table(&exhibits::findings(results, &names)),
-    )?;
+    let findings = exhibits::findings(results, &names);
+    if !findings.is_empty() {
+        page.table("findings", &exhibits::findings_table(&findings))?;
+    }
     page.figure(
         "fig8-q-per-set",
         &exhibits::q_per_set(results, &names),
@@ -239,6 +243,6 @@ fn sect_five(
             "As Fig. 11 of the paper: additive bias per set.",
         )?;
     }
-    page.section("Every set", "The data of Figs 8, 10 and 11.");
+    page.section("Every set", "The data of the figures per set.");
     page.table("fig8-11-per-set", &exhibits::per_set_table(results))
 }
