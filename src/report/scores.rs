@@ -295,7 +295,8 @@ pub fn bandpowers(scored: &[ScoredSet]) -> Table {
     let mut rows = Vec::new();
     for ScoredSet { set, score, .. } in scored {
         let measured = score.spectra();
-        for b in SCORED {
+        // Small grids have bins without modes.
+        for b in SCORED.filter(|&b| score.bins.modes[b] > 0) {
             rows.push(vec![
                 set.map_or(Cell::Empty, |set| Cell::number(f64::from(set), 0)),
                 Cell::number(b as f64 + 1.0, 0),

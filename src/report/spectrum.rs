@@ -5,12 +5,20 @@ use shearq_scoring::{BINS, SCORED};
 use super::figure::{LinePlot, Series, Style};
 use crate::simulate::kinds::SetKind;
 
+/// Share of the highest power below which the truth has none.
+const ROUNDING: f64 = 1e-12;
+
 /// E-mode bandpowers of a set: (multipoles, truth, measured, standard errors).
 pub type Powers<'a> = [&'a [f64; BINS]; 4];
 
 /// The scored bandpowers of the true and of the measured shear.
 pub fn panel(set: Option<u32>, [l, truth, measured, errors]: Powers<'_>) -> LinePlot {
-    let scored = |values: &[f64; BINS]| values[SCORED].to_vec();
+    // Small grids have bins without modes, and at the highest multipole a truth that is rounding alone.
+    let highest = truth[SCORED].iter().copied().fold(0.0, f64::max);
+    let seen: Vec<usize> = SCORED
+        .filter(|&bin| l[bin] > 0.0 && truth[bin] > ROUNDING * highest)
+        .collect();
+    let scored = |values: &[f64; BINS]| seen.iter().map(|&bin| values[bin]).collect::<Vec<_>>();
     let title = set.map(|number| {
         let kind = SetKind::of(number).map_or("", |kind| kind.image.label());
         format!("Set {number} {kind}")

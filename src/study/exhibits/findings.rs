@@ -41,7 +41,7 @@ fn q_difference(results: &[SetResult], first: usize, second: usize) -> Option<(f
 fn with_error(error: f64, decimals: usize) -> String {
     match error.is_finite() {
         true => format!(" ± {error:.decimals$}"),
-        false => " (no error from so few images)".into(),
+        false => " (error unknown)".into(),
     }
 }
 
@@ -59,7 +59,7 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
         found.push(Finding {
             paper,
             here: format!(
-                "Q of {second} is {:+.1}{} % from that of {first}",
+                "Q of {second} from that of {first}: {:+.1}{} %",
                 100.0 * difference / mean,
                 with_error(100.0 * error / mean, 1)
             ),

@@ -255,7 +255,8 @@ pub fn power_spectra(results: &[SetResult], place: usize, name: &str) -> PanelGr
 pub fn power_spectra_table(results: &[SetResult], place: usize) -> Table {
     let mut rows = Vec::new();
     for set in results {
-        for b in SCORED {
+        // Small grids have bins without modes.
+        for b in SCORED.filter(|&b| set.l[b] > 0.0) {
             rows.push(vec![
                 Cell::number(f64::from(set.set), 0),
                 Cell::number(b as f64 + 1.0, 0),
