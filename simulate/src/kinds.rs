@@ -151,9 +151,39 @@ impl SetKind {
     }
 }
 
+/// Share of each of `sets` in a mean in which every kind of image counts as it does among the challenge's 24,
+/// however many of the kind there are here.
+pub fn shares(sets: &[u32]) -> Vec<f64> {
+    let image = |set: u32| SetKind::of(set).map(|kind| kind.image);
+    let share = |&set: &u32| {
+        let same = |other: &u32| image(*other) == image(set);
+        let challenge = (1..=24).filter(same).count();
+        let here = sets.iter().copied().filter(same).count();
+        challenge as f64 / here as f64
+    };
+    let all: Vec<f64> = sets.iter().map(share).collect();
+    let sum: f64 = all.iter().sum();
+    all.iter().map(|share| share / sum).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn each_kind_counts_as_among_the_24_sets() {
+        // Two of three fiducial sets, one of two with small galaxies.
+        let expected = [1.5, 1.5, 2.0].map(|share| share / 5.0);
+        for (share, expected) in shares(&[1, 2, 14]).into_iter().zip(expected) {
+            assert!((share - expected).abs() < 1e-15, "{share} {expected}");
+        }
+        let all: Vec<u32> = (1..=24).collect();
+        assert!(
+            shares(&all)
+                .iter()
+                .all(|share| (share - 1.0 / 24.0).abs() < 1e-15)
+        );
+    }
 
     #[test]
     fn the_table_is_the_papers() {

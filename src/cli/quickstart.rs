@@ -115,7 +115,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
 /// Which submission to use, and the figures that say so.
 fn verdict(submissions: &[(String, Vec<SetRecord>)]) -> String {
-    let calibrated = |sets: &[SetRecord]| mean_figure(sets, "q_calibrated").0;
+    let mean = |sets: &[SetRecord], name: &str| mean_figure(sets, name).0;
+    let calibrated = |sets: &[SetRecord]| mean(sets, "q_calibrated");
     let known = submissions
         .iter()
         .filter(|(_, sets)| calibrated(sets).is_finite());
@@ -142,10 +143,9 @@ fn verdict(submissions: &[(String, Vec<SetRecord>)]) -> String {
         })
         .collect();
     // Where images are few, Q itself can rank otherwise.
-    let q = |sets: &[SetRecord]| mean_figure(sets, "q").0;
     let raised = submissions
         .iter()
-        .filter(|(_, others)| q(others) > q(sets) && mean_figure(others, "m_cross").0 < 0.0)
+        .filter(|(_, others)| mean(others, "q") > mean(sets, "q") && mean(others, "m_cross") < 0.0)
         .map(|(other, _)| other.as_str())
         .collect::<Vec<_>>();
     let warning = match raised.is_empty() {

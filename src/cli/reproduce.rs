@@ -110,28 +110,30 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "Figures and tables of Nurbaeva et al. from simulated data",
         settings,
     );
+    let table_one = exhibits::table_one(&results, &submissions);
+    let names: Vec<String> = names(&submissions);
+    let findings = exhibits::findings_table(&exhibits::findings(&results, &names));
+    let calibration = exhibits::calibration_table(&curves, &base);
+    let of_lambda = exhibits::findings_table(&exhibits::lambda_findings(&curves));
     method(&mut page, &plan)?;
     page.section("Calibration of λ (Sect. 4)", SECT_FOUR);
     exhibits::calibration_figures(&mut page, &curves)?;
-    page.table("calibration", &exhibits::calibration_table(&curves, &base))?;
-    page.table(
-        "findings-lambda",
-        &exhibits::findings_table(&exhibits::lambda_findings(&curves)),
-    )?;
+    page.table("calibration", &calibration)?;
+    page.table("findings-lambda", &of_lambda)?;
     page.data("fig5-7-lambda", &exhibits::curves_table(&curves))?;
-    sect_five(&mut page, &results, &submissions)?;
+    page.section("Submissions (Sect. 5)", SECT_FIVE);
+    page.table("table1", &table_one)?;
+    // Few submissions or sets may decide none.
+    let findings = (!findings.rows.is_empty()).then_some(findings);
+    if let Some(findings) = &findings {
+        page.table("findings", findings)?;
+    }
+    sect_five(&mut page, &results, &names)?;
     page.save()?;
-    print_table(&exhibits::table_one(&results, &submissions))?;
-    for table in [
-        exhibits::findings_table(&exhibits::findings(&results, &names(&submissions))),
-        exhibits::findings_table(&exhibits::lambda_findings(&curves)),
-        exhibits::calibration_table(&curves, &base),
-    ] {
-        if table.rows.is_empty() {
-            continue;
-        }
+    print_table(&table_one)?;
+    for table in findings.iter().chain([&of_lambda, &calibration]) {
         print("\n")?;
-        print_table(&table)?;
+        print_table(table)?;
     }
     tell(format_args!(
         "report, figures and data in {}",
@@ -187,21 +189,11 @@ fn names(submissions: &[(Submission, Published)]) -> Vec<String> {
     submissions.iter().map(|(s, _)| s.name.clone()).collect()
 }
 
-fn sect_five(
-    page: &mut Page<'_>,
-    results: &[SetResult],
-    submissions: &[(Submission, Published)],
-) -> anyhow::Result<()> {
-    let names = names(submissions);
-    page.section("Submissions (Sect. 5)", SECT_FIVE);
-    page.table("table1", &exhibits::table_one(results, submissions))?;
-    let findings = exhibits::findings(results, &names);
-    if !findings.is_empty() {
-        page.table("findings", &exhibits::findings_table(&findings))?;
-    }
+/// Figs 8 to 11, and the tables beside them.
+fn sect_five(page: &mut Page<'_>, results: &[SetResult], names: &[String]) -> anyhow::Result<()> {
     page.figure(
         "fig8-q-per-set",
-        &exhibits::q_per_set(results, &names),
+        &exhibits::q_per_set(results, names),
         "As Fig. 8 of the paper: quality factor per set and submission.",
     )?;
     let place = |name: &str| names.iter().position(|n| n == name);

@@ -5,10 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Value, json};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
-    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Figures, SCORED, SetScore,
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Figures, SetScore,
     SpectrumScore,
 };
 
+use super::spectrum;
 use super::table::{Cell, Heading, Table};
 use crate::results::score::{Basis, ScoredSet, means};
 use crate::simulate::kinds::SetKind;
@@ -295,8 +296,7 @@ pub fn bandpowers(scored: &[ScoredSet]) -> Table {
     let mut rows = Vec::new();
     for ScoredSet { set, score, .. } in scored {
         let measured = score.spectra();
-        // Small grids have bins without modes.
-        for b in SCORED.filter(|&b| score.bins.modes[b] > 0) {
+        for b in spectrum::bins(&score.bins.l) {
             rows.push(vec![
                 set.map_or(Cell::Empty, |set| Cell::number(f64::from(set), 0)),
                 Cell::number(b as f64 + 1.0, 0),

@@ -11,12 +11,17 @@ const ROUNDING: f64 = 1e-12;
 /// E-mode bandpowers of a set: (multipoles, truth, measured, standard errors).
 pub type Powers<'a> = [&'a [f64; BINS]; 4];
 
+/// The scored bins that have modes, of which small grids lack some: those with a multipole `l`.
+pub fn bins(l: &[f64; BINS]) -> impl Iterator<Item = usize> {
+    SCORED.filter(|&bin| l[bin] > 0.0)
+}
+
 /// The scored bandpowers of the true and of the measured shear.
 pub fn panel(set: Option<u32>, [l, truth, measured, errors]: Powers<'_>) -> LinePlot {
-    // Small grids have bins without modes, and at the highest multipole a truth that is rounding alone.
+    // Small grids have at the highest multipole a truth that is rounding alone.
     let highest = truth[SCORED].iter().copied().fold(0.0, f64::max);
-    let seen: Vec<usize> = SCORED
-        .filter(|&bin| l[bin] > 0.0 && truth[bin] > ROUNDING * highest)
+    let seen: Vec<usize> = bins(l)
+        .filter(|&bin| truth[bin] > ROUNDING * highest)
         .collect();
     let scored = |values: &[f64; BINS]| seen.iter().map(|&bin| values[bin]).collect::<Vec<_>>();
     let title = set.map(|number| {

@@ -258,12 +258,7 @@ pub fn lambda_findings(curves: &Curves) -> Vec<Finding> {
                     .collect::<Vec<_>>()
                     .join(", 10^")
             ),
-            // To the half decade at which λ is sampled.
-            agrees: Some(
-                adaptive
-                    .iter()
-                    .all(|curve| (best(curve) + 3.5).abs() <= 0.5),
-            ),
+            agrees: Some(adaptive.iter().all(|curve| best(curve) == -3.5)),
         },
         Finding {
             paper: "dSNR is higher for higher S/N and decreases with λ",

@@ -1,12 +1,12 @@
 //! Sect. 5: Table 1, Figs 8 to 11, and what denoising does to ellipticities.
 
-use shearq_scoring::{Figures, SCORED};
+use shearq_scoring::Figures;
 use shearq_submissions::{PsfForm, Published, Submission};
 
 use crate::report::figure::{BarGroup, BarPlot, ColourMap, HeatMap, PanelGrid};
 use crate::report::spectrum;
 use crate::report::table::{Cell, Heading, Table};
-use crate::simulate::kinds::{ImageType, SetKind};
+use crate::simulate::kinds::{ImageType, SetKind, shares};
 use crate::study::reproduce::SetResult;
 use crate::study::response::Response;
 
@@ -26,30 +26,11 @@ pub(super) fn over_sets(
 /// Images of a set of the challenge, of which figures are published. With fewer, noise is another part of them.
 const PUBLISHED_IMAGES: u32 = 200;
 
-/// Share of each set in a mean in which every kind of image counts as it does among the challenge's 24 sets,
-/// however many of the kind there are.
-fn shares(results: &[SetResult]) -> Vec<f64> {
-    let image = |set: u32| SetKind::of(set).map(|kind| kind.image);
-    let share = |set: &SetResult| {
-        let same = |other: &u32| image(*other) == image(set.set);
-        let challenge = (1..=24).filter(same).count();
-        let here = results.iter().map(|r| r.set).filter(same).count();
-        challenge as f64 / here as f64
-    };
-    let all: Vec<f64> = results.iter().map(share).collect();
-    let sum: f64 = all.iter().sum();
-    all.iter().map(|share| share / sum).collect()
-}
-
-/// Mean of a submission's figure over the challenge's 24 sets, and its error.
-pub(super) fn mean_of_24(
-    results: &[SetResult],
-    place: usize,
-    figure: fn(&Figures) -> f64,
-) -> (f64, f64) {
-    let over = over_sets(results, place, figure);
-    let shares = shares(results);
-    let weighted = over.iter().zip(&shares);
+/// Mean over the challenge's 24 sets of what each set here has, and its error.
+fn weighted(results: &[SetResult], values: &[(f64, f64)]) -> (f64, f64) {
+    let sets: Vec<u32> = results.iter().map(|set| set.set).collect();
+    let shares = shares(&sets);
+    let weighted = values.iter().zip(&shares);
     let mean = weighted
         .clone()
         .map(|((value, _), share)| share * value)
@@ -58,6 +39,15 @@ pub(super) fn mean_of_24(
         .map(|((_, error), share)| (share * error).powi(2))
         .sum();
     (mean, variance.sqrt())
+}
+
+/// Mean of a submission's figure over the challenge's 24 sets, and its error.
+pub(super) fn mean_of_24(
+    results: &[SetResult],
+    place: usize,
+    figure: fn(&Figures) -> f64,
+) -> (f64, f64) {
+    weighted(results, &over_sets(results, place, figure))
 }
 
 /// Table 1: our figures beside the published ones.
@@ -78,6 +68,10 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
             let (mean, error) = mean_of_24(results, place, figure);
             Cell::number((mean - value(published)) / error, 1)
         };
+        let calibrated: Vec<(f64, f64)> = results
+            .iter()
+            .map(|set| (set.results[place].q_calibrated, f64::NAN))
+            .collect();
         let yes = |yes: bool| Cell::text(if yes { "Y" } else { "N" });
         rows.push(vec![
             Cell::text(&submission.name),
@@ -96,14 +90,7 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
             mean(|f| f.q, 2),
             given(|p| p.q, 2),
             apart(|f| f.q, |p| p.q),
-            Cell::number(
-                results
-                    .iter()
-                    .zip(shares(results))
-                    .map(|(set, share)| share * set.results[place].q_calibrated)
-                    .sum(),
-                2,
-            ),
+            Cell::number(weighted(results, &calibrated).0, 2),
             mean(|f| f.q_dn, 1),
             mean(|f| f.m_cross, 4),
         ]);
@@ -255,8 +242,7 @@ pub fn power_spectra(results: &[SetResult], place: usize, name: &str) -> PanelGr
 pub fn power_spectra_table(results: &[SetResult], place: usize) -> Table {
     let mut rows = Vec::new();
     for set in results {
-        // Small grids have bins without modes.
-        for b in SCORED.filter(|&b| set.l[b] > 0.0) {
+        for b in spectrum::bins(&set.l) {
             rows.push(vec![
                 Cell::number(f64::from(set.set), 0),
                 Cell::number(b as f64 + 1.0, 0),
@@ -372,33 +358,5 @@ pub fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table
         notes: vec![
             "Reported ellipticity against the true shear-type one of each galaxy; scatter per component about the line, divided by the slope.".into(),
         ],
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_kind_counts_as_among_the_24_sets() {
-        let set = |set| SetResult {
-            set,
-            images: 1,
-            l: [0.0; shearq_scoring::BINS],
-            true_ee: [0.0; shearq_scoring::BINS],
-            results: Vec::new(),
-        };
-        // Two of three fiducial sets, one of two with small galaxies.
-        let some = [set(1), set(2), set(14)];
-        let expected = [1.5, 1.5, 2.0].map(|share| share / 5.0);
-        for (share, expected) in shares(&some).into_iter().zip(expected) {
-            assert!((share - expected).abs() < 1e-15, "{share} {expected}");
-        }
-        let all: Vec<SetResult> = (1..=24).map(set).collect();
-        assert!(
-            shares(&all)
-                .iter()
-                .all(|share| (share - 1.0 / 24.0).abs() < 1e-15)
-        );
     }
 }
