@@ -23,7 +23,7 @@ pub enum Psfs<'a, P = f64> {
     Stars(ArrayView3<'a, P>),
     /// Formulas, one each.
     Functional(&'a [FunctionalPsf]),
-    /// A PSF for all that is used as it is: of the submission's size, centred, of sum one.
+    /// A PSF for all that is used as it is: of the submission's size, or larger if it is broad, centred, of sum one.
     Prepared(ArrayView2<'a, f64>),
 }
 
@@ -67,7 +67,7 @@ impl Measurer {
             });
         }
         let mut worker = self.worker();
-        worker.set_psf(star_psf(psf, self.submission().psf.size)?.view())?;
+        worker.set_psf(star_psf(psf, self.submission().psf_cut())?.view())?;
         worker.measure(stamp, noise)
     }
 
@@ -143,7 +143,7 @@ impl Worker {
         psfs: Psfs<'_, P>,
         header_noise: Option<f64>,
     ) -> Result<Vec<Measurement>, MeasureError> {
-        let (size, count) = (self.submission().psf.size, stamps.len_of(Axis(0)));
+        let (cut, count) = (self.submission().psf_cut(), stamps.len_of(Axis(0)));
         let side = stamps.len_of(Axis(1));
         let given = match psfs {
             Psfs::Star(_) | Psfs::Prepared(_) => count,
@@ -158,7 +158,7 @@ impl Worker {
             });
         }
         match psfs {
-            Psfs::Star(star) => self.set_psf(star_psf(star, size)?.view())?,
+            Psfs::Star(star) => self.set_psf(star_psf(star, cut)?.view())?,
             Psfs::Prepared(psf) => self.set_psf(psf)?,
             Psfs::Stars(_) | Psfs::Functional(_) => {}
         }
@@ -166,8 +166,8 @@ impl Worker {
         let measured = stamps.map(|(k, stamp)| {
             match psfs {
                 Psfs::Star(_) | Psfs::Prepared(_) => {}
-                Psfs::Stars(stars) => self.take(star_psf(stars.index_axis(Axis(0), k), size)),
-                Psfs::Functional(formulas) => self.take(formulas[k].checked_stamp(size, side)),
+                Psfs::Stars(stars) => self.take(star_psf(stars.index_axis(Axis(0), k), cut)),
+                Psfs::Functional(formulas) => self.take(formulas[k].checked_stamp(cut, side)),
             }
             self.measure(stamp, header_noise)
         });

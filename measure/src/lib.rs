@@ -51,6 +51,7 @@ mod radial;
 mod shape;
 mod sizes;
 mod steps;
+mod surroundings;
 
 pub use batch::{Batch, Psfs, strip};
 pub use calibrate::calibrate;

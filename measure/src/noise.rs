@@ -11,7 +11,8 @@
 //! ```
 //!
 //! B being the polynomials, orthonormal on the block. Blocks brighter than noise makes them, and those
-//! beside them in the frame, are left out: there is another galaxy.
+//! beside them in the frame, are left out: there is another galaxy. So are blocks near a place that is brighter than the
+//! opposite one, whose own power a neighbour may raise by a few per cent only: where all stamps have one, that adds up.
 
 use std::sync::Arc;
 
@@ -19,6 +20,7 @@ use ndarray::{Array2, ArrayView2};
 
 use crate::error::MeasureError;
 use crate::pixel::Pixel;
+use crate::surroundings::{Contrasts, centre, turn};
 
 /// Pixels a side of a block.
 const BLOCK: usize = 8;
@@ -34,6 +36,12 @@ const ENOUGH: usize = 1000;
 const BRIGHT: f64 = 4.0;
 /// Blocks of the frame to each side of a bright one that are left out with it.
 const BESIDE: usize = 2;
+/// Brightness of a place over its opposite, in units of its noise, from which on blocks around it are left out, and how far
+/// around it, in pixels. Of stamps without neighbours a tenth loses some.
+const CONTRAST: f32 = 3.5;
+const AROUND: f32 = 16.0;
+/// The median of |x| over the scatter of x for Gaussian noise.
+const HALF_WIDTH: f32 = 0.6745;
 /// Least share of the power of white noise that is left to a mode of correlated noise: an estimate may
 /// come near zero, and below.
 const LEAST_POWER: f64 = 1e-3;
@@ -163,8 +171,11 @@ impl NoisePlan {
         NoiseSurvey {
             plan: self.clone(),
             block: vec![0.0; PIXELS],
+            pixels: vec![0.0; self.full * self.full],
+            contrasts: Contrasts::new(self.full),
             products: Vec::new(),
-            frames: 0,
+            brightest: Vec::new(),
+            typical: Vec::new(),
         }
     }
 
@@ -178,9 +189,15 @@ impl NoisePlan {
 pub struct NoiseSurvey {
     plan: NoisePlan,
     block: Vec<f64>,
+    /// The stamp, and how it compares with itself turned about the galaxy.
+    pixels: Vec<f32>,
+    contrasts: Contrasts,
     /// Of each block, frame by frame, the sum of products at each lag.
     products: Vec<f32>,
-    frames: usize,
+    /// Of each block, the most that a place around it is brighter than its opposite, over the root of its pixels.
+    brightest: Vec<f32>,
+    /// Of each frame, the median over all places.
+    typical: Vec<f32>,
 }
 
 impl NoiseSurvey {
@@ -210,8 +227,36 @@ impl NoiseSurvey {
                 self.products.push(product(&self.block, dx, dy) as f32);
             }
         }
-        self.frames += 1;
+        self.compare(stamp);
         Ok(())
+    }
+
+    /// Looks for places that are brighter than the opposite ones.
+    fn compare<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) {
+        let full = self.plan.full;
+        for (to, value) in self.pixels.iter_mut().zip(stamp) {
+            *to = value.to_f32();
+        }
+        let turn = turn(centre(&self.pixels, full), full);
+        self.contrasts.compare(&self.pixels, turn);
+        let places = &self.contrasts.blocks;
+        let over_noise = |excess: f32, pixels: f32| excess / pixels.sqrt();
+        for &(y0, x0) in &*self.plan.blocks {
+            let middle = |first: usize, turn: i32| {
+                first as f32 + (BLOCK as f32 - 1.0) / 2.0 - turn as f32 / 2.0
+            };
+            let (x, y) = (middle(x0, turn[0]), middle(y0, turn[1]));
+            let near = places
+                .iter()
+                .filter(|at| (at.place[0] - x).hypot(at.place[1] - y) < AROUND);
+            let most = near.map(|at| over_noise(at.excess, at.pixels));
+            self.brightest.push(most.fold(0.0, f32::max));
+        }
+        let all: Vec<f32> = places
+            .iter()
+            .map(|at| over_noise(at.excess, at.pixels))
+            .collect();
+        self.typical.extend(median(&all));
     }
 
     /// The noise of the stamps looked at; `None` where less than a few frames are left that hold noise alone.
@@ -223,16 +268,19 @@ impl NoiseSurvey {
             .map(|products| f64::from(products[0]))
             .collect();
         let bright = brightest(&powers)?;
+        let contrast = CONTRAST / HALF_WIDTH * median(&self.typical)?;
         let ring = self.plan.blocks.len();
         let mut sums = vec![0.0; lags];
         let mut count = 0;
         let frames = self.products.chunks_exact(ring * lags);
-        for (products, powers) in frames.zip(powers.chunks_exact(ring)) {
+        let places = self.brightest.chunks_exact(ring);
+        for ((products, powers), places) in frames.zip(powers.chunks_exact(ring)).zip(places) {
             let lost = |at: usize| {
-                (ring - BESIDE..=ring + BESIDE).any(|by| {
+                let beside = (ring - BESIDE..=ring + BESIDE).any(|by| {
                     let power = powers[(at + by) % ring];
                     power > bright || power == 0.0
-                })
+                });
+                beside || places[at] > contrast
             };
             for (at, products) in products.chunks_exact(lags).enumerate() {
                 if lost(at) {
@@ -398,6 +446,12 @@ fn matrix(reach: usize, polynomials: &[[f64; PIXELS]; POLYNOMIALS]) -> Array2<f6
     out
 }
 
+fn median(values: &[f32]) -> Option<f32> {
+    let mut values = values.to_vec();
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
+}
+
 /// The power beyond which a block is left out.
 fn brightest(powers: &[f64]) -> Option<f64> {
     let mut all: Vec<f64> = powers
@@ -513,8 +567,9 @@ mod tests {
             let dx = -k[0].sin() * (1.0 + k[1].cos());
             let dy = -k[1].sin() * (1.0 + k[0].cos());
             let along = [k[0] * dx - k[1] * dy, k[1] * dx + k[0] * dy];
+            // Far lags weigh more in slopes, which scatter by 0.07 between seeds.
             for (found, expected) in slopes.iter().zip(along) {
-                assert!((found - expected).abs() < 0.15, "{k:?}: {found} {expected}");
+                assert!((found - expected).abs() < 0.25, "{k:?}: {found} {expected}");
             }
         }
     }
@@ -525,16 +580,13 @@ mod tests {
         let crowded = survey(2, 300, |rng| {
             let mut stamp = noise(rng, false);
             // An exponential disc in the middle with a scale of 6 px and 2000 times the noise's light, and in
-            // every other stamp one like it, of 3 px, 20 px away in any direction.
+            // every stamp one like it, of 3 px and S/N 20, 20 px away in any direction.
             let away: f32 = rng.random_range(0.0..std::f32::consts::TAU);
-            let second = rng.random::<bool>();
             for ((y, x), value) in stamp.indexed_iter_mut() {
                 let (y, x) = (y as f32 - 23.5, x as f32 - 23.5);
                 *value += 2000.0 / 226.0 * (-x.hypot(y) / 6.0).exp();
-                if second {
-                    let (x, y) = (x - 20.0 * away.cos(), y - 20.0 * away.sin());
-                    *value += 300.0 / 56.0 * (-x.hypot(y) / 3.0).exp();
-                }
+                let (x, y) = (x - 20.0 * away.cos(), y - 20.0 * away.sin());
+                *value += 300.0 / 56.0 * (-x.hypot(y) / 3.0).exp();
             }
             stamp
         });

@@ -1,5 +1,6 @@
 //! Point-spread functions: star stamps and functional forms.
 
+pub(crate) mod breadth;
 mod functional;
 mod star;
 

@@ -37,13 +37,13 @@ impl Worker {
         psf: ArrayView2<'_, f64>,
         measurement: &Measurement,
     ) -> Result<Steps, MeasureError> {
-        let (n, p) = (self.submission().stamp.size, self.submission().psf.size);
+        let n = self.submission().stamp.size;
         let (Some(y0), Some(x0)) = (cut_start(stamp.nrows(), n), cut_start(stamp.ncols(), n))
         else {
             let expected = format!("at least {n} × {n}");
             return Err(MeasureError::square("a stamp", stamp.dim(), expected));
         };
-        check_psf(psf, p)?;
+        check_psf(psf, psf.nrows())?;
         let stamp =
             Array2::from_shape_fn((n, n), |(y, x)| f64::from(stamp[(y0 + y, x0 + x)].to_f32()));
         let Images {

@@ -80,7 +80,7 @@ pub(crate) fn measure<'py>(
     let (count, rows, columns) = stamps.dim();
     let stamps = stamps.shared();
     let measurer = Measurer::new(submission, rows).map_err(of_measuring)?;
-    let size = submission.psf.size;
+    let (size, cut) = (submission.psf.size, submission.psf_cut());
     let stars = stars.map(Borrowed::new).transpose()?;
     let noise = match &noises {
         None => Noise::One(noise),
@@ -107,7 +107,7 @@ pub(crate) fn measure<'py>(
     let psfs = match (star, &stars, formulas) {
         (Some(star), None, None) => {
             look(Psfs::Star(star.as_array())).map_err(of_measuring)?;
-            prepared = star_psf(star.as_array(), size).map_err(of_measuring)?;
+            prepared = star_psf(star.as_array(), cut).map_err(of_measuring)?;
             AllPsfs::Shared(prepared.view())
         }
         (None, Some(stars), None) => {
@@ -128,7 +128,7 @@ pub(crate) fn measure<'py>(
             let formulas = self::formulas(formulas.as_array()).map_err(of_measuring)?;
             match formulas.as_slice() {
                 [one] => {
-                    prepared = one.stamp_beside(size, rows);
+                    prepared = one.stamp_beside(cut, rows);
                     look(Psfs::Prepared(prepared.view())).map_err(of_measuring)?;
                     AllPsfs::Shared(prepared.view())
                 }

@@ -97,7 +97,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 break row;
             }
         };
-        let psf = psf_of(&row, ix, submission.psf.size)
+        let psf = psf_of(&row, ix, submission.psf_cut())
             .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
         let mut worker = measurer.worker();
         worker.set_noise(row.noise.as_ref());

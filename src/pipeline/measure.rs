@@ -9,7 +9,7 @@ use shearq_measure::{
     Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, StampNoise, Worker, calibrate,
     star_psf, strip,
 };
-use shearq_submissions::{EllipticityType, NoiseSource, PsfForm, Submission};
+use shearq_submissions::{EllipticityType, NoiseSource, PsfCut, PsfForm, Submission};
 use shearq_tables::polars::{Column, DataFrame};
 use shearq_tables::{TableError, frame};
 
@@ -257,7 +257,7 @@ fn open_psf(
     submission: &Submission,
     mosaic: &Mosaic,
 ) -> Result<PsfSource, PipelineError> {
-    let size = submission.psf.size;
+    let (size, cut) = (submission.psf.size, submission.psf_cut());
     match submission.psf.form {
         PsfForm::Functional => {
             let path = data.psf_functional(id.set, id.image);
@@ -271,7 +271,7 @@ fn open_psf(
             }
             Ok(match rows.as_slice() {
                 [psf] => {
-                    let stamp = psf.stamp_beside(size, mosaic.stamp);
+                    let stamp = psf.stamp_beside(cut, mosaic.stamp);
                     if stamp.iter().any(|value| !value.is_finite()) {
                         let message = format!(
                             "a PSF with a FWHM of {} px has no light on its stamp; expected a width of about a pixel or more",
@@ -331,7 +331,7 @@ fn open_psf(
             let pixels = image.read_rows(height)?;
             let stamp = ArrayView2::from_shape((height, width), &pixels)
                 .map_err(|error| FileError::new(&path, error))?;
-            let psf = star_psf(stamp, size).map_err(|error| FileError::new(&path, error))?;
+            let psf = star_psf(stamp, cut).map_err(|error| FileError::new(&path, error))?;
             Ok(PsfSource::Shared(Arc::new(psf)))
         }
     }
@@ -374,14 +374,14 @@ pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, P
 ///
 /// # Errors
 /// Where it cannot be used.
-pub fn psf_of(row: &StampRow, ix: usize, size: usize) -> Result<Array2<f64>, PipelineError> {
+pub fn psf_of(row: &StampRow, ix: usize, cut: PsfCut) -> Result<Array2<f64>, PipelineError> {
     Ok(match &row.psf {
         RowPsf::Shared(psf) => psf.as_ref().clone(),
         RowPsf::Stars { pixels, side } => {
             let stars = strip(pixels, row.mosaic.columns, *side)?;
-            star_psf(stars.index_axis(Axis(0), ix), size)?
+            star_psf(stars.index_axis(Axis(0), ix), cut)?
         }
-        RowPsf::Functional(field) => field[ix].stamp_beside(size, row.mosaic.stamp),
+        RowPsf::Functional(field) => field[ix].stamp_beside(cut, row.mosaic.stamp),
     })
 }
 

@@ -240,8 +240,8 @@ pub fn simulated_steps(
     set.draw(&fields, ix, iy, &mut RenderScratch::new(), &mut pixels);
     let stamps = strip(&pixels, 1, STAMP)?;
     let stamp = stamps.index_axis(Axis(0), 0);
-    let size = measurer.submission().psf.size;
-    let psf = fields.psf.at(ix, iy).stamp_beside(size, STAMP);
+    let cut = measurer.submission().psf_cut();
+    let psf = fields.psf.at(ix, iy).stamp_beside(cut, STAMP);
     let mut worker = measurer.worker();
     worker.set_psf(psf.view())?;
     let measured = worker.measure(stamp, Some(NOISE_SIGMA))?;
@@ -286,18 +286,18 @@ pub(crate) fn measure_strip(
 /// The PSFs of a row in the form that a submission uses.
 fn row_psf(set: &SetSimulator, fields: &ImageFields, iy: usize, submission: &Submission) -> RowPsf {
     let n = set.grid().n;
-    let size = submission.psf.size;
+    let (size, cut) = (submission.psf.size, submission.psf_cut());
     match (&fields.psf, submission.psf.form) {
         (PsfField::One(psf), PsfForm::Functional) => {
-            RowPsf::Shared(Arc::new(psf.stamp_beside(size, STAMP)))
+            RowPsf::Shared(Arc::new(psf.stamp_beside(cut, STAMP)))
         }
         (PsfField::One(psf), PsfForm::Star) => {
             let star = simulate::star(psf, STAMP);
-            let cut = ArrayView2::from_shape((STAMP, STAMP), &star)
+            let psf = ArrayView2::from_shape((STAMP, STAMP), &star)
                 .ok()
-                .and_then(|star| star_psf(star, size).ok());
+                .and_then(|star| star_psf(star, cut).ok());
             // A noise-free star of the simulator's can always be cut.
-            RowPsf::Shared(Arc::new(cut.unwrap_or_else(|| Array2::zeros((size, size)))))
+            RowPsf::Shared(Arc::new(psf.unwrap_or_else(|| Array2::zeros((size, size)))))
         }
         (PsfField::PerGalaxy(_), PsfForm::Functional) => {
             RowPsf::Functional((0..n).map(|ix| *fields.psf.at(ix, iy)).collect())

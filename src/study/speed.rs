@@ -13,7 +13,8 @@ use shearq_measure::{Measurer, StampNoise};
 use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::{
-    Clipping, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, Start, Submission, Update,
+    Clipping, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut, Start, Submission,
+    Update,
 };
 
 use shearq_tables::frame;
@@ -98,14 +99,14 @@ impl Inputs {
         Ok(Inputs { set, stamps })
     }
 
-    pub(super) fn psf(&self, size: usize) -> ndarray::Array2<f64> {
+    pub(super) fn psf(&self, cut: impl Into<PsfCut>) -> ndarray::Array2<f64> {
         let fields = self.set.image_fields(1);
-        fields.psf.at(0, 0).stamp_beside(size, STAMP)
+        fields.psf.at(0, 0).stamp_beside(cut, STAMP)
     }
 
     /// Microseconds of a whole measurement, the PSF being taken already.
     fn whole(&self, submission: &Submission) -> Result<f64, PipelineError> {
-        let psf = self.psf(submission.psf.size);
+        let psf = self.psf(submission.psf_cut());
         let mut worker = Measurer::new(submission, STAMP)?.worker();
         worker.set_psf(psf.view())?;
         Ok(time(|k| {
@@ -115,7 +116,7 @@ impl Inputs {
 
     /// Microseconds of taking a PSF.
     fn taking_a_psf(&self, submission: &Submission) -> Result<f64, PipelineError> {
-        let psf = self.psf(submission.psf.size);
+        let psf = self.psf(submission.psf_cut());
         let mut worker = Measurer::new(submission, STAMP)?.worker();
         Ok(time(|_| {
             let _ = worker.set_psf(black_box(psf.view()));

@@ -22,7 +22,7 @@ pub use registry::{Entry, Registry};
 pub use settings::{
     AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Denoise,
     EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method, NetworkDeconvolution,
-    NetworkMethod, NoiseSource, Psf, PsfForm, PsfScale, ShareOf, Stamp, Start, StepScale,
+    NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf, Stamp, Start, StepScale,
     Submission, Update, Wavelet, WeightedShape,
 };
 pub use template::Template;

@@ -6,6 +6,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::limits::MAX_PSF;
+
 /// Declares a section as one file of an inheritance chain gives it.
 macro_rules! partial {
     ($name:ident { $($field:ident: $type:ty,)* }) => {
@@ -176,6 +178,7 @@ partial! {
         high_pass_divisor: f64,
         target_sigma: f64,
         window_sigma: f64,
+        reference_area: f64,
     }
 }
 
@@ -238,6 +241,9 @@ section! {
         target_sigma: f64,
         /// σ in pixels of the round Gaussian window by which the result is multiplied.
         window_sigma: f64,
+        /// Noise-equivalent area 1/Σp² in px² of the PSF that lengths are for. For a broader one target and weight are
+        /// longer, and more is cut of it; zero for the same lengths with all PSFs.
+        reference_area: f64,
     }
 }
 
@@ -490,7 +496,42 @@ pub struct LinearMethod {
     pub shape: WeightedShape,
 }
 
+/// How much of a PSF is cut around its middle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PsfCut {
+    /// Pixels a side.
+    pub size: usize,
+    /// Most pixels a side, of a PSF that is broader than the reference.
+    pub most: usize,
+    /// Noise-equivalent area in px² of the reference; zero where all PSFs are cut alike.
+    pub reference_area: f64,
+}
+
+impl From<usize> for PsfCut {
+    /// So many pixels a side, of any PSF.
+    fn from(size: usize) -> Self {
+        PsfCut {
+            size,
+            most: size,
+            reference_area: 0.0,
+        }
+    }
+}
+
 impl Submission {
+    /// How much of a PSF is taken.
+    pub fn psf_cut(&self) -> PsfCut {
+        let size = self.psf.size;
+        match self.linear() {
+            None => size.into(),
+            Some(linear) => PsfCut {
+                size,
+                most: self.stamp.size.clamp(size, MAX_PSF),
+                reference_area: linear.deconvolution.reference_area,
+            },
+        }
+    }
+
     /// The network's settings; `None` for the linear method.
     pub fn network(&self) -> Option<&NetworkMethod> {
         match &self.method {

@@ -170,6 +170,7 @@ impl LinearMethod {
             max_iterations,
             target_sigma: target,
             window_sigma: window,
+            reference_area: area,
         } = self.deconvolution;
         let (scale, softening) = (self.shape.weight_scale, self.shape.softening);
         step(c)?;
@@ -179,6 +180,13 @@ impl LinearMethod {
         real(good, "deconvolution.target_sigma", target, "1 to 6 pixels")?;
         let good = (2.0..=16.0).contains(&window);
         real(good, "deconvolution.window_sigma", window, "2 to 16 pixels")?;
+        let good = area == 0.0 || (1.0..=1e4).contains(&area);
+        real(
+            good,
+            "deconvolution.reference_area",
+            area,
+            "0, or 1 to 10000 px²",
+        )?;
         let good = (0.5..=10.0).contains(&scale);
         real(good, "shape.weight_scale", scale, "0.5 to 10 pixels")?;
         let good = (0.0..=1e6).contains(&softening);

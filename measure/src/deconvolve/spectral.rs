@@ -314,13 +314,21 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut SpectralPsf,
     ) -> Result<(), MeasureError> {
-        check_psf(psf, self.p)?;
+        let side = psf.nrows();
+        // Zero around a smaller one.
+        let fits = side < self.p && (self.p - side).is_multiple_of(2);
+        check_psf(psf, if fits { side } else { self.p })?;
+        let first = (self.p - side) / 2;
         let SpectralScratch {
             plane, image, real, ..
         } = scratch;
         let image = &mut image[..self.p * self.p];
-        for (out, value) in image.iter_mut().zip(psf) {
-            *out = *value as f32;
+        image.fill(0.0);
+        let rows = image.chunks_exact_mut(self.p).skip(first);
+        for (row, from) in rows.zip(psf.rows()) {
+            for (out, value) in row[first..].iter_mut().zip(from) {
+                *out = *value as f32;
+            }
         }
         self.plane.transform(image, self.p, plane);
         let [u, x, y] = &plane.half;
@@ -530,7 +538,7 @@ impl Spectral {
         let rows = stamp.chunks_exact(self.n);
         plan.rows(rows.map(|row| row.iter().copied()), &mut fft, &mut u);
         plan.columns(&mut fft, &mut u);
-        let centre = (self.p / 2) as f32;
+        let centre = (psf.nrows() / 2) as f32;
         let (size, side) = (self.plane.size, self.plane.side);
         for (at, u) in u.iter_mut().enumerate() {
             let (x, y) = (at / size, at % size);

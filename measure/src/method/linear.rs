@@ -16,11 +16,11 @@ use ndarray::ArrayView2;
 use shearq_submissions::LinearMethod;
 
 use super::found::{CutWorker, Found, Images, ResponseMatrix, Sheared, image, whole};
-use super::surroundings::{Surroundings, followed};
 use crate::deconvolve::{Descent, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop};
 use crate::error::MeasureError;
 use crate::noise::StampNoise;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
+use crate::surroundings::{Surroundings, centre, followed};
 
 /// One galaxy in so many is looked at with a field of noise: what it corrects is some per cent of the
 /// response at S/N 10 and less above, and needs to be known in the mean alone.
@@ -30,7 +30,7 @@ const SHARE: u64 = 4;
 const FIELD: f32 = 0.25;
 
 /// What one submission and stamp size need.
-pub(crate) struct LinearPlan {
+pub(super) struct LinearPlan {
     iterations: u32,
     softening: f32,
     spectral: Spectral,
@@ -52,22 +52,7 @@ impl LinearPlan {
 }
 
 /// A worker for one thread.
-pub(super) fn worker(plan: Arc<LinearPlan>) -> Box<dyn CutWorker> {
-    Box::new(LinearWorker {
-        noise: plan.spectral.noise(&StampNoise::white(1.0)),
-        psf: plan.spectral.psf(),
-        buffers: plan.spectral.scratch(),
-        surroundings: Surroundings::new(plan.spectral.stamp_size()),
-        grain: 1.0,
-        lags: plan.spectral.lags(),
-        field: plan.spectral.lags(),
-        shifted: plan.spectral.lags().acf,
-        values: plan.moments.scratch(),
-        plan,
-    })
-}
-
-struct LinearWorker {
+pub(super) struct LinearWorker {
     plan: Arc<LinearPlan>,
     noise: ModeNoise,
     /// Noise of sums over many pixels, in units of that of white noise.
@@ -84,6 +69,21 @@ struct LinearWorker {
 }
 
 impl LinearWorker {
+    pub(super) fn new(plan: Arc<LinearPlan>) -> Self {
+        LinearWorker {
+            noise: plan.spectral.noise(&StampNoise::white(1.0)),
+            psf: plan.spectral.psf(),
+            buffers: plan.spectral.scratch(),
+            surroundings: Surroundings::new(plan.spectral.stamp_size()),
+            grain: 1.0,
+            lags: plan.spectral.lags(),
+            field: plan.spectral.lags(),
+            shifted: plan.spectral.lags().acf,
+            values: plan.moments.scratch(),
+            plan,
+        }
+    }
+
     /// Response of `shape` to a change of the autocorrelation by `lags.shear1` and `lags.shear2`.
     fn response(
         plan: &LinearPlan,
@@ -138,7 +138,7 @@ impl CutWorker for LinearWorker {
         }
         let plan = Arc::clone(&self.plan);
         let sigma = noise as f32;
-        let found = self.surroundings.centre(cut);
+        let found = centre(cut, plan.spectral.stamp_size());
         let cleared = self.surroundings.clear(cut, found, self.grain * sigma);
         let whole = cut;
         let cut = if cleared == Ok(true) {

@@ -10,7 +10,9 @@ use ndarray::{Array2, ArrayViewMut2};
 use puruspe::bessel::Jn;
 use puruspe::gamma::{gamma, ln_gamma};
 use shearq_scoring::Shear;
+use shearq_submissions::PsfCut;
 
+use super::breadth;
 use crate::error::MeasureError;
 use crate::radial::{QuadraticForm, RadialTable, composite_rule, gauss_legendre};
 
@@ -137,13 +139,25 @@ impl FunctionalPsf {
         self.stamp_beside(size, size)
     }
 
-    /// The central `size` pixels a side of a star like this on a stamp of `side` pixels a side, normalised to a sum of
-    /// one.
+    /// The central pixels of a star like this on a stamp of `side` pixels a side, normalised to a sum of one: of a
+    /// size, or as many as a submission takes of a PSF of that breadth.
     ///
     /// With `side` that of the galaxies, galaxy and PSF are off the middle of what is cut of them by the same: half
     /// a pixel where one side is even and the other odd. What is left of the galaxy is on a pixel then, and
     /// is where a star's stamp of that side would leave it.
-    pub fn stamp_beside(&self, size: usize, side: usize) -> Array2<f64> {
+    pub fn stamp_beside(&self, cut: impl Into<PsfCut>, side: usize) -> Array2<f64> {
+        let cut: PsfCut = cut.into();
+        let stamp = self.drawn(cut.size, side);
+        let step = breadth::step(breadth::area(stamp.view()), cut.reference_area);
+        let wanted = breadth::side(cut, step);
+        if wanted > cut.size {
+            self.drawn(wanted, side)
+        } else {
+            stamp
+        }
+    }
+
+    fn drawn(&self, size: usize, side: usize) -> Array2<f64> {
         let mut stamp = Array2::zeros((size, size));
         let off = if side % 2 == size % 2 { 0.0 } else { 0.5 };
         let centre = (size as f64 - 1.0) / 2.0 + off;
@@ -155,11 +169,11 @@ impl FunctionalPsf {
     /// The same for a PSF that may have been assembled with values that [`FunctionalPsf::new`] refuses.
     pub(crate) fn checked_stamp(
         &self,
-        size: usize,
+        cut: PsfCut,
         side: usize,
     ) -> Result<Array2<f64>, MeasureError> {
         let checked = FunctionalPsf::new(self.profile, self.fwhm, self.shape)?;
-        Ok(checked.stamp_beside(size, side))
+        Ok(checked.stamp_beside(cut, side))
     }
 
     fn brightness(&self) -> Brightness {

@@ -6,9 +6,11 @@
 //! such shifts; the window of the linear method would, whose stamp and PSF must have one parity.
 
 use ndarray::{Array2, ArrayView2, s};
+use shearq_submissions::PsfCut;
 
 use crate::error::MeasureError;
 use crate::pixel::Pixel;
+use crate::psf::breadth::{area, side, step};
 
 /// Farthest that the centroid of a PSF may lie from the centre of its stamp along either axis, in
 /// pixels. A PSF that is cut off the centre of its wings adds its own ellipticity to that of all
@@ -20,15 +22,18 @@ pub(crate) fn cut_start(full: usize, size: usize) -> Option<usize> {
     full.checked_sub(size).map(|rest| rest / 2)
 }
 
-/// The central p×p pixels of a star stamp, normalised to a sum of one.
+/// The central pixels of a star stamp, normalised to a sum of one: of a size, or as many as a submission takes of a
+/// PSF of that breadth, as far as the stamp goes.
 ///
 /// # Errors
 /// Where the stamp is too small, has pixels that are not finite, no light, or its light is centred
 /// elsewhere.
 pub fn star_psf<P: Pixel>(
     stamp: ArrayView2<'_, P>,
-    size: usize,
+    cut: impl Into<PsfCut>,
 ) -> Result<Array2<f64>, MeasureError> {
+    let cut: PsfCut = cut.into();
+    let size = cut.size;
     let (rows, columns) = stamp.dim();
     let (Some(y0), Some(x0)) = (cut_start(rows, size), cut_start(columns, size)) else {
         let expected = format!("at least {size} × {size}, as the submission needs");
@@ -43,20 +48,35 @@ pub fn star_psf<P: Pixel>(
             });
         }
     }
-    let cut: Array2<f64> = stamp
-        .slice(s![y0..y0 + size, x0..x0 + size])
-        .mapv(Into::into);
-    let sum = cut.sum();
-    if sum <= 0.0 {
-        return Err(MeasureError::DarkPsf(sum));
-    }
-    let (dx, dy) = offset(stamp, &cut, (x0, y0));
+    let inner = normalised(stamp, size)?;
+    let (dx, dy) = offset(stamp, &inner, (x0, y0));
     if dx.abs() > MAX_CENTROID_OFFSET || dy.abs() > MAX_CENTROID_OFFSET {
         return Err(MeasureError::OffCentre {
             dx,
             dy,
             most: MAX_CENTROID_OFFSET,
         });
+    }
+    let wanted = side(cut, step(area(inner.view()), cut.reference_area));
+    let rest = rows.min(columns) - size;
+    match wanted.min(size + rest - rest % 2) {
+        larger if larger > size => normalised(stamp, larger),
+        _ => Ok(inner),
+    }
+}
+
+/// The central `size` pixels a side, which are there, over their sum.
+fn normalised<P: Pixel>(
+    stamp: ArrayView2<'_, P>,
+    size: usize,
+) -> Result<Array2<f64>, MeasureError> {
+    let [y0, x0] = [stamp.nrows(), stamp.ncols()].map(|side| (side - size) / 2);
+    let cut: Array2<f64> = stamp
+        .slice(s![y0..y0 + size, x0..x0 + size])
+        .mapv(Into::into);
+    let sum = cut.sum();
+    if sum <= 0.0 {
+        return Err(MeasureError::DarkPsf(sum));
     }
     Ok(cut / sum)
 }
@@ -119,6 +139,28 @@ mod tests {
                 assert!((a - b).abs() < 2e-7, "{side}, {size}: {a} {b}");
             }
         }
+    }
+
+    #[test]
+    fn of_a_broad_star_more_is_cut_where_there_is_more() {
+        let profile = PsfProfile::Moffat { beta: 3.0 };
+        let star = |fwhm, side| {
+            let psf = FunctionalPsf::new(profile, fwhm, Shear::new(0.05, -0.03)).unwrap();
+            psf.stamp(side)
+        };
+        let cut = PsfCut {
+            size: 32,
+            most: 48,
+            reference_area: 50.0,
+        };
+        for (fwhm, given, expected) in [(3.4, 48, 32), (4.5, 48, 38), (4.5, 37, 36), (6.0, 64, 48)]
+        {
+            let taken = star_psf(star(fwhm, given).view(), cut).unwrap();
+            assert_eq!(taken.dim(), (expected, expected), "{fwhm} {given}");
+            assert!((taken.sum() - 1.0).abs() < 1e-12);
+        }
+        let drawn = FunctionalPsf::new(profile, 6.0, Shear::new(0.05, -0.03)).unwrap();
+        assert_eq!(drawn.stamp_beside(cut, 48).dim(), (48, 48));
     }
 
     #[test]

@@ -1,0 +1,82 @@
+//! How broad a PSF is, in steps: what lengths of the linear method, and the cut of the PSF itself, follow.
+
+use ndarray::ArrayView2;
+use shearq_submissions::PsfCut;
+
+/// Steps in which lengths double.
+const OCTAVE: f64 = 4.0;
+/// Largest step: 2.8 times as broad as the reference.
+pub(crate) const LAST: usize = 6;
+
+/// Noise-equivalent area in px² of a PSF of sum one: 1/Σp².
+pub(crate) fn area(psf: ArrayView2<'_, f64>) -> f64 {
+    1.0 / psf.iter().map(|value| value * value).sum::<f64>()
+}
+
+/// How many steps a PSF of `area` is broader than one of `reference`, both in px²; none where that is zero.
+pub(crate) fn step(area: f64, reference: f64) -> usize {
+    if reference == 0.0 {
+        return 0;
+    }
+    let steps = OCTAVE * 0.5 * (area / reference).log2();
+    // NaN and what is narrower are none.
+    (steps.round() as usize).min(LAST)
+}
+
+/// How much longer lengths are after so many steps.
+pub(crate) fn factor(step: usize) -> f64 {
+    (step as f64 / OCTAVE).exp2()
+}
+
+/// Pixels a side that are cut of a PSF so many steps broader than the reference.
+pub(crate) fn side(cut: PsfCut, step: usize) -> usize {
+    let more = cut.size as f64 * (factor(step) - 1.0) / 2.0;
+    let most = cut.most.max(cut.size);
+    // Of the same parity.
+    (cut.size + 2 * more as usize).min(most - (most - cut.size) % 2)
+}
+
+#[cfg(test)]
+mod tests {
+    use shearq_scoring::Shear;
+
+    use super::*;
+    use crate::psf::{FunctionalPsf, PsfProfile};
+
+    #[test]
+    fn steps_follow_the_width() {
+        let moffat = |fwhm| {
+            let profile = PsfProfile::Moffat { beta: 3.0 };
+            let psf = FunctionalPsf::new(profile, fwhm, Shear::new(0.03, -0.02)).unwrap();
+            area(psf.stamp(64).view())
+        };
+        // A Moffat of β = 3 has 1.25 π (FWHM/1.0196)² = 3.78 FWHM², and the pixel's width adds to it.
+        let expected = 3.78 * 6.0f64.powi(2);
+        assert!(
+            (moffat(6.0) / expected - 1.0).abs() < 0.02,
+            "{}",
+            moffat(6.0)
+        );
+        let found = [2.0, 3.4, 3.7, 4.5, 6.0, 20.0].map(|fwhm| step(moffat(fwhm), 50.0));
+        assert_eq!(found, [0, 0, 0, 1, 3, 6]);
+        assert_eq!(step(moffat(6.0), 0.0), 0);
+        assert_eq!(step(f64::NAN, 50.0), 0);
+        assert_eq!(factor(4), 2.0);
+    }
+
+    #[test]
+    fn cuts_grow_and_keep_parity_and_limit() {
+        let cut = |size, most| PsfCut {
+            size,
+            most,
+            reference_area: 50.0,
+        };
+        assert_eq!(
+            [0, 1, 3, 6].map(|at| side(cut(32, 48), at)),
+            [32, 38, 48, 48]
+        );
+        assert_eq!([0, 1, 6].map(|at| side(cut(15, 48), at)), [15, 17, 41]);
+        assert_eq!([0, 6].map(|at| side(cut(31, 48), at)), [31, 47]);
+        assert_eq!(side(cut(32, 23), 3), 32);
+    }
+}

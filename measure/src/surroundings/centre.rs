@@ -1,0 +1,74 @@
+//! Where the galaxy is on its stamp.
+
+/// σ in pixels of the weight under which the centre is found: narrow, for the centre not to follow noise.
+const WEIGHT: f32 = 2.0;
+/// Half the side of the square that the weight reaches over, in pixels.
+const WEIGHT_REACH: i32 = 6;
+/// Steps to the centre.
+const STEPS: usize = 3;
+/// Step in units of the weighted centroid, which falls short of the centre by the width of galaxies.
+const STRIDE: f32 = 1.5;
+/// Offsets in pixels up to which the window stays in the middle of the stamp, and from which on it is on the
+/// galaxy. A window that followed each centroid would follow noise (m = −0.004 at S/N 20); a pixel off does no
+/// harm.
+const STAYS: f32 = 1.25;
+const FOLLOWS: f32 = 2.0;
+
+/// Centre (x, y) of the galaxy from the middle of its stamp, in pixels; (0, 0) where none is found.
+pub(crate) fn centre(stamp: &[f32], n: usize) -> [f32; 2] {
+    let n = n as i32;
+    let middle = (n as f32 - 1.0) / 2.0;
+    let most = middle / 2.0;
+    let [mut x, mut y] = [0.0f32; 2];
+    for _ in 0..STEPS {
+        let (first_x, first_y) = (start(middle + x), start(middle + y));
+        let mut along = [0.0f32; (2 * WEIGHT_REACH) as usize];
+        for (i, weight) in along.iter_mut().enumerate() {
+            *weight = gaussian((first_x + i as i32) as f32 - middle - x);
+        }
+        let mut sums = [0.0f32; 3];
+        for j in 0..2 * WEIGHT_REACH {
+            let row = first_y + j;
+            if !(0..n).contains(&row) {
+                continue;
+            }
+            let (mut all, mut first) = (0.0, 0.0);
+            for (i, weight) in along.iter().enumerate() {
+                let column = first_x + i as i32;
+                if (0..n).contains(&column) {
+                    let light = weight * stamp[(row * n + column) as usize];
+                    all += light;
+                    first += light * (column as f32 - middle - x);
+                }
+            }
+            let dy = row as f32 - middle - y;
+            let weight = gaussian(dy);
+            sums[0] += weight * all;
+            sums[1] += weight * first;
+            sums[2] += weight * all * dy;
+        }
+        if sums[0] <= 0.0 {
+            return [0.0; 2];
+        }
+        let step = |sum: f32| STRIDE * (sum / sums[0]).clamp(-WEIGHT, WEIGHT);
+        x = (x + step(sums[1])).clamp(-most, most);
+        y = (y + step(sums[2])).clamp(-most, most);
+    }
+    [x, y]
+}
+
+/// Where the window is for a galaxy centred at `centre`.
+pub(crate) fn followed(centre: [f32; 2]) -> [f32; 2] {
+    let away = centre[0].hypot(centre[1]);
+    let share = ((away - STAYS) / (FOLLOWS - STAYS)).clamp(0.0, 1.0);
+    centre.map(|c| share * c)
+}
+
+/// First of the pixels under the weight.
+fn start(centre: f32) -> i32 {
+    centre.floor() as i32 + 1 - WEIGHT_REACH
+}
+
+fn gaussian(x: f32) -> f32 {
+    (-0.5 * (x / WEIGHT).powi(2)).exp()
+}

@@ -1,0 +1,122 @@
+//! A stamp compared with itself turned about the galaxy's centre: galaxies look nearly the same turned by 180 degrees, and
+//! neighbours do not.
+
+/// Pixels a side of the cells that blocks are made of, two along each axis, so that wherever a neighbour is, most of
+/// its core is in one of them; and least distance in pixels of their centres from the galaxy's.
+const CELL: i32 = 3;
+const LEAST_DISTANCE: f32 = 9.0;
+/// Pixels around the centre whose sum is the galaxy's light.
+const INNER: i32 = 8;
+
+/// Blocks of 6 × 6 pixels away from a galaxy, against their opposites.
+#[derive(Debug, Clone)]
+pub(crate) struct Contrasts {
+    n: i32,
+    cells: Vec<Cell>,
+    /// What was found last.
+    pub(crate) blocks: Vec<Block>,
+    /// The galaxy's light.
+    pub(crate) light: f32,
+}
+
+/// What a cell is brighter than its opposite, and the number of pixels of both.
+#[derive(Debug, Clone, Copy)]
+struct Cell {
+    excess: f32,
+    pixels: i32,
+}
+
+/// A block and its opposite, of which it is the brighter one.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Block {
+    /// Difference of their light.
+    pub(crate) excess: f32,
+    /// Pixels of both.
+    pub(crate) pixels: f32,
+    /// Middle of the block from the galaxy's centre.
+    pub(crate) place: [f32; 2],
+}
+
+/// What to take a pixel p from, along each axis, for its opposite about a galaxy centred at `centre`, which is
+/// known to half a pixel then.
+pub(crate) fn turn(centre: [f32; 2], n: usize) -> [i32; 2] {
+    centre.map(|c| (2.0 * c).round() as i32 + n as i32 - 1)
+}
+
+impl Contrasts {
+    pub(crate) fn new(n: usize) -> Self {
+        Contrasts {
+            n: n as i32,
+            cells: Vec::with_capacity(n * n / 8),
+            blocks: Vec::with_capacity(n * n / 8),
+            light: 0.0,
+        }
+    }
+
+    /// Compares all blocks. Pixel p is opposite to `turn − p`.
+    pub(crate) fn compare(&mut self, stamp: &[f32], turn: [i32; 2]) {
+        self.blocks.clear();
+        self.cells.clear();
+        let most = (self.n / 2 + CELL - 1) / CELL;
+        // The first pixel beyond the centre.
+        let [x0, y0] = turn.map(|turn| turn.div_euclid(2) + 1);
+        self.light = self.sum(stamp, (x0 - INNER, y0 - INNER), 2 * INNER).0;
+        // One row of cells from the other half, for blocks on the line between both.
+        for j in -1..most {
+            for i in -most..most {
+                let (x, y) = (x0 + i * CELL, y0 + j * CELL);
+                let opposite = (turn[0] - x - CELL + 1, turn[1] - y - CELL + 1);
+                let (here, own) = self.sum(stamp, (x, y), CELL);
+                let (there, other) = self.sum(stamp, opposite, CELL);
+                self.cells.push(Cell {
+                    excess: here - there,
+                    pixels: own + other,
+                });
+            }
+        }
+        let row = 2 * most as usize;
+        for (at, pair) in self.cells.windows(row + 2).enumerate() {
+            let (i, j) = ((at % row) as i32 - most, (at / row) as i32 - 1);
+            // Not from the end of a row to the next one's beginning.
+            if i + 1 == most {
+                continue;
+            }
+            let middle = |first: i32, step: i32, turn: i32| {
+                (first + (step + 1) * CELL) as f32 - 0.5 - turn as f32 / 2.0
+            };
+            let (x, y) = (middle(x0, i, turn[0]), middle(y0, j, turn[1]));
+            if x.hypot(y) < LEAST_DISTANCE {
+                continue;
+            }
+            let cells = [pair[0], pair[1], pair[row], pair[row + 1]];
+            let pixels: i32 = cells.iter().map(|cell| cell.pixels).sum();
+            if pixels == 0 {
+                continue;
+            }
+            let excess: f32 = cells.iter().map(|cell| cell.excess).sum();
+            let side = excess.signum();
+            self.blocks.push(Block {
+                excess: excess.abs(),
+                pixels: pixels as f32,
+                place: [side * x, side * y],
+            });
+        }
+    }
+
+    /// Sum over a square, as far as it is on the stamp, and the number of its pixels there.
+    fn sum(&self, stamp: &[f32], (x, y): (i32, i32), side: i32) -> (f32, i32) {
+        let (left, right) = (x.max(0), (x + side).min(self.n));
+        if left >= right {
+            return (0.0, 0);
+        }
+        let (top, bottom) = (y.max(0), (y + side).min(self.n));
+        let mut sum = 0.0;
+        for row in top..bottom {
+            let line = (row * self.n) as usize;
+            sum += stamp[line + left as usize..line + right as usize]
+                .iter()
+                .sum::<f32>();
+        }
+        (sum, (right - left) * (bottom - top).max(0))
+    }
+}
