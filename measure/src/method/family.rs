@@ -121,3 +121,84 @@ impl CutWorker for FamilyWorker {
         self.members[self.at].1.images(cut, psf)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array2;
+    use shearq_scoring::Shear;
+    use shearq_submissions::{Method, Registry, Submission};
+
+    use crate::galaxy::Measurer;
+    use crate::measurement::Measurement;
+    use crate::psf::{FunctionalPsf, PsfProfile};
+
+    fn submission(reference_area: f64) -> Submission {
+        let mut submission = Registry::embedded()
+            .unwrap()
+            .get("48/linear/star")
+            .unwrap()
+            .submission;
+        if let Method::Linear(linear) = &mut submission.method {
+            linear.deconvolution.reference_area = reference_area;
+        }
+        submission
+    }
+
+    fn moffat(fwhm: f64) -> FunctionalPsf {
+        let profile = PsfProfile::Moffat { beta: 3.0 };
+        FunctionalPsf::new(profile, fwhm, Shear::new(0.03, -0.02)).unwrap()
+    }
+
+    /// Of a galaxy as broad as the PSF, elongated along x.
+    fn measured(submission: &Submission, fwhms: &[f64], noise: f64) -> Vec<Measurement> {
+        let mut worker = Measurer::new(submission, 48).unwrap().worker();
+        let each = fwhms.iter().map(|&fwhm| {
+            let psf = moffat(fwhm).stamp_beside(submission.psf_cut(), 48);
+            worker.set_psf(psf.view()).unwrap();
+            let stamp = Array2::from_shape_fn((48, 48), |(y, x)| {
+                let (y, x) = (y as f64 - 23.5, x as f64 - 23.5);
+                (100.0 * (-(x * x / 1.2 + y * y) / (fwhm * fwhm)).exp()) as f32
+            });
+            worker.measure(stamp.view(), Some(noise)).unwrap()
+        });
+        each.collect()
+    }
+
+    #[test]
+    fn usual_psfs_are_measured_as_without_a_family_and_broad_ones_more_smoothly() {
+        let (with, without) = (submission(50.0), submission(0.0));
+        let found = measured(&with, &[3.4, 6.0, 2.0], 0.5);
+        let plain = measured(&without, &[3.4, 6.0, 2.0], 0.5);
+        for k in [0, 2] {
+            assert_eq!(
+                (found[k].e1, found[k].response),
+                (plain[k].e1, plain[k].response)
+            );
+        }
+        assert!(found[1].size > 1.2 * plain[1].size, "{found:?} {plain:?}");
+        // Whatever was measured before, and on whichever worker.
+        let alone = measured(&with, &[6.0], 0.5);
+        assert_eq!((found[1].e1, found[1].e2), (alone[0].e1, alone[0].e2));
+    }
+
+    #[test]
+    fn a_psf_is_taken_in_any_size_from_the_least_on_and_zeros_around_it_do_nothing() {
+        let submission = submission(50.0);
+        let mut worker = Measurer::new(&submission, 48).unwrap().worker();
+        let stamp = moffat(8.0).stamp(48).mapv(|v| 1000.0 * v as f32);
+        let star = moffat(6.0).stamp(36);
+        let mut wide = Array2::zeros((48, 48));
+        wide.slice_mut(ndarray::s![6..42, 6..42]).assign(&star);
+        let [small, large] = [&star, &wide].map(|psf| {
+            worker.set_psf(psf.view()).unwrap();
+            worker.measure(stamp.view(), Some(0.1)).unwrap()
+        });
+        assert_eq!((small.e1, small.response), (large.e1, large.response));
+        for side in [30, 33, 50] {
+            assert!(
+                worker.set_psf(moffat(6.0).stamp(side).view()).is_err(),
+                "{side}"
+            );
+        }
+    }
+}
