@@ -220,7 +220,14 @@ mod tests {
             20.0 * (-(x * x + 0.7 * y * y + 0.4 * x * y) / 18.0).exp()
         };
         let mut profile = Profile::new(N);
-        for place in [[20.0, 0.0], [-12.0, 9.0], [5.0, -17.0], [16.0, 16.0]] {
+        // The nearest one reaches its own opposite side.
+        for place in [
+            [20.0, 0.0],
+            [-12.0, 9.0],
+            [5.0, -17.0],
+            [16.0, 16.0],
+            [8.0, -7.0],
+        ] {
             let light = neighbour(place);
             let mut stamp: Vec<f32> = (0..N * N).map(|p| galaxy(p) + light[p]).collect();
             profile.subtract(&mut stamp, [47, 47], place, 5.0);
