@@ -16,6 +16,8 @@
 use multiversion::multiversion;
 use shearq_submissions::Wavelet;
 
+use crate::robust;
+
 /// Filter for one stamp size; serial, allocates nothing per stamp.
 #[derive(Debug, Clone)]
 pub struct WaveletWiener {
@@ -237,21 +239,11 @@ pub fn border_noise(stamp: &[f32], n: usize, border: usize, buffer: &mut Vec<f32
             buffer.extend_from_slice(&row[n - border.min(n)..]);
         }
     }
-    let median = median(buffer)?;
+    let median = robust::median(buffer)?;
     for value in buffer.iter_mut() {
         *value = (*value - median).abs();
     }
-    Some(self::median(buffer)? * 1.482_602_2)
-}
-
-/// The lower median of finite values; reorders them.
-fn median(values: &mut [f32]) -> Option<f32> {
-    if values.is_empty() {
-        return None;
-    }
-    let middle = (values.len() - 1) / 2;
-    let (_, median, _) = values.select_nth_unstable_by(middle, f32::total_cmp);
-    Some(*median)
+    Some(robust::median(buffer)? * robust::SCATTER)
 }
 
 #[cfg(test)]

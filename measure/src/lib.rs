@@ -48,6 +48,7 @@ pub mod parts;
 mod pixel;
 mod psf;
 mod radial;
+mod robust;
 mod shape;
 mod sizes;
 mod steps;

@@ -20,6 +20,7 @@ use ndarray::{Array2, ArrayView2};
 
 use crate::error::MeasureError;
 use crate::pixel::Pixel;
+use crate::robust::{SCATTER, median};
 use crate::surroundings::{Contrasts, centre, turn};
 
 /// Pixels a side of a block.
@@ -40,8 +41,6 @@ const BESIDE: usize = 2;
 /// around it, in pixels. Of stamps without neighbours a tenth loses some.
 const CONTRAST: f32 = 3.5;
 const AROUND: f32 = 16.0;
-/// The median of |x| over the scatter of x for Gaussian noise.
-const HALF_WIDTH: f32 = 0.6745;
 /// Least share of the power of white noise that is left to a mode of correlated noise: an estimate may
 /// come near zero, and below.
 const LEAST_POWER: f64 = 1e-3;
@@ -252,11 +251,11 @@ impl NoiseSurvey {
             let most = near.map(|at| over_noise(at.excess, at.pixels));
             self.brightest.push(most.fold(0.0, f32::max));
         }
-        let all: Vec<f32> = places
+        let mut all: Vec<f32> = places
             .iter()
             .map(|at| over_noise(at.excess, at.pixels))
             .collect();
-        self.typical.extend(median(&all));
+        self.typical.extend(median(&mut all));
     }
 
     /// The noise of the stamps looked at; `None` where less than a few frames are left that hold noise alone.
@@ -268,7 +267,7 @@ impl NoiseSurvey {
             .map(|products| f64::from(products[0]))
             .collect();
         let bright = brightest(&powers)?;
-        let contrast = CONTRAST / HALF_WIDTH * median(&self.typical)?;
+        let contrast = CONTRAST * SCATTER * median(&mut self.typical.clone())?;
         let ring = self.plan.blocks.len();
         let mut sums = vec![0.0; lags];
         let mut count = 0;
@@ -444,12 +443,6 @@ fn matrix(reach: usize, polynomials: &[[f64; PIXELS]; POLYNOMIALS]) -> Array2<f6
         }
     }
     out
-}
-
-fn median(values: &[f32]) -> Option<f32> {
-    let mut values = values.to_vec();
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
 /// The power beyond which a block is left out.

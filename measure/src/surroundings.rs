@@ -11,6 +11,7 @@ mod contrast;
 mod profile;
 
 pub(crate) use self::centre::{centre, followed};
+use self::contrast::opposite;
 pub(crate) use self::contrast::{Contrasts, turn};
 use self::profile::Profile;
 use crate::flag::Flag;
@@ -27,7 +28,7 @@ const TOO_NEAR: f32 = 12.0;
 
 /// A stamp's surroundings, and room for it without neighbours.
 pub(crate) struct Surroundings {
-    n: i32,
+    n: usize,
     pub(crate) filled: Vec<f32>,
     contrasts: Contrasts,
     profile: Profile,
@@ -38,7 +39,7 @@ pub(crate) struct Surroundings {
 impl Surroundings {
     pub(crate) fn new(n: usize) -> Self {
         Surroundings {
-            n: n as i32,
+            n,
             filled: vec![0.0; n * n],
             contrasts: Contrasts::new(n),
             profile: Profile::new(n),
@@ -58,7 +59,7 @@ impl Surroundings {
         noise: f32,
     ) -> Result<bool, Flag> {
         // Pixel p is opposite to `turn − p`.
-        let turn = turn(centre, self.n as usize);
+        let turn = turn(centre, self.n);
         self.contrasts.compare(stamp, turn);
         let least = BRIGHT * self.contrasts.light;
         let hits = &mut self.contrasts.blocks;
@@ -91,25 +92,14 @@ impl Surroundings {
         Ok(true)
     }
 
-    /// The light left of the opposite of a pixel, none off the stamp.
-    fn opposite(&self, turn: [i32; 2], (x, y): (i32, i32)) -> f32 {
-        let (x, y) = (turn[0] - x, turn[1] - y);
-        let side = 0..self.n;
-        if side.contains(&x) && side.contains(&y) {
-            self.filled[(y * self.n + x) as usize]
-        } else {
-            0.0
-        }
-    }
-
     /// Gives the pixels further than `from` in direction (x, y) those of the opposite side.
     fn fill(&mut self, turn: [i32; 2], [x, y]: [f32; 2], from: f32) {
         for row in 0..self.n {
             let across = (row as f32 - turn[1] as f32 / 2.0) * y;
             for column in 0..self.n {
                 if (column as f32 - turn[0] as f32 / 2.0) * x + across > from {
-                    let light = self.opposite(turn, (column, row));
-                    self.filled[(row * self.n + column) as usize] = light;
+                    let light = opposite(&self.filled, self.n, turn, [column, row]);
+                    self.filled[row * self.n + column] = light.unwrap_or(0.0);
                 }
             }
         }

@@ -6,6 +6,9 @@ pub const MAX_CUT: usize = 64;
 /// Largest side of a PSF stamp, in pixels.
 pub const MAX_PSF: usize = 48;
 
+/// Broadest target of the linear method, in pixels.
+pub const MAX_TARGET: f64 = 6.0;
+
 /// Largest eigenvalue of G = DᵀD, D being Sun's high-pass (Sect. 3.1), rounded up: the square of the kernel's
 /// transform where that is largest.
 pub const MAX_ROUGHNESS: f64 = 0.0093;

@@ -37,6 +37,16 @@ fn agrees(findings: &[Finding], paper: &str) -> bool {
     finding.agrees == Some(true)
 }
 
+fn assert_agree(findings: &[Finding], papers: &[&str]) {
+    for paper in papers {
+        assert!(agrees(findings, paper), "{paper}");
+    }
+}
+
+fn place(names: &[String], name: &str) -> usize {
+    names.iter().position(|n| n == name).unwrap()
+}
+
 /// How a submission's ellipticities follow shear on one kind of set.
 #[derive(Debug, Clone, Copy)]
 struct Follows {
@@ -164,18 +174,18 @@ fn submissions_compare_as_the_paper_found() {
     // Fiducial, low S/N and high S/N: 2,048 galaxies each.
     let (results, names) = on_sets(submissions, &[2, 5, 8]);
     let found = findings(&results, &names);
-    for paper in [
-        "Denoising improves Q (star PSF)",
-        "Denoising improves Q (functional PSF)",
-        "Star and functional PSF",
-        "Q is poor at low S/N",
-    ] {
-        assert!(agrees(&found, paper), "{paper}");
-    }
+    assert_agree(
+        &found,
+        &[
+            "Denoising improves Q (star PSF)",
+            "Denoising improves Q (functional PSF)",
+            "Star and functional PSF",
+            "Q is poor at low S/N",
+        ],
+    );
     // The simulator's stars are drawn from the functional PSFs: with both centred alike nothing but the light beyond
     // the star's stamp tells them apart.
-    let place = |name: &str| names.iter().position(|n| n == name).unwrap();
-    let (star, functional) = (place("23/den/star"), place("23/den/func"));
+    let (star, functional) = (place(&names, "23/den/star"), place(&names, "23/den/func"));
     for set in &results {
         let q = |k: usize| set.results[k].score.figures.q;
         assert!((q(star) / q(functional) - 1.0).abs() < 1e-3, "{}", set.set);
@@ -201,19 +211,19 @@ fn printed_submissions_compare_as_the_paper_found() {
     // times their errors: denoising 30 %, S/N and size factors of two, PSF form below 1 %.
     let (results, names) = on_sets(printed, &[2, 5, 8, 14]);
     let found = findings(&results, &names);
-    for paper in [
-        "Denoising improves Q (star PSF)",
-        "Denoising improves Q (functional PSF)",
-        "Star and functional PSF",
-        "Q is poor at low S/N",
-        "Q is poor for small galaxies",
-    ] {
-        assert!(agrees(&found, paper), "{paper}");
-    }
+    assert_agree(
+        &found,
+        &[
+            "Denoising improves Q (star PSF)",
+            "Denoising improves Q (functional PSF)",
+            "Star and functional PSF",
+            "Q is poor at low S/N",
+            "Q is poor for small galaxies",
+        ],
+    );
     // Denoising lowers the scatter of calibrated ellipticities at S/N 10, 20 and 40: by 15 to 25 %,
     // with errors of 1.3 % each.
-    let place = |name: &str| names.iter().position(|n| n == name).unwrap();
-    let (raw, den) = (place("23/raw/star"), place("23/den/star"));
+    let (raw, den) = (place(&names, "23/raw/star"), place(&names, "23/den/star"));
     for set in &results[..3] {
         let scatter = |k: usize| set.results[k].response.rms_scatter();
         let (raw, den) = (scatter(raw), scatter(den));
@@ -230,20 +240,22 @@ fn updates_compare_as_the_paper_found() {
     };
     let (adopted, printed) = (of("paper"), of("as-printed/paper"));
     let found = lambda_findings(&adopted);
-    for paper in [
-        "CTR is highest at λ = 10^−3.5",
-        "1/RMSD of the adaptive update is the better one for λ ≤ 10⁻⁴",
-    ] {
-        assert!(agrees(&found, paper), "{paper}");
-    }
+    assert_agree(
+        &found,
+        &[
+            "CTR is highest at λ = 10^−3.5",
+            "1/RMSD of the adaptive update is the better one for λ ≤ 10⁻⁴",
+        ],
+    );
     let found = lambda_findings(&printed);
-    for paper in [
-        "Whatever the S/N, the adaptive update has the higher CTR",
-        "dSNR is higher for higher S/N and decreases with λ",
-        "1/RMSD of the adaptive update is the better one for λ ≤ 10⁻⁴",
-    ] {
-        assert!(agrees(&found, paper), "{paper}");
-    }
+    assert_agree(
+        &found,
+        &[
+            "Whatever the S/N, the adaptive update has the higher CTR",
+            "dSNR is higher for higher S/N and decreases with λ",
+            "1/RMSD of the adaptive update is the better one for λ ≤ 10⁻⁴",
+        ],
+    );
     assert!(!agrees(&found, "CTR is highest at λ = 10^−3.5"));
     let [weak, strong] = [PAPER_LAMBDA, LOG_LAMBDA.len() - 1];
     for curve in &adopted.over_lambda[0] {

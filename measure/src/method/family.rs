@@ -7,6 +7,7 @@
 use std::sync::{Arc, OnceLock};
 
 use ndarray::ArrayView2;
+use shearq_submissions::limits::MAX_TARGET;
 use shearq_submissions::{LinearMethod, PsfCut};
 
 use super::found::{CutWorker, Found, Images};
@@ -15,9 +16,6 @@ use crate::error::MeasureError;
 use crate::noise::StampNoise;
 use crate::psf::breadth;
 use crate::sizes::check_psf;
-
-/// Broadest target, in pixels.
-const MAX_TARGET: f64 = 6.0;
 
 /// What one submission and stamp size need.
 pub(crate) struct LinearFamily {
@@ -61,7 +59,7 @@ impl LinearFamily {
 
     /// The member for a PSF of sum one.
     fn step(&self, psf: ArrayView2<'_, f64>) -> usize {
-        let step = breadth::step(breadth::area(psf), self.cut.reference_area);
+        let step = breadth::step(psf, self.cut);
         // It was cut after a look at its middle alone, where it may have been a little broader.
         let fits = |&at: &usize| breadth::side(self.cut, at) >= psf.nrows();
         (step..=breadth::LAST).find(fits).unwrap_or(step)

@@ -9,16 +9,16 @@ const OCTAVE: f64 = 4.0;
 pub(crate) const LAST: usize = 6;
 
 /// Noise-equivalent area in px² of a PSF of sum one: 1/Σp².
-pub(crate) fn area(psf: ArrayView2<'_, f64>) -> f64 {
+fn area(psf: ArrayView2<'_, f64>) -> f64 {
     1.0 / psf.iter().map(|value| value * value).sum::<f64>()
 }
 
-/// How many steps a PSF of `area` is broader than one of `reference`, both in px²; none where that is zero.
-pub(crate) fn step(area: f64, reference: f64) -> usize {
-    if reference == 0.0 {
+/// How many steps a PSF of sum one is broader than the reference of `cut`; none where there is no reference.
+pub(crate) fn step(psf: ArrayView2<'_, f64>, cut: PsfCut) -> usize {
+    if cut.reference_area == 0.0 {
         return 0;
     }
-    let steps = OCTAVE * 0.5 * (area / reference).log2();
+    let steps = OCTAVE * 0.5 * (area(psf) / cut.reference_area).log2();
     // NaN and what is narrower are none.
     (steps.round() as usize).min(LAST)
 }
@@ -48,19 +48,22 @@ mod tests {
         let moffat = |fwhm| {
             let profile = PsfProfile::Moffat { beta: 3.0 };
             let psf = FunctionalPsf::new(profile, fwhm, Shear::new(0.03, -0.02)).unwrap();
-            area(psf.stamp(64).view())
+            psf.stamp(64)
+        };
+        let cut = |reference_area| PsfCut {
+            reference_area,
+            ..PsfCut::from(32)
         };
         // A Moffat of β = 3 has 1.25 π (FWHM/1.0196)² = 3.78 FWHM², and the pixel's width adds to it.
         let expected = 3.78 * 6.0f64.powi(2);
-        assert!(
-            (moffat(6.0) / expected - 1.0).abs() < 0.02,
-            "{}",
-            moffat(6.0)
-        );
-        let found = [2.0, 3.4, 3.7, 4.5, 6.0, 20.0].map(|fwhm| step(moffat(fwhm), 50.0));
+        let found = area(moffat(6.0).view());
+        assert!((found / expected - 1.0).abs() < 0.02, "{found}");
+        let steps = |fwhm| step(moffat(fwhm).view(), cut(50.0));
+        let found = [2.0, 3.4, 3.7, 4.5, 6.0, 20.0].map(steps);
         assert_eq!(found, [0, 0, 0, 1, 3, 6]);
-        assert_eq!(step(moffat(6.0), 0.0), 0);
-        assert_eq!(step(f64::NAN, 50.0), 0);
+        assert_eq!(step(moffat(6.0).view(), cut(0.0)), 0);
+        let dead = moffat(6.0) * f64::NAN;
+        assert_eq!(step(dead.view(), cut(50.0)), 0);
         assert_eq!(factor(4), 2.0);
     }
 

@@ -148,8 +148,7 @@ impl FunctionalPsf {
     pub fn stamp_beside(&self, cut: impl Into<PsfCut>, side: usize) -> Array2<f64> {
         let cut: PsfCut = cut.into();
         let stamp = self.drawn(cut.size, side);
-        let step = breadth::step(breadth::area(stamp.view()), cut.reference_area);
-        let wanted = breadth::side(cut, step);
+        let wanted = breadth::side(cut, breadth::step(stamp.view(), cut));
         if wanted > cut.size {
             self.drawn(wanted, side)
         } else {

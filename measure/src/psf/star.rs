@@ -10,7 +10,7 @@ use shearq_submissions::PsfCut;
 
 use crate::error::MeasureError;
 use crate::pixel::Pixel;
-use crate::psf::breadth::{area, side, step};
+use crate::psf::breadth::{side, step};
 
 /// Farthest that the centroid of a PSF may lie from the centre of its stamp along either axis, in
 /// pixels. A PSF that is cut off the centre of its wings adds its own ellipticity to that of all
@@ -48,7 +48,7 @@ pub fn star_psf<P: Pixel>(
             });
         }
     }
-    let inner = normalised(stamp, size)?;
+    let inner = normalised(stamp, size, (y0, x0))?;
     let (dx, dy) = offset(stamp, &inner, (x0, y0));
     if dx.abs() > MAX_CENTROID_OFFSET || dy.abs() > MAX_CENTROID_OFFSET {
         return Err(MeasureError::OffCentre {
@@ -57,20 +57,21 @@ pub fn star_psf<P: Pixel>(
             most: MAX_CENTROID_OFFSET,
         });
     }
-    let wanted = side(cut, step(area(inner.view()), cut.reference_area));
-    let rest = rows.min(columns) - size;
-    match wanted.min(size + rest - rest % 2) {
-        larger if larger > size => normalised(stamp, larger),
-        _ => Ok(inner),
+    let wanted = side(cut, step(inner.view(), cut));
+    // Of the same parity, as far as the stamp goes.
+    let more = (wanted - size).min(rows.min(columns) - size) / 2;
+    if more == 0 {
+        return Ok(inner);
     }
+    normalised(stamp, size + 2 * more, (y0 - more, x0 - more))
 }
 
-/// The central `size` pixels a side, which are there, over their sum.
+/// `size` pixels a side from `start` on, over their sum.
 fn normalised<P: Pixel>(
     stamp: ArrayView2<'_, P>,
     size: usize,
+    (y0, x0): (usize, usize),
 ) -> Result<Array2<f64>, MeasureError> {
-    let [y0, x0] = [stamp.nrows(), stamp.ncols()].map(|side| (side - size) / 2);
     let cut: Array2<f64> = stamp
         .slice(s![y0..y0 + size, x0..x0 + size])
         .mapv(Into::into);

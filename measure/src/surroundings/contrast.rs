@@ -43,6 +43,14 @@ pub(crate) fn turn(centre: [f32; 2], n: usize) -> [i32; 2] {
     centre.map(|c| (2.0 * c).round() as i32 + n as i32 - 1)
 }
 
+/// The light of the opposite of a pixel (x, y) on a stamp of `n` pixels a side; `None` off the stamp.
+pub(super) fn opposite(stamp: &[f32], n: usize, turn: [i32; 2], [x, y]: [usize; 2]) -> Option<f32> {
+    let on_stamp = |at: i32| usize::try_from(at).ok().filter(|&at| at < n);
+    let column = on_stamp(turn[0] - x as i32)?;
+    let row = on_stamp(turn[1] - y as i32)?;
+    Some(stamp[row * n + column])
+}
+
 impl Contrasts {
     pub(crate) fn new(n: usize) -> Self {
         Contrasts {

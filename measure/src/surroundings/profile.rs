@@ -5,6 +5,8 @@
 //! concentric Gaussians, whose amplitudes follow by least squares. It is taken from the whole stamp: a neighbour's wings
 //! reach the galaxy's own side, where a fit or a copy of the opposite side alone would leave them.
 
+use super::contrast::opposite;
+
 /// σ in pixels of the Gaussians: from a PSF's core to the wings of a galaxy twice as large as the fiducial ones.
 const WIDTHS: [f32; COUNT] = [2.0, 3.5, 6.0, 10.5];
 const COUNT: usize = 4;
@@ -50,7 +52,7 @@ impl Profile {
                 for column in self.around(centre[0] + x) {
                     let dx = column as f32 - centre[0] - x;
                     let excess = stamp[row * self.n + column]
-                        - self.opposite(stamp, turn, column, row).unwrap_or(0.0);
+                        - opposite(stamp, self.n, turn, [column, row]).unwrap_or(0.0);
                     let light = (-0.5 * (dx * dx + dy * dy) / (PLACED_BY * PLACED_BY)).exp();
                     add(
                         &mut matrix,
@@ -84,14 +86,6 @@ impl Profile {
         let first = (pixel - AROUND).ceil().clamp(0.0, self.n as f32) as usize;
         let end = (pixel + AROUND + 1.0).floor().clamp(0.0, self.n as f32) as usize;
         first..end
-    }
-
-    /// The light of the opposite of a pixel; `None` off the stamp.
-    fn opposite(&self, stamp: &[f32], turn: [i32; 2], column: usize, row: usize) -> Option<f32> {
-        let on_stamp = |at: i32| usize::try_from(at).ok().filter(|&at| at < self.n);
-        let column = on_stamp(turn[0] - column as i32)?;
-        let row = on_stamp(turn[1] - row as i32)?;
-        Some(stamp[row * self.n + column])
     }
 
     /// Subtracts from `stamp` the neighbour at `place` from the galaxy's centre, (x, y) in pixels. Pixel p is opposite to
@@ -139,7 +133,7 @@ impl Profile {
                 let mut excess = stamp[row * self.n + column];
                 // In units of the inverse of the noise's variance: a difference has twice that of a pixel.
                 let mut weight = 1.0;
-                if let Some(light) = self.opposite(stamp, turn, column, row) {
+                if let Some(light) = opposite(stamp, self.n, turn, [column, row]) {
                     let (x, y) = (&self.opposite[0][column], &self.opposite[1][row]);
                     for (k, term) in terms.iter_mut().enumerate() {
                         *term -= x[k] * y[k];
