@@ -314,10 +314,14 @@ fn list(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
 
 /// Removes a file with a temporary name.
 fn remove_part(path: &Path) -> Result<(), FileError> {
-    if is_part(path) && path.is_file() {
-        fs::remove_file(path).map_err(FileError::doing(path, "cannot remove the leftover"))?;
+    if !(is_part(path) && path.is_file()) {
+        return Ok(());
     }
-    Ok(())
+    match fs::remove_file(path) {
+        // Another process that is about to claim the folder may have removed its own.
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
+        result => result.map_err(FileError::doing(path, "cannot remove the leftover")),
+    }
 }
 
 /// Whether a name is one that [`part_of`] gives.
