@@ -7,6 +7,7 @@ use shearq_submissions::{Method, NoiseSource, Submission};
 
 use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
+use crate::flag::Flag;
 use crate::galaxy::{Measurer, Worker};
 use crate::measurement::Measurement;
 use crate::noise::StampNoise;
@@ -46,8 +47,9 @@ impl Measurer {
     /// response would be noisy and biased. Divide it by [`Batch::response`] of galaxies like this one.
     ///
     /// # Errors
-    /// Where sizes do not fit, a pixel or the noise level is not finite, or the PSF is dark or off centre. A
-    /// galaxy that cannot be measured for other reasons is flagged.
+    /// Where sizes do not fit, the noise level is not finite, pixels are not (more of them than a linear method fills
+    /// from the opposite side), or the PSF is dark or off centre. A galaxy that cannot be measured for other reasons is
+    /// flagged.
     pub fn stamp<T: Pixel, P: Pixel>(
         &self,
         stamp: ArrayView2<'_, T>,
@@ -58,17 +60,21 @@ impl Measurer {
         if noise.is_none() && self.noise_plan().is_some() {
             return Err(MeasureError::Noise("not given".into()));
         }
-        let finite = |pixel: T| pixel.to_f32().is_finite();
-        if let Some(((y, x), _)) = stamp.indexed_iter().find(|(_, pixel)| !finite(**pixel)) {
+        let mut worker = self.worker();
+        worker.set_psf(star_psf(psf, self.submission().psf_cut())?.view())?;
+        let found = worker.measure(stamp, noise)?;
+        if found.flags.contains(Flag::NotFinite) {
+            let finite = |pixel: T| pixel.to_f32().is_finite();
+            let mut pixels = stamp.indexed_iter();
+            let place = pixels.find(|(_, pixel)| !finite(**pixel)).map(|(at, _)| at);
+            let (y, x) = place.unwrap_or_default();
             return Err(MeasureError::NotFinite {
                 what: "stamp",
                 x: x + 1,
                 y: y + 1,
             });
         }
-        let mut worker = self.worker();
-        worker.set_psf(star_psf(psf, self.submission().psf_cut())?.view())?;
-        worker.measure(stamp, noise)
+        Ok(found)
     }
 
     /// Measures stamps, one each along the first axis, of one noise level, and calibrates their
@@ -78,7 +84,8 @@ impl Measurer {
     ///
     /// # Errors
     /// Where sizes or numbers do not fit, the noise level is not one, or a PSF for all cannot be used. A
-    /// galaxy with a pixel that is not finite, or with a PSF of its own that cannot be used, is flagged.
+    /// galaxy with pixels that are not finite (under a linear method: too many), or with a PSF of its own that cannot be
+    /// used, is flagged.
     pub fn batch<T: Pixel, P: Pixel>(
         &self,
         stamps: ArrayView3<'_, T>,
@@ -332,7 +339,9 @@ mod tests {
     fn what_cannot_be_measured_is_an_error_for_one_and_a_flag_for_one_of_many() {
         let measurer = Measurer::named("48/linear/star", 48).unwrap();
         let mut stamps = stamps(3, 48);
+        // Both sides of the galaxy.
         stamps[(1, 7, 5)] = f32::NAN;
+        stamps.slice_mut(s![1, 23..25, ..]).fill(f32::NAN);
         let star = moffat(0.0).stamp(32);
         let bad = stamps.slice(s![1, .., ..]);
         message(
@@ -350,6 +359,40 @@ mod tests {
             .map(|galaxy| galaxy.flags.iter().collect())
             .collect();
         assert_eq!(flags, [vec![], vec![Flag::NotFinite], vec![Flag::BadPsf]]);
+    }
+
+    #[test]
+    fn a_linear_submission_measures_without_a_few_pixels_and_a_network_does_not() {
+        let whole = stamps(2, 48);
+        let star = moffat(0.0).stamp(32);
+        let mut holed = whole.clone();
+        holed.slice_mut(s![.., 19..22, 26..29]).fill(f32::NAN);
+        let measured = |submission: &str, stamps: &Array3<f32>| {
+            let measurer = Measurer::named(submission, 48).unwrap();
+            let psf = Psfs::Star(star.view());
+            measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
+        };
+        let linear = "48/linear/star";
+        let (found, expected) = (measured(linear, &holed), measured(linear, &whole));
+        for (found, expected) in found.galaxies.iter().zip(&expected.galaxies) {
+            assert!(found.flags.is_empty());
+            // Without noise, and the same turned by 180 degrees.
+            assert!(
+                (found.e1 - expected.e1).abs() < 1e-3,
+                "{found:?} {expected:?}"
+            );
+            assert!(
+                (found.e2 - expected.e2).abs() < 1e-3,
+                "{found:?} {expected:?}"
+            );
+        }
+        let network = measured("23/raw/star", &holed);
+        assert!(
+            network
+                .galaxies
+                .iter()
+                .all(|galaxy| galaxy.flags.contains(Flag::NotFinite))
+        );
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::fmt;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u32)]
 pub enum Flag {
-    /// A pixel is not a finite number.
+    /// Pixels are not finite numbers: one, or under a linear method more than can be filled from the opposite side.
     NotFinite = 1,
     /// The galaxy's PSF cannot be used.
     BadPsf = 2,
@@ -42,7 +42,7 @@ impl Flag {
 impl fmt::Display for Flag {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Flag::NotFinite => "a pixel is not a finite number",
+            Flag::NotFinite => "pixels are missing",
             Flag::BadPsf => "the PSF cannot be used",
             Flag::NoScale => "nothing to scale the brightness by",
             Flag::NoLight => "nothing left after deconvolution",

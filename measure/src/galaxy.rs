@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ndarray::ArrayView2;
 use shearq_scoring::{Distortion, Shear};
-use shearq_submissions::{EllipticityType, NoiseSource, Registry, Submission};
+use shearq_submissions::{EllipticityType, Method, NoiseSource, Registry, Submission};
 
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::MeasureError;
@@ -14,6 +14,7 @@ use crate::method::{CutWorker, Found, MethodPlan, ResponseMatrix};
 use crate::noise::{NoisePlan, StampNoise};
 use crate::pixel::Pixel;
 use crate::psf::cut_start;
+use crate::surroundings::Missing;
 
 /// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
 /// away from the smallest and largest numbers there are.
@@ -45,6 +46,7 @@ pub struct Worker {
     /// Cut stamp.
     pub(crate) cut: Vec<f32>,
     border: Vec<f32>,
+    missing: Missing,
     /// That of the galaxies at hand, where it was given.
     noise: Option<Arc<StampNoise>>,
     usable_psf: bool,
@@ -120,6 +122,7 @@ impl Measurer {
             full: vec![0.0; full * full],
             cut: vec![0.0; n * n],
             border: Vec::with_capacity(full * full),
+            missing: Missing::new(*full),
             usable_psf: false,
             noise: None,
             plan: Arc::clone(&self.plan),
@@ -190,7 +193,10 @@ impl Worker {
             }
         }
         if self.full.iter().any(|v| !v.is_finite()) {
-            return Ok(Measurement::flagged(Flag::NotFinite));
+            let linear = matches!(plan.submission.method, Method::Linear(_));
+            if !(linear && self.missing.mend(&mut self.full, full)) {
+                return Ok(Measurement::flagged(Flag::NotFinite));
+            }
         }
         if !self.usable_psf {
             return Ok(Measurement::flagged(Flag::BadPsf));

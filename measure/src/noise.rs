@@ -14,6 +14,7 @@
 //! beside them in the frame, are left out: there is another galaxy. So are blocks near a place that is brighter than the
 //! opposite one, whose own power a neighbour may raise by a few per cent only: where all stamps have one, that adds up.
 
+use std::iter;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2};
@@ -21,7 +22,7 @@ use ndarray::{Array2, ArrayView2};
 use crate::error::MeasureError;
 use crate::pixel::Pixel;
 use crate::robust::{SCATTER, median};
-use crate::surroundings::{Contrasts, centre, turn};
+use crate::surroundings::{Contrasts, Missing, centre, turn};
 
 /// Pixels a side of a block.
 const BLOCK: usize = 8;
@@ -172,6 +173,7 @@ impl NoisePlan {
             block: vec![0.0; PIXELS],
             pixels: vec![0.0; self.full * self.full],
             contrasts: Contrasts::new(self.full),
+            missing: Missing::new(self.full),
             products: Vec::new(),
             brightest: Vec::new(),
             typical: Vec::new(),
@@ -191,7 +193,8 @@ pub struct NoiseSurvey {
     /// The stamp, and how it compares with itself turned about the galaxy.
     pixels: Vec<f32>,
     contrasts: Contrasts,
-    /// Of each block, frame by frame, the sum of products at each lag.
+    missing: Missing,
+    /// Of each block, frame by frame, the sum of products at each lag; NaN where pixels are missing.
     products: Vec<f32>,
     /// Of each block, the most that a place around it is brighter than its opposite, over the root of its pixels.
     brightest: Vec<f32>,
@@ -200,7 +203,7 @@ pub struct NoiseSurvey {
 }
 
 impl NoiseSurvey {
-    /// Looks at the frame of a stamp. One with pixels that are not finite is left out.
+    /// Looks at the frame of a stamp. Blocks with pixels that are missing are left out, and stamps where too many are.
     ///
     /// # Errors
     /// Where the stamp has other sizes than planned.
@@ -210,7 +213,13 @@ impl NoiseSurvey {
             let expected = format!("{full} × {full}");
             return Err(MeasureError::square("a stamp", stamp.dim(), expected));
         }
-        let before = self.products.len();
+        for (to, value) in self.pixels.iter_mut().zip(stamp) {
+            *to = value.to_f32();
+        }
+        let whole = self.pixels.iter().all(|value| value.is_finite());
+        if !(whole || self.missing.mend(&mut self.pixels, full)) {
+            return Ok(());
+        }
         let blocks = Arc::clone(&self.plan.blocks);
         for &(y0, x0) in &*blocks {
             for (at, value) in self.block.iter_mut().enumerate() {
@@ -218,24 +227,22 @@ impl NoiseSurvey {
                 *value = f64::from(stamp[(y, x)].to_f32());
             }
             if self.block.iter().any(|value| !value.is_finite()) {
-                self.products.truncate(before);
-                return Ok(());
+                self.products
+                    .extend(iter::repeat_n(f32::NAN, self.plan.lags()));
+                continue;
             }
             take_out(&*self.plan.polynomials, &mut self.block);
             for (dx, dy) in lags(self.plan.reach) {
                 self.products.push(product(&self.block, dx, dy) as f32);
             }
         }
-        self.compare(stamp);
+        self.compare();
         Ok(())
     }
 
-    /// Looks for places that are brighter than the opposite ones.
-    fn compare<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) {
+    /// Looks for places of the stamp that are brighter than the opposite ones.
+    fn compare(&mut self) {
         let full = self.plan.full;
-        for (to, value) in self.pixels.iter_mut().zip(stamp) {
-            *to = value.to_f32();
-        }
         let turn = turn(centre(&self.pixels, full), full);
         self.contrasts.compare(&self.pixels, turn);
         let places = &self.contrasts.blocks;
@@ -279,7 +286,7 @@ impl NoiseSurvey {
                     let power = powers[(at + by) % ring];
                     power > bright || power == 0.0
                 });
-                beside || places[at] > contrast
+                beside || powers[at].is_nan() || places[at] > contrast
             };
             for (at, products) in products.chunks_exact(lags).enumerate() {
                 if lost(at) {
@@ -543,6 +550,33 @@ mod tests {
         let (power, _) = found.power([0.5, -0.8]);
         // 24 lags of 1/√400,000 each, both ways: 1.5 %.
         assert!((power - 1.0).abs() < 0.06, "{power}");
+    }
+
+    #[test]
+    fn missing_pixels_cost_their_blocks_alone() {
+        let found = survey(3, 600, |rng| {
+            let mut stamp = noise(rng, false);
+            for value in &mut stamp {
+                if rng.random_range(0.0..1.0) < 0.01 {
+                    *value = f32::NAN;
+                }
+            }
+            stamp
+        });
+        assert!(
+            (found.sigma() - 1.0).abs() < 3.0 * found.error(),
+            "{found:?}"
+        );
+        // Of 600 frames of 20 blocks of 64 pixels about half are whole: as of 300 frames without missing pixels.
+        assert!(
+            found.error() < 2.5e-3 && !found.is_correlated(),
+            "{found:?}"
+        );
+        let mut survey = NoisePlan::new(SIDE, 3).unwrap().survey();
+        survey
+            .add(Array2::from_elem((SIDE, SIDE), f32::NAN).view())
+            .unwrap();
+        assert!(survey.noise().is_none());
     }
 
     #[test]

@@ -8,11 +8,13 @@
 
 mod centre;
 mod contrast;
+mod missing;
 mod profile;
 
 pub(crate) use self::centre::{centre, followed};
 use self::contrast::opposite;
 pub(crate) use self::contrast::{Contrasts, turn};
+pub(crate) use self::missing::Missing;
 use self::profile::Profile;
 use crate::flag::Flag;
 

@@ -88,8 +88,10 @@ def test_no_stamps_are_an_empty_catalogue(image):
 
 def test_galaxies_that_cannot_be_measured_are_flagged(image):
     stamps = image.stamps.copy()
-    stamps[3, 7, 5] = np.nan
+    # Too many are missing; a few are filled from the opposite side.
+    stamps[3, 10:] = np.nan
     stamps[4] = 2.0
+    stamps[6, 7, 5] = np.nan
     found = again(image, stamps)
     assert found["flags"][[3, 4]].tolist() == [shearq.Flag.NotFinite, shearq.Flag.NoScale]
     assert np.isnan(found["e1"][[3, 4]]).all() and found.good.sum() == len(stamps) - 2

@@ -49,6 +49,8 @@ class Case:
     sky: float = 0.0
     header: float = 1.0
     noise: str = "white"
+    #: Which pixels are missing: "bad" ones and a cosmic ray, or those beyond an "edge" of the exposure.
+    missing: str = ""
     #: Whether fluxes are the catalogue's own, a quarter of the galaxies being below S/N 12.
     own_flux: bool = False
     #: Largest scatter in units of the bound; none where there is no bound.
@@ -79,6 +81,8 @@ CASES = [
     Case("off3", off=3.0),
     Case("neighbour20", aim=5.0, neighbour=20.0),
     Case("neighbour14", aim=20.0, neighbour=14.0, or_flagged=True),
+    Case("bad-pixels", missing="bad"),
+    Case("edge", missing="edge"),
     Case("small", galaxy="small"),
     Case("large", galaxy="large"),
     Case("cosmos20", galaxy="cosmos"),
@@ -140,6 +144,20 @@ def direction(random, length):
     return length * np.array([np.cos(angle), np.sin(angle)])
 
 
+def missing(case, random):
+    """True where a stamp has no pixel."""
+    side = case.stamp
+    lost = np.zeros((side, side), dtype=bool)
+    if case.missing == "bad":
+        lost = random.random((side, side)) < 0.01
+        x, y = random.integers(0, side - 3, 2)
+        lost[y : y + 3, x : x + 3] = True
+    if case.missing == "edge":
+        lost[:, : int(random.integers(1, side // 4 + 1))] = True
+        lost = np.rot90(lost, random.integers(4))
+    return lost
+
+
 def render(case, count, random, folder):
     """Stamps without noise, `[±shear, galaxy, y, x]`, of galaxies in pairs turned by 90 degrees; σ is one."""
     psf, kinds, others = psf_of(case), Galaxies(case.galaxy, folder), Galaxies("fiducial", folder)
@@ -163,6 +181,8 @@ def render(case, count, random, folder):
         stamps *= 12.0 / np.percentile(strength, 25)
     else:
         stamps *= (case.snr / strength)[None, :, None, None]
+    if case.missing:
+        stamps[:, np.array([missing(case, random) for _ in range(count)])] = np.nan
     return stamps, psf.drawImage(nx=48, ny=48, scale=1).array
 
 

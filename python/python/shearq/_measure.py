@@ -266,7 +266,8 @@ def measure(
         Postage stamps, square, at least as large as the submission needs, each with its galaxy near the middle
         and its sky subtracted, in any unit. Of any strides, order of bytes and real type: float32 and float64 are
         read where they lie, memory maps included; others are converted a few at a time. A list of 2-D arrays or of
-        GalSim images will do. Galaxies with a pixel that is not finite are flagged.
+        GalSim images will do. Pixels that are not finite are missing: the network flags
+        such a galaxy, a linear submission one with many of them.
     psf : array of shape (py, px) or (n, py, px), or FunctionalPsf
         The PSF for all, or one each, centred like the stamps and at least as large as the submission uses. It is cut
         and normalised.

@@ -1,0 +1,161 @@
+//! Pixels that are missing: bad ones, cosmic rays, another object's, or those beyond the edge of an exposure.
+//!
+//! They get the light of the opposite ones, which a galaxy that looks the same turned by 180 degrees has there, sheared or
+//! not. Noise that is repeated like this adds to the autocorrelation at the lag between the two, so that near the galaxy
+//! only few may be missing.
+
+use super::centre::centre;
+use super::contrast::{opposite, turn};
+
+/// Share of a stamp that may be missing.
+const MOST: f32 = 0.25;
+/// Within so many pixels of the galaxy's centre only so many may be missing, and where the opposite one is too, so many of
+/// the eight around have to be there.
+const INSIDE: f32 = 12.0;
+const MOST_INSIDE: usize = 24;
+const LEAST_AROUND: usize = 7;
+
+/// The pixels of a stamp that are missing, and what they are given.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Missing {
+    places: Vec<usize>,
+    lights: Vec<f32>,
+}
+
+impl Missing {
+    /// Room for stamps of `n` pixels a side.
+    pub(crate) fn new(n: usize) -> Self {
+        Missing {
+            places: Vec::with_capacity(n * n),
+            lights: Vec::with_capacity(n * n),
+        }
+    }
+
+    /// Fills the pixels of a stamp of `n` pixels a side that are not finite. False where too many are, or a hole is on
+    /// both sides of the galaxy's centre.
+    pub(crate) fn mend(&mut self, stamp: &mut [f32], n: usize) -> bool {
+        self.places.clear();
+        let all = stamp.iter().enumerate();
+        let missing = all.filter(|(_, value)| !value.is_finite());
+        self.places.extend(missing.map(|(at, _)| at));
+        if self.places.len() as f32 > MOST * stamp.len() as f32 {
+            return false;
+        }
+        // The centre is found on a stamp that is filled about its middle.
+        self.fill(stamp, n, [0.0; 2]);
+        let found = centre(stamp, n);
+        for &at in &self.places {
+            stamp[at] = f32::NAN;
+        }
+        let near = |at: &&usize| is_near(**at, n, found);
+        self.fill(stamp, n, found) && self.places.iter().filter(near).count() <= MOST_INSIDE
+    }
+
+    /// Gives missing pixels the light of the opposite ones, or where that is missing too the mean of those around, or
+    /// none. False where that is so near the centre.
+    fn fill(&mut self, stamp: &mut [f32], n: usize, centre: [f32; 2]) -> bool {
+        let turn = turn(centre, n);
+        let mut whole = true;
+        self.lights.clear();
+        for &at in &self.places {
+            let other = opposite(stamp, n, turn, [at % n, at / n]);
+            let light = other.filter(|light| light.is_finite());
+            let light = light.or_else(|| around(stamp, n, at));
+            whole &= light.is_some() || !is_near(at, n, centre);
+            self.lights.push(light.unwrap_or(0.0));
+        }
+        for (&at, &light) in self.places.iter().zip(&self.lights) {
+            stamp[at] = light;
+        }
+        whole
+    }
+}
+
+fn is_near(at: usize, n: usize, centre: [f32; 2]) -> bool {
+    let place = |at: usize, c: f32| at as f32 - (n as f32 - 1.0) / 2.0 - c;
+    place(at % n, centre[0]).hypot(place(at / n, centre[1])) < INSIDE
+}
+
+/// The mean of the pixels around one, if enough are there.
+fn around(stamp: &[f32], n: usize, at: usize) -> Option<f32> {
+    let (x, y) = (at % n, at / n);
+    let side = |at: usize| at.saturating_sub(1)..(at + 2).min(n);
+    let square = side(y).flat_map(|y| side(x).map(move |x| stamp[y * n + x]));
+    let there = square.filter(|light| light.is_finite());
+    let (sum, count) = there.fold((0.0, 0), |(sum, count), light| (sum + light, count + 1));
+    (count >= LEAST_AROUND).then(|| sum / count as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const N: usize = 48;
+
+    /// A galaxy that is the same turned by 180 degrees about its centre, (0.5, −0.5) px off the middle.
+    fn galaxy() -> Vec<f32> {
+        let pixel = |at: usize| {
+            let (x, y) = ((at % N) as f32 - 24.0, (at / N) as f32 - 23.0);
+            30.0 * (-(x * x + 0.5 * x * y + 1.5 * y * y) / 20.0).exp()
+        };
+        (0..N * N).map(pixel).collect()
+    }
+
+    fn mended(missing: impl IntoIterator<Item = (usize, usize)>) -> Option<Vec<f32>> {
+        let mut stamp = galaxy();
+        for (x, y) in missing {
+            stamp[y * N + x] = f32::NAN;
+        }
+        // What was found before does not matter.
+        let mut dirty = Missing::new(N);
+        dirty.mend(&mut [f32::INFINITY; 49], 7);
+        dirty.mend(&mut stamp, N).then_some(stamp)
+    }
+
+    #[test]
+    fn missing_pixels_are_filled_from_the_opposite_side() {
+        let whole = galaxy();
+        let patch = (27..31).flat_map(|x| (22..25).map(move |y| (x, y)));
+        let edge = (0..4).flat_map(|x| (0..N).map(move |y| (x, y)));
+        let corners = [(0, 0), (47, 47), (2, 41), (47, 2)];
+        for found in [
+            mended(patch),
+            mended(edge),
+            mended(corners),
+            mended([(24, 21)]),
+        ] {
+            let found = found.unwrap();
+            let worst = found.iter().zip(&whole).map(|(a, b)| (a - b).abs());
+            // The centre lies on half pixels, to which it is rounded.
+            assert!(worst.fold(0.0, f32::max) < 1e-3);
+        }
+        assert_eq!(mended([]).unwrap(), whole);
+    }
+
+    #[test]
+    fn holes_that_hide_the_galaxy_are_told() {
+        // Opposite patches near the centre at (24, 23), and away from it; of single pixels the mean of those around.
+        let patches = |dx: usize| {
+            let patch = (0..9).map(move |k| (24 + dx + k % 3, 19 + k / 3));
+            patch.flat_map(|(x, y)| [(x, y), (48 - x, 46 - y)])
+        };
+        assert!(mended(patches(3)).is_none());
+        assert!(mended(patches(14)).is_some());
+        let found = mended([(27, 20), (21, 26)]).unwrap();
+        let (worst, light) = (
+            found[20 * N + 27] - galaxy()[20 * N + 27],
+            galaxy()[20 * N + 27],
+        );
+        assert!(worst.abs() < 0.1 * light, "{worst} of {light}");
+        // A row through the centre.
+        assert!(mended((0..N).map(|x| (x, 23))).is_none());
+        let square =
+            |side: usize| (0..side).flat_map(move |x| (0..side).map(move |y| (26 + x, 22 + y)));
+        assert!(mended(square(4)).is_some());
+        assert!(mended(square(5)).is_none());
+        // More than a quarter of the stamp.
+        let most = |columns: usize| (0..columns).flat_map(|x| (0..N).map(move |y| (x, y)));
+        assert!(mended(most(12)).is_some());
+        assert!(mended(most(13)).is_none());
+    }
+}
