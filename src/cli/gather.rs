@@ -6,13 +6,14 @@ use clap::Args;
 
 use super::{count, tell};
 use crate::io::layout::{DataFolder, MAX_IMAGE, MAX_SET};
-use crate::pipeline::gather::{Gathered, Stamps, gather};
+use crate::pipeline::gather::{Files, Gathered, Stamps, gather};
 use crate::pipeline::images::ImageId;
 
 /// Gather stamps of your own into a data folder that `measure` takes.
 ///
 /// The sky has to be subtracted. Stamps come as FITS files of one stamp, a cube, or several extensions each, or are cut out of an exposure around
-/// positions; those that reach beyond it are flagged when they are measured. The PSF is one star stamp for all, one
+/// positions. Pixels beyond it, those that are not finite and those that a mask is not zero for are missing: a linear
+/// submission fills some from the opposite side of the galaxy, a network flags it. The PSF is one star stamp for all, one
 /// for each galaxy in the same order, or a table of functional PSFs (x,y,profile,beta,fwhm,e1,e2; docs/formats.md),
 /// of which the positions do not matter. Beside the image a table tells which stamp is which, in the order of the
 /// catalogues.
@@ -24,6 +25,16 @@ pub(super) struct Arguments {
     /// Image to cut stamps out of: the first of its file.
     #[arg(long, value_name = "FILE", requires = "positions")]
     exposure: Option<PathBuf>,
+    /// Only images of this name (EXTNAME) of the files of stamps or the exposure, as SCI.
+    #[arg(long, value_name = "NAME")]
+    extension: Option<String>,
+    /// Masks like the stamps, one each in the same order, or like the exposure: pixels are missing where they are not
+    /// zero.
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    mask: Vec<PathBuf>,
+    /// Only images of this name of the files of masks [default: masks are in the files of the stamps or the exposure].
+    #[arg(long, value_name = "NAME")]
+    mask_extension: Option<String>,
     /// Table of the galaxies' positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the
     /// first is at 1).
     #[arg(long, value_name = "FILE", requires = "exposure")]
@@ -44,6 +55,9 @@ pub(super) struct Arguments {
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv).
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
     psf: Vec<PathBuf>,
+    /// Only images of this name of the files of PSFs.
+    #[arg(long, value_name = "NAME")]
+    psf_extension: Option<String>,
     /// Standard deviation of the noise of a pixel, where a submission is to take it from the header.
     #[arg(long, value_name = "SIGMA")]
     noise: Option<f64>,
@@ -62,10 +76,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Arguments {
         stamps,
         exposure,
+        extension,
+        mask,
+        mask_extension,
         positions,
         columns,
         size,
         psf,
+        psf_extension,
         noise,
         set,
         image,
@@ -77,9 +95,22 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             "--noise is {sigma}; expected a positive number"
         );
     }
+    let images = Files {
+        paths: exposure.as_ref().map_or(stamps, std::slice::from_ref),
+        extension: extension.as_deref(),
+    };
+    let masks = Files {
+        paths: if mask.is_empty() { images.paths } else { mask },
+        extension: mask_extension.as_deref(),
+    };
+    let masked = !mask.is_empty() || mask_extension.is_some();
+    let psfs = Files {
+        paths: psf,
+        extension: psf_extension.as_deref(),
+    };
     let stamps = match (exposure, positions, columns.as_slice()) {
-        (Some(exposure), Some(positions), [x, y]) => Stamps::Cutouts {
-            exposure,
+        (Some(_), Some(positions), [x, y]) => Stamps::Cutouts {
+            exposure: images,
             positions,
             columns: [x, y],
             side: usize::from(*size),
@@ -88,7 +119,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             "--columns is `{}`; expected the names of two columns, as in `x,y`",
             columns.join(",")
         ),
-        (None, ..) => Stamps::Files(stamps),
+        (None, ..) => Stamps::Files(images),
     };
     let data = if out.is_dir() {
         DataFolder::open(out)?
@@ -103,13 +134,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         mosaic,
         incomplete,
         doubts,
-    } = gather(&data, id, &stamps, psf, *noise)?;
+    } = gather(&data, id, &stamps, masked.then_some(masks), psfs, *noise)?;
     for doubt in doubts {
         tell(format_args!("{doubt}"));
     }
     if incomplete > 0 {
         tell(format_args!(
-            "{} with pixels that are missing or beyond the edge, which will be flagged",
+            "{} with pixels that are missing or beyond the edge: flagged by networks, and by linear submissions where they are many",
             count(incomplete, "stamp")
         ));
     }

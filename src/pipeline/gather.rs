@@ -1,17 +1,21 @@
 //! Stamps that people have, gathered into the image of a data folder: cubes, files of one or several images each, and
 //! cut-outs of an exposure.
 
+mod source;
+
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use shearq_scoring::resample::RunningMean;
 
+pub use self::source::Files;
+use self::source::{Exposure, Images, Origin, Planes};
 use super::PipelineError;
 use super::images::ImageId;
 use super::measure::check_strip;
 use crate::io::FileError;
 use crate::io::atomic;
-use crate::io::fits::{ImageReader, ImageWriter, Value};
+use crate::io::fits::{ImageWriter, Value};
 use crate::io::layout::{DataFolder, MAX_STAMP};
 use crate::io::mosaic::Mosaic;
 use crate::io::open::is_there;
@@ -31,11 +35,11 @@ const FRAME: usize = 2;
 /// Where stamps come from.
 pub enum Stamps<'a> {
     /// FITS files, each with one stamp, a cube of them, or several extensions with either.
-    Files(&'a [PathBuf]),
+    Files(Files<'a>),
     /// Squares of an exposure around positions.
     Cutouts {
-        /// The exposure.
-        exposure: &'a Path,
+        /// The exposure: the first image of one file.
+        exposure: Files<'a>,
         /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
         positions: &'a Path,
         /// Names of its columns for x and y.
@@ -50,30 +54,10 @@ pub enum Stamps<'a> {
 pub struct Gathered {
     /// How the stamps lie in the image.
     pub mosaic: Mosaic,
-    /// Of the stamps, those with pixels that are not finite: beyond the exposure, or missing in their file. They
-    /// will be flagged.
+    /// Of the stamps, those with pixels that are not finite: beyond the exposure, masked, or missing in their file.
     pub incomplete: usize,
     /// What is worth a second look.
     pub doubts: Vec<String>,
-}
-
-/// Where a stamp was found.
-#[derive(Debug, Clone, Copy)]
-struct Origin<'a> {
-    file: &'a Path,
-    /// Image of the file, from 1.
-    image: usize,
-    /// Plane of the image, from 1.
-    plane: usize,
-    /// Its galaxy's position.
-    position: Option<(f64, f64)>,
-}
-
-impl Origin<'_> {
-    fn fault(&self, what: &str) -> FileError {
-        let Origin { image, plane, .. } = self;
-        FileError::new(self.file, format!("image {image}, plane {plane}: {what}"))
-    }
 }
 
 /// A row of the table that says which stamp is which.
@@ -89,16 +73,18 @@ struct Place<'a> {
 }
 
 /// Gathers stamps and their PSFs into image `id` of `data`: PSFs, the table of which stamp is which, and last the
-/// image. `noise` is written as its NOISESIG.
+/// image. Pixels are missing where those of `masks`, images like those of the stamps or the exposure, are not zero.
+/// `noise` is written as the image's NOISESIG.
 ///
 /// # Errors
-/// Where a file cannot be read, stamps are not square or of different sizes, there are neither one PSF nor as many as
-/// stamps, or the image is there already.
+/// Where a file cannot be read, stamps are not square or of different sizes, masks are of others, there are neither one
+/// PSF nor as many as stamps, or the image is there already.
 pub fn gather(
     data: &DataFolder,
     id: ImageId,
     stamps: &Stamps<'_>,
-    psfs: &[PathBuf],
+    masks: Option<Files<'_>>,
+    psfs: Files<'_>,
     noise: Option<f64>,
 ) -> Result<Gathered, PipelineError> {
     let target = data.galaxies(id.set, id.image);
@@ -120,7 +106,7 @@ pub fn gather(
         } => read_positions(positions, *columns)?,
     };
     let (count, side) = match stamps {
-        Stamps::Files(files) => survey(files)?,
+        Stamps::Files(files) => survey(*files)?,
         Stamps::Cutouts { side, .. } => (positions.len(), *side),
     };
     let mosaic = Mosaic::of(count, side);
@@ -151,19 +137,37 @@ pub fn gather(
         image.add(pixels)
     };
     match stamps {
-        Stamps::Files(files) => each_stamp(files, &mut take)?,
+        Stamps::Files(files) => {
+            let (mut planes, mut masks) = (Planes::of(*files), masks.map(Planes::of));
+            while let Some((origin, mut pixels)) = planes.next()? {
+                if let Some(masks) = &mut masks {
+                    let Some((place, mask)) = masks.next()? else {
+                        return Err(origin.fault("there is no mask for this stamp").into());
+                    };
+                    lose(&mut pixels, &mask, &place)?;
+                }
+                take(&origin, &pixels)?;
+            }
+            if let Some((place, _)) = masks.as_mut().map_or(Ok(None), Planes::next)? {
+                return Err(place.fault("there is no stamp for this mask").into());
+            }
+        }
         Stamps::Cutouts { exposure, .. } => {
-            let mut reader = ImageReader::open(exposure)?;
+            let mut exposure = Exposure::open(*exposure)?;
+            let mut masks = masks.map(Exposure::open).transpose()?;
+            if let Some(mask) = &mut masks {
+                mask.like(&mut exposure)?;
+            }
             for &(x, y) in &positions {
+                let mut pixels = exposure.square((x, y), side)?;
+                if let Some(mask) = &mut masks {
+                    lose(&mut pixels, &mask.square((x, y), side)?, &mask.origin)?;
+                }
                 let origin = Origin {
-                    file: exposure,
-                    image: 1,
-                    plane: 1,
                     position: Some((x, y)),
+                    ..exposure.origin
                 };
-                // The first pixel, from 0, of the square whose centre is nearest.
-                let first = |at: f64| (at - (side as f64 + 1.0) / 2.0).round() as i64;
-                take(&origin, &reader.read_square(first(x), first(y), side)?)?;
+                take(&origin, &pixels)?;
             }
         }
     }
@@ -241,10 +245,29 @@ fn read_positions(path: &Path, columns: [&str; 2]) -> Result<Vec<(f64, f64)>, Fi
     }
 }
 
+/// Makes those pixels of a stamp missing whose `mask` is not zero.
+fn lose(pixels: &mut [f32], mask: &[f32], place: &Origin<'_>) -> Result<(), FileError> {
+    if mask.len() != pixels.len() {
+        let message = format!(
+            "the mask has {} pixels; its stamp has {}",
+            mask.len(),
+            pixels.len()
+        );
+        return Err(place.fault(&message));
+    }
+    for (pixel, mask) in pixels.iter_mut().zip(mask) {
+        if *mask != 0.0 {
+            *pixel = f32::NAN;
+        }
+    }
+    Ok(())
+}
+
 /// Number of stamps in files, and the pixels a side that all of them have.
-fn survey(files: &[PathBuf]) -> Result<(usize, usize), FileError> {
+fn survey(files: Files<'_>) -> Result<(usize, usize), FileError> {
     let (mut count, mut first) = (0usize, None);
-    each_image(files, |origin, image| {
+    let mut images = Images::of(files);
+    while let Some((origin, image)) = images.next()? {
         let (width, height) = (image.width(), image.height());
         if width != height || width > MAX_STAMP {
             let message = format!(
@@ -262,53 +285,16 @@ fn survey(files: &[PathBuf]) -> Result<(usize, usize), FileError> {
         if count > MAX_STAMPS {
             return Err(origin.fault(&format!("there are more than {MAX_STAMPS} stamps")));
         }
-        Ok(())
-    })?;
+    }
     // No list of files is empty.
     Ok((count, first.unwrap_or(1)))
-}
-
-/// Every image of files, in order.
-fn each_image(
-    files: &[PathBuf],
-    mut visit: impl FnMut(Origin<'_>, &mut ImageReader) -> Result<(), FileError>,
-) -> Result<(), FileError> {
-    for file in files {
-        let mut next = Some(ImageReader::open_stack(file)?);
-        let mut origin = Origin {
-            file,
-            image: 1,
-            plane: 1,
-            position: None,
-        };
-        while let Some(mut image) = next {
-            visit(origin, &mut image)?;
-            origin.image += 1;
-            next = image.next_stack()?;
-        }
-    }
-    Ok(())
-}
-
-/// Every stamp of files, in order.
-fn each_stamp(
-    files: &[PathBuf],
-    mut take: impl FnMut(&Origin<'_>, &[f32]) -> Result<(), FileError>,
-) -> Result<(), FileError> {
-    each_image(files, |origin, image| {
-        for plane in 1..=image.planes() {
-            let pixels = image.read_rows(image.height())?;
-            take(&Origin { plane, ..origin }, &pixels)?;
-        }
-        Ok(())
-    })
 }
 
 /// Writes the PSFs of an image: functional ones of a table, or stars.
 fn gather_psfs(
     data: &DataFolder,
     id: ImageId,
-    files: &[PathBuf],
+    files: Files<'_>,
     mosaic: &Mosaic,
     doubts: &mut Vec<String>,
 ) -> Result<PsfFile, FileError> {
@@ -322,7 +308,7 @@ fn gather_psfs(
         );
         Err(FileError::new(path, message))
     };
-    if let [table] = files
+    if let [table] = files.paths
         && table
             .extension()
             .is_some_and(|ending| ending.eq_ignore_ascii_case("csv"))
@@ -337,12 +323,13 @@ fn gather_psfs(
     }
     let (count, side) = survey(files)?;
     // No list of files is empty.
-    check(&files[0], count)?;
+    check(&files.paths[0], count)?;
     // One, or as many as galaxies, which lie as these do.
     let stars = Mosaic::of(count, side);
     let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
-    each_stamp(files, |origin, pixels| {
-        let pedestal = pedestal(pixels, side);
+    let mut planes = Planes::of(files);
+    while let Some((origin, pixels)) = planes.next()? {
+        let pedestal = pedestal(&pixels, side);
         // Of a star without light it is no number.
         if image.next == 0 && (pedestal.abs() > PEDESTAL || pedestal.is_nan()) {
             doubts.push(format!(
@@ -351,8 +338,8 @@ fn gather_psfs(
                 100.0 * pedestal
             ));
         }
-        image.add(pixels)
-    })?;
+        image.add(&pixels)?;
+    }
     Ok(PsfFile::Stars(Box::new(image)))
 }
 

@@ -34,13 +34,21 @@ fn cube(stamps: &[Vec<f32>], side: usize) -> Vec<u8> {
 
 /// A file of an empty primary header and one extension a stamp.
 fn extensions(stamps: &[Vec<f32>], side: usize) -> Vec<u8> {
+    let unnamed: Vec<(&str, &[f32])> = stamps.iter().map(|stamp| ("", &stamp[..])).collect();
+    named_extensions(&unnamed, side)
+}
+
+/// The same with names.
+fn named_extensions(stamps: &[(&str, &[f32])], side: usize) -> Vec<u8> {
     let mut file = fits_image(8, &[], &["EXTEND  =                    T"], &[]);
-    let counts = [
-        "PCOUNT  =                    0",
-        "GCOUNT  =                    1",
-    ];
-    for stamp in stamps {
-        let mut image = fits_image(-32, &[side, side], &counts, &floats(stamp));
+    for (name, stamp) in stamps {
+        let name = format!("EXTNAME = '{name:<8}'");
+        let keys = [
+            "PCOUNT  =                    0",
+            "GCOUNT  =                    1",
+            &name,
+        ];
+        let mut image = fits_image(-32, &[side, side], &keys, &floats(stamp));
         image[..80].copy_from_slice(format!("{:<80}", "XTENSION= 'IMAGE   '").as_bytes());
         file.extend(image);
     }
@@ -365,4 +373,144 @@ fn a_tilde_is_a_letter_of_a_name() {
     let rest = ["--out", "~out", "--catalogue-format", "fits"];
     run(&[&measure[..], &rest].concat());
     run(&["mean", "--measured", "~out"]);
+}
+
+/// Pixels of the stamps that were gathered, of which those that are missing are NaN.
+fn gathered(root: &Path, from: &[&str], side: usize) -> Vec<Vec<f32>> {
+    let data = root.join("data");
+    let _ = fs::remove_dir_all(&data);
+    let psf = root.join("psf.fits");
+    let rest = ["--psf", text(&psf), "--out", text(&data)];
+    succeed(&[&["gather"][..], from, &rest].concat());
+    stamps_of(&data.join("set01/galaxies-001.fits"), side)
+}
+
+#[test]
+fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    fs::write(at("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
+    let stamps: Vec<Vec<f32>> = (0..4).map(|k| vec![1.0 + k as f32; 576]).collect();
+    let mut flags = vec![vec![0.0f32; 576]; 4];
+    flags[2][24 * 3 + 5] = 4.0;
+    let mut parts: Vec<(&str, &[f32])> = Vec::new();
+    for (stamp, flag) in stamps.iter().zip(&flags) {
+        parts.extend([("SCI", &stamp[..]), ("ERR", flag), ("DQ", flag)]);
+    }
+    let (parts_file, masks) = (at("parts.fits"), at("masks.fits"));
+    fs::write(&parts_file, named_extensions(&parts, 24)).unwrap();
+    fs::write(&masks, cube(&flags, 24)).unwrap();
+    let from = ["--stamps", text(&parts_file)];
+    let sky = [&from[..], &["--extension", "sci"]].concat();
+    assert_eq!(gathered(root.path(), &sky, 24), stamps);
+    let lost = |found: &[Vec<f32>]| {
+        let places = found.iter().flatten().enumerate();
+        let nan = places.filter(|(_, value)| value.is_nan());
+        nan.map(|(at, _)| at).collect::<Vec<_>>()
+    };
+    for mask in [["--mask-extension", "DQ"], ["--mask", text(&masks)]] {
+        let found = gathered(root.path(), &[&sky[..], &mask].concat(), 24);
+        assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
+        assert_eq!(found[3], stamps[3]);
+    }
+
+    // An exposure of the four side by side, as its first image.
+    let wide = |of: &[Vec<f32>]| {
+        let rows =
+            (0..24).flat_map(|y| of.iter().flat_map(move |s| s[24 * y..24 * y + 24].to_vec()));
+        fits_image(-32, &[96, 24], &[], &floats(&rows.collect::<Vec<_>>()))
+    };
+    let (exposure, mask, positions) = (at("wide.fits"), at("wide-mask.fits"), at("places.csv"));
+    fs::write(&exposure, wide(&stamps)).unwrap();
+    fs::write(&mask, wide(&flags)).unwrap();
+    fs::write(
+        &positions,
+        "x,y\n12.5,12.5\n36.5,12.5\n60.5,12.5\n84.5,12.5\n",
+    )
+    .unwrap();
+    let cut = [
+        "--exposure",
+        text(&exposure),
+        "--positions",
+        text(&positions),
+        "--size",
+        "24",
+    ];
+    let found = gathered(
+        root.path(),
+        &[&cut[..], &["--mask", text(&mask)]].concat(),
+        24,
+    );
+    assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
+
+    let refused = |from: &[&str], expected: &str| {
+        let (psf, out) = (at("psf.fits"), at("none"));
+        let rest = ["--psf", text(&psf), "--out", text(&out)];
+        let message = fail(&[&["gather"][..], from, &rest].concat());
+        assert!(message.contains(expected), "{message}");
+        assert!(!out.join("set01/galaxies-001.fits").exists());
+    };
+    refused(
+        &from,
+        "parts.fits: image 2, plane 1: the image is called ERR; expected images of the sky alone",
+    );
+    let wrong = [&from[..], &["--extension", "PRIMARY"]].concat();
+    refused(
+        &wrong,
+        "there is no image called PRIMARY; found `SCI`, `ERR`, `DQ`, `SCI`",
+    );
+    let three = at("three.fits");
+    fs::write(&three, cube(&flags[..3], 24)).unwrap();
+    refused(
+        &[&sky[..], &["--mask", text(&three)]].concat(),
+        "image 10, plane 1: there is no mask for this stamp",
+    );
+    let five = [&flags[..], &flags[..1]].concat();
+    fs::write(&three, cube(&five, 24)).unwrap();
+    refused(
+        &[&sky[..], &["--mask", text(&three)]].concat(),
+        "plane 5: there is no stamp for this mask",
+    );
+    refused(
+        &[&sky[..], &["--mask", text(&mask)]].concat(),
+        "wide-mask.fits: image 1, plane 1: the mask has 2304 pixels; its stamp has 576",
+    );
+    let narrow = ["--mask", text(&masks)];
+    refused(
+        &[&cut[..], &narrow].concat(),
+        "masks.fits: image 1, plane 1: the image has 4 planes",
+    );
+    refused(
+        &[&cut[..], &["--mask", text(&at("psf.fits"))]].concat(),
+        "the mask is 20 × 20 pixels; the exposure has 96 × 24",
+    );
+}
+
+#[test]
+fn compressed_cubes_are_read_plane_by_plane() {
+    let root = tempfile::tempdir().unwrap();
+    fs::write(root.path().join("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
+    // As astropy wrote it, in tiles of 24 × 10 pixels.
+    let value = |plane: usize, at: usize| {
+        ((17 * (at % 24) + 31 * (at / 24) + 101 * plane) % 256) as f32 / 16.0
+    };
+    let expected: Vec<Vec<f32>> = (0..3)
+        .map(|plane| (0..576).map(|at| value(plane, at)).collect())
+        .collect();
+    let found = gathered(root.path(), &["--stamps", "tests/data/cube.fits"], 24);
+    assert_eq!(found[..3], expected);
+    let bytes = fs::read("tests/data/cube.fits").unwrap();
+    let text_of = String::from_utf8_lossy(&bytes).into_owned();
+    let place = text_of.find("ZTILE3  =                    1").unwrap();
+    let mut thick = bytes.clone();
+    thick[place + 29] = b'3';
+    let path = root.path().join("thick.fits");
+    fs::write(&path, thick).unwrap();
+    let (psf, out) = (root.path().join("psf.fits"), root.path().join("none"));
+    let gather = ["gather", "--stamps", text(&path), "--psf", text(&psf)];
+    let message = fail(&[&gather[..], &["--out", text(&out)]].concat());
+    assert!(
+        message.contains("its tiles are of 3 planes each; expected one"),
+        "{message}"
+    );
 }

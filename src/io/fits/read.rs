@@ -15,8 +15,8 @@ use shearq_tables::polars::{Column, DataFrame};
 
 /// Largest image side accepted, against absurd sizes in damaged headers.
 pub const MAX_SIDE: usize = 200_000;
-/// Most rows of a table accepted, one for each galaxy of the largest grid.
-const MAX_ROWS: usize = Grid::MAX_SIDE * Grid::MAX_SIDE;
+/// Most rows of a table accepted, and most planes of a cube: one for each galaxy of the largest grid.
+pub(super) const MAX_ROWS: usize = Grid::MAX_SIDE * Grid::MAX_SIDE;
 /// Most numbers read from a table that has fewer bytes than that on disk.
 const FREE_NUMBERS: u64 = 1 << 22;
 
@@ -157,6 +157,11 @@ impl ImageReader {
             next_row: 0,
             pixels,
         })
+    }
+
+    /// Its name, EXTNAME; empty where it has none.
+    pub fn name(&self) -> String {
+        self.file.text("EXTNAME")
     }
 
     /// Columns.

@@ -6,7 +6,7 @@ use fitsio::sys;
 
 use super::cards::Cards;
 use super::file::File;
-use super::read::MAX_SIDE;
+use super::read::{MAX_ROWS as MAX_PLANES, MAX_SIDE};
 use super::streams::{self, Coding, Damaged};
 use crate::io::error::FileError;
 
@@ -32,9 +32,11 @@ pub struct Tiling {
     real: Option<usize>,
     /// Whether ZQUANTIZ says that real numbers are stored as they are.
     as_they_are: bool,
-    /// Columns and rows of the image.
+    /// Columns and rows of the image, or of each plane of a cube.
     sides: [usize; 2],
-    /// Columns and rows of a tile.
+    /// Planes of a cube, one of an image.
+    planes: usize,
+    /// Columns and rows of a tile, which is of one plane.
     tile: [usize; 2],
 }
 
@@ -52,9 +54,19 @@ impl Tiling {
             found.ok_or_else(|| format!("there is no header key {key}; a compressed image has one"))
         };
         let dimensions = need("ZNAXIS", 0..=999)?;
-        if dimensions != 2 {
+        let planes = match dimensions {
+            2 => 1,
+            3 => need("ZNAXIS3", 1..=MAX_PLANES)?,
+            _ => {
+                return Err(format!(
+                    "the compressed image has {dimensions} dimensions; expected 2, or 3 of a cube"
+                ));
+            }
+        };
+        let depth = cards.number("ZTILE3", 1..=MAX_PLANES)?.unwrap_or(1);
+        if depth != 1 {
             return Err(format!(
-                "the compressed image has {dimensions} dimensions; expected 2"
+                "its tiles are of {depth} planes each; expected one"
             ));
         }
         let sides = [
@@ -88,13 +100,25 @@ impl Tiling {
             real,
             as_they_are: cards.text("ZQUANTIZ") == Some("NONE"),
             sides,
+            planes,
             tile,
         }))
     }
 
     /// Number of tiles.
     fn tiles(&self) -> usize {
+        self.of_plane() * self.planes
+    }
+
+    /// Number of tiles of a plane.
+    fn of_plane(&self) -> usize {
         self.across() * self.sides[1].div_ceil(self.tile[1])
+    }
+
+    /// Number of tiles that hold the first `rows` rows, those of a plane following those of the one before.
+    fn holding(&self, rows: usize) -> usize {
+        let (planes, rest) = (rows / self.sides[1], rows % self.sides[1]);
+        planes * self.of_plane() + rest.div_ceil(self.tile[1]) * self.across()
     }
 
     /// Number of tiles side by side.
@@ -104,6 +128,7 @@ impl Tiling {
 
     /// Pixels of the tile of a number, from 0: fewer than others at the image's right and upper edge.
     fn pixels(&self, number: usize) -> usize {
+        let number = number % self.of_plane();
         let place = [number % self.across(), number / self.across()];
         let side = |axis: usize| {
             let start = place[axis] * self.tile[axis];
@@ -212,8 +237,8 @@ impl Tiles {
     /// Where one of them cannot be unpacked.
     pub fn check(&mut self, file: &mut File, rows: usize) -> Result<(), FileError> {
         file.need_all()?;
-        let wanted = rows.div_ceil(self.tiling.tile[1]) * self.tiling.across();
-        while self.checked < wanted.min(self.tiling.tiles()) {
+        let wanted = self.tiling.holding(rows).min(self.tiling.tiles());
+        while self.checked < wanted {
             self.check_tile(file, self.checked)?;
             self.checked += 1;
         }
