@@ -85,6 +85,10 @@ pub(super) struct Printing {
     /// wider than the terminal.
     #[arg(long)]
     wide: bool,
+    /// Print these figures alone, beside the names of the rows and in this order: columns by their names in CSV, as
+    /// `q,q_calibrated,m_cross`; a table that fits into a column of a paper.
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    figures: Vec<String>,
 }
 
 impl Printing {
@@ -93,7 +97,22 @@ impl Printing {
     }
 
     /// Prints a table.
+    ///
+    /// # Errors
+    /// Where a figure that is asked for is no column of it.
     pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
+        if !self.figures.is_empty() {
+            let chosen = table.chosen(&self.figures).map_err(|unknown| {
+                let known = table.figures().join(", ");
+                anyhow::anyhow!(
+                    "--figures: no figure is called {unknown:?}; expected some of {known}"
+                )
+            })?;
+            return match (self.form.format, self.wide) {
+                (TableFormat::Table, true) => print(&fitted(&chosen, None)),
+                _ => self.form.print(&chosen),
+            };
+        }
         match (self.form.format, self.wide) {
             (TableFormat::Table, true) => print(&fitted(table, None)),
             (TableFormat::Table, false) => {

@@ -287,6 +287,7 @@ pub fn q_heat_map<R: Borrow<SetRecord>>(variants: &[(String, Vec<R>)]) -> HeatMa
         }
         row[sets.len()] = mean_figure(own, "q").0;
     }
+    let most = values.iter().copied().fold(f64::NAN, f64::max);
     HeatMap {
         title: "Quality factor per set".into(),
         row_label: "submission".into(),
@@ -294,7 +295,7 @@ pub fn q_heat_map<R: Borrow<SetRecord>>(variants: &[(String, Vec<R>)]) -> HeatMa
         rows: variants.iter().map(|(name, _)| name.clone()).collect(),
         columns,
         values,
-        decimals: 1,
+        decimals: if most < 10.0 { 2 } else { 1 },
         value_label: "Q".into(),
         map: ColourMap::Viridis,
     }

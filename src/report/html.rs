@@ -32,6 +32,9 @@ const SCRIPT: &str = include_str!("html/script.js");
 /// Characters above which the heading of a row may be folded.
 const LONG: usize = 16;
 
+/// Characters above which the words of a cell run over several lines.
+const SENTENCE: usize = 48;
+
 /// What replaces `DARK` in the style sheet, which needs it in two places.
 const DARK: &str = "color-scheme: dark; --paper: #15171a; --ink: #dddcd8; --muted: #a0a4a9; \
      --rule: #34383d; --strong-rule: #8b9096; --link: #8fb8e0; --shade: #202327; --edge: #000a; --dim: brightness(.92);";
@@ -484,7 +487,13 @@ impl Column {
                 let long = words.chars().count() > LONG;
                 html! { th scope="row" class=[self.class(long)] { (Words(words)) } }
             }
-            Some(Cell::Text(words)) => html! { td class=[class] { (Words(words)) } },
+            Some(Cell::Text(words)) => {
+                let sentence = words.chars().count() > SENTENCE;
+                let classes = [class.as_deref(), sentence.then_some("sentence")];
+                let classes: Vec<&str> = classes.into_iter().flatten().collect();
+                let class = (!classes.is_empty()).then(|| classes.join(" "));
+                html! { td class=[class] { (Words(words)) } }
+            }
             Some(number @ Cell::Number { value, .. }) => html! {
                 td class=[class] data-value=(sort_value(*value)) {
                     (number.figures().map_or_else(String::new, |shown| shown.0.replace('-', "−")))

@@ -171,17 +171,59 @@ pub struct Table {
 }
 
 impl Table {
+    /// The columns at `places`, in that order.
+    fn picked(&self, places: &[usize]) -> Self {
+        let row = |row: &Vec<Cell>| {
+            places
+                .iter()
+                .map(|&k| row.get(k).cloned().unwrap_or(Cell::Empty))
+                .collect()
+        };
+        Table {
+            title: self.title.clone(),
+            headings: places.iter().map(|&k| self.headings[k].clone()).collect(),
+            rows: self.rows.iter().map(row).collect(),
+            notes: self.notes.clone(),
+        }
+    }
+
     /// The table without its columns of detail.
     pub fn narrow(&self) -> Self {
-        let keep: Vec<bool> = self.headings.iter().map(|h| !h.detail).collect();
-        let mut table = self.clone();
-        let mut kept = keep.iter().copied();
-        table.headings.retain(|_| kept.next().unwrap_or(true));
-        for row in &mut table.rows {
-            let mut kept = keep.iter().copied();
-            row.retain(|_| kept.next().unwrap_or(true));
+        let all = 0..self.headings.len();
+        self.picked(
+            &all.filter(|&k| !self.headings[k].detail)
+                .collect::<Vec<_>>(),
+        )
+    }
+
+    /// How many columns come before the first with a number: they name the rows.
+    fn names(&self) -> usize {
+        let number = |k: &usize| {
+            let mut cells = self.rows.iter().filter_map(|row| row.get(*k));
+            cells.any(|cell| matches!(cell, Cell::Number { .. }))
+        };
+        let all = self.headings.len();
+        (0..all).find(number).unwrap_or(all)
+    }
+
+    /// Keys of the columns after those that name the rows.
+    pub fn figures(&self) -> Vec<&'static str> {
+        let figures = self.headings.iter().skip(self.names());
+        figures.map(|heading| heading.key).collect()
+    }
+
+    /// The columns that name the rows, but for those of detail, and those of `figures`, in this order.
+    ///
+    /// # Errors
+    /// The first of `figures` that is no key of a figure.
+    pub fn chosen<'a>(&self, figures: &'a [String]) -> Result<Self, &'a str> {
+        let names = self.names();
+        let mut places: Vec<usize> = (0..names).filter(|&k| !self.headings[k].detail).collect();
+        for key in figures {
+            let place = self.place(key).filter(|&place| place >= names);
+            places.push(place.ok_or(key.as_str())?);
         }
-        table
+        Ok(self.picked(&places))
     }
 
     /// Place of the column called `key`.
@@ -192,19 +234,15 @@ impl Table {
     /// The columns of `keys`, of rows that have something in the last of them, under another title and
     /// with some of the notes.
     pub fn part(&self, keys: &[&str], title: &str, notes: &[String]) -> Self {
-        let kept: Vec<usize> = (0..self.headings.len())
+        let all = 0..self.headings.len();
+        let kept: Vec<usize> = all
             .filter(|&k| keys.contains(&self.headings[k].key))
             .collect();
-        let cells = |row: &Vec<Cell>| kept.iter().map(|&k| row[k].clone()).collect::<Vec<_>>();
-        let rows = self.rows.iter().map(cells);
-        Table {
-            title: title.to_owned(),
-            headings: kept.iter().map(|&k| self.headings[k].clone()).collect(),
-            rows: rows
-                .filter(|row| row.last() != Some(&Cell::Empty))
-                .collect(),
-            notes: notes.to_vec(),
-        }
+        let mut part = self.picked(&kept);
+        part.title = title.to_owned();
+        part.rows.retain(|row| row.last() != Some(&Cell::Empty));
+        part.notes = notes.to_vec();
+        part
     }
 
     /// The table in a format, ending in a line break.
@@ -462,5 +500,35 @@ mod tests {
         assert!(whole.json()["rows"][2]["q"].is_null());
         let part = whole.part(&["name", "q"], "Part", &[]);
         assert_eq!((part.rows.len(), part.headings.len()), (2, 2));
+    }
+
+    #[test]
+    fn figures_are_chosen_beside_the_names_of_the_rows() {
+        let mut whole = table();
+        whole.headings.push(Heading::new("m", "m").detail());
+        whole.rows[0].push(Cell::number(0.5, 1));
+        assert_eq!(whole.figures(), ["q", "m"]);
+        let keys = |figures: &[&str]| {
+            let figures: Vec<String> = figures.iter().map(|&key| key.to_owned()).collect();
+            whole
+                .chosen(&figures)
+                .map(|table| {
+                    table
+                        .headings
+                        .iter()
+                        .map(|heading| heading.key)
+                        .collect::<Vec<_>>()
+                })
+                .map_err(str::to_owned)
+        };
+        // A column of detail that is asked for is there.
+        assert_eq!(keys(&["m", "q"]).unwrap(), ["name", "m", "q"]);
+        assert_eq!(keys(&["q", "name"]).unwrap_err(), "name");
+        assert_eq!(keys(&["Q"]).unwrap_err(), "Q");
+        let csv = whole
+            .chosen(&["m".to_owned()])
+            .unwrap()
+            .render(TableFormat::Csv);
+        assert!(csv.starts_with("name,m"), "{csv}");
     }
 }

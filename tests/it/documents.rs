@@ -35,6 +35,9 @@ fn links_lead_to_files_and_the_summary_has_every_page() {
         for target in links(&page) {
             let path = page.parent().unwrap().join(&target);
             assert!(path.exists(), "{}: {target}", page.display());
+            // The site has the documents alone.
+            let inside = !page.starts_with("docs") || !target.starts_with("..");
+            assert!(inside, "{}: {target}", page.display());
             count += 1;
         }
     }
@@ -75,32 +78,60 @@ fn images(folder: &Path) {
     fs::copy(set.join("psf-001.fits"), folder.join("star.fits")).unwrap();
 }
 
-#[test]
-fn the_tutorial_can_be_followed() {
-    let root = tempfile::tempdir().unwrap();
-    images(root.path());
-    let tutorial = fs::read_to_string("docs/tutorial.md").unwrap();
-    let blocks = tutorial.split("```sh\n").skip(1);
+/// Does what a page says, in `folder`: the lines of its blocks for a shell, which are so many.
+fn follow(page: &str, folder: &Path, expected: usize) {
+    let text = fs::read_to_string(Path::new("docs").join(page)).unwrap();
+    let text = text.replace("\\\n", " ");
+    let blocks = text.split("```sh\n").skip(1);
     let lines = blocks.flat_map(|block| block.split("```").next().unwrap_or("").lines());
     let mut commands = 0;
     for line in lines.filter(|line| line.starts_with("shearq ")) {
         let done = Command::new(env!("CARGO_BIN_EXE_shearq"))
             .args(line.split_whitespace().skip(1))
-            .current_dir(root.path())
+            .current_dir(folder)
             .output()
             .unwrap();
         let said = String::from_utf8_lossy(&done.stderr);
-        assert!(done.status.success(), "{line}: {said}");
+        assert!(done.status.success(), "{page}: {line}: {said}");
         commands += 1;
     }
-    assert_eq!(commands, 10);
-    for file in [
+    assert_eq!(commands, expected, "{page}");
+}
+
+/// The files are there and hold something.
+fn written(folder: &Path, files: &[&str]) {
+    for file in files {
+        let size = fs::metadata(folder.join(file)).unwrap().len();
+        assert!(size > 1000, "{file}: {size} bytes");
+    }
+}
+
+#[test]
+fn the_tutorial_can_be_followed() {
+    let root = tempfile::tempdir().unwrap();
+    images(root.path());
+    follow("tutorial.md", root.path(), 10);
+    let files = [
         "galaxy.png",
         "linear.html",
         "compare.html",
         "to-send.tar.gz",
-    ] {
-        let size = fs::metadata(root.path().join(file)).unwrap().len();
-        assert!(size > 1000, "{file}: {size} bytes");
-    }
+    ];
+    written(root.path(), &files);
+}
+
+#[test]
+fn the_first_steps_and_the_recipes_can_be_followed() {
+    let first = tempfile::tempdir().unwrap();
+    follow("quickstart.md", first.path(), 6);
+    written(first.path(), &["steps.png"]);
+    let recipes = tempfile::tempdir().unwrap();
+    follow("recipes.md", recipes.path(), 27);
+    let files = [
+        "own.toml",
+        "parts/scores.csv",
+        "spectra.tar.gz",
+        "study/report.html",
+    ];
+    written(recipes.path(), &files);
 }

@@ -70,7 +70,19 @@
     });
   };
 
-  const foldable = (table) => {
+  // A table that is wider than its place has its errors below the values.
+  const stackable = (table) => {
+    const place = table.closest(".scroll");
+    const check = () => {
+      table.classList.remove("stacked");
+      table.classList.toggle("stacked", place.scrollWidth > place.clientWidth);
+    };
+    addEventListener("resize", check);
+    check();
+    return check;
+  };
+
+  const foldable = (table, changed) => {
     if (!table.querySelector("th.detail")) return;
     const button = document.createElement("button");
     button.type = "button";
@@ -78,6 +90,7 @@
       table.classList.toggle("narrow", narrow);
       button.textContent = narrow ? "All columns" : "Fewer columns";
       button.setAttribute("aria-expanded", String(!narrow));
+      changed();
     };
     fold(true);
     button.addEventListener("click", () => fold(!table.classList.contains("narrow")));
@@ -131,7 +144,7 @@
     themeButton();
     for (const table of document.querySelectorAll("main table")) {
       sortable(table);
-      foldable(table);
+      foldable(table, stackable(table));
     }
     document.querySelectorAll("main figure").forEach(enlargeable);
     contents();

@@ -37,11 +37,12 @@ fn q_difference(results: &[SetResult], first: usize, second: usize) -> Option<(f
     Some((difference.difference, difference.error, mean))
 }
 
-/// " ± error", or words where it is not known.
-fn with_error(error: f64, decimals: usize) -> String {
-    match error.is_finite() {
-        true => format!(" ± {error:.decimals$}"),
-        false => " (error unknown)".into(),
+/// A value with its error as tables have them, or a word where that is not known.
+fn with_error(value: f64, error: f64, decimals: usize) -> String {
+    match Cell::with_error(value, Some(error), decimals).figures() {
+        Some((value, Some(error))) => format!("{value} ± {error}"),
+        Some((value, None)) => format!("{value} (error unknown)"),
+        None => String::new(),
     }
 }
 
@@ -59,9 +60,8 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
         found.push(Finding {
             paper,
             here: format!(
-                "Q of {second} from that of {first}: {:+.1}{} %",
-                100.0 * difference / mean,
-                with_error(100.0 * error / mean, 1)
+                "Q of {second} from that of {first}: {} %",
+                with_error(100.0 * difference / mean, 100.0 * error / mean, 1)
             ),
             agrees: expected(difference / mean, error / mean),
         });
@@ -120,7 +120,9 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
             found.push(Finding {
                 paper,
                 here: format!(
-                    "{label}: Q {q:.1} ± {error:.1}, fiducial {base:.1} ± {base_error:.1}"
+                    "{label}: Q {}, fiducial {}",
+                    with_error(q, error, 1),
+                    with_error(base, base_error, 1)
                 ),
                 agrees: told.then_some((q > base) == above),
             });
@@ -166,8 +168,9 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
             found.push(Finding {
                 paper,
                 here: format!(
-                    "{name}: raw {raw:+.4}, denoised {den:+.4}; the difference{} at most",
-                    with_error(error, 4)
+                    "{name}: raw {}, denoised {}",
+                    with_error(raw, raw_error, 4),
+                    with_error(den, den_error, 4)
                 ),
                 agrees: (change.abs() > error).then_some((change < 0.0) == lower),
             });

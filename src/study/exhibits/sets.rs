@@ -99,9 +99,9 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
         title: "Table 1: submissions over all sets (simulated data)".into(),
         headings: vec![
             Heading::new("method", "Method"),
-            Heading::new("size", "Size"),
-            Heading::new("denoised", "Den"),
-            Heading::new("psf", "PSF"),
+            Heading::new("size", "Size").detail(),
+            Heading::new("denoised", "Den").detail(),
+            Heading::new("psf", "PSF").detail(),
             Heading::new("m_half", "M/2"),
             Heading::new("m_half_published", "M/2 publ."),
             Heading::new("m_half_apart", "M/2 apart"),
