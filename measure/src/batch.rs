@@ -130,10 +130,14 @@ impl Measurer {
         for at in plan.rows(1, count) {
             survey.add(stamps.index_axis(Axis(0), at))?;
         }
-        let noise = survey.noise();
-        let noise = noise
-            .ok_or_else(|| MeasureError::Noise("not to be seen on the stamps' frames".into()))?;
-        Ok(Some(Arc::new(noise)))
+        match survey.noise() {
+            Some(noise) => Ok(Some(Arc::new(noise))),
+            // All of them will be flagged.
+            None if survey.is_blind() => Ok(None),
+            None => Err(MeasureError::Noise(
+                "not to be seen on the stamps' frames".into(),
+            )),
+        }
     }
 }
 

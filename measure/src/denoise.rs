@@ -228,7 +228,7 @@ fn scale_variances(levels: usize) -> Vec<f32> {
 }
 
 /// Noise level of a stamp: 1.4826 times the median absolute deviation from the median of the pixels
-/// within `border` of the edge. `buffer` is overwritten. `None` where the frame holds no pixel.
+/// within `border` of the edge that are finite. `buffer` is overwritten. `None` where less than half of them are.
 pub fn border_noise(stamp: &[f32], n: usize, border: usize, buffer: &mut Vec<f32>) -> Option<f32> {
     buffer.clear();
     for (y, row) in stamp.chunks_exact(n).enumerate() {
@@ -238,6 +238,11 @@ pub fn border_noise(stamp: &[f32], n: usize, border: usize, buffer: &mut Vec<f32
             buffer.extend_from_slice(&row[..border.min(n)]);
             buffer.extend_from_slice(&row[n - border.min(n)..]);
         }
+    }
+    let frame = buffer.len();
+    buffer.retain(|value| value.is_finite());
+    if 2 * buffer.len() < frame {
+        return None;
     }
     let median = robust::median(buffer)?;
     for value in buffer.iter_mut() {
@@ -341,5 +346,11 @@ mod tests {
         let sigma = border_noise(&stamp, 48, 4, &mut Vec::new()).unwrap();
         // 704 pixels: the deviation scatters by 1.17/√(2·704) = 3 %.
         assert!((sigma / 3.0 - 1.0).abs() < 0.1, "{sigma}");
+        // Pixels that are missing do not count, and half of the frame has to be there.
+        stamp[..3 * 48].fill(f32::NAN);
+        let sigma = border_noise(&stamp, 48, 4, &mut Vec::new()).unwrap();
+        assert!((sigma / 3.0 - 1.0).abs() < 0.1, "{sigma}");
+        stamp[24 * 48..].fill(f32::NAN);
+        assert_eq!(border_noise(&stamp, 48, 4, &mut Vec::new()), None);
     }
 }

@@ -42,6 +42,8 @@ const BESIDE: usize = 2;
 /// around it, in pixels. Of stamps without neighbours a tenth loses some.
 const CONTRAST: f32 = 3.5;
 const AROUND: f32 = 16.0;
+/// Differences of opposite blocks in units of the stamp's largest that are none: noise has one of 10⁴ below.
+const ROUNDING: f32 = 1e-4;
 /// Least share of the power of white noise that is left to a mode of correlated noise: an estimate may
 /// come near zero, and below.
 const LEAST_POWER: f64 = 1e-3;
@@ -177,6 +179,7 @@ impl NoisePlan {
             products: Vec::new(),
             brightest: Vec::new(),
             typical: Vec::new(),
+            counts: [0; 3],
         }
     }
 
@@ -200,6 +203,8 @@ pub struct NoiseSurvey {
     brightest: Vec<f32>,
     /// Of each frame, the median over all places.
     typical: Vec<f32>,
+    /// Number of stamps looked at, of those with missing pixels, and of those that were left out for that.
+    counts: [usize; 3],
 }
 
 impl NoiseSurvey {
@@ -217,7 +222,10 @@ impl NoiseSurvey {
             *to = value.to_f32();
         }
         let whole = self.pixels.iter().all(|value| value.is_finite());
+        self.counts[0] += 1;
+        self.counts[1] += usize::from(!whole);
         if !(whole || self.missing.mend(&mut self.pixels, full)) {
+            self.counts[2] += 1;
             return Ok(());
         }
         let blocks = Arc::clone(&self.plan.blocks);
@@ -258,11 +266,21 @@ impl NoiseSurvey {
             let most = near.map(|at| over_noise(at.excess, at.pixels));
             self.brightest.push(most.fold(0.0, f32::max));
         }
-        let mut all: Vec<f32> = places
-            .iter()
-            .map(|at| over_noise(at.excess, at.pixels))
-            .collect();
+        let most = places.iter().map(|at| at.excess).fold(0.0, f32::max);
+        // Where one side was filled from the other there is no difference but rounding.
+        let seen = places.iter().filter(|at| at.excess > ROUNDING * most);
+        let mut all: Vec<f32> = seen.map(|at| over_noise(at.excess, at.pixels)).collect();
         self.typical.extend(median(&mut all));
+    }
+
+    /// How many of the stamps looked at have missing pixels.
+    pub fn incomplete(&self) -> usize {
+        self.counts[1]
+    }
+
+    /// Whether there is no stamp that is not left out: galaxies on them cannot be measured.
+    pub fn is_blind(&self) -> bool {
+        self.counts[0] == self.counts[2]
     }
 
     /// The noise of the stamps looked at; `None` where less than a few frames are left that hold noise alone.

@@ -98,6 +98,8 @@ pub struct SpectralPsf {
     field: Vec<Complex32>,
     /// Change of a mode of the field with the components of shear, in units of it and in the mean.
     field_tilts: Vec<[f32; 2]>,
+    /// What the field would be with the PSF turned by 90 degrees, less what it is, in units of it.
+    turned: Vec<f32>,
     /// Mean power of windowed noise, in units of σ².
     floor: Vec<f32>,
     /// Mean of the autocorrelation of noise of σ = 1 at zero lag.
@@ -272,6 +274,7 @@ impl Spectral {
             restore: vec![Complex32::ZERO; modes],
             field: vec![Complex32::ZERO; modes],
             field_tilts: vec![[0.0; 2]; modes],
+            turned: vec![0.0; modes],
             floor: vec![0.0; modes],
             noise_peak: 0.0,
             tilts: vec![[Complex32::ZERO; 2]; modes],
@@ -348,6 +351,14 @@ impl Spectral {
             let tilts = [0, 1].map(|k| noise.tilts[at][k] - out.tilts[at][k].re);
             out.field_tilts[at] = tilts;
             *value = out.field[at].norm_sqr();
+        }
+        for (at, value) in out.turned.iter_mut().enumerate() {
+            let power = tilt[at];
+            *value = if power > 0.0 {
+                (tilt[self.plane.turned(at)] / power).sqrt() - 1.0
+            } else {
+                0.0
+            };
         }
         spread(self.plane.side, &self.leak, tilt, along, &mut out.floor);
         let terms = out.floor.iter().zip(&self.scale).enumerate();
@@ -464,6 +475,32 @@ impl Spectral {
             let [first, second] = psf.field_tilts[at];
             x[at] = *value * first;
             y[at] = *value * second;
+        }
+        self.plane.window(across, down, plane);
+        self.changes(stamp, plane, out);
+    }
+
+    /// Writes to `acf` how the autocorrelation of the stamp last given would change further, were the PSF behind the field
+    /// of noise of [`Spectral::noise_field`] turned by 90 degrees.
+    pub fn turned_field(
+        &self,
+        psf: &SpectralPsf,
+        seed: u64,
+        scratch: &mut SpectralScratch,
+        out: &mut Lags,
+    ) {
+        let SpectralScratch {
+            plane,
+            stamp,
+            windows: [across, down],
+            ..
+        } = scratch;
+        self.signs(seed, &mut plane.half[0]);
+        let [u, x, y] = &mut plane.half;
+        for (at, value) in u.iter_mut().enumerate() {
+            *value *= psf.field[at] * psf.turned[at];
+            x[at] = Complex32::ZERO;
+            y[at] = Complex32::ZERO;
         }
         self.plane.window(across, down, plane);
         self.changes(stamp, plane, out);

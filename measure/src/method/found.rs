@@ -46,6 +46,8 @@ pub(crate) type ResponseMatrix = [[f64; 2]; 2];
 pub(crate) struct Sheared {
     /// With the field added, and taken away.
     pub(crate) sides: [(Distortion, ResponseMatrix); 2],
+    /// Change of the distortion on either side with what that field lacks to be one of a PSF turned by 90 degrees.
+    pub(crate) turned: [[f64; 2]; 2],
     /// Factor from the difference of responses to what sheared noise adds to the mean response.
     pub(crate) weight: f64,
 }

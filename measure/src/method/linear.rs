@@ -9,6 +9,14 @@
 //! noise's own shear. It is estimated with a second field of noise (as Sheldon & Huff 2017 do, but on
 //! both sides and as a derivative), of which response and ellipticity are taken with the field added and
 //! taken away. One galaxy in [`SHARE`] is enough.
+//!
+//! # What noise makes of the PSF
+//!
+//! Deconvolved noise has the ellipticity of the PSF, and its mean effect on the galaxy's, ½f″(δA, δA), leaves −0.014 of it
+//! for small galaxies of S/N 10. With a PSF turned by 90 degrees it would be the opposite: half of the difference,
+//! −½f″(δA, δA⊥ − δA), is subtracted. δA⊥ is that of the same field, each mode with the amplitude that the turned PSF
+//! gives it, so that its noise is that of the PSF's small ellipticity alone. It is worked out and subtracted on the same
+//! galaxies as the above, for all.
 
 use std::sync::Arc;
 
@@ -61,8 +69,9 @@ pub(super) struct LinearWorker {
     psf: SpectralPsf,
     buffers: SpectralScratch,
     lags: Lags,
-    /// Of a field of noise.
+    /// Of a field of noise, and of what it lacks to be that of a PSF turned by 90 degrees.
     field: Lags,
+    turned: Lags,
     /// The autocorrelation with that field.
     shifted: Vec<f32>,
     values: AdaptiveScratch,
@@ -78,6 +87,7 @@ impl LinearWorker {
             grain: 1.0,
             lags: plan.spectral.lags(),
             field: plan.spectral.lags(),
+            turned: plan.spectral.lags(),
             shifted: plan.spectral.lags().acf,
             values: plan.moments.scratch(),
             plan,
@@ -101,6 +111,8 @@ impl LinearWorker {
         let plan = &*self.plan;
         plan.spectral
             .noise_field(&self.psf, seed, &mut self.buffers, &mut self.field);
+        plan.spectral
+            .turned_field(&self.psf, seed, &mut self.buffers, &mut self.turned);
         let step = FIELD * noise;
         let mut side = |step: f32| {
             let terms = self.lags.acf.iter().zip(&self.field.acf);
@@ -111,10 +123,13 @@ impl LinearWorker {
             let shape = moments.measure(&self.shifted, softening, &mut self.values);
             let shape = shape.ok()?;
             let response = Self::response(plan, &shape, &self.field, &mut self.values);
-            Some((shape.distortion, response))
+            let turned = moments.response(&shape, &self.turned.acf, &mut self.values);
+            Some(((shape.distortion, response), turned))
         };
+        let (plus, minus) = (side(step)?, side(-step)?);
         Some(Sheared {
-            sides: [side(step)?, side(-step)?],
+            sides: [plus.0, minus.0],
+            turned: [plus.1, minus.1],
             weight: f64::from(noise * noise / (2.0 * step)) * SHARE as f64,
         })
     }

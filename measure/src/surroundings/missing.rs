@@ -7,8 +7,9 @@
 use super::centre::centre;
 use super::contrast::{opposite, turn};
 
-/// Share of a stamp that may be missing.
+/// Share of a stamp that may be missing, and share of it that may be so together with the opposite pixels.
 const MOST: f32 = 0.25;
+const MOST_TWICE: f32 = 0.02;
 /// Within so many pixels of the galaxy's centre only so many may be missing, and where the opposite one is too, so many of
 /// the eight around have to be there.
 const INSIDE: f32 = 12.0;
@@ -52,22 +53,26 @@ impl Missing {
     }
 
     /// Gives missing pixels the light of the opposite ones, or where that is missing too the mean of those around, or
-    /// none. False where that is so near the centre.
+    /// none. False where that is so near the centre, or of many.
     fn fill(&mut self, stamp: &mut [f32], n: usize, centre: [f32; 2]) -> bool {
         let turn = turn(centre, n);
-        let mut whole = true;
+        let (mut whole, mut dark) = (true, 0);
         self.lights.clear();
         for &at in &self.places {
             let other = opposite(stamp, n, turn, [at % n, at / n]);
             let light = other.filter(|light| light.is_finite());
             let light = light.or_else(|| around(stamp, n, at));
-            whole &= light.is_some() || !is_near(at, n, centre);
+            if light.is_none() {
+                // An opposite that is off the stamp is so far out that there is no light.
+                dark += usize::from(other.is_some());
+                whole &= !is_near(at, n, centre);
+            }
             self.lights.push(light.unwrap_or(0.0));
         }
         for (&at, &light) in self.places.iter().zip(&self.lights) {
             stamp[at] = light;
         }
-        whole
+        whole && dark as f32 <= MOST_TWICE * stamp.len() as f32
     }
 }
 
@@ -153,6 +158,13 @@ mod tests {
             |side: usize| (0..side).flat_map(move |x| (0..side).map(move |y| (26 + x, 22 + y)));
         assert!(mended(square(4)).is_some());
         assert!(mended(square(5)).is_none());
+        // Columns on both sides away from the centre.
+        let both = |from: usize, count: usize| {
+            let columns = (from..from + count).flat_map(|x| [x, 48 - x]);
+            columns.flat_map(|x| (0..N).map(move |y| (x, y)))
+        };
+        assert!(mended(both(6, 3)).is_none());
+        assert!(mended((0..20).map(|y| (7 + y % 2, 2 + y))).is_some());
         // More than a quarter of the stamp.
         let most = |columns: usize| (0..columns).flat_map(|x| (0..N).map(move |y| (x, y)));
         assert!(mended(most(12)).is_some());

@@ -74,6 +74,20 @@ impl Plane {
         }
     }
 
+    /// Place in a half spectrum of the mode at `at` turned by 90 degrees, or of its opposite.
+    pub(super) fn turned(&self, at: usize) -> usize {
+        let (x, y) = (at / self.side, at % self.side);
+        // (k_x, k_y) becomes (k_y, −k_x).
+        if y <= self.modes {
+            y * self.side + (self.side - x) % self.side
+        } else if y < self.side - self.modes {
+            // No mode is kept here.
+            at
+        } else {
+            (self.side - y) * self.side + x
+        }
+    }
+
     /// Buffers for images of up to `n` rows.
     pub(super) fn scratch(&self, n: usize) -> PlaneScratch {
         let zeros = |count| vec![Complex32::ZERO; count];

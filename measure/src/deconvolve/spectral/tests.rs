@@ -415,6 +415,47 @@ fn changed_as_by_noise(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
 }
 
 #[test]
+fn the_field_of_a_turned_psf_is_the_field_and_what_it_lacks() {
+    for (n, p) in [(40, 11), (33, 10)] {
+        let plan = Spectral::new(n, p, &settings(1000, 1.5, 8.0, 0.0)).unwrap();
+        let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+        let straight = psf(p);
+        // Of even and odd sides alike: about the middle of its stamp.
+        let turned = Array2::from_shape_fn((p, p), |(y, x)| straight[(x, p - 1 - y)]);
+        let mut lags = [(); 3].map(|()| plan.lags());
+        let stamp = observed(n, &psf(11), 0.1, 0.2);
+        let take = |psf: &Array2<f64>, own: &mut SpectralPsf, scratch: &mut SpectralScratch| {
+            plan.set_psf(psf.view(), &white(&plan), scratch, own)
+                .unwrap();
+        };
+        take(&turned, &mut own, &mut scratch);
+        plan.autocorrelate(&own, &stamp, 0.0, &mut scratch, &mut lags[0]);
+        let seen = scratch.stamp.clone();
+        plan.noise_field(&own, 7, &mut scratch, &mut lags[0]);
+        take(&straight, &mut own, &mut scratch);
+        // The same stamp behind both.
+        scratch.stamp.copy_from_slice(&seen);
+        plan.noise_field(&own, 7, &mut scratch, &mut lags[1]);
+        plan.turned_field(&own, 7, &mut scratch, &mut lags[2]);
+        let [expected, field, lack] = lags.map(|lags| lags.acf);
+        let peak = expected
+            .iter()
+            .fold(0.0f32, |most, value| most.max(value.abs()));
+        let largest = lack
+            .iter()
+            .fold(0.0f32, |most, value| most.max(value.abs()));
+        assert!(largest > 0.05 * peak, "{largest} {peak}");
+        for ((expected, field), lack) in expected.iter().zip(&field).zip(&lack) {
+            // f32 transforms of two PSFs, divided by modes of which some are small.
+            assert!(
+                (expected - field - lack).abs() < 1e-4 * peak,
+                "{expected} {field} {lack}"
+            );
+        }
+    }
+}
+
+#[test]
 fn unusable_sizes_and_psfs_are_refused() {
     let settings = settings(10, 1.5, 3.0, 0.0);
     assert!(Spectral::new(65, 15, &settings).is_err());
