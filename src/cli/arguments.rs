@@ -96,6 +96,11 @@ impl Printing {
         self.form.format
     }
 
+    /// Whether only some figures are printed.
+    pub(super) fn chooses(&self) -> bool {
+        !self.figures.is_empty()
+    }
+
     /// Prints a table.
     ///
     /// # Errors

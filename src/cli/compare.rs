@@ -76,10 +76,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             (table, q_heat_map(&by_name(&variants)))
         }
     };
+    arguments.printing.print(&table)?;
     if let Some(path) = &arguments.heat_map {
         map.save(path)?;
     }
-    arguments.printing.print(&table)?;
     let paths = arguments.store.iter().chain(&arguments.measured);
     let made_by = paths.chain(&arguments.foreign).chain(&arguments.data);
     let made_by = made_by.map(|path| ("Input".to_owned(), path.display().to_string()));

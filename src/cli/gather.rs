@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::{count, tell};
 use crate::io::layout::{DataFolder, MAX_IMAGE, MAX_SET};
-use crate::pipeline::gather::{Files, Gathered, Stamps, gather};
+use crate::pipeline::gather::{Content, Files, Gathered, Stamps, gather};
 use crate::pipeline::images::ImageId;
 
 /// Gather stamps of your own into a data folder that `measure` takes.
@@ -98,15 +98,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let images = Files {
         paths: exposure.as_ref().map_or(stamps, std::slice::from_ref),
         extension: extension.as_deref(),
+        content: Content::Sky,
     };
     let masks = Files {
         paths: if mask.is_empty() { images.paths } else { mask },
         extension: mask_extension.as_deref(),
+        content: Content::Mask,
     };
     let masked = !mask.is_empty() || mask_extension.is_some();
     let psfs = Files {
         paths: psf,
         extension: psf_extension.as_deref(),
+        content: Content::Psf,
     };
     let stamps = match (exposure, positions, columns.as_slice()) {
         (Some(_), Some(positions), [x, y]) => Stamps::Cutouts {
@@ -140,7 +143,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     if incomplete > 0 {
         tell(format_args!(
-            "{} with pixels that are missing or beyond the edge: flagged by networks, and by linear submissions where they are many",
+            "{} with pixels that are missing or beyond the edge: flagged by networks, and by linear submissions where too much is missing",
             count(incomplete, "stamp")
         ));
     }

@@ -411,6 +411,10 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         arguments.threads.number(),
     )?;
     if arguments.printing.format() == TableFormat::Json {
+        anyhow::ensure!(
+            !arguments.printing.chooses(),
+            "--figures: JSON of one set from plain files has everything; use --format csv for some figures"
+        );
         let name = |path: &Path| path.display().to_string();
         let input = SetInput {
             case: truth

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use shearq_scoring::resample::RunningMean;
 
-pub use self::source::Files;
+pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, Origin, Planes};
 use super::PipelineError;
 use super::images::ImageId;
@@ -144,7 +144,16 @@ pub fn gather(
                     let Some((place, mask)) = masks.next()? else {
                         return Err(origin.fault("there is no mask for this stamp").into());
                     };
-                    lose(&mut pixels, &mask, &place)?;
+                    let sides = masks.sides();
+                    if sides != [side; 2] {
+                        let message = format!(
+                            "the mask is {} × {} pixels; its stamp has {side} × {side}",
+                            sides[0], sides[1]
+                        );
+                        return Err(place.fault(&message).into());
+                    }
+                    another(&place, &origin)?;
+                    lose(&mut pixels, &mask);
                 }
                 take(&origin, &pixels)?;
             }
@@ -157,11 +166,12 @@ pub fn gather(
             let mut masks = masks.map(Exposure::open).transpose()?;
             if let Some(mask) = &mut masks {
                 mask.like(&mut exposure)?;
+                another(&mask.origin, &exposure.origin)?;
             }
             for &(x, y) in &positions {
                 let mut pixels = exposure.square((x, y), side)?;
                 if let Some(mask) = &mut masks {
-                    lose(&mut pixels, &mask.square((x, y), side)?, &mask.origin)?;
+                    lose(&mut pixels, &mask.square((x, y), side)?);
                 }
                 let origin = Origin {
                     position: Some((x, y)),
@@ -245,22 +255,22 @@ fn read_positions(path: &Path, columns: [&str; 2]) -> Result<Vec<(f64, f64)>, Fi
     }
 }
 
-/// Makes those pixels of a stamp missing whose `mask` is not zero.
-fn lose(pixels: &mut [f32], mask: &[f32], place: &Origin<'_>) -> Result<(), FileError> {
-    if mask.len() != pixels.len() {
-        let message = format!(
-            "the mask has {} pixels; its stamp has {}",
-            mask.len(),
-            pixels.len()
-        );
-        return Err(place.fault(&message));
+/// Refuses an image that is its own mask.
+fn another(mask: &Origin<'_>, image: &Origin<'_>) -> Result<(), FileError> {
+    if (mask.file, mask.image) == (image.file, image.image) {
+        let message = "the mask is the image itself; expected another (--mask-extension)";
+        return Err(mask.fault(message));
     }
+    Ok(())
+}
+
+/// Makes those pixels of a stamp missing whose `mask` is not zero.
+fn lose(pixels: &mut [f32], mask: &[f32]) {
     for (pixel, mask) in pixels.iter_mut().zip(mask) {
         if *mask != 0.0 {
             *pixel = f32::NAN;
         }
     }
-    Ok(())
 }
 
 /// Number of stamps in files, and the pixels a side that all of them have.

@@ -162,7 +162,8 @@ impl ImageSource {
         self.mosaic
     }
 
-    /// Measures the noise of the image on its stamps, for the rows that follow and for the caller.
+    /// Measures the noise of the image on its stamps, for the rows that follow and for the caller; `None` where all are
+    /// such that their galaxies will be flagged.
     ///
     /// # Errors
     /// Where they cannot be read, or hold no frame of noise alone.
@@ -170,7 +171,7 @@ impl ImageSource {
         &mut self,
         data: &DataFolder,
         plan: &NoisePlan,
-    ) -> Result<Arc<StampNoise>, PipelineError> {
+    ) -> Result<Option<Arc<StampNoise>>, PipelineError> {
         let path = data.galaxies(self.id.set, self.id.image);
         let mut image = ImageReader::open(&path)?;
         let Mosaic { columns, stamp, .. } = self.mosaic;
@@ -185,13 +186,18 @@ impl ImageSource {
                 survey.add(stamp)?;
             }
         }
-        let Some(noise) = survey.noise() else {
-            let message = "the frames of the stamps hold too little noise to measure it; set noise.source to \"header\" where NOISESIG is known";
+        self.noise = survey.noise().map(Arc::new);
+        if self.noise.is_none() && !survey.is_blind() {
+            let missing = match survey.incomplete() {
+                0 => String::new(),
+                count => format!(" ({count} of those looked at have missing pixels)"),
+            };
+            let message = format!(
+                "the frames of the stamps hold too little noise to measure it{missing}; set noise.source to \"header\" where NOISESIG is known"
+            );
             return Err(FileError::new(&path, message).into());
-        };
-        let noise = Arc::new(noise);
-        self.noise = Some(Arc::clone(&noise));
-        Ok(noise)
+        }
+        Ok(self.noise.clone())
     }
 
     /// The next row of stamps, `None` after the last.
@@ -510,9 +516,9 @@ fn first_noise(
     let mut source = ImageSource::open(data, first, submission)?;
     let asked = measurer.noise_plan().is_some();
     let noise = match source.measure_noise(data, plan) {
-        Ok(noise) => noise,
+        Ok(Some(noise)) => noise,
         Err(error) if asked => return Err(error),
-        Err(_) => return Ok(nothing),
+        Ok(None) | Err(_) => return Ok(nothing),
     };
     let image = format!("set {:02} image {:03}", first.set, first.image);
     let mut doubts = Vec::new();

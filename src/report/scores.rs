@@ -107,6 +107,20 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         }
         lines.extend(rows.oddities(&name));
     }
+    let blank = |set: &&ScoredSet| {
+        set.score.constant.is_none() && set.rows.used > 0 && set.score.figures.q_calibrated.is_nan()
+    };
+    let blank: Vec<String> = scored
+        .iter()
+        .filter(blank)
+        .filter_map(|set| Some(set.set?.to_string()))
+        .collect();
+    if !blank.is_empty() {
+        lines.push(format!(
+            "Note: no Q cal. and noise for set {}, whose response is less than three of its errors from zero: more galaxies tell.",
+            blank.join(", ")
+        ));
+    }
     lines
 }
 

@@ -196,9 +196,12 @@ impl Table {
         )
     }
 
-    /// How many columns come before the first with a number: they name the rows.
+    /// How many columns come before the first with a number that is not that of a set: they name the rows.
     fn names(&self) -> usize {
         let number = |k: &usize| {
+            if self.headings[*k].key == "set" {
+                return false;
+            }
             let mut cells = self.rows.iter().filter_map(|row| row.get(*k));
             cells.any(|cell| matches!(cell, Cell::Number { .. }))
         };
@@ -221,7 +224,10 @@ impl Table {
         let mut places: Vec<usize> = (0..names).filter(|&k| !self.headings[k].detail).collect();
         for key in figures {
             let place = self.place(key).filter(|&place| place >= names);
-            places.push(place.ok_or(key.as_str())?);
+            let place = place.ok_or(key.as_str())?;
+            if !places.contains(&place) {
+                places.push(place);
+            }
         }
         Ok(self.picked(&places))
     }
@@ -522,7 +528,7 @@ mod tests {
                 .map_err(str::to_owned)
         };
         // A column of detail that is asked for is there.
-        assert_eq!(keys(&["m", "q"]).unwrap(), ["name", "m", "q"]);
+        assert_eq!(keys(&["m", "q", "m"]).unwrap(), ["name", "m", "q"]);
         assert_eq!(keys(&["q", "name"]).unwrap_err(), "name");
         assert_eq!(keys(&["Q"]).unwrap_err(), "Q");
         let csv = whole

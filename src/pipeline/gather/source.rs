@@ -6,7 +6,8 @@ use crate::io::FileError;
 use crate::io::fits::ImageReader;
 
 /// Names by which instruments call what lies beside an image of the sky: without a choice, none of these is one.
-const COMPANIONS: [&str; 14] = [
+const COMPANIONS: [&str; 15] = [
+    "PSF",
     "ERR",
     "ERROR",
     "DQ",
@@ -30,6 +31,42 @@ pub struct Files<'a> {
     pub paths: &'a [PathBuf],
     /// Name of the images (EXTNAME, in any case); without, all of them.
     pub extension: Option<&'a str>,
+    /// What they are images of.
+    pub content: Content,
+}
+
+/// What images are of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Content {
+    /// Galaxies.
+    Sky,
+    /// PSFs.
+    Psf,
+    /// Nothing: they are not zero where a pixel is bad.
+    Mask,
+}
+
+impl Content {
+    /// Whether an image of this name is of something else, for all that is known.
+    fn is_not(self, name: &str) -> bool {
+        let companion = COMPANIONS
+            .iter()
+            .any(|other| name.eq_ignore_ascii_case(other));
+        match self {
+            Content::Sky => companion,
+            Content::Psf => companion && !name.eq_ignore_ascii_case("PSF"),
+            Content::Mask => false,
+        }
+    }
+
+    /// The option that names images of this.
+    fn option(self) -> &'static str {
+        match self {
+            Content::Sky => "--extension",
+            Content::Psf => "--psf-extension",
+            Content::Mask => "--mask-extension",
+        }
+    }
 }
 
 /// Where a stamp was found.
@@ -108,12 +145,10 @@ impl<'a> Images<'a> {
                     self.others.push(name);
                     continue;
                 }
-                None if COMPANIONS
-                    .iter()
-                    .any(|other| name.eq_ignore_ascii_case(other)) =>
-                {
+                None if self.files.content.is_not(&name) => {
                     return Err(origin.fault(&format!(
-                        "the image is called {name}; expected images of the sky alone, or their name (--extension, --psf-extension)"
+                        "the image is called {name}; expected no such images, or the name of those that are meant ({})",
+                        self.files.content.option()
                     )));
                 }
                 Some(_) | None => self.found = true,
@@ -131,7 +166,7 @@ impl<'a> Images<'a> {
             (Some(wanted), Some(path)) if !self.found => {
                 let names = self.others.iter().map(|name| format!("`{name}`"));
                 let names = names.collect::<Vec<_>>().join(", ");
-                let message = format!("there is no image called {wanted}; found {names}");
+                let message = format!("there is no image called `{wanted}`; found {names}");
                 Err(FileError::new(path, message))
             }
             _ => Ok(()),
@@ -154,6 +189,12 @@ impl<'a> Planes<'a> {
             origin: None,
             left: 0,
         }
+    }
+
+    /// Columns and rows of the one at hand.
+    pub(super) fn sides(&self) -> [usize; 2] {
+        let now = self.images.now.as_ref();
+        now.map_or([0; 2], |image| [image.width(), image.height()])
     }
 
     /// The next one with its pixels, `None` after the last.
@@ -194,6 +235,12 @@ impl<'a> Exposure<'a> {
     /// # Errors
     /// As [`Images::next`], and where the image is a cube.
     pub(super) fn open(files: Files<'a>) -> Result<Self, FileError> {
+        if let Some(more) = files.paths.get(1) {
+            return Err(FileError::new(
+                more,
+                "this is a second file; expected one, as the exposure is",
+            ));
+        }
         let mut images = Images::of(files);
         let (origin, planes) = match images.next()? {
             Some((origin, image)) => (origin, image.planes()),
