@@ -531,6 +531,10 @@ mod tests {
         assert_eq!(keys(&["m", "q", "m"]).unwrap(), ["name", "m", "q"]);
         assert_eq!(keys(&["q", "name"]).unwrap_err(), "name");
         assert_eq!(keys(&["Q"]).unwrap_err(), "Q");
+        // The number of a set names a row.
+        let mut sets = whole.clone();
+        sets.headings[1].key = "set";
+        assert_eq!(sets.figures(), ["m"]);
         let csv = whole
             .chosen(&["m".to_owned()])
             .unwrap()

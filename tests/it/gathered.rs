@@ -459,6 +459,25 @@ fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
         &wrong,
         "there is no image called `PRIMARY`; found `SCI`, `ERR`, `DQ`, `SCI`",
     );
+    refused(
+        &[&sky[..], &["--mask", text(&parts_file)]].concat(),
+        "parts.fits: image 1, plane 1: the mask is the image itself; expected another (--mask-extension)",
+    );
+    // What is called a mask may be one.
+    let called: Vec<(&str, &[f32])> = flags.iter().map(|flag| ("MASK", &flag[..])).collect();
+    let named = at("named.fits");
+    fs::write(&named, named_extensions(&called, 24)).unwrap();
+    let found = gathered(
+        root.path(),
+        &[&sky[..], &["--mask", text(&named)]].concat(),
+        24,
+    );
+    assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
+    let pair = ["--mask", text(&mask), text(&named)];
+    refused(
+        &[&cut[..], &pair].concat(),
+        "named.fits: this is a second file",
+    );
     let three = at("three.fits");
     fs::write(&three, cube(&flags[..3], 24)).unwrap();
     refused(
