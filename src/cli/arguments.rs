@@ -101,18 +101,26 @@ impl Printing {
         !self.figures.is_empty()
     }
 
+    /// The figures that are asked for of a table.
+    fn chosen(&self, table: &Table) -> anyhow::Result<Table> {
+        table.chosen(&self.figures).map_err(|unknown| {
+            let known = table.figures().join(", ");
+            anyhow::anyhow!("--figures: no figure is called {unknown:?}; expected some of {known}")
+        })
+    }
+
+    /// Refuses figures that such a table does not have, before anything is written.
+    pub(super) fn check(&self, table: &Table) -> anyhow::Result<()> {
+        self.chosen(table).map(|_| ())
+    }
+
     /// Prints a table.
     ///
     /// # Errors
     /// Where a figure that is asked for is no column of it.
     pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
-        if !self.figures.is_empty() {
-            let chosen = table.chosen(&self.figures).map_err(|unknown| {
-                let known = table.figures().join(", ");
-                anyhow::anyhow!(
-                    "--figures: no figure is called {unknown:?}; expected some of {known}"
-                )
-            })?;
+        if self.chooses() {
+            let chosen = self.chosen(table)?;
             return match (self.form.format, self.wide) {
                 (TableFormat::Table, true) => print(&fitted(&chosen, None)),
                 _ => self.form.print(&chosen),

@@ -168,6 +168,9 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             let data = data.map_or_else(|| run.source.data(measured), Ok)?;
             let scored = score_folder(&data, measured, &run, sets, options, threads)?;
             if let Some(store) = &arguments.store {
+                arguments
+                    .printing
+                    .check(&per_set(&scored, "", options.definition))?;
                 let made = Measured::run(&run, &data, measured)?;
                 record(store, made, &scored, options)?;
             }
@@ -183,6 +186,9 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             let scored = score_sets(&data, sets, catalogues, &read, options, threads)
                 .with_context(|| path.display().to_string())?;
             if let Some(store) = &arguments.store {
+                arguments
+                    .printing
+                    .check(&per_set(&scored, "", options.definition))?;
                 let made = Measured {
                     name: &foreign.name,
                     settings: crate::io::open::read_to_string(path, crate::io::open::SETTINGS)

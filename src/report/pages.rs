@@ -164,6 +164,7 @@ pub fn contest(table: &Table) -> PanelGrid {
         LinePlot {
             title: label.into(),
             x_label: "set".into(),
+            x_whole: true,
             y_label: label.into(),
             series,
             ..LinePlot::default()

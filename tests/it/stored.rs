@@ -168,3 +168,23 @@ fn what_is_no_file_of_a_store_is_refused_by_name() {
     let message = fail(&["compare", "--store", text(&recorded.at("empty"))]);
     assert!(message.contains("there is no recorded run"), "{message}");
 }
+
+#[test]
+fn figures_are_chosen_beside_what_names_a_row_and_unknown_ones_refused_before_anything_is_kept() {
+    let recorded = Recorded::new();
+    let store = recorded.at("store");
+    let grouped = ["compare", "--store", text(&store), "--group-by", "set"];
+    let table = succeed(&[&grouped[..], &["--figures", "q,q", "--format", "csv"]].concat());
+    let mut lines = table.lines();
+    assert_eq!(lines.next(), Some("submission,run,set,sets,q,q_error"));
+    assert_eq!(lines.count(), 4);
+    let (raw, new) = (recorded.at("raw"), recorded.at("new"));
+    let score = ["score", "--measured", text(&raw), "--store", text(&new)];
+    let message = fail(&[&score[..], &["--figures", "q,nope"]].concat());
+    assert!(
+        message.contains("no figure is called \"nope\""),
+        "{message}"
+    );
+    assert!(message.contains("q_dn"), "{message}");
+    assert!(files(&new).is_empty());
+}

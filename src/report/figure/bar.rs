@@ -4,7 +4,7 @@ use super::colour::{INK, series_colour};
 use super::legend::{Entry, Legend, Sample};
 use super::line::{Frame, draw_error_bar};
 use super::scene::{Anchor, Scene, text_width};
-use super::ticks::{Axis, Direction, shown};
+use super::ticks::{Axis, Direction, Scale, shown};
 use super::{Figure, FigureError, LABEL_SIZE, MARGIN, TICK_SIZE, TITLE_SIZE};
 
 /// The bars of one variant, one per category.
@@ -104,7 +104,14 @@ impl Figure for BarPlot {
             (0.0, 1.0)
         };
         let none = std::iter::empty();
-        let axis = Axis::new(none, Some(range), false, height, TICK_SIZE, Direction::Up);
+        let axis = Axis::new(
+            none,
+            Some(range),
+            Scale::Linear,
+            height,
+            TICK_SIZE,
+            Direction::Up,
+        );
 
         let names_height = if upright { widest } else { TICK_SIZE };
         let entries: Vec<Entry> = self

@@ -3,7 +3,7 @@
 use super::colour::{GRID, INK, Rgb, series_colour};
 use super::legend::{Entry, Legend, Sample};
 use super::scene::{Anchor, Point, Scene};
-use super::ticks::{Axis, Direction, TINIEST, shown};
+use super::ticks::{Axis, Direction, Scale, TINIEST, shown};
 use super::{Figure, FigureError, LABEL_SIZE, MARGIN, TICK_SIZE, TITLE_SIZE};
 
 /// How a series is drawn.
@@ -100,6 +100,8 @@ pub struct LinePlot {
     pub y_label: String,
     /// Whether the horizontal axis is logarithmic.
     pub x_log: bool,
+    /// Whether the horizontal axis is of whole numbers, as those of sets.
+    pub x_whole: bool,
     /// Whether the vertical axis is logarithmic.
     pub y_log: bool,
     /// The ends of the horizontal axis; from the data if there are none.
@@ -141,7 +143,10 @@ impl LinePlot {
             Axis::new(
                 x,
                 self.x_range,
-                self.x_log,
+                match self.x_whole {
+                    true => Scale::Whole,
+                    false => Scale::log(self.x_log),
+                },
                 width,
                 TICK_SIZE,
                 Direction::Across,
@@ -149,7 +154,7 @@ impl LinePlot {
             Axis::new(
                 y,
                 self.y_range,
-                self.y_log,
+                Scale::log(self.y_log),
                 height,
                 TICK_SIZE,
                 Direction::Up,

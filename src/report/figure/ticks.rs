@@ -23,6 +23,25 @@ pub(super) struct Axis {
     pub factor: Option<String>,
 }
 
+/// How values are laid along an axis.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Scale {
+    Linear,
+    /// Linear, of whole numbers: no tick lies between them.
+    Whole,
+    Logarithmic,
+}
+
+impl Scale {
+    /// Logarithmic or not.
+    pub(super) fn log(log: bool) -> Self {
+        match log {
+            true => Scale::Logarithmic,
+            false => Scale::Linear,
+        }
+    }
+}
+
 /// How labels follow each other along an axis, which limits how many fit.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Direction {
@@ -45,11 +64,12 @@ impl Axis {
     pub(super) fn new(
         values: impl Iterator<Item = f64>,
         range: Option<(f64, f64)>,
-        log: bool,
+        scale: Scale,
         length: f64,
         size: f64,
         direction: Direction,
     ) -> Self {
+        let log = scale == Scale::Logarithmic;
         let range = range.filter(|&(low, high)| shown(low, log) && shown(high, log) && low < high);
         let (low, high) = range.unwrap_or_else(|| padded(values, log));
         let mut axis = Self {
@@ -73,7 +93,8 @@ impl Axis {
         let (ticks, minor, factor) = match log.then(|| log_ticks(low, high, &fits)).flatten() {
             Some((ticks, minor)) => (ticks, minor, None),
             None => {
-                let (ticks, factor) = linear_ticks(low, high, &fits);
+                let least = if scale == Scale::Whole { 1.0 } else { 0.0 };
+                let (ticks, factor) = linear_ticks(low, high, least, &fits);
                 (ticks, Vec::new(), factor)
             }
         };
@@ -128,10 +149,12 @@ fn padded(values: impl Iterator<Item = f64>, log: bool) -> (f64, f64) {
     }
 }
 
-/// Round ticks on a linear axis, as many as fit up to nine, and the factor taken out of the labels.
+/// Round ticks on a linear axis, as many as fit up to nine and no nearer than `least`, and the factor taken out of the
+/// labels.
 fn linear_ticks(
     low: f64,
     high: f64,
+    least: f64,
     fits: &dyn Fn(&[Tick]) -> bool,
 ) -> (Vec<Tick>, Option<String>) {
     let largest = low.abs().max(high.abs());
@@ -145,7 +168,7 @@ fn linear_ticks(
     let scale = 10_f64.powi(exponent);
     let mut coarsest = Vec::new();
     for wanted in (1..=8).rev() {
-        let step = round_step((high - low) / f64::from(wanted));
+        let step = round_step((high - low) / f64::from(wanted)).max(least);
         let decimals = (exponent as f64 - (step * 1.0001).log10().floor()).max(0.0) as usize;
         let ticks: Vec<Tick> = multiples(step, low, high)
             .map(|value| Tick {
@@ -306,11 +329,29 @@ mod tests {
         Axis::new(
             values.iter().copied(),
             range,
-            log,
+            Scale::log(log),
             400.0,
             12.0,
             Direction::Up,
         )
+    }
+
+    #[test]
+    fn whole_numbers_have_no_ticks_between_them() {
+        let axis = |low: f64, high: f64| {
+            let range = Some((low, high));
+            Axis::new(
+                std::iter::empty(),
+                range,
+                Scale::Whole,
+                400.0,
+                12.0,
+                Direction::Up,
+            )
+        };
+        assert_eq!(labels(&axis(1.8, 2.2)), ["2"]);
+        assert_eq!(labels(&axis(0.9, 4.1)), ["1", "2", "3", "4"]);
+        assert_eq!(labels(&axis(0.0, 24.0)), ["0", "5", "10", "15", "20"]);
     }
 
     #[test]
