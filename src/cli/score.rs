@@ -168,11 +168,8 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             let data = data.map_or_else(|| run.source.data(measured), Ok)?;
             let scored = score_folder(&data, measured, &run, sets, options, threads)?;
             if let Some(store) = &arguments.store {
-                arguments
-                    .printing
-                    .check(&per_set(&scored, "", options.definition))?;
                 let made = Measured::run(&run, &data, measured)?;
-                record(store, made, &scored, options)?;
+                record_printable(arguments, store, made, &scored, options)?;
             }
             let unscored = unscored(&data, &scored, sets)?;
             let made_by = made_by(&run, measured)?;
@@ -186,9 +183,6 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             let scored = score_sets(&data, sets, catalogues, &read, options, threads)
                 .with_context(|| path.display().to_string())?;
             if let Some(store) = &arguments.store {
-                arguments
-                    .printing
-                    .check(&per_set(&scored, "", options.definition))?;
                 let made = Measured {
                     name: &foreign.name,
                     settings: crate::io::open::read_to_string(path, crate::io::open::SETTINGS)
@@ -196,7 +190,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
                     source: &Source::folder(&data, path.parent().unwrap_or(path))?,
                     data: &data,
                 };
-                record(store, made, &scored, options)?;
+                record_printable(arguments, store, made, &scored, options)?;
             }
             let unscored = unscored(&data, &scored, sets)?;
             let made_by = [("Catalogues", path.as_path()), ("Data", data.root())]
@@ -211,6 +205,19 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
     arguments.printing.print(&table)?;
     let sections = || Ok(vec![pages::scores(&name, &scored, table)?]);
     arguments.report.save(&title, sections, made_by)
+}
+
+/// Records scores that can be printed as asked for: nothing is kept of a command that fails after it.
+fn record_printable(
+    arguments: &Arguments,
+    store: &Path,
+    measured: Measured<'_>,
+    scored: &[ScoredSet],
+    options: Options,
+) -> anyhow::Result<()> {
+    let table = per_set(scored, "", options.definition);
+    arguments.printing.check(&table)?;
+    record(store, measured, scored, options)
 }
 
 /// What made the catalogues of a run, for reports.

@@ -462,22 +462,11 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut Lags,
     ) {
-        let SpectralScratch {
-            plane,
-            stamp,
-            windows: [across, down],
-            ..
-        } = scratch;
-        self.signs(seed, &mut plane.half[0]);
-        let [u, x, y] = &mut plane.half;
-        for (at, value) in u.iter_mut().enumerate() {
-            *value *= psf.field[at];
+        self.field_of(seed, scratch, out, |at, sign| {
+            let field = sign * psf.field[at];
             let [first, second] = psf.field_tilts[at];
-            x[at] = *value * first;
-            y[at] = *value * second;
-        }
-        self.plane.window(across, down, plane);
-        self.changes(stamp, plane, out);
+            [field, field * first, field * second]
+        });
     }
 
     /// Writes to `acf` how the autocorrelation of the stamp last given would change further, were the PSF behind the field
@@ -489,6 +478,21 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut Lags,
     ) {
+        self.field_of(seed, scratch, out, |at, sign| {
+            let lack = sign * (psf.field[at] * psf.turned[at]);
+            [lack, Complex32::ZERO, Complex32::ZERO]
+        });
+    }
+
+    /// Writes how the autocorrelation of the stamp last given changes with three changes of v̂, before the window: what
+    /// `modes` makes of each mode of a field of noise.
+    fn field_of(
+        &self,
+        seed: u64,
+        scratch: &mut SpectralScratch,
+        out: &mut Lags,
+        modes: impl Fn(usize, Complex32) -> [Complex32; 3],
+    ) {
         let SpectralScratch {
             plane,
             stamp,
@@ -498,9 +502,7 @@ impl Spectral {
         self.signs(seed, &mut plane.half[0]);
         let [u, x, y] = &mut plane.half;
         for (at, value) in u.iter_mut().enumerate() {
-            *value *= psf.field[at] * psf.turned[at];
-            x[at] = Complex32::ZERO;
-            y[at] = Complex32::ZERO;
+            [*value, x[at], y[at]] = modes(at, *value);
         }
         self.plane.window(across, down, plane);
         self.changes(stamp, plane, out);
