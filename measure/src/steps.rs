@@ -22,8 +22,9 @@ pub struct Steps {
     /// Autocorrelation, zero lag in the middle: all lags for the network, those that the weight
     /// reaches for the linear one.
     pub acf: Array2<f64>,
-    /// The same, NaN beyond the radius within which it is used.
-    pub clipped: Array2<f64>,
+    /// The same under the weight that its moments have, which for the network is none; NaN beyond the radius within
+    /// which it is used.
+    pub used: Array2<f64>,
 }
 
 impl Worker {
@@ -49,14 +50,15 @@ impl Worker {
         let Images {
             deconvolved,
             acf,
+            weight,
             spacing,
         } = self.method.images(&self.cut, psf);
         let reconvolved = convolve(deconvolved.view(), psf);
         let middle = (acf.nrows() / 2) as f64;
-        let clipped = Array2::from_shape_fn(acf.dim(), |at| {
+        let used = Array2::from_shape_fn(acf.dim(), |at| {
             let (dy, dx) = (at.0 as f64 - middle, at.1 as f64 - middle);
             if dy.hypot(dx) * spacing <= measurement.radius {
-                acf[at]
+                acf[at] * weight.as_ref().map_or(1.0, |weight| weight[at])
             } else {
                 f64::NAN
             }
@@ -66,7 +68,7 @@ impl Worker {
             stamp,
             deconvolved,
             acf,
-            clipped,
+            used,
         })
     }
 }

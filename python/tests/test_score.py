@@ -176,6 +176,16 @@ def test_catalogues_are_compared_over_the_same_images():
     assert rows[2]["q_published"] == 80.33 and np.isnan(rows[1]["q_published"])
     few = shearq.compare({"mine": raw[:7], "48/linear/star": linear[:7]}, simulation, frame="list")
     assert np.isfinite(few[1]["q_difference"]) and np.isnan(few[1]["sigma"])
+    # A method that halves the shear differs in Q, and not in calibrated Q beyond what rounding leaves.
+    draw = np.random.default_rng(3).normal
+    good = [{"e1": simulation.g1 + draw(0, 0.005, (16, 16)), "e2": simulation.g2 + draw(0, 0.005, (16, 16))} for _ in range(8)]
+    half = [{name: 0.5 * catalogue[name] for name in catalogue} for catalogue in good]
+    halved = shearq.compare({"good": good, "half": half}, simulation, frame="list")[1]
+    assert halved["sigma"] < -3 and abs(halved["q_calibrated_difference"]) < 1e-6 * halved["q_calibrated"]
+    noisy = [{name: catalogue[name] + draw(0, 0.02, (16, 16)) for name in catalogue} for catalogue in good]
+    noisier = shearq.compare({"good": good, "noisy": noisy}, simulation, frame="list")[1]
+    calibrated = noisier["q_calibrated_difference"]
+    assert calibrated < 0 and noisier["q_calibrated_sigma"] == calibrated / noisier["q_calibrated_difference_error"]
     pandas = pytest.importorskip("pandas", reason="frames of pandas need it")
     frame = shearq.compare({"mine": raw[0]}, (simulation.g1, simulation.g2), frame="pandas")
     assert isinstance(frame, pandas.DataFrame) and frame.shape == (1, len(rows[0]))

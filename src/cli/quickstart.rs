@@ -20,7 +20,7 @@ use crate::report::pages;
 use crate::report::scores::per_set;
 use crate::report::table::Cell;
 use crate::report::terminal::wrapped;
-use crate::results::compare::{by_name, mean_figure, score_all};
+use crate::results::compare::{Paired, by_name, difference, mean_figure, score_all};
 use crate::results::row::SetRecord;
 use crate::results::score::{OWN, score_folder};
 use crate::simulate::set::SimulationSettings;
@@ -113,6 +113,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Significance from which one submission is said to be better than another.
+const CLEAR: f64 = 3.0;
+
 /// Which submission to use, and the figures that say so.
 fn verdict(submissions: &[(String, Vec<SetRecord>)]) -> String {
     let mean = |sets: &[SetRecord], name: &str| mean_figure(sets, name).0;
@@ -126,22 +129,35 @@ fn verdict(submissions: &[(String, Vec<SetRecord>)]) -> String {
     };
     let shown = |sets: &[SetRecord], name: &str, decimals: usize| {
         let (value, error) = mean_figure(sets, name);
-        match Cell::with_error(value, Some(error), decimals).figures() {
-            Some((value, Some(error))) => format!("{value} ± {error}"),
-            _ => "unknown".into(),
-        }
+        Cell::with_error(value, Some(error), decimals).in_words()
     };
-    let others: Vec<String> = submissions
-        .iter()
-        .filter(|(other, _)| other != name)
-        .map(|(other, sets)| {
+    let rivals = || submissions.iter().filter(|(other, _)| other != name);
+    let behind = |others: &[SetRecord]| difference(Paired::Calibrated, others, sets);
+    let others: Vec<String> = rivals()
+        .map(|(other, others)| {
+            let behind = behind(others).map_or(String::new(), |d| {
+                let lower = Cell::with_error(d.difference, Some(d.error), 1);
+                format!(", lower by {}", lower.in_words())
+            });
             format!(
-                "{other} has m = {} and Q calibrated = {}",
-                shown(sets, "m_cross", 2),
-                shown(sets, "q_calibrated", 1)
+                "{other} has m = {} and Q calibrated = {}{behind}",
+                shown(others, "m_cross", 2),
+                shown(others, "q_calibrated", 1)
             )
         })
         .collect();
+    // Neither is one told from another that has no calibrated Q.
+    let untold: Vec<&str> = rivals()
+        .filter(|(_, others)| !behind(others).is_some_and(|d| d.sigma() >= CLEAR))
+        .map(|(other, _)| other.as_str())
+        .collect();
+    let lead = match untold.is_empty() {
+        true => format!("Use {name}"),
+        false => format!(
+            "{name} has the highest Q calibrated, which these images do not tell from that of {}",
+            untold.join(" and ")
+        ),
+    };
     // Where images are few, Q itself can rank otherwise.
     let raised = submissions
         .iter()
@@ -156,11 +172,11 @@ fn verdict(submissions: &[(String, Vec<SetRecord>)]) -> String {
         ),
     };
     format!(
-        "Use {name}: m = {}, noise {} a galaxy once calibrated, and Q calibrated = {}; {}.{warning}",
+        "{lead}: m = {}, noise {} a galaxy once calibrated, and Q calibrated = {}; {}.{warning}",
         shown(sets, "m_cross", 2),
         shown(sets, "galaxy_noise", 3),
         shown(sets, "q_calibrated", 1),
-        others.join(", ")
+        others.join("; ")
     )
 }
 
@@ -169,4 +185,74 @@ fn next_step(out: &Path) -> String {
         "shearq show --submission 48/linear/star --data {} --galaxy 8/1/1 --out galaxy.png",
         out.join("data").display()
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shearq_scoring::Figures;
+
+    /// A submission with one set of eight images, whose calibrated Q is that of `replicates` without any.
+    fn submission(
+        name: &str,
+        q: f64,
+        calibrated: f64,
+        replicates: [f64; 8],
+    ) -> (String, Vec<SetRecord>) {
+        let with = |q, q_calibrated, m_cross| Figures {
+            q,
+            q_calibrated,
+            m_cross,
+            ..Figures::unknown()
+        };
+        let record = SetRecord {
+            set: 2,
+            data: String::new(),
+            images: (1..=8).collect(),
+            galaxies: 8,
+            flagged: 0,
+            figures: with(q, calibrated, -0.3),
+            errors: with(0.1, 2.0, 0.01),
+            q_replicates: vec![q; 8],
+            q_calibrated_replicates: replicates.map(|off| calibrated + off).to_vec(),
+            q_leaderboard: q,
+            convention: 5,
+            convention_known: true,
+            convention_leaderboard: 5,
+        };
+        (name.into(), vec![record])
+    }
+
+    #[test]
+    fn a_submission_is_named_where_its_images_tell_it_from_the_others() {
+        let common = [0.5, -0.5, 0.5, -0.5, 0.5, -0.5, 0.5, -0.5];
+        let own = [0.7, -0.7, 0.3, -0.3, 0.7, -0.7, 0.3, -0.3];
+        let better = submission("b", 10.0, 25.0, own);
+        // The noise that both have in common takes their errors of 2 down to √(7/8 · Σ 0.2²) = 0.53.
+        let told = verdict(&[submission("a", 12.0, 20.0, common), better.clone()]);
+        assert!(told.starts_with("Use b: m = -0.300 ± 0.010"), "{told}");
+        assert!(
+            told.contains("Q calibrated = 20.0 ± 2.0, lower by 5.00 ± 0.53"),
+            "{told}"
+        );
+        assert!(
+            told.contains("Q itself is higher for a, which lose shear"),
+            "{told}"
+        );
+        let untold = verdict(&[submission("a", 9.0, 24.0, common), better.clone()]);
+        let start =
+            "b has the highest Q calibrated, which these images do not tell from that of a: m";
+        assert!(
+            untold.starts_with(start) && !untold.contains("itself"),
+            "{untold}"
+        );
+        let unknown = verdict(&[submission("a", 9.0, f64::NAN, common), better]);
+        assert!(unknown.contains("do not tell from that of a"), "{unknown}");
+        assert!(
+            unknown.contains("a has m = -0.300 ± 0.010 and Q calibrated = unknown"),
+            "{unknown}"
+        );
+        let none = verdict(&[submission("a", 9.0, f64::NAN, common)]);
+        assert!(none.starts_with("So few data"), "{none}");
+    }
 }

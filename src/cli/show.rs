@@ -70,7 +70,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     PictureFormat::of(out)?;
     let submission = Registry::embedded()?.get(submission)?.submission;
     let data = DataFolder::open(data)?;
-    let mut rows = Vec::new();
+    let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
         let measurer = Measurer::new(&submission, source.mosaic().stamp)?;
@@ -111,20 +111,36 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             measured.flags
         );
         let steps = worker.steps(stamp, psf.view(), &measured)?;
+        let own_response = response(&measured, "\nR ");
+        responses |= !own_response.is_empty();
         let label = format!(
-            "{}/{}/{index}: {:+.3}, {:+.3}",
+            "{}/{}/{index}: {:+.3}, {:+.3}{own_response}",
             image.set, image.image, measured.e1, measured.e2
         );
         rows.push(steps_row(&label, psf, steps));
         print(&format!("{}\n", describe(image, index, &measured)))?;
     }
     let title = format!(
-        "{}; set/image/galaxy: e1, e2 before calibration",
-        submission.name
+        "{}; set/image/galaxy: e1, e2 before calibration{}",
+        submission.name,
+        match responses {
+            true => "; R: their response to shear",
+            false => "",
+        }
     );
     steps_figure(&title, rows).save(out)?;
     tell(format_args!("wrote {}", out.display()));
     Ok(())
+}
+
+/// The galaxy's own response to shear after `lead`, where the method knows it.
+fn response(measured: &Measurement, lead: &str) -> String {
+    match measured.response {
+        [first, second] if first.is_finite() && second.is_finite() => {
+            format!("{lead}{first:.3}, {second:.3}")
+        }
+        _ => String::new(),
+    }
 }
 
 fn describe(id: ImageId, index: usize, m: &Measurement) -> String {
@@ -139,11 +155,12 @@ fn describe(id: ImageId, index: usize, m: &Measurement) -> String {
         format!("{} iterations ({ended})", d.iterations)
     });
     format!(
-        "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4} before calibration, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",
+        "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4} before calibration{}, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",
         id.set,
         id.image,
         m.e1,
         m.e2,
+        response(m, ", response "),
         m.flags.bits(),
         m.noise,
         m.radius

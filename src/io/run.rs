@@ -206,6 +206,13 @@ impl Numbers for f64 {
     }
 }
 
+impl Numbers for Vec<f64> {
+    type Form = Vec<Option<f64>>;
+    fn from_form(form: Vec<Option<f64>>) -> Self {
+        form.into_iter().map(f64::from_form).collect()
+    }
+}
+
 impl<const N: usize> Numbers for [f64; N]
 where
     [Option<f64>; N]: DeserializeOwned,

@@ -1,4 +1,4 @@
-//! Submissions and recorded runs side by side: the means of their figures, differences in Q, and Q per set.
+//! Submissions and recorded runs side by side: the means of their figures, differences in Q and calibrated Q, and Q per set.
 
 use std::borrow::Borrow;
 use std::collections::BTreeSet;
@@ -12,7 +12,7 @@ use shearq_tables::polars::AnyValue;
 use super::figure::{ColourMap, HeatMap};
 use super::scores::{best_is_another, definition_note, notes};
 use super::table::{Cell, Heading, Table};
-use crate::results::compare::{Variant, common_sets, mean_figure, q_difference};
+use crate::results::compare::{Paired, Variant, common_sets, difference, mean_figure};
 use crate::results::groups::{Group, Grouping};
 use crate::results::row::{RunRecord, SetRecord};
 
@@ -46,16 +46,45 @@ fn leaderboard_cell(sets: &[&SetRecord]) -> Cell {
     Cell::number(sum / sets.len() as f64, 2)
 }
 
-/// Cells of a difference in Q and of its significance.
-fn difference_cells(difference: Option<PairedDifference>) -> [Cell; 2] {
+/// Differences from the first in Q and in calibrated Q; absent of the first itself.
+type Differences = Option<[Option<PairedDifference>; 2]>;
+
+/// Those of `sets` from `first`.
+fn differences<R: Borrow<SetRecord>>(first: &[R], sets: &[R]) -> [Option<PairedDifference>; 2] {
+    [Paired::Q, Paired::Calibrated].map(|figure| difference(figure, first, sets))
+}
+
+/// Headings of Q and calibrated Q, each with its difference and that one's significance.
+fn q_headings() -> [Heading; 6] {
     [
-        Cell::with_error(
-            difference.map_or(f64::NAN, |d| d.difference),
-            difference.map(|d| d.error),
-            2,
-        ),
-        Cell::number(difference.map_or(f64::NAN, |d| d.sigma()), 1),
+        figure_heading("q"),
+        Heading::new("q_difference", "ΔQ to first"),
+        Heading::new("sigma", "in σ"),
+        figure_heading("q_calibrated"),
+        Heading::new("q_calibrated_difference", "ΔQ cal."),
+        Heading::new("q_calibrated_sigma", "in σ"),
     ]
+}
+
+/// Their cells.
+fn q_cells(sets: &[&SetRecord], differences: Differences) -> Vec<Cell> {
+    let differences = differences.unwrap_or_default();
+    let of = |(name, found): (&str, Option<PairedDifference>)| {
+        [
+            mean_cell(sets, name),
+            Cell::with_error(
+                found.map_or(f64::NAN, |d| d.difference),
+                found.map(|d| d.error),
+                2,
+            ),
+            Cell::number(found.map_or(f64::NAN, |d| d.sigma()), 1),
+        ]
+    };
+    ["q", "q_calibrated"]
+        .into_iter()
+        .zip(differences)
+        .flat_map(of)
+        .collect()
 }
 
 /// Why differences are absent, if any are.
@@ -73,12 +102,9 @@ fn unpaired_note(names: &[&str]) -> Option<String> {
 pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     let records: Vec<Vec<SetRecord>> = variants.iter().map(Variant::records).collect();
     let common = common_sets(&records);
-    let headings = vec![
-        Heading::new("submission", "Submission"),
-        figure_heading("q"),
-        Heading::new("q_difference", "ΔQ to first"),
-        Heading::new("sigma", "in σ"),
-        figure_heading("q_calibrated"),
+    let mut headings = vec![Heading::new("submission", "Submission")];
+    headings.extend(q_headings());
+    headings.extend([
         figure_heading("galaxy_noise"),
         figure_heading("m_cross"),
         leaderboard_heading(records.iter().flatten()),
@@ -88,7 +114,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
         Heading::new("q_published", "Q publ."),
         Heading::new("m_half_published", "M/2 publ."),
         Heading::new("sqrt_a_published", "√A publ."),
-    ];
+    ]);
     let shown: Vec<&str> = headings.iter().map(|heading| heading.key).collect();
     let others = || {
         Figures::ALL
@@ -105,20 +131,16 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             .iter()
             .filter(|set| common.contains(&set.set))
             .collect();
-        let difference = first.as_ref().and_then(|first| q_difference(first, &sets));
-        if first.is_some() && difference.is_none() {
+        let differences = first.as_ref().map(|first| differences(first, &sets));
+        if matches!(differences, Some([None, _])) {
             unpaired.push(variant.name.as_str());
         }
         let published = |value: fn(&Published) -> f64, decimals: usize| {
             Cell::number(variant.published.as_ref().map_or(f64::NAN, value), decimals)
         };
-        let [delta, sigma] = difference_cells(difference);
-        let mut row = vec![
-            Cell::text(&variant.name),
-            mean_cell(&sets, "q"),
-            delta,
-            sigma,
-            mean_cell(&sets, "q_calibrated"),
+        let mut row = vec![Cell::text(&variant.name)];
+        row.extend(q_cells(&sets, differences));
+        row.extend([
             mean_cell(&sets, "galaxy_noise"),
             mean_cell(&sets, "m_cross"),
             leaderboard_cell(&sets),
@@ -128,7 +150,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             published(|p| p.q, 2),
             published(|p| p.m_half, 4),
             published(|p| p.sqrt_a, 4),
-        ];
+        ]);
         row.extend(others().map(|figure| mean_cell(&sets, figure.name)));
         rows.push(row);
         first.get_or_insert(sets);
@@ -138,7 +160,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     let mut lines = vec![
         format!("Means over sets {}; {images} images in all.", list.join(", ")),
         definition_note(definition),
-        "ΔQ: jackknife of the paired difference on the same images, without an error where a set has fewer than eight. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
+        "ΔQ, ΔQ cal.: from the first, with the jackknife's error of the paired difference on the same images, without an error where a set has fewer than eight. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
     ];
     lines.extend(unpaired_note(&unpaired));
     for variant in variants {
@@ -175,10 +197,9 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
     headings.extend([
         Heading::new("sets", "Sets"),
         Heading::new("images", "Images"),
-        figure_heading("q"),
-        Heading::new("q_difference", "ΔQ to first"),
-        Heading::new("sigma", "in σ"),
-        figure_heading("q_calibrated"),
+    ]);
+    headings.extend(q_headings());
+    headings.extend([
         figure_heading("galaxy_noise"),
         figure_heading("m_cross"),
         leaderboard_heading(groups.iter().flat_map(|group| group.sets.iter().copied())),
@@ -190,10 +211,11 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
     let mut unpaired = Vec::new();
     for (k, group) in groups.iter().enumerate() {
         let first = groups[..k].iter().find(|other| other.value == group.value);
-        let difference = first
-            .filter(|first| first.run.definition == group.run.definition)
-            .and_then(|first| q_difference(&first.sets, &group.sets));
-        if first.is_some() && difference.is_none() && !unpaired.contains(&group.id.as_str()) {
+        let differences = first.map(|first| match first.run.definition == group.run.definition {
+            true => differences(&first.sets, &group.sets),
+            false => [None; 2],
+        });
+        if matches!(differences, Some([None, _])) && !unpaired.contains(&group.id.as_str()) {
             unpaired.push(group.id.as_str());
         }
         let mut row = vec![
@@ -208,11 +230,9 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
         row.extend([
             Cell::text(ranges(&group.sets)),
             Cell::number(group.images() as f64, 0),
-            mean_cell(&group.sets, "q"),
         ]);
-        row.extend(difference_cells(difference));
+        row.extend(q_cells(&group.sets, differences));
         row.extend([
-            mean_cell(&group.sets, "q_calibrated"),
             mean_cell(&group.sets, "galaxy_noise"),
             mean_cell(&group.sets, "m_cross"),
             leaderboard_cell(&group.sets),
@@ -247,7 +267,7 @@ fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[&str]) 
         ways.join("; ")
     )];
     if grouping.is_some() {
-        notes.push("ΔQ: from the first row of the same group.".into());
+        notes.push("ΔQ, ΔQ cal.: from the first row of the same group.".into());
     }
     if several {
         notes.push("Warning: these runs were scored in different ways; choose one with --where definition=... or choice=...".into());

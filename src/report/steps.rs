@@ -23,7 +23,7 @@ pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
             panel("Deconvolved", steps.deconvolved, Viridis, Stretch::Linear),
             panel("Residual", steps.residual, Diverging, Stretch::Linear),
             panel("ACF", steps.acf, Viridis, Stretch::Linear),
-            panel("ACF used", steps.clipped, Viridis, Stretch::Linear),
+            panel("ACF used", steps.used, Viridis, Stretch::Linear),
         ],
     }
 }

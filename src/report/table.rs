@@ -95,6 +95,15 @@ impl Cell {
         Some((shown(*value), error.map(shown)))
     }
 
+    /// A number as a sentence has it: with its error, or the word that this is not known.
+    pub fn in_words(&self) -> String {
+        match self.figures() {
+            Some((number, Some(error))) => format!("{number} ± {error}"),
+            Some((number, None)) if number != "–" => format!("{number} (error unknown)"),
+            _ => "unknown".into(),
+        }
+    }
+
     /// For people, words by `escape`; `latex` wraps numbers in mathematics.
     fn print(&self, escape: fn(&str) -> String, latex: bool) -> String {
         match (self, self.figures()) {

@@ -1,4 +1,4 @@
-//! Results held against each other: which sets they share, means over them, and paired differences in Q.
+//! Results held against each other: which sets they share, means over them, and paired differences.
 
 use std::borrow::Borrow;
 use std::collections::BTreeSet;
@@ -216,25 +216,54 @@ pub fn mean_figure<R: Borrow<SetRecord>>(sets: &[R], name: &str) -> (f64, f64) {
     mean_over_sets(&pairs)
 }
 
-/// Paired difference in Q of `second` from `first`; `None` where they are not of the same sets, data
+/// A figure that is kept for every group of images left out, so that differences in it can be paired.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Paired {
+    /// Q.
+    Q,
+    /// Calibrated Q.
+    Calibrated,
+}
+
+impl Paired {
+    /// Its value of a set, and those with each group left out.
+    fn of(self, set: &SetRecord) -> (f64, &[f64]) {
+        match self {
+            Paired::Q => (set.figures.q, &set.q_replicates),
+            Paired::Calibrated => (set.figures.q_calibrated, &set.q_calibrated_replicates),
+        }
+    }
+}
+
+/// Paired difference in a figure of `second` from `first`; `None` where they are not of the same sets, data
 /// and images, or where noise may have chosen the convention of either.
-pub fn q_difference(first: &[&SetRecord], second: &[&SetRecord]) -> Option<PairedDifference> {
-    let same = |(a, b): (&&SetRecord, &&SetRecord)| {
+pub fn difference<R: Borrow<SetRecord>>(
+    figure: Paired,
+    first: &[R],
+    second: &[R],
+) -> Option<PairedDifference> {
+    let pairs = || {
+        let sets = first.iter().zip(second);
+        sets.map(|(a, b)| (a.borrow(), b.borrow()))
+    };
+    let same = |(a, b): (&SetRecord, &SetRecord)| {
         let known = a.convention_known && b.convention_known;
         known && a.set == b.set && a.data == b.data && a.images == b.images
     };
-    if first.len() != second.len() || !first.iter().zip(second).all(same) {
+    if first.len() != second.len() || !pairs().all(same) {
         return None;
     }
-    let pairs: Vec<PairedSet<'_>> = first
-        .iter()
-        .zip(second)
-        .map(|(a, b)| PairedSet {
-            images: a.images.len(),
-            first: a.figures.q,
-            first_replicates: &a.q_replicates,
-            second: b.figures.q,
-            second_replicates: &b.q_replicates,
+    let pairs: Vec<PairedSet<'_>> = pairs()
+        .map(|(a, b)| {
+            let ((first, first_replicates), (second, second_replicates)) =
+                (figure.of(a), figure.of(b));
+            PairedSet {
+                images: a.images.len(),
+                first,
+                first_replicates,
+                second,
+                second_replicates,
+            }
         })
         .collect();
     paired_difference(&pairs)

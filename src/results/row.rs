@@ -12,7 +12,7 @@ use super::score::ScoredSet;
 use crate::io::FileError;
 use crate::io::fingerprint::{self, Fingerprint};
 use crate::io::layout::DataFolder;
-use crate::io::run::{Run, Source};
+use crate::io::run::{Run, Source, nan_for_null};
 use crate::pipeline::PipelineError;
 use crate::simulate::kinds::SetKind;
 
@@ -35,6 +35,9 @@ pub struct SetRecord {
     pub errors: Figures,
     /// Q with each group of images left out in turn, for paired differences.
     pub q_replicates: Vec<f64>,
+    /// Calibrated Q likewise; empty in records of versions that did not keep it.
+    #[serde(default, deserialize_with = "nan_for_null")]
+    pub q_calibrated_replicates: Vec<f64>,
     /// The leaderboard's Q: the best of the eight conventions.
     pub q_leaderboard: f64,
     /// Number of the chosen convention.
@@ -64,6 +67,7 @@ impl SetRecord {
             figures: score.figures,
             errors: score.errors,
             q_replicates: score.replicates.iter().map(|r| r.q).collect(),
+            q_calibrated_replicates: score.replicates.iter().map(|r| r.q_calibrated).collect(),
             q_leaderboard: score.conventions[score.best.index()].quality.q,
             convention: score.chosen.number(),
             convention_known: basis.is_known(),
@@ -300,6 +304,9 @@ pub fn table_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
             u64::from(set.convention_leaderboard)
         }),
         text("q_replicates", &|set| list(&set.q_replicates)),
+        text("q_calibrated_replicates", &|set| {
+            list(&set.q_calibrated_replicates)
+        }),
     ]);
     shearq_tables::frame(columns)
 }
@@ -389,6 +396,11 @@ impl Rows<'_> {
             figures: figures(&str::to_owned)?,
             errors: figures(&error_of)?,
             q_replicates: self.list("q_replicates", row)?,
+            // Earlier versions did not keep them.
+            q_calibrated_replicates: match self.table.column("q_calibrated_replicates") {
+                Ok(_) => self.list("q_calibrated_replicates", row)?,
+                Err(_) => Vec::new(),
+            },
             q_leaderboard: self.real("q_leaderboard", row)?,
             convention: self.count("convention", row)?,
             // Earlier versions let each set choose.

@@ -130,18 +130,21 @@ fn the_chain_ends_in_scores_that_every_format_carries() {
     assert!(compared["rows"][1]["q_published"].is_null());
     assert!(compared["rows"][1]["sigma"].is_number());
     let picture = at("figure.png");
-    succeed(&[
-        "show",
-        "--submission",
-        "23/raw/star",
-        "--data",
-        text(&at("data")),
-        "--galaxy",
-        "8/1/14",
-        "--out",
-        text(&picture),
-    ]);
-    assert!(fs::read(picture).unwrap().starts_with(b"\x89PNG"));
+    for (submission, responds) in [("23/raw/star", false), ("48/linear/star", true)] {
+        let shown = succeed(&[
+            "show",
+            "--submission",
+            submission,
+            "--data",
+            text(&at("data")),
+            "--galaxy",
+            "8/1/14",
+            "--out",
+            text(&picture),
+        ]);
+        assert!(fs::read(&picture).unwrap().starts_with(b"\x89PNG"));
+        assert_eq!(shown.contains(", response 0."), responds, "{shown}");
+    }
 }
 
 #[test]

@@ -98,6 +98,8 @@ fn a_store_gives_the_same_figures_as_the_folders_however_it_was_filled() {
                 "q_difference",
                 "q_difference_error",
                 "sigma",
+                "q_calibrated_difference",
+                "q_calibrated_sigma",
                 "m_half",
             ] {
                 assert_eq!(row[key], folders["rows"][k][key], "{store} {k} {key}");

@@ -57,6 +57,8 @@ pub(crate) struct Images {
     pub(crate) deconvolved: Array2<f64>,
     /// Zero lag in the middle.
     pub(crate) acf: Array2<f64>,
+    /// Weight of each lag in the moments, where it is not the same within the radius.
+    pub(crate) weight: Option<Array2<f64>>,
     /// Pixels between lags.
     pub(crate) spacing: f64,
 }

@@ -20,7 +20,7 @@
 
 use std::sync::Arc;
 
-use ndarray::ArrayView2;
+use ndarray::{Array2, ArrayView2};
 use shearq_submissions::LinearMethod;
 
 use super::found::{CutWorker, Found, Images, ResponseMatrix, Sheared, image, whole};
@@ -69,6 +69,8 @@ pub(super) struct LinearWorker {
     psf: SpectralPsf,
     buffers: SpectralScratch,
     lags: Lags,
+    /// What was found on them last.
+    shape: Option<AdaptiveShape>,
     /// Of a field of noise, and of what it lacks to be that of a PSF turned by 90 degrees.
     field: Lags,
     turned: Lags,
@@ -86,6 +88,7 @@ impl LinearWorker {
             surroundings: Surroundings::new(plan.spectral.stamp_size()),
             grain: 1.0,
             lags: plan.spectral.lags(),
+            shape: None,
             field: plan.spectral.lags(),
             turned: plan.spectral.lags(),
             shifted: plan.spectral.lags().acf,
@@ -168,6 +171,7 @@ impl CutWorker for LinearWorker {
         let softening = plan.softening * sigma * sigma * self.psf.noise_peak();
         let shape =
             cleared.and_then(|_| plan.moments.measure(&lags.acf, softening, &mut self.values));
+        self.shape = shape.as_ref().ok().copied();
         let mut response = [[f64::NAN; 2]; 2];
         let mut sheared_noise = None;
         if let Ok(shape) = &shape {
@@ -195,10 +199,18 @@ impl CutWorker for LinearWorker {
     }
 
     fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
-        let spectral = &self.plan.spectral;
+        let LinearPlan {
+            spectral, moments, ..
+        } = &*self.plan;
+        let acf = whole(&self.lags.acf, spectral.reach());
+        let lag = |place: usize| (place as f64 - spectral.reach() as f64) * spectral.spacing();
+        let weight = self.shape.map(|shape| {
+            Array2::from_shape_fn(acf.dim(), |(y, x)| moments.weight(&shape, lag(x), lag(y)))
+        });
         Images {
             deconvolved: image(&spectral.deconvolved(psf, cut), spectral.stamp_size()),
-            acf: whole(&self.lags.acf, spectral.reach()),
+            acf,
+            weight,
             spacing: spectral.spacing(),
         }
     }

@@ -92,6 +92,7 @@ impl CutWorker for NetworkWorker {
         Images {
             deconvolved: image(&self.deconvolved, n),
             acf: whole(self.acf_buffers.lags(), n - 1),
+            weight: None,
             spacing: 1.0,
         }
     }

@@ -200,6 +200,14 @@ impl AdaptiveMoments {
             .map(|row| f64::from(row[0] * moved[0] + row[1] * moved[1]))
     }
 
+    /// The weight W at lag (x, y), in pixels, that `shape` was found with.
+    pub fn weight(&self, shape: &AdaptiveShape, x: f64, y: f64) -> f64 {
+        let [chi1, chi2] = shape.chi.map(f64::from);
+        let q = f64::from(self.scale(shape.chi))
+            * ((1.0 - chi1) * x * x + (1.0 + chi1) * y * y - 2.0 * chi2 * x * y);
+        (1.0 + q).powf(-1.5)
+    }
+
     fn gather(&self, acf: &[f32], values: &mut [f32]) {
         for ((value, &at), &area) in values.iter_mut().zip(&self.at).zip(&self.area) {
             *value = acf[at as usize] * area;
@@ -314,6 +322,34 @@ mod tests {
             }
         }
         acf
+    }
+
+    #[test]
+    fn the_weight_is_that_of_the_moments() {
+        let (spacing, scale) = (1.5, 3.0);
+        let moments = AdaptiveMoments::new(scale, spacing, REACH);
+        let mut scratch = moments.scratch();
+        let acf = gaussian(spacing, 20.0, 0.3, -0.2);
+        let shape = moments.measure(&acf, 0.0, &mut scratch).unwrap();
+        let (mut all, mut extent, mut e2) = (0.0, 0.0, 0.0);
+        let side = REACH as i32;
+        for y in -side..=side {
+            for x in -side..=side {
+                if x * x + y * y > side * side {
+                    continue;
+                }
+                let (near, sign) = if y < 0 { (-y, -x) } else { (y, x) };
+                let value = acf[(near * (2 * side + 1) + sign + side) as usize];
+                let (x, y) = (f64::from(x) * spacing, f64::from(y) * spacing);
+                let weighted = f64::from(value) * moments.weight(&shape, x, y);
+                all += weighted;
+                extent += weighted * (x * x + y * y);
+                e2 += weighted * 2.0 * x * y;
+            }
+        }
+        // Sums of hundreds of f32 terms.
+        assert!((extent / all / shape.size - 1.0).abs() < 1e-5);
+        assert!((e2 / extent - shape.distortion.e2).abs() < 1e-5);
     }
 
     #[test]

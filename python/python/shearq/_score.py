@@ -238,7 +238,8 @@ def compare(
     -------
     pandas.DataFrame, polars.DataFrame or list of dict
         A row each: ``submission``, figures with their errors, ``q_difference`` to the first with its error, paired
-        over the same images, and its significance ``sigma`` (both from eight images on), ``q_leaderboard``, and the figures published for a
+        over the same images, and its significance ``sigma`` (both from eight images on), the same of calibrated Q
+        (``q_calibrated_difference``, ``q_calibrated_sigma``), ``q_leaderboard``, and the figures published for a
         submission of that name.
     """
     make = _frame(frame)
@@ -259,28 +260,40 @@ def compare(
     rows = []
     first = next(iter(scores.values()), None)
     for name, scored in scores.items():
-        q = list(scored.figures).index("q")
-        paired = None
-        if scored is not first:
-            paired = _shearq.difference(
-                scored.images, first["q"], list(first.replicates[:, q]), scored["q"], list(scored.replicates[:, q])
-            )
-        difference, error = (math.nan, math.nan) if paired is None else paired
+        paired: dict[str, float] = {}
+        for figure, sigma in (("q", "sigma"), ("q_calibrated", "q_calibrated_sigma")):
+            difference, error = _difference(figure, first, scored)
+            paired[f"{figure}_difference"] = difference
+            paired[f"{figure}_difference_error"] = error
+            paired[sigma] = difference / error if error else math.nan
         figures = {f"{key}_published": value for key, value in (published.get(name) or {}).items()}
         missing = {f"{key}_published": math.nan for key in ("q", "m_half", "sqrt_a")}
         rows.append(
             {
                 "submission": name,
                 **scored.to_dict(),
-                "q_difference": difference,
-                "q_difference_error": error,
-                "sigma": difference / error if error else math.nan,
+                **paired,
                 "q_leaderboard": scored.q_leaderboard,
                 **missing,
                 **figures,
             }
         )
     return make(rows)
+
+
+def _difference(figure: str, first: Score | None, scored: Score) -> tuple[float, float]:
+    """The paired difference in a figure from the first, and its error; NaN of the first itself."""
+    if first is None or scored is first:
+        return math.nan, math.nan
+    column = list(scored.figures).index(figure)
+    paired = _shearq.difference(
+        scored.images,
+        first[figure],
+        list(first.replicates[:, column]),
+        scored[figure],
+        list(scored.replicates[:, column]),
+    )
+    return (math.nan, math.nan) if paired is None else paired
 
 
 def _frame(name: str | None) -> Any:

@@ -9,6 +9,8 @@ use super::{Figure, FigureError, LABEL_SIZE, MARGIN, TITLE_SIZE};
 
 /// The em of the numbers at colour bars.
 const NUMBER_SIZE: f64 = 9.5;
+/// From line to line of a row's label.
+const LABEL_LINE: f64 = LABEL_SIZE + 4.0;
 const BAR_HEIGHT: f64 = 7.0;
 /// The longer side of an image, in points.
 const SIDE: f64 = 144.0;
@@ -54,7 +56,7 @@ pub struct ImagePanel {
 /// Images side by side.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ImageRow {
-    /// Beside the row.
+    /// Beside the row; its lines are side by side.
     pub label: String,
     /// The images, from left to right.
     pub panels: Vec<ImagePanel>,
@@ -221,9 +223,10 @@ impl Figure for ImageGrid {
             .unwrap_or(0);
         let gap = MARGIN + 6.0;
         let cell_width = SIDE + gap;
-        let label_room = match self.rows.iter().any(|row| !row.label.is_empty()) {
-            true => LABEL_SIZE + 8.0,
-            false => 0.0,
+        let label_lines = self.rows.iter().map(|row| row.label.lines().count());
+        let label_room = match label_lines.max().unwrap_or(0) {
+            0 => 0.0,
+            lines => lines as f64 * LABEL_LINE + 4.0,
         };
         let title_height = if self.title.is_empty() {
             0.0
@@ -258,8 +261,11 @@ impl Figure for ImageGrid {
         let mut top = MARGIN + title_height;
         for (number, row) in self.rows.iter().enumerate() {
             top += above(row);
-            let baseline = (MARGIN + LABEL_SIZE, top + 0.5 * SIDE);
-            scene.text_upwards(&row.label, baseline, LABEL_SIZE, INK, Anchor::Middle);
+            for (line, text) in row.label.lines().enumerate() {
+                let x = MARGIN + LABEL_SIZE + line as f64 * LABEL_LINE;
+                let baseline = (x, top + 0.5 * SIDE);
+                scene.text_upwards(text, baseline, LABEL_SIZE, INK, Anchor::Middle);
+            }
             for (column, panel) in row.panels.iter().enumerate() {
                 let corner = (left + column as f64 * cell_width, top);
                 draw_panel(&mut scene, panel, self.limits(number, column), corner);

@@ -1,10 +1,12 @@
 //! The paper's qualitative statements, held against results.
 
 use shearq_scoring::Figures;
-use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
+use shearq_scoring::resample::mean_over_sets;
 
 use super::sets::{mean_of_24, over_sets};
 use crate::report::table::{Cell, Heading, Table};
+use crate::results::compare::{Paired, difference};
+use crate::results::row::SetRecord;
 use crate::simulate::kinds::{ImageType, SetKind};
 use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, LambdaSums, PAPER_LAMBDA, SNR_DB};
 use crate::study::reproduce::SetResult;
@@ -22,28 +24,18 @@ pub struct Finding {
 
 /// Mean ratio-like difference in Q of `second` over `first`: (ΔQ, error, Q of the first).
 fn q_difference(results: &[SetResult], first: usize, second: usize) -> Option<(f64, f64, f64)> {
-    let sets: Vec<PairedSet<'_>> = results
-        .iter()
-        .map(|set| PairedSet {
-            images: set.images as usize,
-            first: set.results[first].score.figures.q,
-            first_replicates: &set.results[first].score.q_replicates,
-            second: set.results[second].score.figures.q,
-            second_replicates: &set.results[second].score.q_replicates,
-        })
-        .collect();
-    let difference = paired_difference(&sets)?;
+    let of = |submission: usize| -> Vec<&SetRecord> {
+        let scored = results.iter();
+        scored.map(|set| &set.results[submission].score).collect()
+    };
+    let difference = difference(Paired::Q, &of(first), &of(second))?;
     let mean = mean_over_sets(&over_sets(results, first, |f| f.q)).0;
     Some((difference.difference, difference.error, mean))
 }
 
-/// A value with its error as tables have them, or a word where that is not known.
+/// A value with its error as a sentence has them.
 fn with_error(value: f64, error: f64, decimals: usize) -> String {
-    match Cell::with_error(value, Some(error), decimals).figures() {
-        Some((value, Some(error))) => format!("{value} ± {error}"),
-        Some((value, None)) => format!("{value} (error unknown)"),
-        None => String::new(),
-    }
+    Cell::with_error(value, Some(error), decimals).in_words()
 }
 
 /// The paper's qualitative findings (Sect. 5.3) held against `results`.

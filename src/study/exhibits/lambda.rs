@@ -196,6 +196,7 @@ pub fn curves_table(curves: &Curves) -> Table {
 /// A short table for terminals: per rule and S/N, the best λ and the figures at 10⁻⁴.
 pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
     let mut rows = Vec::new();
+    let mut at_edge = false;
     for (rule, name) in RULES.iter().enumerate() {
         for (s, snr) in SNR_DB.iter().enumerate() {
             let curve = &curves.over_lambda[rule][s];
@@ -206,6 +207,7 @@ pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
                         .total_cmp(&curve[*b].inverse_rmsd())
                 })
                 .unwrap_or(0);
+            at_edge |= best == 0 || best + 1 == curve.len();
             let paper = &curve[PAPER_LAMBDA];
             let value = |sums: &LambdaSums| {
                 Cell::with_error(sums.inverse_rmsd(), Some(sums.inverse_rmsd_error()), 3)
@@ -231,6 +233,17 @@ pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
             )
         })
         .collect();
+    let mut notes = vec![format!(
+        "λ chosen (the largest within two standard errors of the best 1/RMSD over all S/N): {}. The paper suggests 10^-4.",
+        chosen.join(", ")
+    )];
+    if at_edge {
+        notes.push(format!(
+            "Warning: a best λ is at the edge of what was looked at, 10^{} to 10^{}; it may lie beyond.",
+            LOG_LAMBDA[0],
+            LOG_LAMBDA[LOG_LAMBDA.len() - 1]
+        ));
+    }
     Table {
         title: format!(
             "Calibration of λ for {} on {} synthetic galaxies",
@@ -246,9 +259,6 @@ pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
             Heading::new("dsnr_db", "dSNR at 10⁻⁴ [dB]"),
         ],
         rows,
-        notes: vec![format!(
-            "λ chosen (the largest within two standard errors of the best 1/RMSD over all S/N): {}. The paper suggests 10^-4.",
-            chosen.join(", ")
-        )],
+        notes,
     }
 }
