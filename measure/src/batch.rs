@@ -10,7 +10,7 @@ use crate::error::{MeasureError, length};
 use crate::flag::Flag;
 use crate::galaxy::{Measurer, Worker};
 use crate::measurement::Measurement;
-use crate::noise::StampNoise;
+use crate::noise::Survey;
 use crate::pixel::Pixel;
 use crate::psf::{FunctionalPsf, star_psf};
 
@@ -101,7 +101,7 @@ impl Measurer {
         check(self.submission(), (rows, columns), star, noise)?;
         let mut worker = self.worker();
         if noise.is_none() {
-            worker.set_noise(self.survey(stamps)?.as_ref());
+            worker.set_survey(self.survey(stamps)?.as_ref());
         }
         let mut galaxies = [worker.measure_each(stamps, psfs, noise)?];
         let response = calibrate(self.submission(), &mut galaxies);
@@ -109,8 +109,8 @@ impl Measurer {
         Ok(Batch { galaxies, response })
     }
 
-    /// The noise of `stamps`, one each along the first axis, where the submission asks for it to be measured on
-    /// them.
+    /// What `stamps`, one each along the first axis, tell of their image, where the submission asks for noise to be
+    /// measured on them.
     ///
     /// # Errors
     /// Where there is no stamp, stamps have other sizes than planned, or too few of them have a frame of noise
@@ -118,7 +118,7 @@ impl Measurer {
     pub fn survey<T: Pixel>(
         &self,
         stamps: ArrayView3<'_, T>,
-    ) -> Result<Option<Arc<StampNoise>>, MeasureError> {
+    ) -> Result<Option<Arc<Survey>>, MeasureError> {
         let count = stamps.len_of(Axis(0));
         let Some(plan) = self.noise_plan() else {
             return Ok(None);
@@ -130,8 +130,8 @@ impl Measurer {
         for at in plan.rows(1, count) {
             survey.add(stamps.index_axis(Axis(0), at))?;
         }
-        match survey.noise() {
-            Some(noise) => Ok(Some(Arc::new(noise))),
+        match survey.found() {
+            Some(found) => Ok(Some(Arc::new(found))),
             // All of them will be flagged.
             None if survey.is_blind() => Ok(None),
             None => Err(MeasureError::Noise(

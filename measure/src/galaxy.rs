@@ -11,7 +11,7 @@ use crate::error::MeasureError;
 use crate::flag::{Flag, Flags};
 use crate::measurement::Measurement;
 use crate::method::{CutWorker, Found, MethodPlan, ResponseMatrix};
-use crate::noise::{NoisePlan, StampNoise};
+use crate::noise::{NoisePlan, StampNoise, Survey};
 use crate::pixel::Pixel;
 use crate::psf::cut_start;
 use crate::surroundings::Missing;
@@ -47,8 +47,8 @@ pub struct Worker {
     pub(crate) cut: Vec<f32>,
     border: Vec<f32>,
     missing: Missing,
-    /// That of the galaxies at hand, where it was given.
-    noise: Option<Arc<StampNoise>>,
+    /// Of the image of the galaxies at hand, where it was given.
+    survey: Option<Arc<Survey>>,
     usable_psf: bool,
 }
 
@@ -124,7 +124,7 @@ impl Measurer {
             border: Vec::with_capacity(full * full),
             missing: Missing::new(*n),
             usable_psf: false,
-            noise: None,
+            survey: None,
             plan: Arc::clone(&self.plan),
         }
     }
@@ -136,18 +136,20 @@ impl Worker {
         &self.plan.submission
     }
 
-    /// Takes the noise of the galaxies that follow, as [`NoiseSurvey`](crate::NoiseSurvey) found it on their
-    /// image: level and correlation; one that is correlated no more than chance would have it is taken as
-    /// white. `None` leaves them with the level that they are given one by one, and white noise. The PSF has to
-    /// be taken after it, without which galaxies are flagged.
-    pub fn set_noise(&mut self, noise: Option<&Arc<StampNoise>>) {
-        if self.noise.as_ref() == noise {
+    /// Takes what [`NoiseSurvey`](crate::NoiseSurvey) found on the image of the galaxies that follow: level and
+    /// correlation of the noise, where one that is correlated no more than chance would have it is taken as
+    /// white, and how broad they are. `None` leaves them with the level that they are given one by one, white noise, and
+    /// the submission's own window. The PSF has to be taken after it, without which galaxies are flagged.
+    pub fn set_survey(&mut self, survey: Option<&Arc<Survey>>) {
+        if self.survey.as_ref() == survey {
             return;
         }
         self.usable_psf = false;
-        self.noise = noise.cloned();
-        match noise {
-            Some(noise) if noise.is_correlated() => self.method.set_noise(noise),
+        self.survey = survey.cloned();
+        self.method
+            .set_extent(survey.and_then(|survey| survey.extent));
+        match survey {
+            Some(survey) if survey.noise.is_correlated() => self.method.set_noise(&survey.noise),
             Some(_) | None => self.method.set_noise(&StampNoise::white(1.0)),
         }
     }
@@ -203,8 +205,8 @@ impl Worker {
             return Ok(Measurement::flagged(Flag::NoScale));
         }
         let noise = match plan.submission.noise {
-            NoiseSource::Header | NoiseSource::Image { .. } => match &self.noise {
-                Some(noise) => noise.sigma(),
+            NoiseSource::Header | NoiseSource::Image { .. } => match &self.survey {
+                Some(survey) => survey.noise.sigma(),
                 None => header_noise.unwrap_or(f64::NAN),
             },
             NoiseSource::Border { border } => {

@@ -1,4 +1,5 @@
-//! The noise of an image, measured on its own stamps: its level, and how its pixels are correlated.
+//! The noise of an image, measured on its own stamps: its level, and how its pixels are correlated; and with it how broad
+//! its galaxies are.
 //!
 //! What is looked at are blocks of 8 × 8 pixels along the edges of many stamps. The wings of the galaxies
 //! in the middle are smooth there: the polynomials of second degree that fit a block best are taken out of
@@ -20,9 +21,10 @@ use std::sync::Arc;
 use ndarray::{Array2, ArrayView2};
 
 use crate::error::MeasureError;
+use crate::extent::Light;
 use crate::pixel::Pixel;
 use crate::robust::{SCATTER, median};
-use crate::surroundings::{Contrasts, Missing, centre, turn};
+use crate::surroundings::{Contrasts, Missing, centre, followed, turn};
 
 /// Pixels a side of a block.
 const BLOCK: usize = 8;
@@ -124,6 +126,16 @@ impl StampNoise {
     }
 }
 
+/// What the stamps of an image tell of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Survey {
+    /// Its noise.
+    pub noise: StampNoise,
+    /// How broad its galaxies are seen through the PSF: the mean square of their radii per axis in px², were they
+    /// Gaussians. `None` of a few galaxies.
+    pub extent: Option<f64>,
+}
+
 /// Plan for measuring the noise of images with stamps of one size.
 #[derive(Debug, Clone)]
 pub struct NoisePlan {
@@ -179,6 +191,7 @@ impl NoisePlan {
             products: Vec::new(),
             brightest: Vec::new(),
             typical: Vec::new(),
+            light: Light::default(),
             counts: [0; 3],
         }
     }
@@ -203,6 +216,7 @@ pub struct NoiseSurvey {
     brightest: Vec<f32>,
     /// Of each frame, the median over all places.
     typical: Vec<f32>,
+    light: Light,
     /// Number of stamps looked at, of those with missing pixels, and of those that were left out for that.
     counts: [usize; 3],
 }
@@ -248,10 +262,12 @@ impl NoiseSurvey {
         Ok(())
     }
 
-    /// Looks for places of the stamp that are brighter than the opposite ones.
+    /// Looks for places of the stamp that are brighter than the opposite ones, and how broad its galaxy is.
     fn compare(&mut self) {
         let full = self.plan.full;
-        let turn = turn(centre(&self.pixels, full), full);
+        let found = centre(&self.pixels, full);
+        self.light.add(&self.pixels, full, followed(found));
+        let turn = turn(found, full);
         self.contrasts.compare(&self.pixels, turn);
         let places = &self.contrasts.blocks;
         let over_noise = |excess: f32, pixels: f32| excess / pixels.sqrt();
@@ -281,6 +297,14 @@ impl NoiseSurvey {
     /// Whether there is no stamp that is not left out: galaxies on them cannot be measured.
     pub fn is_blind(&self) -> bool {
         self.counts[0] == self.counts[2]
+    }
+
+    /// What the stamps looked at tell of their image; `None` where they do not tell its noise.
+    pub fn found(&self) -> Option<Survey> {
+        Some(Survey {
+            noise: self.noise()?,
+            extent: self.light.extent(),
+        })
     }
 
     /// The noise of the stamps looked at; `None` where less than a few frames are left that hold noise alone.

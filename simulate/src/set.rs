@@ -381,14 +381,17 @@ impl SetSimulator {
         let centre = (STAMP as f64 - 1.0) / 2.0;
         let x = centre + rng.random_range(-0.5..0.5);
         let y = centre + rng.random_range(-0.5..0.5);
+        let mut again = rng.clone();
         let (galaxy, snr) = self.galaxy(version.intrinsic, version.shear, &mut rng);
         let psf = self
             .transform
             .of(fields.psf.at(ix, iy))
             .expect("all PSFs of a set have one profile");
-        self.renderer.render(&galaxy, &psf, (x, y), scratch, out);
-        // S/N = √(Σ I²)/σ over the stamp.
+        // S/N = √(Σ I²)/σ over the stamp is that of the galaxy before lensing, which leaves its flux as it is.
+        let (unlensed, _) = self.galaxy(version.intrinsic, Shear::new(0.0, 0.0), &mut again);
+        self.renderer.render(&unlensed, &psf, (x, y), scratch, out);
         let norm: f64 = out.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
+        self.renderer.render(&galaxy, &psf, (x, y), scratch, out);
         let scale = (snr * NOISE_SIGMA / norm.sqrt()) as f32;
         let sigma = version.noise * NOISE_SIGMA as f32;
         for value in out.iter_mut() {

@@ -75,7 +75,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let mut source = ImageSource::open(&data, image, &submission)?;
         let measurer = Measurer::new(&submission, source.mosaic().stamp)?;
         if let Some(plan) = measurer.noise_plan() {
-            source.measure_noise(&data, plan)?;
+            source.look(&data, plan)?;
         }
         let Mosaic {
             columns,
@@ -100,7 +100,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let psf = psf_of(&row, ix, submission.psf_cut())
             .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
         let mut worker = measurer.worker();
-        worker.set_noise(row.noise.as_ref());
+        worker.set_survey(row.survey.as_ref());
         worker.set_psf(psf.view())?;
         let stamps = strip(&row.pixels, columns, side)?;
         let stamp = stamps.index_axis(Axis(0), ix);

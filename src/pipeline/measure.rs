@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis, Slice};
 use shearq_measure::{
-    Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, StampNoise, Worker, calibrate,
+    Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, Survey, Worker, calibrate,
     star_psf, strip,
 };
 use shearq_submissions::{EllipticityType, NoiseSource, PsfCut, PsfForm, Submission};
@@ -63,8 +63,8 @@ pub struct StampRow {
     pub pixels: Vec<f32>,
     /// NOISESIG.
     pub header_noise: Option<f64>,
-    /// The noise as measured on the image, where the submission asks for that.
-    pub noise: Option<Arc<StampNoise>>,
+    /// What the image's stamps tell of it, where the submission asks for noise to be measured on them.
+    pub survey: Option<Arc<Survey>>,
     /// PSFs.
     pub psf: RowPsf,
 }
@@ -99,7 +99,7 @@ pub struct ImageSource {
     image: ImageReader,
     mosaic: Mosaic,
     header_noise: Option<f64>,
-    noise: Option<Arc<StampNoise>>,
+    survey: Option<Arc<Survey>>,
     psf: PsfSource,
     next: usize,
 }
@@ -152,7 +152,7 @@ impl ImageSource {
             image,
             mosaic,
             header_noise,
-            noise: None,
+            survey: None,
             next: 0,
         })
     }
@@ -162,16 +162,16 @@ impl ImageSource {
         self.mosaic
     }
 
-    /// Measures the noise of the image on its stamps, for the rows that follow and for the caller; `None` where all are
-    /// such that their galaxies will be flagged.
+    /// Measures the noise of the image on its stamps, and how broad its galaxies are, for the rows that follow and for the
+    /// caller; `None` where all are such that their galaxies will be flagged.
     ///
     /// # Errors
     /// Where they cannot be read, or hold no frame of noise alone.
-    pub fn measure_noise(
+    pub fn look(
         &mut self,
         data: &DataFolder,
         plan: &NoisePlan,
-    ) -> Result<Option<Arc<StampNoise>>, PipelineError> {
+    ) -> Result<Option<Arc<Survey>>, PipelineError> {
         let path = data.galaxies(self.id.set, self.id.image);
         let mut image = ImageReader::open(&path)?;
         let Mosaic { columns, stamp, .. } = self.mosaic;
@@ -186,8 +186,8 @@ impl ImageSource {
                 survey.add(stamp)?;
             }
         }
-        self.noise = survey.noise().map(Arc::new);
-        if self.noise.is_none() && !survey.is_blind() {
+        self.survey = survey.found().map(Arc::new);
+        if self.survey.is_none() && !survey.is_blind() {
             let missing = match survey.incomplete() {
                 0 => String::new(),
                 count => format!(" ({count} of those looked at have missing pixels)"),
@@ -197,7 +197,7 @@ impl ImageSource {
             );
             return Err(FileError::new(&path, message).into());
         }
-        Ok(self.noise.clone())
+        Ok(self.survey.clone())
     }
 
     /// The next row of stamps, `None` after the last.
@@ -218,7 +218,7 @@ impl ImageSource {
             mosaic,
             pixels: self.image.read_rows(mosaic.stamp)?,
             header_noise: self.header_noise,
-            noise: self.noise.clone(),
+            survey: self.survey.clone(),
             psf: match &mut self.psf {
                 PsfSource::Shared(psf) => RowPsf::Shared(Arc::clone(psf)),
                 PsfSource::Stars { image, side } => RowPsf::Stars {
@@ -350,7 +350,7 @@ fn open_psf(
 pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, PipelineError> {
     let Mosaic { columns, stamp, .. } = row.mosaic;
     let noise = row.header_noise;
-    worker.set_noise(row.noise.as_ref());
+    worker.set_survey(row.survey.as_ref());
     // Behind the last galaxy there is nothing to measure.
     let here = Slice::from(..row.mosaic.of_row(row.iy));
     let stamps = strip(&row.pixels, columns, stamp)?;
@@ -489,13 +489,13 @@ pub fn measure_folder(
     Ok(summary)
 }
 
-/// The noise of the first image to be measured with the linear method, which needs to know it, where the submission
-/// measures it; and what it says against the header and against what the submission takes it for.
+/// What the stamps of the first image to be measured with the linear method tell of it, where the submission measures
+/// its noise; and what it says against the header and against what the submission takes it for.
 fn first_noise(
     data: &DataFolder,
     first: ImageId,
     measurer: &Measurer,
-) -> Result<(Option<Arc<StampNoise>>, Vec<String>), PipelineError> {
+) -> Result<(Option<Arc<Survey>>, Vec<String>), PipelineError> {
     let submission = measurer.submission();
     let nothing = (None, Vec::new());
     if submission.linear().is_none() {
@@ -515,11 +515,12 @@ fn first_noise(
     };
     let mut source = ImageSource::open(data, first, submission)?;
     let asked = measurer.noise_plan().is_some();
-    let noise = match source.measure_noise(data, plan) {
-        Ok(Some(noise)) => noise,
+    let survey = match source.look(data, plan) {
+        Ok(Some(survey)) => survey,
         Err(error) if asked => return Err(error),
         Ok(None) | Err(_) => return Ok(nothing),
     };
+    let noise = &survey.noise;
     let image = format!("set {:02} image {:03}", first.set, first.image);
     let mut doubts = Vec::new();
     if let Some(header) = source.header_noise {
@@ -546,7 +547,7 @@ fn first_noise(
             noise.correlation(0, 1)
         ));
     }
-    Ok((asked.then_some(noise), doubts))
+    Ok((asked.then_some(survey), doubts))
 }
 
 /// Number of galaxies that `measure_folder` will measure, for progress bars: an estimate from the
@@ -579,7 +580,7 @@ fn read_images(
     data: &DataFolder,
     todo: &[ImageId],
     measurer: &Measurer,
-    mut first: Option<Arc<StampNoise>>,
+    mut first: Option<Arc<Survey>>,
     mut opened: impl FnMut(ImageId) -> Result<(), FileError>,
     feeder: &mut Feeder<'_, StampRow>,
 ) -> Result<(), PipelineError> {
@@ -597,9 +598,9 @@ fn read_images(
         }
         if let Some(plan) = measurer.noise_plan() {
             match first.take() {
-                Some(noise) => source.noise = Some(noise),
+                Some(survey) => source.survey = Some(survey),
                 None => {
-                    source.measure_noise(data, plan)?;
+                    source.look(data, plan)?;
                 }
             }
         }

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis};
-use shearq_measure::{Measurer, NoisePlan, StampNoise, Steps, Worker, calibrate, star_psf, strip};
+use shearq_measure::{Measurer, NoisePlan, Steps, Survey, Worker, calibrate, star_psf, strip};
 use shearq_scoring::Shear;
 use shearq_submissions::{PsfForm, Submission};
 
@@ -21,12 +21,15 @@ use crate::simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
 };
 
+/// What an image's stamps tell of it, for each measurer that measures its noise.
+pub(crate) type Surveys = Arc<[Option<Arc<Survey>>]>;
+
 /// One row of stamps to draw and measure.
 pub(crate) struct RowJob {
     pub(crate) fields: Arc<ImageFields>,
     pub(crate) iy: usize,
-    /// The noise of the image for each measurer that measures it.
-    pub(crate) noises: Arc<[Option<Arc<StampNoise>>]>,
+    /// What the image's stamps tell of it, for each measurer that measures its noise.
+    pub(crate) surveys: Surveys,
 }
 
 /// A row of stamps, measured by each measurer.
@@ -153,7 +156,7 @@ pub fn run_set(
     )
 }
 
-/// Hands out the rows of images of a set, in order, with the noise that `measurers` measure on them.
+/// Hands out the rows of images of a set, in order, with what `measurers` find on their stamps.
 ///
 /// # Errors
 /// Where a measurer is for stamps of another size.
@@ -165,11 +168,15 @@ pub(crate) fn feed(
 ) -> Result<(), PipelineError> {
     for &image in images {
         let fields = Arc::new(set.image_fields(image));
-        let noises: Arc<[_]> = noises(set, &fields, measurers)?.into();
+        let surveys = surveys(set, &fields, measurers)?;
         for iy in 0..set.grid().n {
             let fields = Arc::clone(&fields);
-            let noises = Arc::clone(&noises);
-            if !feeder.push(RowJob { fields, iy, noises }) {
+            let surveys = Arc::clone(&surveys);
+            if !feeder.push(RowJob {
+                fields,
+                iy,
+                surveys,
+            }) {
                 return Ok(());
             }
         }
@@ -177,19 +184,19 @@ pub(crate) fn feed(
     Ok(())
 }
 
-/// The noise of a simulated image for each measurer that measures it, from the rows that it would look at.
-fn noises(
+/// What the stamps of a simulated image tell each measurer that measures its noise, from the rows that it would look at.
+fn surveys(
     set: &SetSimulator,
     fields: &ImageFields,
     measurers: &[Measurer],
-) -> Result<Vec<Option<Arc<StampNoise>>>, PipelineError> {
+) -> Result<Surveys, PipelineError> {
     let n = set.grid().n;
     let mut surveys: Vec<_> = measurers
         .iter()
         .map(|measurer| measurer.noise_plan().map(NoisePlan::survey))
         .collect();
     let Some(plan) = measurers.iter().find_map(Measurer::noise_plan) else {
-        return Ok(vec![None; measurers.len()]);
+        return Ok(measurers.iter().map(|_| None).collect());
     };
     let mut render = RenderScratch::new();
     // Plans differ in their lags alone.
@@ -203,7 +210,7 @@ fn noises(
     }
     let found = surveys
         .iter()
-        .map(|survey| survey.as_ref()?.noise().map(Arc::new));
+        .map(|survey| survey.as_ref()?.found().map(Arc::new));
     Ok(found.collect())
 }
 
@@ -219,7 +226,7 @@ fn draw_and_measure(
         job.iy,
         pixels,
         &mut scratch.workers,
-        &job.noises,
+        &job.surveys,
     )?;
     Ok(MeasuredJob { observed, rows })
 }
@@ -260,7 +267,7 @@ pub(crate) fn measure_strip(
     iy: usize,
     pixels: Vec<f32>,
     workers: &mut [Worker],
-    noises: &[Option<Arc<StampNoise>>],
+    surveys: &[Option<Arc<Survey>>],
 ) -> Result<Vec<MeasuredRow>, PipelineError> {
     let mut row = StampRow {
         id: ImageId {
@@ -271,12 +278,12 @@ pub(crate) fn measure_strip(
         mosaic: Mosaic::square(set.grid().n, STAMP),
         pixels,
         header_noise: Some(NOISE_SIGMA),
-        noise: None,
+        survey: None,
         psf: RowPsf::Functional(Vec::new()),
     };
     let mut measured = Vec::with_capacity(workers.len());
     for (k, worker) in workers.iter_mut().enumerate() {
-        row.noise = noises.get(k).cloned().flatten();
+        row.survey = surveys.get(k).cloned().flatten();
         row.psf = row_psf(set, fields, iy, worker.submission());
         measured.push(measure_row(worker, &row)?);
     }

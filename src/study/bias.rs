@@ -12,8 +12,7 @@
 //! the other of an elliptical galaxy, which has no mean but scatters, is the same for e and −e and
 //! cancels too.
 //!
-//! As in the simulated sets, a galaxy's S/N is that after lensing: its noise-free image is as bright under
-//! γ as under −γ, while lensing at fixed flux would change the S/N of an elliptical one a little.
+//! As in the simulated sets, lensing leaves a galaxy's flux as it is.
 
 use serde::{Deserialize, Serialize};
 use shearq_measure::{Measurement, Measurer, Worker};
@@ -89,18 +88,23 @@ pub fn biases(
     engine::ordered(
         threads,
         |feeder| {
-            // Of strips drawn several times, whose noise is known.
-            feed(set, images, &[], feeder)
+            // Versions of galaxies are as broad and as noisy as those of the set.
+            feed(set, images, measurers, feeder)
         },
         || {
             let workers: Vec<Worker> = measurers.iter().map(Measurer::worker).collect();
             (RenderScratch::new(), workers)
         },
-        |(render, workers), RowJob { fields, iy, .. }| {
+        |(render, workers), job| {
+            let RowJob {
+                fields,
+                iy,
+                surveys,
+            } = job;
             let mut versions = Vec::with_capacity(VERSIONS.len());
             for version in VERSIONS {
                 let strip = draw(set, &fields, iy, version, render);
-                versions.push(measure_strip(set, &fields, iy, strip, workers, &[])?);
+                versions.push(measure_strip(set, &fields, iy, strip, workers, &surveys)?);
             }
             let found = (0..measurers.len()).map(|k| {
                 let mut sums = BiasSums::default();

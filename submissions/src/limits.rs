@@ -9,6 +9,9 @@ pub const MAX_PSF: usize = 48;
 /// Broadest target of the linear method, in pixels.
 pub const MAX_TARGET: f64 = 6.0;
 
+/// Windows of the linear method, in pixels.
+pub const WINDOWS: std::ops::RangeInclusive<f64> = 2.0..=16.0;
+
 /// Largest eigenvalue of G = DᵀD, D being Sun's high-pass (Sect. 3.1), rounded up: the square of the kernel's
 /// transform where that is largest.
 pub const MAX_ROUGHNESS: f64 = 0.0093;

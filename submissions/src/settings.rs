@@ -178,6 +178,7 @@ partial! {
         high_pass_divisor: f64,
         target_sigma: f64,
         window_sigma: f64,
+        reference_extent: f64,
         reference_area: f64,
     }
 }
@@ -241,6 +242,10 @@ section! {
         target_sigma: f64,
         /// σ in pixels of the round Gaussian window by which the result is multiplied.
         window_sigma: f64,
+        /// Mean square per axis of the galaxies' radii, in px² and without the PSF's, that the window is for. Where it is
+        /// measured with the noise, those of images with broader or narrower galaxies are wider or narrower; zero for
+        /// the same window on all.
+        reference_extent: f64,
         /// Noise-equivalent area 1/Σp² in px² of the PSF that lengths are for. For a broader one target and weight are
         /// longer, and more is cut of it; zero for the same lengths with all PSFs.
         reference_area: f64,
@@ -283,7 +288,7 @@ section! {
         /// Scale in pixels of the Moffat weight.
         weight_scale: f64,
         /// Added to the weighted integral of x² + y² by which the moments are divided: px⁴ times the noise
-        /// of the ACF at zero lag.
+        /// of the ACF at zero lag. Galaxies of low S/N count less for it, as their noise asks.
         softening: f64,
         /// Which ellipticity the catalogue reports as e1, e2.
         ellipticity: EllipticityType,

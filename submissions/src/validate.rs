@@ -3,7 +3,7 @@
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET};
+use crate::limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, WINDOWS};
 use crate::name;
 use crate::settings::{
     Clipping, Denoise, LinearDeconvolution, LinearMethod, Method, NetworkDeconvolution,
@@ -170,6 +170,7 @@ impl LinearMethod {
             max_iterations,
             target_sigma: target,
             window_sigma: window,
+            reference_extent: extent,
             reference_area: area,
         } = self.deconvolution;
         let (scale, softening) = (self.shape.weight_scale, self.shape.softening);
@@ -178,8 +179,15 @@ impl LinearMethod {
         iterations(max_iterations)?;
         let good = (1.0..=MAX_TARGET).contains(&target);
         real(good, "deconvolution.target_sigma", target, "1 to 6 pixels")?;
-        let good = (2.0..=16.0).contains(&window);
+        let good = WINDOWS.contains(&window);
         real(good, "deconvolution.window_sigma", window, "2 to 16 pixels")?;
+        let good = extent == 0.0 || (0.1..=1e3).contains(&extent);
+        real(
+            good,
+            "deconvolution.reference_extent",
+            extent,
+            "0, or 0.1 to 1000 px²",
+        )?;
         let good = area == 0.0 || (1.0..=1e4).contains(&area);
         real(
             good,

@@ -281,7 +281,7 @@ fn cross_spectra_are_scored_with_the_errors_of_their_manifest() {
         "--sets",
         "2,5",
         "--images",
-        "9",
+        "20",
         "--grid",
         "12",
         "--submission",

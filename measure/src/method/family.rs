@@ -1,8 +1,8 @@
-//! The linear method for PSFs of any breadth: a member for each step of it.
+//! The linear method for PSFs and galaxies of any breadth: a member for each step of either.
 //!
 //! What a PSF destroys follows its width, and so do the Gaussian that the deconvolved stamp is convolved with and
-//! the weight of the moments: a target much sharper than the PSF is made of noise. The window does not, which keeps
-//! out noise beyond the galaxy.
+//! the weight of the moments: a target much sharper than the PSF is made of noise. The window, which keeps out noise
+//! beyond the galaxy, follows the galaxies.
 
 use std::sync::{Arc, OnceLock};
 
@@ -12,6 +12,7 @@ use shearq_submissions::{LinearMethod, PsfCut};
 
 use super::found::{CutWorker, Found, Images};
 use super::linear::{LinearPlan, LinearWorker};
+use super::window;
 use crate::error::MeasureError;
 use crate::noise::StampNoise;
 use crate::psf::breadth;
@@ -23,8 +24,8 @@ pub(crate) struct LinearFamily {
     n: usize,
     cut: PsfCut,
     first: Arc<LinearPlan>,
-    /// Of further steps, planned when first needed.
-    others: Vec<OnceLock<Arc<LinearPlan>>>,
+    /// Of each step of the PSF, for each window; planned when first needed.
+    members: Vec<[OnceLock<Arc<LinearPlan>>; window::COUNT]>,
 }
 
 impl LinearFamily {
@@ -34,15 +35,16 @@ impl LinearFamily {
             n,
             cut,
             first: Arc::new(LinearPlan::new(method, n, cut.size)?),
-            others: (1..=breadth::LAST).map(|_| OnceLock::new()).collect(),
+            members: (0..=breadth::LAST).map(|_| Default::default()).collect(),
         })
     }
 
-    fn member(&self, step: usize) -> Result<Arc<LinearPlan>, MeasureError> {
-        let Some(place) = step.checked_sub(1) else {
+    fn member(&self, kind: Kind) -> Result<Arc<LinearPlan>, MeasureError> {
+        if kind == Kind::OWN {
             return Ok(Arc::clone(&self.first));
-        };
-        let place = &self.others[place];
+        }
+        let Kind { step, window } = kind;
+        let place = &self.members[step][window];
         if let Some(plan) = place.get() {
             return Ok(Arc::clone(plan));
         }
@@ -53,24 +55,48 @@ impl LinearFamily {
         method.shape.weight_scale *= factor;
         // An area squared.
         method.shape.softening *= factor.powi(4);
+        let own = &mut method.deconvolution.window_sigma;
+        *own = window::sigma(*own, window, self.n);
         let plan = LinearPlan::new(&method, self.n, breadth::side(self.cut, step))?;
         Ok(Arc::clone(place.get_or_init(|| Arc::new(plan))))
     }
 
-    /// The member for a PSF of sum one.
-    fn step(&self, psf: ArrayView2<'_, f64>) -> usize {
+    /// The member for a PSF of sum one, and galaxies that are seen so broad.
+    fn kind(&self, psf: ArrayView2<'_, f64>, extent: Option<f64>) -> Kind {
         let step = breadth::step(psf, self.cut);
         // It was cut after a look at its middle alone, where it may have been a little broader.
         let fits = |&at: &usize| breadth::side(self.cut, at) >= psf.nrows();
-        (step..=breadth::LAST).find(fits).unwrap_or(step)
+        let reference = self.method.deconvolution.reference_extent;
+        Kind {
+            step: (step..=breadth::LAST).find(fits).unwrap_or(step),
+            window: window::place(extent, psf, reference),
+        }
     }
+}
+
+/// What tells a member from the others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Kind {
+    /// Of the PSF's breadth.
+    step: usize,
+    /// Place of the window's width.
+    window: usize,
+}
+
+impl Kind {
+    /// Lengths as they are set.
+    const OWN: Kind = Kind {
+        step: 0,
+        window: window::OWN,
+    };
 }
 
 /// A worker for one thread.
 pub(super) fn worker(family: Arc<LinearFamily>) -> Box<dyn CutWorker> {
     Box::new(FamilyWorker {
-        members: vec![(0, LinearWorker::new(Arc::clone(&family.first)))],
+        members: vec![(Kind::OWN, LinearWorker::new(Arc::clone(&family.first)))],
         at: 0,
+        extent: None,
         noise: StampNoise::white(1.0),
         family,
     })
@@ -78,11 +104,12 @@ pub(super) fn worker(family: Arc<LinearFamily>) -> Box<dyn CutWorker> {
 
 struct FamilyWorker {
     family: Arc<LinearFamily>,
-    /// Members that were needed so far, with their steps.
-    members: Vec<(usize, LinearWorker)>,
+    /// Members that were needed so far.
+    members: Vec<(Kind, LinearWorker)>,
     /// The one for the PSF at hand.
     at: usize,
     noise: StampNoise,
+    extent: Option<f64>,
 }
 
 impl CutWorker for FamilyWorker {
@@ -93,19 +120,23 @@ impl CutWorker for FamilyWorker {
         }
     }
 
+    fn set_extent(&mut self, extent: Option<f64>) {
+        self.extent = extent;
+    }
+
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
         let LinearFamily { cut, .. } = &*self.family;
         if psf.nrows() < cut.size {
             check_psf(psf, cut.size)?;
         }
-        let step = self.family.step(psf);
-        let known = self.members.iter().position(|(of, _)| *of == step);
+        let kind = self.family.kind(psf, self.extent);
+        let known = self.members.iter().position(|(of, _)| *of == kind);
         self.at = if let Some(at) = known {
             at
         } else {
-            let mut member = LinearWorker::new(self.family.member(step)?);
+            let mut member = LinearWorker::new(self.family.member(kind)?);
             member.set_noise(&self.noise);
-            self.members.push((step, member));
+            self.members.push((kind, member));
             self.members.len() - 1
         };
         self.members[self.at].1.set_psf(psf)
@@ -126,8 +157,11 @@ mod tests {
     use shearq_scoring::Shear;
     use shearq_submissions::{Method, Registry, Submission};
 
+    use std::sync::Arc;
+
     use crate::galaxy::Measurer;
     use crate::measurement::Measurement;
+    use crate::noise::{StampNoise, Survey};
     use crate::psf::{FunctionalPsf, PsfProfile};
 
     fn submission(reference_area: f64) -> Submission {
@@ -177,6 +211,31 @@ mod tests {
         // Whatever was measured before, and on whichever worker.
         let alone = measured(&with, &[6.0], 0.5);
         assert_eq!((found[1].e1, found[1].e2), (alone[0].e1, alone[0].e2));
+    }
+
+    #[test]
+    fn windows_follow_the_galaxies_of_the_image() {
+        let submission = submission(50.0);
+        let mut worker = Measurer::new(&submission, 48).unwrap().worker();
+        let psf = moffat(3.4).stamp_beside(submission.psf_cut(), 48);
+        let stamp = moffat(6.0).stamp(48).mapv(|v| 1000.0 * v as f32);
+        let mut radius = |extent: Option<f64>| {
+            let survey = Survey {
+                noise: StampNoise::white(0.1),
+                extent,
+            };
+            worker.set_survey(Some(&Arc::new(survey)));
+            worker.set_psf(psf.view()).unwrap();
+            let found = worker.measure(stamp.view(), None).unwrap();
+            assert!(found.e1.is_finite() && found.noise == 0.1, "{found:?}");
+            found.radius
+        };
+        let [own, narrow, wide, again] = [None, Some(4.0), Some(30.0), Some(13.0)].map(&mut radius);
+        // In steps of the lags; the wide one is held by the stamp's side.
+        assert!(
+            narrow < 0.7 * own && wide > own && again == own,
+            "{narrow} {own} {wide} {again}"
+        );
     }
 
     #[test]

@@ -14,6 +14,10 @@ pub(crate) trait CutWorker {
     /// taken after it.
     fn set_noise(&mut self, _noise: &StampNoise) {}
 
+    /// Takes how broad the galaxies that follow are seen in their image, in px², where that is known. The PSF has to be
+    /// taken after it.
+    fn set_extent(&mut self, _extent: Option<f64>) {}
+
     /// Takes a PSF.
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;
 

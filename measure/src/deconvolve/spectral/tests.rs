@@ -14,6 +14,7 @@ fn settings(iterations: usize, target: f64, window: f64, lambda: f64) -> LinearD
         max_iterations: iterations,
         target_sigma: target,
         window_sigma: window,
+        reference_extent: 0.0,
         reference_area: 0.0,
         lambda,
         step: named.linear().unwrap().deconvolution.step,
