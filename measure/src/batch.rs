@@ -130,14 +130,7 @@ impl Measurer {
         for at in plan.rows(1, count) {
             survey.add(stamps.index_axis(Axis(0), at))?;
         }
-        match survey.found() {
-            Some(found) => Ok(Some(Arc::new(found))),
-            // All of them will be flagged.
-            None if survey.is_blind() => Ok(None),
-            None => Err(MeasureError::Noise(
-                "not to be seen on the stamps' frames".into(),
-            )),
-        }
+        survey.shared()
     }
 }
 

@@ -307,6 +307,21 @@ impl NoiseSurvey {
         })
     }
 
+    /// The same for [`Worker::set_survey`](crate::Worker::set_survey); `None` where all stamps are such that their galaxies
+    /// will be flagged.
+    ///
+    /// # Errors
+    /// Where they do not tell the noise.
+    pub fn shared(&self) -> Result<Option<Arc<Survey>>, MeasureError> {
+        match self.found() {
+            Some(found) => Ok(Some(Arc::new(found))),
+            None if self.is_blind() => Ok(None),
+            None => Err(MeasureError::Noise(
+                "not to be seen on the stamps' frames".into(),
+            )),
+        }
+    }
+
     /// The noise of the stamps looked at; `None` where less than a few frames are left that hold noise alone.
     pub fn noise(&self) -> Option<StampNoise> {
         let lags = self.plan.lags();

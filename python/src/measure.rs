@@ -1,5 +1,7 @@
 //! Stamps and PSFs into calibrated ellipticities.
 
+use std::sync::Arc;
+
 use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
 use numpy::{IntoPyArray, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
@@ -7,8 +9,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq::pipeline::engine;
 use shearq_measure::{
-    Flag, FunctionalPsf, MeasureError, Measurement, Measurer, Pixel, PsfProfile, Psfs, Worker,
-    calibrate, star_psf,
+    Flag, FunctionalPsf, MeasureError, Measurement, Measurer, NoisePlan, Pixel, PsfProfile, Psfs,
+    Survey, Worker, calibrate, star_psf,
 };
 use shearq_scoring::Shear;
 
@@ -59,8 +61,8 @@ struct Job<'a> {
 }
 
 /// Measures stamps `(n, ny, nx)` with a star stamp for all, star stamps one each, or formulas (FWHM, e1, e2 and
-/// β, which is not a number for Kolmogorov), one or one each; and a noise level for all or one each. Returns the
-/// catalogue's columns and the mean response that the ellipticities were divided by.
+/// β, which is not a number for Kolmogorov), one or one each; and a noise level for all or one each, or none where the
+/// submission measures it on the stamps. Returns the catalogue's columns and the mean response that the ellipticities were divided by.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
 pub(crate) fn measure<'py>(
@@ -89,7 +91,13 @@ pub(crate) fn measure<'py>(
 
     // A batch of no stamps finds all that is wrong with the request, before the work begins.
     let none = Array3::<f64>::zeros((0, rows, columns));
+    let looked_at = match noise {
+        Noise::One(None) => measurer.noise_plan().filter(|_| count > 0),
+        Noise::One(Some(_)) | Noise::Each(_) => None,
+    };
     let level = match noise {
+        // It will be measured.
+        Noise::One(None) if looked_at.is_some() => Some(1.0),
         Noise::One(level) => level,
         Noise::Each(levels) => Some(worst(levels)),
     };
@@ -144,6 +152,10 @@ pub(crate) fn measure<'py>(
         one_each("noise", levels.len(), count)?;
     }
 
+    let survey = match looked_at {
+        Some(plan) => look_at(plan, &stamps, count)?,
+        None => None,
+    };
     let mut galaxies = Vec::new();
     galaxies
         .try_reserve_exact(count)
@@ -163,7 +175,11 @@ pub(crate) fn measure<'py>(
                 }
                 Ok(())
             },
-            || measurer.worker(),
+            || {
+                let mut worker = measurer.worker();
+                worker.set_survey(survey.as_ref());
+                worker
+            },
             |worker, job: Job<'_>| Ok(measure_job(worker, &job)?),
             |measured: Vec<Measurement>| {
                 watch.advance(measured.len())?;
@@ -177,6 +193,20 @@ pub(crate) fn measure<'py>(
     let mut galaxies = [galaxies];
     let response = calibrate(submission, &mut galaxies);
     Ok((catalogue(py, &galaxies[0])?, response))
+}
+
+/// What the stamps tell of their image, from as many as are enough.
+fn look_at(plan: &NoisePlan, stamps: &Stamps<'_>, count: usize) -> PyResult<Option<Arc<Survey>>> {
+    let mut survey = plan.survey();
+    for at in plan.rows(1, count) {
+        match stamps.piece(at, at + 1)? {
+            Piece::Single(one) => survey.add(one.index_axis(Axis(0), 0)),
+            Piece::Double(one) => survey.add(one.index_axis(Axis(0), 0)),
+            Piece::Copied(one) => survey.add(one.index_axis(Axis(0), 0)),
+        }
+        .map_err(of_measuring)?;
+    }
+    survey.shared().map_err(of_measuring)
 }
 
 /// The first level that is none, so that it is told; any where all are.

@@ -103,7 +103,7 @@ impl Submission {
     /// Whether the noise level has to be given.
     #[getter]
     fn needs_noise(&self) -> bool {
-        !matches!(self.entry.submission.noise, NoiseSource::Border { .. })
+        self.entry.submission.noise == NoiseSource::Header
     }
 
     /// `shear` or `distortion`.

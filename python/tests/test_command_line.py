@@ -82,6 +82,17 @@ def test_catalogues_are_the_same_bit_for_bit(command, data, simulations, tmp_pat
                 assert same_bits(native, measured[own]), (set, image.number, own)
 
 
+def test_catalogues_with_noise_measured_on_the_stamps_are_the_same(command, data, simulations, tmp_path):
+    table = pytest.importorskip("astropy.io.fits", reason="reading FITS files needs astropy")
+    command("measure", "--submission", "48/linear/star", "--data", data, "--out", tmp_path, "--catalogue-format", "fits")
+    for set, simulation in simulations.items():
+        for image in simulation:
+            written = table.getdata(tmp_path / f"set{set:02}" / f"catalogue-{image.number:03}.fits", 1)
+            measured = shearq.measure(image.stamps, image.psf)
+            for own, column in COLUMNS.items():
+                assert same_bits(written[column].astype(measured[own].dtype), measured[own]), (set, image.number, own)
+
+
 def test_memory_maps_of_fits_files_are_measured_as_they_are(data, simulations):
     fits = pytest.importorskip("astropy.io.fits", reason="reading FITS files needs astropy")
     image = simulations[8][0]

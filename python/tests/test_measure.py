@@ -214,8 +214,19 @@ def test_what_is_wrong_is_told_by_the_arguments_name(image, arguments, error, me
 
 
 def test_noise_that_is_needed_is_asked_for(image):
+    told = {"extends": "48/linear/star", "noise": {"source": "header"}}
+    assert shearq.submission(told).needs_noise and not shearq.submission("48/linear/star").needs_noise
     with pytest.raises(ValueError, match="noise: the noise level is not given"):
-        shearq.measure(image.stamps, image.psf)
+        shearq.measure(image.stamps, image.psf, submission=told)
+
+
+def test_noise_is_measured_on_stamps_that_hold_some(image):
+    found = shearq.measure(image.stamps, image.psf)
+    assert found["noise"] == pytest.approx(image.noise, rel=0.02) and found.good.all()
+    # Of other numbers and another order of bytes.
+    assert same_bits(shearq.measure(image.stamps.astype(">f8"), image.psf), found)
+    with pytest.raises(ValueError, match="noise: the noise level is not to be seen on the stamps' frames"):
+        shearq.measure(0 * image.stamps + image.stamps[:, :1, :1], image.psf)
 
 
 def test_progress_counts_every_galaxy_and_its_exceptions_come_through(image, measured):

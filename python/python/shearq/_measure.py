@@ -272,8 +272,9 @@ def measure(
         The PSF for all, or one each, centred like the stamps and at least as large as the submission uses. It is cut
         and normalised.
     noise : float or array of shape (n,), optional
-        Standard deviation of the noise per pixel in the stamps' unit, for all or one each. Needed unless the
-        submission measures it on the stamps' borders.
+        Standard deviation of white noise per pixel in the stamps' unit, for all or one each. Without it a linear
+        submission takes the stamps for those of one image, and measures on their frames how large their noise is and how
+        it is correlated, and on the galaxies how wide a window they need; a network measures it on each stamp's border.
     submission : str, path, mapping or Submission
         How to measure: see :func:`shearq.submission`.
     threads : int, optional

@@ -32,7 +32,7 @@ class Submission:
     psf_form : {'star', 'functional'}
         The PSFs that the command line gives it. Here, either serves.
     needs_noise : bool
-        Whether the noise level has to be given; otherwise it is measured on each stamp's border.
+        Whether the noise level has to be given; otherwise it is measured on all stamps, or on each one's border.
     ellipticity : {'shear', 'distortion'}
         The type of e1 and e2.
     """
