@@ -227,21 +227,26 @@ fn scale_variances(levels: usize) -> Vec<f32> {
         .collect()
 }
 
+/// The pixels of an n × n stamp within `width` of its edges, in pieces, row by row.
+pub fn frame(stamp: &[f32], n: usize, width: usize) -> impl Iterator<Item = &[f32]> {
+    let width = width.min(n);
+    let rows = stamp.chunks_exact(n).enumerate();
+    rows.flat_map(move |(y, row)| match y < width || y >= n - width {
+        true => [row, &[]],
+        false => [&row[..width], &row[n - width..]],
+    })
+}
+
 /// Noise level of a stamp: 1.4826 times the median absolute deviation from the median of the pixels
 /// within `border` of the edge that are finite. `buffer` is overwritten. `None` where less than half of them are.
 pub fn border_noise(stamp: &[f32], n: usize, border: usize, buffer: &mut Vec<f32>) -> Option<f32> {
     buffer.clear();
-    for (y, row) in stamp.chunks_exact(n).enumerate() {
-        if y < border || y >= n - border.min(n) {
-            buffer.extend_from_slice(row);
-        } else {
-            buffer.extend_from_slice(&row[..border.min(n)]);
-            buffer.extend_from_slice(&row[n - border.min(n)..]);
-        }
+    for part in frame(stamp, n, border) {
+        buffer.extend_from_slice(part);
     }
-    let frame = buffer.len();
+    let all = buffer.len();
     buffer.retain(|value| value.is_finite());
-    if 2 * buffer.len() < frame {
+    if 2 * buffer.len() < all {
         return None;
     }
     let median = robust::median(buffer)?;

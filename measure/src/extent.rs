@@ -6,6 +6,8 @@
 
 use ndarray::ArrayView2;
 
+use crate::denoise::frame;
+
 /// σ of the weight in pixels.
 const WEIGHT: f64 = 5.0;
 /// Pixels that a stamp's frame is wide, whose mean is taken for the sky.
@@ -18,40 +20,64 @@ const FEWEST: usize = 30;
 pub(crate) struct Light {
     stamps: usize,
     /// Σ W I and Σ W r² I.
-    light: f64,
-    squares: f64,
-    /// Weights of the columns and rows at hand.
-    weights: [Vec<[f64; 2]>; 2],
+    sums: [f64; 2],
+    moments: Moments,
+}
+
+/// Room for sums over a stamp: W and x² of each of its columns, and of its rows.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Moments {
+    columns: Vec<[f64; 2]>,
+    rows: Vec<[f64; 2]>,
+}
+
+impl Moments {
+    /// Σ W I and Σ W r² I of rows of `sides` = [columns, rows] pixels about `centre`, (x, y) in pixels from the middle.
+    fn of<R: IntoIterator<Item = f64>>(
+        &mut self,
+        sides: [usize; 2],
+        centre: [f64; 2],
+        pixels: impl Iterator<Item = R>,
+    ) -> [f64; 2] {
+        for (axis, weights) in [&mut self.columns, &mut self.rows].into_iter().enumerate() {
+            let middle = (sides[axis] as f64 - 1.0) / 2.0;
+            weights.clear();
+            weights.extend((0..sides[axis]).map(|at| {
+                let square = (at as f64 - middle - centre[axis]).powi(2);
+                [(-0.5 * square / (WEIGHT * WEIGHT)).exp(), square]
+            }));
+        }
+        let mut sums = [0.0; 2];
+        for (row, &[weight, square]) in pixels.zip(&self.rows) {
+            let [mut all, mut along] = [0.0; 2];
+            for (value, [weight, square]) in row.into_iter().zip(&self.columns) {
+                all += weight * value;
+                along += weight * square * value;
+            }
+            sums[0] += weight * all;
+            sums[1] += weight * (along + square * all);
+        }
+        sums
+    }
+
+    /// The extent of a PSF stamp in px²; `None` where its light has none.
+    pub(crate) fn of_psf(&mut self, psf: ArrayView2<'_, f64>) -> Option<f64> {
+        let rows = psf.rows().into_iter();
+        let sides = [psf.ncols(), psf.nrows()];
+        of_sums(self.of(sides, [0.0; 2], rows.map(|row| row.into_iter().copied())))
+    }
 }
 
 impl Light {
     /// Adds a stamp of `n` × `n` pixels with a galaxy at `centre`, (x, y) in pixels from the middle.
     pub(crate) fn add(&mut self, pixels: &[f32], n: usize, centre: [f32; 2]) {
         let sky = sky(pixels, n);
+        let rows = pixels.chunks_exact(n);
+        let rows = rows.map(|row| row.iter().map(|value| f64::from(*value) - sky));
+        let [light, squares] = self.moments.of([n; 2], centre.map(f64::from), rows);
         self.stamps += 1;
-        self.weigh(n, centre.map(f64::from));
-        let [across, down] = &self.weights;
-        for (row, &[weight, square]) in pixels.chunks_exact(n).zip(down) {
-            let [mut all, mut along] = [0.0; 2];
-            for (value, [weight, square]) in row.iter().zip(across) {
-                let value = f64::from(*value) - sky;
-                all += weight * value;
-                along += weight * square * value;
-            }
-            self.light += weight * all;
-            self.squares += weight * (along + square * all);
-        }
-    }
-
-    fn weigh(&mut self, n: usize, centre: [f64; 2]) {
-        let middle = (n as f64 - 1.0) / 2.0;
-        for (weights, centre) in self.weights.iter_mut().zip(centre) {
-            weights.clear();
-            weights.extend((0..n).map(|at| {
-                let square = (at as f64 - middle - centre).powi(2);
-                [(-0.5 * square / (WEIGHT * WEIGHT)).exp(), square]
-            }));
-        }
+        self.sums[0] += light;
+        self.sums[1] += squares;
     }
 
     /// The extent of the galaxies, with the PSF's, in px²; `None` of few stamps, and where their light has none.
@@ -59,37 +85,22 @@ impl Light {
         if self.stamps < FEWEST {
             return None;
         }
-        of_square(0.5 * self.squares / self.light)
+        of_sums(self.sums)
     }
 }
 
-/// The extent of a PSF stamp in px²; `None` where its light has none.
-pub(crate) fn of_psf(psf: ArrayView2<'_, f64>) -> Option<f64> {
-    let middle = |side: usize| (side as f64 - 1.0) / 2.0;
-    let (y0, x0) = (middle(psf.nrows()), middle(psf.ncols()));
-    let (mut light, mut squares) = (0.0, 0.0);
-    for ((y, x), value) in psf.indexed_iter() {
-        let square = (x as f64 - x0).powi(2) + (y as f64 - y0).powi(2);
-        let weighted = value * (-0.5 * square / (WEIGHT * WEIGHT)).exp();
-        light += weighted;
-        squares += weighted * square;
-    }
-    of_square(0.5 * squares / light)
-}
-
-/// The extent where the weighted mean square is `q`.
-fn of_square(q: f64) -> Option<f64> {
+/// The extent of light with these Σ W I and Σ W r² I.
+fn of_sums([light, squares]: [f64; 2]) -> Option<f64> {
+    let q = 0.5 * squares / light;
     let extent = 1.0 / (1.0 / q - 1.0 / (WEIGHT * WEIGHT));
     (extent > 0.0 && extent.is_finite()).then_some(extent)
 }
 
 /// Mean of a stamp's outermost pixels.
 fn sky(pixels: &[f32], n: usize) -> f64 {
-    let inside = FRAME..n.saturating_sub(FRAME);
-    let framed = |at: &usize| !(inside.contains(&(at / n)) && inside.contains(&(at % n)));
     let (mut sum, mut count) = (0.0, 0.0);
-    for at in (0..pixels.len()).filter(framed) {
-        sum += f64::from(pixels[at]);
+    for value in frame(pixels, n, FRAME).flatten() {
+        sum += f64::from(*value);
         count += 1.0;
     }
     sum / count
@@ -138,7 +149,8 @@ mod tests {
                 // The frame holds 10⁻⁴ of the light of the broadest.
                 assert!((found / extent - 1.0).abs() < 2e-3, "{extent} {found}");
             }
-            let psf = of_psf(gaussian(extent, [0.0; 2]).view()).unwrap();
+            let psf = Moments::default().of_psf(gaussian(extent, [0.0; 2]).view());
+            let psf = psf.unwrap();
             assert!((psf / extent - 1.0).abs() < 1e-3, "{extent} {psf}");
         }
     }

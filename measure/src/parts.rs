@@ -5,7 +5,7 @@ pub use crate::deconvolve::{
     Lags, Matrices, ModeNoise, Network, NetworkScratch, Rule, Spectral, SpectralPsf,
     SpectralScratch, Step, Wide, convolve, psf_factor,
 };
-pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
+pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise, frame};
 pub use crate::fft::{FftScratch, StampFft};
 pub use crate::psf::{PsfTransform, TransformedPsf};
 pub use crate::radial::{QuadraticForm, RadialTable, SingleTable, composite_rule, gauss_legendre};

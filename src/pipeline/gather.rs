@@ -6,6 +6,7 @@ mod source;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
+use shearq_measure::parts::frame;
 use shearq_scoring::resample::RunningMean;
 
 pub use self::source::{Content, Files};
@@ -218,11 +219,9 @@ fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
 
 /// The pixels of a stamp's frame, as far as they are finite.
 fn frame_of(pixels: &[f32], side: usize) -> impl Iterator<Item = f64> + '_ {
-    let inside = FRAME..side.saturating_sub(FRAME);
-    let framed = move |k: usize| !(inside.contains(&(k % side)) && inside.contains(&(k / side)));
-    let all = pixels.iter().enumerate();
-    all.filter(move |(k, value)| framed(*k) && value.is_finite())
-        .map(|(_, &value)| f64::from(value))
+    let all = frame(pixels, side, FRAME).flatten();
+    all.filter(|value| value.is_finite())
+        .map(|&value| f64::from(value))
 }
 
 /// Positions of galaxies on an exposure.

@@ -186,8 +186,7 @@ impl ImageSource {
                 survey.add(stamp)?;
             }
         }
-        self.survey = survey.found().map(Arc::new);
-        if self.survey.is_none() && !survey.is_blind() {
+        self.survey = survey.shared().map_err(|_| {
             let missing = match survey.incomplete() {
                 0 => String::new(),
                 count => format!(" ({count} of those looked at have missing pixels)"),
@@ -195,8 +194,8 @@ impl ImageSource {
             let message = format!(
                 "the frames of the stamps hold too little noise to measure it{missing}; set noise.source to \"header\" where NOISESIG is known"
             );
-            return Err(FileError::new(&path, message).into());
-        }
+            FileError::new(&path, message)
+        })?;
         Ok(self.survey.clone())
     }
 

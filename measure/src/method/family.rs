@@ -14,6 +14,7 @@ use super::found::{CutWorker, Found, Images};
 use super::linear::{LinearPlan, LinearWorker};
 use super::window;
 use crate::error::MeasureError;
+use crate::extent::Moments;
 use crate::noise::StampNoise;
 use crate::psf::breadth;
 use crate::sizes::check_psf;
@@ -62,14 +63,14 @@ impl LinearFamily {
     }
 
     /// The member for a PSF of sum one, and galaxies that are seen so broad.
-    fn kind(&self, psf: ArrayView2<'_, f64>, extent: Option<f64>) -> Kind {
+    fn kind(&self, psf: ArrayView2<'_, f64>, extent: Option<f64>, moments: &mut Moments) -> Kind {
         let step = breadth::step(psf, self.cut);
         // It was cut after a look at its middle alone, where it may have been a little broader.
         let fits = |&at: &usize| breadth::side(self.cut, at) >= psf.nrows();
         let reference = self.method.deconvolution.reference_extent;
         Kind {
             step: (step..=breadth::LAST).find(fits).unwrap_or(step),
-            window: window::place(extent, psf, reference),
+            window: window::place(extent, psf, reference, moments),
         }
     }
 }
@@ -97,6 +98,7 @@ pub(super) fn worker(family: Arc<LinearFamily>) -> Box<dyn CutWorker> {
         members: vec![(Kind::OWN, LinearWorker::new(Arc::clone(&family.first)))],
         at: 0,
         extent: None,
+        moments: Moments::default(),
         noise: StampNoise::white(1.0),
         family,
     })
@@ -110,6 +112,7 @@ struct FamilyWorker {
     at: usize,
     noise: StampNoise,
     extent: Option<f64>,
+    moments: Moments,
 }
 
 impl CutWorker for FamilyWorker {
@@ -129,7 +132,7 @@ impl CutWorker for FamilyWorker {
         if psf.nrows() < cut.size {
             check_psf(psf, cut.size)?;
         }
-        let kind = self.family.kind(psf, self.extent);
+        let kind = self.family.kind(psf, self.extent, &mut self.moments);
         let known = self.members.iter().position(|(of, _)| *of == kind);
         self.at = if let Some(at) = known {
             at

@@ -9,7 +9,7 @@ use std::ops::RangeInclusive;
 use ndarray::ArrayView2;
 use shearq_submissions::limits::WINDOWS;
 
-use crate::extent;
+use crate::extent::Moments;
 
 /// Steps in which the width doubles, and its power of the extent.
 const OCTAVE: f64 = 4.0;
@@ -21,18 +21,23 @@ const STEPS: RangeInclusive<i32> = -3..=3;
 /// shear, and a window of 10 px on 48 px made m1 −0.004.
 const WIDEST: f64 = 0.1875;
 
+/// The place of the submission's own width among all.
+pub(super) const OWN: usize = STEPS.start().unsigned_abs() as usize;
 /// Number of widths.
-pub(super) const COUNT: usize = 7;
-/// The place of the submission's own width among them.
-pub(super) const OWN: usize = 3;
+pub(super) const COUNT: usize = OWN + 1 + STEPS.end().unsigned_abs() as usize;
 
 /// The width's place for galaxies that are `seen` so broad in px², through `psf`, where `reference` px² is what the
 /// submission's own is for.
-pub(super) fn place(seen: Option<f64>, psf: ArrayView2<'_, f64>, reference: f64) -> usize {
+pub(super) fn place(
+    seen: Option<f64>,
+    psf: ArrayView2<'_, f64>,
+    reference: f64,
+    moments: &mut Moments,
+) -> usize {
     let (Some(seen), true) = (seen, reference > 0.0) else {
         return OWN;
     };
-    let Some(psf) = extent::of_psf(psf) else {
+    let Some(psf) = moments.of_psf(psf) else {
         return OWN;
     };
     // Of a point nothing is left, which is the narrowest.
@@ -60,22 +65,28 @@ mod tests {
     #[test]
     fn windows_follow_the_extent_without_that_of_the_psf() {
         assert_eq!(STEPS.count(), COUNT);
+        let mut moments = Moments::default();
         // Of a variance of 3 px².
         let psf = Array2::from_shape_fn((32, 32), |(y, x)| {
             let (x, y) = (x as f64 - 15.5, y as f64 - 15.5);
             (-(x * x + y * y) / 6.0).exp()
         });
-        let places =
-            [13.0, 5.0, 23.0, 3.0, 1.0, 1e9].map(|seen| place(Some(seen), psf.view(), 10.0));
+        let places = [13.0, 5.0, 23.0, 3.0, 1.0, 1e9]
+            .map(|seen| place(Some(seen), psf.view(), 10.0, &mut moments));
         // A fifth, once, twice, and nothing of 10 px²: 3.2·log₂ of it, within bounds.
         assert_eq!(places, [OWN, 0, 6, 0, 0, 6]);
         assert_eq!(
-            place(Some(3.0 + 10.0 * 2f64.powf(0.34)), psf.view(), 10.0),
+            place(
+                Some(3.0 + 10.0 * 2f64.powf(0.34)),
+                psf.view(),
+                10.0,
+                &mut moments
+            ),
             OWN + 1
         );
-        assert_eq!(place(None, psf.view(), 10.0), OWN);
-        assert_eq!(place(Some(5.0), psf.view(), 0.0), OWN);
-        assert_eq!(place(Some(5.0), (-&psf).view(), 0.0), OWN);
+        assert_eq!(place(None, psf.view(), 10.0, &mut moments), OWN);
+        assert_eq!(place(Some(5.0), psf.view(), 0.0, &mut moments), OWN);
+        assert_eq!(place(Some(5.0), (-&psf).view(), 0.0, &mut moments), OWN);
         let twice = sigma(5.0, OWN + 2, 48) / sigma(5.0, OWN - 2, 48);
         assert!((twice - 2.0).abs() < 1e-12, "{twice}");
         assert_eq!([OWN, 6].map(|at| sigma(8.0, at, 48)), [8.0, 9.0]);
