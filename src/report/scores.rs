@@ -22,6 +22,9 @@ fn figure_cells(figures: &Figures, errors: &Figures) -> Vec<Cell> {
         .collect()
 }
 
+/// Where kinds come from: catalogues of other sets may have the same numbers.
+const KINDS: &str = "Kinds are those of GREAT10's sets of these numbers.";
+
 /// What a set is called in tables.
 fn kind_label(set: Option<u32>) -> String {
     set.and_then(SetKind::of)
@@ -179,7 +182,7 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     let counts: BTreeSet<usize> = scored.iter().map(|set| set.score.images).collect();
     let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
     let mut lines = vec![
-        format!("Images a set: {}.", counts.join(", ")),
+        format!("Images a set: {}. {KINDS}", counts.join(", ")),
         definition_note(definition),
     ];
     lines.extend(notes(scored));
@@ -209,7 +212,6 @@ fn q_leaderboard(score: &SetScore) -> f64 {
 fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
     let headings = [
         ("set", "Set"),
-        ("kind", "Kind"),
         ("images", "Images"),
         ("e1", "mean e1"),
         ("e2", "mean e2"),
@@ -224,7 +226,6 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
         let shear = |value, error| Cell::with_error(value, Some(error), 5);
         Some(vec![
             set_cell(scored.set),
-            Cell::text(kind_label(scored.set)),
             Cell::number(score.images as f64, 0),
             shear(mean.e[0], mean.error[0]),
             shear(mean.e[1], mean.error[1]),
@@ -299,7 +300,7 @@ pub fn spectra(
         headings,
         rows,
         notes: vec![format!(
-            "Figures: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian."
+            "Figures: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian. {KINDS}"
         )],
     }
 }

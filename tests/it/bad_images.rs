@@ -310,7 +310,11 @@ fn what_cfitsio_would_divide_by_is_refused_however_it_is_written() {
         ("ZBITPIX", "ZBITPIX = 64", "ZBITPIX is 64"),
         ("ZCMPTYPE", "ZCMPTYPE= 'BZIP2_1 '", "ZCMPTYPE is BZIP2_1"),
         ("ZNAME1", "ZDITHER0= -99999999", "ZDITHER0 is -99999999"),
-        ("ZNAME1", "ZQUANTIZ= 'NONE    '", "compressed as they are"),
+        (
+            "ZNAME1",
+            "ZQUANTIZ= 'NONE    '",
+            "without being quantised to integers",
+        ),
         (
             "ZNAME1",
             "A=111111111111111111111111111111111111111111111111111111111111111111111111111111",

@@ -218,10 +218,12 @@ impl Tiles {
             .any(|name| column(file, name) != 0);
         let lossless = tiling.as_they_are || tiling.real.is_some() && !scaled;
         if lossless && (tiling.real.is_none() || tiling.coding != Coding::Gzip) {
-            return Err(file.fault(
-                "the pixels are compressed as they are; expected real numbers and GZIP_1 or GZIP_2 for that"
-                    .into(),
-            ));
+            let message = if tiling.real.is_some() {
+                "real numbers are compressed without being quantised to integers first; expected GZIP_1 or GZIP_2 for that, or quantised ones"
+            } else {
+                "the header key ZQUANTIZ is NONE for integers; expected it for real numbers (ZBITPIX -32 or -64) alone"
+            };
+            return Err(file.fault(message.into()));
         }
         Ok(Tiles {
             tiling,
