@@ -22,26 +22,11 @@ pub struct PartFile {
     part: PathBuf,
     target: PathBuf,
     finished: bool,
-    /// The file with a lock on it, where this made it.
-    _held: Option<fs::File>,
+    /// The file with a lock on it, where there are such.
+    _held: fs::File,
 }
 
 impl PartFile {
-    /// Makes the folder and chooses a temporary name, for those that make the file themselves.
-    ///
-    /// # Errors
-    /// Where the folder cannot be made.
-    pub fn new(target: impl AsRef<Path>) -> Result<Self, FileError> {
-        let target = regular(target.as_ref())?;
-        let part = part_of(&target)?;
-        Ok(PartFile {
-            part,
-            target,
-            finished: false,
-            _held: None,
-        })
-    }
-
     /// Makes the folder and the file, to be written to.
     ///
     /// # Errors
@@ -58,16 +43,9 @@ impl PartFile {
             part,
             target,
             finished: false,
-            _held: Some(held),
+            _held: held,
         };
         Ok((part, file))
-    }
-
-    /// Locks the file, which another library has made, so that no process takes it for a leftover.
-    pub fn hold(&mut self) {
-        // File systems without locks have none that could be taken by others.
-        let file = fs::File::open(&self.part);
-        self._held = file.ok().filter(|file| file.lock().is_ok());
     }
 
     /// Where to write.
@@ -420,7 +398,7 @@ mod tests {
     fn an_abandoned_file_leaves_nothing_and_a_finished_one_only_itself() {
         let folder = tempfile::tempdir().unwrap();
         let target = folder.path().join("new/result.csv");
-        let part = PartFile::new(&target).unwrap();
+        let (part, _) = PartFile::create(&target).unwrap();
         fs::write(part.path(), "half").unwrap();
         drop(part);
         let count = || fs::read_dir(target.parent().unwrap()).unwrap().count();
@@ -434,10 +412,8 @@ mod tests {
     fn processes_that_write_the_same_file_do_not_meet_in_it() {
         let folder = tempfile::tempdir().unwrap();
         let target = folder.path().join("set01/truth.csv");
-        let (one, two) = (
-            PartFile::new(&target).unwrap(),
-            PartFile::new(&target).unwrap(),
-        );
+        let part = || PartFile::create(&target).unwrap().0;
+        let (one, two) = (part(), part());
         fs::write(one.path(), "one").unwrap();
         fs::write(two.path(), "two").unwrap();
         one.finish().unwrap();
@@ -445,7 +421,7 @@ mod tests {
         assert_eq!(fs::read(&target).unwrap(), b"two");
         assert!(!write_if_absent(&target, b"three").unwrap());
         assert_eq!(fs::read(&target).unwrap(), b"two");
-        let killed = PartFile::new(&target).unwrap();
+        let killed = part();
         fs::write(killed.path(), "half").unwrap();
         std::mem::forget(killed);
         remove_leftovers(folder.path()).unwrap();

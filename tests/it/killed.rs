@@ -1,4 +1,4 @@
-//! Killed at any moment: whatever a SIGKILL interrupts, going on ends in the same bytes.
+//! Killed at any moment, or without room on the disk: whatever that interrupts, going on ends in the same bytes.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -146,6 +146,60 @@ fn what_killed_commands_leave_is_removed_by_the_next() {
                 "{command:?}: {left:?} in {}",
                 folder.display()
             );
+        }
+    }
+}
+
+/// The binary where no file may be longer than `blocks` of 512 bytes, as on a disk that is full.
+#[cfg(unix)]
+fn confined(blocks: usize, arguments: &[&str]) -> std::process::Output {
+    let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$0\" \"$@\"");
+    Command::new("sh")
+        .args(["-c", &script, env!("CARGO_BIN_EXE_shearq")])
+        .args(arguments)
+        .output()
+        .unwrap()
+}
+
+#[cfg(unix)]
+#[test]
+fn what_a_full_disk_does_not_take_is_an_error_and_no_file() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let (data, measured, cube) = (at("data"), at("measured"), at("cube"));
+    let sets = ["--sets", "2", "--images", "1", "--grid", "8"];
+    let simulate = [&["simulate"][..], &sets].concat();
+    let measure = ["measure", "--submission", "23/raw/star", "--data"];
+    let measure = [&measure[..], &[text(&data), "--catalogue-format", "fits"]].concat();
+    succeed(&[&simulate[..], &["--out", text(&data)]].concat());
+    let stamp = data.join("set02/psf-001.fits");
+    let gather = ["gather", "--stamps", text(&stamp), "--psf", text(&stamp)];
+    // The largest file of each is of 593,280, 17,280 and 12,096 bytes: none of it, half, and all but the end fit.
+    for (command, whole, sizes) in [
+        (&simulate[..], &data, [1, 600, 1158]),
+        (&measure, &measured, [1, 12, 32]),
+        (&gather, &cube, [1, 12, 20]),
+    ] {
+        if !whole.exists() {
+            succeed(&[command, &["--out", text(whole)]].concat());
+        }
+        let expected: BTreeMap<String, Vec<u8>> = contents(whole).into_iter().collect();
+        let out = whole.with_extension("again");
+        for blocks in sizes {
+            let arguments = [command, &["--out", text(&out)]].concat();
+            let output = confined(blocks, &arguments);
+            let message = String::from_utf8_lossy(&output.stderr);
+            assert_eq!(output.status.code(), Some(1), "{command:?}: {message}");
+            assert!(message.contains("cannot write"), "{command:?}: {message}");
+            if out.exists() {
+                for (name, bytes) in contents(&out) {
+                    assert!(expected.get(&name) == Some(&bytes), "{command:?}: {name}");
+                }
+            }
+            succeed(&arguments);
+            let found: BTreeMap<String, Vec<u8>> = contents(&out).into_iter().collect();
+            assert!(found == expected, "{command:?} after {blocks} blocks");
+            std::fs::remove_dir_all(&out).unwrap();
         }
     }
 }
