@@ -91,8 +91,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     } = arguments;
     if let Some(sigma) = noise {
         anyhow::ensure!(
-            *sigma > 0.0 && sigma.is_finite(),
-            "--noise is {sigma}; expected a positive number"
+            *sigma > 0.0 && sigma.is_normal(),
+            "--noise is {sigma:e}; expected a positive number"
         );
     }
     let images = Files {

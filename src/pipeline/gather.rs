@@ -3,6 +3,7 @@
 
 mod source;
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -10,7 +11,7 @@ use shearq_measure::parts::frame;
 use shearq_scoring::resample::RunningMean;
 
 pub use self::source::{Content, Files};
-use self::source::{Exposure, Images, Origin, Planes};
+use self::source::{Exposure, Images, Origin, Planes, shown};
 use super::PipelineError;
 use super::images::ImageId;
 use super::measure::check_strip;
@@ -34,6 +35,8 @@ const SKY: f64 = 1.0;
 const FRAME: usize = 2;
 
 /// Where stamps come from.
+#[derive(Serialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Stamps<'a> {
     /// FITS files, each with one stamp, a cube of them, or several extensions with either.
     Files(Files<'a>),
@@ -42,6 +45,7 @@ pub enum Stamps<'a> {
         /// The exposure: the first image of one file.
         exposure: Files<'a>,
         /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
+        #[serde(serialize_with = "shown")]
         positions: &'a Path,
         /// Names of its columns for x and y.
         columns: [&'a str; 2],
@@ -66,6 +70,7 @@ pub struct Gathered {
 struct Place<'a> {
     x: f64,
     y: f64,
+    #[serde(serialize_with = "shown")]
     file: &'a Path,
     image: usize,
     plane: usize,
@@ -73,9 +78,20 @@ struct Place<'a> {
     position_y: Option<f64>,
 }
 
-/// Gathers stamps and their PSFs into image `id` of `data`: PSFs, the table of which stamp is which, and last the
-/// image. Pixels are missing where those of `masks`, images like those of the stamps or the exposure, are not zero.
-/// `noise` is written as the image's NOISESIG.
+/// What made an image, kept beside it.
+#[derive(Serialize)]
+struct Record<'a> {
+    version: &'a str,
+    stamps: &'a Stamps<'a>,
+    masks: Option<Files<'a>>,
+    psfs: Files<'a>,
+    noise: Option<f64>,
+}
+
+/// Gathers stamps and their PSFs into image `id` of `data`: the table of which stamp is which and the record of what
+/// made it, PSFs, and last the image. Pixels are missing where those of `masks`, images like those of the stamps or the
+/// exposure, are not zero. `noise` is written as the image's NOISESIG. What a stopped process left of the image is
+/// replaced; others that gather into the same folder are waited for.
 ///
 /// # Errors
 /// Where a file cannot be read, stamps are not square or of different sizes, masks are of others, there are neither one
@@ -88,17 +104,58 @@ pub fn gather(
     psfs: Files<'_>,
     noise: Option<f64>,
 ) -> Result<Gathered, PipelineError> {
+    let which = data.stamps(id.set, id.image);
+    let folder = which.parent().unwrap_or(Path::new("."));
+    let (made, cannot) = (!folder.exists(), "cannot make the folder");
+    fs::create_dir_all(folder).map_err(FileError::doing(folder, cannot))?;
+    let alone = fs::File::open(folder).map_err(FileError::doing(folder, cannot))?;
+    // File systems without locks have none that could be waited for.
+    let _ = alone.lock();
+    let gathered = gather_alone(data, id, stamps, masks, psfs, noise);
+    if made && gathered.is_err() {
+        // Unless there is something in it.
+        let _ = fs::remove_dir(folder);
+    }
+    gathered
+}
+
+fn gather_alone(
+    data: &DataFolder,
+    id: ImageId,
+    stamps: &Stamps<'_>,
+    masks: Option<Files<'_>>,
+    psfs: Files<'_>,
+    noise: Option<f64>,
+) -> Result<Gathered, PipelineError> {
     let target = data.galaxies(id.set, id.image);
     let which = data.stamps(id.set, id.image);
-    let own = [
-        target.clone(),
+    if is_there(&target) {
+        return Err(already(target).into());
+    }
+    let psfs_there = [
         data.psf_star(id.set, id.image),
         data.psf_functional(id.set, id.image),
-        which.clone(),
-    ];
-    if let Some(path) = own.into_iter().find(|path| is_there(path)) {
-        return Err(already(path).into());
+    ]
+    .into_iter()
+    .filter(|path| is_there(path));
+    // Nothing but this makes the table, and the image comes last: where there is one without the other, this was
+    // stopped, and the PSF is its own.
+    let stopped = is_there(&which);
+    for path in psfs_there {
+        if !stopped {
+            return Err(already(path).into());
+        }
+        fs::remove_file(&path).map_err(FileError::doing(&path, "cannot remove the leftover"))?;
     }
+    let record = Record {
+        version: crate::VERSION,
+        stamps,
+        masks,
+        psfs,
+        noise,
+    };
+    let record = serde_json::to_string_pretty(&record)
+        .map_err(FileError::doing(&which, "cannot tell what made it"))?;
     let mut doubts = Vec::new();
     let positions = match stamps {
         Stamps::Files(_) => Vec::new(),
@@ -192,9 +249,12 @@ pub fn gather(
     let text = places
         .into_inner()
         .map_err(|error| FileError::new(&which, error.to_string()))?;
-    // Whoever is the first to have the PSF has the image.
-    psf.finish()?;
+    atomic::write(
+        which.with_extension("json"),
+        format!("{record}\n").as_bytes(),
+    )?;
     atomic::write(&which, &text)?;
+    psf.finish()?;
     image.finish()?;
     Ok(Gathered {
         mosaic,
@@ -337,10 +397,19 @@ fn gather_psfs(
     let stars = Mosaic::of(count, side);
     let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
     let mut planes = Planes::of(files);
+    let mut dark = 0;
     while let Some((origin, pixels)) = planes.next()? {
+        let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
+        if !(light > 0.0 && light.is_finite()) {
+            if count == 1 {
+                let message =
+                    format!("the pixels of the PSF add up to {light}; expected a positive sum");
+                return Err(origin.fault(&message));
+            }
+            dark += 1;
+        }
         let pedestal = pedestal(&pixels, side);
-        // Of a star without light it is no number.
-        if image.next == 0 && (pedestal.abs() > PEDESTAL || pedestal.is_nan()) {
+        if image.next == 0 && pedestal.abs() > PEDESTAL {
             doubts.push(format!(
                 "warning: {}: the frame of the first PSF is as bright as {:.0} % of its light would make it if all of the stamp were: is a background left in it?",
                 origin.file.display(),
@@ -348,6 +417,11 @@ fn gather_psfs(
             ));
         }
         image.add(&pixels)?;
+    }
+    if dark > 0 {
+        doubts.push(format!(
+            "warning: the pixels of {dark} of {count} PSFs add up to nothing, less or no number: galaxies with them will be flagged"
+        ));
     }
     Ok(PsfFile::Stars(Box::new(image)))
 }

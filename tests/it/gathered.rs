@@ -307,6 +307,7 @@ fn a_gathered_image_goes_where_the_layout_says_and_is_of_one_run() {
     let gather = ["gather", "--stamps", text(&three), "--out", text(&out)];
     let absent = at("absent.fits");
     fail(&[&gather[..], &["--psf", text(&absent)]].concat());
+    assert!(!out.join("set01").exists());
     succeed(&[&gather[..], &["--psf", text(&psf)]].concat());
     let mut names: Vec<_> = fs::read_dir(&out)
         .unwrap()
@@ -314,8 +315,21 @@ fn a_gathered_image_goes_where_the_layout_says_and_is_of_one_run() {
         .collect();
     names.sort();
     assert_eq!(names, ["g-1-1.fits", "layout.toml", "p-1-1.fits", "set01"]);
+    let record = fs::read_to_string(out.join("set01/stamps-001.json")).unwrap();
+    assert!(
+        record.contains("three.fits") && record.contains("psf.fits") && record.contains("version")
+    );
+    // Without the image, which comes last, all of it is what a stopped run has left.
+    let image = fs::read(out.join("g-1-1.fits")).unwrap();
+    for psf in [&formula, &psf] {
+        fs::remove_file(out.join("g-1-1.fits")).unwrap();
+        succeed(&[&gather[..], &["--psf", text(psf)]].concat());
+        assert_eq!(fs::read(out.join("g-1-1.fits")).unwrap(), image);
+    }
+    assert!(!out.join("set01/psf-001.csv").exists());
     // A PSF of either form that is there belongs to another image.
     fs::remove_file(out.join("g-1-1.fits")).unwrap();
+    fs::remove_file(out.join("set01/stamps-001.csv")).unwrap();
     for psf in [&psf, &formula] {
         let message = fail(&[&gather[..], &["--psf", text(psf)]].concat());
         assert!(

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::{Serialize, Serializer};
+
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
 
@@ -24,14 +26,25 @@ const COMPANIONS: [&str; 15] = [
     "BACKGROUND",
 ];
 
+/// Writes a path as it is shown: not all of them are Unicode.
+pub(super) fn shown<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&path.display())
+}
+
+fn all_shown<S: Serializer>(paths: &[PathBuf], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(paths.iter().map(|path| path.display().to_string()))
+}
+
 /// FITS files, and which of their images are meant.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize)]
 pub struct Files<'a> {
     /// At least one.
+    #[serde(serialize_with = "all_shown")]
     pub paths: &'a [PathBuf],
     /// Name of the images (EXTNAME, in any case); without, all of them.
     pub extension: Option<&'a str>,
     /// What they are images of.
+    #[serde(skip)]
     pub content: Content,
 }
 
