@@ -5,14 +5,17 @@ use shearq_submissions::{Calibration, Submission};
 use crate::flag::Flag;
 use crate::measurement::Measurement;
 
+/// A mean response of less than so many of its errors is none.
+const CLEAR: f64 = 3.0;
+
 /// Divides the ellipticities of an image, all of whose galaxies are given (in parts, such as rows), as the
 /// submission asks, each component by its mean response over the good galaxies, which is returned; `None`
 /// where nothing is divided.
 ///
 /// One galaxy's response is far too noisy to divide by (and correlated with its ellipticity); the
 /// mean over 10,000 has an error of 0.2 to 0.5 %, independent from image to image, so that the error
-/// of a set's mean ellipticity is far below a thousandth. Where the mean is not positive, all
-/// galaxies are flagged.
+/// of a set's mean ellipticity is far below a thousandth. Where a mean is not positive by three of its errors, as where
+/// there are no galaxies on the stamps, all are flagged. (One galaxy's has no error, and need be positive alone.)
 pub fn calibrate<P>(submission: &Submission, parts: &mut [P]) -> Option<[f64; 2]>
 where
     P: AsRef<[Measurement]> + AsMut<[Measurement]>,
@@ -29,7 +32,14 @@ where
     let count = good().count() as f64;
     // Components apart: lags on a square grid, and PSFs with a direction, tell them from each other.
     let means = [0, 1].map(|k| good().map(|g| g.response[k]).sum::<f64>() / count);
-    let usable = means.iter().all(|mean| *mean > 0.0 && mean.is_finite());
+    let usable = [0, 1].into_iter().all(|k| {
+        let off = good().map(|g| (g.response[k] - means[k]).powi(2));
+        let error = match count > 1.0 {
+            true => (off.sum::<f64>() / (count * (count - 1.0))).sqrt(),
+            false => 0.0,
+        };
+        means[k].is_finite() && means[k] > 0.0 && means[k] >= CLEAR * error
+    });
     for galaxy in parts.iter_mut().flat_map(AsMut::as_mut) {
         if usable {
             galaxy.e1 /= means[0];
@@ -79,6 +89,12 @@ mod tests {
         assert!((mean[0] - 0.5).abs() < 1e-12 && mean[0] == mean[1]);
         assert!((rows[0][0].e1 - 0.2).abs() < 1e-12);
         assert!((rows[1][0].e2 + 0.4).abs() < 1e-12);
+        // 0.1 ± 0.1 and, of others, 0.1 ± 0.03.
+        let unsure = [0.3, -0.1, 0.25, -0.05];
+        assert_eq!(calibrate(&calibrated, &mut [row(&unsure[..])]), None);
+        let scatter = [0.19, 0.01, 0.17, 0.03];
+        let mut rows = [row(&scatter[..]), row(&scatter[..])];
+        assert!(calibrate(&calibrated, &mut rows).is_some());
         let mut rows = vec![row(&[-0.1, f64::NAN])];
         assert_eq!(calibrate(&calibrated, &mut rows), None);
         assert_eq!(rows[0][0].flags, Flag::NoResponse.into());

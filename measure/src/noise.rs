@@ -289,6 +289,11 @@ impl NoiseSurvey {
         self.typical.extend(median(&mut all));
     }
 
+    /// How many stamps were looked at.
+    pub fn looked_at(&self) -> usize {
+        self.counts[0]
+    }
+
     /// How many of the stamps looked at have missing pixels.
     pub fn incomplete(&self) -> usize {
         self.counts[1]

@@ -163,7 +163,8 @@ impl ImageSource {
     }
 
     /// Measures the noise of the image on its stamps, and how broad its galaxies are, for the rows that follow and for the
-    /// caller; `None` where all are such that their galaxies will be flagged.
+    /// caller; `None` where too many pixels of all of them are missing. NOISESIG does not take its place then, so that their
+    /// galaxies are flagged.
     ///
     /// # Errors
     /// Where they cannot be read, or hold no frame of noise alone.
@@ -189,13 +190,17 @@ impl ImageSource {
         self.survey = survey.shared().map_err(|_| {
             let missing = match survey.incomplete() {
                 0 => String::new(),
-                count => format!(" ({count} of those looked at have missing pixels)"),
+                count => format!(", {count} of which have missing pixels"),
             };
+            let looked_at = survey.looked_at();
             let message = format!(
-                "the frames of the stamps hold too little noise to measure it{missing}; set noise.source to \"header\" where NOISESIG is known"
+                "the frames of {looked_at} stamp(s){missing} hold too little noise to measure it; expected two whole frames or more: set noise.source to \"border\", or to \"header\" where NOISESIG is known"
             );
             FileError::new(&path, message)
         })?;
+        if self.survey.is_none() {
+            self.header_noise = None;
+        }
         Ok(self.survey.clone())
     }
 
@@ -514,13 +519,19 @@ fn first_noise(
     };
     let mut source = ImageSource::open(data, first, submission)?;
     let asked = measurer.noise_plan().is_some();
+    let image = format!("set {:02} image {:03}", first.set, first.image);
     let survey = match source.look(data, plan) {
         Ok(Some(survey)) => survey,
         Err(error) if asked => return Err(error),
+        Ok(None) if asked => {
+            let doubt = format!(
+                "warning: {image}: no stamp has pixels enough to measure the noise on: its galaxies are flagged; noise.source \"header\" takes NOISESIG"
+            );
+            return Ok((None, vec![doubt]));
+        }
         Ok(None) | Err(_) => return Ok(nothing),
     };
     let noise = &survey.noise;
-    let image = format!("set {:02} image {:03}", first.set, first.image);
     let mut doubts = Vec::new();
     if let Some(header) = source.header_noise {
         let apart = noise.sigma() / header - 1.0;

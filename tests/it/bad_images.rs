@@ -3,6 +3,9 @@
 
 use std::fs;
 
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 use shearq_tables::polars::df;
 
 use crate::support::{PACKED, Small, fits_image, floats, pixels_of};
@@ -110,6 +113,18 @@ fn images_of_other_shapes_and_types_work_or_are_refused() {
             &["0 × 384 pixels; expected 1 to"],
         ),
         (fits_image(8, &[], &[], &[]), &["0 dimensions; expected 2"]),
+        (
+            fits_image(-32, &[side; 2], &["BSCALE  = 'abc     '"], &float),
+            &["the header key BSCALE is not a number"],
+        ),
+        (
+            fits_image(-32, &[side; 2], &["BSCALE  =                  0.0"], &float),
+            &["the header key BSCALE is 0; expected"],
+        ),
+        (
+            fits_image(-32, &[side; 2], &["BZERO   =                1E400"], &float),
+            &["the header key BZERO is"],
+        ),
     ];
     for (bytes, expected) in cases {
         refuse(&small, first, &bytes, &RAW, expected);
@@ -313,7 +328,7 @@ fn what_cfitsio_would_divide_by_is_refused_however_it_is_written() {
         (
             "ZNAME1",
             "ZQUANTIZ= 'NONE    '",
-            "without being quantised to integers",
+            "ZQUANTIZ is NONE for integers",
         ),
         (
             "ZNAME1",
@@ -522,6 +537,21 @@ fn stamps_without_a_galaxy_are_flagged_and_noise_is_measured() {
                 .all(|(e, flag)| e.is_nan() == (*flag != 0.0))
         );
     }
+}
+
+#[test]
+fn noise_alone_has_no_shear() {
+    let small = Small::new("2");
+    let first = "data/set02/galaxies-001.fits";
+    let (mut pixels, side) = pixels_of(&small.at(first));
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    pixels.fill_with(|| StandardNormal.sample(&mut rng));
+    let cards = ["STAMP   =                   48"];
+    let image = fits_image(-32, &[side, side], &cards, &floats(&pixels));
+    fs::write(small.at(first), image).unwrap();
+    small.measure(&["--submission", "48/linear/star"]);
+    let e1 = small.measured("02", "e1");
+    assert!(e1[..64].iter().all(|e| e.is_nan()), "{e1:?}");
 }
 
 #[test]

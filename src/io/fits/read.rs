@@ -111,6 +111,15 @@ impl ImageReader {
 
     /// The image that `file` is at.
     fn here(mut file: File, place: &str, dimensions: Dimensions) -> Result<Self, FileError> {
+        // cfitsio leaves out those that are no numbers.
+        for key in ["BSCALE", "BZERO"] {
+            let value = file.number(key)?;
+            if let Some(value) = value.filter(|v| !v.is_finite() || key == "BSCALE" && *v == 0.0) {
+                return Err(file.fault(format!(
+                    "the header key {key} is {value}; expected a number by which pixels are scaled"
+                )));
+            }
+        }
         let sides = file.sides()?;
         let (x, y, z) = match (sides.as_slice(), dimensions) {
             (&[x, y], _) => (x, y, 1),
