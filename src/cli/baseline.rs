@@ -30,7 +30,13 @@ pub(super) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    #[command(
+        after_help = "Examples:\n  shearq baseline record mine --measured raw den\n  shearq baseline record mine --simulate --sets 2,8 --images 4 --submission own.toml"
+    )]
     Record(RecordArguments),
+    #[command(
+        after_help = "Examples:\n  shearq baseline check mine\n  shearq baseline check mine --update --reason \"new window\""
+    )]
     Check(CheckArguments),
 }
 
@@ -174,13 +180,7 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
             set.images
         );
     }
-    let baseline = Baseline {
-        version: crate::VERSION.into(),
-        source,
-        history: Vec::new(),
-        submissions,
-    };
-    baseline.create(&path)?;
+    Baseline::new(source, Vec::new(), submissions).create(&path)?;
     tell(format_args!("recorded {}", path.display()));
     Ok(())
 }
@@ -324,13 +324,7 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
                 from_version: baseline.version,
                 moved,
             });
-            let updated = Baseline {
-                version: crate::VERSION.into(),
-                source,
-                history,
-                submissions,
-            };
-            updated.replace(path)?;
+            Baseline::new(source, history, submissions).replace(path)?;
             tell(format_args!("updated {}", path.display()));
         }
     }

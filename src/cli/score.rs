@@ -1,6 +1,6 @@
 //! `shearq score`.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -415,6 +415,15 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         missing: arguments.missing,
         max_modulus: arguments.max_modulus,
     };
+    let mut seen = BTreeSet::new();
+    for path in &arguments.catalogues {
+        let same = path.canonicalize().unwrap_or_else(|_| path.clone());
+        anyhow::ensure!(
+            seen.insert(same),
+            "{}: this catalogue is given twice; expected one for each image",
+            path.display()
+        );
+    }
     let scored = score_files(
         truth,
         &arguments.catalogues,

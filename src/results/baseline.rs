@@ -21,6 +21,9 @@ pub use moved::{Checked, Shift, check};
 pub struct Baseline {
     /// Version of shearq that measured it.
     pub version: String,
+    /// Number of sets of all submissions together, by which a file that was cut short is known. Older ones have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sets_held: Option<usize>,
     /// Where the galaxies come from.
     pub source: Source,
     /// Why it was changed, oldest first.
@@ -90,6 +93,17 @@ pub struct Change {
 }
 
 impl Baseline {
+    /// Of what this version measured.
+    pub fn new(source: Source, history: Vec<Change>, submissions: Vec<BaselineSubmission>) -> Self {
+        Baseline {
+            version: crate::VERSION.into(),
+            sets_held: Some(sets_of(&submissions).count()),
+            source,
+            history,
+            submissions,
+        }
+    }
+
     /// The file of the baseline `name` in `folder`.
     pub fn path(folder: &Path, name: &str) -> PathBuf {
         folder.join(format!("{name}.{ENDING}"))
@@ -122,10 +136,22 @@ impl Baseline {
             .map_err(FileError::doing(path, "cannot read the baseline"))?;
         let baseline: Baseline = toml::from_str(&text)
             .map_err(|error| FileError::new(path, error.to_string().trim_end()))?;
-        let sets = baseline.submissions.iter().flat_map(|s| &s.sets);
-        let infinite = |set: &&BaselineSet| set.figures.values().flatten().any(|v| v.is_infinite());
-        if let Some(set) = sets.clone().find(infinite) {
-            let message = format!("set {} has an infinite figure or error", set.set);
+        let wild = |set: &&BaselineSet| {
+            let mut figures = set.figures.values();
+            figures.any(|[value, error]| value.is_infinite() || error.is_infinite() || *error < 0.0)
+        };
+        if let Some(set) = sets_of(&baseline.submissions).find(wild) {
+            let message = format!(
+                "set {} has an infinite figure, or an error that is infinite or negative",
+                set.set
+            );
+            return Err(FileError::new(path, message));
+        }
+        let found = sets_of(&baseline.submissions).count();
+        if let Some(held) = baseline.sets_held.filter(|held| *held != found) {
+            let message = format!(
+                "{found} of {held} sets are there, as `sets_held` counts them: it was cut short or edited"
+            );
             return Err(FileError::new(path, message));
         }
         Ok(baseline)
@@ -166,6 +192,10 @@ impl Baseline {
     fn text(&self, path: &Path) -> Result<String, FileError> {
         toml::to_string(self).map_err(FileError::doing(path, "cannot write the baseline"))
     }
+}
+
+fn sets_of(submissions: &[BaselineSubmission]) -> impl Iterator<Item = &BaselineSet> {
+    submissions.iter().flat_map(|submission| &submission.sets)
 }
 
 /// Ending of file names.

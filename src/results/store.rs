@@ -68,6 +68,20 @@ fn read_run(path: &Path) -> Result<RunRecord, FileError> {
         );
         return Err(FileError::new(path, message));
     }
+    let bytes = std::fs::read(path).map_err(FileError::doing(path, "cannot read the file"))?;
+    let print = fingerprint::of_bytes(&bytes);
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    // Whoever names a file anew has it without.
+    let named = stem
+        .rsplit('-')
+        .next()
+        .filter(|end| end.len() == print.len() && end.bytes().all(|byte| byte.is_ascii_hexdigit()));
+    if named.is_some_and(|named| named != print) {
+        let message = format!(
+            "the file was changed since it was recorded: its content is {print}, not what its name ends in"
+        );
+        return Err(FileError::new(path, message));
+    }
     RunRecord::from_table(&table, path)
 }
 

@@ -195,19 +195,30 @@ fn options_and_baselines_hold_finite_positive_limits() {
             assert_eq!(output.status.code(), Some(2), "{arguments:?}: {message}");
         }
     }
-    run_simulated("2", "23/raw/star", &out, &[]);
+    run_simulated("2,5", "23/raw/star", &out, &[]);
     let record = ["baseline", "record", "mine", "--folder", text(&folder)];
     succeed(&[&record[..], &["--measured", text(&out)]].concat());
     let path = folder.join("mine.toml");
     let sound = fs::read_to_string(&path).unwrap();
     let start = sound.find("\nq = [").unwrap() + "\nq = [".len();
     let end = start + sound[start..].find(',').unwrap();
-    fs::write(&path, format!("{}inf{}", &sound[..start], &sound[end..])).unwrap();
-    let error = fail(&["baseline", "check", "--folder", text(&folder)]);
-    has(
-        &error,
-        &["mine.toml", "set 2 has an infinite figure or error"],
-    );
+    let shorter = &sound[..sound.rfind("[[submissions.sets]]").unwrap()];
+    let negative = sound[end..].replacen(", ", ", -", 1);
+    for (text_of, words) in [
+        (
+            format!("{}inf{}", &sound[..start], &sound[end..]),
+            "set 2 has an infinite figure",
+        ),
+        (
+            format!("{}{negative}", &sound[..end]),
+            "an error that is infinite or negative",
+        ),
+        (shorter.to_owned(), "1 of 2 sets are there"),
+    ] {
+        fs::write(&path, text_of).unwrap();
+        let error = fail(&["baseline", "check", "--folder", text(&folder)]);
+        has(&error, &["mine.toml", words]);
+    }
 }
 
 #[cfg(unix)]

@@ -109,6 +109,24 @@ fn a_store_gives_the_same_figures_as_the_folders_however_it_was_filled() {
 }
 
 #[test]
+fn what_was_changed_since_it_was_recorded_is_refused() {
+    let recorded = Recorded::new();
+    let store = recorded.at("store");
+    let [one, other] = files(&store).try_into().unwrap();
+    fs::write(&one.0, &other.1).unwrap();
+    let message = fail(&["compare", "--store", text(&store)]);
+    assert!(message.contains(text(&one.0)), "{message}");
+    assert!(
+        message.contains("changed since it was recorded"),
+        "{message}"
+    );
+    // Under a name of one's own it is what it is.
+    fs::remove_file(&one.0).unwrap();
+    fs::rename(&other.0, store.join("mine.parquet")).unwrap();
+    assert_eq!(recorded.compare("store", &[]).len(), 1);
+}
+
+#[test]
 fn runs_are_chosen_sorted_and_grouped() {
     let recorded = Recorded::new();
     let q = |row: &Value| row["q"].as_f64().unwrap();
