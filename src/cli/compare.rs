@@ -6,7 +6,8 @@ use anyhow::Context;
 use clap::Args;
 
 use super::arguments::{Printing, ReportFile, ScoreSettings, Threads};
-use super::print_heat_map;
+use super::{print_heat_map, score};
+use crate::io::run::Run;
 use crate::report::comparison::{compare, compare_runs, q_heat_map};
 use crate::report::figure::{Figure, HeatMap};
 use crate::report::pages;
@@ -80,16 +81,27 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let Some(path) = &arguments.heat_map {
         map.save(path)?;
     }
-    let paths = arguments.store.iter().chain(&arguments.measured);
-    let made_by = paths.chain(&arguments.foreign).chain(&arguments.data);
-    let made_by = made_by.map(|path| ("Input".to_owned(), path.display().to_string()));
     let sections = || Ok(vec![pages::comparison(table, &map)?]);
     let title = "Comparison of submissions";
-    arguments.report.save(title, sections, made_by.collect())?;
+    arguments
+        .report
+        .save(title, sections, made_by(arguments)?)?;
     if arguments.printing.format() == TableFormat::Table {
         print_heat_map(map)?;
     }
     Ok(())
+}
+
+/// Where the figures come from: inputs, and settings of what shearq measured.
+fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
+    let mut made_by = Vec::new();
+    for folder in &arguments.measured {
+        made_by.extend(score::made_by(&Run::require(folder)?, folder)?);
+    }
+    let paths = arguments.store.iter().chain(&arguments.foreign);
+    let paths = paths.chain(&arguments.data);
+    made_by.extend(paths.map(|path| ("Input".to_owned(), path.display().to_string())));
+    Ok(made_by)
 }
 
 /// The comparison of a store's runs.

@@ -171,10 +171,18 @@ fn verdict(submissions: &[(String, Vec<SetRecord>)]) -> String {
             raised.join(" and ")
         ),
     };
+    let noise: Vec<String> = sets
+        .iter()
+        .map(|set| {
+            let noise = Some(set.errors.galaxy_noise);
+            let noise = Cell::with_error(set.figures.galaxy_noise, noise, 3).in_words();
+            format!("{noise} in set {}", set.set)
+        })
+        .collect();
     format!(
-        "{lead}: m = {}, noise {} a galaxy once calibrated, and Q calibrated = {}; {}.{warning}",
+        "{lead}: m = {}, noise of a galaxy once calibrated {}, and Q calibrated = {}; {}.{warning}",
         shown(sets, "m_cross", 2),
-        shown(sets, "galaxy_noise", 3),
+        noise.join(" and "),
         shown(sets, "q_calibrated", 1),
         others.join("; ")
     )

@@ -191,6 +191,7 @@ fn names(submissions: &[(Submission, Published)]) -> Vec<String> {
 
 /// Figs 8 to 11, and the tables beside them.
 fn sect_five(page: &mut Page<'_>, results: &[SetResult], names: &[String]) -> anyhow::Result<()> {
+    let images = results.first().map_or(0, |set| set.images);
     page.figure(
         "fig8-q-per-set",
         &exhibits::q_per_set(results, names),
@@ -205,7 +206,7 @@ fn sect_five(page: &mut Page<'_>, results: &[SetResult], names: &[String]) -> an
         page.figure(
             "fig9-power-spectra",
             &exhibits::power_spectra(results, den, "23/den/star"),
-            "As Fig. 9 of the paper: true and measured shear power spectra of 23/den/star. The measured ones hold the noise of few images.",
+            &format!("As Fig. 9 of the paper: true and measured shear power spectra of 23/den/star. The measured ones hold the noise that {images} images leave."),
         )?;
         page.data(
             "fig9-power-spectra",

@@ -19,6 +19,11 @@ use crate::report::steps::{steps_figure, steps_row};
 
 /// Draw the steps of galaxies like the paper's Fig. 3: stamp, PSF, deconvolved, residual, ACF,
 /// clipped ACF.
+///
+/// A row is a galaxy: its stamp as it is measured, the PSF, the deconvolved galaxy, what the stamp has beyond
+/// that galaxy seen through the PSF (noise alone where all went well), the autocorrelation of the deconvolved galaxy,
+/// and as much of it as its moments are taken of, for linear submissions times their weight. Its
+/// label has the ellipticity, and for linear submissions the response by which that of a sample is divided.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Name of a submission or a TOML file of your own.

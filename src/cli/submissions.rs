@@ -20,17 +20,20 @@ pub(super) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// The embedded submissions with their published figures.
+    #[command(after_help = "Example:\n  shearq submissions list --format markdown")]
     List {
         #[command(flatten)]
         form: Form,
     },
     /// All settings of a submission, resolved, as TOML.
+    #[command(after_help = "Example:\n  shearq submissions show 48/linear/star")]
     Show {
         /// Name or file.
         #[arg(value_name = "NAME|FILE")]
         name: String,
     },
     /// Write a commented configuration of your own to start from.
+    #[command(after_help = "Example:\n  shearq submissions init own.toml --method linear")]
     Init {
         /// File to write; it must not exist.
         #[arg(value_name = "FILE")]

@@ -45,7 +45,7 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
         .filter(|shift| shift.moved)
         .count();
     let mut notes = vec![format!(
-        "{moved} of {looked} figures of {} submission(s) moved by more than may be. In σ: difference over the figure's standard error.",
+        "{moved} of {looked} figures of {} submission(s) moved by more than rounding or noise explains. In σ: difference over the figure's standard error.",
         checks.len()
     )];
     for check in checks {

@@ -158,9 +158,12 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     let images: usize = first.iter().flatten().map(|set| set.images.len()).sum();
     let list: Vec<String> = common.iter().map(u32::to_string).collect();
     let mut lines = vec![
-        format!("Means over sets {}; {images} images in all.", list.join(", ")),
+        match list.as_slice() {
+            [one] => format!("Set {one}; {images} images."),
+            _ => format!("Means over sets {}; {images} images in all.", list.join(", ")),
+        },
         definition_note(definition),
-        "ΔQ, ΔQ cal.: from the first, with the jackknife's error of the paired difference on the same images, without an error where a set has fewer than eight. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
+        "ΔQ, ΔQ cal.: from the first, with the jackknife's error of the paired difference on the same images, without an error where a set has fewer than eight images. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
     ];
     lines.extend(unpaired_note(&unpaired));
     for variant in variants {

@@ -26,7 +26,7 @@ pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section,
                 &spectra(name, &with_power),
                 PictureFormat::Svg,
                 format!("spectra-{name}"),
-                "True and measured E-mode bandpowers of the scored bins, noise included. Where the measured ones keep their distance at high ℓ, it is noise; where they run below, shear is lost.",
+                "E-mode bandpowers of the scored bins: true, measured with the noise that the images leave, which Q counts, and less that noise, which Q_dn has. Those run below the truth where shear is lost, and are left out where they are below zero.",
             )?,
         ));
     }
@@ -58,7 +58,7 @@ pub fn comparison(table: Table, map: &HeatMap) -> Result<Section, FigureError> {
             )?));
         }
     }
-    let caption = "Q of each set as the leaderboard has it, and the mean.";
+    let caption = "Q of each set in the convention of the table, and the mean.";
     blocks.push(Block::Figure(Picture::draw(
         map,
         PictureFormat::Svg,
@@ -99,7 +99,7 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
             &score.spectra().ee,
             &score.ee_error,
         ];
-        spectrum::panel(set.set, powers)
+        spectrum::panel(set.set, powers, score.noise.as_ref())
     };
     PanelGrid {
         title: format!("Shear power of {name}"),
@@ -147,9 +147,12 @@ pub fn contest(table: &Table) -> PanelGrid {
         );
         vec![least - 0.5, most + 0.5]
     };
-    let plot = |key: &str, label: &str, levels: &[f64]| {
-        let level = |&value: &f64| Series::new("", ends(), vec![value; 2], Style::Dashed, AIM);
-        let mut series: Vec<Series> = levels.iter().map(level).collect();
+    let plot = |key: &str, label: &str, of_levels: &str, levels: &[f64]| {
+        let level = |(k, &value): (usize, &f64)| {
+            let name = if k == 0 { of_levels } else { "" };
+            Series::new(name, ends(), vec![value; 2], Style::Dashed, AIM)
+        };
+        let mut series: Vec<Series> = levels.iter().enumerate().map(level).collect();
         for (k, name) in names.iter().enumerate() {
             // Beside each other, for all of them to be seen.
             let aside = (k as f64 - (names.len() as f64 - 1.0) / 2.0) * 0.2;
@@ -172,7 +175,7 @@ pub fn contest(table: &Table) -> PanelGrid {
     };
     // Uncalibrated submissions would leave nothing to be seen of the others: they are beyond the picture.
     let near = |key: &str, label: &str| {
-        let plot = plot(key, label, &[-BAND, BAND]);
+        let plot = plot(key, label, &format!("± {BAND}"), &[-BAND, BAND]);
         let beyond: Vec<bool> = rows
             .iter()
             .map(|(_, row)| number(row, key).0.abs() > SEEN)
@@ -186,7 +189,7 @@ pub fn contest(table: &Table) -> PanelGrid {
             ..plot
         }
     };
-    let mut q = plot("q_spectrum", "Q of cross-spectra", &[]);
+    let mut q = plot("q_spectrum", "Q of cross-spectra", "", &[]);
     let limit = rows
         .iter()
         .map(|(_, row)| number(row, "q_limit").0)
@@ -200,11 +203,16 @@ pub fn contest(table: &Table) -> PanelGrid {
         title: "Submissions against each other and what can be reached".into(),
         columns: 2,
         plots: vec![
-            plot("scatter_over_bound", "scatter / bound", &[1.0]),
+            plot(
+                "scatter_over_bound",
+                "scatter / bound",
+                "Cramér–Rao bound",
+                &[1.0],
+            ),
             near("m1", "m1×10³"),
             near("m2", "m2×10³"),
-            plot("c1", "c1×10⁴", &[0.0]),
-            plot("leakage", "PSF leakage", &[0.0]),
+            plot("c1", "c1×10⁴", "", &[0.0]),
+            plot("leakage", "PSF leakage", "", &[0.0]),
             q,
         ],
     }

@@ -38,7 +38,7 @@ pub(super) fn definition_note(definition: Definition) -> String {
         Definition::Corrected => "corrected definition (azimuthal averages, fixed bins)",
     };
     format!(
-        "Figures: {definition}. Errors: from what the truth leaves unexplained, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian; over its error it is twice as far from zero as A."
+        "Figures: {definition}. Errors: from what the truth leaves unexplained, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian; over its error it is twice as far from zero as A, and it has one where A is two of its own from zero."
     )
 }
 

@@ -83,8 +83,13 @@ impl Cell {
         if value.is_infinite() {
             return Some((if *value > 0.0 { "∞" } else { "-∞" }.into(), None));
         }
+        let decimals = match *error {
+            Some(error) if error.is_finite() => decimals_of(error, *decimals),
+            // Of an error that is not known no digit is vouched for.
+            Some(_) => decimals_for(*value, UNSURE).min(*decimals),
+            None => *decimals,
+        };
         let error = error.filter(|error| error.is_finite());
-        let decimals = error.map_or(*decimals, |error| decimals_of(error, *decimals));
         let shown = |number: f64| match format!("{number:.decimals$}") {
             // What rounds to nothing has no sign.
             zero if zero.starts_with('-') && !zero.contains(|c: char| ('1'..='9').contains(&c)) => {
@@ -121,19 +126,30 @@ impl Cell {
 /// The most decimals that are printed for the sake of an error.
 const MOST_DECIMALS: usize = 12;
 
+/// Significant digits of a number whose error is not known.
+const UNSURE: i32 = 3;
+
 /// Decimals that give `error` two significant digits; `otherwise` for an error of zero.
 fn decimals_of(error: f64, otherwise: usize) -> usize {
-    // Rounding can lengthen a number: 0.0996 is 0.10.
-    let rounded = format!("{error:.1e}");
-    match rounded
-        .split_once('e')
-        .map(|(_, exponent)| exponent.parse::<i32>())
-    {
-        Some(Ok(exponent)) if error > 0.0 => usize::try_from(1 - exponent)
-            .unwrap_or(0)
-            .min(MOST_DECIMALS),
-        _ => otherwise,
+    match error > 0.0 {
+        true => decimals_for(error, 2),
+        false => otherwise,
     }
+}
+
+/// Decimals that give a number so many significant `digits`.
+fn decimals_for(number: f64, digits: i32) -> usize {
+    // Rounding can lengthen a number: 0.0996 is 0.10.
+    let before = usize::try_from(digits - 1).unwrap_or(0);
+    let rounded = format!("{number:.before$e}");
+    let exponent = rounded
+        .split_once('e')
+        .map(|(_, exponent)| exponent.parse::<i32>());
+    let Some(Ok(exponent)) = exponent else {
+        return MOST_DECIMALS;
+    };
+    let decimals = digits - 1 - exponent;
+    usize::try_from(decimals).unwrap_or(0).min(MOST_DECIMALS)
 }
 
 /// A column: its key for programs and its heading for people.
@@ -502,6 +518,21 @@ mod tests {
         let json: Value = serde_json::from_str(&table().render(TableFormat::Json)).unwrap();
         assert_eq!(json["rows"][0]["q_error"], 1.5);
         assert!(json["rows"][1]["q"].is_null());
+    }
+
+    #[test]
+    fn numbers_without_the_error_they_ought_to_have_are_short() {
+        let shown = |value, error| Cell::with_error(value, error, 4).figures().unwrap().0;
+        for (value, expected) in [
+            (2.011, "2.01"),
+            (-0.020_914, "-0.0209"),
+            (123.456, "123"),
+            (9.999, "10.0"),
+            (0.0, "0.00"),
+        ] {
+            assert_eq!(shown(value, Some(f64::NAN)), expected);
+        }
+        assert_eq!(shown(2.011, None), "2.0110");
     }
 
     #[test]

@@ -23,6 +23,8 @@ pub struct SetBiases {
     pub set: u32,
     /// Cramér–Rao bound on the scatter of ε per component, where there is one.
     pub bound: Option<f64>,
+    /// Its standard error.
+    pub bound_error: Option<f64>,
     /// Mean Q of spectra of the plan's images with a scatter at the bound.
     pub limit: Option<f64>,
     /// One per submission, in the plan's order.
@@ -53,10 +55,11 @@ pub fn bias_sets(
         }
         let simulator = simulator(set, plan.simulation)?;
         progress.note(&format!("set {set:02}"));
-        let bound = cramer_rao(&simulator);
+        let (bound, bound_error) = cramer_rao(&simulator).unzip();
         let result = SetBiases {
             set,
             bound,
+            bound_error,
             limit: bound.map(|bound| sample_limit(&simulator, bound, plan.images)),
             biases: biases(&simulator, &numbers, &measurers, threads, progress)?,
         };
@@ -130,7 +133,7 @@ pub fn contest_table(
         headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
         rows,
         notes: vec![
-            "Scatter of ε per component after dividing by its slope, and over the Cramér–Rao bound of the galaxies (none for bulges off their discs' centres).".into(),
+            "Scatter of ε per component after dividing by its slope, and over the Cramér–Rao bound of the galaxies (none for bulges off their discs' centres), which is that of a sample of them. Where S/N differ galaxies of low S/N count less, and the scatter can be below it.".into(),
             "m and c from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign; leakage: c along the PSF's ellipticity; unmeasured: galaxies without ellipticity, which all of these leave out.".into(),
             "Q of the catalogues, and of cross-spectra between groups of images, in which noise has no mean; leaderboard definition, standard convention. limit: mean Q that noise at the bound leaves of a perfect spectrum.".into(),
         ],
@@ -179,14 +182,16 @@ fn row(
     let scaled = |value: f64, error: f64, scale: f64| {
         Cell::with_error(value * scale, Some(error * scale), 1)
     };
-    let scatter = own.response.rms_scatter();
+    let (scatter, scatter_error) = (own.response.rms_scatter(), own.response.rms_scatter_error());
+    let bound = bias.bound.unwrap_or(f64::NAN);
+    let relative = (scatter_error / scatter).hypot(bias.bound_error.unwrap_or(f64::NAN) / bound);
     let (q_spectrum, q_spectrum_error) = spectrum(own);
     vec![
         Cell::text(format!("{:02}", result.set)),
         Cell::text(SetKind::of(result.set).map_or("", |kind| kind.image.label())),
         Cell::text(&submission.name),
-        Cell::with_error(scatter, Some(own.response.rms_scatter_error()), 5),
-        Cell::number(bias.bound.map_or(f64::NAN, |bound| scatter / bound), 3),
+        Cell::with_error(scatter, Some(scatter_error), 5),
+        Cell::with_error(scatter / bound, Some(scatter / bound * relative), 3),
         scaled(biases.m[0], biases.m_error[0], 1e3),
         scaled(biases.m[1], biases.m_error[1], 1e3),
         scaled(biases.c[0], biases.c_error[0], 1e4),

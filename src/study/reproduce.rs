@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shearq_scoring::quality::{calibrated_quality, quality, quality_error};
+use shearq_scoring::quality::{quality, quality_error};
 use shearq_scoring::{
     BINS, Convention, FieldSum, Grid, Noise, Options, Row, RowCounts, SetImages, SetScore,
     SetScorer, cross_spectrum,
@@ -75,8 +75,6 @@ pub struct SubmissionResult {
     /// Their standard errors, for the truth as it is; not numbers beyond the scored bins.
     #[serde(deserialize_with = "nan_for_null")]
     pub ee_error: [f64; BINS],
-    /// Q of those bandpowers over the square of the response's mean slope.
-    pub q_calibrated: f64,
     /// Q of the cross-spectrum of the images' groups, `None` for a single image.
     pub q_spectrum: Option<f64>,
     /// Its standard error, `None` where it is not known: with fewer than eight images.
@@ -199,7 +197,6 @@ pub fn run_sets(
                         convention_matched: score.matching.best().number(),
                         ee: score.spectra().ee,
                         ee_error: score.ee_error,
-                        q_calibrated: calibrated_q(score, &responses[at]),
                         q_spectrum: spectrum.map(|(q, _)| q),
                         q_spectrum_error: spectrum.and_then(|(_, error)| error),
                         response: responses[at],
@@ -211,13 +208,6 @@ pub fn run_sets(
         results.push(result);
     }
     Ok(results)
-}
-
-/// Q that the spectrum of `score` would have, had the ellipticities been divided by the slope at
-/// which they follow the true ones.
-fn calibrated_q(score: &SetScore, response: &Response) -> f64 {
-    let slope = response.slope.iter().sum::<f64>() / 2.0;
-    calibrated_quality(&score.bins, &score.spectra().ee, &score.true_ee, slope).q
 }
 
 /// Q of the cross-spectrum of `images`, with its error where that is known.

@@ -9,7 +9,7 @@ use shearq_scoring::{
 };
 
 use super::challenge::{Kind, SpectrumLine, read_spectrum, wrong_multipoles};
-use super::manifest::{FileSum, Manifest};
+use super::manifest::{Contents, FileSum, Manifest};
 use super::packed::Sent;
 use crate::io::layout::read_rows;
 use crate::io::table::most_rows;
@@ -215,6 +215,13 @@ fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
     }
     for (name, message) in manifest.faults(&found) {
         report.error(&folder.join(name), "manifest", message);
+    }
+    if manifest.contents == Contents::CrossSpectra {
+        let bare = |name: &&String| !manifest.covariances.contains_key(*name);
+        for name in manifest.files.keys().filter(bare) {
+            let message = "the manifest has no covariance of its bandpowers, so that scores have no errors; expected one, which takes eight images";
+            report.warn(&folder.join(name), "covariance", message.into());
+        }
     }
 }
 

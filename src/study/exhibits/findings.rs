@@ -3,10 +3,9 @@
 use shearq_scoring::Figures;
 use shearq_scoring::resample::mean_over_sets;
 
-use super::sets::{mean_of_24, over_sets};
+use super::sets::{mean_of_24, weighted};
 use crate::report::table::{Cell, Heading, Table};
 use crate::results::compare::{Paired, difference};
-use crate::results::row::SetRecord;
 use crate::simulate::kinds::{ImageType, SetKind};
 use crate::study::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, LambdaSums, PAPER_LAMBDA, SNR_DB};
 use crate::study::reproduce::SetResult;
@@ -22,15 +21,15 @@ pub struct Finding {
     pub agrees: Option<bool>,
 }
 
-/// Mean ratio-like difference in Q of `second` over `first`: (ΔQ, error, Q of the first).
+/// Mean difference in Q of `second` from `first` over the challenge's 24 sets: (ΔQ, error, Q of the first).
 fn q_difference(results: &[SetResult], first: usize, second: usize) -> Option<(f64, f64, f64)> {
-    let of = |submission: usize| -> Vec<&SetRecord> {
-        let scored = results.iter();
-        scored.map(|set| &set.results[submission].score).collect()
+    let of_set = |set: &SetResult| {
+        let [a, b] = [first, second].map(|submission| &set.results[submission].score);
+        difference(Paired::Q, &[a], &[b]).map(|paired| (paired.difference, paired.error))
     };
-    let difference = difference(Paired::Q, &of(first), &of(second))?;
-    let mean = mean_over_sets(&over_sets(results, first, |f| f.q)).0;
-    Some((difference.difference, difference.error, mean))
+    let differences = results.iter().map(of_set).collect::<Option<Vec<_>>>()?;
+    let (difference, error) = weighted(results, &differences);
+    Some((difference, error, mean_of_24(results, first, |f| f.q).0))
 }
 
 /// A value with its error as a sentence has them.
