@@ -101,14 +101,15 @@ impl RowCounts {
         let mut lines = Vec::new();
         if self.outside + self.excess > 0 {
             lines.push(format!(
-                "Warning: {whose} has {} rows outside the grid and {} beyond the number of cells; they do not count.",
-                self.outside, self.excess
+                "Warning: {whose} has {} outside the grid and {} beyond the number of cells; they do not count.",
+                rows(self.outside),
+                self.excess
             ));
         }
         if self.repeated > 0 {
             lines.push(format!(
-                "Warning: {} rows of {whose} are of galaxies that have one already; they add up.",
-                self.repeated
+                "Warning: {} of {whose} of galaxies that have one already; they add up.",
+                rows(self.repeated)
             ));
         }
         if self.missing > 0 {
@@ -120,8 +121,9 @@ impl RowCounts {
         }
         if self.above_one > 0 {
             lines.push(format!(
-                "Warning: {} rows of {whose} have |e| > 1, {} of them |e| > {ABSURD}; they are scored as they are.",
-                self.above_one, self.absurd
+                "Warning: {} of {whose} with |e| > 1, {} with |e| > {ABSURD}; scored as they are.",
+                rows(self.above_one),
+                self.absurd
             ));
         }
         if self.not_finite > 0 {
@@ -133,6 +135,11 @@ impl RowCounts {
         }
         lines
     }
+}
+
+/// So many rows.
+fn rows(count: usize) -> String {
+    format!("{count} row{}", if count == 1 { "" } else { "s" })
 }
 
 /// Sums over images of ellipticities and of counts, on cells `[ix, iy]`.

@@ -125,11 +125,11 @@ fn what_is_odd_is_said_and_counted() {
     let large = case(folder.path(), |k| {
         Some(if k < 3 { (1.2, 0.3) } else { shear(k) })
     });
-    assert!(has(&json(&large, &[]), "3 rows of this set have |e| > 1"));
+    assert!(has(&json(&large, &[]), "3 rows of this set with |e| > 1"));
     // CSV has no room for notes: they go to standard error.
     let output = shearq(&scoring(&large, &["--format", "csv"]));
     let (out, err) = (output.stdout, String::from_utf8(output.stderr).unwrap());
-    assert!(err.contains("3 rows of this set have |e| > 1"), "{err}");
+    assert!(err.contains("3 rows of this set with |e| > 1"), "{err}");
     assert!(!String::from_utf8(out).unwrap().contains("|e|"));
 }
 

@@ -457,10 +457,10 @@ fn rows_that_are_not_what_they_should_be_are_refused_and_odd_ones_told() {
     };
     let lines = odd.oddities("set 7");
     let expected = [
-        "set 7 has 1 rows outside the grid and 2 beyond",
+        "set 7 has 1 row outside the grid and 2 beyond",
         "4 rows of set 7",
         "15 of 64 galaxies of set 7 are not in the catalogues",
-        "5 rows of set 7 have |e| > 1, 2 of them |e| > 5",
+        "5 rows of set 7 with |e| > 1, 2 with |e| > 5",
         "3 of 53 galaxies of set 7 have no ellipticity",
     ];
     assert_eq!(lines.len(), expected.len());
