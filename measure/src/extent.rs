@@ -82,6 +82,11 @@ impl Light {
         self.stamps.push(sums);
     }
 
+    /// Adds the stamps of another, as if they had come after its own.
+    pub(crate) fn join(&mut self, other: &Self) {
+        self.stamps.extend_from_slice(&other.stamps);
+    }
+
     /// The extent of the galaxies, with the PSF's, in px²; `None` of few stamps, and where their light has none.
     pub(crate) fn extent(&self) -> Option<f64> {
         if self.stamps.len() < FEWEST {

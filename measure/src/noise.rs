@@ -262,6 +262,17 @@ impl NoiseSurvey {
         Ok(())
     }
 
+    /// Adds what another survey of the same plan has found, as if its stamps had been added here.
+    pub fn join(&mut self, other: &Self) {
+        self.products.extend_from_slice(&other.products);
+        self.brightest.extend_from_slice(&other.brightest);
+        self.typical.extend_from_slice(&other.typical);
+        self.light.join(&other.light);
+        for (count, more) in self.counts.iter_mut().zip(other.counts) {
+            *count += more;
+        }
+    }
+
     /// Looks for places of the stamp that are brighter than the opposite ones, and how broad its galaxy is.
     fn compare(&mut self) {
         let full = self.plan.full;
@@ -639,6 +650,32 @@ mod tests {
             .add(Array2::from_elem((SIDE, SIDE), f32::NAN).view())
             .unwrap();
         assert!(survey.noise().is_none());
+    }
+
+    #[test]
+    fn surveys_joined_are_one() {
+        let plan = NoisePlan::new(SIDE, 2).unwrap();
+        let mut rng = ChaCha8Rng::seed_from_u64(10);
+        let mut whole = plan.survey();
+        let mut parts = [plan.survey(), plan.survey()];
+        for k in 0..60 {
+            let mut stamp = noise(&mut rng, false);
+            stamp[(SIDE / 2, SIDE / 2)] += 500.0;
+            if k % 7 == 0 {
+                stamp[(0, 0)] = f32::NAN;
+            }
+            whole.add(stamp.view()).unwrap();
+            parts[k / 25 % 2].add(stamp.view()).unwrap();
+        }
+        // The last ten were added to the first.
+        let [mut first, second] = parts;
+        first.join(&second);
+        assert_eq!(first.looked_at(), whole.looked_at());
+        assert_eq!(first.incomplete(), whole.incomplete());
+        let [found, expected] = [first, whole].map(|survey| survey.found().unwrap());
+        // Sums in another order.
+        assert!((found.noise.sigma() / expected.noise.sigma() - 1.0).abs() < 1e-12);
+        assert!((found.extent.unwrap() / expected.extent.unwrap() - 1.0).abs() < 1e-12);
     }
 
     #[test]

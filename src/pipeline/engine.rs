@@ -10,6 +10,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Mutex, PoisonError};
 
+use rayon::iter::{IntoParallelIterator, ParallelIterator};
+
 use super::PipelineError;
 
 /// Items read, in work or waiting to be written, per worker.
@@ -43,6 +45,8 @@ pub struct Feeder<'a, I> {
     items: SyncSender<(u64, I)>,
     permits: &'a Receiver<()>,
     next: u64,
+    /// As many threads as there are workers, which are busy with what was handed to them.
+    ahead: &'a rayon::ThreadPool,
 }
 
 impl<I> Feeder<'_, I> {
@@ -54,6 +58,15 @@ impl<I> Feeder<'_, I> {
         }
         self.next += 1;
         self.items.send((self.next - 1, item)).is_ok()
+    }
+
+    /// Maps what has to be known before items are handed over, on several threads, in order.
+    pub fn each<T, R>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R>
+    where
+        T: Send,
+        R: Send,
+    {
+        self.ahead.install(|| of.into_par_iter().map(map).collect())
     }
 }
 
@@ -79,9 +92,8 @@ where
     I: Send,
     O: Send,
 {
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(threads)
-        .build()?;
+    let threads_of = || rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+    let (pool, ahead) = (threads_of()?, threads_of()?);
     let capacity = IN_FLIGHT * threads;
     let (item_sender, item_receiver) = sync_channel::<(u64, I)>(capacity);
     let (result_sender, result_receiver) = sync_channel::<(u64, Done<O>)>(capacity);
@@ -92,11 +104,13 @@ where
     }
     let items = Mutex::new(item_receiver);
     std::thread::scope(|threads_scope| {
+        let ahead = &ahead;
         let reader = threads_scope.spawn(move || {
             let mut feeder = Feeder {
                 items: item_sender,
                 permits: &permit_receiver,
                 next: 0,
+                ahead,
             };
             read(&mut feeder)
         });
@@ -191,6 +205,30 @@ mod tests {
             .unwrap();
             assert_eq!(found, (0..200).map(|k| k * k).collect::<Vec<_>>());
         }
+    }
+
+    #[test]
+    fn what_is_looked_at_ahead_comes_in_order() {
+        let mut found = Vec::new();
+        ordered(
+            3,
+            |feeder| {
+                for k in 0..5usize {
+                    let ahead = feeder.each((0..40).collect(), |i| i * k);
+                    assert_eq!(ahead, (0..40).map(|i| i * k).collect::<Vec<_>>());
+                    let _ = feeder.push(ahead[39]);
+                }
+                Ok(())
+            },
+            || (),
+            |(), k| Ok(k),
+            |k| {
+                found.push(k);
+                Ok(())
+            },
+        )
+        .unwrap();
+        assert_eq!(found, [0, 39, 78, 117, 156]);
     }
 
     #[test]

@@ -5,7 +5,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis};
-use shearq_measure::{Measurer, NoisePlan, Steps, Survey, Worker, calibrate, star_psf, strip};
+use shearq_measure::{
+    Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Worker, calibrate, star_psf, strip,
+};
 use shearq_scoring::Shear;
 use shearq_submissions::{PsfForm, Submission};
 
@@ -168,7 +170,7 @@ pub(crate) fn feed(
 ) -> Result<(), PipelineError> {
     for &image in images {
         let fields = Arc::new(set.image_fields(image));
-        let surveys = surveys(set, &fields, measurers)?;
+        let surveys = surveys(set, &fields, measurers, feeder)?;
         for iy in 0..set.grid().n {
             let fields = Arc::clone(&fields);
             let surveys = Arc::clone(&surveys);
@@ -189,23 +191,32 @@ fn surveys(
     set: &SetSimulator,
     fields: &ImageFields,
     measurers: &[Measurer],
+    feeder: &Feeder<'_, RowJob>,
 ) -> Result<Surveys, PipelineError> {
     let n = set.grid().n;
-    let mut surveys: Vec<_> = measurers
-        .iter()
-        .map(|measurer| measurer.noise_plan().map(NoisePlan::survey))
-        .collect();
+    let empty = || -> Vec<Option<NoiseSurvey>> {
+        let plans = measurers.iter().map(Measurer::noise_plan);
+        plans.map(|plan| plan.map(NoisePlan::survey)).collect()
+    };
     let Some(plan) = measurers.iter().find_map(Measurer::noise_plan) else {
         return Ok(measurers.iter().map(|_| None).collect());
     };
-    let mut render = RenderScratch::new();
     // Plans differ in their lags alone.
-    for iy in plan.rows(n, n) {
-        let (pixels, _) = simulate::draw_stamps(set, fields, iy, &mut render);
+    let rows = feeder.each(plan.rows(n, n), |iy| {
+        let (pixels, _) = simulate::draw_stamps(set, fields, iy, &mut RenderScratch::new());
+        let mut surveys = empty();
         for stamp in strip(&pixels, n, STAMP)?.outer_iter() {
             for survey in surveys.iter_mut().flatten() {
                 survey.add(stamp)?;
             }
+        }
+        Ok::<_, PipelineError>(surveys)
+    });
+    let mut surveys = empty();
+    for row in rows {
+        let found = row?;
+        for (survey, more) in surveys.iter_mut().flatten().zip(found.iter().flatten()) {
+            survey.join(more);
         }
     }
     let found = surveys
