@@ -3,7 +3,7 @@
 //! * [`kinds`]: what distinguishes the 24 sets (the paper's Table 2).
 //! * [`field`]: shear, intrinsic and PSF ellipticity fields as Gaussian random fields.
 //! * [`set`]: one set: its fields, and each galaxy from a random stream of its own.
-//! * [`galaxy`], [`render`]: profiles and their drawing.
+//! * [`galaxy`], [`render`]: profiles and their drawing; [`signal`]: the light that S/N counts.
 //!
 //! What GREAT10 did not publish is chosen here and documented at each choice.
 
@@ -12,3 +12,4 @@ pub mod galaxy;
 pub mod kinds;
 pub mod render;
 pub mod set;
+pub mod signal;

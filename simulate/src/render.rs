@@ -517,7 +517,7 @@ fn good_size(n: usize) -> usize {
 }
 
 /// sin(k/2)/(k/2): the transform of a pixel along one axis.
-fn sinc(k: f64) -> f64 {
+pub(crate) fn sinc(k: f64) -> f64 {
     if k == 0.0 {
         1.0
     } else {

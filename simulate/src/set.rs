@@ -21,6 +21,7 @@ use super::field::{Content, ShearSpectrum, random_field};
 use super::galaxy::Galaxy;
 use super::kinds::{ImageType, SetKind, Variability};
 use super::render::{RenderScratch, Renderer};
+use super::signal::power;
 
 /// A setting of a simulation out of its range.
 #[derive(Debug, thiserror::Error)]
@@ -387,12 +388,10 @@ impl SetSimulator {
             .transform
             .of(fields.psf.at(ix, iy))
             .expect("all PSFs of a set have one profile");
-        // S/N = √(Σ I²)/σ over the stamp is that of the galaxy before lensing, which leaves its flux as it is.
-        let (unlensed, _) = self.galaxy(version.intrinsic, Shear::new(0.0, 0.0), &mut again);
-        self.renderer.render(&unlensed, &psf, (x, y), scratch, out);
-        let norm: f64 = out.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
         self.renderer.render(&galaxy, &psf, (x, y), scratch, out);
-        let scale = (snr * NOISE_SIGMA / norm.sqrt()) as f32;
+        // Lensing leaves the flux as it is: S/N is that of the galaxy before.
+        let (unlensed, _) = self.galaxy(version.intrinsic, Shear::new(0.0, 0.0), &mut again);
+        let scale = (snr * NOISE_SIGMA / power(&unlensed, &psf).sqrt()) as f32;
         let sigma = version.noise * NOISE_SIGMA as f32;
         for value in out.iter_mut() {
             let noise: f32 = StandardNormal.sample(&mut rng);

@@ -16,7 +16,7 @@ use crate::pipeline::simulate::{SimulationRecord, simulate_folder};
 /// The sets are those of the paper's Table 2: galaxies of bulge and disc at S/N 20 with a Moffat PSF of 3.4 pixels
 /// (1 to 3), S/N 10 (4 to 6), 40 (7 to 9), of many S/N (10 to 12), small (13, 14), large (15, 16), of many sizes (17,
 /// 18), a Kolmogorov PSF (19, 20), many bulge fractions (21, 22) and bulges off the disc's centre (23, 24). S/N is
-/// √(Σ I²)/σ over the stamp, before lensing. Images already in the folder are kept if the same settings made them, so
+/// √(Σ I²)/σ before lensing and behind a round PSF. Images already in the folder are kept if the same settings made them, so
 /// a stopped simulation goes on where it was.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
