@@ -1,5 +1,6 @@
 //! Calibration of ellipticities by their own mean response to shear.
 
+use shearq_scoring::resample::RunningMean;
 use shearq_submissions::{Calibration, Submission};
 
 use crate::flag::Flag;
@@ -33,12 +34,10 @@ where
     // Components apart: lags on a square grid, and PSFs with a direction, tell them from each other.
     let means = [0, 1].map(|k| good().map(|g| g.response[k]).sum::<f64>() / count);
     let usable = [0, 1].into_iter().all(|k| {
-        let off = good().map(|g| (g.response[k] - means[k]).powi(2));
-        let error = match count > 1.0 {
-            true => (off.sum::<f64>() / (count * (count - 1.0))).sqrt(),
-            false => 0.0,
-        };
-        means[k].is_finite() && means[k] > 0.0 && means[k] >= CLEAR * error
+        let mut responses = RunningMean::default();
+        good().for_each(|g| responses.add(g.response[k]));
+        let error = responses.deviation() / count.sqrt();
+        means[k].is_finite() && means[k] > 0.0 && (count == 1.0 || means[k] >= CLEAR * error)
     });
     for galaxy in parts.iter_mut().flat_map(AsMut::as_mut) {
         if usable {

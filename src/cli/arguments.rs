@@ -158,10 +158,10 @@ impl ReportFile {
         &self,
         title: &str,
         sections: impl FnOnce() -> Result<Vec<Section>, FigureError>,
-        settings: Vec<(String, String)>,
+        made_by: impl FnOnce() -> anyhow::Result<Vec<(String, String)>>,
     ) -> anyhow::Result<()> {
         if let Some(path) = &self.path {
-            pages::save(path, title, sections()?, settings)?;
+            pages::save(path, title, sections()?, made_by()?)?;
         }
         Ok(())
     }

@@ -85,7 +85,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let title = "Comparison of submissions";
     arguments
         .report
-        .save(title, sections, made_by(arguments)?)?;
+        .save(title, sections, || made_by(arguments))?;
     if arguments.printing.format() == TableFormat::Table {
         print_heat_map(map)?;
     }

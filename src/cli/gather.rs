@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::{count, tell};
 use crate::io::layout::{DataFolder, MAX_IMAGE, MAX_SET};
-use crate::pipeline::gather::{Content, Files, Gathered, Stamps, gather};
+use crate::pipeline::gather::{Content, Files, Gathered, Gathering, Stamps, gather};
 use crate::pipeline::images::ImageId;
 
 /// Gather stamps of your own into a data folder that `measure` takes.
@@ -124,6 +124,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ),
         (None, ..) => Stamps::Files(images),
     };
+    let gathering = Gathering {
+        stamps,
+        masks: masked.then_some(masks),
+        psfs,
+        noise: *noise,
+    };
     let data = if out.is_dir() {
         DataFolder::open(out)?
     } else {
@@ -137,7 +143,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         mosaic,
         incomplete,
         doubts,
-    } = gather(&data, id, &stamps, masked.then_some(masks), psfs, *noise)?;
+    } = gather(&data, id, &gathering)?;
     for doubt in doubts {
         tell(format_args!("{doubt}"));
     }

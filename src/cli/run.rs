@@ -138,7 +138,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             scored.1,
         )?])
     };
-    report.save(&title, sections, score::made_by(&run, out)?)
+    report.save(&title, sections, || score::made_by(&run, out))
 }
 
 /// Scores a folder of catalogues (those of `sets`, or all), prints the scores and keeps them and the

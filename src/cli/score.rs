@@ -204,7 +204,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
     table.notes.extend(unscored);
     arguments.printing.print(&table)?;
     let sections = || Ok(vec![pages::scores(&name, &scored, table)?]);
-    arguments.report.save(&title, sections, made_by)
+    arguments.report.save(&title, sections, || Ok(made_by))
 }
 
 /// Records scores that can be printed as asked for: nothing is kept of a command that fails after it.
@@ -464,5 +464,5 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
             .map(|(k, path)| (format!("Catalogue {}", k + 1), path.display().to_string())),
     );
     let sections = || Ok(vec![pages::scores("catalogues", &scored, table)?]);
-    arguments.report.save(&title, sections, made_by)
+    arguments.report.save(&title, sections, || Ok(made_by))
 }

@@ -78,19 +78,29 @@ struct Place<'a> {
     position_y: Option<f64>,
 }
 
+/// What an image is made of.
+#[derive(Serialize)]
+pub struct Gathering<'a> {
+    /// Its stamps.
+    pub stamps: Stamps<'a>,
+    /// Images like those of the stamps or the exposure: pixels are missing where these are not zero.
+    pub masks: Option<Files<'a>>,
+    /// One PSF, or one a stamp.
+    pub psfs: Files<'a>,
+    /// The image's NOISESIG.
+    pub noise: Option<f64>,
+}
+
 /// What made an image, kept beside it.
 #[derive(Serialize)]
 struct Record<'a> {
     version: &'a str,
-    stamps: &'a Stamps<'a>,
-    masks: Option<Files<'a>>,
-    psfs: Files<'a>,
-    noise: Option<f64>,
+    #[serde(flatten)]
+    gathering: &'a Gathering<'a>,
 }
 
 /// Gathers stamps and their PSFs into image `id` of `data`: the table of which stamp is which and the record of what
-/// made it, PSFs, and last the image. Pixels are missing where those of `masks`, images like those of the stamps or the
-/// exposure, are not zero. `noise` is written as the image's NOISESIG. What a stopped process left of the image is
+/// made it, PSFs, and last the image. What a stopped process left of the image is
 /// replaced; others that gather into the same folder are waited for.
 ///
 /// # Errors
@@ -99,10 +109,7 @@ struct Record<'a> {
 pub fn gather(
     data: &DataFolder,
     id: ImageId,
-    stamps: &Stamps<'_>,
-    masks: Option<Files<'_>>,
-    psfs: Files<'_>,
-    noise: Option<f64>,
+    gathering: &Gathering<'_>,
 ) -> Result<Gathered, PipelineError> {
     let which = data.stamps(id.set, id.image);
     let folder = which.parent().unwrap_or(Path::new("."));
@@ -111,7 +118,7 @@ pub fn gather(
     let alone = fs::File::open(folder).map_err(FileError::doing(folder, cannot))?;
     // File systems without locks have none that could be waited for.
     let _ = alone.lock();
-    let gathered = gather_alone(data, id, stamps, masks, psfs, noise);
+    let gathered = gather_alone(data, id, gathering);
     if made && gathered.is_err() {
         // Unless there is something in it.
         let _ = fs::remove_dir(folder);
@@ -122,11 +129,14 @@ pub fn gather(
 fn gather_alone(
     data: &DataFolder,
     id: ImageId,
-    stamps: &Stamps<'_>,
-    masks: Option<Files<'_>>,
-    psfs: Files<'_>,
-    noise: Option<f64>,
+    gathering: &Gathering<'_>,
 ) -> Result<Gathered, PipelineError> {
+    let &Gathering {
+        ref stamps,
+        masks,
+        psfs,
+        noise,
+    } = gathering;
     let target = data.galaxies(id.set, id.image);
     let which = data.stamps(id.set, id.image);
     if is_there(&target) {
@@ -149,10 +159,7 @@ fn gather_alone(
     }
     let record = Record {
         version: crate::VERSION,
-        stamps,
-        masks,
-        psfs,
-        noise,
+        gathering,
     };
     let record = serde_json::to_string_pretty(&record)
         .map_err(FileError::doing(&which, "cannot tell what made it"))?;

@@ -68,8 +68,7 @@ fn read_run(path: &Path) -> Result<RunRecord, FileError> {
         );
         return Err(FileError::new(path, message));
     }
-    let bytes = std::fs::read(path).map_err(FileError::doing(path, "cannot read the file"))?;
-    let print = fingerprint::of_bytes(&bytes);
+    let print = fingerprint::of_file(path)?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     // Whoever names a file anew has it without.
     let named = stem

@@ -3,7 +3,7 @@
 
 use std::ffi::{CStr, CString, c_int};
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::Path;
 use std::ptr;
 
@@ -37,11 +37,13 @@ pub enum Value {
 
 /// An image being written.
 pub struct ImageWriter {
-    file: BufWriter<File>,
+    file: File,
     part: PartFile,
     width: usize,
     height: usize,
     next_row: usize,
+    /// Rows as they stand in the file.
+    bytes: Vec<u8>,
 }
 
 impl ImageWriter {
@@ -60,13 +62,14 @@ impl ImageWriter {
         let header = image_header([width, height], header).map_err(cannot(path))?;
         let (part, file) = PartFile::create(path)?;
         let mut writer = ImageWriter {
-            file: BufWriter::new(file),
+            file,
             part,
             width,
             height,
             next_row: 0,
+            bytes: header,
         };
-        writer.write(&header)?;
+        writer.write()?;
         Ok(writer)
     }
 
@@ -85,11 +88,10 @@ impl ImageWriter {
                 ),
             ));
         }
-        for row in pixels.chunks_exact(self.width) {
-            for pixel in row {
-                self.write(&pixel.to_be_bytes())?;
-            }
-        }
+        self.bytes.clear();
+        self.bytes
+            .extend(pixels.iter().flat_map(|pixel| pixel.to_be_bytes()));
+        self.write()?;
         self.next_row += rows;
         Ok(())
     }
@@ -125,17 +127,14 @@ impl ImageWriter {
             ));
         }
         let data = size_of::<f32>() * width * height;
-        self.write(&vec![0; data.next_multiple_of(BLOCK) - data])?;
-        let flushed = self.file.flush();
-        flushed.map_err(FileError::doing(
-            self.part.target(),
-            "cannot write the image",
-        ))?;
+        self.bytes.clear();
+        self.bytes.resize(data.next_multiple_of(BLOCK) - data, 0);
+        self.write()?;
         Ok(self.part)
     }
 
-    fn write(&mut self, bytes: &[u8]) -> Result<(), FileError> {
-        let written = self.file.write_all(bytes);
+    fn write(&mut self) -> Result<(), FileError> {
+        let written = self.file.write_all(&self.bytes);
         written.map_err(FileError::doing(
             self.part.target(),
             "cannot write the image",
