@@ -17,12 +17,16 @@ from pathlib import Path
 
 import galsim
 import numpy as np
+import peers
 import pyarrow.parquet as parquet
 from astropy.io import fits
 
 SHEAR = 0.02
 #: Noise fields a galaxy is measured under: four, each added and taken away.
 FIELDS = 8
+#: Galaxies that differ by turns of 45 degrees alone: their ellipticities cancel, and so does what one component of
+#: shear does to the other, which goes as the product of those of the ellipticity.
+TURNS = 4
 #: Most galaxies along an axis of an image.
 MOST = 50
 PSF_SHAPE = {"g1": 0.03, "g2": -0.02}
@@ -159,17 +163,17 @@ def missing(case, random):
 
 
 def render(case, count, random, folder):
-    """Stamps without noise, `[±shear, galaxy, y, x]`, of galaxies in pairs turned by 90 degrees; σ is one."""
+    """Stamps without noise, `[±shear, galaxy, y, x]`, of galaxies in fours turned by 45 degrees; σ is one."""
     psf, kinds, others = psf_of(case), Galaxies(case.galaxy, folder), Galaxies("fiducial", folder)
     side = case.stamp
     stamps = np.empty((2, count, side, side))
     strength = np.empty(count)
-    for pair in range(0, count, 2):
+    for first in range(0, count, TURNS):
         galaxy = kinds(random)
-        for turn in range(2):
-            at = pair + turn
+        for turn in range(TURNS):
+            at = first + turn
             place = direction(random, case.off) if case.off else random.uniform(-0.5, 0.5, 2)
-            turned = galaxy.rotate(90 * turn * galsim.degrees)
+            turned = galaxy.rotate(180 / TURNS * turn * galsim.degrees)
             for sign in range(2):
                 g = SHEAR * (1 - 2 * sign)
                 stamps[sign, at] = drawn(turned.shear(g1=g, g2=g).shift(*place), psf, side)
@@ -254,20 +258,65 @@ def measured(case, stamps, psf, fields, options):
     return {name: values.reshape(-1, 2, count) for name, values in columns.items()}
 
 
+def mean_of(values, good):
+    """Mean over good galaxies and its error, from the scatter of groups of turned galaxies, which are not independent."""
+    mean = values[good].mean()
+    off = np.where(good, values - mean, 0.0).reshape(-1, TURNS).sum(1)
+    return mean, np.sqrt((off**2).sum()) / good.sum()
+
+
+class Peers:
+    """What others make of the stamps of a case."""
+
+    def __init__(self, case, names, seed):
+        # Missing pixels are not theirs to fill.
+        self.found = {name: [] for name in names if not case.missing}
+        self.case, self.seed = case, seed
+
+    def look(self, stamps, fields):
+        versions = np.stack([stamps[0] + fields[0], stamps[1] + fields[0], stamps[0] + fields[2]]) + self.case.sky
+
+        def noise(version):
+            block = len(next(iter(self.found.values())))
+            random = np.random.default_rng([self.seed, block, version // 2])
+            return noise_field(self.case, stamps.shape[1:], random)
+
+        for name, found in self.found.items():
+            found.append(peers.PEERS[name](versions, psf_of(self.case), noise))
+
+    def results(self):
+        return {name: self.result(found) for name, found in self.found.items()}
+
+    @staticmethod
+    def result(found):
+        e = np.concatenate([e for e, _ in found], 1)
+        own = np.average([own for _, own in found], 0, [e.shape[1] for e, _ in found])
+        good = np.isfinite(e).all((0, 2))
+        result = {"failed": 1.0 - good.mean()}
+        noise = []
+        for k in (0, 1):
+            apart, error = mean_of((e[0, :, k] - e[1, :, k]) / (2 * SHEAR), good)
+            result[f"m{k + 1}"] = 1e3 * (apart / own[k] - 1)
+            result[f"m{k + 1}_error"] = 1e3 * error / own[k]
+            noise.append((e[0] - e[2])[good, k].std() / np.sqrt(2) / apart)
+        return result | {"noise": float(np.sqrt(np.mean(np.square(noise))))}
+
+
 def examine(case, options):
     """The row of a case."""
     random = np.random.default_rng([options.seed, sum(case.name.encode())])
     wanted = max(options.galaxies // FIELDS, 8)
-    rows = []
+    rows, others = [], Peers(case, options.peers, options.seed)
     while sum(len(row["good"]) for row in rows) < wanted:
         left = wanted - sum(len(row["good"]) for row in rows)
-        # An even number a side keeps pairs together.
+        # An even number a side keeps fours together.
         grid = min(MOST, 2 * int(np.ceil(np.sqrt(left) / 2)))
         stamps, psf = render(case, grid * grid, random, options.real)
         fields = []
         for _ in range(FIELDS // 2):
             noise = noise_field(case, stamps.shape[1:], random)
             fields += [noise, -noise]
+        others.look(stamps, fields)
         found = measured(case, stamps, psf, fields, options)
         good = (found["flag"] == 0).all((0, 1))
         row = {"good": good}
@@ -281,20 +330,21 @@ def examine(case, options):
     good = np.concatenate([row["good"] for row in rows])
     flagged = 1.0 - good.mean()
     result = {"case": case.name, "galaxies": int(len(good)) * FIELDS, "flagged": flagged, "aim": case.aim}
+    result["peers"] = others.results()
     if good.sum() < 8:
         return result | {"verdict": "flagged" if case.or_flagged else "FAILED"}
     for k in (1, 2):
         kept = [row for row in rows if k in row]
-        e = np.concatenate([row[k][0][:, :, row["good"]] for row in kept], 2)
-        response = np.concatenate([row[k][1][:, :, row["good"]] for row in kept], 2)
-        mean = response.mean()
+        e = np.concatenate([row[k][0] for row in kept], 2)
+        response = np.concatenate([row[k][1] for row in kept], 2)
+        of = np.concatenate([row["good"] for row in kept])
+        mean = response[:, :, of].mean()
         apart = ((e[:, 0] - e[:, 1]) / (2 * SHEAR)).mean(0) - response.mean((0, 1))
-        result[f"m{k}"] = 1e3 * apart.mean() / mean
-        result[f"m{k}_error"] = 1e3 * apart.std() / np.sqrt(len(apart)) / mean
-        centre = e.mean((0, 1)) / mean
-        result[f"c{k}"] = 1e4 * centre.mean()
-        result[f"c{k}_error"] = 1e4 * centre.std() / np.sqrt(len(centre))
-        result[f"noise{k}"] = (e[0, 0] - e[2, 0]).std() / np.sqrt(2) / mean
+        m, error = mean_of(apart, of)
+        result[f"m{k}"], result[f"m{k}_error"] = 1e3 * m / mean, 1e3 * error / mean
+        c, error = mean_of(e.mean((0, 1)) / mean, of)
+        result[f"c{k}"], result[f"c{k}_error"] = 1e4 * c, 1e4 * error
+        result[f"noise{k}"] = (e[0, 0] - e[2, 0])[of].std() / np.sqrt(2) / mean
     result["noise"] = float(np.sqrt((result["noise1"] ** 2 + result["noise2"] ** 2) / 2))
     least = bound(case)
     held = [abs(result[f"m{k}"]) <= case.aim + 2 * result[f"m{k}_error"] for k in (1, 2)]
@@ -324,6 +374,12 @@ def line(row):
     )
 
 
+def lines_of_peers(row):
+    for name, found in row["peers"].items():
+        m = f"{found['m1']:+8.2f} {found['m2']:+8.2f} ± {max(found['m1_error'], found['m2_error']):.2f}"
+        yield f"  {name:10} {m:>26} {'':24} {found['noise']:.4f} {'':6} {100 * found['failed']:6.2f}"
+
+
 def main():
     words = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     words.add_argument("--shearq", default="target/release/shearq", help="the program")
@@ -332,6 +388,9 @@ def main():
     words.add_argument("--cases", help="names with commas; all of them without")
     words.add_argument("--real", type=Path, help="folder with GalSim's example catalogues; without, those cases are left out")
     words.add_argument("--seed", type=int, default=20261)
+    words.add_argument(
+        "--peers", nargs="*", default=[], choices=list(peers.PEERS), help="estimators of others, on the same stamps"
+    )
     words.add_argument("--threads", type=int, default=1)
     words.add_argument("--json", type=Path, help="the table as JSON")
     options = words.parse_args()
@@ -346,7 +405,7 @@ def main():
     rows = []
     for name in names:
         rows.append(examine(known[name], options))
-        print(line(rows[-1]), flush=True)
+        print(line(rows[-1]), *lines_of_peers(rows[-1]), sep="\n", flush=True)
         if options.json:
             settings = {"submission": options.submission, "galaxies": options.galaxies, "seed": options.seed}
             options.json.write_text(json.dumps({"settings": settings, "cases": rows}, indent=1))
