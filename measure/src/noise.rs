@@ -188,6 +188,7 @@ impl NoisePlan {
             pixels: vec![0.0; self.full * self.full],
             contrasts: Contrasts::new(self.full),
             missing: Missing::new(self.full),
+            over_noise: Vec::new(),
             products: Vec::new(),
             brightest: Vec::new(),
             typical: Vec::new(),
@@ -210,6 +211,8 @@ pub struct NoiseSurvey {
     pixels: Vec<f32>,
     contrasts: Contrasts,
     missing: Missing,
+    /// Of each place of a stamp, how much brighter it is than its opposite, over the root of its pixels.
+    over_noise: Vec<f32>,
     /// Of each block, frame by frame, the sum of products at each lag; NaN where pixels are missing.
     products: Vec<f32>,
     /// Of each block, the most that a place around it is brighter than its opposite, over the root of its pixels.
@@ -281,23 +284,32 @@ impl NoiseSurvey {
         let turn = turn(found, full);
         self.contrasts.compare(&self.pixels, turn);
         let places = &self.contrasts.blocks;
-        let over_noise = |excess: f32, pixels: f32| excess / pixels.sqrt();
+        let over_noise = places.iter().map(|at| at.excess / at.pixels.sqrt());
+        self.over_noise.clear();
+        self.over_noise.extend(over_noise);
         for &(y0, x0) in &*self.plan.blocks {
             let middle = |first: usize, turn: i32| {
                 first as f32 + (BLOCK as f32 - 1.0) / 2.0 - turn as f32 / 2.0
             };
             let (x, y) = (middle(x0, turn[0]), middle(y0, turn[1]));
-            let near = places
-                .iter()
-                .filter(|at| (at.place[0] - x).hypot(at.place[1] - y) < AROUND);
-            let most = near.map(|at| over_noise(at.excess, at.pixels));
-            self.brightest.push(most.fold(0.0, f32::max));
+            let mut most = 0.0f32;
+            for (at, &over_noise) in places.iter().zip(&self.over_noise) {
+                let square = (at.place[0] - x).powi(2) + (at.place[1] - y).powi(2);
+                let near = if square < AROUND * AROUND {
+                    over_noise
+                } else {
+                    0.0
+                };
+                most = most.max(near);
+            }
+            self.brightest.push(most);
         }
         let most = places.iter().map(|at| at.excess).fold(0.0, f32::max);
         // Where one side was filled from the other there is no difference but rounding.
-        let seen = places.iter().filter(|at| at.excess > ROUNDING * most);
-        let mut all: Vec<f32> = seen.map(|at| over_noise(at.excess, at.pixels)).collect();
-        self.typical.extend(median(&mut all));
+        let mut at = places.iter();
+        self.over_noise
+            .retain(|_| at.next().is_some_and(|at| at.excess > ROUNDING * most));
+        self.typical.extend(median(&mut self.over_noise));
     }
 
     /// How many stamps were looked at.

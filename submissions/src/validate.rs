@@ -3,7 +3,7 @@
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, WINDOWS};
+use crate::limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, MIN_TARGET, WINDOWS};
 use crate::name;
 use crate::settings::{
     Clipping, Denoise, LinearDeconvolution, LinearMethod, Method, NetworkDeconvolution,
@@ -177,7 +177,7 @@ impl LinearMethod {
         step(c)?;
         lambda(l)?;
         iterations(max_iterations)?;
-        let good = (1.0..=MAX_TARGET).contains(&target);
+        let good = (MIN_TARGET..=MAX_TARGET).contains(&target);
         real(good, "deconvolution.target_sigma", target, "1 to 6 pixels")?;
         let good = WINDOWS.contains(&window);
         real(good, "deconvolution.window_sigma", window, "2 to 16 pixels")?;

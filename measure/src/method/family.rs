@@ -7,7 +7,7 @@
 use std::sync::{Arc, OnceLock};
 
 use ndarray::ArrayView2;
-use shearq_submissions::limits::MAX_TARGET;
+use shearq_submissions::limits::{MAX_TARGET, MIN_TARGET};
 use shearq_submissions::{LinearMethod, PsfCut};
 
 use super::found::{CutWorker, Found, Images};
@@ -36,7 +36,7 @@ impl LinearFamily {
             n,
             cut,
             first: Arc::new(LinearPlan::new(method, n, cut.size)?),
-            members: (0..=breadth::LAST).map(|_| Default::default()).collect(),
+            members: breadth::STEPS.map(|_| Default::default()).collect(),
         })
     }
 
@@ -45,13 +45,15 @@ impl LinearFamily {
             return Ok(Arc::clone(&self.first));
         }
         let Kind { step, window } = kind;
-        let place = &self.members[step][window];
+        let place = &self.members[(step - breadth::STEPS.start()) as usize][window];
         if let Some(plan) = place.get() {
             return Ok(Arc::clone(plan));
         }
         let mut method = self.method.clone();
         let target = &mut method.deconvolution.target_sigma;
-        let factor = breadth::factor(step).min(MAX_TARGET / *target).max(1.0);
+        // A target beyond the bounds is the submission's own.
+        let (least, most) = (MIN_TARGET / *target, MAX_TARGET / *target);
+        let factor = breadth::factor(step).clamp(least.min(1.0), most.max(1.0));
         *target *= factor;
         method.shape.weight_scale *= factor;
         // An area squared.
@@ -66,10 +68,10 @@ impl LinearFamily {
     fn kind(&self, psf: ArrayView2<'_, f64>, extent: Option<f64>, moments: &mut Moments) -> Kind {
         let step = breadth::step(psf, self.cut);
         // It was cut after a look at its middle alone, where it may have been a little broader.
-        let fits = |&at: &usize| breadth::side(self.cut, at) >= psf.nrows();
+        let fits = |&at: &i32| breadth::side(self.cut, at) >= psf.nrows();
         let reference = self.method.deconvolution.reference_extent;
         Kind {
-            step: (step..=breadth::LAST).find(fits).unwrap_or(step),
+            step: (step..=*breadth::STEPS.end()).find(fits).unwrap_or(step),
             window: window::place(extent, psf, reference, moments),
         }
     }
@@ -79,7 +81,7 @@ impl LinearFamily {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Kind {
     /// Of the PSF's breadth.
-    step: usize,
+    step: i32,
     /// Place of the window's width.
     window: usize,
 }
@@ -200,10 +202,11 @@ mod tests {
     }
 
     #[test]
-    fn usual_psfs_are_measured_as_without_a_family_and_broad_ones_more_smoothly() {
+    fn usual_psfs_are_measured_as_without_a_family_broad_ones_more_smoothly_and_narrow_ones_less() {
         let (with, without) = (submission(50.0), submission(0.0));
-        let found = measured(&with, &[3.4, 6.0, 2.0], 0.5);
-        let plain = measured(&without, &[3.4, 6.0, 2.0], 0.5);
+        let fwhms = [3.4, 6.0, 3.06, 2.0];
+        let found = measured(&with, &fwhms, 0.5);
+        let plain = measured(&without, &fwhms, 0.5);
         for k in [0, 2] {
             assert_eq!(
                 (found[k].e1, found[k].response),
@@ -211,6 +214,7 @@ mod tests {
             );
         }
         assert!(found[1].size > 1.2 * plain[1].size, "{found:?} {plain:?}");
+        assert!(found[3].size < 0.8 * plain[3].size, "{found:?} {plain:?}");
         // Whatever was measured before, and on whichever worker.
         let alone = measured(&with, &[6.0], 0.5);
         assert_eq!((found[1].e1, found[1].e2), (alone[0].e1, alone[0].e2));
