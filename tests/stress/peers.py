@@ -1,27 +1,25 @@
 """Shapes by estimators that others made, of the stamps that a submission is measured on.
 
-Each takes stamps `[version, galaxy, y, x]` (with both shears and one field of noise, and with the first and another),
-their PSF, and a function that draws noise like that of a version. It returns ellipticities `[version, galaxy, component]`,
-not a number where it failed, and its own mean response per component.
+Each takes stamps `[version, galaxy, y, x]`, their PSF, and a function that draws noise like that of a version. The
+versions are the two shears under one field of noise, and the first under another. It returns ellipticities
+`[version, galaxy, component]`, not a number where it failed, and its own response `[galaxy, component]`.
 """
 
 import galsim
 import numpy as np
 
-try:
-    import anacal
-except ImportError:
-    anacal = None
-
-#: Kernel of FPFS in pixels, by which its noise is least among 2.6, 3.2 and 4 px, and what is added to its divisor in
-#: units of a galaxy's.
+#: Kernel of FPFS in pixels, and C of its e = M22 / (M00 + C) in units of the median M00: see README.md.
 KERNEL, OFFSET = 4.0, 1.0
-#: Pixels a side of FPFS's stamps, and arcseconds a pixel, which it is told lengths in.
+#: Pixels a side of FPFS's stamps, and arcseconds a pixel: it takes lengths in arcseconds.
 SIDE, SCALE = 64, 0.2
 
 
 def regauss(stamps, psf, _noise):
-    """Re-Gaussianization (Hirata & Seljak 2003) of GalSim's HSM; shears are half of its distortions."""
+    """Re-Gaussianization (Hirata & Seljak 2003) of GalSim's HSM; ellipticities are half of its distortions χ.
+
+    Distortions respond to shear by 2 (1 − χ²) with the intrinsic χ² of the component, which is the covariance of two
+    measurements with noise of their own. Moduli of χ above 2 count as failed: they would rule all scatter.
+    """
     side = stamps.shape[-1]
     image = psf.drawImage(nx=side, ny=side, scale=1, dtype=float)
     e = np.full((*stamps.shape[:2], 2), np.nan)
@@ -32,15 +30,18 @@ def regauss(stamps, psf, _noise):
             )
             if not found.error_message:
                 e[version, k] = found.corrected_e1 / 2, found.corrected_e2 / 2
-    # A distortion of modulus 2 is none.
-    e[np.abs(e) > 1.0] = np.nan
-    # The response of distortions to shear is 2 (1 − χ²) with the intrinsic χ² per component: what noise does not add.
-    change = np.nanvar(e[0] - e[2], 0) / 2
-    return e, 1.0 - 4.0 * (np.nanvar(e[0], 0) - change)
+    e[np.hypot(e[..., 0], e[..., 1]) > 1.0] = np.nan
+    e[:, np.isnan(e).any((0, 2))] = np.nan
+    off = e - np.nanmean(e, 1, keepdims=True)
+    return e, 1.0 - 4.0 * off[0] * off[2]
 
 
 def fpfs(stamps, psf, noise):
-    """FPFS (Li et al. 2022) of AnaCal at the stamps' middles, without detection, with its doubled noise."""
+    """FPFS (Li et al. 2022) of AnaCal at the stamps' middles, without detection, with noise added for its response."""
+    try:
+        import anacal
+    except ImportError:
+        raise SystemExit("FPFS needs AnaCal: pip install anacal") from None
     versions, count, side, _ = stamps.shape
     full = max(SIDE, side)
     grid = int(np.sqrt(count))
@@ -52,8 +53,8 @@ def fpfs(stamps, psf, noise):
         image = image.reshape(grid, grid, full, full).transpose(0, 2, 1, 3)
         return np.ascontiguousarray(image.reshape(grid * full, grid * full))
 
-    # Its PSF has the middle of a pixel for its own, at half of the side.
-    drawn = psf.shift(0.5, 0.5).drawImage(nx=full, ny=full, scale=1, dtype=float).array
+    # The PSF is half a pixel off the place that is told as its middle, as the galaxies are.
+    drawn = psf.drawImage(nx=full, ny=full, scale=1, dtype=float).array
     task = anacal.fpfs.FpfsTask(
         npix=full, pixel_scale=SCALE, sigma_shapelets=KERNEL * SCALE, psf_array=drawn, kmax_thres=1e-12
     )
@@ -62,18 +63,16 @@ def fpfs(stamps, psf, noise):
     places["y"], places["x"] = y.ravel(), x.ravel()
     e, responses, offset = [], [], None
     for version in range(versions):
-        # The version with another field of noise has another of these, too.
+        # It adds this to the image itself.
         added = mosaic(noise(version))
-        found = task.run(
-            gal_array=mosaic(stamps[version]) + added, psf=drawn, noise_array=added, det=places
-        )
+        found = task.run(gal_array=mosaic(stamps[version]), psf=drawn, noise_array=added, det=places)
         if offset is None:
             offset = OFFSET * float(np.median(found["data"]["m00"]))
         shapes = anacal.fpfs.measure_fpfs(C0=offset, x_array=found["data"], y_array=found["noise"])
         e.append(np.stack([shapes["e1"], shapes["e2"]], 1))
-        responses.append([shapes["de1_dg1"].mean(), shapes["de2_dg2"].mean()])
+        responses.append(np.stack([shapes["de1_dg1"], shapes["de2_dg2"]], 1))
     return np.array(e), np.mean(responses[:2], 0)
 
 
 #: What can be asked for.
-PEERS = {"REGAUSS": regauss} | ({"FPFS": fpfs} if anacal else {})
+PEERS = {"REGAUSS": regauss, "FPFS": fpfs}
