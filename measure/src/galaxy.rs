@@ -317,7 +317,7 @@ fn reported(
     }
 }
 
-/// The largest of the pixels, or zero: in lanes, as one maximum would wait for the other.
+/// The largest of the pixels, or zero: of 16 running maxima, which vector instructions take at a time.
 fn highest(pixels: &[f32]) -> f32 {
     const LANES: usize = 16;
     let mut lanes = [0.0f32; LANES];

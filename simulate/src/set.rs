@@ -510,6 +510,44 @@ mod tests {
     }
 
     #[test]
+    fn galaxies_have_the_same_flux_however_they_lie_to_the_psf_and_are_sheared() {
+        // Small ones, of which the stamp holds nearly all light; one elliptical PSF.
+        let simulator = simulator(14, 5, 16);
+        let fields = simulator.image_fields(1);
+        let long = fields.psf.at(3, 2).shape;
+        let mut out = vec![0.0; STAMP * STAMP];
+        let mut flux = |intrinsic: f64, shear: f64| {
+            let of = |size: f64| {
+                let scale = size / long.modulus();
+                Shear::new(scale * long.e1, scale * long.e2)
+            };
+            let version = Version {
+                intrinsic: of(intrinsic),
+                shear: of(shear),
+                noise: 0.0,
+            };
+            simulator.draw_as(
+                &fields,
+                (3, 2),
+                version,
+                &mut RenderScratch::new(),
+                &mut out,
+            );
+            out.iter().map(|v| f64::from(*v)).sum::<f64>()
+        };
+        let along = flux(0.3, 0.0);
+        for (intrinsic, shear) in [(-0.3, 0.0), (0.3, 0.05), (-0.3, 0.05)] {
+            let other = flux(intrinsic, shear);
+            // Light beyond the stamp. By the S/N of the stamp itself it was 0.006.
+            assert!(
+                (other / along - 1.0).abs() < 1e-3,
+                "{intrinsic} {shear}: {}",
+                other / along - 1.0
+            );
+        }
+    }
+
+    #[test]
     fn noise_and_signal_have_the_levels_stated() {
         let simulator = simulator(8, 5, 16);
         let fields = simulator.image_fields(1);

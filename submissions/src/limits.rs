@@ -6,9 +6,10 @@ pub const MAX_CUT: usize = 64;
 /// Largest side of a PSF stamp, in pixels.
 pub const MAX_PSF: usize = 48;
 
-/// Narrowest and broadest target of the linear method, in pixels.
+/// Narrowest target of the linear method, in pixels.
 pub const MIN_TARGET: f64 = 1.0;
-/// See [`MIN_TARGET`].
+
+/// Broadest target of the linear method, in pixels.
 pub const MAX_TARGET: f64 = 6.0;
 
 /// Windows of the linear method, in pixels.

@@ -247,8 +247,8 @@ section! {
         /// the same window on all.
         reference_extent: f64,
         /// Noise-equivalent area 1/Σp² in px² of the PSF that lengths are for. For a broader one target and weight are
-        /// longer, and more is cut of it; for one below half of it target and weight are shorter. Zero for the same lengths with
-        /// all PSFs.
+        /// longer, softening larger as the fourth power, and more is cut of it; for one below half of it target and weight are
+        /// shorter and softening smaller. Zero for the same with all PSFs.
         reference_area: f64,
     }
 }

@@ -2,22 +2,35 @@
 
 use std::ops::RangeInclusive;
 
-use ndarray::ArrayView2;
+use ndarray::{ArrayView2, s};
 use shearq_submissions::PsfCut;
 
 /// Steps in which lengths double.
 const OCTAVE: f64 = 4.0;
-/// Steps: from 0.6 to 2.8 times as broad as the reference.
+/// Steps of lengths: 0.6 to 2.8 times as long.
 pub(crate) const STEPS: RangeInclusive<i32> = -3..=6;
 
-/// Noise-equivalent area in px² of a PSF of sum one: 1/Σp².
+/// Pixels that the frame is wide which tells a star's noise, and pixels a side from which on it is free of the star's light.
+const FRAME: usize = 2;
+const LEAST_SIDE: usize = 12;
+
+/// Noise-equivalent area in px² of a PSF of sum one: 1/Σp², without what a star's noise adds to the sum, which is told
+/// from its frame.
 fn area(psf: ArrayView2<'_, f64>) -> f64 {
-    1.0 / psf.iter().map(|value| value * value).sum::<f64>()
+    let square = |value: &f64| value * value;
+    let mut sum = psf.iter().map(square).sum::<f64>();
+    let n = psf.nrows();
+    if n >= LEAST_SIDE {
+        let inner = psf.slice(s![FRAME..n - FRAME, FRAME..n - FRAME]);
+        let frame = sum - inner.iter().map(square).sum::<f64>();
+        sum -= frame * psf.len() as f64 / (psf.len() - inner.len()) as f64;
+    }
+    1.0 / sum
 }
 
-/// How many steps a PSF of sum one is broader than the reference of `cut`; none where there is no reference. Narrower ones
-/// count whole steps alone, and the first of them not: sharp lengths bring noise into the response before they take any
-/// out of ellipticities.
+/// How many steps a PSF of sum one is broader than the reference of `cut`; none where there is no reference. Steps to
+/// broader ones are rounded; those to narrower ones are rounded towards zero, less one, so that lengths first shrink where
+/// the PSF is 1/√2 as broad: sharp lengths bring noise into the response before they take any out of ellipticities.
 pub(crate) fn step(psf: ArrayView2<'_, f64>, cut: PsfCut) -> i32 {
     if cut.reference_area == 0.0 {
         return 0;
@@ -39,7 +52,7 @@ pub(crate) fn factor(step: i32) -> f64 {
 
 /// Pixels a side that are cut of a PSF so many steps broader than the reference; not less of a narrower one.
 pub(crate) fn side(cut: PsfCut, step: i32) -> usize {
-    // A negative number is zero as a whole one.
+    // `as usize` makes negative numbers zero.
     let more = cut.size as f64 * (factor(step) - 1.0) / 2.0;
     let most = cut.most.max(cut.size);
     // Of the same parity.
@@ -48,6 +61,8 @@ pub(crate) fn side(cut: PsfCut, step: i32) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
     use shearq_scoring::Shear;
 
     use super::*;
@@ -69,9 +84,17 @@ mod tests {
         let found = area(moffat(6.0).view());
         assert!((found / expected - 1.0).abs() < 0.02, "{found}");
         let steps = |fwhm| step(moffat(fwhm).view(), cut(50.0));
-        let found = [0.5, 2.0, 2.7, 3.06, 3.4, 3.74, 4.5, 6.0, 20.0].map(steps);
-        assert_eq!(found, [-3, -2, 0, 0, 0, 0, 1, 3, 6]);
+        let narrow = [0.5, 2.0, 2.3, 2.45, 2.55, 2.7, 3.06].map(steps);
+        assert_eq!(narrow, [-3, -2, -1, -1, 0, 0, 0]);
+        let broad = [3.4, 3.74, 4.5, 6.0, 20.0].map(steps);
+        assert_eq!(broad, [0, 0, 1, 3, 6]);
         assert_eq!(step(moffat(6.0).view(), cut(0.0)), 0);
+        // As narrow as ever in noise of a star of S/N 30, which alone would make it a step narrower.
+        let clean = moffat(3.4);
+        let sigma = clean.iter().map(|v| v * v).sum::<f64>().sqrt() / 30.0;
+        let mut rng = ChaCha8Rng::seed_from_u64(9);
+        let star = clean.mapv(|v| v + sigma * 12f64.sqrt() * rng.random_range(-0.5..0.5));
+        assert_eq!(step(star.view(), cut(50.0)), 0);
         let dead = moffat(6.0) * f64::NAN;
         assert_eq!(step(dead.view(), cut(50.0)), 0);
         assert_eq!([-4, 0, 4].map(factor), [0.5, 1.0, 2.0]);
