@@ -400,18 +400,14 @@ impl NoiseSurvey {
             let reach = self.plan.reach as i32;
             let width = 2 * reach + 1;
             let mut correlation = vec![0.0; ((reach + 1) * width) as usize];
-            let mut square = 0.0;
             for (&(dx, dy), value) in lags(self.plan.reach).iter().zip(&covariance) {
                 let ratio = value / variance;
                 correlation[(dy * width + dx + reach) as usize] = ratio;
                 if dy == 0 {
                     correlation[(reach - dx) as usize] = ratio;
                 }
-                let pairs = (BLOCK as i32 - dx.abs()) * (BLOCK as i32 - dy);
-                if (dx, dy) != (0, 0) {
-                    square += ratio * ratio * f64::from(pairs) * count;
-                }
             }
+            let square = count * colour(&self.plan.matrix, &covariance) / (variance * variance);
             // Of squares of noise that is correlated in patches of Σρ² pixels.
             let patch = correlation.iter().map(|ratio| ratio * ratio).sum::<f64>() * 2.0;
             let freedom = (PIXELS - POLYNOMIALS) as f64 * count;
@@ -424,6 +420,25 @@ impl NoiseSurvey {
             }
         })
     }
+}
+
+/// χ² of a covariance against white noise of variance one, for one block.
+///
+/// With S_l one for pixels ±l apart, products are q′S_l q/2 (q′q at l = 0), so that M(l, l′) = tr(P S_l P S_l′)/2 and, in
+/// white noise, the products' covariance is M(l, l′), and twice that for l′ = 0. That of the solutions has the inverse
+/// A(l, l′) = M(l′, l), half of it for l′ = 0, of which the variance at lag zero, whatever it is, takes its share.
+fn colour(matrix: &Array2<f64>, covariance: &[f64]) -> f64 {
+    let inverse = |i: usize, j: usize| matrix[(j, i)] * if j == 0 { 0.5 } else { 1.0 };
+    let others = 1..covariance.len();
+    let pairs = others
+        .clone()
+        .flat_map(|i| others.clone().map(move |j| (i, j)));
+    pairs
+        .map(|(i, j)| {
+            let freed = inverse(i, 0) * inverse(0, j) / inverse(0, 0);
+            covariance[i] * covariance[j] * (inverse(i, j) - freed)
+        })
+        .sum()
 }
 
 /// Lags of half the plane, zero first.
@@ -635,6 +650,28 @@ mod tests {
         let (power, _) = found.power([0.5, -0.8]);
         // 24 lags of 1/√400,000 each, both ways: 1.5 %.
         assert!((power - 1.0).abs() < 0.06, "{power}");
+    }
+
+    #[test]
+    fn chance_has_as_much_correlation_as_white_noise_is_allowed() {
+        let mut rng = ChaCha8Rng::seed_from_u64(21);
+        let plan = NoisePlan::new(SIDE, 3).unwrap();
+        let count = 150;
+        let found = (0..count).map(|_| {
+            let mut survey = plan.survey();
+            for _ in 0..16 {
+                survey.add(noise(&mut rng, false).view()).unwrap();
+            }
+            survey.noise().unwrap()
+        });
+        let found: Vec<StampNoise> = found.collect();
+        assert!(found.iter().all(|noise| !noise.is_correlated()));
+        let (mean, freedom) = (
+            found.iter().map(|noise| noise.colour.0).sum::<f64>() / f64::from(count),
+            found[0].colour.1,
+        );
+        // χ² scatters by √(2·24): 0.57 in the mean of 150.
+        assert!((mean - freedom).abs() < 2.0, "{mean} {freedom}");
     }
 
     #[test]
