@@ -3,7 +3,7 @@
 //! Where a block of the stamp is brighter than its opposite by more than noise makes it, there is a neighbour. Its
 //! light, a round profile that is fitted to the difference of the two sides, is subtracted; of what a round profile leaves,
 //! most is where the neighbour is, so that the half of the stamp from half of the way to it gets the pixels of the opposite
-//! side. A neighbour that is too near for this flags the galaxy. Pixels that are filled like this repeat noise only at
+//! side. A neighbour that is too near or too bright for this flags the galaxy. Pixels that are filled like this repeat noise only at
 //! lags beyond those that the shape is measured on.
 
 mod centre;
@@ -27,6 +27,9 @@ const FITTED_FROM: f32 = 0.3;
 const FILLED_FROM: f32 = 0.5;
 /// Distance in pixels of neighbours that are too near to be taken away.
 const TOO_NEAR: f32 = 12.0;
+/// Light of a neighbour, in units of that within 8 px of the galaxy's centre, from which on what a round profile leaves of
+/// it is no longer small beside the galaxy: two to three galaxies.
+const TOO_BRIGHT: f32 = 5.0;
 
 /// A stamp's surroundings, and room for it without neighbours.
 pub(crate) struct Surroundings {
@@ -53,7 +56,7 @@ impl Surroundings {
     /// where there are some, and the stamp without them is in `self.filled`.
     ///
     /// # Errors
-    /// Where one is too near.
+    /// Where one is too near, or too bright.
     pub(crate) fn clear(
         &mut self,
         stamp: &[f32],
@@ -72,6 +75,7 @@ impl Surroundings {
         hits.sort_unstable_by(|a, b| b.excess.total_cmp(&a.excess));
         self.filled.copy_from_slice(stamp);
         self.sides.clear();
+        let mut most = 0.0f32;
         while let Some(&brightest) = hits.first() {
             let [x, y] = self.profile.place(&self.filled, turn, brightest.place);
             let distance = x.hypot(y);
@@ -80,12 +84,16 @@ impl Surroundings {
             }
             let side = [x / distance, y / distance];
             let from = FITTED_FROM * distance;
-            self.profile.subtract(&mut self.filled, turn, [x, y], from);
+            let light = self.profile.subtract(&mut self.filled, turn, [x, y], from);
+            most = most.max(light);
             let along = |place: [f32; 2]| place[0] * side[0] + place[1] * side[1];
             // The brightest one is done wherever its light was found.
             hits.remove(0);
             hits.retain(|hit| along(hit.place) <= from);
             self.sides.push((side, FILLED_FROM * distance));
+        }
+        if most > TOO_BRIGHT * self.contrasts.inner(&self.filled, turn) {
+            return Err(Flag::Neighbour);
         }
         for at in 0..self.sides.len() {
             let (side, from) = self.sides[at];
@@ -171,5 +179,16 @@ mod tests {
         blob(&mut stamp, 0.0, 0.0, 20.0);
         blob(&mut stamp, -7.0, 8.0, 20.0);
         assert_eq!(look.clear(&stamp, [0.0; 2], 1.0), Err(Flag::Neighbour));
+    }
+
+    #[test]
+    fn neighbours_that_outshine_the_galaxy_are_told() {
+        let mut look = Surroundings::new(N);
+        for (light, expected) in [(30.0, Ok(true)), (200.0, Err(Flag::Neighbour))] {
+            let mut stamp = vec![0.0; N * N];
+            blob(&mut stamp, 0.0, 0.0, 20.0);
+            blob(&mut stamp, -14.0, 9.0, light);
+            assert_eq!(look.clear(&stamp, [0.0; 2], 1.0), expected, "{light}");
+        }
     }
 }

@@ -43,6 +43,11 @@ pub(crate) fn turn(centre: [f32; 2], n: usize) -> [i32; 2] {
     centre.map(|c| (2.0 * c).round() as i32 + n as i32 - 1)
 }
 
+/// The first pixel beyond the centre along each axis.
+fn beyond(turn: [i32; 2]) -> [i32; 2] {
+    turn.map(|turn| turn.div_euclid(2) + 1)
+}
+
 /// The light of the opposite of a pixel (x, y) on a stamp of `n` pixels a side; `None` off the stamp.
 pub(super) fn opposite(stamp: &[f32], n: usize, turn: [i32; 2], [x, y]: [usize; 2]) -> Option<f32> {
     let on_stamp = |at: i32| usize::try_from(at).ok().filter(|&at| at < n);
@@ -66,9 +71,8 @@ impl Contrasts {
         self.blocks.clear();
         self.cells.clear();
         let most = (self.n / 2 + CELL - 1) / CELL;
-        // The first pixel beyond the centre.
-        let [x0, y0] = turn.map(|turn| turn.div_euclid(2) + 1);
-        self.light = self.sum(stamp, (x0 - INNER, y0 - INNER), 2 * INNER).0;
+        let [x0, y0] = beyond(turn);
+        self.light = self.inner(stamp, turn);
         // One row of cells from the other half, for blocks on the line between both.
         for j in -1..most {
             for i in -most..most {
@@ -109,6 +113,12 @@ impl Contrasts {
                 place: [side * x, side * y],
             });
         }
+    }
+
+    /// The light of 16 × 16 pixels around the centre.
+    pub(super) fn inner(&self, stamp: &[f32], turn: [i32; 2]) -> f32 {
+        let [x0, y0] = beyond(turn);
+        self.sum(stamp, (x0 - INNER, y0 - INNER), 2 * INNER).0
     }
 
     /// Sum over a square, as far as it is on the stamp, and the number of its pixels there.

@@ -89,14 +89,14 @@ impl Profile {
     }
 
     /// Subtracts from `stamp` the neighbour at `place` from the galaxy's centre, (x, y) in pixels. Pixel p is opposite to
-    /// `turn − p`. The fit is to pixels further than `from` in the neighbour's direction.
+    /// `turn − p`. The fit is to pixels further than `from` in the neighbour's direction. Returns the neighbour's light.
     pub(super) fn subtract(
         &mut self,
         stamp: &mut [f32],
         turn: [i32; 2],
         place: [f32; 2],
         from: f32,
-    ) {
+    ) -> f32 {
         for axis in 0..2 {
             let centre = turn[axis] as f32 / 2.0;
             for at in 0..self.n {
@@ -114,6 +114,9 @@ impl Profile {
                 *pixel -= terms.map(|(x, y)| x * y).sum::<f32>();
             }
         }
+        let areas = WIDTHS.map(|width| 2.0 * std::f32::consts::PI * width * width);
+        let lights = amplitudes.iter().zip(areas);
+        lights.map(|(peak, area)| *peak as f32 * area).sum()
     }
 
     /// Amplitudes of the Gaussians.
