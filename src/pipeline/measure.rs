@@ -194,7 +194,7 @@ impl ImageSource {
             };
             let looked_at = survey.looked_at();
             let message = format!(
-                "the frames of {looked_at} stamp(s){missing} hold too little noise to measure it; expected two whole frames or more: set noise.source to \"border\", or to \"header\" where NOISESIG is known"
+                "the frames of {looked_at} stamp(s){missing} hold too little noise to measure it; expected two or more whole frames of pixels that differ by noise: set noise.source to \"border\", or to \"header\" where NOISESIG is known"
             );
             FileError::new(&path, message)
         })?;
@@ -544,8 +544,9 @@ fn first_noise(
                 "NOISESIG is not what is there"
             };
             doubts.push(format!(
-                "warning: {image}: NOISESIG is {header}, the noise of the stamps' frames {:.4}: {taken}",
-                noise.sigma()
+                "warning: {image}: NOISESIG is {}, the noise of the stamps' frames {}: {taken}",
+                level(header),
+                level(noise.sigma())
             ));
         }
     }
@@ -558,6 +559,14 @@ fn first_noise(
         ));
     }
     Ok((asked.then_some(survey), doubts))
+}
+
+/// A level of noise to five digits, in whatever unit pixels have.
+fn level(sigma: f64) -> String {
+    if sigma == 0.0 || (1e-3..1e6).contains(&sigma.abs()) || !sigma.is_finite() {
+        return format!("{sigma:.4}");
+    }
+    format!("{sigma:.4e}")
 }
 
 /// Number of galaxies that `measure_folder` will measure, for progress bars: an estimate from the

@@ -269,6 +269,13 @@ def mean_of(values, good):
     return mean, np.sqrt((off**2).sum()) / good.sum()
 
 
+def bias(apart, response, good):
+    """m and its error in 10⁻³, and the mean response, of galaxies' change with shear beside their responses."""
+    m, error = mean_of(apart - response, good)
+    mean = response[good].mean()
+    return 1e3 * m / mean, 1e3 * error / mean, mean
+
+
 class Peers:
     """What others make of the stamps of a case."""
 
@@ -302,9 +309,7 @@ class Peers:
         noise = []
         for k in (0, 1):
             apart = (e[0, :, k] - e[1, :, k]) / (2 * SHEAR)
-            m, error = mean_of(apart - response[:, k], good)
-            mean = response[good, k].mean()
-            result[f"m{k + 1}"], result[f"m{k + 1}_error"] = 1e3 * m / mean, 1e3 * error / mean
+            result[f"m{k + 1}"], result[f"m{k + 1}_error"], _ = bias(apart, response[:, k], good)
             noise.append((e[0] - e[2])[good, k].std() / np.sqrt(2) / apart[good].mean())
         return result | {"noise": float(np.sqrt(np.mean(np.square(noise))))}
 
@@ -345,10 +350,8 @@ def examine(case, options):
         e = np.concatenate([row[k][0] for row in kept], 2)
         response = np.concatenate([row[k][1] for row in kept], 2)
         of = np.concatenate([row["good"] for row in kept])
-        mean = response[:, :, of].mean()
-        apart = ((e[:, 0] - e[:, 1]) / (2 * SHEAR)).mean(0) - response.mean((0, 1))
-        m, error = mean_of(apart, of)
-        result[f"m{k}"], result[f"m{k}_error"] = 1e3 * m / mean, 1e3 * error / mean
+        apart = ((e[:, 0] - e[:, 1]) / (2 * SHEAR)).mean(0)
+        result[f"m{k}"], result[f"m{k}_error"], mean = bias(apart, response.mean((0, 1)), of)
         c, error = mean_of(e.mean((0, 1)) / mean, of)
         result[f"c{k}"], result[f"c{k}_error"] = 1e4 * c, 1e4 * error
         result[f"noise{k}"] = (e[0, 0] - e[2, 0])[of].std() / np.sqrt(2) / mean
