@@ -4,6 +4,7 @@ mod family;
 mod found;
 mod linear;
 mod network;
+mod softening;
 mod window;
 
 use std::sync::Arc;

@@ -247,8 +247,8 @@ section! {
         /// the same window on all.
         reference_extent: f64,
         /// Noise-equivalent area 1/Σp² in px² of the PSF that lengths are for. For a broader one target and weight are
-        /// longer, softening larger as the fourth power, and more is cut of it; for one below half of it target and weight are
-        /// shorter and softening smaller. Zero for the same with all PSFs.
+        /// longer, and more is cut of it; for one below half of it target and weight are shorter. Zero for the same with all
+        /// PSFs.
         reference_area: f64,
     }
 }
@@ -260,7 +260,7 @@ partial! {
         acf_share: f64,
         share_of: ShareOf,
         weight_scale: f64,
-        softening: f64,
+        half_snr: f64,
         ellipticity: EllipticityType,
         calibration: Calibration,
     }
@@ -288,9 +288,10 @@ section! {
     WeightedShape, PartialShape, "shape" {
         /// Scale in pixels of the Moffat weight.
         weight_scale: f64,
-        /// Added to the weighted integral of x² + y² by which the moments are divided: px⁴ times the noise
-        /// of the ACF at zero lag. Galaxies of low S/N count less for it, as their noise asks.
-        softening: f64,
+        /// S/N at which a galaxy counts half, that of the best filter for a round galaxy of `reference_extent`: what is
+        /// added to the weighted integral of x² + y² by which the moments are divided halves the ellipticity of such a
+        /// galaxy, so that those of low S/N count less, as their noise asks. Zero for all alike.
+        half_snr: f64,
         /// Which ellipticity the catalogue reports as e1, e2.
         ellipticity: EllipticityType,
         /// What ellipticities are divided by.

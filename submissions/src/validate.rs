@@ -173,7 +173,7 @@ impl LinearMethod {
             reference_extent: extent,
             reference_area: area,
         } = self.deconvolution;
-        let (scale, softening) = (self.shape.weight_scale, self.shape.softening);
+        let (scale, half) = (self.shape.weight_scale, self.shape.half_snr);
         step(c)?;
         lambda(l)?;
         iterations(max_iterations)?;
@@ -197,8 +197,8 @@ impl LinearMethod {
         )?;
         let good = (0.5..=10.0).contains(&scale);
         real(good, "shape.weight_scale", scale, "0.5 to 10 pixels")?;
-        let good = (0.0..=1e6).contains(&softening);
-        real(good, "shape.softening", softening, "0 to 1e6")?;
+        let good = (0.0..=1e3).contains(&half);
+        real(good, "shape.half_snr", half, "0 to 1000")?;
         // The largest eigenvalue of W is 1 for a PSF of sum one.
         need(
             c * (1.0 + MAX_ROUGHNESS * l) < 2.0,

@@ -8,7 +8,7 @@ use crate::support::{Small, fail, shearq, text};
 fn submissions_with_mistakes_are_refused_with_file_and_place() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("own.toml");
-    let cases: [(&str, &[&str]); 17] = [
+    let cases: [(&str, &[&str]); 19] = [
         (
             "extends = \"paper\"\n[stamp]\nsise = 3\n",
             &["line 3", "unknown field `sise`, expected `size`"],
@@ -51,6 +51,14 @@ fn submissions_with_mistakes_are_refused_with_file_and_place() {
                 "line 3",
                 "`shape.acf_share` has no effect with method = \"linear\"",
             ],
+        ),
+        (
+            "extends = \"48/linear/star\"\n[shape]\nsoftening = 100.0\n",
+            &["line 3", "unknown field `softening`", "`half_snr`"],
+        ),
+        (
+            "extends = \"48/linear/star\"\n[shape]\nhalf_snr = -1.0\n",
+            &["`shape.half_snr` is -1; expected 0 to 1000"],
         ),
         (
             "extends = \"23/den/star\"\nmethod = \"linear\"\n[stamp]\nsize = 48\n",

@@ -102,8 +102,8 @@ pub struct SpectralPsf {
     turned: Vec<f32>,
     /// Mean power of windowed noise, in units of σ².
     floor: Vec<f32>,
-    /// Mean of the autocorrelation of noise of σ = 1 at zero lag.
-    noise_peak: f32,
+    /// |p|²/S of each mode: the square of what a point of flux one is there, in units of the noise.
+    clarity: Vec<f32>,
     /// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p.
     tilts: Vec<[Complex32; 2]>,
     /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ².
@@ -111,9 +111,9 @@ pub struct SpectralPsf {
 }
 
 impl SpectralPsf {
-    /// Mean of the autocorrelation of windowed noise of σ = 1 at zero lag.
-    pub fn noise_peak(&self) -> f32 {
-        self.noise_peak
+    /// |p|²/S of each mode of a half spectrum, S being the power of the noise.
+    pub fn clarity(&self) -> &[f32] {
+        &self.clarity
     }
 }
 
@@ -276,7 +276,7 @@ impl Spectral {
             field_tilts: vec![[0.0; 2]; modes],
             turned: vec![0.0; modes],
             floor: vec![0.0; modes],
-            noise_peak: 0.0,
+            clarity: vec![0.0; modes],
             tilts: vec![[Complex32::ZERO; 2]; modes],
             noise_tilts: vec![[0.0; 2]; modes],
         }
@@ -293,6 +293,22 @@ impl Spectral {
         });
         let (power, tilts) = modes.unzip();
         ModeNoise { power, tilts }
+    }
+
+    /// |g|² of each mode of a half spectrum over the plane's area in px², of a round Gaussian galaxy of flux one with a
+    /// mean square of `extent` px² per axis; twice where the mode stands for its opposite too. The sum of this times |p|²
+    /// is that of the squared pixels of the galaxy behind p.
+    pub fn light(&self, extent: f64) -> Vec<f32> {
+        let area = (self.plane.size * self.plane.size) as f64;
+        let modes = self.waves.iter().enumerate();
+        modes
+            .map(|(at, k)| {
+                // Columns with k_x > 0 stand for those with k_x < 0 too.
+                let twice = if at < self.plane.side { 1.0 } else { 2.0 };
+                let square = k.iter().map(|&k| f64::from(k).powi(2)).sum::<f64>();
+                (twice / area * (-square * extent).exp()) as f32
+            })
+            .collect()
     }
 
     /// Room for the lags.
@@ -337,6 +353,7 @@ impl Spectral {
         let [u, x, y] = &plane.half;
         for at in 0..self.waves.len() {
             let power = u[at].norm_sqr();
+            out.clarity[at] = power / noise.power[at];
             let centred = u[at] * self.centre[at];
             out.restore[at] = centred.conj() * self.amplitude(at, power);
             out.tilts[at] = if power < LEAST_POWER {
@@ -361,10 +378,6 @@ impl Spectral {
             };
         }
         spread(self.plane.side, &self.leak, tilt, along, &mut out.floor);
-        let terms = out.floor.iter().zip(&self.scale).enumerate();
-        // Columns with k_x > 0 stand for those with k_x < 0 too.
-        let twice = |at| if at < self.plane.side { 1.0 } else { 2.0 };
-        out.noise_peak = terms.map(|(at, (a, b))| twice(at) * a * b).sum();
         for component in 0..2 {
             let modes = out.field_tilts.iter().zip(&out.field);
             for (value, (tilts, field)) in tilt.iter_mut().zip(modes) {

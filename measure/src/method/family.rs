@@ -35,7 +35,12 @@ impl LinearFamily {
             method: method.clone(),
             n,
             cut,
-            first: Arc::new(LinearPlan::new(method, n, cut.size)?),
+            first: Arc::new(LinearPlan::new(
+                method,
+                n,
+                cut.size,
+                extent(method, window::OWN),
+            )?),
             members: breadth::STEPS.map(|_| Default::default()).collect(),
         })
     }
@@ -56,11 +61,10 @@ impl LinearFamily {
         let factor = breadth::factor(step).clamp(least.min(1.0), most.max(1.0));
         *target *= factor;
         method.shape.weight_scale *= factor;
-        // An area squared.
-        method.shape.softening *= factor.powi(4);
+        let extent = extent(&method, window);
         let own = &mut method.deconvolution.window_sigma;
         *own = window::sigma(*own, window, self.n);
-        let plan = LinearPlan::new(&method, self.n, breadth::side(self.cut, step))?;
+        let plan = LinearPlan::new(&method, self.n, breadth::side(self.cut, step), extent)?;
         Ok(Arc::clone(place.get_or_init(|| Arc::new(plan))))
     }
 
@@ -75,6 +79,12 @@ impl LinearFamily {
             window: window::place(extent, psf, reference, moments),
         }
     }
+}
+
+/// Of the galaxies that the window at `place` is for.
+fn extent(method: &LinearMethod, place: usize) -> f64 {
+    let settings = &method.deconvolution;
+    window::extent(settings.reference_extent, settings.window_sigma, place)
 }
 
 /// What tells a member from the others.

@@ -24,6 +24,7 @@ use ndarray::{Array2, ArrayView2};
 use shearq_submissions::LinearMethod;
 
 use super::found::{CutWorker, Found, Images, ResponseMatrix, Sheared, image, whole};
+use super::softening::Softening;
 use crate::deconvolve::{Descent, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop};
 use crate::error::MeasureError;
 use crate::noise::StampNoise;
@@ -40,20 +41,27 @@ const FIELD: f32 = 0.25;
 /// What one submission and stamp size need.
 pub(super) struct LinearPlan {
     iterations: u32,
-    softening: f32,
+    softening: Softening,
     spectral: Spectral,
     moments: AdaptiveMoments,
 }
 
 impl LinearPlan {
-    pub(super) fn new(method: &LinearMethod, n: usize, p: usize) -> Result<Self, MeasureError> {
+    /// For stamps of `n` and PSFs of `p` pixels a side, and galaxies with a mean square of `extent` px² per axis.
+    pub(super) fn new(
+        method: &LinearMethod,
+        n: usize,
+        p: usize,
+        extent: f64,
+    ) -> Result<Self, MeasureError> {
         let settings = &method.deconvolution;
         let spectral = Spectral::new(n, p, settings)?;
         let scale = method.shape.weight_scale;
+        let moments = AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach());
         Ok(LinearPlan {
             iterations: u32::try_from(settings.max_iterations).unwrap_or(u32::MAX),
-            softening: method.shape.softening as f32,
-            moments: AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach()),
+            softening: Softening::new(method, extent, &spectral, &moments),
+            moments,
             spectral,
         })
     }
@@ -67,6 +75,8 @@ pub(super) struct LinearWorker {
     grain: f32,
     surroundings: Surroundings,
     psf: SpectralPsf,
+    /// What is added to the divisor of the moments, in px⁴ times the unit of the autocorrelation, in noise of level one.
+    added: f32,
     buffers: SpectralScratch,
     lags: Lags,
     /// What was found on them last.
@@ -84,6 +94,7 @@ impl LinearWorker {
         LinearWorker {
             noise: plan.spectral.noise(&StampNoise::white(1.0)),
             psf: plan.spectral.psf(),
+            added: 0.0,
             buffers: plan.spectral.scratch(),
             surroundings: Surroundings::new(plan.spectral.stamp_size()),
             grain: 1.0,
@@ -147,7 +158,9 @@ impl CutWorker for LinearWorker {
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
         self.plan
             .spectral
-            .set_psf(psf, &self.noise, &mut self.buffers, &mut self.psf)
+            .set_psf(psf, &self.noise, &mut self.buffers, &mut self.psf)?;
+        self.added = self.plan.softening.behind(&self.psf);
+        Ok(())
     }
 
     fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
@@ -168,7 +181,7 @@ impl CutWorker for LinearWorker {
         plan.spectral.place_window(followed(found), buffers);
         plan.spectral
             .autocorrelate(&self.psf, cut, sigma, buffers, lags);
-        let softening = plan.softening * sigma * sigma * self.psf.noise_peak();
+        let softening = self.added * sigma * sigma;
         let shape =
             cleared.and_then(|_| plan.moments.measure(&lags.acf, softening, &mut self.values));
         self.shape = shape.as_ref().ok().copied();

@@ -17,9 +17,13 @@ const POWER: f64 = 0.8;
 /// Steps from the submission's own width.
 const STEPS: RangeInclusive<i32> = -3..=3;
 
+/// Mean square per axis of the galaxies, in units of σ² of the window that is best for those of GREAT10.
+const USUAL: f64 = 0.1375;
+
 /// Widest in units of the stamp's side: of large galaxies the stamp's edges take light, which is there with another
-/// shear, and a window of 10 px on 48 px made m1 −0.004.
-const WIDEST: f64 = 0.1875;
+/// shear, and a window of 10 px on 48 px made m1 −0.004. From 0.19 on lags hold a step more of large galaxies, by which
+/// their scatter is 0.6 % smaller, and m1 0.0006 less.
+const WIDEST: f64 = 0.19;
 
 /// The place of the submission's own width among all.
 pub(super) const OWN: usize = STEPS.start().unsigned_abs() as usize;
@@ -44,6 +48,17 @@ pub(super) fn place(
     let ratio = ((seen - psf) / reference).max(f64::MIN_POSITIVE);
     let step = (OCTAVE * POWER * ratio.log2()).round() as i32;
     OWN.wrapping_add_signed(step.clamp(*STEPS.start(), *STEPS.end()) as isize)
+}
+
+/// Mean square per axis in px² of the galaxies that the width at `place` is for, of a submission whose own is `sigma`
+/// px for `reference` px². Where `reference` is zero that of GREAT10's galaxies is taken, in proportion to `sigma`².
+pub(super) fn extent(reference: f64, sigma: f64, place: usize) -> f64 {
+    let own = if reference > 0.0 {
+        reference
+    } else {
+        sigma * sigma * USUAL
+    };
+    own * ((place as f64 - OWN as f64) / (OCTAVE * POWER)).exp2()
 }
 
 /// The width at `place` of a submission whose own is `sigma`, on stamps of `n` pixels a side.
@@ -89,7 +104,16 @@ mod tests {
         assert_eq!(place(Some(5.0), (-&psf).view(), 0.0, &mut moments), OWN);
         let twice = sigma(5.0, OWN + 2, 48) / sigma(5.0, OWN - 2, 48);
         assert!((twice - 2.0).abs() < 1e-12, "{twice}");
-        assert_eq!([OWN, 6].map(|at| sigma(8.0, at, 48)), [8.0, 9.0]);
+        let widest = sigma(8.0, 6, 48);
+        assert!(
+            sigma(8.0, OWN, 48) == 8.0 && (widest - 9.12).abs() < 1e-12,
+            "{widest}"
+        );
+        // Twice as broad: a galaxy whose window is wider by 2^0.8.
+        assert_eq!(extent(9.0, 8.0, OWN), 9.0);
+        let twice = extent(9.0, 8.0, OWN + 2) / extent(9.0, 8.0, OWN - 2);
+        assert!((twice.powf(POWER) - 2.0).abs() < 1e-12, "{twice}");
+        assert_eq!(extent(0.0, 8.0, OWN), 8.8);
         assert_eq!([OWN, 6].map(|at| sigma(8.0, at, 32)), [8.0, 8.0]);
         assert_eq!((sigma(15.0, 6, 64), sigma(2.0, 0, 48)), (15.0, 2.0));
         assert_eq!(sigma(8.0, 6, 96), 8.0 * 2f64.powf(0.75));
