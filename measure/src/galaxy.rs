@@ -154,9 +154,8 @@ impl Worker {
         }
     }
 
-    /// Takes the PSF of the galaxies that follow, centred, of sum one, and of the submission's size or, where it is
-    /// broad, as much larger as [`star_psf`](crate::star_psf) cuts it with
-    /// [`Submission::psf_cut`](shearq_submissions::Submission::psf_cut). One that is refused flags them.
+    /// Takes the PSF of the galaxies that follow, centred, of sum one, and as large as [`star_psf`](crate::star_psf) cuts it
+    /// with [`Submission::psf_cut`](shearq_submissions::Submission::psf_cut). One that is refused flags them.
     ///
     /// # Errors
     /// Where its sizes are others, or a pixel is not finite.

@@ -7,7 +7,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq::pipeline::engine;
-use shearq::pipeline::simulate::{STAR_STAMP, simulator, star};
+use shearq::pipeline::simulate::{simulator, star};
 use shearq::simulate::field::ShearSpectrum;
 use shearq::simulate::render::RenderScratch;
 use shearq::simulate::set::{
@@ -135,13 +135,9 @@ fn draw(set: &SetSimulator, fields: &ImageFields, iy: usize, scratch: &mut Rende
         PsfField::One(_) => Vec::new(),
         PsfField::PerGalaxy(field) => (0..n).map(|ix| field[(ix, iy)]).collect(),
     };
-    let side = match &fields.psf {
-        PsfField::One(_) => STAMP,
-        PsfField::PerGalaxy(_) => STAR_STAMP,
-    };
     Drawn {
         pixels,
-        stars: psfs.iter().flat_map(|psf| star(psf, side)).collect(),
+        stars: psfs.iter().flat_map(|psf| star(psf, STAMP)).collect(),
         formulas: psfs.iter().map(formula).collect(),
         observed,
     }

@@ -322,7 +322,7 @@ fn row_psf(set: &SetSimulator, fields: &ImageFields, iy: usize, submission: &Sub
         }
         (PsfField::PerGalaxy(_), PsfForm::Star) => RowPsf::Stars {
             pixels: simulate::draw_stars(set, fields, iy),
-            side: simulate::STAR_STAMP,
+            side: STAMP,
         },
     }
 }

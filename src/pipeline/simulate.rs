@@ -22,8 +22,6 @@ use crate::simulate::set::{
 
 /// Name of the record in a simulated data folder.
 pub const SIMULATION_FILE: &str = "simulation.json";
-/// Pixels a side of each star stamp where there is one per galaxy.
-pub const STAR_STAMP: usize = 32;
 
 /// Settings of a simulation, as stored with its data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -167,13 +165,13 @@ pub(super) fn draw_stamps(
     (pixels, observed)
 }
 
-/// A strip of star stamps of [`STAR_STAMP`] pixels, one per galaxy.
+/// A strip of star stamps, one per galaxy.
 pub(super) fn draw_stars(set: &SetSimulator, fields: &ImageFields, iy: usize) -> Vec<f32> {
     let n = set.grid().n;
-    let mut strip = vec![0.0; n * STAR_STAMP * STAR_STAMP];
+    let mut strip = vec![0.0; n * STAMP * STAMP];
     for ix in 0..n {
-        let star = star(fields.psf.at(ix, iy), STAR_STAMP);
-        place(&star, STAR_STAMP, ix, n, &mut strip);
+        let star = star(fields.psf.at(ix, iy), STAMP);
+        place(&star, STAMP, ix, n, &mut strip);
     }
     strip
 }
@@ -239,29 +237,22 @@ impl OpenImage {
         let side = n * STAMP;
         let galaxies = ImageWriter::create(data.galaxies(set, image), side, side, &header)?;
         let psf_path = data.psf_star(set, image);
-        let psf_header = |stamp: usize| {
-            vec![
-                ("SET", Value::Int(i64::from(set))),
-                ("IMAGE", Value::Int(i64::from(image))),
-                ("STAMP", Value::Int(stamp as i64)),
-                ("CREATOR", Value::Text(format!("shearq {}", record.version))),
-            ]
-        };
+        let psf_header = [
+            ("SET", Value::Int(i64::from(set))),
+            ("IMAGE", Value::Int(i64::from(image))),
+            ("STAMP", Value::Int(STAMP as i64)),
+            ("CREATOR", Value::Text(format!("shearq {}", record.version))),
+        ];
         let stars = match &job.fields.psf {
             PsfField::One(psf) => {
-                let mut writer = ImageWriter::create(&psf_path, STAMP, STAMP, &psf_header(STAMP))?;
+                let mut writer = ImageWriter::create(&psf_path, STAMP, STAMP, &psf_header)?;
                 writer.write_rows(&star(psf, STAMP))?;
                 writer.finish()?;
                 None
             }
             PsfField::PerGalaxy(_) => {
-                let side = n * STAR_STAMP;
-                Some(ImageWriter::create(
-                    &psf_path,
-                    side,
-                    side,
-                    &psf_header(STAR_STAMP),
-                )?)
+                let side = n * STAMP;
+                Some(ImageWriter::create(&psf_path, side, side, &psf_header)?)
             }
         };
         write_psf_table(data, job)?;

@@ -65,7 +65,8 @@ section! {
     Psf, PartialPsf, "psf" {
         /// From star stamps or from the functional form.
         form: PsfForm,
-        /// Pixels a side of the PSF stamp; 3 to 48.
+        /// Pixels a side of the PSF stamp; 3 to 48. With the linear method the least: of a larger one as many are taken
+        /// as of the galaxies' stamps.
         size: usize,
     }
 }
@@ -247,8 +248,7 @@ section! {
         /// the same window on all.
         reference_extent: f64,
         /// Noise-equivalent area 1/Σp² in px² of the PSF that lengths are for. For a broader one target and weight are
-        /// longer, and more is cut of it; for one below half of it target and weight are shorter. Zero for the same with all
-        /// PSFs.
+        /// longer; for one below half of it they are shorter. Zero for the same with all PSFs.
         reference_area: f64,
     }
 }
@@ -504,24 +504,18 @@ pub struct LinearMethod {
 }
 
 /// How much of a PSF is cut around its middle.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PsfCut {
-    /// Pixels a side.
+    /// Least pixels a side.
     pub size: usize,
-    /// Most pixels a side, of a PSF that is broader than the reference.
+    /// Most pixels a side, where the PSF's stamp has them; of the parity of `size`.
     pub most: usize,
-    /// Noise-equivalent area in px² of the reference; zero where all PSFs are cut alike.
-    pub reference_area: f64,
 }
 
 impl From<usize> for PsfCut {
     /// So many pixels a side, of any PSF.
     fn from(size: usize) -> Self {
-        PsfCut {
-            size,
-            most: size,
-            reference_area: 0.0,
-        }
+        PsfCut { size, most: size }
     }
 }
 
@@ -529,13 +523,13 @@ impl Submission {
     /// How much of a PSF is taken.
     pub fn psf_cut(&self) -> PsfCut {
         let size = self.psf.size;
-        match self.linear() {
-            None => size.into(),
-            Some(linear) => PsfCut {
-                size,
-                most: self.stamp.size.clamp(size, MAX_PSF),
-                reference_area: linear.deconvolution.reference_area,
-            },
+        if self.linear().is_none() {
+            return size.into();
+        }
+        let most = self.stamp.size.clamp(size, MAX_PSF);
+        PsfCut {
+            size,
+            most: most - (most - size) % 2,
         }
     }
 

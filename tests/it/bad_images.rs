@@ -632,15 +632,22 @@ fn a_star_that_cannot_be_used_flags_its_galaxy_alone() {
     let small = Small::new("19");
     let stars = "data/set19/psf-001.fits";
     let (mut pixels, side) = pixels_of(&small.at(stars));
-    for y in 0..32 {
-        pixels[y * side..y * side + 32].fill(0.0);
+    for y in 0..48 {
+        pixels[y * side..y * side + 48].fill(0.0);
     }
-    let cards = ["STAMP   =                   32"];
-    fs::write(
-        small.at(stars),
-        fits_image(-32, &[side, side], &cards, &floats(&pixels)),
-    )
-    .unwrap();
+    let write = |size: usize| {
+        // The middle of each star.
+        let (count, first) = (side / 48, (48 - size) / 2);
+        let place = |at: usize| at / size * 48 + first + at % size;
+        let places = (0..count * size).flat_map(|y| (0..count * size).map(move |x| (y, x)));
+        let cut: Vec<f32> = places
+            .map(|(y, x)| pixels[place(y) * side + place(x)])
+            .collect();
+        let card = format!("STAMP   = {size:>20}");
+        let image = fits_image(-32, &[count * size; 2], &[card.as_str()], &floats(&cut));
+        fs::write(small.at(stars), image).unwrap();
+    };
+    write(48);
     let said = small.measure(&RAW);
     assert!(
         said.contains("flagged: the PSF cannot be used (1)"),
@@ -656,10 +663,19 @@ fn a_star_that_cannot_be_used_flags_its_galaxy_alone() {
     );
     let wide = small.at("wide.toml");
     fs::write(&wide, "extends = \"23/raw/star\"\n[psf]\nsize = 48\n").unwrap();
-    let message = small.fail_to_measure(&["--submission", wide.to_str().unwrap()]);
+    // The linear method takes what there is, from a least size on.
+    let linear = ["--submission", "48/linear/star"];
+    for (size, submission, needs) in [(40, wide.to_str().unwrap(), 48), (30, linear[1], 32)] {
+        write(size);
+        let message = small.fail_to_measure(&["--submission", submission]);
+        let expected = format!("{size} pixels a side; the submission needs {needs}");
+        assert!(message.contains(&expected), "{message}");
+    }
+    write(40);
+    let said = small.measure(&linear);
     assert!(
-        message.contains("32 pixels a side; the submission needs 48"),
-        "{message}"
+        said.contains("flagged: the PSF cannot be used (1)"),
+        "{said}"
     );
 }
 

@@ -38,7 +38,7 @@ impl LinearFamily {
             first: Arc::new(LinearPlan::new(
                 method,
                 n,
-                cut.size,
+                cut.most,
                 extent(method, window::OWN),
             )?),
             members: breadth::STEPS.map(|_| Default::default()).collect(),
@@ -64,19 +64,16 @@ impl LinearFamily {
         let extent = extent(&method, window);
         let own = &mut method.deconvolution.window_sigma;
         *own = window::sigma(*own, window, self.n);
-        let plan = LinearPlan::new(&method, self.n, breadth::side(self.cut, step), extent)?;
+        let plan = LinearPlan::new(&method, self.n, self.cut.most, extent)?;
         Ok(Arc::clone(place.get_or_init(|| Arc::new(plan))))
     }
 
     /// The member for a PSF of sum one, and galaxies that are seen so broad.
     fn kind(&self, psf: ArrayView2<'_, f64>, extent: Option<f64>, moments: &mut Moments) -> Kind {
-        let step = breadth::step(psf, self.cut);
-        // It was cut after a look at its middle alone, where it may have been a little broader.
-        let fits = |&at: &i32| breadth::side(self.cut, at) >= psf.nrows();
-        let reference = self.method.deconvolution.reference_extent;
+        let settings = &self.method.deconvolution;
         Kind {
-            step: (step..=*breadth::STEPS.end()).find(fits).unwrap_or(step),
-            window: window::place(extent, psf, reference, moments),
+            step: breadth::step(psf, settings.reference_area),
+            window: window::place(extent, psf, settings.reference_extent, moments),
         }
     }
 }

@@ -1,9 +1,8 @@
-//! How broad a PSF is, in steps: what lengths of the linear method, and the cut of the PSF itself, follow.
+//! How broad a PSF is, in steps: what lengths of the linear method follow.
 
 use std::ops::RangeInclusive;
 
 use ndarray::{ArrayView2, s};
-use shearq_submissions::PsfCut;
 
 /// Steps in which lengths double.
 const OCTAVE: f64 = 4.0;
@@ -28,14 +27,15 @@ fn area(psf: ArrayView2<'_, f64>) -> f64 {
     1.0 / sum
 }
 
-/// How many steps a PSF of sum one is broader than the reference of `cut`; none where there is no reference. Steps to
+/// How many steps a PSF of sum one is broader than one of a noise-equivalent area of `reference` px²; none where that is
+/// zero. Steps to
 /// broader ones are rounded; those to narrower ones are rounded towards zero, less one, so that lengths first shrink where
 /// the PSF is 1/√2 as broad: sharp lengths bring noise into the response before they take any out of ellipticities.
-pub(crate) fn step(psf: ArrayView2<'_, f64>, cut: PsfCut) -> i32 {
-    if cut.reference_area == 0.0 {
+pub(crate) fn step(psf: ArrayView2<'_, f64>, reference: f64) -> i32 {
+    if reference == 0.0 {
         return 0;
     }
-    let steps = OCTAVE * 0.5 * (area(psf) / cut.reference_area).log2();
+    let steps = OCTAVE * 0.5 * (area(psf) / reference).log2();
     let whole = if steps < 0.0 {
         (steps + 1.0).ceil().min(0.0)
     } else {
@@ -48,15 +48,6 @@ pub(crate) fn step(psf: ArrayView2<'_, f64>, cut: PsfCut) -> i32 {
 /// How much longer lengths are after so many steps.
 pub(crate) fn factor(step: i32) -> f64 {
     (f64::from(step) / OCTAVE).exp2()
-}
-
-/// Pixels a side that are cut of a PSF so many steps broader than the reference; not less of a narrower one.
-pub(crate) fn side(cut: PsfCut, step: i32) -> usize {
-    // `as usize` makes negative numbers zero.
-    let more = cut.size as f64 * (factor(step) - 1.0) / 2.0;
-    let most = cut.most.max(cut.size);
-    // Of the same parity.
-    (cut.size + 2 * more as usize).min(most - (most - cut.size) % 2)
 }
 
 #[cfg(test)]
@@ -75,44 +66,24 @@ mod tests {
             let psf = FunctionalPsf::new(profile, fwhm, Shear::new(0.03, -0.02)).unwrap();
             psf.stamp(64)
         };
-        let cut = |reference_area| PsfCut {
-            reference_area,
-            ..PsfCut::from(32)
-        };
         // A Moffat of β = 3 has 1.25 π (FWHM/1.0196)² = 3.78 FWHM², and the pixel's width adds to it.
         let expected = 3.78 * 6.0f64.powi(2);
         let found = area(moffat(6.0).view());
         assert!((found / expected - 1.0).abs() < 0.02, "{found}");
-        let steps = |fwhm| step(moffat(fwhm).view(), cut(50.0));
+        let steps = |fwhm| step(moffat(fwhm).view(), 50.0);
         let narrow = [0.5, 2.0, 2.3, 2.45, 2.55, 2.7, 3.06].map(steps);
         assert_eq!(narrow, [-3, -2, -1, -1, 0, 0, 0]);
         let broad = [3.4, 3.74, 4.5, 6.0, 20.0].map(steps);
         assert_eq!(broad, [0, 0, 1, 3, 6]);
-        assert_eq!(step(moffat(6.0).view(), cut(0.0)), 0);
+        assert_eq!(step(moffat(6.0).view(), 0.0), 0);
         // As narrow as ever in noise of a star of S/N 30, which alone would make it a step narrower.
         let clean = moffat(3.4);
         let sigma = clean.iter().map(|v| v * v).sum::<f64>().sqrt() / 30.0;
         let mut rng = ChaCha8Rng::seed_from_u64(9);
         let star = clean.mapv(|v| v + sigma * 12f64.sqrt() * rng.random_range(-0.5..0.5));
-        assert_eq!(step(star.view(), cut(50.0)), 0);
+        assert_eq!(step(star.view(), 50.0), 0);
         let dead = moffat(6.0) * f64::NAN;
-        assert_eq!(step(dead.view(), cut(50.0)), 0);
+        assert_eq!(step(dead.view(), 50.0), 0);
         assert_eq!([-4, 0, 4].map(factor), [0.5, 1.0, 2.0]);
-    }
-
-    #[test]
-    fn cuts_grow_and_keep_parity_and_limit() {
-        let cut = |size, most| PsfCut {
-            size,
-            most,
-            reference_area: 50.0,
-        };
-        assert_eq!(
-            [-3, 0, 1, 3, 6].map(|at| side(cut(32, 48), at)),
-            [32, 32, 38, 48, 48]
-        );
-        assert_eq!([0, 1, 6].map(|at| side(cut(15, 48), at)), [15, 17, 41]);
-        assert_eq!([0, 6].map(|at| side(cut(31, 48), at)), [31, 47]);
-        assert_eq!(side(cut(32, 23), 3), 32);
     }
 }

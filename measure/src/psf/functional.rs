@@ -12,7 +12,6 @@ use puruspe::gamma::{gamma, ln_gamma};
 use shearq_scoring::Shear;
 use shearq_submissions::PsfCut;
 
-use super::breadth;
 use crate::error::MeasureError;
 use crate::radial::{QuadraticForm, RadialTable, composite_rule, gauss_legendre};
 
@@ -140,23 +139,14 @@ impl FunctionalPsf {
     }
 
     /// The central pixels of a star like this on a stamp of `side` pixels a side, normalised to a sum of one: of a
-    /// size, or as many as a submission takes of a PSF of that breadth.
+    /// size, or the most that a submission takes.
     ///
     /// With `side` that of the galaxies, galaxy and PSF are off the middle of what is cut of them by the same: half
     /// a pixel where one side is even and the other odd. What is left of the galaxy is on a pixel then, and
     /// is where a star's stamp of that side would leave it.
     pub fn stamp_beside(&self, cut: impl Into<PsfCut>, side: usize) -> Array2<f64> {
         let cut: PsfCut = cut.into();
-        let stamp = self.drawn(cut.size, side);
-        let wanted = breadth::side(cut, breadth::step(stamp.view(), cut));
-        if wanted > cut.size {
-            self.drawn(wanted, side)
-        } else {
-            stamp
-        }
-    }
-
-    fn drawn(&self, size: usize, side: usize) -> Array2<f64> {
+        let size = cut.most;
         let mut stamp = Array2::zeros((size, size));
         let off = if side % 2 == size % 2 { 0.0 } else { 0.5 };
         let centre = (size as f64 - 1.0) / 2.0 + off;

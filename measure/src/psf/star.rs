@@ -10,7 +10,6 @@ use shearq_submissions::PsfCut;
 
 use crate::error::MeasureError;
 use crate::pixel::Pixel;
-use crate::psf::breadth::{side, step};
 
 /// Farthest that the centroid of a PSF may lie from the centre of its stamp along either axis, in
 /// pixels. A PSF that is cut off the centre of its wings adds its own ellipticity to that of all
@@ -22,8 +21,8 @@ pub(crate) fn cut_start(full: usize, size: usize) -> Option<usize> {
     full.checked_sub(size).map(|rest| rest / 2)
 }
 
-/// The central pixels of a star stamp, normalised to a sum of one: of a size, or as many as a submission takes of a
-/// PSF of that breadth, as far as the stamp goes.
+/// The central pixels of a star stamp, normalised to a sum of one: of a size, or as many as a submission takes and the
+/// stamp has.
 ///
 /// # Errors
 /// Where the stamp is too small, has pixels that are not finite, no light, or its light is centred
@@ -33,8 +32,8 @@ pub fn star_psf<P: Pixel>(
     cut: impl Into<PsfCut>,
 ) -> Result<Array2<f64>, MeasureError> {
     let cut: PsfCut = cut.into();
-    let size = cut.size;
     let (rows, columns) = stamp.dim();
+    let size = cut.size;
     let (Some(y0), Some(x0)) = (cut_start(rows, size), cut_start(columns, size)) else {
         let expected = format!("at least {size} × {size}, as the submission needs");
         return Err(MeasureError::square("a PSF stamp", stamp.dim(), expected));
@@ -48,7 +47,8 @@ pub fn star_psf<P: Pixel>(
             });
         }
     }
-    let inner = normalised(stamp, size, (y0, x0))?;
+    let inner = central(stamp, size, (y0, x0));
+    light(&inner)?;
     let (dx, dy) = offset(stamp, &inner, (x0, y0));
     if dx.abs() > MAX_CENTROID_OFFSET || dy.abs() > MAX_CENTROID_OFFSET {
         return Err(MeasureError::OffCentre {
@@ -57,29 +57,30 @@ pub fn star_psf<P: Pixel>(
             most: MAX_CENTROID_OFFSET,
         });
     }
-    let wanted = side(cut, step(inner.view(), cut));
-    // Of the same parity, as far as the stamp goes.
-    let more = (wanted - size).min(rows.min(columns) - size) / 2;
-    if more == 0 {
-        return Ok(inner);
-    }
-    normalised(stamp, size + 2 * more, (y0 - more, x0 - more))
+    // On all sides, so that the parity is the same.
+    let more = (cut.most.min(rows).min(columns) - size) / 2;
+    let taken = central(stamp, size + 2 * more, (y0 - more, x0 - more));
+    let sum = light(&taken)?;
+    Ok(taken / sum)
 }
 
-/// `size` pixels a side from `start` on, over their sum.
-fn normalised<P: Pixel>(
+/// `size` pixels a side from `start` on.
+fn central<P: Pixel>(
     stamp: ArrayView2<'_, P>,
     size: usize,
     (y0, x0): (usize, usize),
-) -> Result<Array2<f64>, MeasureError> {
-    let cut: Array2<f64> = stamp
-        .slice(s![y0..y0 + size, x0..x0 + size])
-        .mapv(Into::into);
-    let sum = cut.sum();
+) -> Array2<f64> {
+    let pixels = stamp.slice(s![y0..y0 + size, x0..x0 + size]);
+    pixels.mapv(Into::into)
+}
+
+/// The sum of a star's pixels.
+fn light(star: &Array2<f64>) -> Result<f64, MeasureError> {
+    let sum = star.sum();
     if sum <= 0.0 {
         return Err(MeasureError::DarkPsf(sum));
     }
-    Ok(cut / sum)
+    Ok(sum)
 }
 
 /// Where the star is, from the centre of the stamp. A star outside the cut, of which `start` is the
@@ -143,25 +144,27 @@ mod tests {
     }
 
     #[test]
-    fn of_a_broad_star_more_is_cut_where_there_is_more() {
+    fn of_a_star_as_much_is_taken_as_there_is_and_its_middle_stays_where_it_was() {
         let profile = PsfProfile::Moffat { beta: 3.0 };
-        let star = |fwhm, side| {
-            let psf = FunctionalPsf::new(profile, fwhm, Shear::new(0.05, -0.03)).unwrap();
-            psf.stamp(side)
-        };
-        let cut = PsfCut {
-            size: 32,
-            most: 48,
-            reference_area: 50.0,
-        };
-        for (fwhm, given, expected) in [(3.4, 48, 32), (4.5, 48, 38), (4.5, 37, 36), (6.0, 64, 48)]
-        {
-            let taken = star_psf(star(fwhm, given).view(), cut).unwrap();
-            assert_eq!(taken.dim(), (expected, expected), "{fwhm} {given}");
+        let cut = PsfCut { size: 32, most: 48 };
+        let whole = FunctionalPsf::new(profile, 3.4, Shear::new(0.05, -0.03)).unwrap();
+        let stamp = whole.stamp(64);
+        for (given, expected) in [(32, 32), (37, 36), (48, 48), (64, 48)] {
+            let from = cut_start(64, given).unwrap();
+            let star = stamp.slice(s![from..from + given, from..from + given]);
+            let taken = star_psf(star, cut).unwrap();
+            assert_eq!(taken.dim(), (expected, expected), "{given}");
             assert!((taken.sum() - 1.0).abs() < 1e-12);
+            // Where the parity is another, half a pixel early.
+            let early = given % 2;
+            let middle = expected / 2;
+            let found = taken[(middle - 3, middle + 5)] / taken[(middle, middle)];
+            let at = |y: usize, x: usize| stamp[(y - early, x - early)];
+            let expected = at(29, 37) / at(32, 32);
+            assert!((found - expected).abs() < 1e-12, "{given}");
         }
-        let drawn = FunctionalPsf::new(profile, 6.0, Shear::new(0.05, -0.03)).unwrap();
-        assert_eq!(drawn.stamp_beside(cut, 48).dim(), (48, 48));
+        assert!(star_psf(stamp.slice(s![..31, ..31]), cut).is_err());
+        assert_eq!(whole.stamp_beside(cut, 48).dim(), (48, 48));
     }
 
     #[test]
