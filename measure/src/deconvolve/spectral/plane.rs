@@ -176,6 +176,11 @@ impl Plane {
         }
     }
 
+    /// Transforms lines of `size` pixels in place.
+    pub(super) fn along(&self, lines: &mut [Complex32], scratch: &mut PlaneScratch) {
+        self.wide.process_with_scratch(lines, &mut scratch.fft);
+    }
+
     /// Multiplies the images of the half spectra by `along` x and `down` y, and transforms again:
     /// `side²` times too large.
     pub(super) fn window(&self, along: &[f32], down: &[f32], scratch: &mut PlaneScratch) {

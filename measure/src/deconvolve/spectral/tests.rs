@@ -228,6 +228,71 @@ fn the_response_is_that_of_a_sheared_galaxy() {
     }
 }
 
+/// The stamp of a broad Gaussian galaxy under a shear about `centre`, with light beyond all edges: cut out of a wider field.
+fn broad(n: usize, h: &Array2<f64>, centre: [f64; 2], g1: f64, g2: f64) -> Vec<f32> {
+    let beyond = 16;
+    let side = n + 2 * beyond;
+    let middle = (side as f64 - 1.0) / 2.0;
+    let field = Array2::from_shape_fn((side, side), |(y, x)| {
+        let (x, y) = (x as f64 - middle - centre[0], y as f64 - middle - centre[1]);
+        let (u, v) = ((1.0 - g1) * x - g2 * y, (1.0 + g1) * y - g2 * x);
+        let (u, v) = (u + 1.5, v - 1.0);
+        (-(u * u / 140.0 + v * v / 100.0 + 0.3 * u * v / 110.0)).exp()
+    });
+    let image = convolve(field.view(), h.view());
+    let stamp = image.slice(ndarray::s![beyond..beyond + n, beyond..beyond + n]);
+    stamp.iter().map(|&v| v as f32).collect()
+}
+
+#[test]
+fn edges_stay_where_they_are_while_the_light_is_sheared() {
+    for (n, centre) in [(40, [0.0, 0.0]), (41, [0.0, 0.0]), (40, [2.5, -3.0])] {
+        let h = psf(11);
+        let plan = Spectral::new(n, 11, &settings(1000, 1.5, n as f64 / 4.0, 0.0)).unwrap();
+        assert!(plan.edges.is_some());
+        let mut without = plan.clone();
+        without.edges = None;
+        let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+        plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+            .unwrap();
+        plan.place_window(centre.map(|at| at as f32), &mut scratch);
+        let mut lags_of = |plan: &Spectral, g1: f64, g2: f64| {
+            let mut lags = plan.lags();
+            let stamp = broad(n, &h, centre, g1, g2);
+            plan.autocorrelate(&own, &stamp, 0.0, &mut scratch, &mut lags);
+            lags
+        };
+        let (here, naive) = (lags_of(&plan, 0.0, 0.0), lags_of(&without, 0.0, 0.0));
+        let step = 0.01;
+        for (found, naive, plus, minus) in [
+            (
+                &here.shear1,
+                &naive.shear1,
+                lags_of(&plan, step, 0.0),
+                lags_of(&plan, -step, 0.0),
+            ),
+            (
+                &here.shear2,
+                &naive.shear2,
+                lags_of(&plan, 0.0, step),
+                lags_of(&plan, 0.0, -step),
+            ),
+        ] {
+            let apart = |lags: &[f32]| {
+                let pairs = lags.iter().zip(plus.acf.iter().zip(&minus.acf));
+                let apart = pairs.map(|(found, (a, b))| {
+                    let expected = (a - b) / (2.0 * step as f32);
+                    (found - expected).powi(2)
+                });
+                apart.sum::<f32>().sqrt()
+            };
+            let [with, without] = [found, naive].map(|lags| apart(lags));
+            // The light between the last pixels and the edge is not quite on a straight line.
+            assert!(with < 0.1 * without, "{n} {centre:?}: {with} {without}");
+        }
+    }
+}
+
 #[test]
 fn light_by_what_the_psf_leaves_of_it_is_the_squared_signal_in_units_of_the_noise() {
     let (n, p, extent) = (44, 11, 7.0);
@@ -355,6 +420,27 @@ fn noise_is_subtracted_in_the_mean_from_the_autocorrelation_and_its_derivatives(
     for own in [StampNoise::white(1.0), correlated] {
         subtracted_in_the_mean(&own, &mut rng);
     }
+}
+
+#[test]
+fn there_is_no_noise_beyond_the_edges_of_the_stamp() {
+    let (n, p) = (32, 9);
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, n as f64 / 4.0, 0.0)).unwrap();
+    let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+    plan.set_psf(psf(p).view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
+    let mut means = [0.0; 2];
+    for _ in 0..8000 {
+        let stamp = noise(n, &mut rng);
+        for (mean, level) in means.iter_mut().zip([1.0, 0.0]) {
+            plan.autocorrelate(&own, &stamp, level, &mut scratch, &mut lags);
+            *mean += f64::from(lags.acf[plan.reach()]);
+        }
+    }
+    // 0.5 % of the window's square is beyond the edges of either axis. 8000 squares of some fifty modes: 0.2 %.
+    assert!((inside(n, n as f64 / 4.0) - 0.9953).abs() < 1e-4);
+    assert!(means[0].abs() < 0.004 * means[1], "{means:?}");
 }
 
 fn subtracted_in_the_mean(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
