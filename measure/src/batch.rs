@@ -17,14 +17,14 @@ use crate::psf::{FunctionalPsf, star_psf};
 /// PSFs of the galaxies of a batch.
 #[derive(Debug, Clone, Copy)]
 pub enum Psfs<'a, P = f64> {
-    /// A star stamp for all, centred and at least as large as the submission's PSF. It is cut and
+    /// A star stamp for all, centred and at least as large as the submission needs. It is cut and
     /// normalised.
     Star(ArrayView2<'a, P>),
     /// Star stamps, one each along the first axis.
     Stars(ArrayView3<'a, P>),
     /// Formulas, one each.
     Functional(&'a [FunctionalPsf]),
-    /// A PSF for all that is used as it is: of the submission's size, or larger if it is broad, centred, of sum one.
+    /// A PSF for all that is used as it is: as large as [`star_psf`] cuts it, centred, of sum one.
     Prepared(ArrayView2<'a, f64>),
 }
 
@@ -433,7 +433,7 @@ mod tests {
         );
         message(
             measurer.stamp(one, moffat(0.0).stamp(33).view(), noise),
-            "a PSF stamp of 33 × 33 pixels; expected an even number a side, as the 32",
+            "a PSF stamp of 33 × 33 pixels; expected an even number a side, as the 48",
         );
         let odd = Measurer::named("48/linear/star", 49).unwrap();
         let stamp = stamps(1, 49);
@@ -452,7 +452,7 @@ mod tests {
                 Psfs::<f64>::Prepared(star.slice(s![1.., ..])),
                 noise,
             ),
-            "a PSF stamp of 31 × 32 pixels; expected 32 × 32",
+            "a PSF stamp of 31 × 32 pixels; expected an even number a side, 32 to 48",
         );
         for (level, found) in [
             (None, "not given"),

@@ -222,12 +222,13 @@ pub struct NoiseSurvey {
     /// Of each frame, the median over all places.
     typical: Vec<f32>,
     light: Light,
-    /// Number of stamps looked at, of those with missing pixels, and of those that were left out for that.
+    /// Number of stamps looked at, of those with missing pixels, and of those that were left out.
     counts: [usize; 3],
 }
 
 impl NoiseSurvey {
-    /// Looks at the frame of a stamp. Blocks with pixels that are missing are left out, and stamps where too many are.
+    /// Looks at the frame of a stamp. Blocks with pixels that are missing are left out, and stamps where too many are or
+    /// all are equal.
     ///
     /// # Errors
     /// Where the stamp has other sizes than planned.
@@ -241,9 +242,10 @@ impl NoiseSurvey {
             *to = value.to_f32();
         }
         let whole = self.pixels.iter().all(|value| value.is_finite());
+        let flat = self.pixels.iter().all(|value| *value == self.pixels[0]);
         self.counts[0] += 1;
         self.counts[1] += usize::from(!whole);
-        if !(whole || self.missing.mend(&mut self.pixels, full)) {
+        if flat || !(whole || self.missing.mend(&mut self.pixels, full)) {
             self.counts[2] += 1;
             return Ok(());
         }
@@ -426,7 +428,7 @@ impl NoiseSurvey {
 
 /// χ² of a covariance against white noise of variance one, for one block.
 ///
-/// With S_l one for pixels ±l apart, products are q′S_l q/2 (q′q at l = 0), so that M(l, l′) = tr(P S_l P S_l′)/2 and, in
+/// With S_l one for pixels ±l apart, products are q′S_l q/2 (q′q at l = 0), so that M(l, l′) = tr(P S_l P S_l′)/2 (without the half at l = 0) and, in
 /// white noise, the products' covariance is M(l, l′), and twice that for l′ = 0. That of the solutions has the inverse
 /// A(l, l′) = M(l′, l), half of it for l′ = 0, of which the variance at lag zero, whatever it is, takes its share.
 fn colour(matrix: &Array2<f64>, covariance: &[f64]) -> f64 {
@@ -566,7 +568,9 @@ fn brightest(powers: &[f64]) -> Option<f64> {
     }
     all.sort_by(f64::total_cmp);
     let (median, low) = (all[all.len() / 2].cbrt(), all[all.len() * 16 / 100].cbrt());
-    Some((median + BRIGHT * (median - low)).powi(3))
+    // Not below the median by rounding, where all are alike.
+    let bright = (median + BRIGHT * (median - low)).powi(3);
+    Some(bright.max(all[all.len() / 2]))
 }
 
 /// Solves linear equations by elimination with pivots; `None` where there is no solution.
@@ -701,6 +705,25 @@ mod tests {
             .add(Array2::from_elem((SIDE, SIDE), f32::NAN).view())
             .unwrap();
         assert!(survey.noise().is_none());
+    }
+
+    #[test]
+    fn stamps_without_anything_on_them_leave_an_image_blind_and_cost_others_nothing() {
+        let plan = NoisePlan::new(SIDE, 3).unwrap();
+        let (mut empty, mut with, mut without) = (plan.survey(), plan.survey(), plan.survey());
+        let mut rng = ChaCha8Rng::seed_from_u64(12);
+        for _ in 0..20 {
+            let flat = Array2::from_elem((SIDE, SIDE), 2.5f32);
+            let stamp = noise(&mut rng, false);
+            empty.add(flat.view()).unwrap();
+            with.add(flat.view()).unwrap();
+            for survey in [&mut with, &mut without] {
+                survey.add(stamp.view()).unwrap();
+            }
+        }
+        assert!(empty.is_blind() && empty.shared().unwrap().is_none());
+        assert!(!with.is_blind());
+        assert_eq!(with.found(), without.found());
     }
 
     #[test]

@@ -82,7 +82,8 @@ pub(crate) fn measure<'py>(
     let (count, rows, columns) = stamps.dim();
     let stamps = stamps.shared();
     let measurer = Measurer::new(submission, rows).map_err(of_measuring)?;
-    let (size, cut) = (submission.psf.size, submission.psf_cut());
+    let cut = submission.psf_cut();
+    let least = cut.least;
     let stars = stars.map(Borrowed::new).transpose()?;
     let noise = match &noises {
         None => Noise::One(noise),
@@ -121,9 +122,9 @@ pub(crate) fn measure<'py>(
         (None, Some(stars), None) => {
             let (given, rows, columns) = stars.dim();
             one_each("psf", given, count)?;
-            if rows < size || columns < size {
+            if rows < least || columns < least {
                 return Err(PyValueError::new_err(format!(
-                    "psf: PSF stamps of {rows} × {columns} pixels; expected at least {size} × {size}, as submission {} needs",
+                    "psf: PSF stamps of {rows} × {columns} pixels; expected at least {least} × {least}, as submission {} needs",
                     submission.name
                 )));
             }

@@ -168,7 +168,7 @@ def test_submissions_have_settings_and_published_figures():
     assert all_of_them["23/den/star"].published == {"q": 87.06, "m_half": 0.0357, "sqrt_a": 0.0895}
     linear = all_of_them["48/linear/star"]
     assert linear.published is None and linear.settings["stamp"]["size"] == linear.stamp_size == 48
-    assert (linear.psf_size, linear.psf_form, linear.extends) == (32, "star", None)
+    assert (linear.psf_size, linear.psf_form, linear.extends) == (48, "star", None)
 
 
 WRONG = [

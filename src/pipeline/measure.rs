@@ -267,7 +267,8 @@ fn open_psf(
     submission: &Submission,
     mosaic: &Mosaic,
 ) -> Result<PsfSource, PipelineError> {
-    let (size, cut) = (submission.psf.size, submission.psf_cut());
+    let cut = submission.psf_cut();
+    let PsfCut { size, least } = cut;
     match submission.psf.form {
         PsfForm::Functional => {
             let path = data.psf_functional(id.set, id.image);
@@ -301,8 +302,8 @@ fn open_psf(
             let (columns, rows) = (mosaic.columns, mosaic.rows());
             let side = match whole(&image, &path, "STAMP", MAX_STAMP)? {
                 Some(side) => side,
-                // One star is never as large as a mosaic of the smallest PSF stamps that could be cut.
-                None if width >= columns * size
+                // One star is never as large as a mosaic of the smallest PSF stamps that could be taken.
+                None if width >= columns * least
                     && width.is_multiple_of(columns)
                     && height == rows * (width / columns) =>
                 {
@@ -310,9 +311,9 @@ fn open_psf(
                 }
                 None => width,
             };
-            if side < size {
+            if side < least {
                 let message =
-                    format!("the PSF stamp has {side} pixels a side; the submission needs {size}");
+                    format!("the PSF stamp has {side} pixels a side; the submission needs {least}");
                 return Err(FileError::new(&path, message).into());
             }
             let stars = whole(&image, &path, "NSTAMPS", mosaic.columns * mosaic.rows())?;
@@ -563,10 +564,14 @@ fn first_noise(
 
 /// A level of noise to five digits, in whatever unit pixels have.
 fn level(sigma: f64) -> String {
-    if sigma == 0.0 || (1e-3..1e6).contains(&sigma.abs()) || !sigma.is_finite() {
-        return format!("{sigma:.4}");
+    if sigma == 0.0 {
+        return "0".into();
     }
-    format!("{sigma:.4e}")
+    if !(1e-3..1e5).contains(&sigma) {
+        return format!("{sigma:.4e}");
+    }
+    let decimals = 4.0 - sigma.log10().floor();
+    format!("{sigma:.*}", decimals.max(0.0) as usize)
 }
 
 /// Number of galaxies that `measure_folder` will measure, for progress bars: an estimate from the
@@ -727,4 +732,24 @@ pub(super) fn metadata(
         .map(|(key, value)| (key.to_owned(), value)),
     );
     Ok(all)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::level;
+
+    #[test]
+    fn levels_have_five_digits_in_any_unit() {
+        let shown = [0.0, 0.00121, 0.12345678, 1.0, 12345.67, 123456.7, 3.2e-7].map(level);
+        let expected = [
+            "0",
+            "0.0012100",
+            "0.12346",
+            "1.0000",
+            "12346",
+            "1.2346e5",
+            "3.2000e-7",
+        ];
+        assert_eq!(shown, expected);
+    }
 }

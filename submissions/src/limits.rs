@@ -6,6 +6,9 @@ pub const MAX_CUT: usize = 64;
 /// Largest side of a PSF stamp, in pixels.
 pub const MAX_PSF: usize = 48;
 
+/// Pixels a side of the smallest PSF stamps that the linear method takes where its settings ask for more.
+pub const LEAST_PSF: usize = 32;
+
 /// Narrowest target of the linear method, in pixels.
 pub const MIN_TARGET: f64 = 1.0;
 

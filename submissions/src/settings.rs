@@ -6,7 +6,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::limits::MAX_PSF;
+use crate::limits::LEAST_PSF;
 
 /// Declares a section as one file of an inheritance chain gives it.
 macro_rules! partial {
@@ -65,8 +65,7 @@ section! {
     Psf, PartialPsf, "psf" {
         /// From star stamps or from the functional form.
         form: PsfForm,
-        /// Pixels a side of the PSF stamp; 3 to 48. With the linear method the least: of a larger one as many are taken
-        /// as of the galaxies' stamps.
+        /// Pixels a side of the PSF stamp; 3 to 48. With the linear method stamps may have fewer, from 32 on.
         size: usize,
     }
 }
@@ -506,16 +505,16 @@ pub struct LinearMethod {
 /// How much of a PSF is cut around its middle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PsfCut {
-    /// Least pixels a side.
+    /// Pixels a side.
     pub size: usize,
-    /// Most pixels a side, where the PSF's stamp has them; of the parity of `size`.
-    pub most: usize,
+    /// Pixels a side of the smallest stamp that will do, of which all are taken; of the parity of `size`.
+    pub least: usize,
 }
 
 impl From<usize> for PsfCut {
     /// So many pixels a side, of any PSF.
     fn from(size: usize) -> Self {
-        PsfCut { size, most: size }
+        PsfCut { size, least: size }
     }
 }
 
@@ -526,10 +525,10 @@ impl Submission {
         if self.linear().is_none() {
             return size.into();
         }
-        let most = self.stamp.size.clamp(size, MAX_PSF);
+        let least = size.min(LEAST_PSF);
         PsfCut {
             size,
-            most: most - (most - size) % 2,
+            least: least - (size - least) % 2,
         }
     }
 

@@ -219,7 +219,7 @@ impl LinearMethod {
             &p,
             "even with an even stamp.size and odd with an odd one, with the linear method, whose window is centred on the stamp",
         )?;
-        // Noise beyond the stamp's edges, which its level is subtracted for, is 1 % of the window's.
+        // A wider one sees a galaxy that is beyond the stamp, and what wraps around.
         need(
             4.0 * window <= n as f64,
             "deconvolution.window_sigma",

@@ -43,8 +43,7 @@ use crate::fft::StampFft;
 use crate::noise::StampNoise;
 use crate::sizes::{check_psf, check_sizes};
 
-/// Pixels by which the deconvolved stamp may spread beyond the stamp before it wraps around. The window
-/// is down to a hundredth at the stamp's edge.
+/// Pixels by which the deconvolved stamp may spread beyond the stamp before it wraps around.
 const SPREAD: usize = 8;
 /// Modes with |p|² below this are left out: they are noise alone. The PSFs of the simulated sets are above
 /// 1e-3 where Γ is not yet zero; this keeps single precision finite for broader ones.
@@ -76,8 +75,8 @@ pub struct Spectral {
     /// The window along an axis of the coarse grid, over the number of places.
     window: Vec<f32>,
     window_sigma: f64,
-    /// Where the window sees them.
-    edges: Option<Edges>,
+    /// The stamp's.
+    edges: Edges,
     /// Power that windowed white noise brings from a mode to one so many frequencies away along an
     /// axis, either way; the product of both axes is in units of σ².
     leak: Vec<f32>,
@@ -187,7 +186,6 @@ impl Spectral {
         leak.iter_mut().for_each(|power| *power *= inside);
         let reach = (REACH * settings.window_sigma / plane.lag_spacing()) as usize;
         let least = plane.wave(plane.modes);
-        let seen = (-0.5 * (n as f64 / 2.0 / settings.window_sigma).powi(2)).exp();
         let scale = |&[kx, ky]: &[f64; 2]| {
             let area = (plane.size * plane.size) as f32;
             if kx.hypot(ky) <= least {
@@ -214,7 +212,7 @@ impl Spectral {
             waves: waves.iter().map(|k| k.map(|k| k as f32)).collect(),
             window: window.iter().map(|w| *w as f32).collect(),
             window_sigma: settings.window_sigma,
-            edges: (seen > LIT).then(|| Edges::new(n, &plane)),
+            edges: Edges::new(n, &plane),
             scale: waves.iter().map(scale).collect(),
             centre: waves.iter().map(centre).collect(),
             leak,
@@ -254,10 +252,7 @@ impl Spectral {
             real: std::array::from_fn(|_| vec![0.0; self.waves.len()]),
             centre: [0.0; 2],
             windows: [self.window.clone(), self.window.clone()],
-            edges: match &self.edges {
-                Some(edges) => edges.scratch(&self.plane),
-                None => EdgesScratch::default(),
-            },
+            edges: self.edges.scratch(&self.plane),
         }
     }
 
@@ -476,12 +471,20 @@ impl Spectral {
             *y = restore * (cross - second * u[at]);
             u[at] *= restore;
         }
-        if let Some(edges) = &self.edges {
-            edges.take(stamp, *centre, &self.plane, plane, at_edges);
+        if self.sees_edges(*centre) {
+            self.edges
+                .take(stamp, *centre, &self.plane, plane, at_edges);
             let [_, x, y] = &mut plane.half;
-            edges.add(at_edges, &psf.restore, x, y);
+            self.edges.add(at_edges, &psf.restore, x, y);
         }
         self.plane.window(across, down, plane);
+    }
+
+    /// Whether a window at `centre` sees light at the edges.
+    fn sees_edges(&self, centre: [f32; 2]) -> bool {
+        let off = centre.into_iter().map(f32::abs).fold(0.0, f32::max);
+        let away = (self.n as f64 / 2.0 - f64::from(off)) / self.window_sigma;
+        (-0.5 * away * away).exp() > LIT
     }
 
     /// Writes how the autocorrelation of the stamp last given changes with a field of noise of σ = 1

@@ -17,7 +17,6 @@ use crate::error::MeasureError;
 use crate::extent::Moments;
 use crate::noise::StampNoise;
 use crate::psf::breadth;
-use crate::sizes::check_psf;
 
 /// What one submission and stamp size need.
 pub(crate) struct LinearFamily {
@@ -38,7 +37,7 @@ impl LinearFamily {
             first: Arc::new(LinearPlan::new(
                 method,
                 n,
-                cut.most,
+                cut.size,
                 extent(method, window::OWN),
             )?),
             members: breadth::STEPS.map(|_| Default::default()).collect(),
@@ -64,7 +63,7 @@ impl LinearFamily {
         let extent = extent(&method, window);
         let own = &mut method.deconvolution.window_sigma;
         *own = window::sigma(*own, window, self.n);
-        let plan = LinearPlan::new(&method, self.n, self.cut.most, extent)?;
+        let plan = LinearPlan::new(&method, self.n, self.cut.size, extent)?;
         Ok(Arc::clone(place.get_or_init(|| Arc::new(plan))))
     }
 
@@ -137,9 +136,12 @@ impl CutWorker for FamilyWorker {
     }
 
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
-        let LinearFamily { cut, .. } = &*self.family;
-        if psf.nrows() < cut.size {
-            check_psf(psf, cut.size)?;
+        let PsfCut { size, least } = self.family.cut;
+        let side = psf.nrows();
+        if !(least..=size).contains(&side) || side % 2 != size % 2 {
+            let parity = if size % 2 == 0 { "an even" } else { "an odd" };
+            let expected = format!("{parity} number a side, {least} to {size}");
+            return Err(MeasureError::square("a PSF stamp", psf.dim(), expected));
         }
         let kind = self.family.kind(psf, self.extent, &mut self.moments);
         let known = self.members.iter().position(|(of, _)| *of == kind);

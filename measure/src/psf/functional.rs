@@ -139,14 +139,14 @@ impl FunctionalPsf {
     }
 
     /// The central pixels of a star like this on a stamp of `side` pixels a side, normalised to a sum of one: of a
-    /// size, or the most that a submission takes.
+    /// size, or as many as a submission takes.
     ///
     /// With `side` that of the galaxies, galaxy and PSF are off the middle of what is cut of them by the same: half
     /// a pixel where one side is even and the other odd. What is left of the galaxy is on a pixel then, and
     /// is where a star's stamp of that side would leave it.
     pub fn stamp_beside(&self, cut: impl Into<PsfCut>, side: usize) -> Array2<f64> {
         let cut: PsfCut = cut.into();
-        let size = cut.most;
+        let size = cut.size;
         let mut stamp = Array2::zeros((size, size));
         let off = if side % 2 == size % 2 { 0.0 } else { 0.5 };
         let centre = (size as f64 - 1.0) / 2.0 + off;

@@ -22,7 +22,7 @@ pub(crate) fn cut_start(full: usize, size: usize) -> Option<usize> {
 }
 
 /// The central pixels of a star stamp, normalised to a sum of one: of a size, or as many as a submission takes and the
-/// stamp has.
+/// stamp has. The star has to be in the middle of the least of them.
 ///
 /// # Errors
 /// Where the stamp is too small, has pixels that are not finite, no light, or its light is centred
@@ -33,7 +33,7 @@ pub fn star_psf<P: Pixel>(
 ) -> Result<Array2<f64>, MeasureError> {
     let cut: PsfCut = cut.into();
     let (rows, columns) = stamp.dim();
-    let size = cut.size;
+    let size = cut.least;
     let (Some(y0), Some(x0)) = (cut_start(rows, size), cut_start(columns, size)) else {
         let expected = format!("at least {size} × {size}, as the submission needs");
         return Err(MeasureError::square("a PSF stamp", stamp.dim(), expected));
@@ -48,8 +48,8 @@ pub fn star_psf<P: Pixel>(
         }
     }
     let inner = central(stamp, size, (y0, x0));
-    light(&inner)?;
-    let (dx, dy) = offset(stamp, &inner, (x0, y0));
+    light(inner.iter().map(|&value| -> f64 { value.into() }).sum())?;
+    let (dx, dy) = offset(stamp, inner, (x0, y0));
     if dx.abs() > MAX_CENTROID_OFFSET || dy.abs() > MAX_CENTROID_OFFSET {
         return Err(MeasureError::OffCentre {
             dx,
@@ -58,25 +58,24 @@ pub fn star_psf<P: Pixel>(
         });
     }
     // On all sides, so that the parity is the same.
-    let more = (cut.most.min(rows).min(columns) - size) / 2;
+    let more = (cut.size.min(rows).min(columns) - size) / 2;
     let taken = central(stamp, size + 2 * more, (y0 - more, x0 - more));
-    let sum = light(&taken)?;
+    let taken: Array2<f64> = taken.mapv(Into::into);
+    let sum = light(taken.sum())?;
     Ok(taken / sum)
 }
 
 /// `size` pixels a side from `start` on.
-fn central<P: Pixel>(
+fn central<P>(
     stamp: ArrayView2<'_, P>,
     size: usize,
     (y0, x0): (usize, usize),
-) -> Array2<f64> {
-    let pixels = stamp.slice(s![y0..y0 + size, x0..x0 + size]);
-    pixels.mapv(Into::into)
+) -> ArrayView2<'_, P> {
+    stamp.slice_move(s![y0..y0 + size, x0..x0 + size])
 }
 
-/// The sum of a star's pixels.
-fn light(star: &Array2<f64>) -> Result<f64, MeasureError> {
-    let sum = star.sum();
+/// The sum of a star's pixels, which has to be light.
+fn light(sum: f64) -> Result<f64, MeasureError> {
     if sum <= 0.0 {
         return Err(MeasureError::DarkPsf(sum));
     }
@@ -87,7 +86,7 @@ fn light(star: &Array2<f64>) -> Result<f64, MeasureError> {
 /// first pixel, is where its brightest pixel is; the centroid of its faint wings would be elsewhere.
 fn offset<P: Pixel>(
     stamp: ArrayView2<'_, P>,
-    cut: &Array2<f64>,
+    cut: ArrayView2<'_, P>,
     start: (usize, usize),
 ) -> (f64, f64) {
     let from_centre = |at: f64, side: usize| at - (side as f64 - 1.0) / 2.0;
@@ -105,6 +104,7 @@ fn offset<P: Pixel>(
     }
     let (mut sum, mut sum_x, mut sum_y) = (0.0, 0.0, 0.0);
     for ((y, x), &value) in cut.indexed_iter() {
+        let value: f64 = value.into();
         sum += value;
         sum_x += value * (x0 + x) as f64;
         sum_y += value * (y0 + y) as f64;
@@ -146,7 +146,10 @@ mod tests {
     #[test]
     fn of_a_star_as_much_is_taken_as_there_is_and_its_middle_stays_where_it_was() {
         let profile = PsfProfile::Moffat { beta: 3.0 };
-        let cut = PsfCut { size: 32, most: 48 };
+        let cut = PsfCut {
+            size: 48,
+            least: 32,
+        };
         let whole = FunctionalPsf::new(profile, 3.4, Shear::new(0.05, -0.03)).unwrap();
         let stamp = whole.stamp(64);
         for (given, expected) in [(32, 32), (37, 36), (48, 48), (64, 48)] {

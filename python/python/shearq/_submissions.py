@@ -28,7 +28,7 @@ class Submission:
     published : dict or None
         Published figures: ``q``, ``m_half`` (M/2) and ``sqrt_a`` (√A in 10⁻⁴).
     stamp_size, psf_size : int
-        Pixels a side of the piece of a stamp, and of a PSF stamp, that are used.
+        Pixels a side of the piece of a stamp, and of a PSF stamp, that are used; of smaller PSF stamps all, where those do.
     psf_form : {'star', 'functional'}
         The PSFs that the command line gives it. Here, either serves.
     needs_noise : bool

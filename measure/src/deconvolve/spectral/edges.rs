@@ -28,7 +28,7 @@ pub(super) struct Edges {
 }
 
 /// Buffers for one thread. Their content between calls does not matter.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub(super) struct EdgesScratch {
     /// Left and right edge, the same times y, lower and upper edge, and the same times x.
     lines: Vec<Complex32>,
