@@ -54,7 +54,7 @@ def test_simulated_stamps_stars_and_shear_are_those_written(data, simulations):
             assert same_bits(stamps.astype("f4"), image.stamps)
             stars = fits.getdata(folder / f"psf-{image.number:03}.fits").astype("f4")
             if image.psf.ndim == 3:
-                stars = stars.reshape(GRID, 32, GRID, 32).swapaxes(1, 2).reshape(-1, 32, 32)
+                stars = stars.reshape(GRID, 48, GRID, 48).swapaxes(1, 2).reshape(-1, 48, 48)
             assert same_bits(stars, image.psf)
 
 

@@ -225,8 +225,12 @@ def test_noise_is_measured_on_stamps_that_hold_some(image):
     assert found["noise"] == pytest.approx(image.noise, rel=0.02) and found.good.all()
     # Of other numbers and another order of bytes.
     assert same_bits(shearq.measure(image.stamps.astype(">f8"), image.psf), found)
+    point = np.zeros_like(image.stamps)
+    point[:, 24, 24] = 1
     with pytest.raises(ValueError, match="noise: the noise level is not to be seen on the stamps' frames"):
-        shearq.measure(0 * image.stamps + image.stamps[:, :1, :1], image.psf)
+        shearq.measure(point, image.psf)
+    # Without anything on them there is nothing to measure.
+    assert not shearq.measure(0 * point + 3, image.psf).good.any()
 
 
 def test_progress_counts_every_galaxy_and_its_exceptions_come_through(image, measured):
