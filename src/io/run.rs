@@ -167,9 +167,15 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),
     };
-    serde_json::from_str(&text)
-        .map(Some)
-        .map_err(|error| FileError::new(path, format!("not a record of this kind: {error}")))
+    serde_json::from_str(&text).map(Some).map_err(|error| {
+        // It is JSON that says something else.
+        let other = if error.is_data() {
+            "; the results of another version have to be made anew, in another folder"
+        } else {
+            ""
+        };
+        FileError::new(path, format!("not a record of this kind: {error}{other}"))
+    })
 }
 
 /// Writes any record as indented JSON.

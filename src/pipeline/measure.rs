@@ -526,7 +526,7 @@ fn first_noise(
         Err(error) if asked => return Err(error),
         Ok(None) if asked => {
             let doubt = format!(
-                "warning: {image}: no stamp has pixels enough to measure the noise on: its galaxies are flagged; noise.source \"header\" takes NOISESIG"
+                "warning: {image}: no stamp has enough pixels that differ to measure the noise on: its galaxies are flagged; noise.source \"header\" takes NOISESIG"
             );
             return Ok((None, vec![doubt]));
         }
