@@ -184,7 +184,7 @@ mod tests {
     #[test]
     fn neighbours_that_outshine_the_galaxy_are_told() {
         let mut look = Surroundings::new(N);
-        for (light, expected) in [(30.0, Ok(true)), (200.0, Err(Flag::Neighbour))] {
+        for (light, expected) in [(75.0, Ok(true)), (95.0, Err(Flag::Neighbour))] {
             let mut stamp = vec![0.0; N * N];
             blob(&mut stamp, 0.0, 0.0, 20.0);
             blob(&mut stamp, -14.0, 9.0, light);
