@@ -18,6 +18,7 @@
 use std::iter;
 use std::sync::Arc;
 
+use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2};
 
 use crate::error::MeasureError;
@@ -145,6 +146,7 @@ pub struct NoisePlan {
     reach: usize,
     /// First pixels of the blocks, around the frame.
     blocks: Arc<[(usize, usize)]>,
+    lags: Arc<[(i32, i32)]>,
     polynomials: Arc<[[f64; PIXELS]; POLYNOMIALS]>,
     /// M(l, l′).
     matrix: Arc<Array2<f64>>,
@@ -168,6 +170,7 @@ impl NoisePlan {
             full,
             reach,
             blocks: frame(full).into(),
+            lags: lags(reach).into(),
             matrix: Arc::new(matrix(reach, &polynomials)),
             polynomials: Arc::new(polynomials),
         })
@@ -198,10 +201,6 @@ impl NoisePlan {
             counts: [0; 3],
         }
     }
-
-    fn lags(&self) -> usize {
-        lags(self.reach).len()
-    }
 }
 
 /// Sums over stamps of an image. The result does not depend on anything but the stamps and their order.
@@ -227,8 +226,8 @@ pub struct NoiseSurvey {
 }
 
 impl NoiseSurvey {
-    /// Looks at the frame of a stamp. Blocks with pixels that are missing are left out, and stamps where too many are or
-    /// all are equal.
+    /// Looks at the frame of a stamp. Blocks with pixels that are missing are left out, those along an edge whose pixels are
+    /// all equal (padding has no noise), and stamps where too many are missing or all are equal.
     ///
     /// # Errors
     /// Where the stamp has other sizes than planned.
@@ -250,20 +249,27 @@ impl NoiseSurvey {
             return Ok(());
         }
         let blocks = Arc::clone(&self.plan.blocks);
+        let padded = padded(&self.pixels, full);
         for &(y0, x0) in &*blocks {
             for (at, value) in self.block.iter_mut().enumerate() {
                 let (y, x) = (y0 + at / BLOCK, x0 + at % BLOCK);
                 *value = f64::from(stamp[(y, x)].to_f32());
             }
-            if self.block.iter().any(|value| !value.is_finite()) {
+            let reaches = [y0 == 0, y0 + BLOCK == full, x0 == 0, x0 + BLOCK == full];
+            let of_padding = reaches.iter().zip(padded).any(|(at, is)| *at && is);
+            if of_padding || self.block.iter().any(|value| !value.is_finite()) {
                 self.products
-                    .extend(iter::repeat_n(f32::NAN, self.plan.lags()));
+                    .extend(iter::repeat_n(f32::NAN, self.plan.lags.len()));
                 continue;
             }
-            take_out(&*self.plan.polynomials, &mut self.block);
-            for (dx, dy) in lags(self.plan.reach) {
-                self.products.push(product(&self.block, dx, dy) as f32);
-            }
+            let first = self.products.len();
+            self.products.resize(first + self.plan.lags.len(), 0.0);
+            look_at(
+                &*self.plan.polynomials,
+                &self.plan.lags,
+                &mut self.block,
+                &mut self.products[first..],
+            );
         }
         self.compare();
         Ok(())
@@ -356,7 +362,7 @@ impl NoiseSurvey {
 
     /// The noise of the stamps looked at; `None` where less than a few frames are left that hold noise alone.
     pub fn noise(&self) -> Option<StampNoise> {
-        let lags = self.plan.lags();
+        let lags = self.plan.lags.len();
         let powers: Vec<f64> = self
             .products
             .chunks_exact(lags)
@@ -404,7 +410,7 @@ impl NoiseSurvey {
             let reach = self.plan.reach as i32;
             let width = 2 * reach + 1;
             let mut correlation = vec![0.0; ((reach + 1) * width) as usize];
-            for (&(dx, dy), value) in lags(self.plan.reach).iter().zip(&covariance) {
+            for (&(dx, dy), value) in self.plan.lags.iter().zip(&covariance) {
                 let ratio = value / variance;
                 correlation[(dy * width + dx + reach) as usize] = ratio;
                 if dy == 0 {
@@ -424,6 +430,15 @@ impl NoiseSurvey {
             }
         })
     }
+}
+
+/// Whether the pixels along the lower, upper, left and right edge of a stamp of `n` × `n` are all equal.
+fn padded(pixels: &[f32], n: usize) -> [bool; 4] {
+    let last = n * (n - 1);
+    [(0, 1), (last, 1), (0, n), (n - 1, n)].map(|(first, step)| {
+        let mut edge = (0..n).map(|at| pixels[first + at * step]);
+        edge.all(|value| value == pixels[first])
+    })
 }
 
 /// χ² of a covariance against white noise of variance one, for one block.
@@ -491,29 +506,62 @@ fn polynomials() -> [[f64; PIXELS]; POLYNOMIALS] {
     out
 }
 
+/// Takes orthonormal `polynomials` out of a block, and writes the sum of products of what is left at each of `lags`.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn look_at(
+    polynomials: &[[f64; PIXELS]],
+    lags: &[(i32, i32)],
+    block: &mut [f64],
+    products: &mut [f32],
+) {
+    take_out(polynomials, block);
+    let rows = beside_zeros(block);
+    for (out, &(dx, dy)) in products.iter_mut().zip(lags) {
+        *out = product(&rows, dx, dy) as f32;
+    }
+}
+
 /// Takes orthonormal `polynomials` out of a block.
+#[inline(always)]
 fn take_out(polynomials: &[[f64; PIXELS]], block: &mut [f64]) {
     for polynomial in polynomials {
-        let terms = polynomial.iter().zip(&*block);
-        let share: f64 = terms.map(|(a, b)| a * b).sum();
+        // Columns side by side, each of which would wait for the one before.
+        let mut columns = [0.0; BLOCK];
+        let rows = polynomial.chunks_exact(BLOCK);
+        for (p, row) in rows.zip(block.chunks_exact(BLOCK)) {
+            for (sum, (p, value)) in columns.iter_mut().zip(p.iter().zip(row)) {
+                *sum += p * value;
+            }
+        }
+        let share: f64 = columns.iter().sum();
         for (value, p) in block.iter_mut().zip(polynomial) {
             *value -= share * p;
         }
     }
 }
 
+/// The rows of a block with zeros on either side, so that all lags are sums over rows of one length.
+#[inline(always)]
+fn beside_zeros(block: &[f64]) -> [[f64; 3 * BLOCK]; BLOCK] {
+    let mut rows = [[0.0; 3 * BLOCK]; BLOCK];
+    for (row, from) in rows.iter_mut().zip(block.chunks_exact(BLOCK)) {
+        row[BLOCK..2 * BLOCK].copy_from_slice(from);
+    }
+    rows
+}
+
 /// Sum of products of the block's pixels (dx, dy) apart.
-fn product(block: &[f64], dx: i32, dy: i32) -> f64 {
-    let (across, down) = (dx.unsigned_abs() as usize, dy as usize);
-    let (left, right) = if dx >= 0 { (0, across) } else { (across, 0) };
-    let width = BLOCK - across;
-    (0..BLOCK - down)
-        .map(|y| {
-            let a = &block[y * BLOCK + left..][..width];
-            let b = &block[(y + down) * BLOCK + right..][..width];
-            a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>()
-        })
-        .sum()
+#[inline(always)]
+fn product(rows: &[[f64; 3 * BLOCK]; BLOCK], dx: i32, dy: i32) -> f64 {
+    let right = BLOCK.saturating_add_signed(dx as isize);
+    let mut columns = [0.0; BLOCK];
+    for (a, b) in rows.iter().zip(&rows[dy as usize..]) {
+        let pairs = a[BLOCK..2 * BLOCK].iter().zip(&b[right..right + BLOCK]);
+        for (sum, (a, b)) in columns.iter_mut().zip(pairs) {
+            *sum += a * b;
+        }
+    }
+    columns.iter().sum()
 }
 
 /// M(l, l′): the mean of the products at lag l on noise of covariance one at ±l′ and zero elsewhere.
@@ -681,6 +729,35 @@ mod tests {
     }
 
     #[test]
+    fn padding_is_no_noise() {
+        let padded = |edges: &[bool; 4], rng: &mut ChaCha8Rng| {
+            let mut stamp = noise(rng, false);
+            for ((y, x), value) in stamp.indexed_iter_mut() {
+                let near = [y < 3, y >= SIDE - 2, x < 1, x >= SIDE - 5];
+                if near.iter().zip(edges).any(|(near, edge)| *near && *edge) {
+                    *value = 7.0;
+                }
+            }
+            stamp
+        };
+        for edge in 0..4 {
+            let mut edges = [false; 4];
+            edges[edge] = true;
+            let found = survey(3, 300, |rng| padded(&edges, rng));
+            assert!(
+                (found.sigma() - 1.0).abs() < 3.0 * found.error() && !found.is_correlated(),
+                "{edge}: {found:?}"
+            );
+        }
+        let mut rng = ChaCha8Rng::seed_from_u64(10);
+        let mut survey = NoisePlan::new(SIDE, 3).unwrap().survey();
+        for _ in 0..30 {
+            survey.add(padded(&[true; 4], &mut rng).view()).unwrap();
+        }
+        assert!(survey.noise().is_none() && !survey.is_blind());
+    }
+
+    #[test]
     fn missing_pixels_cost_their_blocks_alone() {
         let found = survey(3, 600, |rng| {
             let mut stamp = noise(rng, false);
@@ -808,9 +885,9 @@ mod tests {
         for _ in 0..500 {
             survey.add(noise(&mut rng, true).view()).unwrap();
         }
-        let blocks = survey.products.chunks_exact(plan.lags());
+        let blocks = survey.products.chunks_exact(plan.lags.len());
         let count = blocks.len() as f64;
-        let mut means = vec![0.0; plan.lags()];
+        let mut means = vec![0.0; plan.lags.len()];
         for block in blocks {
             for (mean, product) in means.iter_mut().zip(block) {
                 *mean += f64::from(*product) / count;

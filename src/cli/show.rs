@@ -126,10 +126,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         print(&format!("{}\n", describe(image, index, &measured)))?;
     }
     let title = format!(
-        "{}; set/image/galaxy: e1, e2 before calibration{}",
+        "{}; set/image/galaxy: e1, e2{}",
         submission.name,
         match responses {
-            true => "; R: their response to shear",
+            true => " before calibration; R: their response to shear",
             false => "",
         }
     );
@@ -160,12 +160,12 @@ fn describe(id: ImageId, index: usize, m: &Measurement) -> String {
         format!("{} iterations ({ended})", d.iterations)
     });
     format!(
-        "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4} before calibration{}, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",
+        "set {} image {} galaxy {index}: e1 {:+.4}, e2 {:+.4}{}, flag {}, {stop}, noise {:.3}, ACF radius {:.1} px",
         id.set,
         id.image,
         m.e1,
         m.e2,
-        response(m, ", response "),
+        response(m, " before calibration, response "),
         m.flags.bits(),
         m.noise,
         m.radius

@@ -140,8 +140,12 @@ impl ImageSource {
             && !header_noise.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite())
         {
             let found = header_noise.map_or("absent".into(), |sigma| sigma.to_string());
+            let other = match submission.linear() {
+                Some(_) => "image",
+                None => "border",
+            };
             let message = format!(
-                "the header key NOISESIG is {found}; expected a positive number, as submission {} takes the noise from it (noise.source = \"border\" would measure it)",
+                "the header key NOISESIG is {found}; expected a positive number, as submission {} takes the noise from it (noise.source = \"{other}\" would measure it)",
                 submission.name
             );
             return Err(FileError::new(data.galaxies(id.set, id.image), message).into());
@@ -532,6 +536,13 @@ fn first_noise(
         }
         Ok(None) | Err(_) => return Ok(nothing),
     };
+    let white = !matches!(submission.noise, NoiseSource::Image { correlation } if correlation > 0);
+    // A survey that takes noise as white does not look for more.
+    let coloured = match NoisePlan::new(measurer.full(), CORRELATION) {
+        Ok(plan) if white && asked => source.look(data, &plan)?,
+        _ => None,
+    };
+    let coloured = &coloured.as_ref().unwrap_or(&survey).noise;
     let noise = &survey.noise;
     let mut doubts = Vec::new();
     if let Some(header) = source.header_noise {
@@ -551,12 +562,11 @@ fn first_noise(
             ));
         }
     }
-    let white = !matches!(submission.noise, NoiseSource::Image { correlation } if correlation > 0);
-    if white && noise.is_correlated() {
+    if white && coloured.is_correlated() {
         doubts.push(format!(
             "warning: {image}: neighbouring pixels have noise correlated by {:.2} along x and {:.2} along y, which is taken as white; set noise.source to \"image\" and noise.correlation above 0",
-            noise.correlation(1, 0),
-            noise.correlation(0, 1)
+            coloured.correlation(1, 0),
+            coloured.correlation(0, 1)
         ));
     }
     Ok((asked.then_some(survey), doubts))

@@ -370,6 +370,64 @@ fn sky_and_noise_that_is_another_are_told_where_they_are_seen() {
 }
 
 #[test]
+fn noise_that_is_told_to_be_white_and_is_not_and_padding_are_told() {
+    let small = Small::new("2");
+    let set = small.at("data/set02");
+    let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
+    let psf = set.join("psf-001.fits");
+    let settings = |name: &str, lines: &str| {
+        let path = small.at(name);
+        fs::write(&path, format!("extends = \"{LINEAR}\"\n[noise]\n{lines}\n")).unwrap();
+        path
+    };
+    let white = settings("white.toml", "correlation = 0");
+    let border = settings("border.toml", "source = \"border\"");
+    let measure = |name: &str, stamps: &[Vec<f32>], submission: &str| {
+        let (file, data) = (small.at(&format!("{name}.fits")), small.at(name));
+        if !data.exists() {
+            fs::write(&file, cube(stamps, 48)).unwrap();
+            let gather = ["gather", "--stamps", text(&file), "--psf", text(&psf)];
+            succeed(&[&gather[..], &["--out", text(&data)]].concat());
+        }
+        let out = tempfile::tempdir().unwrap();
+        let measure = ["measure", "--submission", submission, "--data", text(&data)];
+        let done = shearq(&[&measure[..], &["--out", text(out.path())]].concat());
+        let said = String::from_utf8(done.stderr).unwrap();
+        (done.status.success(), said)
+    };
+    let summed: Vec<Vec<f32>> = galaxies
+        .iter()
+        .map(|stamp| {
+            let at = |y: usize, x: usize| stamp[y % 48 * 48 + x % 48];
+            let sum = |y, x| at(y, x) + at(y + 1, x) + at(y, x + 1) + at(y + 1, x + 1);
+            (0..48 * 48).map(|k| sum(k / 48, k % 48)).collect()
+        })
+        .collect();
+    for (submission, told) in [(LINEAR, false), (text(&white), true), (text(&border), true)] {
+        let (_, said) = measure("plain", &galaxies, submission);
+        assert!(!said.contains("is taken as white"), "{said}");
+        let (well, said) = measure("summed", &summed, submission);
+        assert_eq!(
+            (well, said.contains("is taken as white")),
+            (true, told),
+            "{said}"
+        );
+    }
+    let mut padded = galaxies;
+    for (k, value) in padded.iter_mut().flatten().enumerate() {
+        let (y, x) = (k / 48 % 48, k % 48);
+        if y.min(x) < 3 || y.max(x) > 44 {
+            *value = 0.0;
+        }
+    }
+    let (well, said) = measure("padded", &padded, LINEAR);
+    assert!(
+        !well && said.contains("expected two or more whole frames"),
+        "{said}"
+    );
+}
+
+#[test]
 fn a_tilde_is_a_letter_of_a_name() {
     let root = tempfile::tempdir().unwrap();
     let run = |arguments: &[&str]| {

@@ -105,7 +105,8 @@ impl Edges {
                     }
                 };
                 let here = signed(at);
-                let (a, b) = (line[here], line[(size - here) % size].conj());
+                let opposite = if here == 0 { 0 } else { size - here };
+                let (a, b) = (line[here], line[opposite].conj());
                 // The transform of the real part, and that of the imaginary part.
                 let d = (a - b) * 0.5;
                 *out = [(a + b) * (0.5 * first), Complex32::new(d.im, -d.re) * last];
