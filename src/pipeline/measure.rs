@@ -538,9 +538,10 @@ fn first_noise(
     };
     let white = !matches!(submission.noise, NoiseSource::Image { correlation } if correlation > 0);
     // A survey that takes noise as white does not look for more.
-    let coloured = match NoisePlan::new(measurer.full(), CORRELATION) {
-        Ok(plan) if white && asked => source.look(data, &plan)?,
-        _ => None,
+    let coloured = if white && asked {
+        source.look(data, &NoisePlan::new(measurer.full(), CORRELATION)?)?
+    } else {
+        None
     };
     let coloured = &coloured.as_ref().unwrap_or(&survey).noise;
     let noise = &survey.noise;

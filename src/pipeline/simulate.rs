@@ -251,7 +251,6 @@ impl OpenImage {
                 None
             }
             PsfField::PerGalaxy(_) => {
-                let side = n * STAMP;
                 Some(ImageWriter::create(&psf_path, side, side, &psf_header)?)
             }
         };

@@ -652,11 +652,11 @@ impl Spectral {
 /// Fall of Γ towards its largest wave number, at 1: a quarter of a cosine, squared.
 fn taper(k: f64) -> f64 {
     const FROM: f64 = 0.75;
-    let place = ((k - FROM) / (1.0 - FROM)).max(0.0);
-    if place >= 1.0 {
-        // The cosine is 10⁻¹⁶, which makes modes of denormal numbers, and these take long.
+    if k >= 1.0 {
+        // The cosine would be 10⁻¹⁶, which makes modes of denormal numbers, and these take long.
         return 0.0;
     }
+    let place = ((k - FROM) / (1.0 - FROM)).max(0.0);
     (std::f64::consts::FRAC_PI_2 * place).cos().powi(2)
 }
 

@@ -28,9 +28,9 @@ fn area(psf: ArrayView2<'_, f64>) -> f64 {
 }
 
 /// How many steps a PSF of sum one is broader than one of a noise-equivalent area of `reference` px²; none where that is
-/// zero. Steps to
-/// broader ones are rounded; those to narrower ones are rounded towards zero, less one, so that lengths first shrink where
-/// the PSF is 1/√2 as broad: sharp lengths bring noise into the response before they take any out of ellipticities.
+/// zero. Steps to broader ones are rounded; those to narrower ones are rounded towards zero, less one, so that lengths first
+/// shrink where the PSF is 1/√2 as broad: sharp lengths bring noise into the response before they take any out of
+/// ellipticities.
 pub(crate) fn step(psf: ArrayView2<'_, f64>, reference: f64) -> i32 {
     if reference == 0.0 {
         return 0;

@@ -145,8 +145,7 @@ impl FunctionalPsf {
     /// a pixel where one side is even and the other odd. What is left of the galaxy is on a pixel then, and
     /// is where a star's stamp of that side would leave it.
     pub fn stamp_beside(&self, cut: impl Into<PsfCut>, side: usize) -> Array2<f64> {
-        let cut: PsfCut = cut.into();
-        let size = cut.size;
+        let PsfCut { size, .. } = cut.into();
         let mut stamp = Array2::zeros((size, size));
         let off = if side % 2 == size % 2 { 0.0 } else { 0.5 };
         let centre = (size as f64 - 1.0) / 2.0 + off;

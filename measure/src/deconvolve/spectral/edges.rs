@@ -14,7 +14,7 @@
 use multiversion::multiversion;
 use rustfft::num_complex::Complex32;
 
-use super::plane::{Plane, PlaneScratch};
+use super::plane::{Plane, PlaneScratch, parts};
 
 /// Pairs of real lines: the edges, and the edges times the place along them.
 const PAIRS: usize = 4;
@@ -97,19 +97,14 @@ impl Edges {
         let pairs = lines.chunks_exact(size).zip(terms).zip(factors);
         for ((line, terms), [first, last]) in pairs {
             for (at, out) in terms.iter_mut().enumerate() {
-                let signed = |at: usize| {
-                    if 2 * at > plane.side {
-                        size + at - plane.side
-                    } else {
-                        at
-                    }
+                let here = if 2 * at > plane.side {
+                    size + at - plane.side
+                } else {
+                    at
                 };
-                let here = signed(at);
                 let opposite = if here == 0 { 0 } else { size - here };
-                let (a, b) = (line[here], line[opposite].conj());
-                // The transform of the real part, and that of the imaginary part.
-                let d = (a - b) * 0.5;
-                *out = [(a + b) * (0.5 * first), Complex32::new(d.im, -d.re) * last];
+                let [one, other] = parts(line[here], line[opposite]);
+                *out = [one * first, other * last];
             }
         }
     }

@@ -271,12 +271,18 @@ fn split(
     let opposite = (size - column) % size;
     let lines = rows.chunks_exact(size);
     for (line, (first, second)) in lines.zip(first.iter_mut().zip(second)) {
-        let (a, b) = (line[column], line[opposite].conj());
-        *first = (a + b) * 0.5;
-        // (a − b)/2i.
-        let d = (a - b) * 0.5;
-        *second = Complex32::new(d.im, -d.re);
+        [*first, *second] = parts(line[column], line[opposite]);
     }
+}
+
+/// Transforms of two real images at one frequency, from those of the one plus i times the other there and at the opposite
+/// frequency.
+#[inline]
+pub(super) fn parts(here: Complex32, opposite: Complex32) -> [Complex32; 2] {
+    let (a, b) = (here, opposite.conj());
+    // (a − b)/2i is the second.
+    let d = (a - b) * 0.5;
+    [(a + b) * 0.5, Complex32::new(d.im, -d.re)]
 }
 
 /// The spectrum of row `first` plus i times row `second` of a real image, whose columns were
