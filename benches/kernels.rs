@@ -5,11 +5,12 @@ use std::hint::black_box;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use ndarray::ArrayView2;
 use shearq_benches::{stamp, submission};
+use shearq_measure::Measurer;
 use shearq_measure::parts::{
     AdaptiveMoments, Autocorrelation, Network, Rule, Spectral, Step, WaveletWiener,
 };
-use shearq_measure::{FunctionalPsf, Measurer, PsfProfile};
-use shearq_scoring::Shear;
+use shearq_quantities::Shear;
+use shearq_quantities::{FunctionalPsf, PsfProfile};
 use shearq_submissions::{Clipping, Kept, Start};
 
 fn moffat(size: usize) -> ndarray::Array2<f64> {

@@ -9,10 +9,11 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq::pipeline::engine;
 use shearq_measure::{
-    Flag, FunctionalPsf, MeasureError, Measurement, Measurer, NoisePlan, Pixel, PsfProfile, Psfs,
-    Survey, Worker, calibrate, star_psf,
+    Flag, MeasureError, Measurement, Measurer, NoisePlan, Pixel, Psfs, Survey, Worker, calibrate,
+    star_psf,
 };
-use shearq_scoring::Shear;
+use shearq_quantities::Shear;
+use shearq_quantities::{FunctionalPsf, PsfProfile};
 
 use crate::errors::{no_memory, of_measuring};
 use crate::stamps::{Borrowed, Piece, Stamps};
@@ -137,7 +138,7 @@ pub(crate) fn measure<'py>(
             let formulas = self::formulas(formulas.as_array()).map_err(of_measuring)?;
             match formulas.as_slice() {
                 [one] => {
-                    prepared = one.stamp_beside(cut, rows);
+                    prepared = one.stamp_beside(cut.size, rows);
                     look(Psfs::Prepared(prepared.view())).map_err(of_measuring)?;
                     AllPsfs::Shared(prepared.view())
                 }

@@ -5,9 +5,9 @@ use numpy::{IntoPyArray, PyReadonlyArray1, ToPyArray};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
-use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{
     BINS, Bins, Choice, Convention, Definition, FieldSum, Figures, Grid, Noise, Options, Row,
     RowCounts, SCORED, SetImages, SetScorer, TrueShear, TruthSign,

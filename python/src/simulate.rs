@@ -13,8 +13,8 @@ use shearq::simulate::render::RenderScratch;
 use shearq::simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
 };
-use shearq_measure::{FunctionalPsf, PsfProfile};
-use shearq_scoring::Shear;
+use shearq_quantities::Shear;
+use shearq_quantities::{FunctionalPsf, PsfProfile};
 
 use crate::errors::{no_memory, of_pipeline};
 use crate::work::{Failure, Watch, threads};

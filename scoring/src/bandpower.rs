@@ -11,8 +11,8 @@
 use std::ops::Range;
 
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
 use serde::{Deserialize, Serialize};
+use shearq_fourier::Complex64;
 
 use crate::grid::Grid;
 

@@ -1,8 +1,8 @@
 //! The eight sign and axis conventions that the original scoring tries on every submission.
 
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
 use serde::{Deserialize, Serialize};
+use shearq_fourier::Complex64;
 
 use crate::error::ScoringError;
 

@@ -27,7 +27,7 @@
 //! groups would give twice the variance where noise prevails.)
 
 use ndarray::{Array2, Zip};
-use rustfft::num_complex::Complex64;
+use shearq_fourier::Complex64;
 
 use crate::bandpower::{BINS, Bins, Definition, SCORED};
 use crate::catalogue::FieldSum;

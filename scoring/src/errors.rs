@@ -20,7 +20,7 @@
 //! nothing tells the two kinds apart, and that of a mean is the mean of both.
 
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
+use shearq_fourier::Complex64;
 
 use crate::bandpower::{BINS, Bins, SCORED};
 use crate::grid::Grid;

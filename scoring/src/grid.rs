@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 use serde::{Deserialize, Serialize};
 
 use crate::error::ScoringError;
-use crate::units::{Degrees, Multipole, Pixels, Radians};
+use shearq_quantities::units::{Degrees, Multipole, Pixels, Radians};
 
 /// Offset that the original scoring program adds to both components of every wave vector, so that
 /// the zero mode has a direction. It decides which of the modes at exactly ℓ_min are counted.

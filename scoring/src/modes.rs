@@ -3,11 +3,8 @@
 //! Fourier scaling is stated here once: `FFT` is the plain sum Σ f·e^{−2πi(jk/n)} without a factor,
 //! `IFFT` carries 1/n². A mode's power per steradian is |FFT|²·L²/n⁴.
 
-use std::sync::Arc;
-
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
-use rustfft::{Fft, FftPlanner};
+use shearq_fourier::{Complex64, Plan64, Planner64};
 
 use crate::grid::Grid;
 
@@ -23,15 +20,15 @@ pub struct Modes {
 /// Two-dimensional FFT of one grid size, with the E/B kernel of that grid.
 pub struct Decomposer {
     grid: Grid,
-    forward: Arc<dyn Fft<f64>>,
-    inverse: Arc<dyn Fft<f64>>,
+    forward: Plan64,
+    inverse: Plan64,
     kernel: Array2<Complex64>,
 }
 
 impl Decomposer {
     /// Plans the transforms of `grid`.
     pub fn new(grid: Grid) -> Self {
-        let mut planner = FftPlanner::new();
+        let mut planner = Planner64::new();
         let mut kernel = Array2::zeros((grid.n, grid.n));
         for i in 0..grid.n {
             for j in 0..grid.n {
@@ -40,8 +37,8 @@ impl Decomposer {
         }
         Decomposer {
             grid,
-            forward: planner.plan_fft_forward(grid.n),
-            inverse: planner.plan_fft_inverse(grid.n),
+            forward: planner.forward(grid.n),
+            inverse: planner.inverse(grid.n),
             kernel,
         }
     }
@@ -94,7 +91,7 @@ impl Decomposer {
     }
 
     /// One-dimensional transforms along both axes, unscaled.
-    fn transform(&self, field: &mut Array2<Complex64>, fft: &Arc<dyn Fft<f64>>) {
+    fn transform(&self, field: &mut Array2<Complex64>, fft: &Plan64) {
         for _ in 0..2 {
             let mut turned = field.t().as_standard_layout().into_owned();
             if let Some(rows) = turned.as_slice_mut() {

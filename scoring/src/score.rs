@@ -1,8 +1,8 @@
 //! Scores of one set: every convention, noise, biases, null tests, and errors of all of them.
 
 use ndarray::{Array2, ArrayView2};
-use rustfft::num_complex::Complex64;
 use serde::Serialize;
+use shearq_fourier::Complex64;
 
 use crate::bandpower::{BINS, Bins, Definition, SCORED};
 use crate::catalogue::{FieldSum, TrueShear};

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::Args;
+use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::Grid;
-use shearq_scoring::units::{Degrees, Pixels};
 
 use super::{Findings, count, print};
 use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, MAX_SET, read_truth_rows};

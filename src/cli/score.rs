@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::{ArgGroup, Args, ValueEnum};
-use shearq_scoring::units::{Degrees, Pixels};
+use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore, TrueShear, TruthSign};
 
 use super::arguments::{Printing, ReportFile, ScoreSettings, SetList, Threads, positive};

@@ -1,6 +1,6 @@
 //! The postage stamps of an image side by side.
 
-use shearq_scoring::units::Pixels;
+use shearq_quantities::units::Pixels;
 use shearq_scoring::{cell_at, centre_of};
 
 /// Stamps in rows of `columns`, the last of which may be shorter.

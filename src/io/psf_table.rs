@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use shearq_measure::{FunctionalPsf, PsfProfile};
-use shearq_scoring::Shear;
+use shearq_quantities::Shear;
+use shearq_quantities::{FunctionalPsf, PsfProfile};
 
 use super::atomic;
 use super::error::FileError;

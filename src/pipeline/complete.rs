@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::Grid;
-use shearq_scoring::units::{Degrees, Pixels};
 
 use super::PipelineError;
 use super::engine::{self, Progress};

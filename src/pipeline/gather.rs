@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use shearq_measure::parts::frame;
-use shearq_scoring::resample::RunningMean;
+use shearq_quantities::statistics::RunningMean;
 
 pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, Origin, Planes, shown};

@@ -6,9 +6,9 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis, Slice};
 use shearq_measure::{
-    Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, Survey, Worker, calibrate,
-    star_psf, strip,
+    Flag, Measurement, Measurer, NoisePlan, Psfs, Survey, Worker, calibrate, star_psf, strip,
 };
+use shearq_quantities::FunctionalPsf;
 use shearq_submissions::{EllipticityType, NoiseSource, PsfCut, PsfForm, Submission};
 use shearq_tables::polars::{Column, DataFrame};
 use shearq_tables::{TableError, frame};
@@ -286,7 +286,7 @@ fn open_psf(
             }
             Ok(match rows.as_slice() {
                 [psf] => {
-                    let stamp = psf.stamp_beside(cut, mosaic.stamp);
+                    let stamp = psf.stamp_beside(cut.size, mosaic.stamp);
                     if stamp.iter().any(|value| !value.is_finite()) {
                         let message = format!(
                             "a PSF with a FWHM of {} px has no light on its stamp; expected a width of about a pixel or more",
@@ -396,7 +396,7 @@ pub fn psf_of(row: &StampRow, ix: usize, cut: PsfCut) -> Result<Array2<f64>, Pip
             let stars = strip(pixels, row.mosaic.columns, *side)?;
             star_psf(stars.index_axis(Axis(0), ix), cut)?
         }
-        RowPsf::Functional(field) => field[ix].stamp_beside(cut, row.mosaic.stamp),
+        RowPsf::Functional(field) => field[ix].stamp_beside(cut.size, row.mosaic.stamp),
     })
 }
 

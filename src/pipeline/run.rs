@@ -8,7 +8,7 @@ use ndarray::{Array2, ArrayView2, Axis};
 use shearq_measure::{
     Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Worker, calibrate, star_psf, strip,
 };
-use shearq_scoring::Shear;
+use shearq_quantities::Shear;
 use shearq_submissions::{PsfForm, Submission};
 
 use super::engine::{self, Feeder, Progress};
@@ -259,7 +259,7 @@ pub fn simulated_steps(
     let stamps = strip(&pixels, 1, STAMP)?;
     let stamp = stamps.index_axis(Axis(0), 0);
     let cut = measurer.submission().psf_cut();
-    let psf = fields.psf.at(ix, iy).stamp_beside(cut, STAMP);
+    let psf = fields.psf.at(ix, iy).stamp_beside(cut.size, STAMP);
     let mut worker = measurer.worker();
     worker.set_psf(psf.view())?;
     let measured = worker.measure(stamp, Some(NOISE_SIGMA))?;
@@ -307,7 +307,7 @@ fn row_psf(set: &SetSimulator, fields: &ImageFields, iy: usize, submission: &Sub
     let (size, cut) = (submission.psf.size, submission.psf_cut());
     match (&fields.psf, submission.psf.form) {
         (PsfField::One(psf), PsfForm::Functional) => {
-            RowPsf::Shared(Arc::new(psf.stamp_beside(cut, STAMP)))
+            RowPsf::Shared(Arc::new(psf.stamp_beside(cut.size, STAMP)))
         }
         (PsfField::One(psf), PsfForm::Star) => {
             let star = simulate::star(psf, STAMP);

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
-use shearq_measure::FunctionalPsf;
-use shearq_scoring::Shear;
+use shearq_quantities::FunctionalPsf;
+use shearq_quantities::Shear;
 
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use shearq_scoring::units::{Degrees, Pixels};
+use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, TrueShear, TruthSign};
 
 use super::grid;

@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shearq_scoring::{Distortion, FieldSum, Grid, Row, RowCounts, Shear};
+use shearq_quantities::{Distortion, Shear};
+use shearq_scoring::{FieldSum, Grid, Row, RowCounts};
 use shearq_submissions::{EllipticityType, checked_name};
 
 use crate::io::FileError;

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use shearq_scoring::resample::RunningMean;
+use shearq_quantities::statistics::RunningMean;
 
 use crate::io::FileError;
 use crate::io::run::Run;

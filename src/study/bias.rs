@@ -16,7 +16,7 @@
 
 use serde::{Deserialize, Serialize};
 use shearq_measure::{Measurement, Measurer, Worker};
-use shearq_scoring::Shear;
+use shearq_quantities::Shear;
 use shearq_submissions::Calibration;
 
 use crate::io::run::nan_for_null;

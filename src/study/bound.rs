@@ -4,11 +4,12 @@
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
-use rustfft::num_complex::Complex64;
+use shearq_fourier::Complex64;
+use shearq_quantities::Shear;
+use shearq_quantities::statistics::RunningMean;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::quality::quality;
-use shearq_scoring::resample::RunningMean;
-use shearq_scoring::{Bins, Convention, Definition, Shear};
+use shearq_scoring::{Bins, Convention, Definition};
 
 use crate::simulate::kinds::ImageType;
 use crate::simulate::render::RenderScratch;

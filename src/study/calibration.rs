@@ -18,8 +18,8 @@ use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::parts::{
     ClippedAcf, ClippedAcfScratch, Network, NetworkScratch, Rule, convolve, psf_factor,
 };
-use shearq_measure::{FunctionalPsf, PsfProfile};
-use shearq_scoring::{Distortion, Shear};
+use shearq_quantities::{Distortion, Shear};
+use shearq_quantities::{FunctionalPsf, PsfProfile};
 use shearq_submissions::{NetworkDeconvolution, Submission, Update};
 
 use super::speed::network_of;

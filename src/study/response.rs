@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use shearq_measure::Measurement;
-use shearq_scoring::Shear;
+use shearq_quantities::Shear;
 
 use crate::io::run::nan_for_null;
 

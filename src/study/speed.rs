@@ -10,7 +10,7 @@ use shearq_measure::parts::{
     border_noise,
 };
 use shearq_measure::{Measurer, StampNoise};
-use shearq_scoring::units::{Degrees, Pixels};
+use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::{
     Clipping, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut, Start, Submission,
@@ -101,7 +101,7 @@ impl Inputs {
 
     pub(super) fn psf(&self, cut: impl Into<PsfCut>) -> ndarray::Array2<f64> {
         let fields = self.set.image_fields(1);
-        fields.psf.at(0, 0).stamp_beside(cut, STAMP)
+        fields.psf.at(0, 0).stamp_beside(cut.size, STAMP)
     }
 
     /// Microseconds of a whole measurement, the PSF being taken already.

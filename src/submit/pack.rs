@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_scoring::units::Degrees;
+use shearq_quantities::units::Degrees;
 use shearq_scoring::{
     Convention, ConventionMatch, FieldSum, Grid, Options, Row, SetImages, SetScorer,
     SpectrumCovariance,

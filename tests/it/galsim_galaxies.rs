@@ -4,9 +4,9 @@ use std::path::Path;
 
 use shearq::simulate::galaxy::Galaxy;
 use shearq::simulate::render::{RenderScratch, Renderer, render_reference};
-use shearq_measure::parts::{PsfTransform, TransformedPsf};
-use shearq_measure::{FunctionalPsf, PsfProfile};
-use shearq_scoring::Shear;
+use shearq_quantities::Shear;
+use shearq_quantities::{FunctionalPsf, PsfProfile};
+use shearq_quantities::{PsfTransform, TransformedPsf};
 
 use crate::support::shared;
 

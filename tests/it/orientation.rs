@@ -3,9 +3,10 @@
 use ndarray::{Array2, ArrayView2};
 use shearq::simulate::galaxy::Galaxy;
 use shearq::simulate::render::{RenderScratch, Renderer};
-use shearq_measure::parts::PsfTransform;
-use shearq_measure::{FunctionalPsf, Measurer, PsfProfile};
-use shearq_scoring::Shear;
+use shearq_measure::Measurer;
+use shearq_quantities::PsfTransform;
+use shearq_quantities::Shear;
+use shearq_quantities::{FunctionalPsf, PsfProfile};
 use shearq_submissions::{Denoise, Method, Registry, StepScale};
 
 #[test]

@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
+use shearq_fourier::Complex64;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::quality::{bias, bias_fits, quality, quality_error};
 use shearq_scoring::resample::{PairedDifference, PairedSet, mean_over_sets, paired_difference};

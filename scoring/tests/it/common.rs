@@ -1,6 +1,6 @@
 //! Fields and random numbers that tests of the scoring share.
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
+use shearq_fourier::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{Grid, Row, TrueShear};
 

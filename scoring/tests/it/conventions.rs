@@ -1,7 +1,7 @@
 //! A catalogue's figures are the same in whichever convention it comes.
 
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
+use shearq_fourier::Complex64;
 use shearq_scoring::{
     Choice, Convention, Definition, FieldSum, Figures, Grid, Noise, Options, Row, SetImages,
     SetScore, SetScorer,

@@ -1,7 +1,7 @@
 //! The errors of a set's figures against the scatter of repeated trials.
 
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
+use shearq_fourier::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
     Choice, Convention, Definition, FieldSum, Figures, Grid, Options, SCORED, SetImages, SetScorer,

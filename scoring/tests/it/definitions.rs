@@ -1,7 +1,7 @@
 //! The corrected definition, null tests, masks, noise and errors, on fields made for the purpose.
 
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
+use shearq_fourier::Complex64;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{
     BINS, Bins, Choice, Convention, CrossSpectrum, Definition, FieldSum, Grid, Noise, Options, Row,

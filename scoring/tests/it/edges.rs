@@ -1,7 +1,7 @@
 //! Cases at the edges of what is scored: gaps, nothing at all, a constant shear, the fewest images.
 
 use ndarray::Array2;
-use rustfft::num_complex::Complex64;
+use shearq_fourier::Complex64;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::quality::quality;
 use shearq_scoring::{
@@ -409,7 +409,7 @@ fn only_squares_have_a_side_and_only_fields_on_the_sky_make_a_grid() {
         (Grid::side_of(64), Grid::side_of(63), Grid::side_of(65)),
         (Some(8), None, None)
     );
-    use shearq_scoring::units::{Degrees, Pixels};
+    use shearq_quantities::units::{Degrees, Pixels};
     let grid = |field| Grid::new(8, Pixels(48.0), Degrees(field));
     assert!(grid(1e-3).is_ok() && grid(360.0).is_ok());
     for field in [0.0, 9e-4, 361.0, 1e308, f64::NAN, f64::INFINITY, -10.0] {

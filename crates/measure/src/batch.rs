@@ -1,0 +1,476 @@
+//! One stamp, and many.
+
+use std::sync::Arc;
+
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
+use shearq_submissions::{Method, NoiseSource, Submission};
+
+use crate::calibrate::calibrate;
+use crate::error::{MeasureError, length};
+use crate::flag::Flag;
+use crate::galaxy::{Measurer, Worker};
+use crate::measurement::Measurement;
+use crate::noise::Survey;
+use crate::pixel::Pixel;
+use crate::psf::star_psf;
+use shearq_quantities::FunctionalPsf;
+
+/// PSFs of the galaxies of a batch.
+#[derive(Debug, Clone, Copy)]
+pub enum Psfs<'a, P = f64> {
+    /// A star stamp for all, centred and at least as large as the submission needs. It is cut and
+    /// normalised.
+    Star(ArrayView2<'a, P>),
+    /// Star stamps, one each along the first axis.
+    Stars(ArrayView3<'a, P>),
+    /// Formulas, one each.
+    Functional(&'a [FunctionalPsf]),
+    /// A PSF for all that is used as it is: as large as [`star_psf`] cuts it, centred, of sum one.
+    Prepared(ArrayView2<'a, f64>),
+}
+
+/// A batch of galaxies, measured.
+#[derive(Debug, Clone)]
+pub struct Batch {
+    /// One per stamp. Ellipticities are calibrated; responses are the galaxies' own.
+    pub galaxies: Vec<Measurement>,
+    /// The mean response of e1 to γ1 and of e2 to γ2 that ellipticities were divided by; `None` where
+    /// the submission asks for no calibration, or (then all galaxies are flagged) where it is not
+    /// positive.
+    pub response: Option<[f64; 2]>,
+}
+
+impl Measurer {
+    /// Measures one stamp with its star stamp and noise level, which may be `None` where the submission
+    /// measures it on the border of the stamp.
+    ///
+    /// The response is the galaxy's own. The ellipticity is **not calibrated**: dividing it by its own
+    /// response would be noisy and biased. Divide it by [`Batch::response`] of galaxies like this one.
+    ///
+    /// # Errors
+    /// Where sizes do not fit, the noise level is not finite, pixels are not (more of them than a linear method fills
+    /// from the opposite side), or the PSF is dark or off centre. A galaxy that cannot be measured for other reasons is
+    /// flagged.
+    pub fn stamp<T: Pixel, P: Pixel>(
+        &self,
+        stamp: ArrayView2<'_, T>,
+        psf: ArrayView2<'_, P>,
+        noise: Option<f64>,
+    ) -> Result<Measurement, MeasureError> {
+        check(self.submission(), stamp.dim(), Some(psf.dim()), noise)?;
+        if noise.is_none() && self.noise_plan().is_some() {
+            return Err(MeasureError::Noise("not given".into()));
+        }
+        let mut worker = self.worker();
+        worker.set_psf(star_psf(psf, self.submission().psf_cut())?.view())?;
+        let found = worker.measure(stamp, noise)?;
+        if found.flags.contains(Flag::NotFinite) {
+            let finite = |pixel: T| pixel.to_f32().is_finite();
+            let mut pixels = stamp.indexed_iter();
+            let place = pixels.find(|(_, pixel)| !finite(**pixel)).map(|(at, _)| at);
+            let (y, x) = place.unwrap_or_default();
+            return Err(MeasureError::NotFinite {
+                what: "stamp",
+                x: x + 1,
+                y: y + 1,
+            });
+        }
+        Ok(found)
+    }
+
+    /// Measures stamps, one each along the first axis, of one noise level, and calibrates their
+    /// ellipticities by their mean response, as the submission asks. A noise level that is given is that of white
+    /// noise; where none is, a submission that asks for it measures the noise on the stamps. Several thousand galaxies tell the
+    /// response to a per cent.
+    ///
+    /// # Errors
+    /// Where sizes or numbers do not fit, the noise level is not one, or a PSF for all cannot be used. A
+    /// galaxy with pixels that are not finite (under a linear method: too many), or with a PSF of its own that cannot be
+    /// used, is flagged.
+    pub fn batch<T: Pixel, P: Pixel>(
+        &self,
+        stamps: ArrayView3<'_, T>,
+        psfs: Psfs<'_, P>,
+        noise: Option<f64>,
+    ) -> Result<Batch, MeasureError> {
+        let (_, rows, columns) = stamps.dim();
+        let star = match psfs {
+            Psfs::Star(star) => Some(star.dim()),
+            Psfs::Stars(stars) => Some((stars.dim().1, stars.dim().2)),
+            Psfs::Functional(_) | Psfs::Prepared(_) => None,
+        };
+        check(self.submission(), (rows, columns), star, noise)?;
+        let mut worker = self.worker();
+        if noise.is_none() {
+            worker.set_survey(self.survey(stamps)?.as_ref());
+        }
+        let mut galaxies = [worker.measure_each(stamps, psfs, noise)?];
+        let response = calibrate(self.submission(), &mut galaxies);
+        let [galaxies] = galaxies;
+        Ok(Batch { galaxies, response })
+    }
+
+    /// What `stamps`, one each along the first axis, tell of their image, where the submission asks for noise to be
+    /// measured on them.
+    ///
+    /// # Errors
+    /// Where there is no stamp, stamps have other sizes than planned, or too few of them have a frame of noise
+    /// alone.
+    pub fn survey<T: Pixel>(
+        &self,
+        stamps: ArrayView3<'_, T>,
+    ) -> Result<Option<Arc<Survey>>, MeasureError> {
+        let count = stamps.len_of(Axis(0));
+        let Some(plan) = self.noise_plan() else {
+            return Ok(None);
+        };
+        if count == 0 {
+            return Err(MeasureError::Noise("not given".into()));
+        }
+        let mut survey = plan.survey();
+        for at in plan.rows(1, count) {
+            survey.add(stamps.index_axis(Axis(0), at))?;
+        }
+        survey.shared()
+    }
+}
+
+impl Worker {
+    /// Measures stamps, one each along the first axis, before any calibration. `header_noise` as in
+    /// [`Worker::measure`].
+    ///
+    /// # Errors
+    /// Where sizes or numbers do not fit, or a PSF for all cannot be used. A galaxy whose own PSF cannot be
+    /// used is flagged.
+    pub fn measure_each<T: Pixel, P: Pixel>(
+        &mut self,
+        stamps: ArrayView3<'_, T>,
+        psfs: Psfs<'_, P>,
+        header_noise: Option<f64>,
+    ) -> Result<Vec<Measurement>, MeasureError> {
+        let (cut, count) = (self.submission().psf_cut(), stamps.len_of(Axis(0)));
+        let side = stamps.len_of(Axis(1));
+        let given = match psfs {
+            Psfs::Star(_) | Psfs::Prepared(_) => count,
+            Psfs::Stars(stars) => stars.len_of(Axis(0)),
+            Psfs::Functional(formulas) => formulas.len(),
+        };
+        if given != count {
+            return Err(MeasureError::Shape {
+                what: "PSFs",
+                found: format!("{given} galaxies"),
+                expected: format!("{count}, one each"),
+            });
+        }
+        match psfs {
+            Psfs::Star(star) => self.set_psf(star_psf(star, cut)?.view())?,
+            Psfs::Prepared(psf) => self.set_psf(psf)?,
+            Psfs::Stars(_) | Psfs::Functional(_) => {}
+        }
+        let stamps = stamps.outer_iter().enumerate();
+        let measured = stamps.map(|(k, stamp)| {
+            match psfs {
+                Psfs::Star(_) | Psfs::Prepared(_) => {}
+                Psfs::Stars(stars) => self.take(star_psf(stars.index_axis(Axis(0), k), cut)),
+                Psfs::Functional(formulas) => {
+                    let stamp = formulas[k].checked_stamp(cut.size, side);
+                    self.take(stamp.map_err(MeasureError::from));
+                }
+            }
+            self.measure(stamp, header_noise)
+        });
+        measured.collect()
+    }
+
+    /// Takes a galaxy's own PSF, without which it is flagged.
+    fn take(&mut self, psf: Result<Array2<f64>, MeasureError>) {
+        let taken = psf.and_then(|psf| self.set_psf(psf.view()));
+        if taken.is_err() {
+            self.lose_psf();
+        }
+    }
+}
+
+/// Views an image of `count` stamps of `side` pixels next to each other, row-major, as stamps one each along
+/// the first axis.
+///
+/// # Errors
+/// Where the image has another number of pixels.
+pub fn strip<T>(
+    pixels: &[T],
+    count: usize,
+    side: usize,
+) -> Result<ArrayView3<'_, T>, MeasureError> {
+    length("a strip of stamps", pixels.len(), count * side * side)?;
+    let rows = ArrayView3::from_shape((side, count, side), pixels);
+    match rows {
+        Ok(rows) => Ok(rows.permuted_axes([1, 0, 2])),
+        Err(error) => Err(MeasureError::Shape {
+            what: "a strip of stamps",
+            found: format!("{count} stamps of {side} × {side} pixels"),
+            expected: error.to_string(),
+        }),
+    }
+}
+
+/// Checks what a measurement of single stamps, or of star stamps, asks for beyond that they are large enough.
+fn check(
+    submission: &Submission,
+    stamp: (usize, usize),
+    star: Option<(usize, usize)>,
+    noise: Option<f64>,
+) -> Result<(), MeasureError> {
+    let given = match (noise, submission.noise) {
+        (Some(sigma), _) => (!(sigma >= 0.0 && sigma.is_finite())).then(|| sigma.to_string()),
+        (None, NoiseSource::Header) => Some("not given".to_owned()),
+        (None, NoiseSource::Border { .. } | NoiseSource::Image { .. }) => None,
+    };
+    if let Some(found) = given {
+        return Err(MeasureError::Noise(found));
+    }
+    // The linear method's window is fixed at the middle of the stamp, where the PSF has to leave the galaxy.
+    if matches!(submission.method, Method::Linear(_)) {
+        let sides = [
+            ("stamps", Some(stamp), submission.stamp.size),
+            ("a PSF stamp", star, submission.psf.size),
+        ];
+        for (what, found, size) in sides {
+            if let Some((rows, columns)) = found
+                && (rows % 2 != size % 2 || columns % 2 != size % 2)
+            {
+                let parity = if size % 2 == 0 { "an even" } else { "an odd" };
+                let expected = format!(
+                    "{parity} number a side, as the {size} that submission {} cuts around the centre",
+                    submission.name
+                );
+                return Err(MeasureError::square(what, (rows, columns), expected));
+            }
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::{Array3, s};
+    use shearq_quantities::Shear;
+
+    use super::*;
+    use crate::flag::Flag;
+    use shearq_quantities::PsfProfile;
+
+    fn moffat(e1: f64) -> FunctionalPsf {
+        let profile = PsfProfile::Moffat { beta: 3.0 };
+        FunctionalPsf::new(profile, 3.4, Shear::new(e1, 0.0)).unwrap()
+    }
+
+    /// Elongated galaxies, every one a little more than the one before.
+    fn stamps(count: usize, side: usize) -> Array3<f32> {
+        let middle = (side as f32 - 1.0) / 2.0;
+        Array3::from_shape_fn((count, side, side), |(k, y, x)| {
+            let (y, x) = (y as f32 - middle, x as f32 - middle);
+            100.0 * (-(x * x / (9.0 + 0.5 * k as f32) + y * y / 9.0)).exp()
+        })
+    }
+
+    fn message<T>(result: Result<T, MeasureError>, expected: &str) {
+        let Err(error) = result else {
+            panic!("nothing wrong; expected {expected}")
+        };
+        assert!(error.to_string().contains(expected), "{error}");
+    }
+
+    #[test]
+    fn a_batch_is_its_stamps_divided_by_their_mean_response_in_either_precision() {
+        let measurer = Measurer::named("48/linear/star", 48).unwrap();
+        let (stamps, psf) = (stamps(6, 48), moffat(0.02));
+        let star = psf.stamp(40);
+        let batch = measurer.batch(stamps.view(), Psfs::Star(star.view()), Some(0.5));
+        let batch = batch.unwrap();
+        let response = batch.response.unwrap();
+        let mut means = [0.0; 2];
+        for (stamp, galaxy) in stamps.outer_iter().zip(&batch.galaxies) {
+            let double = stamp.mapv(f64::from);
+            let one = measurer
+                .stamp(double.view(), star.view(), Some(0.5))
+                .unwrap();
+            assert_eq!(one.response, galaxy.response);
+            assert_eq!(one.e1 / response[0], galaxy.e1);
+            means = [0, 1].map(|k| means[k] + one.response[k] / 6.0);
+        }
+        assert!((means[0] / response[0] - 1.0).abs() < 1e-12);
+        assert!((means[1] / response[1] - 1.0).abs() < 1e-12);
+        let increase = batch
+            .galaxies
+            .windows(2)
+            .all(|pair| pair[0].e1 < pair[1].e1);
+        assert!(increase, "{:?}", batch.galaxies);
+    }
+
+    #[test]
+    fn psfs_one_each_are_each_galaxys_own() {
+        let measurer = Measurer::named("23/raw/star", 48).unwrap();
+        let stamps = stamps(3, 48);
+        let formulas = [0.0, 0.1, -0.1].map(moffat);
+        let mut stars = Array3::<f32>::zeros((3, 26, 26));
+        for (formula, mut star) in formulas.iter().zip(stars.outer_iter_mut()) {
+            star.assign(&formula.stamp(26).mapv(|v| v as f32));
+        }
+        let batch = measurer
+            .batch(stamps.view(), Psfs::Stars(stars.view()), None)
+            .unwrap();
+        assert_eq!(batch.response, None);
+        for (k, galaxy) in batch.galaxies.iter().enumerate() {
+            let (stamp, star) = (stamps.slice(s![k, .., ..]), stars.slice(s![k, .., ..]));
+            let one = measurer.stamp(stamp, star, None).unwrap();
+            assert_eq!(
+                (one.e1, one.e2, one.size),
+                (galaxy.e1, galaxy.e2, galaxy.size)
+            );
+        }
+        let functional = Psfs::<f64>::Functional(&formulas);
+        let drawn = measurer.batch(stamps.view(), functional, None).unwrap();
+        for (drawn, star) in drawn.galaxies.iter().zip(&batch.galaxies) {
+            // Light beyond the 15 px of the submission, which each is normalised without.
+            assert!((drawn.e1 - star.e1).abs() < 1e-3, "{drawn:?} {star:?}");
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_measured_is_an_error_for_one_and_a_flag_for_one_of_many() {
+        let measurer = Measurer::named("48/linear/star", 48).unwrap();
+        let mut stamps = stamps(3, 48);
+        // Both sides of the galaxy.
+        stamps[(1, 7, 5)] = f32::NAN;
+        stamps.slice_mut(s![1, 23..25, ..]).fill(f32::NAN);
+        let star = moffat(0.0).stamp(32);
+        let bad = stamps.slice(s![1, .., ..]);
+        message(
+            measurer.stamp(bad, star.view(), Some(1.0)),
+            "pixel (6, 8) of the stamp, counted from 1, is not a finite number",
+        );
+        let mut stars = Array3::zeros((3, 32, 32));
+        stars.slice_mut(s![0, .., ..]).assign(&star);
+        stars.slice_mut(s![1, .., ..]).assign(&star);
+        let batch = measurer.batch(stamps.view(), Psfs::Stars(stars.view()), Some(1.0));
+        let flags: Vec<Vec<Flag>> = batch
+            .unwrap()
+            .galaxies
+            .iter()
+            .map(|galaxy| galaxy.flags.iter().collect())
+            .collect();
+        assert_eq!(flags, [vec![], vec![Flag::NotFinite], vec![Flag::BadPsf]]);
+    }
+
+    #[test]
+    fn a_linear_submission_measures_without_a_few_pixels_and_a_network_does_not() {
+        let whole = stamps(2, 48);
+        let star = moffat(0.0).stamp(32);
+        let mut holed = whole.clone();
+        holed.slice_mut(s![.., 19..22, 26..29]).fill(f32::NAN);
+        let measured = |submission: &str, stamps: &Array3<f32>| {
+            let measurer = Measurer::named(submission, 48).unwrap();
+            let psf = Psfs::Star(star.view());
+            measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
+        };
+        let linear = "48/linear/star";
+        let (found, expected) = (measured(linear, &holed), measured(linear, &whole));
+        for (found, expected) in found.galaxies.iter().zip(&expected.galaxies) {
+            assert!(found.flags.is_empty());
+            // Without noise, and the same turned by 180 degrees.
+            assert!(
+                (found.e1 - expected.e1).abs() < 1e-3,
+                "{found:?} {expected:?}"
+            );
+            assert!(
+                (found.e2 - expected.e2).abs() < 1e-3,
+                "{found:?} {expected:?}"
+            );
+        }
+        // Pixels beyond the 48 that are cut are not looked at.
+        let (mut holed, mut framed) = (stamps(2, 64), stamps(2, 64));
+        framed.slice_mut(s![.., .., ..8]).fill(f32::NAN);
+        framed.slice_mut(s![.., 56.., ..]).fill(f32::NAN);
+        let measurer = Measurer::named(linear, 64).unwrap();
+        let [whole, framed] = [&holed, &framed].map(|stamps| {
+            let psf = Psfs::Star(star.view());
+            measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
+        });
+        for (whole, framed) in whole.galaxies.iter().zip(&framed.galaxies) {
+            assert_eq!((whole.e1, whole.e2), (framed.e1, framed.e2));
+        }
+        holed.slice_mut(s![.., 30, 30]).fill(f32::NAN);
+        let network = Measurer::named("23/raw/star", 64).unwrap();
+        let network = network.batch(holed.view(), Psfs::Star(star.view()), Some(1.0));
+        let network = network.unwrap();
+        assert!(
+            network
+                .galaxies
+                .iter()
+                .all(|galaxy| galaxy.flags.contains(Flag::NotFinite))
+        );
+    }
+
+    #[test]
+    fn wrong_shapes_parities_and_numbers_are_told_with_what_was_expected() {
+        let measurer = Measurer::named("48/linear/star", 48).unwrap();
+        let (good, star) = (stamps(2, 48), moffat(0.0).stamp(32));
+        let one = good.slice(s![0, .., ..]);
+        let noise = Some(1.0);
+        message(
+            Measurer::named("48/linear/star", 40),
+            "stamps of 40 × 40 pixels; expected at least 48 × 48",
+        );
+        message(
+            Measurer::named("48/linear/stra", 48),
+            "no submission or file named",
+        );
+        let narrow = one.slice(s![.., ..46]);
+        message(
+            measurer.stamp(narrow, star.view(), noise),
+            "a stamp of 48 × 46 pixels; expected 48 × 48",
+        );
+        let small = star.slice(s![..30, ..]);
+        message(
+            measurer.stamp(one, small, noise),
+            "a PSF stamp of 30 × 32 pixels; expected at least 32 × 32",
+        );
+        message(
+            measurer.stamp(one, moffat(0.0).stamp(33).view(), noise),
+            "a PSF stamp of 33 × 33 pixels; expected an even number a side, as the 48",
+        );
+        let odd = Measurer::named("48/linear/star", 49).unwrap();
+        let stamp = stamps(1, 49);
+        message(
+            odd.stamp(stamp.slice(s![0, .., ..]), star.view(), noise),
+            "stamps of 49 × 49 pixels; expected an even number a side, as the 48",
+        );
+        let stars = Array3::<f32>::zeros((3, 32, 32));
+        message(
+            measurer.batch(good.view(), Psfs::Stars(stars.view()), noise),
+            "PSFs of 3 galaxies; expected 2, one each",
+        );
+        message(
+            measurer.batch(
+                good.view(),
+                Psfs::<f64>::Prepared(star.slice(s![1.., ..])),
+                noise,
+            ),
+            "a PSF stamp of 31 × 32 pixels; expected an even number a side, 32 to 48",
+        );
+        for (level, found) in [
+            (None, "not given"),
+            (Some(f64::NAN), "NaN"),
+            (Some(-1.0), "-1"),
+        ] {
+            let expected = format!("the noise level is {found}; expected a finite number");
+            message(measurer.stamp(one, star.view(), level), &expected);
+        }
+        let mut dead = star.clone();
+        dead[(3, 2)] = f64::INFINITY;
+        message(
+            measurer.batch(good.view(), Psfs::Star(dead.view()), noise),
+            "pixel (3, 4) of the PSF stamp",
+        );
+    }
+}

@@ -1,0 +1,599 @@
+use ndarray::{Array2, ArrayView2};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use shearq_fourier::Complex64;
+use shearq_submissions::{LinearDeconvolution, Registry};
+
+use super::super::reference::convolve;
+use super::*;
+
+fn settings(iterations: usize, target: f64, window: f64, lambda: f64) -> LinearDeconvolution {
+    let registry = Registry::embedded().unwrap();
+    let named = registry.get("48/linear/star").unwrap().submission;
+    LinearDeconvolution {
+        max_iterations: iterations,
+        target_sigma: target,
+        window_sigma: window,
+        reference_extent: 0.0,
+        reference_area: 0.0,
+        lambda,
+        step: named.linear().unwrap().deconvolution.step,
+    }
+}
+
+/// White noise.
+fn white(plan: &Spectral) -> ModeNoise {
+    plan.noise(&StampNoise::white(1.0))
+}
+
+/// A lopsided PSF of sum one, centred on its stamp.
+fn psf(p: usize) -> Array2<f64> {
+    let centre = (p as f64 - 1.0) / 2.0;
+    let psf = Array2::from_shape_fn((p, p), |(y, x)| {
+        let (dy, dx) = (y as f64 - centre, x as f64 - centre);
+        (-(dx * dx + 0.7 * dy * dy + 0.5 * dx * dy) / 3.0).exp()
+    });
+    let sum = psf.sum();
+    psf / sum
+}
+
+/// An elliptical Gaussian galaxy off the stamp's middle under a shear about the middle, before the PSF.
+fn galaxy(n: usize, g1: f64, g2: f64) -> Array2<f64> {
+    let middle = (n as f64 - 1.0) / 2.0;
+    Array2::from_shape_fn((n, n), |(y, x)| {
+        let (y, x) = (y as f64 - middle, x as f64 - middle);
+        // Position before the shear, whose matrix is (1 + γ₁, γ₂; γ₂, 1 − γ₁), of determinant
+        // one to first order.
+        let (u, v) = ((1.0 - g1) * x - g2 * y, (1.0 + g1) * y - g2 * x);
+        let (u, v) = (u + 0.3, v - 0.2);
+        (-(u * u / 7.0 + v * v / 4.0 + 0.3 * u * v / 5.0)).exp()
+    })
+}
+
+/// The galaxy as it is observed: centred PSFs of odd sides leave it where it is.
+fn observed(n: usize, h: &Array2<f64>, g1: f64, g2: f64) -> Vec<f32> {
+    let image = convolve(galaxy(n, g1, g2).view(), h.view());
+    image.iter().map(|&v| v as f32).collect()
+}
+
+fn noise(n: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    // Uniform noise of variance one.
+    let half = 3f32.sqrt();
+    (0..n * n).map(|_| rng.random_range(-half..half)).collect()
+}
+
+/// The transform of an image at wave vector (kx, ky), its first pixel at the origin: a plain sum.
+fn transform(image: ArrayView2<'_, f64>, kx: f64, ky: f64) -> Complex64 {
+    let terms = image.indexed_iter();
+    terms
+        .map(|((y, x), v)| Complex64::from_polar(*v, -(kx * x as f64 + ky * y as f64)))
+        .sum()
+}
+
+/// The autocorrelation as the module's description has it, by plain sums in f64.
+fn plain(
+    plan: &Spectral,
+    settings: &LinearDeconvolution,
+    h: &Array2<f64>,
+    stamp: &Array2<f64>,
+) -> Vec<f64> {
+    let (size, side, modes) = plan.grid();
+    let (n, p) = (stamp.nrows() as f64, h.nrows() as f64);
+    let unit = std::f64::consts::TAU / size as f64;
+    let spacing = size as f64 / side as f64;
+    let waves: Vec<f64> = (-(modes as i32)..=modes as i32)
+        .map(|j| unit * f64::from(j))
+        .collect();
+    let plane = || {
+        waves
+            .iter()
+            .flat_map(|&kx| waves.iter().map(move |&ky| (kx, ky)))
+    };
+    // v̂ of each mode.
+    let restored: Vec<Complex64> = plane()
+        .map(|(kx, ky)| {
+            let square = kx * kx + ky * ky;
+            if square > (CUT / settings.target_sigma).powi(2) {
+                return Complex64::ZERO;
+            }
+            let centre = (p - 1.0) / 2.0 * (kx + ky);
+            let h = transform(h.view(), kx, ky) * Complex64::from_polar(1.0, centre);
+            let w = h.norm_sqr() + settings.lambda * high_pass(kx, ky).powi(2);
+            let rest = (1.0 - settings.step * w).powi(settings.max_iterations as i32);
+            let gaussian = (-0.5 * settings.target_sigma.powi(2) * square).exp();
+            // cos² from three quarters of the largest wave number to it.
+            let place = (square.sqrt() * settings.target_sigma / CUT - 0.75) / 0.25;
+            let fall = (std::f64::consts::FRAC_PI_2 * place.max(0.0)).cos().powi(2);
+            let target = gaussian * fall;
+            transform(stamp.view(), kx, ky) * h.conj() * (target * (1.0 - rest) / w)
+        })
+        .collect();
+    // v at the places of the coarse grid, windowed.
+    let from_middle = |at: usize| {
+        let x = at as f64 * spacing - (n - 1.0) / 2.0;
+        x - size as f64 * (x / size as f64).round()
+    };
+    let windowed = Array2::from_shape_fn((side, side), |(y, x)| {
+        let sum: Complex64 = plane()
+            .zip(&restored)
+            .map(|((kx, ky), v)| {
+                v * Complex64::from_polar(1.0, spacing * (kx * x as f64 + ky * y as f64))
+            })
+            .sum();
+        let square = from_middle(x).powi(2) + from_middle(y).powi(2);
+        let window = (-0.5 * square / settings.window_sigma.powi(2)).exp();
+        sum.re / (size * size) as f64 * window
+    });
+    // Its power and the lags.
+    let circle = unit * modes as f64 * (1.0 + 1e-12);
+    let reach = plan.reach() as i32;
+    let powers: Vec<(f64, f64, f64)> = plane()
+        .filter(|(kx, ky)| kx.hypot(*ky) <= circle)
+        .map(|(kx, ky)| {
+            let v = transform(windowed.view(), kx * spacing, ky * spacing);
+            (
+                kx,
+                ky,
+                v.norm_sqr() * spacing.powi(4) / (size * size) as f64,
+            )
+        })
+        .collect();
+    let mut lags = Vec::new();
+    for y in 0..=reach {
+        for x in -reach..=reach {
+            let terms = powers.iter().map(|(kx, ky, power)| {
+                power * (plan.spacing() * (kx * f64::from(x) + ky * f64::from(y))).cos()
+            });
+            lags.push(terms.sum());
+        }
+    }
+    lags
+}
+
+#[test]
+fn the_autocorrelation_is_that_of_plain_sums_for_odd_and_even_sizes_and_dirty_scratch() {
+    for (n, p, iterations, lambda) in [(24, 11, 3, 0.0), (19, 8, 40, 1e-3), (13, 13, 1000, 0.0)] {
+        let settings = settings(iterations, 1.5, n as f64 / 4.0, lambda);
+        let h = psf(p);
+        let stamp = convolve(galaxy(n, 0.0, 0.0).view(), h.view());
+        let plan = Spectral::new(n, p, &settings).unwrap();
+        let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+        let data: Vec<f32> = stamp.iter().map(|&v| v as f32).collect();
+        // What another stamp left behind must not matter.
+        plan.set_psf(psf(p).t(), &white(&plan), &mut scratch, &mut own)
+            .unwrap();
+        let other: Vec<f32> = data.iter().map(|v| 1e3 - v).collect();
+        plan.autocorrelate(&own, &other, 3.0, &mut scratch, &mut lags);
+        plan.noise_field(&own, 1, &mut scratch, &mut lags);
+        plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+            .unwrap();
+        plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
+        let expected = plain(&plan, &settings, &h, &stamp);
+        let peak = expected[plan.reach()];
+        for (found, expected) in lags.acf.iter().zip(&expected) {
+            // f32 transforms; modes below `LEAST_POWER`, which are left out, have none of the light.
+            let apart = (f64::from(*found) - expected).abs();
+            assert!(apart < 1e-5 * peak, "{n} {p}: {found} {expected}");
+        }
+    }
+}
+
+#[test]
+fn pictures_show_the_stamp_whose_lags_are_measured() {
+    // The stamp's square is the autocorrelation's zero lag, on the finer grid of pixels too.
+    let (n, p) = (33, 9);
+    let settings = settings(1000, 1.5, 8.0, 0.0);
+    let h = psf(p);
+    let plan = Spectral::new(n, p, &settings).unwrap();
+    let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
+    let data = observed(n, &h, 0.1, 0.0);
+    plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
+    let picture = plan.deconvolved(h.view(), &data);
+    let square: f64 = picture.iter().map(|v| f64::from(v * v)).sum();
+    let peak = f64::from(lags.acf[plan.reach()]);
+    // The window spreads a little light beyond the largest circle of modes.
+    assert!((square / peak - 1.0).abs() < 4e-3, "{square} {peak}");
+}
+
+#[test]
+fn the_response_is_that_of_a_sheared_galaxy() {
+    // The window goes through the galaxy.
+    let (n, p) = (40, 11);
+    let h = psf(p);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 3.0, 0.0)).unwrap();
+    let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
+    let mut lags_of = |g1: f64, g2: f64| {
+        let mut lags = plan.lags();
+        plan.autocorrelate(&own, &observed(n, &h, g1, g2), 0.0, &mut scratch, &mut lags);
+        lags
+    };
+    let here = lags_of(0.0, 0.0);
+    let peak = here.acf[plan.reach()];
+    let step = 0.01;
+    for (derivative, plus, minus) in [
+        (&here.shear1, lags_of(step, 0.0), lags_of(-step, 0.0)),
+        (&here.shear2, lags_of(0.0, step), lags_of(0.0, -step)),
+    ] {
+        let largest = derivative.iter().fold(0.0f32, |a, b| a.max(b.abs()));
+        assert!(largest > 0.05 * peak);
+        for (found, (a, b)) in derivative.iter().zip(plus.acf.iter().zip(&minus.acf)) {
+            let expected = (a - b) / (2.0 * step as f32);
+            // f32 rounding over the step (1e-5), second order in the step (1e-4 of the size).
+            assert!((found - expected).abs() < 1e-3 * peak, "{found} {expected}");
+        }
+    }
+}
+
+/// The stamp of a broad Gaussian galaxy under a shear about `centre`, with light beyond all edges: cut out of a wider field.
+fn broad(n: usize, h: &Array2<f64>, centre: [f64; 2], g1: f64, g2: f64) -> Vec<f32> {
+    let beyond = 16;
+    let side = n + 2 * beyond;
+    let middle = (side as f64 - 1.0) / 2.0;
+    let field = Array2::from_shape_fn((side, side), |(y, x)| {
+        let (x, y) = (x as f64 - middle - centre[0], y as f64 - middle - centre[1]);
+        let (u, v) = ((1.0 - g1) * x - g2 * y, (1.0 + g1) * y - g2 * x);
+        let (u, v) = (u + 1.5, v - 1.0);
+        (-(u * u / 140.0 + v * v / 100.0 + 0.3 * u * v / 110.0)).exp()
+    });
+    let image = convolve(field.view(), h.view());
+    let stamp = image.slice(ndarray::s![beyond..beyond + n, beyond..beyond + n]);
+    stamp.iter().map(|&v| v as f32).collect()
+}
+
+#[test]
+fn edges_stay_where_they_are_while_the_light_is_sheared() {
+    for (n, centre) in [(40, [0.0, 0.0]), (41, [0.0, 0.0]), (40, [2.5, -3.0])] {
+        let h = psf(11);
+        let plan = Spectral::new(n, 11, &settings(1000, 1.5, n as f64 / 4.0, 0.0)).unwrap();
+        // A window that is told to be narrow does not look at the edges.
+        let mut without = plan.clone();
+        without.window_sigma = 1.0;
+        assert!(plan.sees_edges([0.0; 2]) && !without.sees_edges([0.0; 2]));
+        let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+        plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+            .unwrap();
+        plan.place_window(centre.map(|at| at as f32), &mut scratch);
+        let mut lags_of = |plan: &Spectral, g1: f64, g2: f64| {
+            let mut lags = plan.lags();
+            let stamp = broad(n, &h, centre, g1, g2);
+            plan.autocorrelate(&own, &stamp, 0.0, &mut scratch, &mut lags);
+            lags
+        };
+        let (here, naive) = (lags_of(&plan, 0.0, 0.0), lags_of(&without, 0.0, 0.0));
+        let step = 0.01;
+        for (found, naive, plus, minus) in [
+            (
+                &here.shear1,
+                &naive.shear1,
+                lags_of(&plan, step, 0.0),
+                lags_of(&plan, -step, 0.0),
+            ),
+            (
+                &here.shear2,
+                &naive.shear2,
+                lags_of(&plan, 0.0, step),
+                lags_of(&plan, 0.0, -step),
+            ),
+        ] {
+            let apart = |lags: &[f32]| {
+                let pairs = lags.iter().zip(plus.acf.iter().zip(&minus.acf));
+                let apart = pairs.map(|(found, (a, b))| {
+                    let expected = (a - b) / (2.0 * step as f32);
+                    (found - expected).powi(2)
+                });
+                apart.sum::<f32>().sqrt()
+            };
+            let [with, without] = [found, naive].map(|lags| apart(lags));
+            // The light between the last pixels and the edge is not quite on a straight line.
+            assert!(with < 0.1 * without, "{n} {centre:?}: {with} {without}");
+        }
+    }
+}
+
+#[test]
+fn light_by_what_the_psf_leaves_of_it_is_the_squared_signal_in_units_of_the_noise() {
+    let (n, p, extent) = (44, 11, 7.0);
+    let h = psf(p);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 8.0, 0.0)).unwrap();
+    let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+    let light = plan.light(extent);
+    let mut signal = |noise: &ModeNoise| {
+        plan.set_psf(h.view(), noise, &mut scratch, &mut own)
+            .unwrap();
+        let modes = light.iter().zip(own.clarity());
+        modes.map(|(light, clarity)| light * clarity).sum::<f32>()
+    };
+    let galaxy = Array2::from_shape_fn((n, n), |(y, x)| {
+        let [y, x] = [y, x].map(|at| at as f64 - (n as f64 - 1.0) / 2.0);
+        (-0.5 * (x * x + y * y) / extent).exp() / (2.0 * std::f64::consts::PI * extent)
+    });
+    let image = convolve(galaxy.view(), h.view());
+    let squares = image.iter().map(|v| v * v).sum::<f64>();
+    // Single precision; modes beyond those kept have 10⁻⁷ of the galaxy's light.
+    let found = f64::from(signal(&white(&plan)));
+    assert!((found / squares - 1.0).abs() < 1e-5, "{found} {squares}");
+    // Noise of a level of two, and of one that falls with the wavenumber along x: where it is less the galaxy is clearer.
+    let mut noise = white(&plan);
+    noise.power.fill(4.0);
+    let less = f64::from(signal(&noise));
+    assert!((4.0 * less / squares - 1.0).abs() < 1e-5, "{less}");
+    for (power, k) in noise.power.iter_mut().zip(&plan.waves) {
+        *power = (1.0 + k[0] * k[0]).recip();
+    }
+    // ∂/∂x of the image, squared, is what k_x² adds; by differences that are exact to k⁶/140, k² being 0.06 here.
+    let slopes = image.rows().into_iter().flat_map(|row| {
+        let row = row.to_vec();
+        let slope = |w: &[f64]| (45.0 * (w[4] - w[2]) - 9.0 * (w[5] - w[1]) + (w[6] - w[0])) / 60.0;
+        row.windows(7).map(|w| slope(w).powi(2)).collect::<Vec<_>>()
+    });
+    let (more, expected) = (f64::from(signal(&noise)), squares + slopes.sum::<f64>());
+    assert!((more / expected - 1.0).abs() < 1e-4, "{more} {expected}");
+}
+
+#[test]
+fn a_window_that_follows_the_galaxy_sees_what_one_in_the_middle_sees() {
+    let (n, p) = (48, 11);
+    let h = psf(p);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 6.0, 0.0)).unwrap();
+    let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
+    let middle = observed(n, &h, 0.05, -0.03);
+    // Three pixels along x and minus two along y.
+    let moved: Vec<f32> = (0..n * n)
+        .map(|at| {
+            let (x, y) = ((at % n) as i32 - 3, (at / n) as i32 + 2);
+            let side = 0..n as i32;
+            if side.contains(&x) && side.contains(&y) {
+                middle[y as usize * n + x as usize]
+            } else {
+                0.0
+            }
+        })
+        .collect();
+    let (mut there, mut here) = (plan.lags(), plan.lags());
+    plan.place_window([3.0, -2.0], &mut scratch);
+    plan.autocorrelate(&own, &moved, 0.0, &mut scratch, &mut there);
+    plan.place_window([0.0; 2], &mut scratch);
+    plan.autocorrelate(&own, &middle, 0.0, &mut scratch, &mut here);
+    let peak = here.acf[plan.reach()];
+    let pairs = |a: &[f32], b: &[f32]| {
+        let apart = a.iter().zip(b).map(|(a, b)| (a - b).abs());
+        apart.fold(0.0, f32::max)
+    };
+    // f32 through the division by the PSF's transform.
+    assert!(pairs(&there.acf, &here.acf) < 1e-4 * peak);
+    assert!(pairs(&there.shear1, &here.shear1) < 1e-3 * peak);
+    assert!(pairs(&there.shear2, &here.shear2) < 1e-3 * peak);
+}
+
+#[test]
+fn a_round_galaxy_keeps_nothing_of_the_psfs_ellipticity() {
+    let (n, p) = (48, 21);
+    let centre = (n as f64 - 1.0) / 2.0;
+    let round = Array2::from_shape_fn((n, n), |(y, x)| {
+        (-((y as f64 - centre).powi(2) + (x as f64 - centre).powi(2)) / 18.0).exp()
+    });
+    let h = psf(p);
+    let stamp = convolve(round.view(), h.view());
+    let data: Vec<f32> = stamp.iter().map(|&v| v as f32).collect();
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 8.0, 0.0)).unwrap();
+    let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
+    plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
+    let (reach, width) = (plan.reach(), 2 * plan.reach() + 1);
+    for lag in 1..=reach {
+        let (x, y) = (lags.acf[reach + lag], lags.acf[lag * width + reach]);
+        // 1e-5 is f32 through the division by the PSF's transform.
+        assert!((x - y).abs() < 2e-5 * lags.acf[reach], "{lag}: {x} {y}");
+    }
+}
+
+/// Sum of 2 × 2 pixels of white noise, halved: of variance one, and power (1 + cos k_x)(1 + cos k_y).
+fn summed(n: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    let white = noise(n + 1, rng);
+    let sum = |x: usize, y: usize| {
+        let at = y * (n + 1) + x;
+        0.5 * (white[at] + white[at + 1] + white[at + n + 1] + white[at + n + 2])
+    };
+    (0..n * n).map(|at| sum(at % n, at / n)).collect()
+}
+
+/// The noise of [`summed`], as it is known from many frames of it.
+fn of_summed(rng: &mut ChaCha8Rng) -> StampNoise {
+    let mut survey = crate::noise::NoisePlan::new(48, 1).unwrap().survey();
+    for _ in 0..2000 {
+        let stamp = Array2::from_shape_vec((48, 48), summed(48, rng)).unwrap();
+        survey.add(stamp.view()).unwrap();
+    }
+    survey.noise().unwrap()
+}
+
+#[test]
+fn noise_is_subtracted_in_the_mean_from_the_autocorrelation_and_its_derivatives() {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let correlated = of_summed(&mut rng);
+    for own in [StampNoise::white(1.0), correlated] {
+        subtracted_in_the_mean(&own, &mut rng);
+    }
+}
+
+#[test]
+fn there_is_no_noise_beyond_the_edges_of_the_stamp() {
+    let (n, p) = (32, 9);
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, n as f64 / 4.0, 0.0)).unwrap();
+    let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+    plan.set_psf(psf(p).view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
+    let mut means = [0.0; 2];
+    for _ in 0..8000 {
+        let stamp = noise(n, &mut rng);
+        for (mean, level) in means.iter_mut().zip([1.0, 0.0]) {
+            plan.autocorrelate(&own, &stamp, level, &mut scratch, &mut lags);
+            *mean += f64::from(lags.acf[plan.reach()]);
+        }
+    }
+    // 0.5 % of the window's square is beyond the edges of either axis. 8000 squares of some fifty modes: 0.2 %.
+    assert!((inside(n, n as f64 / 4.0) - 0.9953).abs() < 1e-4);
+    assert!(means[0].abs() < 0.004 * means[1], "{means:?}");
+}
+
+fn subtracted_in_the_mean(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
+    let (n, p) = (32, 9);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 5.0, 1e-4)).unwrap();
+    let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+    plan.set_psf(
+        psf(p).view(),
+        &plan.noise(own_noise),
+        &mut scratch,
+        &mut own,
+    )
+    .unwrap();
+    let count = 4000;
+    let mut means = [(); 2].map(|()| [(); 3].map(|()| vec![0.0f64; lags.acf.len()]));
+    for _ in 0..count {
+        let stamp = if own_noise.is_correlated() {
+            summed(n, rng)
+        } else {
+            noise(n, rng)
+        };
+        for (level, sums) in [own_noise.sigma() as f32, 0.0].into_iter().zip(&mut means) {
+            plan.autocorrelate(&own, &stamp, level, &mut scratch, &mut lags);
+            for (sums, lags) in sums.iter_mut().zip([&lags.acf, &lags.shear1, &lags.shear2]) {
+                for (sum, lag) in sums.iter_mut().zip(lags) {
+                    *sum += f64::from(*lag) / f64::from(count);
+                }
+            }
+        }
+    }
+    let [with, without] = means;
+    let peak = without[0][plan.reach()];
+    let largest = |lags: &[f64]| lags.iter().fold(0.0f64, |a, b| a.max(b.abs()));
+    for (kind, (with, without)) in with.iter().zip(&without).enumerate() {
+        let (left, all) = (largest(with), largest(without));
+        // Some twenty independent modes in each of 4000 stamps: 0.4 % of the peak; the shear of noise
+        // moves pixels by several of their distances, for which five times as much.
+        let tolerance = [0.012, 0.06, 0.06][kind] * peak;
+        assert!(left < tolerance, "{kind}: {left} of {all}, peak {peak}");
+        assert!(all > 3.0 * tolerance, "{kind}: {all}, peak {peak}");
+    }
+}
+
+#[test]
+fn a_field_of_noise_changes_the_autocorrelation_as_noise_on_the_stamp_does() {
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    let correlated = of_summed(&mut rng);
+    for own in [StampNoise::white(1.0), correlated] {
+        changed_as_by_noise(&own, &mut rng);
+    }
+}
+
+fn changed_as_by_noise(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
+    let (n, p) = (32, 9);
+    let h = psf(p);
+    let plan = Spectral::new(n, p, &settings(1000, 1.5, 5.0, 0.0)).unwrap();
+    let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+    plan.set_psf(h.view(), &plan.noise(own_noise), &mut scratch, &mut own)
+        .unwrap();
+    let data = observed(n, &h, 0.0, 0.0);
+    // Products of the change of a lag with itself and with the changes under sheared noise, summed
+    // over lags: of both kinds of noise.
+    let mut sums = [[0.0f64; 3]; 2];
+    let add = |sums: &mut [f64; 3], lags: &Lags| {
+        for (sum, other) in sums.iter_mut().zip([&lags.acf, &lags.shear1, &lags.shear2]) {
+            let products = lags.acf.iter().zip(other);
+            *sum += products.map(|(a, b)| f64::from(a * b)).sum::<f64>();
+        }
+    };
+    let mut lags = plan.lags();
+    plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
+    let galaxy = scratch.stamp.clone();
+    for seed in 0..6000 {
+        let stamp = if own_noise.is_correlated() {
+            summed(n, rng)
+        } else {
+            noise(n, rng)
+        };
+        plan.deconvolve(&own, &stamp, &mut scratch);
+        plan.changes(&galaxy, &mut scratch.plane, &mut lags);
+        add(&mut sums[0], &lags);
+        plan.noise_field(&own, seed, &mut scratch, &mut lags);
+        add(&mut sums[1], &lags);
+    }
+    let [expected, found] = sums;
+    let apart = |k: usize| (found[k] - expected[k]).abs() / expected[0];
+    // 6000 sums of some ten independent squares: 0.6 % each.
+    assert!(apart(0) < 0.04, "{found:?} {expected:?}");
+    for k in 1..3 {
+        // A shear moves the noise's pixels by several of their distances, which has no mean product but
+        // adds to its error.
+        assert!(apart(k) < 0.04, "{k}: {found:?} {expected:?}");
+        assert!(expected[k].abs() > 0.12 * expected[0], "{k}: {expected:?}");
+    }
+}
+
+#[test]
+fn the_field_of_a_turned_psf_is_the_field_and_what_it_lacks() {
+    for (n, p) in [(40, 11), (33, 10)] {
+        let plan = Spectral::new(n, p, &settings(1000, 1.5, 8.0, 0.0)).unwrap();
+        let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+        let straight = psf(p);
+        // Of even and odd sides alike: about the middle of its stamp.
+        let turned = Array2::from_shape_fn((p, p), |(y, x)| straight[(x, p - 1 - y)]);
+        let mut lags = [(); 3].map(|()| plan.lags());
+        let stamp = observed(n, &psf(11), 0.1, 0.2);
+        let take = |psf: &Array2<f64>, own: &mut SpectralPsf, scratch: &mut SpectralScratch| {
+            plan.set_psf(psf.view(), &white(&plan), scratch, own)
+                .unwrap();
+        };
+        take(&turned, &mut own, &mut scratch);
+        plan.autocorrelate(&own, &stamp, 0.0, &mut scratch, &mut lags[0]);
+        let seen = scratch.stamp.clone();
+        plan.noise_field(&own, 7, &mut scratch, &mut lags[0]);
+        take(&straight, &mut own, &mut scratch);
+        // The same stamp behind both.
+        scratch.stamp.copy_from_slice(&seen);
+        plan.noise_field(&own, 7, &mut scratch, &mut lags[1]);
+        plan.turned_field(&own, 7, &mut scratch, &mut lags[2]);
+        let [expected, field, lack] = lags.map(|lags| lags.acf);
+        let peak = expected
+            .iter()
+            .fold(0.0f32, |most, value| most.max(value.abs()));
+        let largest = lack
+            .iter()
+            .fold(0.0f32, |most, value| most.max(value.abs()));
+        assert!(largest > 0.05 * peak, "{largest} {peak}");
+        for ((expected, field), lack) in expected.iter().zip(&field).zip(&lack) {
+            // f32 transforms of two PSFs, divided by modes of which some are small.
+            assert!(
+                (expected - field - lack).abs() < 1e-4 * peak,
+                "{expected} {field} {lack}"
+            );
+        }
+    }
+}
+
+#[test]
+fn unusable_sizes_and_psfs_are_refused() {
+    let settings = settings(10, 1.5, 3.0, 0.0);
+    assert!(Spectral::new(65, 15, &settings).is_err());
+    assert!(Spectral::new(32, 49, &settings).is_err());
+    let plan = Spectral::new(32, 7, &settings).unwrap();
+    let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+    let mut bad = psf(7);
+    assert!(
+        plan.set_psf(psf(9).view(), &white(&plan), &mut scratch, &mut own)
+            .is_err()
+    );
+    bad[(2, 3)] = f64::NAN;
+    let error = plan
+        .set_psf(bad.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap_err();
+    assert!(error.to_string().contains("pixel (4, 3)"), "{error}");
+}

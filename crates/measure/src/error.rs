@@ -1,0 +1,86 @@
+//! What can be wrong with a request.
+
+use shearq_quantities::ProfileError;
+use shearq_submissions::SubmissionError;
+use thiserror::Error;
+
+/// What can be wrong with stamps, PSFs or settings. A galaxy that cannot be measured is no error: it has
+/// [`Flags`](crate::Flags).
+#[derive(Debug, Error)]
+pub enum MeasureError {
+    /// Sizes that do not fit.
+    #[error("{what} of {found}; expected {expected}")]
+    Shape {
+        /// What has these sizes.
+        what: &'static str,
+        /// The sizes found.
+        found: String,
+        /// The sizes expected.
+        expected: String,
+    },
+    /// A pixel that is not finite.
+    #[error("pixel ({x}, {y}) of the {what}, counted from 1, is not a finite number")]
+    NotFinite {
+        /// The image.
+        what: &'static str,
+        /// Column, 1-based.
+        x: usize,
+        /// Row, 1-based.
+        y: usize,
+    },
+    /// A noise level that is missing or not one.
+    #[error("the noise level is {0}; expected a finite number of image units, not negative")]
+    Noise(String),
+    /// No light to normalise a PSF by.
+    #[error("the pixels of the PSF stamp sum to {0}; expected a positive sum")]
+    DarkPsf(f64),
+    /// A star that is not where it should be.
+    #[error(
+        "the PSF is centred ({dx:+.1}, {dy:+.1}) px off the centre of its stamp; expected at most {most} px"
+    )]
+    OffCentre {
+        /// Offset along x.
+        dx: f64,
+        /// Offset along y.
+        dy: f64,
+        /// Largest offset along either.
+        most: f64,
+    },
+    /// A PSF profile that does not exist.
+    #[error(transparent)]
+    Profile(#[from] ProfileError),
+    /// A submission that does not exist or is not valid.
+    #[error(transparent)]
+    Submission(#[from] SubmissionError),
+}
+
+impl MeasureError {
+    /// A square image, or several, of the wrong sizes.
+    pub(crate) fn square(
+        what: &'static str,
+        (rows, columns): (usize, usize),
+        expected: impl Into<String>,
+    ) -> Self {
+        MeasureError::Shape {
+            what,
+            found: format!("{rows} × {columns} pixels"),
+            expected: expected.into(),
+        }
+    }
+}
+
+/// Checks the number of values of a slice that should hold `expected` of them.
+pub(crate) fn length(
+    what: &'static str,
+    found: usize,
+    expected: usize,
+) -> Result<(), MeasureError> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(MeasureError::Shape {
+        what,
+        found: format!("{found} values"),
+        expected: format!("{expected}"),
+    })
+}

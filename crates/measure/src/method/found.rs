@@ -1,0 +1,86 @@
+//! What the methods have in common.
+
+use ndarray::{Array2, ArrayView2};
+use shearq_quantities::Distortion;
+
+use crate::deconvolve::Descent;
+use crate::error::MeasureError;
+use crate::flag::Flag;
+use crate::noise::StampNoise;
+
+/// One thread's part in a method: its plan, PSF and buffers.
+pub(crate) trait CutWorker {
+    /// Takes the noise of the galaxies that follow, in units of its level; white at first. The PSF has to be
+    /// taken after it.
+    fn set_noise(&mut self, _noise: &StampNoise) {}
+
+    /// Takes how broad the galaxies that follow are seen in their image, in px², where that is known. The PSF has to be
+    /// taken after it.
+    fn set_extent(&mut self, _extent: Option<f64>) {}
+
+    /// Takes a PSF.
+    fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;
+
+    /// Measures a cut stamp of noise level `noise`. `None` where there is no scale to work in.
+    fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError>;
+
+    /// The deconvolved stamp and the autocorrelation behind the last measurement. For pictures.
+    fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images;
+}
+
+/// What a method found on a stamp.
+pub(crate) struct Found {
+    pub(crate) descent: Descent,
+    /// The distortion, or why there is none.
+    pub(crate) distortion: Result<Distortion, Flag>,
+    /// Response of the distortion; NaN where the method does not know it.
+    pub(crate) response: ResponseMatrix,
+    /// Sheared noise, where the method has looked at it.
+    pub(crate) sheared_noise: Option<Sheared>,
+    pub(crate) flux: f64,
+    pub(crate) radius: f64,
+    pub(crate) size: f64,
+}
+
+/// ∂χ_i/∂γ_j, `[i][j]`.
+pub(crate) type ResponseMatrix = [[f64; 2]; 2];
+
+/// How the response of a galaxy differs with a field of noise added and taken away, to a shear of
+/// that field alone.
+pub(crate) struct Sheared {
+    /// With the field added, and taken away.
+    pub(crate) sides: [(Distortion, ResponseMatrix); 2],
+    /// Change of the distortion on either side with what that field lacks to be one of a PSF turned by 90 degrees.
+    pub(crate) turned: [[f64; 2]; 2],
+    /// Factor from the difference of responses to what sheared noise adds to the mean response.
+    pub(crate) weight: f64,
+}
+
+/// The steps of a measurement as images.
+pub(crate) struct Images {
+    pub(crate) deconvolved: Array2<f64>,
+    /// Zero lag in the middle.
+    pub(crate) acf: Array2<f64>,
+    /// Weight of each lag in the moments, where it is not the same within the radius.
+    pub(crate) weight: Option<Array2<f64>>,
+    /// Pixels between lags.
+    pub(crate) spacing: f64,
+}
+
+/// The whole autocorrelation from its lags dy = 0…R, dx = −R…R: the half with dy < 0 follows from
+/// A(−dx, −dy) = A(dx, dy).
+pub(super) fn whole(lags: &[f32], reach: usize) -> Array2<f64> {
+    let side = 2 * reach + 1;
+    Array2::from_shape_fn((side, side), |(y, x)| {
+        let (y, x) = if y < reach {
+            (side - 1 - y, side - 1 - x)
+        } else {
+            (y, x)
+        };
+        f64::from(lags[(y - reach) * side + x])
+    })
+}
+
+pub(super) fn image(values: &[f32], n: usize) -> Array2<f64> {
+    Array2::from_shape_fn((n, n), |(y, x)| f64::from(values[y * n + x]))
+}

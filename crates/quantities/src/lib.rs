@@ -1,0 +1,22 @@
+//! Quantities of weak lensing as types, and the profiles that are made of them.
+//!
+//! * [`Shear`] and [`Distortion`]: the two definitions of ellipticity, which do not mix.
+//! * [`units`]: degrees, radians, pixels and multipoles.
+//! * [`FunctionalPsf`]: a Moffat or Kolmogorov PSF, integrated over pixels, with its transform.
+//! * [`radial`]: tables of radial profiles, elliptical radii and quadrature rules.
+//! * [`statistics`]: running means and medians.
+//!
+//! # Conventions
+//!
+//! Positions are in pixels, x along columns and y along rows; arrays are indexed `[y, x]`. e1 > 0 is elongation along
+//! +x, e2 > 0 along x = y. Wavenumbers are in radians per pixel. A transform is F(k) = ∫ I(x) e^(−ik·x) d²x.
+#![cfg_attr(not(test), forbid(unsafe_code))] // ndarray's slicing in tests allows it
+
+mod ellipticity;
+mod psf;
+pub mod radial;
+pub mod statistics;
+pub mod units;
+
+pub use ellipticity::{Distortion, Shear};
+pub use psf::{FunctionalPsf, ProfileError, PsfProfile, PsfTransform, TransformedPsf};

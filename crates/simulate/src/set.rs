@@ -1,0 +1,570 @@
+//! One simulated set: fields shared by its images, fields of each image, and each galaxy.
+//!
+//! Random numbers come from ChaCha8 streams: the key is (seed, set, image, purpose), the stream the
+//! galaxy's place on the grid. What a galaxy is like therefore does not depend on the order or the
+//! thread in which it is drawn.
+
+use std::ops::RangeInclusive;
+
+use ndarray::Array2;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use shearq_fourier::Complex64;
+use shearq_quantities::PsfTransform;
+use shearq_quantities::Shear;
+use shearq_quantities::{FunctionalPsf, PsfProfile};
+use shearq_scoring::modes::Decomposer;
+use shearq_scoring::{Grid, TrueShear};
+
+use super::field::{Content, ShearSpectrum, random_field};
+use super::galaxy::Galaxy;
+use super::kinds::{ImageType, SetKind, Variability};
+use super::render::{RenderScratch, Renderer};
+use super::signal::power;
+
+/// A setting of a simulation out of its range.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct SettingsError(String);
+
+/// Pixels a side of a postage stamp.
+pub const STAMP: usize = 48;
+/// Noise per pixel; images are scaled so that it is one.
+pub const NOISE_SIGMA: f64 = 1.0;
+/// Standard deviation of the intrinsic ellipticities per component, by default.
+const INTRINSIC_SIGMA: f64 = 0.14;
+/// Intrinsic ellipticities are scaled back to this modulus.
+const MAX_INTRINSIC: f64 = 0.7;
+/// Shears beyond this are not weak, and with intrinsic shapes could exceed 1.
+const MAX_SHEAR: f64 = 0.5;
+/// FWHM of every PSF in pixels.
+const FWHM: f64 = 3.4;
+/// Range of S/N in the "smooth" sets, around which the distribution is cut.
+const SNR_RANGE: (f64, f64) = (10.0, 80.0);
+
+/// Galaxies a side that a simulated image may have.
+const SIDES: RangeInclusive<usize> = 8..=400;
+
+/// Tilts of a spectrum: beyond these all power lies in one mode or none.
+const TILTS: RangeInclusive<f64> = -20.0..=20.0;
+
+/// What a simulation is made from, beside the sets and images asked for. Wherever it is read from, it is
+/// checked by [`SimulationSettings::validate`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(remote = "Self", deny_unknown_fields)]
+pub struct SimulationSettings {
+    /// Seed of all random streams.
+    pub seed: u64,
+    /// Galaxies a side.
+    pub grid: usize,
+    /// Shear power spectrum.
+    pub spectrum: ShearSpectrum,
+    /// Standard deviation of each component of the intrinsic ellipticities (shear-type).
+    pub intrinsic_sigma: f64,
+}
+
+impl Serialize for SimulationSettings {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived one.
+        SimulationSettings::serialize(self, serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for SimulationSettings {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        // The derived one.
+        let settings = SimulationSettings::deserialize(deserializer)?;
+        settings.validate().map_err(serde::de::Error::custom)?;
+        Ok(settings)
+    }
+}
+
+/// What a random stream is for.
+#[derive(Clone, Copy)]
+enum Purpose {
+    Shear = 1,
+    Intrinsic = 2,
+    Psf = 3,
+    Galaxy = 4,
+}
+
+/// Image number in a key that stands for the whole set.
+const WHOLE_SET: u32 = 0;
+
+impl SimulationSettings {
+    /// The defaults with a seed and a number of galaxies a side.
+    pub fn new(seed: u64, grid: usize) -> Self {
+        SimulationSettings {
+            seed,
+            grid,
+            spectrum: ShearSpectrum::default(),
+            intrinsic_sigma: INTRINSIC_SIGMA,
+        }
+    }
+
+    /// Checks every value against its range.
+    ///
+    /// # Errors
+    /// What was found and what was expected.
+    pub fn validate(&self) -> Result<(), SettingsError> {
+        let &SimulationSettings {
+            seed: _,
+            grid,
+            spectrum: ShearSpectrum { amplitude, tilt },
+            intrinsic_sigma,
+        } = self;
+        if !SIDES.contains(&grid) {
+            let (least, most) = (SIDES.start(), SIDES.end());
+            return Err(SettingsError(format!(
+                "the simulation has {grid} galaxies a side; expected {least} to {most}"
+            )));
+        }
+        for (what, value) in [
+            ("amplitude", amplitude),
+            ("intrinsic_sigma", intrinsic_sigma),
+        ] {
+            if !(value.is_finite() && value >= 0.0) {
+                return Err(SettingsError(format!(
+                    "the simulation's {what} is {value}; expected a finite number, not negative"
+                )));
+            }
+        }
+        if !TILTS.contains(&tilt) {
+            let (least, most) = (TILTS.start(), TILTS.end());
+            return Err(SettingsError(format!(
+                "the simulation's tilt is {tilt}; expected {least} to {most}"
+            )));
+        }
+        Ok(())
+    }
+
+    fn stream(&self, set: u32, image: u32, purpose: Purpose) -> ChaCha8Rng {
+        let mut key = [0; 32];
+        let words = [self.seed, u64::from(set), u64::from(image), purpose as u64];
+        for (bytes, word) in key.chunks_exact_mut(8).zip(words) {
+            bytes.copy_from_slice(&word.to_le_bytes());
+        }
+        ChaCha8Rng::from_seed(key)
+    }
+}
+
+/// The PSF of an image.
+#[derive(Debug, Clone)]
+pub enum PsfField {
+    /// One for all galaxies.
+    One(FunctionalPsf),
+    /// One per galaxy, `[ix, iy]`.
+    PerGalaxy(Array2<FunctionalPsf>),
+}
+
+impl PsfField {
+    /// The PSF of cell `(ix, iy)`.
+    pub fn at(&self, ix: usize, iy: usize) -> &FunctionalPsf {
+        match self {
+            PsfField::One(psf) => psf,
+            PsfField::PerGalaxy(field) => &field[(ix, iy)],
+        }
+    }
+}
+
+/// A set, ready to simulate its images.
+pub struct SetSimulator {
+    kind: SetKind,
+    settings: SimulationSettings,
+    grid: Grid,
+    decomposer: Decomposer,
+    shear: Array2<Complex64>,
+    renderer: Renderer,
+    transform: PsfTransform,
+}
+
+/// One galaxy as it might have been.
+#[derive(Debug, Clone, Copy)]
+pub struct Version {
+    /// Ellipticity before lensing.
+    pub intrinsic: Shear,
+    /// The shear on it.
+    pub shear: Shear,
+    /// Factor of its noise.
+    pub noise: f32,
+}
+
+/// What is common to all galaxies of one image.
+pub struct ImageFields {
+    /// Image number, from 1.
+    pub image: u32,
+    /// Unlensed shear-type ellipticities, `[ix, iy]`.
+    pub intrinsic: Array2<Complex64>,
+    /// PSFs.
+    pub psf: PsfField,
+}
+
+impl SetSimulator {
+    /// Draws the fields that the whole set shares.
+    ///
+    /// # Errors
+    /// Where the grid is out of range or the spectrum so high that the shear is not weak.
+    pub fn new(
+        kind: SetKind,
+        settings: SimulationSettings,
+    ) -> Result<Self, shearq_scoring::ScoringError> {
+        let grid = Grid::great10(settings.grid)?;
+        let decomposer = Decomposer::new(grid);
+        let mut rng = settings.stream(kind.set, WHOLE_SET, Purpose::Shear);
+        let shear = random_field(&decomposer, &mut rng, Content::EOnly, |l| {
+            settings.spectrum.c_l(l)
+        });
+        let strongest = shear.iter().map(|g| g.norm()).fold(0.0, f64::max);
+        // What is not a number is not weak either.
+        if strongest > MAX_SHEAR || shear.iter().any(|g| !g.norm().is_finite()) {
+            return Err(shearq_scoring::ScoringError::StrongShear {
+                found: strongest,
+                most: MAX_SHEAR,
+            });
+        }
+        let profile = psf_profile(kind);
+        Ok(SetSimulator {
+            kind,
+            settings,
+            grid,
+            decomposer,
+            shear,
+            renderer: Renderer::new(STAMP),
+            transform: PsfTransform::new(profile).expect("β = 3 and Kolmogorov are valid profiles"),
+        })
+    }
+
+    /// The set's kind.
+    pub fn kind(&self) -> SetKind {
+        self.kind
+    }
+
+    /// The grid of galaxies.
+    pub fn grid(&self) -> Grid {
+        self.grid
+    }
+
+    /// True shear, shared by all images.
+    pub fn truth(&self) -> TrueShear {
+        TrueShear {
+            g1: self.shear.mapv(|g| g.re),
+            g2: self.shear.mapv(|g| g.im),
+        }
+    }
+
+    /// True shear of cell `(ix, iy)`.
+    pub fn shear_at(&self, ix: usize, iy: usize) -> Shear {
+        let g = self.shear[(ix, iy)];
+        Shear::new(g.re, g.im)
+    }
+
+    /// S/N written into headers: that of every galaxy, or the mode of its distribution.
+    pub fn nominal_snr(&self) -> f64 {
+        match self.kind.image {
+            ImageType::LowSnr => 10.0,
+            ImageType::HighSnr => 40.0,
+            _ => 20.0,
+        }
+    }
+
+    /// Draws the fields of image `image` (from 1).
+    pub fn image_fields(&self, image: u32) -> ImageFields {
+        let number = |variability| match variability {
+            Variability::Fixed => WHOLE_SET,
+            Variability::Variable => image,
+        };
+        let set = self.kind.set;
+        let mut rng = self
+            .settings
+            .stream(set, number(self.kind.ellipticity), Purpose::Intrinsic);
+        // A white B-mode field: σ² per component and cell is half the power of both modes.
+        let cell = (self.grid.side().0 / self.grid.n as f64).powi(2);
+        let power = 2.0 * self.settings.intrinsic_sigma.powi(2) * cell;
+        let mut intrinsic = random_field(&self.decomposer, &mut rng, Content::BOnly, |_| {
+            power / NYQUIST_SHARE
+        });
+        intrinsic.mapv_inplace(|e| {
+            let modulus = e.norm();
+            if modulus > MAX_INTRINSIC {
+                e * (MAX_INTRINSIC / modulus)
+            } else {
+                e
+            }
+        });
+        let mut rng = self
+            .settings
+            .stream(set, number(self.kind.psf), Purpose::Psf);
+        ImageFields {
+            image,
+            intrinsic,
+            psf: self.psf_field(&mut rng),
+        }
+    }
+
+    /// Fixed PSF: one, of small ellipticity in a direction of the set's own. Variable PSF: an
+    /// ellipticity of modulus 0.05 turning over the field and a FWHM varying by ± 10 %, with phases
+    /// and directions of the image's own; for Kolmogorov a turbulent random field of ellipticity
+    /// instead, power ∝ ℓ^(−11/3).
+    fn psf_field(&self, rng: &mut ChaCha8Rng) -> PsfField {
+        let profile = psf_profile(self.kind);
+        let tau = std::f64::consts::TAU;
+        let psf = |fwhm: f64, e: Complex64| {
+            FunctionalPsf::new(profile, fwhm, Shear::new(e.re, e.im))
+                .expect("the PSFs drawn here are within range")
+        };
+        if self.kind.psf == Variability::Fixed {
+            let angle = rng.random_range(0.0..tau);
+            return PsfField::One(psf(FWHM, Complex64::from_polar(0.025, angle)));
+        }
+        let n = self.grid.n;
+        let phases: [f64; 4] = std::array::from_fn(|_| rng.random_range(0.0..tau));
+        let wave = |phase: f64, ix: usize, iy: usize, turns: f64| {
+            let (sin, cos) = phases[3].sin_cos();
+            let along = (ix as f64 * cos + iy as f64 * sin) / n as f64;
+            phase + turns * tau * along
+        };
+        let turbulence = (self.kind.image == ImageType::Kolmogorov).then(|| {
+            let field = random_field(&self.decomposer, rng, Content::Both, |l| {
+                l.powf(-11.0 / 3.0)
+            });
+            let mean_square = field.iter().map(|e| e.norm_sqr()).sum::<f64>() / field.len() as f64;
+            // Scaled to an rms of 0.03, and no more than 0.2 anywhere.
+            field.mapv(|e| {
+                let e = e * (0.03 / mean_square.sqrt());
+                e * (0.2 / e.norm()).min(1.0)
+            })
+        });
+        PsfField::PerGalaxy(Array2::from_shape_fn((n, n), |(ix, iy)| {
+            let fwhm = FWHM * (1.0 + 0.1 * wave(phases[0], ix, iy, 1.0).sin());
+            let e = match &turbulence {
+                Some(field) => field[(ix, iy)],
+                None => Complex64::from_polar(0.05, wave(phases[1], ix, iy, 1.5)),
+            };
+            psf(fwhm, e)
+        }))
+    }
+
+    /// Draws galaxy `(ix, iy)` of an image with its noise into `out` (48×48, row-major) and returns
+    /// its ellipticity after lensing.
+    pub fn draw(
+        &self,
+        fields: &ImageFields,
+        ix: usize,
+        iy: usize,
+        scratch: &mut RenderScratch,
+        out: &mut [f32],
+    ) -> Shear {
+        let e = fields.intrinsic[(ix, iy)];
+        let version = Version {
+            intrinsic: Shear::new(e.re, e.im),
+            shear: self.shear_at(ix, iy),
+            noise: 1.0,
+        };
+        self.draw_as(fields, (ix, iy), version, scratch, out);
+        self.observed(fields, ix, iy)
+    }
+
+    /// Draws galaxy `(ix, iy)` like [`SetSimulator::draw`], with all of its random numbers the same,
+    /// but as another version of it.
+    pub fn draw_as(
+        &self,
+        fields: &ImageFields,
+        (ix, iy): (usize, usize),
+        version: Version,
+        scratch: &mut RenderScratch,
+        out: &mut [f32],
+    ) {
+        let mut rng = self
+            .settings
+            .stream(self.kind.set, fields.image, Purpose::Galaxy);
+        rng.set_stream((iy * self.grid.n + ix) as u64);
+        let centre = (STAMP as f64 - 1.0) / 2.0;
+        let x = centre + rng.random_range(-0.5..0.5);
+        let y = centre + rng.random_range(-0.5..0.5);
+        let mut again = rng.clone();
+        let (galaxy, snr) = self.galaxy(version.intrinsic, version.shear, &mut rng);
+        let psf = self
+            .transform
+            .of(fields.psf.at(ix, iy))
+            .expect("all PSFs of a set have one profile");
+        self.renderer.render(&galaxy, &psf, (x, y), scratch, out);
+        // Lensing leaves the flux as it is: S/N is that of the galaxy before.
+        let (unlensed, _) = self.galaxy(version.intrinsic, Shear::new(0.0, 0.0), &mut again);
+        let scale = (snr * NOISE_SIGMA / power(&unlensed, &psf).sqrt()) as f32;
+        let sigma = version.noise * NOISE_SIGMA as f32;
+        for value in out.iter_mut() {
+            let noise: f32 = StandardNormal.sample(&mut rng);
+            *value = *value * scale + noise * sigma;
+        }
+    }
+
+    /// Ellipticity of galaxy `(ix, iy)` after lensing.
+    pub fn observed(&self, fields: &ImageFields, ix: usize, iy: usize) -> Shear {
+        let e = fields.intrinsic[(ix, iy)];
+        Shear::new(e.re, e.im).sheared_by(self.shear_at(ix, iy))
+    }
+
+    /// The galaxy of the set's kind, of an intrinsic ellipticity and under a shear, and its S/N.
+    fn galaxy(&self, intrinsic: Shear, shear: Shear, rng: &mut ChaCha8Rng) -> (Galaxy, f64) {
+        let shape = intrinsic.sheared_by(shear);
+        let (mut bulge, mut disc) = match self.kind.image {
+            ImageType::SmallGalaxy => (1.8, 2.6),
+            ImageType::LargeGalaxy => (3.4, 10.0),
+            _ => (2.3, 4.8),
+        };
+        let mut fraction = 0.5;
+        let mut offset = None;
+        let mut snr = self.nominal_snr();
+        match self.kind.image {
+            ImageType::SmoothSnr => {
+                // Rayleigh with its mode at 20.
+                let u: f64 = rng.random_range(f64::EPSILON..1.0);
+                snr = (snr * (-2.0 * u.ln()).sqrt()).clamp(SNR_RANGE.0, SNR_RANGE.1);
+            }
+            ImageType::SmoothGalaxy => {
+                // Log-normal sizes, 20 % wide, about the fiducial.
+                let draw: f64 = StandardNormal.sample(rng);
+                let scale = (0.2 * draw).exp();
+                bulge *= scale;
+                disc *= scale;
+            }
+            ImageType::UniformBulge => fraction = rng.random_range(0.0..1.0),
+            ImageType::OffsetBulge => {
+                let dx: f64 = StandardNormal.sample(rng);
+                let dy: f64 = StandardNormal.sample(rng);
+                // A shear moves the bulge with the rest of the galaxy.
+                let [[xx, xy], [yx, yy]] = shear.matrix();
+                offset = Some((xx * dx + xy * dy, yx * dx + yy * dy));
+            }
+            _ => {}
+        }
+        let galaxy = Galaxy::bulge_and_disc(1.0, fraction, bulge, disc, shape)
+            .and_then(|galaxy| match offset {
+                Some((dx, dy)) => galaxy.with_bulge_offset(dx, dy),
+                None => Ok(galaxy),
+            })
+            .expect("sizes, fractions and ellipticities drawn here are within range");
+        (galaxy, snr)
+    }
+}
+
+/// Share of the grid's modes inside the circle of the axes' Nyquist multipole, which random fields
+/// fill: π/4.
+const NYQUIST_SHARE: f64 = std::f64::consts::FRAC_PI_4;
+
+fn psf_profile(kind: SetKind) -> PsfProfile {
+    match kind.image {
+        ImageType::Kolmogorov => PsfProfile::Kolmogorov,
+        _ => PsfProfile::Moffat { beta: 3.0 },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn settings(seed: u64, grid: usize) -> SimulationSettings {
+        SimulationSettings::new(seed, grid)
+    }
+
+    fn simulator(set: u32, seed: u64, grid: usize) -> SetSimulator {
+        SetSimulator::new(SetKind::of(set).unwrap(), settings(seed, grid)).unwrap()
+    }
+
+    #[test]
+    fn fixed_fields_repeat_over_images_and_variable_ones_do_not() {
+        let same = |set: u32| {
+            let simulator = simulator(set, 7, 16);
+            let (a, b) = (simulator.image_fields(1), simulator.image_fields(2));
+            (a.intrinsic == b.intrinsic, a.psf.at(3, 4) == b.psf.at(3, 4))
+        };
+        assert_eq!(same(1), (false, false));
+        assert_eq!(same(2), (false, true));
+        assert_eq!(same(3), (true, false));
+    }
+
+    #[test]
+    fn intrinsic_shapes_have_the_scatter_asked_for() {
+        let simulator = simulator(2, 1, 64);
+        let fields = simulator.image_fields(1);
+        let mean = fields.intrinsic.iter().map(|e| e.norm_sqr()).sum::<f64>() / (2.0 * 4096.0);
+        // 4096 modes' worth of squared Gaussians: 2 % on the variance, four sigma on σ.
+        assert!((mean.sqrt() / 0.14 - 1.0).abs() < 0.05, "{}", mean.sqrt());
+    }
+
+    #[test]
+    fn galaxies_do_not_depend_on_order_but_on_seed_set_image_and_place() {
+        let simulator = simulator(22, 5, 16);
+        let fields = simulator.image_fields(1);
+        let draw = |simulator: &SetSimulator, fields: &ImageFields, ix, iy| {
+            let mut out = vec![0.0; STAMP * STAMP];
+            simulator.draw(fields, ix, iy, &mut RenderScratch::new(), &mut out);
+            out
+        };
+        let first = draw(&simulator, &fields, 3, 2);
+        let other = draw(&simulator, &fields, 2, 3);
+        assert_ne!(first, other);
+        assert_eq!(first, draw(&simulator, &fields, 3, 2));
+        assert_ne!(first, draw(&simulator, &simulator.image_fields(2), 3, 2));
+    }
+
+    #[test]
+    fn galaxies_have_the_same_flux_however_they_lie_to_the_psf_and_are_sheared() {
+        // Small ones, of which the stamp holds nearly all light; one elliptical PSF.
+        let simulator = simulator(14, 5, 16);
+        let fields = simulator.image_fields(1);
+        let long = fields.psf.at(3, 2).shape;
+        let mut out = vec![0.0; STAMP * STAMP];
+        let mut flux = |intrinsic: f64, shear: f64| {
+            let of = |size: f64| {
+                let scale = size / long.modulus();
+                Shear::new(scale * long.e1, scale * long.e2)
+            };
+            let version = Version {
+                intrinsic: of(intrinsic),
+                shear: of(shear),
+                noise: 0.0,
+            };
+            simulator.draw_as(
+                &fields,
+                (3, 2),
+                version,
+                &mut RenderScratch::new(),
+                &mut out,
+            );
+            out.iter().map(|v| f64::from(*v)).sum::<f64>()
+        };
+        let along = flux(0.3, 0.0);
+        for (intrinsic, shear) in [(-0.3, 0.0), (0.3, 0.05), (-0.3, 0.05)] {
+            let other = flux(intrinsic, shear);
+            // Light beyond the stamp. By the S/N of the stamp itself it was 0.006.
+            assert!(
+                (other / along - 1.0).abs() < 1e-3,
+                "{intrinsic} {shear}: {}",
+                other / along - 1.0
+            );
+        }
+    }
+
+    #[test]
+    fn noise_and_signal_have_the_levels_stated() {
+        let simulator = simulator(8, 5, 16);
+        let fields = simulator.image_fields(1);
+        let mut out = vec![0.0; STAMP * STAMP];
+        let mut scratch = RenderScratch::new();
+        let (mut total, mut corner) = (0.0, 0.0);
+        for k in 0..64 {
+            simulator.draw(&fields, k % 8, k / 8, &mut scratch, &mut out);
+            total += out.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / 64.0;
+            let frame = out[..4 * STAMP].iter().map(|v| f64::from(*v).powi(2));
+            corner += frame.sum::<f64>() / (64.0 * 4.0 * STAMP as f64);
+        }
+        // Noise of σ = 1 in the corner (12288 pixels: 1.3 %) and S/N 40: Σ I² = 1600.
+        assert!((corner - 1.0).abs() < 0.06, "{corner}");
+        let signal = total - (STAMP * STAMP) as f64;
+        // √(2·2304 + 4·1600)/√64 = 13.
+        assert!((signal - 1600.0).abs() < 52.0, "{signal}");
+    }
+}
