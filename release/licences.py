@@ -58,7 +58,7 @@ def main():
         print(f"{p['name']} {p['version']}: {p['license'] or p['license_file']}")
     print("DejaVu Sans: DejaVuSans-LICENSE")
     places = [(p["name"], path) for p in packages for path in texts(Path(p["manifest_path"]).parent)]
-    places.append(("DejaVu Sans", ROOT / "assets" / "DejaVuSans-LICENSE.txt"))
+    places.append(("DejaVu Sans", ROOT / "crates" / "render" / "fonts" / "DejaVuSans-LICENSE.txt"))
     once = {}
     for name, path in places:
         text = path.read_text(errors="replace").strip()

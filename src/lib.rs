@@ -1,33 +1,313 @@
-//! shearq: challenge scoring and submissions for weak-lensing shape measurement, around a
-//! deconvolution by a Hopfield network (Nurbaeva et al., *Hopfield Neural Network deconvolution for
-//! weak lensing measurement*).
-//!
-//! # Where things are
-//!
-//! * [`simulate`]: GREAT10-like sets.
-//! * [`io`]: files; [`pipeline`]: the chain over many galaxies, from stamps to catalogues.
-//! * [`results`]: what happens to scores: scoring, rows, stores, comparisons, baselines; [`report`]: tables
-//!   and figures.
-//! * [`study`]: the paper's calibration of λ and its results on 24 sets; biases, bounds and speed.
-//! * [`submit`]: challenge files and checks.
-//! * [`cli`]: the command line; nothing else knows it.
-//! * The crates `shearq-measure` (stamps and PSFs into ellipticities), `shearq-scoring` (spectra and figures
-//!   of merit), `shearq-submissions` (settings) and `shearq-tables` (data frames) stand below this one.
-//!
-//! # Conventions
-//!
-//! Positions are FITS pixels, 1-based; stamps are row-major with rows along y; e₁ > 0 is elongation
-//! along +x, e₂ > 0 along x = y; noise levels are standard deviations per pixel in image units.
-//! Ellipticity types, FFT scaling and units of spectra are stated in `shearq-scoring`.
+//! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage. A reader of
+//! standard output that goes away (`| head`) is no failure: the command does its work and ends quietly.
 
-pub mod cli;
-pub mod io;
-pub mod pipeline;
-pub mod report;
-pub mod results;
-pub use shearq_simulate as simulate;
-pub mod study;
-pub mod submit;
+mod arguments;
+mod choices;
+mod commands;
+mod progress;
 
-/// Version of this package, as outputs carry it.
-pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+use commands::{
+    baseline, bench, calibrate, check, compare, gather, help_files, mean, measure, merge, pack,
+    quickstart, reproduce, run, score, show, simulate, study, submissions, unpack,
+};
+use shearq_render::escape::visible;
+use shearq_render::figure::HeatMap;
+use shearq_render::table::Table;
+use shearq_render::terminal::fitted;
+
+/// Score and submit weak-lensing shape measurements, and measure them by Hopfield-network
+/// deconvolution.
+///
+/// Start with `shearq quickstart`. The chain in steps: `simulate` writes GREAT10-like sets (or `gather` takes
+/// stamps of your own), `measure` turns images into catalogues by a named submission, `score` turns catalogues
+/// into Q, M/2 and √A, `compare` puts variants side by side, `pack` and `check` prepare what is sent.
+/// `mean` ends a field of constant shear. `run` measures and scores in one go; `merge` completes what parts of it on a cluster left.
+#[derive(Debug, Parser)]
+#[command(name = "shearq", version, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    #[command(after_help = "Example:\n  shearq quickstart --out first")]
+    Quickstart(quickstart::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq simulate --sets 1,2,7-9 --images 10 --seed 1 --out data"
+    )]
+    Simulate(simulate::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq gather --stamps cube.fits --psf star.fits --out data\n  shearq gather --exposure field.fits --positions galaxies.csv --psf stars.fits --out data"
+    )]
+    Gather(gather::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq measure --submission 48/linear/star --data data --out linear"
+    )]
+    Measure(measure::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq run --simulate --sets all --images 200 --submission 48/linear/star --out run"
+    )]
+    Run(run::Arguments),
+    #[command(after_help = "Example:\n  shearq merge run --sets all --images 200 --shards 8")]
+    Merge(merge::Arguments),
+    #[command(after_help = "Example:\n  shearq mean --measured linear")]
+    Mean(mean::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq score --measured linear --wide\n  shearq score --truth truth.csv catalogue-1.csv catalogue-2.csv"
+    )]
+    Score(score::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq compare raw den linear --format latex\n  shearq compare --store results --where 'snr=high,submission=23/*' --sort q:desc"
+    )]
+    Compare(compare::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq baseline record mine --measured raw den\n  shearq baseline check mine"
+    )]
+    Baseline(baseline::Arguments),
+    #[command(after_help = "Example:\n  shearq check to-send.tar.gz --data data")]
+    Check(check::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq pack --measured linear --method MINE --out to-send.tar.gz"
+    )]
+    Pack(pack::Arguments),
+    #[command(after_help = "Example:\n  shearq unpack to-send.tar.gz --out sent")]
+    Unpack(unpack::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq show --submission 48/linear/star --data data --galaxy 7/1/42 --out galaxy.png"
+    )]
+    Show(show::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq calibrate --submission 23/den/star --out calibration"
+    )]
+    Calibrate(calibrate::Arguments),
+    #[command(after_help = "Example:\n  shearq reproduce --images 4 --out paper")]
+    Reproduce(reproduce::Arguments),
+    #[command(after_help = "Example:\n  shearq study --sets 2,8 --images 10 --pairs 4 --out study")]
+    Study(study::Arguments),
+    #[command(after_help = "Example:\n  shearq bench --submission 48/linear/star")]
+    Bench(bench::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq submissions show 48/linear/star\n  shearq submissions init own.toml --method linear"
+    )]
+    Submissions(submissions::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq completions bash > ~/.local/share/bash-completion/completions/shearq"
+    )]
+    Completions(help_files::Completions),
+    #[command(after_help = "Example:\n  shearq manual ~/.local/share/man/man1")]
+    Manual(help_files::Manual),
+}
+
+/// What the command found: done.
+const DONE: u8 = 0;
+/// It failed, or found something.
+const FAILED: u8 = 1;
+/// It was called wrongly.
+const MISUSED: u8 = 2;
+
+/// Runs the command that this process was started with.
+pub fn main() -> ExitCode {
+    progress::end_at_interrupt();
+    ExitCode::from(run_with(std::env::args_os()))
+}
+
+/// Parses the arguments, of which the first is the program's name, runs the command and reports its error, if
+/// any, in one place. Returns the exit code.
+pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
+    let cli = match Cli::try_parse_from(arguments) {
+        Ok(cli) => cli,
+        Err(message) => return usage(&message),
+    };
+    let result = match cli.command {
+        Command::Quickstart(arguments) => quickstart::run(&arguments),
+        Command::Simulate(arguments) => simulate::run(&arguments),
+        Command::Gather(arguments) => gather::run(&arguments),
+        Command::Measure(arguments) => measure::run(&arguments),
+        Command::Run(arguments) => run::run(&arguments),
+        Command::Mean(arguments) => mean::run(&arguments),
+        Command::Merge(arguments) => merge::run(&arguments),
+        Command::Score(arguments) => score::run(&arguments),
+        Command::Compare(arguments) => compare::run(&arguments),
+        Command::Baseline(arguments) => baseline::run(&arguments),
+        Command::Check(arguments) => check::run(&arguments),
+        Command::Pack(arguments) => pack::run(&arguments),
+        Command::Unpack(arguments) => unpack::run(&arguments),
+        Command::Show(arguments) => show::run(&arguments),
+        Command::Calibrate(arguments) => calibrate::run(&arguments),
+        Command::Reproduce(arguments) => reproduce::run(&arguments),
+        Command::Study(arguments) => study::run(&arguments),
+        Command::Bench(arguments) => bench::run(&arguments),
+        Command::Submissions(arguments) => submissions::run(&arguments),
+        Command::Completions(arguments) => help_files::completions(&arguments),
+        Command::Manual(arguments) => help_files::manual(&arguments),
+    };
+    match result {
+        Ok(()) => DONE,
+        Err(error) if error.is::<Findings>() => FAILED,
+        Err(error) => {
+            tell(format_args!("error: {error:#}"));
+            FAILED
+        }
+    }
+}
+
+/// Prints help, the version or what is wrong with the arguments.
+fn usage(message: &clap::Error) -> u8 {
+    match written(|| message.print()) {
+        Ok(()) => u8::try_from(message.exit_code()).unwrap_or(MISUSED),
+        Err(error) => {
+            tell(format_args!("error: {error:#}"));
+            FAILED
+        }
+    }
+}
+
+/// Failure of a command whose printed results say already what was found.
+#[derive(Debug, thiserror::Error)]
+#[error("there are findings")]
+struct Findings;
+
+/// Prints a heat map below a table that is read on a terminal; where output goes to a file or
+/// another program, nothing. `NO_COLOR` and a terminal without colours are respected.
+fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
+    use std::io::IsTerminal;
+    if !std::io::stdout().is_terminal() {
+        return Ok(());
+    }
+    // Two digits a cell leave room for 24 sets.
+    let decimals = usize::from(!map.values.iter().any(|value| *value >= 10.0));
+    let map = HeatMap { decimals, ..map };
+    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
+    let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
+    // Its colours are control characters; names were checked when they were read.
+    write(&format!("\n{}", map.terminal(coloured)))
+}
+
+/// Says something on standard error; a reader that has gone away is no error.
+fn tell(line: std::fmt::Arguments<'_>) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stderr(), "{}", visible(&line.to_string()));
+}
+
+/// A number of things.
+fn count(number: usize, thing: &str) -> String {
+    let ending = if number == 1 { "" } else { "s" };
+    format!("{number} {thing}{ending}")
+}
+
+/// Columns of the terminal that results are printed on; where they go elsewhere, those that `COLUMNS`
+/// names, or 80.
+fn width() -> usize {
+    let told = || std::env::var("COLUMNS").ok()?.parse().ok();
+    let terminal = terminal_size::terminal_size_of(std::io::stdout());
+    terminal
+        .map(|(width, _)| usize::from(width.0))
+        .or_else(told)
+        .filter(|width| *width > 0)
+        .unwrap_or(80)
+}
+
+/// Prints a table for reading, within the terminal's width.
+fn print_table(table: &Table) -> anyhow::Result<()> {
+    print(&fitted(table, Some(width())))
+}
+
+/// Prints results to standard output; a reader that has gone away is no error.
+fn print(text: &str) -> anyhow::Result<()> {
+    write(&visible(text))
+}
+
+/// The same for text with control characters of ours.
+fn write(text: &str) -> anyhow::Result<()> {
+    use std::io::Write;
+    written(|| std::io::stdout().write_all(text.as_bytes()))
+}
+
+/// Writes to standard output, of which nothing may be left in a buffer whose loss would not be noticed.
+fn written(write: impl FnOnce() -> std::io::Result<()>) -> anyhow::Result<()> {
+    use std::io::Write;
+    match write().and_then(|()| std::io::stdout().flush()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(anyhow::Error::new(error).context("standard output"))
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    /// The words of a line of a shell, of which quotes and redirections are understood.
+    fn words(line: &str) -> Vec<String> {
+        let line = line.split(" > ").next().unwrap_or(line);
+        line.split_whitespace()
+            .map(|word| word.trim_matches('\'').to_owned())
+            .collect()
+    }
+
+    /// The commands in the documents, a backslash at the end of a line putting two together; those without variables
+    /// of a shell.
+    fn documented() -> Vec<(String, String)> {
+        let mut found = Vec::new();
+        let mut pages = vec!["README.md".into(), "CONTRIBUTING.md".into()];
+        pages.extend(
+            std::fs::read_dir("docs")
+                .unwrap()
+                .map(|entry| entry.unwrap().path())
+                .filter(|path| path.extension().is_some_and(|ending| ending == "md")),
+        );
+        for page in pages {
+            let text = std::fs::read_to_string(&page).unwrap();
+            let text = text.replace("\\\n", " ");
+            let mut inside = false;
+            for line in text.lines() {
+                if line.starts_with("```") {
+                    inside = !inside;
+                } else if inside && line.starts_with("shearq ") && !line.contains('$') {
+                    found.push((page.display().to_string(), line.to_owned()));
+                }
+            }
+        }
+        found
+    }
+
+    #[test]
+    fn every_command_in_the_documents_is_understood() {
+        let commands = documented();
+        assert!(commands.len() > 20);
+        for (page, line) in commands {
+            let line = line.split(" #").next().unwrap_or(&line);
+            let parsed = Cli::try_parse_from(words(line));
+            assert!(parsed.is_ok(), "{page}: {line}: {}", parsed.unwrap_err());
+        }
+    }
+
+    #[test]
+    fn every_command_has_an_example_that_it_understands() {
+        for command in Cli::command().get_subcommands() {
+            let help = command
+                .get_after_help()
+                .map(ToString::to_string)
+                .unwrap_or_default();
+            let start = format!("  shearq {}", command.get_name());
+            let examples: Vec<&str> = help
+                .lines()
+                .filter(|line| line.starts_with(&start))
+                .collect();
+            assert!(!examples.is_empty(), "{}: {help}", command.get_name());
+            for example in examples {
+                let parsed = Cli::try_parse_from(words(example));
+                assert!(parsed.is_ok(), "{example}: {}", parsed.unwrap_err());
+            }
+        }
+    }
+}

@@ -8,5 +8,5 @@ use pyo3::prelude::*;
 /// code.
 #[pyfunction]
 pub(crate) fn run_command(py: Python<'_>, arguments: Vec<OsString>) -> u8 {
-    py.detach(|| shearq::cli::run_with(arguments))
+    py.detach(|| shearq::run_with(arguments))
 }

@@ -2,8 +2,8 @@
 
 use pyo3::PyErr;
 use pyo3::exceptions::{PyKeyError, PyMemoryError, PyRuntimeError, PyValueError};
-use shearq::pipeline::PipelineError;
 use shearq_measure::MeasureError;
+use shearq_pipeline::PipelineError;
 use shearq_scoring::ScoringError;
 use shearq_submissions::SubmissionError;
 

@@ -2,7 +2,7 @@
 //!
 //! What Python hands in is looked at by the package around it (`python/shearq`), which knows how arguments are
 //! called; here, arrays become views, requests become those of the crates, and errors become exceptions.
-//! Threads are started by `shearq::pipeline::engine` alone, with the interpreter released.
+//! Threads are started by `shearq_pipeline::engine` alone, with the interpreter released.
 
 mod command;
 mod errors;
@@ -31,5 +31,5 @@ mod _shearq {
     /// Version of shearq.
     #[pymodule_export]
     #[expect(non_upper_case_globals, reason = "its name in Python")]
-    const __version__: &str = shearq::VERSION;
+    const __version__: &str = shearq_pipeline::VERSION;
 }

@@ -7,11 +7,11 @@ use numpy::{IntoPyArray, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use shearq::pipeline::engine;
 use shearq_measure::{
     Flag, MeasureError, Measurement, Measurer, NoisePlan, Pixel, Psfs, Survey, Worker, calibrate,
     star_psf,
 };
+use shearq_pipeline::engine;
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
 
@@ -236,7 +236,11 @@ fn formulas(rows: ArrayView2<'_, f64>) -> Result<Vec<FunctionalPsf>, MeasureErro
             beta if beta.is_nan() => PsfProfile::Kolmogorov,
             beta => PsfProfile::Moffat { beta },
         };
-        FunctionalPsf::new(profile, row[0], Shear::new(row[1], row[2]))
+        Ok(FunctionalPsf::new(
+            profile,
+            row[0],
+            Shear::new(row[1], row[2]),
+        )?)
     };
     rows.outer_iter().map(formula).collect()
 }

@@ -6,15 +6,15 @@ use numpy::IntoPyArray;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use shearq::pipeline::engine;
-use shearq::pipeline::simulate::{simulator, star};
-use shearq::simulate::field::ShearSpectrum;
-use shearq::simulate::render::RenderScratch;
-use shearq::simulate::set::{
-    ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
-};
+use shearq_pipeline::engine;
+use shearq_pipeline::simulate::{simulator, star};
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
+use shearq_simulate::field::ShearSpectrum;
+use shearq_simulate::render::RenderScratch;
+use shearq_simulate::set::{
+    ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
+};
 
 use crate::errors::{no_memory, of_pipeline};
 use crate::work::{Failure, Watch, threads};

@@ -4,7 +4,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use pyo3::prelude::*;
-use shearq::pipeline::PipelineError;
+use shearq_pipeline::PipelineError;
 
 use crate::errors::of_pipeline;
 

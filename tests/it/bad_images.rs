@@ -6,7 +6,7 @@ use std::fs;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_tables::polars::df;
+use shearq_files::frames::polars::df;
 
 use crate::support::{PACKED, Small, fits_image, floats, pixels_of};
 
@@ -131,7 +131,7 @@ fn images_of_other_shapes_and_types_work_or_are_refused() {
     }
     let table = small.at("data/set02/table.fits");
     let columns = df!("a" => [1.0]).unwrap();
-    shearq::io::fits::write_table(&table, &columns, &[]).unwrap();
+    shearq_files::fits::write_table(&table, &columns, &[]).unwrap();
     let expected = ["the first extension is a table; expected a two-dimensional image"];
     refuse(&small, first, &fs::read(&table).unwrap(), &RAW, &expected);
 

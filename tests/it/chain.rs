@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use serde_json::Value;
-use shearq::report::table::Cell;
+use shearq_render::table::Cell;
 
 use crate::support::{contents, fail, succeed, text};
 

@@ -1,7 +1,7 @@
 //! Every kind of figure with data that are empty, constant, not finite or extreme, and the errors.
 
 use ndarray::{Array2, array};
-use shearq::report::figure::{
+use shearq_render::figure::{
     BarGroup, BarPlot, ColourMap, Figure, FigureError, HeatMap, ImageGrid, ImagePanel, ImageRow,
     LinePlot, PanelGrid, PictureFormat, Scale, Series, Stretch, Style,
 };

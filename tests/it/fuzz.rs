@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use shearq::io::layout::DataFolder;
-use shearq::io::run::Run;
-use shearq::io::table;
-use shearq::pipeline::images::ImageId;
-use shearq::pipeline::measure::ImageSource;
-use shearq::results::foreign::Foreign;
-use shearq::submit::challenge::{Kind, read_spectrum};
+use shearq_files::table;
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::run::Run;
+use shearq_pipeline::images::ImageId;
+use shearq_pipeline::measure::ImageSource;
+use shearq_results::foreign::Foreign;
+use shearq_results::submit::challenge::{Kind, read_spectrum};
 use shearq_submissions::{Registry, Submission};
 
 use crate::bad_images::gzip;

@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use shearq::simulate::galaxy::Galaxy;
-use shearq::simulate::render::{RenderScratch, Renderer, render_reference};
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
 use shearq_quantities::{PsfTransform, TransformedPsf};
+use shearq_simulate::galaxy::Galaxy;
+use shearq_simulate::render::{RenderScratch, Renderer, render_reference};
 
 use crate::support::shared;
 

@@ -1,11 +1,11 @@
 //! Every submission on images that GalSim rendered: measured ellipticities follow the truth.
 
-use shearq::io::layout::DataFolder;
-use shearq::io::run::{Run, Source};
-use shearq::io::table::{self, FileFormat};
-use shearq::pipeline::Quiet;
-use shearq::pipeline::images;
-use shearq::pipeline::measure::measure_folder;
+use shearq_files::table::{self, FileFormat};
+use shearq_pipeline::Quiet;
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::images;
+use shearq_pipeline::measure::measure_folder;
 use shearq_submissions::{Calibration, Registry};
 
 use crate::support::{csv, shared};

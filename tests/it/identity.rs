@@ -6,11 +6,11 @@ use std::process::{Command, Output};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use shearq::io::fits::{ImageReader, ImageWriter, Value};
-use shearq::io::run::{read_record, write_record};
-use shearq::report::table::{Cell, Heading, Table, TableFormat};
-use shearq::simulate::field::ShearSpectrum;
-use shearq::simulate::set::SimulationSettings;
+use shearq_files::fits::{ImageReader, ImageWriter, Value};
+use shearq_pipeline::data::run::{read_record, write_record};
+use shearq_render::table::{Cell, Heading, Table, TableFormat};
+use shearq_simulate::field::ShearSpectrum;
+use shearq_simulate::set::SimulationSettings;
 use shearq_submissions::{Denoise, Method, Registry, Submission};
 
 use crate::support::{contents, succeed, text};

@@ -6,8 +6,8 @@ use std::path::Path;
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
-use shearq_tables::polars::df;
-use shearq_tables::{Metadata, read_parquet, write_parquet};
+use shearq_files::frames::polars::df;
+use shearq_files::frames::{Metadata, read_parquet, write_parquet};
 
 use crate::support::{Small, fail, run_simulated, shearq, succeed, text};
 

@@ -1,12 +1,12 @@
 //! The PSF's orientation: deconvolution undoes it, and a turned or flipped PSF does not.
 
 use ndarray::{Array2, ArrayView2};
-use shearq::simulate::galaxy::Galaxy;
-use shearq::simulate::render::{RenderScratch, Renderer};
 use shearq_measure::Measurer;
 use shearq_quantities::PsfTransform;
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
+use shearq_simulate::galaxy::Galaxy;
+use shearq_simulate::render::{RenderScratch, Renderer};
 use shearq_submissions::{Denoise, Method, Registry, StepScale};
 
 #[test]

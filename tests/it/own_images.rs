@@ -4,8 +4,8 @@ use std::fs;
 use std::path::Path;
 
 use serde_json::Value;
-use shearq::io::fits::{self, ImageWriter};
-use shearq::io::table;
+use shearq_files::fits::{self, ImageWriter};
+use shearq_files::table;
 
 use crate::bad_images::gzip;
 use crate::support::{Small, fail, pixels_of, shearq, succeed, text};

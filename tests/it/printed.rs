@@ -5,8 +5,8 @@ use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use shearq::io::run::Run;
-use shearq::results::store;
+use shearq_pipeline::data::run::Run;
+use shearq_results::store;
 
 use crate::support::{Small, fail, run_simulated, shearq, succeed, text};
 

@@ -5,17 +5,17 @@ use ndarray::Array2;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq::pipeline::Quiet;
-use shearq::pipeline::run::measurers;
-use shearq::pipeline::simulate::simulator;
-use shearq::results::score::OWN;
-use shearq::simulate::kinds::shares;
-use shearq::simulate::set::SimulationSettings;
-use shearq::study::bias::biases;
-use shearq::study::calibration::{LOG_LAMBDA, PAPER_LAMBDA, calibrate};
-use shearq::study::exhibits::{Finding, findings, lambda_findings};
-use shearq::study::reproduce::{Plan, SetResult, Study, run_sets};
+use shearq_pipeline::Quiet;
+use shearq_pipeline::run::measurers;
+use shearq_pipeline::simulate::simulator;
+use shearq_results::score::OWN;
 use shearq_scoring::{Figures, Options, SetImages, SetScorer};
+use shearq_simulate::kinds::shares;
+use shearq_simulate::set::SimulationSettings;
+use shearq_studies::bias::biases;
+use shearq_studies::calibration::{LOG_LAMBDA, PAPER_LAMBDA, calibrate};
+use shearq_studies::exhibits::{Finding, findings, lambda_findings};
+use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
 use shearq_submissions::{PsfForm, Registry, Submission};
 
 /// A set of each kind.
@@ -263,7 +263,7 @@ fn updates_compare_as_the_paper_found() {
         assert!(curve[strong].mean_dsnr() < curve[weak].mean_dsnr() - 1.0);
     }
     // The mean over S/N; λ has steps of half a decade.
-    let highest = |curves: &shearq::study::calibration::Curves| {
+    let highest = |curves: &shearq_studies::calibration::Curves| {
         let mean = |k: usize| {
             curves.over_lambda[0]
                 .iter()

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use shearq::io::table;
+use shearq_files::table;
 
 /// The images of `tests/data` that fpack made, one for each of its ways.
 pub const PACKED: [&str; 7] = [
@@ -194,7 +194,7 @@ pub fn fits_image(bitpix: i32, sides: &[usize], cards: &[&str], pixels: &[u8]) -
 
 /// All pixels of an image, and its side.
 pub fn pixels_of(path: &Path) -> (Vec<f32>, usize) {
-    let mut image = shearq::io::fits::ImageReader::open(path).expect("an image");
+    let mut image = shearq_files::fits::ImageReader::open(path).expect("an image");
     let side = image.width();
     (image.read_rows(side).expect("its pixels"), side)
 }

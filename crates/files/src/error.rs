@@ -1,0 +1,71 @@
+//! One kind of error for everything that can be wrong with a file.
+
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+
+use thiserror::Error;
+
+/// A file that cannot be used: which, where in it, what was found and what was expected.
+#[derive(Debug, Error)]
+#[error("{}: {message}", path.display())]
+pub struct FileError {
+    /// The file.
+    pub path: PathBuf,
+    /// Place, what was found, what was expected.
+    pub message: String,
+    /// Whether all that is wrong is that a column asked for is not there.
+    pub no_column: bool,
+}
+
+/// Most names of columns that a message lists.
+const SHOWN: usize = 40;
+
+/// Most characters of a message, which may quote what a file holds.
+const LONGEST: usize = 4000;
+
+/// Names of columns as a message lists them.
+pub fn names_of(names: &[impl AsRef<str>]) -> String {
+    let shown: Vec<&str> = names.iter().take(SHOWN).map(AsRef::as_ref).collect();
+    let more = if names.len() > SHOWN { ", …" } else { "" };
+    shown.join(", ") + more
+}
+
+impl FileError {
+    /// About `path`, saying `message`.
+    pub fn new(path: impl AsRef<Path>, message: impl Display) -> Self {
+        let mut message = message.to_string();
+        if let Some((end, _)) = message.char_indices().nth(LONGEST) {
+            message.truncate(end);
+            message.push('…');
+        }
+        FileError {
+            path: path.as_ref().to_owned(),
+            message,
+            no_column: false,
+        }
+    }
+
+    /// About `path`, whose columns are `found`, without one named `wanted`.
+    pub fn no_column(path: &Path, wanted: &str, found: &[impl AsRef<str>]) -> Self {
+        let found = names_of(found);
+        let message = format!("there is no column `{wanted}`; columns found: {found}");
+        FileError {
+            no_column: true,
+            ..FileError::new(path, message)
+        }
+    }
+
+    /// With a word on where the names of columns come from, if one was not found.
+    pub fn hint_of_columns(mut self, hint: &str) -> Self {
+        if self.no_column {
+            self.message = format!("{}; {hint}", self.message);
+        }
+        self
+    }
+
+    /// For `map_err`: about `path`, while doing `what`.
+    pub fn doing<E: Display>(path: &Path, what: &'static str) -> impl FnOnce(E) -> FileError {
+        let path = path.to_owned();
+        move |error| FileError::new(path, format!("{what}: {error}"))
+    }
+}

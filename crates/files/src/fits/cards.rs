@@ -1,0 +1,131 @@
+//! Header cards as cfitsio reads them, before it does: some of them it divides by, and for some it
+//! takes memory, while it opens a header.
+
+use std::collections::BTreeMap;
+use std::ffi::{c_char, c_int};
+use std::ops::RangeInclusive;
+
+use fitsio::sys;
+
+use super::file::plain;
+use super::lock;
+use super::source::Source;
+use crate::error::FileError;
+
+/// Bytes of a header card.
+const CARD: usize = 80;
+/// Bytes of a block of a file.
+const BLOCK: usize = 2880;
+/// Most bytes of a header: fifty thousand cards.
+const MOST: u64 = 1 << 22;
+/// Longest value that cfitsio has room for.
+const LONGEST_VALUE: usize = 70;
+/// Longest comment that it has room for.
+const LONGEST_COMMENT: usize = 72;
+/// Keys that describe a compressed image; `#` stands for a number.
+const KEYS: [&str; 10] = [
+    "ZIMAGE", "ZCMPTYPE", "ZBITPIX", "ZNAXIS", "ZNAXIS#", "ZTILE#", "ZVAL#", "ZNAME#", "ZQUANTIZ",
+    "ZDITHER0",
+];
+
+/// The keys of a header that describe a compressed image, by name in capitals, with their values.
+pub struct Cards(BTreeMap<String, String>);
+
+impl Cards {
+    /// Of the header that starts at a byte of the file; `None` where the file ends there.
+    ///
+    /// # Errors
+    /// Where the header has no end, a card that cfitsio has no room for, or two of these keys.
+    pub fn read(source: &mut Source, start: u64) -> Result<Option<Self>, FileError> {
+        let mut cards = BTreeMap::new();
+        let mut at = start;
+        loop {
+            let block = source.read_at(at, BLOCK)?;
+            if block.is_empty() && at == start {
+                return Ok(None);
+            }
+            if block.len() < BLOCK || at - start >= MOST {
+                let read = at - start + block.len() as u64;
+                let message = format!(
+                    "cannot open the file: the header from byte {start} has no END in {read} bytes"
+                );
+                return Err(FileError::new(source.path(), message));
+            }
+            for (k, card) in block.chunks_exact(CARD).enumerate() {
+                if card.starts_with(b"END     ") {
+                    return Ok(Some(Cards(cards)));
+                }
+                let wrong = |what: String| {
+                    let byte = at + (k * CARD) as u64;
+                    let message = format!("the header card at byte {byte} {what}");
+                    FileError::new(source.path(), message)
+                };
+                let (key, value) = parse(card).map_err(wrong)?;
+                if KEYS.contains(&key.replace(|c: char| c.is_ascii_digit(), "#").as_str())
+                    || KEYS.contains(&key.as_str())
+                {
+                    let name = key.clone();
+                    if cards.insert(key, value).is_some() {
+                        return Err(wrong(format!("is the second one named {name}")));
+                    }
+                }
+            }
+            at += BLOCK as u64;
+        }
+    }
+
+    /// The text of a key, without quotes; `None` where it is absent.
+    pub fn text(&self, key: &str) -> Option<&str> {
+        let value = self.0.get(key)?;
+        let inner = value.strip_prefix('\'').and_then(|v| v.strip_suffix('\''));
+        Some(inner.unwrap_or(value).trim_end())
+    }
+
+    /// The whole number of a key, which must be in a range; `None` where it is absent.
+    ///
+    /// # Errors
+    /// What else was found.
+    pub fn number(&self, key: &str, range: RangeInclusive<usize>) -> Result<Option<usize>, String> {
+        let Some(value) = self.0.get(key) else {
+            return Ok(None);
+        };
+        let number = value.parse().ok().filter(|number| range.contains(number));
+        number.map(Some).ok_or_else(|| {
+            let (first, last) = (range.start(), range.end());
+            format!("the header key {key} is {value}; expected a whole number, {first} to {last}")
+        })
+    }
+}
+
+/// Name of a card, in capitals, and its value.
+fn parse(card: &[u8]) -> Result<(String, String), String> {
+    let mut text = [0 as c_char; CARD + 1];
+    for (to, from) in text.iter_mut().zip(card) {
+        *to = c_char::from_ne_bytes([*from]);
+    }
+    // Longer than anything that a card can hold.
+    let [mut name, mut value, mut comment] = [[0 as c_char; 2 * CARD + 2]; 3];
+    let (mut length, mut status): (c_int, c_int) = (0, 0);
+    let _guard = lock();
+    // SAFETY: the card ends in a zero byte, and what is found of it has room.
+    unsafe {
+        sys::ffgknm(
+            text.as_mut_ptr(),
+            name.as_mut_ptr(),
+            &mut length,
+            &mut status,
+        );
+        sys::ffpsvc(
+            text.as_mut_ptr(),
+            value.as_mut_ptr(),
+            comment.as_mut_ptr(),
+            &mut status,
+        );
+        sys::ffcmsg();
+    }
+    let length = |text: &[c_char]| text.iter().take_while(|c| **c != 0).count();
+    if length(&value) > LONGEST_VALUE || length(&comment) > LONGEST_COMMENT {
+        return Err("has a value or a comment that is too long".into());
+    }
+    Ok((plain(&name).to_ascii_uppercase(), plain(&value)))
+}

@@ -1,0 +1,396 @@
+//! An open FITS file: cfitsio's own functions, after what they would believe was checked.
+
+use std::ffi::{CString, c_char, c_int};
+use std::path::Path;
+use std::ptr;
+
+use fitsio::sys;
+
+use super::cards::Cards;
+use super::lock;
+use super::source::Source;
+use super::tiles::Tiling;
+use crate::error::FileError;
+
+// Numbers of cfitsio's interface, from its fitsio.h.
+const READONLY: c_int = 0;
+const IMAGE_HDU: c_int = 0;
+const KEY_NO_EXIST: c_int = 202;
+const VALUE_UNDEFINED: c_int = 204;
+/// Bytes of a block of a file.
+const BLOCK: u64 = 2880;
+
+/// One of cfitsio's functions that read values of a column, of bytes or of words.
+type ReadColumn<T> = unsafe extern "C" fn(
+    *mut sys::fitsfile,
+    c_int,
+    sys::LONGLONG,
+    sys::LONGLONG,
+    sys::LONGLONG,
+    T,
+    *mut T,
+    *mut c_int,
+    *mut c_int,
+) -> c_int;
+
+/// An open file, closed under the lock.
+pub struct File {
+    raw: *mut sys::fitsfile,
+    source: Source,
+    /// Bytes of the file when cfitsio opened it.
+    seen: u64,
+    /// Number of the header that it is at, from 1.
+    place: c_int,
+    /// How the image there is compressed, if it is.
+    tiling: Option<Tiling>,
+    what: &'static str,
+}
+
+impl File {
+    /// Opens a plain or gzip-compressed FITS file; `what` is expected in it.
+    pub fn open(path: &Path, what: &'static str) -> Result<Self, FileError> {
+        let mut source = Source::open(path, what)?;
+        Cards::read(&mut source, 0)?;
+        let mut file = File {
+            raw: ptr::null_mut(),
+            source,
+            seen: 0,
+            place: 1,
+            tiling: None,
+            what,
+        };
+        file.reopen()?;
+        Ok(file)
+    }
+
+    /// Lets cfitsio open the file, again where it has grown, and goes to where it was.
+    fn reopen(&mut self) -> Result<(), FileError> {
+        let name = self.source.name()?;
+        self.seen = self.source.size(0)?;
+        let mut status = 0;
+        let _guard = lock();
+        self.close();
+        // SAFETY: the name ends in a zero byte, and the pointers are to live variables or null.
+        unsafe {
+            sys::ffcmsg();
+            sys::ffdkopn(&mut self.raw, name.as_ptr(), READONLY, &mut status);
+            if self.place > 1 {
+                sys::ffmahd(self.raw, self.place, ptr::null_mut(), &mut status);
+            }
+        }
+        if status == 0 && !self.raw.is_null() {
+            return Ok(());
+        }
+        let message = format!("cannot open the {}: {}", self.what, describe(status));
+        Err(FileError::new(self.source.path(), message))
+    }
+
+    /// Closes the file where it is open, under a lock that the caller holds.
+    fn close(&mut self) {
+        if !self.raw.is_null() {
+            let mut status = 0;
+            // SAFETY: the file is open and, the pointer being null from here on, not used again.
+            unsafe { sys::ffclos(self.raw, &mut status) };
+            self.raw = ptr::null_mut();
+        }
+    }
+
+    /// Runs a cfitsio call; its error is worded as `doing`.
+    pub fn call(
+        &self,
+        doing: impl FnOnce() -> String,
+        call: impl FnOnce(*mut sys::fitsfile, &mut c_int),
+    ) -> Result<(), FileError> {
+        let mut status = 0;
+        let _guard = lock();
+        // SAFETY: it empties the stack of messages, of those of earlier calls.
+        unsafe { sys::ffcmsg() };
+        call(self.raw, &mut status);
+        if status == 0 {
+            return Ok(());
+        }
+        Err(self.fault(format!("{}: {}", doing(), describe(status))))
+    }
+
+    /// An error about this file.
+    pub fn fault(&self, message: String) -> FileError {
+        FileError::new(self.source.path(), message)
+    }
+
+    /// Goes to the next header, and says whether there is one.
+    ///
+    /// # Errors
+    /// Where it is damaged.
+    pub fn next(&mut self) -> Result<bool, FileError> {
+        let start = self.extent()?[1];
+        let Some(cards) = Cards::read(&mut self.source, start)? else {
+            return Ok(false);
+        };
+        self.tiling = Tiling::of(&cards).map_err(|message| self.fault(message))?;
+        self.place += 1;
+        if self.source.size(0)? > self.seen {
+            self.reopen()?;
+        } else {
+            self.call(
+                || format!("cannot read header {} of the file", self.place),
+                // SAFETY: the file is open, and the type of what is there is not asked for.
+                |raw, status| unsafe {
+                    sys::ffmahd(raw, self.place, ptr::null_mut(), status);
+                },
+            )?;
+        }
+        Ok(true)
+    }
+
+    /// Takes out how the image here is compressed, if it is.
+    pub fn take_tiling(&mut self) -> Result<Option<Tiling>, FileError> {
+        let mut compressed = 0;
+        // SAFETY: the file is open.
+        self.call(
+            || "cannot tell the type of the image".into(),
+            |raw, status| unsafe { compressed = sys::fits_is_compressed_image(raw, status) },
+        )?;
+        if (compressed != 0) == self.tiling.is_some() {
+            return Ok(self.tiling.take());
+        }
+        Err(self.fault("the header contradicts itself about a compressed image".into()))
+    }
+
+    /// Whether an image is here, and no table.
+    pub fn is_image(&self) -> Result<bool, FileError> {
+        let mut kind = 0;
+        self.call(
+            || "cannot tell what the header describes".into(),
+            // SAFETY: the file is open, and the pointers are to live variables.
+            |raw, status| unsafe {
+                sys::ffghdt(raw, &mut kind, status);
+            },
+        )?;
+        Ok(kind == IMAGE_HDU)
+    }
+
+    /// Sides of the image here, the first one along x.
+    pub fn sides(&self) -> Result<Vec<i64>, FileError> {
+        let doing = || "cannot tell the size of the image".into();
+        let mut count = 0;
+        // SAFETY: the file is open, and the pointers are to live variables.
+        self.call(doing, |raw, status| unsafe {
+            sys::ffgidm(raw, &mut count, status);
+        })?;
+        let mut sides = vec![0; usize::try_from(count).unwrap_or(0)];
+        // SAFETY: the file is open, and there is room for `count` numbers.
+        self.call(doing, |raw, status| unsafe {
+            sys::ffgiszll(raw, count, sides.as_mut_ptr(), status);
+        })?;
+        Ok(sides)
+    }
+
+    /// Bytes of a pixel of the image here as stored.
+    pub fn pixel_bytes(&self) -> Result<u64, FileError> {
+        let mut bits = 0;
+        // SAFETY: the file is open, and the pointer is to a live variable.
+        self.call(
+            || "cannot tell the type of the image".into(),
+            |raw, status| unsafe {
+                sys::ffgidt(raw, &mut bits, status);
+            },
+        )?;
+        Ok(u64::from(bits.unsigned_abs()) / 8)
+    }
+
+    /// First byte of the data here, and the first one after them.
+    fn extent(&self) -> Result<[u64; 2], FileError> {
+        let (mut header, mut start, mut end) = (0, 0, 0);
+        // SAFETY: the file is open, and the pointers are to live variables.
+        self.call(
+            || "cannot tell where the data are".into(),
+            |raw, status| unsafe {
+                sys::ffghadll(raw, &mut header, &mut start, &mut end, status);
+            },
+        )?;
+        let place = |byte| u64::try_from(byte).ok().filter(|byte| byte % BLOCK == 0);
+        match [place(start), place(end)] {
+            [Some(start), Some(end)] if start <= end => Ok([start, end]),
+            _ => Err(self.fault(format!(
+                "the header is damaged: its data are from byte {start} to {end}"
+            ))),
+        }
+    }
+
+    /// Makes sure that the file has the first `bytes` bytes of the data here.
+    pub fn need(&mut self, bytes: u64) -> Result<(), FileError> {
+        let wanted = self.extent()?[0].saturating_add(bytes);
+        self.need_first(wanted)
+    }
+
+    /// Makes sure that the file has all data here, but for what fills up their last block.
+    pub fn need_all(&mut self) -> Result<(), FileError> {
+        let [start, end] = self.extent()?;
+        self.need_first((end + 1).saturating_sub(BLOCK).max(start))
+    }
+
+    /// Makes sure that the file can have the first `bytes` bytes of the data here: those of a gzip file
+    /// are not looked for before they are needed.
+    pub fn expect(&mut self, bytes: u64) -> Result<(), FileError> {
+        let wanted = self.extent()?[0].saturating_add(bytes);
+        if self.source.is_packed() {
+            self.source.allow(wanted)
+        } else {
+            self.need_first(wanted)
+        }
+    }
+
+    fn need_first(&mut self, wanted: u64) -> Result<(), FileError> {
+        let size = self.source.size(wanted)?;
+        if size < wanted {
+            return Err(self.fault(format!(
+                "the file is truncated or its header damaged: it can hold {size} bytes; expected {wanted}"
+            )));
+        }
+        if size > self.seen {
+            self.reopen()?;
+        }
+        Ok(())
+    }
+
+    /// Bytes of the file on disk.
+    pub fn disk_size(&self) -> u64 {
+        self.source.disk_size()
+    }
+
+    /// Makes sure, when nothing else is read, that a gzip file is whole.
+    pub fn check_end(&mut self) -> Result<(), FileError> {
+        self.source.check_end()
+    }
+
+    /// A numeric header value, `None` where absent or without a value.
+    pub fn number(&self, key: &str) -> Result<Option<f64>, FileError> {
+        let doing = || format!("the header key {key} is not a number");
+        let name = CString::new(key).map_err(|_| self.fault(doing()))?;
+        let mut value = 0.0;
+        let mut present = true;
+        // SAFETY: the file is open, the name ends in a zero byte, and a comment is not asked for.
+        self.call(doing, |raw, status| unsafe {
+            sys::ffgkyd(raw, name.as_ptr(), &mut value, ptr::null_mut(), status);
+            if [KEY_NO_EXIST, VALUE_UNDEFINED].contains(status) {
+                sys::ffcmsg();
+                present = false;
+                *status = 0;
+            }
+        })?;
+        Ok(present.then_some(value))
+    }
+
+    /// Text of a header key, empty where there is none.
+    pub fn text(&self, key: &str) -> String {
+        let Ok(name) = CString::new(key) else {
+            return String::new();
+        };
+        // A value has at most 68 characters, FLEN_VALUE with its quotes and zero byte is 71.
+        let mut value = [0 as c_char; 81];
+        // SAFETY: the file is open, the name ends in a zero byte, and the value has room.
+        let found = self.call(String::new, |raw, status| unsafe {
+            sys::ffgkys(
+                raw,
+                name.as_ptr(),
+                value.as_mut_ptr(),
+                ptr::null_mut(),
+                status,
+            );
+        });
+        if found.is_ok() {
+            plain(&value)
+        } else {
+            String::new()
+        }
+    }
+
+    /// Type code of a column of the table here, and values in each of its rows.
+    pub fn column_type(&self, column: c_int) -> Result<(c_int, i64), FileError> {
+        let (mut kind, mut repeat, mut width) = (0, 0, 0);
+        // SAFETY: the file is open, and the pointers are to live variables.
+        self.call(
+            || format!("cannot tell the type of column {column}"),
+            |raw, status| unsafe {
+                sys::ffgtclll(raw, column, &mut kind, &mut repeat, &mut width, status);
+            },
+        )?;
+        Ok((kind, repeat))
+    }
+
+    /// Number of values of the array in a column and a row, from 1.
+    pub fn array_length(&self, column: c_int, row: usize) -> Result<i64, FileError> {
+        let (mut length, mut place) = (0, 0);
+        // SAFETY: the file is open, and the pointers are to live variables.
+        self.call(
+            || format!("cannot read the place of the pixels of tile {row}"),
+            |raw, status| unsafe {
+                sys::ffgdesll(raw, column, row as i64, &mut length, &mut place, status);
+            },
+        )?;
+        Ok(length)
+    }
+
+    /// The first values of an array of bytes.
+    pub fn array(&self, column: c_int, row: usize, length: usize) -> Result<Vec<u8>, FileError> {
+        self.values(sys::ffgcvb, column, row, length)
+    }
+
+    /// The first values of an array of 16-bit integers.
+    pub fn words(&self, column: c_int, row: usize, length: usize) -> Result<Vec<i16>, FileError> {
+        self.values(sys::ffgcvi, column, row, length)
+    }
+
+    fn values<T: Copy + Default>(
+        &self,
+        read: ReadColumn<T>,
+        column: c_int,
+        row: usize,
+        length: usize,
+    ) -> Result<Vec<T>, FileError> {
+        let mut values = vec![T::default(); length];
+        let (row, length, mut missing) = (row as i64, length as i64, 0);
+        self.call(
+            || format!("cannot read the pixels of tile {row}"),
+            // SAFETY: the file is open, and there is room for the values asked for.
+            |raw, status| unsafe {
+                let (none, to) = (T::default(), values.as_mut_ptr());
+                read(raw, column, row, 1, length, none, to, &mut missing, status);
+            },
+        )?;
+        Ok(values)
+    }
+}
+
+impl Drop for File {
+    fn drop(&mut self) {
+        let _guard = lock();
+        self.close();
+    }
+}
+
+/// The text of a buffer that cfitsio filled.
+pub fn plain(buffer: &[c_char]) -> String {
+    let bytes: Vec<u8> = buffer
+        .iter()
+        .take_while(|c| **c != 0)
+        .map(|c| c.to_ne_bytes()[0])
+        .collect();
+    String::from_utf8_lossy(&bytes).trim().to_owned()
+}
+
+/// cfitsio's words for a status with the messages on its stack, the first and closest to the cause
+/// first, which are taken from it.
+pub fn describe(status: c_int) -> String {
+    // FLEN_STATUS is 31, FLEN_ERRMSG 81.
+    let mut text = [0 as c_char; 81];
+    // SAFETY: the buffer has room for cfitsio's longest text.
+    unsafe { sys::ffgerr(status, text.as_mut_ptr()) };
+    let mut words = format!("cfitsio error {status}: {}", plain(&text));
+    // SAFETY: as above.
+    while unsafe { sys::ffgmsg(text.as_mut_ptr()) } != 0 {
+        let message = plain(&text).replace(char::is_control, " ");
+        words.push_str(&format!("; {message}"));
+    }
+    words
+}

@@ -1,0 +1,453 @@
+//! Reading, by cfitsio's own functions: what a header says is checked before it is believed.
+
+use std::collections::BTreeMap;
+use std::ffi::{c_char, c_int};
+use std::path::Path;
+use std::ptr;
+
+use fitsio::sys;
+
+use super::file::File;
+use super::tiles::Tiles;
+use crate::error::FileError;
+use crate::frames::polars::{Column, DataFrame};
+
+/// Largest image side accepted, against absurd sizes in damaged headers.
+pub const MAX_SIDE: usize = 200_000;
+/// Most rows of a table accepted, and most planes of a cube: one for each galaxy of the largest grid.
+pub(super) const MAX_ROWS: usize = crate::table::MAX_ROWS;
+/// Most numbers read from a table that has fewer bytes than that on disk.
+const FREE_NUMBERS: u64 = 1 << 22;
+
+// Numbers of cfitsio's interface, from its fitsio.h.
+const TLOGICAL: c_int = 14;
+const TFLOAT: c_int = 42;
+/// Type codes of columns that `ffgcvd` reads as one number a row: TBYTE, TSBYTE, TUSHORT, TSHORT,
+/// TUINT, TINT, TULONG, TLONG, TFLOAT, TULONGLONG, TLONGLONG, TDOUBLE.
+const NUMBERS: [c_int; 12] = [11, 12, 20, 21, 30, 31, 40, 41, 42, 80, 81, 82];
+
+/// An image, or a cube of several of one size, open for reading.
+pub struct ImageReader {
+    file: File,
+    width: usize,
+    height: usize,
+    /// Images of a cube, one of a plain image.
+    planes: usize,
+    /// Whether nothing is read after it, so that a compressed file has to end well.
+    last: bool,
+    next_row: usize,
+    pixels: Pixels,
+}
+
+/// How the pixels of an image are stored.
+enum Pixels {
+    /// As they are, in so many bytes each.
+    Plain(u64),
+    /// By tiles.
+    Tiles(Tiles),
+}
+
+/// Dimensions that an image may have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Dimensions {
+    Two,
+    TwoOrThree,
+}
+
+impl ImageReader {
+    /// Opens the first image of a file: the primary one, or that of the first extension where the
+    /// primary is empty (as fpack writes it).
+    ///
+    /// # Errors
+    /// Where the file cannot be read or holds no two-dimensional image of sensible size, or not all
+    /// of it.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self, FileError> {
+        let mut file = File::open(path.as_ref(), "image")?;
+        let mut place = "primary";
+        if file.sides()?.is_empty() && file.next()? {
+            place = "first extension";
+            if !file.is_image()? {
+                return Err(file.fault(format!(
+                    "the {place} is a table; expected a two-dimensional image"
+                )));
+            }
+        }
+        ImageReader::here(file, place, Dimensions::Two)
+    }
+
+    /// Opens the first image or cube of a file of which more may follow. The planes of a cube are read as if
+    /// their rows were those of one image.
+    ///
+    /// # Errors
+    /// Where the file cannot be read, holds no image, or one of other dimensions, of no sensible size, or not
+    /// all of it.
+    pub fn open_stack(path: impl AsRef<Path>) -> Result<Self, FileError> {
+        let path = path.as_ref();
+        let file = File::open(path, "image")?;
+        if !file.sides()?.is_empty() {
+            return ImageReader::here(file, "primary", Dimensions::TwoOrThree);
+        }
+        ImageReader::after(file)?
+            .ok_or_else(|| FileError::new(path, "there is no image in this file"))
+    }
+
+    /// The next image or cube of the file, `None` after the last. Tables are passed over.
+    ///
+    /// # Errors
+    /// As [`ImageReader::open_stack`].
+    pub fn next_stack(self) -> Result<Option<Self>, FileError> {
+        ImageReader::after(self.file)
+    }
+
+    fn after(mut file: File) -> Result<Option<Self>, FileError> {
+        while file.next()? {
+            if file.is_image()? && !file.sides()?.is_empty() {
+                return ImageReader::here(file, "next", Dimensions::TwoOrThree).map(Some);
+            }
+        }
+        Ok(None)
+    }
+
+    /// The image that `file` is at.
+    fn here(mut file: File, place: &str, dimensions: Dimensions) -> Result<Self, FileError> {
+        // cfitsio leaves out those that are no numbers.
+        for key in ["BSCALE", "BZERO"] {
+            let value = file.number(key)?;
+            if let Some(value) = value.filter(|v| !v.is_finite() || key == "BSCALE" && *v == 0.0) {
+                return Err(file.fault(format!(
+                    "the header key {key} is {value}; expected a number by which pixels are scaled"
+                )));
+            }
+        }
+        let sides = file.sides()?;
+        let (x, y, z) = match (sides.as_slice(), dimensions) {
+            (&[x, y], _) => (x, y, 1),
+            (&[x, y, z], Dimensions::TwoOrThree) => (x, y, z),
+            (sides, _) => {
+                let or_cube = match dimensions {
+                    Dimensions::Two => "",
+                    Dimensions::TwoOrThree => ", or 3 of a cube",
+                };
+                return Err(file.fault(format!(
+                    "the {place} image has {} dimensions; expected 2{or_cube}",
+                    sides.len()
+                )));
+            }
+        };
+        let side = |found: i64| {
+            usize::try_from(found)
+                .ok()
+                .filter(|side| (1..=MAX_SIDE).contains(side))
+        };
+        let (Some(width), Some(height)) = (side(x), side(y)) else {
+            return Err(file.fault(format!(
+                "the image is {x} × {y} pixels; expected 1 to {MAX_SIDE} a side"
+            )));
+        };
+        let planes = usize::try_from(z).ok();
+        let Some(planes) = planes.filter(|planes| (1..=MAX_ROWS).contains(planes)) else {
+            return Err(file.fault(format!("the cube has {z} planes; expected 1 to {MAX_ROWS}")));
+        };
+        let pixels = match file.take_tiling()? {
+            Some(tiling) => Pixels::Tiles(Tiles::open(&file, tiling)?),
+            None => Pixels::Plain(file.pixel_bytes()?),
+        };
+        if let Pixels::Plain(bytes) = pixels {
+            let pixels = (width as u64 * height as u64).saturating_mul(planes as u64);
+            file.expect(pixels.saturating_mul(bytes))?;
+        }
+        Ok(ImageReader {
+            file,
+            width,
+            height,
+            planes,
+            last: dimensions == Dimensions::Two,
+            next_row: 0,
+            pixels,
+        })
+    }
+
+    /// Its name, EXTNAME; empty where it has none.
+    pub fn name(&self) -> String {
+        self.file.text("EXTNAME")
+    }
+
+    /// Columns.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Rows, of one plane of a cube.
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// Planes of a cube, 1 of an image.
+    pub fn planes(&self) -> usize {
+        self.planes
+    }
+
+    /// Rows of all planes.
+    fn rows(&self) -> usize {
+        self.height * self.planes
+    }
+
+    /// A numeric header value, `None` where absent.
+    ///
+    /// # Errors
+    /// Where it is there and not a number.
+    pub fn number(&self, key: &str) -> Result<Option<f64>, FileError> {
+        self.file.number(key)
+    }
+
+    /// Leaves the next `rows` rows out.
+    pub fn skip_rows(&mut self, rows: usize) {
+        self.next_row = (self.next_row + rows).min(self.rows());
+    }
+
+    /// The next `rows` rows, or fewer at the end of the image. Pixels that are not finite or, in an
+    /// image of integers, have the value of its key BLANK, are NaN.
+    ///
+    /// # Errors
+    /// Where the pixels cannot be read, as in a damaged file.
+    pub fn read_rows(&mut self, rows: usize) -> Result<Vec<f32>, FileError> {
+        let first = self.next_row;
+        let last = (first + rows).min(self.rows());
+        self.need(last)?;
+        let mut pixels = vec![0f32; (last - first) * self.width];
+        self.fill(first * self.width, &mut pixels)?;
+        self.next_row = last;
+        if self.last && last == self.rows() {
+            self.file.check_end()?;
+        }
+        Ok(pixels)
+    }
+
+    /// A square of `side` pixels a side, row-major, of which the lower left pixel is column `x` and row `y` of the
+    /// image, both from 0. Beyond the image it is NaN.
+    ///
+    /// # Errors
+    /// As [`ImageReader::read_rows`].
+    pub fn read_square(&mut self, x: i64, y: i64, side: usize) -> Result<Vec<f32>, FileError> {
+        let mut pixels = vec![f32::NAN; side * side];
+        let inside = |at: i64, most: usize| at.clamp(0, most as i64) as usize;
+        let across = |first: i64, most| inside(first, most)..inside(first + side as i64, most);
+        let (columns, rows) = (across(x, self.width), across(y, self.height));
+        if columns.is_empty() || rows.is_empty() {
+            return Ok(pixels);
+        }
+        self.need(rows.end)?;
+        let skipped = (columns.start as i64 - x) as usize;
+        for row in rows {
+            let line = &mut pixels[(row as i64 - y) as usize * side..][..side];
+            let first = row * self.width + columns.start;
+            self.fill(first, &mut line[skipped..skipped + columns.len()])?;
+        }
+        Ok(pixels)
+    }
+
+    /// Makes sure that the first `rows` rows are there.
+    fn need(&mut self, rows: usize) -> Result<(), FileError> {
+        match &mut self.pixels {
+            Pixels::Plain(bytes) => self.file.need((rows * self.width) as u64 * *bytes),
+            Pixels::Tiles(tiles) => tiles.check(&mut self.file, rows),
+        }
+    }
+
+    /// Reads as many pixels as there is room for, from the one at `first`, from 0.
+    fn fill(&mut self, first: usize, pixels: &mut [f32]) -> Result<(), FileError> {
+        // cfitsio writes to the second unasked.
+        let (mut blank, mut some_blank) = (f32::NAN, 0);
+        let start = (first + 1) as i64;
+        let (width, rows) = (self.width, self.rows());
+        let last = (first + pixels.len()).div_ceil(width);
+        self.file.call(
+            || format!("cannot read rows {} to {last} of {rows}", first / width + 1),
+            // SAFETY: the file is open, and there is room for all the pixels asked for.
+            |raw, status| unsafe {
+                sys::ffgpv(
+                    raw,
+                    TFLOAT,
+                    start,
+                    pixels.len() as i64,
+                    ptr::from_mut(&mut blank).cast(),
+                    pixels.as_mut_ptr().cast(),
+                    &mut some_blank,
+                    status,
+                );
+            },
+        )
+    }
+}
+
+/// A column of a table, by its number from 1.
+struct Description {
+    number: c_int,
+    name: String,
+    kind: c_int,
+    repeat: i64,
+}
+
+/// Columns of the first table of a file: those of `wanted`, or all that are numbers.
+///
+/// # Errors
+/// Where the file cannot be read, holds no table, or lacks a column.
+pub fn read_table(path: &Path, wanted: Option<&[&str]>) -> Result<DataFrame, FileError> {
+    let mut file = File::open(path, "table")?;
+    while file.is_image()? {
+        if !file.next()? {
+            return Err(file.fault("there is no table in this file".into()));
+        }
+    }
+    let rows = table_rows(&mut file)?;
+    let descriptions = describe_columns(&file)?;
+    if let Some(missing) = wanted
+        .into_iter()
+        .flatten()
+        .find(|name| !descriptions.iter().any(|d| d.name == **name))
+    {
+        let names: Vec<&str> = descriptions.iter().map(|d| d.name.as_str()).collect();
+        return Err(FileError::no_column(path, missing, &names));
+    }
+    let mut chosen = Vec::new();
+    for description in &descriptions {
+        let name = description.name.as_str();
+        let number = description.repeat == 1
+            && (NUMBERS.contains(&description.kind) || description.kind == TLOGICAL);
+        match wanted {
+            Some(wanted) if !wanted.contains(&name) => continue,
+            None if !number => continue,
+            _ => {}
+        }
+        if !number {
+            return Err(file.fault(format!("column `{name}` does not hold one number per row")));
+        }
+        chosen.push(description);
+    }
+    let numbers = rows as u64 * chosen.len() as u64;
+    let most = FREE_NUMBERS.max(file.disk_size());
+    if numbers > most {
+        return Err(file.fault(format!(
+            "its {rows} rows of {} columns are {numbers} numbers; expected at most {most} in a file of this size",
+            chosen.len()
+        )));
+    }
+    let columns = chosen
+        .into_iter()
+        .map(|column| read_column(&file, column, rows))
+        .collect::<Result<_, FileError>>()?;
+    file.check_end()?;
+    crate::frames::frame(columns).map_err(|error| file.fault(error.to_string()))
+}
+
+/// Text values of the header of a file's first extension, of those of `keys` that are there.
+///
+/// # Errors
+/// Where the file cannot be read or has no extension.
+pub fn read_table_keys<'a>(
+    path: &Path,
+    keys: impl Iterator<Item = &'a String>,
+) -> Result<BTreeMap<String, String>, FileError> {
+    let mut file = File::open(path, "table")?;
+    if !file.next()? {
+        return Err(file.fault("there is no table in this file".into()));
+    }
+    let value = |key: &String| (key.clone(), file.text(&key.to_ascii_uppercase()));
+    Ok(keys.map(value).filter(|(_, v)| !v.is_empty()).collect())
+}
+
+/// Rows of the table here, which the file must be able to hold.
+fn table_rows(file: &mut File) -> Result<usize, FileError> {
+    let mut count = 0;
+    // SAFETY: the file is open, and the pointers are to live variables.
+    file.call(
+        || "cannot tell the number of rows".into(),
+        |raw, status| unsafe {
+            sys::ffgnrwll(raw, &mut count, status);
+        },
+    )?;
+    let rows = usize::try_from(count)
+        .ok()
+        .filter(|rows| *rows <= MAX_ROWS)
+        .ok_or_else(|| {
+            file.fault(format!(
+                "the table says it has {count} rows; expected at most {MAX_ROWS}"
+            ))
+        })?;
+    let bytes = file.number("NAXIS1")?.unwrap_or(0.0);
+    file.need((bytes * rows as f64) as u64)?;
+    Ok(rows)
+}
+
+fn describe_columns(file: &File) -> Result<Vec<Description>, FileError> {
+    let mut count = 0;
+    // SAFETY: the file is open, and the pointers are to live variables.
+    file.call(
+        || "cannot tell the number of columns".into(),
+        |raw, status| unsafe {
+            sys::ffgncl(raw, &mut count, status);
+        },
+    )?;
+    (1..=count)
+        .map(|number| {
+            let name = file.text(&format!("TTYPE{number}"));
+            let (kind, repeat) = file.column_type(number)?;
+            Ok(Description {
+                number,
+                name,
+                kind,
+                repeat,
+            })
+        })
+        .collect()
+}
+
+/// A column as real numbers; missing ones are NaN, true is 1 and false 0.
+fn read_column(file: &File, description: &Description, rows: usize) -> Result<Column, FileError> {
+    let doing = || format!("cannot read column `{}`", description.name);
+    let mut some_missing = 0;
+    if description.kind == TLOGICAL {
+        // Neither true nor false is missing.
+        let missing = 2;
+        let mut values = vec![0 as c_char; rows];
+        // SAFETY: the file is open, and there is room for all the rows.
+        file.call(doing, |raw, status| unsafe {
+            sys::ffgcvl(
+                raw,
+                description.number,
+                1,
+                1,
+                rows as i64,
+                missing,
+                values.as_mut_ptr(),
+                &mut some_missing,
+                status,
+            );
+        })?;
+        let real = |value: c_char| {
+            if value == missing {
+                f64::NAN
+            } else {
+                f64::from(value)
+            }
+        };
+        let values: Vec<f64> = values.into_iter().map(real).collect();
+        return Ok(Column::new(description.name.as_str().into(), values));
+    }
+    let mut values = vec![0.0; rows];
+    // SAFETY: the file is open, and there is room for all the rows.
+    file.call(doing, |raw, status| unsafe {
+        sys::ffgcvd(
+            raw,
+            description.number,
+            1,
+            1,
+            rows as i64,
+            f64::NAN,
+            values.as_mut_ptr(),
+            &mut some_missing,
+            status,
+        );
+    })?;
+    Ok(Column::new(description.name.as_str().into(), values))
+}

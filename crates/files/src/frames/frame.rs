@@ -1,0 +1,80 @@
+//! Frames in memory: columns of equal length with names of their own.
+
+use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
+
+use polars::prelude::{ChunkedArray, Column, DataFrame, DataType, PolarsNumericType};
+
+use super::TableError;
+
+/// Text by name that a file keeps beside its columns.
+pub type Metadata = BTreeMap<String, String>;
+
+/// The frame of `columns`, in this order.
+///
+/// # Errors
+/// [`TableError::DuplicateColumn`] if two columns share a name, and [`TableError::UnequalLengths`] if
+/// a column's length differs from the first one's.
+pub fn frame(columns: Vec<Column>) -> Result<DataFrame, TableError> {
+    let mut seen = BTreeSet::new();
+    for column in &columns {
+        let name = column.name().to_string();
+        let (first, expected) = (columns[0].name(), columns[0].len());
+        if column.len() != expected {
+            return Err(TableError::UnequalLengths {
+                column: name,
+                found: column.len(),
+                first: first.to_string(),
+                expected,
+            });
+        }
+        if !seen.insert(name.clone()) {
+            return Err(TableError::DuplicateColumn { name });
+        }
+    }
+    DataFrame::new_infer_height(columns).map_err(|error| TableError::Invalid {
+        detail: error.to_string(),
+    })
+}
+
+/// The values of a column of numbers as 64-bit floats, NaN where one is missing; true is 1, false 0, and
+/// integers beyond ±2⁵³ are rounded. `None` for a column of anything else. What the column holds as such
+/// floats in one piece is lent, not copied.
+pub fn reals(column: &Column) -> Option<Cow<'_, [f64]>> {
+    let series = column.as_materialized_series();
+    if let Ok(all) = series.f64()
+        && let Ok(whole) = all.cont_slice()
+    {
+        return Some(Cow::Borrowed(whole));
+    }
+    let values = match series.dtype() {
+        DataType::Float64 => series.f64().ok().map(|all| list(all, |v| v)),
+        DataType::Float32 => series.f32().ok().map(|all| list(all, f64::from)),
+        DataType::Int64 => series.i64().ok().map(|all| list(all, |v| v as f64)),
+        DataType::UInt64 => series.u64().ok().map(|all| list(all, |v| v as f64)),
+        DataType::Int32 => series.i32().ok().map(|all| list(all, f64::from)),
+        DataType::UInt32 => series.u32().ok().map(|all| list(all, f64::from)),
+        DataType::Boolean => series.bool().ok().map(|all| {
+            let value = |flag: Option<bool>| flag.map_or(f64::NAN, f64::from);
+            all.iter().map(value).collect()
+        }),
+        _ => None,
+    };
+    values.map(Cow::Owned)
+}
+
+fn list<T>(chunks: &ChunkedArray<T>, convert: impl Fn(T::Native) -> f64) -> Vec<f64>
+where
+    T: PolarsNumericType,
+{
+    let mut values = Vec::with_capacity(chunks.len());
+    for chunk in chunks.downcast_iter() {
+        if chunk.validity().is_none() {
+            values.extend(chunk.values().iter().map(|&value| convert(value)));
+        } else {
+            let value = |value: Option<&T::Native>| value.map_or(f64::NAN, |&value| convert(value));
+            values.extend(chunk.iter().map(value));
+        }
+    }
+    values
+}

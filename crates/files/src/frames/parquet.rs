@@ -1,0 +1,528 @@
+//! Parquet files.
+//!
+//! Writing goes through polars' frame writer. Reading takes polars' footer parser and column
+//! decoder, but fetches the bytes itself: only the column chunks that are wanted are read, nothing
+//! is memory-mapped (a mapped file that shrinks kills the process), no second thread pool starts,
+//! and 8- and 16-bit integers decode into wider ones without polars' features for them.
+
+use std::cell::Cell;
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::io::{Cursor, Read, Seek, SeekFrom, Write};
+use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
+use std::path::Path;
+use std::sync::Once;
+
+use polars::prelude::{
+    ArrowDataType, ArrowField, ChunkFillNullValue, ChunkedArray, Column, DataFrame, DataType,
+    FileMetadataRef, IntoSeries, KeyValueMetadata, ParquetCompression, ParquetReader,
+    ParquetWriter, PolarsError, PolarsNumericType, PolarsResult, SerReader, Series,
+    StatisticsOptions,
+};
+use polars_parquet::parquet::page::CompressedPage;
+use polars_parquet::read::{
+    BasicDecompressor, ColumnChunkMetadata, PageReader, column_iter_to_arrays,
+};
+
+use super::frame;
+use super::{Metadata, TableError};
+
+/// The key under which Parquet files keep the Arrow schema.
+const SCHEMA_KEY: &str = "ARROW:schema";
+
+/// Most values read from a file of fewer bytes than that; a larger one may have one for each byte.
+const FREE_VALUES: u64 = 1 << 22;
+/// Most bytes that the pages of a column chunk, and all texts of a file, may unpack to beyond
+/// [`INFLATION`] times the file's own.
+const FREE_BYTES: u64 = 1 << 26;
+/// Most bytes of a footer: names, metadata, and some hundred bytes for each chunk of a column.
+const MAX_FOOTER: u32 = 1 << 24;
+/// Most bytes for one of the file's in a large file.
+const INFLATION: u64 = 8;
+
+/// Writes `frame` as a Parquet file with `metadata` into `writer`.
+///
+/// Equal frames give equal bytes. The metadata becomes the file's key-value metadata, in the order
+/// of the keys. The data are not compressed: measured shears and sizes are noise in most of their
+/// bits, so that compression gains a few per cent of space and costs up to half of the reading
+/// speed. Repeated values still become small, by dictionaries.
+///
+/// The file must be opened (and, to be replaced at once or not at all, renamed) by the caller.
+///
+/// # Errors
+/// [`TableError::ReservedKey`] for a metadata key that Parquet files use for themselves, and
+/// [`TableError::Write`] if the encoder or `writer` fails.
+pub fn write_parquet<W: Write>(
+    writer: W,
+    frame: &DataFrame,
+    metadata: &Metadata,
+) -> Result<(), TableError> {
+    if metadata.contains_key(SCHEMA_KEY) {
+        return Err(TableError::ReservedKey {
+            key: SCHEMA_KEY.into(),
+        });
+    }
+    let pairs = metadata.iter();
+    let pairs = pairs.map(|(key, value)| (key.clone(), value.clone()));
+    ParquetWriter::new(writer)
+        .with_compression(ParquetCompression::Uncompressed)
+        // Nothing selects rows by minima and maxima, which cost a pass over the values.
+        .with_statistics(StatisticsOptions {
+            null_count: true,
+            ..StatisticsOptions::empty()
+        })
+        .with_key_value_metadata(Some(KeyValueMetadata::from_static(pairs.collect())))
+        .set_parallel(false)
+        .finish(&mut frame.clone())
+        .map(drop)
+        .map_err(|error| TableError::Write {
+            detail: error.to_string(),
+        })
+}
+
+/// Reads the Parquet file at `path`: all columns in file order, or those in `wanted`, in that order.
+///
+/// Small integers become 32-bit ones, and text with a dictionary plain text. Missing values in float
+/// columns become NaN. Columns that are not wanted may be of any type. It runs on the calling thread
+/// alone, so that a caller with many files reads them in parallel.
+///
+/// # Errors
+/// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read;
+/// [`TableError::MissingColumn`], [`TableError::DuplicateColumn`], [`TableError::UnsupportedType`] and
+/// [`TableError::MissingValues`] for a wanted column that is absent, named twice, or neither of
+/// numbers nor of text.
+pub fn read_parquet(
+    path: impl AsRef<Path>,
+    wanted: Option<&[&str]>,
+) -> Result<DataFrame, TableError> {
+    let path = path.as_ref();
+    let mut source = Source::open(path)?;
+    let fields = match wanted {
+        None => source.fields.clone(),
+        Some(names) => source.pick(names)?,
+    };
+    source.check_size(fields.len())?;
+    let columns = fields.iter().map(|field| source.read_column(field));
+    frame(columns.collect::<Result<_, TableError>>()?)
+}
+
+/// The names of the columns of the Parquet file at `path`, in file order, from the footer alone.
+///
+/// # Errors
+/// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read.
+pub fn parquet_columns(path: impl AsRef<Path>) -> Result<Vec<String>, TableError> {
+    Ok(Source::open(path.as_ref())?.names())
+}
+
+/// The text metadata of the Parquet file at `path`, from the footer alone.
+///
+/// # Errors
+/// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read.
+pub fn parquet_metadata(path: impl AsRef<Path>) -> Result<Metadata, TableError> {
+    Ok(Source::open(path.as_ref())?.key_values())
+}
+
+/// An open file with its parsed footer.
+struct Source<'a> {
+    path: &'a Path,
+    file: File,
+    /// In bytes.
+    length: u64,
+    footer: FileMetadataRef,
+    /// The columns with the types the file declares.
+    fields: Vec<ArrowField>,
+    /// Bytes of text that may still be read.
+    text_left: u64,
+}
+
+impl<'a> Source<'a> {
+    fn open(path: &'a Path) -> Result<Self, TableError> {
+        let io = |source| TableError::Io {
+            path: path.into(),
+            source,
+        };
+        let length = |about: fs::Metadata| {
+            if about.is_file() {
+                return Ok(about.len());
+            }
+            Err(TableError::Damaged {
+                path: path.into(),
+                detail: "found no regular file".into(),
+            })
+        };
+        // Before it is opened, which would wait for the writer of a pipe, and for what was opened.
+        fs::metadata(path).map_err(io).and_then(length)?;
+        let mut file = File::open(path).map_err(io)?;
+        let length = file.metadata().map_err(io).and_then(length)?;
+        check_footer(&mut file, length).map_err(|detail| TableError::Damaged {
+            path: path.into(),
+            detail,
+        })?;
+        let (footer, fields) = guarded(path, "footer", || {
+            let mut reader = ParquetReader::new(&mut file);
+            let fields = reader.schema()?.iter_values().cloned().collect();
+            Ok((reader.get_metadata()?.clone(), fields))
+        })?;
+        Ok(Self {
+            path,
+            file,
+            length,
+            footer,
+            fields,
+            text_left: unpacked_bytes(length),
+        })
+    }
+
+    /// Checks that the rows of `columns` columns can be those of a file of this size, before memory is
+    /// taken for them: repeated values take next to nothing in a file.
+    fn check_size(&self, columns: usize) -> Result<(), TableError> {
+        let damaged = |detail| TableError::Damaged {
+            path: self.path.into(),
+            detail,
+        };
+        let groups = self.footer.row_groups.iter();
+        let rows = groups.fold(0, |rows: usize, group| {
+            rows.saturating_add(group.num_rows())
+        });
+        if rows != self.footer.num_rows {
+            return Err(damaged(format!(
+                "found row groups of {rows} rows, expected {} as in the footer",
+                self.footer.num_rows
+            )));
+        }
+        let values = (rows as u64).saturating_mul(columns as u64);
+        let most = FREE_VALUES.max(self.length);
+        if values > most {
+            return Err(damaged(format!(
+                "found {rows} rows of {columns} columns, expected at most {most} values in a file of this size"
+            )));
+        }
+        Ok(())
+    }
+
+    fn names(&self) -> Vec<String> {
+        self.fields
+            .iter()
+            .map(|field| field.name.to_string())
+            .collect()
+    }
+
+    /// The fields called `names`, in that order.
+    fn pick(&self, names: &[&str]) -> Result<Vec<ArrowField>, TableError> {
+        let mut seen = BTreeSet::new();
+        names
+            .iter()
+            .map(|&name| {
+                if !seen.insert(name) {
+                    return Err(TableError::DuplicateColumn { name: name.into() });
+                }
+                let field = self.fields.iter().find(|field| field.name == name);
+                field.cloned().ok_or_else(|| TableError::MissingColumn {
+                    path: self.path.into(),
+                    wanted: name.into(),
+                    present: self.names(),
+                })
+            })
+            .collect()
+    }
+
+    /// The file's own key-value metadata, without the schema that Arrow keeps there.
+    fn key_values(&self) -> Metadata {
+        let pairs = self.footer.key_value_metadata().iter().flatten();
+        pairs
+            .filter(|pair| pair.key != SCHEMA_KEY)
+            .map(|pair| (pair.key.clone(), pair.value.clone().unwrap_or_default()))
+            .collect()
+    }
+
+    /// All rows of one column.
+    fn read_column(&mut self, field: &ArrowField) -> Result<Column, TableError> {
+        let (path, name) = (self.path, field.name.as_str());
+        let Some(decoded) = decoded_type(&field.dtype) else {
+            return Err(TableError::UnsupportedType {
+                path: path.into(),
+                column: name.into(),
+                found: format!("{:?}", field.dtype),
+            });
+        };
+        let field = ArrowField::new(field.name.clone(), decoded, field.is_nullable);
+        let footer = self.footer.clone();
+        let mut column = Series::new_empty(field.name.clone(), &DataType::from_arrow_field(&field));
+        for (number, group) in footer.row_groups.iter().enumerate() {
+            let place = format!("column `{name}`, row group {number}");
+            let damaged = |detail| TableError::Damaged {
+                path: path.into(),
+                detail: format!("{place}: {detail}"),
+            };
+            let found = group
+                .columns_under_root_iter(name)
+                .map(|mut all| (all.len(), all.next()));
+            let Some((1, Some(chunk))) = found else {
+                return Err(damaged("found no single column chunk".into()));
+            };
+            if usize::try_from(chunk.num_values()) != Ok(group.num_rows()) {
+                return Err(damaged(format!(
+                    "found {} values, expected {} as the row group has rows",
+                    chunk.num_values(),
+                    group.num_rows()
+                )));
+            }
+            let start = chunk
+                .dictionary_page_offset()
+                .unwrap_or(chunk.data_page_offset());
+            let bytes = self
+                .read_bytes(start, chunk.compressed_size())
+                .map_err(damaged)?;
+            let most = unpacked_bytes(self.length);
+            let series = guarded(path, &place, || decode(chunk, bytes, &field, most))?;
+            if series.len() != group.num_rows() {
+                return Err(damaged(format!(
+                    "found {} rows, expected {}",
+                    series.len(),
+                    group.num_rows()
+                )));
+            }
+            let left = self.text_left.checked_sub(text_bytes(&series));
+            self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
+            column = match number {
+                0 => series,
+                _ => {
+                    let joined = column.append(&series);
+                    joined.map_err(|error| damaged(error.to_string()))?;
+                    column
+                }
+            };
+        }
+        with_missing(path, column)
+    }
+
+    /// The bytes from `start`, as many as `size`, after checking that the file has them.
+    fn read_bytes(&mut self, start: i64, size: i64) -> Result<Vec<u8>, String> {
+        let range = u64::try_from(start).ok().zip(u64::try_from(size).ok());
+        let Some((start, size)) = range.filter(|(start, size)| {
+            start
+                .checked_add(*size)
+                .is_some_and(|end| end <= self.length)
+        }) else {
+            return Err(format!(
+                "found bytes from {start}, {size} of them, expected a part of the file's {} bytes",
+                self.length
+            ));
+        };
+        let size = usize::try_from(size).map_err(|error| error.to_string())?;
+        let mut bytes = vec![0; size];
+        self.file
+            .seek(SeekFrom::Start(start))
+            .and_then(|_| self.file.read_exact(&mut bytes))
+            .map_err(|error| error.to_string())?;
+        Ok(bytes)
+    }
+}
+
+/// Checks the length of a footer, which takes several times as much memory once it is read. The last eight
+/// bytes of a file are that length and a mark.
+fn check_footer(file: &mut File, length: u64) -> Result<(), String> {
+    let mut end = [0; 8];
+    if length >= 8 {
+        file.seek(SeekFrom::Start(length - 8))
+            .and_then(|_| file.read_exact(&mut end))
+            .map_err(|error| error.to_string())?;
+    }
+    let [a, b, c, d, mark @ ..] = end;
+    let found = u32::from_le_bytes([a, b, c, d]);
+    // Of a file without the mark the reader says what it is not.
+    match &mark == b"PAR1" && found > MAX_FOOTER {
+        true => Err(format!(
+            "found a footer of {found} bytes, expected at most {MAX_FOOTER}"
+        )),
+        false => Ok(()),
+    }
+}
+
+/// The values in one column chunk of a file, as the type in `field`.
+fn decode(
+    chunk: &ColumnChunkMetadata,
+    bytes: Vec<u8>,
+    field: &ArrowField,
+    most: u64,
+) -> PolarsResult<Series> {
+    let wrong = |what: String| PolarsError::ComputeError(what.into());
+    let length = bytes.len();
+    let dictionary = unpacked_size_of_first_page(&bytes);
+    // Cloning it shares the bytes.
+    let source = Cursor::new(bytes.into());
+    let pages = || PageReader::new(source.clone(), chunk, Vec::new(), length);
+    // The decoder makes room for as many values as a page claims, a negative count being taken for
+    // a huge one, and for as many bytes; a failed allocation ends the process: add the claims up first.
+    let (mut claimed, mut unpacked) = (0_usize, 0_u64);
+    for page in pages() {
+        let size = match page? {
+            CompressedPage::Data(page) => {
+                claimed = claimed.saturating_add(page.num_values());
+                if page.header().encoding().0 == DELTA_BYTE_ARRAY {
+                    return Err(wrong("found texts without their common beginnings (DELTA_BYTE_ARRAY), expected whole ones".into()));
+                }
+                page.uncompressed_size() as u64
+            }
+            CompressedPage::Dict(_) => dictionary.unwrap_or(u64::MAX),
+        };
+        unpacked = unpacked.saturating_add(size);
+    }
+    if i64::try_from(claimed) != Ok(chunk.num_values()) {
+        let expected = chunk.num_values();
+        return Err(wrong(format!(
+            "found pages with {claimed} values, expected {expected} as in the footer"
+        )));
+    }
+    if unpacked > most {
+        return Err(wrong(format!(
+            "found pages that unpack to {unpacked} bytes, expected at most {most} in a file of this size"
+        )));
+    }
+    let (arrays, _) = column_iter_to_arrays(
+        vec![BasicDecompressor::new(pages(), Vec::new())],
+        vec![&chunk.descriptor().descriptor.primitive_type],
+        field.clone(),
+        None,
+    )?;
+    Series::try_from((field, arrays))
+}
+
+/// Number of the encoding in which a text repeats the beginning of the one before, so that a few bytes
+/// stand for any number.
+const DELTA_BYTE_ARRAY: i32 = 7;
+
+/// Most bytes that a part of a file of `length` bytes may unpack to.
+fn unpacked_bytes(length: u64) -> u64 {
+    length.saturating_mul(INFLATION).max(FREE_BYTES)
+}
+
+/// Bytes of the texts of a column.
+fn text_bytes(series: &Series) -> u64 {
+    let texts = series.str().ok();
+    texts.map_or(0, |texts| {
+        texts.iter().flatten().map(|text| text.len() as u64).sum()
+    })
+}
+
+/// Unpacked size of the page that starts a column chunk, `None` where it cannot be told. The reader
+/// keeps that of a dictionary page to itself.
+///
+/// The header of a page is a list of fields in Thrift's compact form, each a byte that tells its number
+/// and type and a value: first the type of the page, then its unpacked size.
+fn unpacked_size_of_first_page(bytes: &[u8]) -> Option<u64> {
+    const NEXT_FIELD_OF_32_BITS: u8 = 0x15;
+    let mut rest = bytes.iter();
+    let mut field = || {
+        if rest.next() != Some(&NEXT_FIELD_OF_32_BITS) {
+            return None;
+        }
+        // Seven bits a byte, the lowest first; the lowest of all is the sign.
+        let mut number = 0;
+        for shift in (0..35).step_by(7) {
+            let byte = *rest.next()?;
+            number |= u64::from(byte & 0x7f) << shift;
+            if byte < 0x80 {
+                return (number & 1 == 0).then_some(number >> 1);
+            }
+        }
+        None
+    };
+    field()?;
+    field()
+}
+
+/// Runs a part of polars on what a file says.
+///
+/// Its decoders return errors for most damage, but index out of range or overflow on some; that
+/// must not take a long run down, so such a panic becomes an error too.
+fn guarded<T>(
+    path: &Path,
+    place: &str,
+    run: impl FnOnce() -> PolarsResult<T>,
+) -> Result<T, TableError> {
+    let detail = match silently(run) {
+        Ok(Ok(value)) => return Ok(value),
+        Ok(Err(error)) => error.to_string(),
+        Err(_) => "the contents contradict themselves".into(),
+    };
+    Err(TableError::Damaged {
+        path: path.into(),
+        detail: format!("{place}: {detail}"),
+    })
+}
+
+thread_local! {
+    /// Whether a panic on this thread is caught and reported as an error.
+    static CAUGHT: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Catches a panic of `run` without its message on standard error.
+///
+/// The hook that prints such messages belongs to the whole process, so it is replaced only once, by
+/// one that is silent where this thread catches and else does what the one before did.
+fn silently<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let others = take_hook();
+        set_hook(Box::new(move |panic| {
+            if !CAUGHT.get() {
+                others(panic);
+            }
+        }));
+    });
+    let outer = CAUGHT.replace(true);
+    let result = catch_unwind(AssertUnwindSafe(run));
+    CAUGHT.set(outer);
+    result
+}
+
+/// The type into which a column declared as `declared` is decoded, if it is one that is read.
+fn decoded_type(declared: &ArrowDataType) -> Option<ArrowDataType> {
+    use ArrowDataType as Type;
+    match declared {
+        Type::Int8 | Type::Int16 | Type::Int32 => Some(Type::Int32),
+        Type::UInt8 | Type::UInt16 | Type::UInt32 => Some(Type::UInt32),
+        Type::Boolean
+        | Type::Int64
+        | Type::UInt64
+        | Type::Float32
+        | Type::Float64
+        | Type::Utf8View => Some(declared.clone()),
+        // Text with few different values, as data frames in Python like to write it.
+        Type::Dictionary(_, value, _) => {
+            matches!(**value, Type::Utf8 | Type::LargeUtf8 | Type::Utf8View)
+                .then_some(Type::Utf8View)
+        }
+        _ => None,
+    }
+}
+
+/// The column, in which missing floats are NaN.
+fn with_missing(path: &Path, column: Series) -> Result<Column, TableError> {
+    let name = column.name().to_string();
+    let filled = match (column.null_count(), column.dtype()) {
+        (0, _) => return Ok(column.into()),
+        (_, DataType::Float64) => filled(column.f64(), f64::NAN),
+        (_, DataType::Float32) => filled(column.f32(), f32::NAN),
+        (count, _) => {
+            return Err(TableError::MissingValues {
+                path: path.into(),
+                column: name,
+                count,
+            });
+        }
+    };
+    filled.map_err(|error| TableError::Damaged {
+        path: path.into(),
+        detail: format!("column `{name}`: {error}"),
+    })
+}
+
+fn filled<T>(values: PolarsResult<&ChunkedArray<T>>, missing: T::Native) -> PolarsResult<Column>
+where
+    T: PolarsNumericType,
+    ChunkedArray<T>: ChunkFillNullValue<T::Native> + IntoSeries,
+{
+    Ok(values?.fill_null_with_values(missing)?.into_series().into())
+}

@@ -1,0 +1,16 @@
+//! Files: FITS, Parquet, ASCII and CSV tables, read with care and written completely or not at all.
+//!
+//! [`fits`] is the only user of cfitsio and serialises its calls. [`open`] is the only place that opens files for
+//! reading. [`atomic`] writes each file under a temporary name and renames it when it is complete.
+//! [`frames`] are polars' data frames with text metadata.
+
+pub mod atomic;
+mod error;
+pub mod fits;
+pub mod frames;
+pub mod open;
+pub mod parquet;
+pub mod table;
+mod text;
+
+pub use error::{FileError, names_of};

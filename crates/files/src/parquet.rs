@@ -1,0 +1,51 @@
+//! Parquet tables, by way of the crate that guards their reading.
+
+use std::path::Path;
+
+use crate::frames::polars::DataFrame;
+use crate::frames::{self as tables, Metadata};
+
+use crate::atomic;
+use crate::error::FileError;
+
+/// Reads columns of numbers: those of `wanted`, or all there are.
+pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<DataFrame, FileError> {
+    let mut table = tables::read_parquet(path, wanted).map_err(|error| bare(path, &error))?;
+    let texts: Vec<String> = table
+        .columns()
+        .iter()
+        .filter(|column| column.dtype().is_string())
+        .map(|column| column.name().to_string())
+        .collect();
+    if let (Some(name), Some(_)) = (texts.first(), wanted) {
+        let message = format!("column `{name}` holds text; expected numbers");
+        return Err(FileError::new(path, message));
+    }
+    table = table.drop_many(texts);
+    Ok(table)
+}
+
+/// The metadata in the footer.
+pub(super) fn metadata(path: &Path) -> Result<Metadata, FileError> {
+    tables::parquet_metadata(path).map_err(|error| bare(path, &error))
+}
+
+/// Writes the table with its metadata in the footer.
+pub(super) fn write(path: &Path, table: &DataFrame, metadata: &Metadata) -> Result<(), FileError> {
+    let mut bytes = Vec::new();
+    tables::write_parquet(&mut bytes, table, metadata).map_err(|error| bare(path, &error))?;
+    atomic::write(path, &bytes)
+}
+
+/// The crate's errors name the file already; keep the name once.
+pub fn bare(path: &Path, error: &tables::TableError) -> FileError {
+    if let tables::TableError::MissingColumn {
+        wanted, present, ..
+    } = error
+    {
+        return FileError::no_column(path, wanted, present);
+    }
+    let message = error.to_string();
+    let prefix = format!("{}: ", path.display());
+    FileError::new(path, message.strip_prefix(&prefix).unwrap_or(&message))
+}

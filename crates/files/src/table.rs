@@ -1,0 +1,204 @@
+//! Tables of named columns, read and written by the file's ending.
+//!
+//! | ending | format |
+//! |---|---|
+//! | `.fits`, `.fit`, these with `.gz`, `.fits.fz` | FITS binary table |
+//! | `.parquet`, `.pq` | Parquet |
+//! | anything else (`.csv`, `.dat`, `.txt`, `.cat`, `.csv.gz`) | text, plain or compressed by gzip: numbers between commas, semicolons, tabs or blanks, as the content has them; columns `x y e1 e2` unless a header names them |
+
+use std::borrow::Cow;
+use std::path::Path;
+
+use crate::frames::polars::DataFrame;
+use crate::frames::{Metadata, reals};
+
+use crate::error::FileError;
+use crate::{fits, parquet, text};
+
+/// A column of numbers of the table of `path`; missing ones are NaN.
+///
+/// # Errors
+/// Where it is not there.
+pub fn numbers<'t>(
+    table: &'t DataFrame,
+    name: &str,
+    path: &Path,
+) -> Result<Cow<'t, [f64]>, FileError> {
+    let column = table.column(name).ok();
+    column.and_then(reals).ok_or_else(|| {
+        let message = format!("there is no column `{name}` that holds numbers");
+        FileError::new(path, message)
+    })
+}
+
+/// File format of a table.
+#[derive(
+    Debug, Clone, Copy, Default, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize,
+)]
+#[serde(rename_all = "lowercase")]
+pub enum FileFormat {
+    /// Parquet.
+    #[default]
+    Parquet,
+    /// FITS binary table.
+    Fits,
+}
+
+impl FileFormat {
+    /// Ending of file names.
+    pub fn extension(self) -> &'static str {
+        match self {
+            FileFormat::Parquet => "parquet",
+            FileFormat::Fits => "fits",
+        }
+    }
+}
+
+/// What a file is by its ending.
+enum Ending {
+    Parquet,
+    Fits,
+    Text,
+}
+
+impl Ending {
+    fn of(path: &Path) -> Self {
+        let name = path.to_string_lossy().to_ascii_lowercase();
+        let ends = |endings: &[&str]| endings.iter().any(|end| name.ends_with(end));
+        if ends(&[".parquet", ".pq"]) {
+            Ending::Parquet
+        } else if ends(&[".fits", ".fit", ".fits.gz", ".fit.gz", ".fits.fz"]) {
+            Ending::Fits
+        } else {
+            Ending::Text
+        }
+    }
+}
+
+/// Most rows of a table that may fill the largest grid, of 4000 × 4000 cells.
+pub const MAX_ROWS: usize = 4000 * 4000;
+/// Rows that a catalogue may have beyond those of its grid.
+const SPARE_ROWS: usize = 1 << 18;
+
+/// Most rows that a catalogue of galaxies on a grid of `cells` may have: more than are scored, so that it can be
+/// said how many there are.
+pub fn most_rows(cells: usize) -> usize {
+    cells + SPARE_ROWS
+}
+
+/// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending. A
+/// text table has at most `most_rows`.
+///
+/// # Errors
+/// Where the file cannot be read, or lacks a column.
+pub fn read(
+    path: &Path,
+    wanted: Option<&[&str]>,
+    most_rows: usize,
+) -> Result<DataFrame, FileError> {
+    if let Some(wanted) = wanted {
+        for (k, column) in wanted.iter().enumerate() {
+            if wanted[..k].contains(column) {
+                let message = format!("the column `{column}` is asked for twice");
+                return Err(FileError::new(path, message));
+            }
+        }
+    }
+    let request = text::Request {
+        wanted,
+        default_names: &text::CHALLENGE_COLUMNS,
+        most_rows,
+    };
+    match Ending::of(path) {
+        Ending::Parquet => parquet::read(path, wanted),
+        Ending::Fits => fits::read_table(path, wanted),
+        Ending::Text => text::read(path, &request),
+    }
+}
+
+/// Reads a truth file's x, y, g1, g2.
+///
+/// # Errors
+/// Where the file cannot be read, or lacks a column.
+pub fn read_truth(path: &Path) -> Result<DataFrame, FileError> {
+    read_columns(path, &["x", "y", "g1", "g2"])
+}
+
+/// Reads the columns `names`: of a text table, which has these and no others where it has no header, or of another
+/// format.
+///
+/// # Errors
+/// Where the file cannot be read, or lacks a column.
+pub fn read_columns(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
+    match Ending::of(path) {
+        Ending::Text => read_text(path, names),
+        Ending::Parquet | Ending::Fits => read(path, Some(names), MAX_ROWS),
+    }
+}
+
+/// Reads an ASCII or CSV table whose columns, where it has no header, are `names`.
+///
+/// # Errors
+/// Where the file cannot be read.
+pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
+    let request = text::Request {
+        wanted: Some(names),
+        default_names: names,
+        most_rows: MAX_ROWS,
+    };
+    text::read(path, &request)
+}
+
+/// What is left of `metadata` in a table written as `format`: all in Parquet; in FITS what fits into a
+/// header, which is keys of at most eight characters with values of at most 68.
+pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
+    let fits = |key: &str, value: &str| key.len() <= 8 && value.len() <= 68;
+    metadata
+        .iter()
+        .filter(|(key, value)| format == FileFormat::Parquet || fits(key, value))
+        .map(|(key, value)| (key.clone(), value.clone()))
+        .collect()
+}
+
+/// The values of `keys` that a table written by [`write`] carries, those that it has.
+///
+/// # Errors
+/// Where the file cannot be read.
+pub fn read_metadata<'a>(
+    path: &Path,
+    format: FileFormat,
+    keys: impl Iterator<Item = &'a String>,
+) -> Result<Metadata, FileError> {
+    match format {
+        FileFormat::Parquet => {
+            let mut all = parquet::metadata(path)?;
+            Ok(keys.filter_map(|key| all.remove_entry(key)).collect())
+        }
+        FileFormat::Fits => fits::read_table_keys(path, keys),
+    }
+}
+
+/// Writes `table` as `format`, with the key–value pairs that say what made it, as far as
+/// they are [`kept`].
+///
+/// # Errors
+/// Where the file cannot be written.
+pub fn write(
+    path: &Path,
+    format: FileFormat,
+    table: &DataFrame,
+    metadata: &Metadata,
+) -> Result<(), FileError> {
+    match format {
+        FileFormat::Parquet => parquet::write(path, table, metadata),
+        FileFormat::Fits => {
+            let keys: Vec<(String, fits::Value)> = kept(metadata, format)
+                .into_iter()
+                .map(|(key, value)| (key.to_ascii_uppercase(), fits::Value::Text(value)))
+                .collect();
+            let header: Vec<(&str, fits::Value)> =
+                keys.iter().map(|(k, v)| (k.as_str(), v.clone())).collect();
+            fits::write_table(path, table, &header)
+        }
+    }
+}

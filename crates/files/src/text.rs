@@ -1,0 +1,687 @@
+//! CSV and ASCII tables of numbers, plain or compressed by gzip, read as they stream by.
+
+use std::cell::Cell;
+use std::io::{BufRead, BufReader, Chain, Cursor, ErrorKind, Read};
+use std::path::Path;
+use std::rc::Rc;
+
+use csv::{ReaderBuilder, StringRecord};
+use flate2::bufread::MultiGzDecoder;
+
+use crate::frames::polars::{Column, DataFrame};
+
+use crate::error::{FileError, names_of};
+use crate::open;
+
+/// Columns of an ASCII table without a header: the challenge's catalogue.
+pub(super) const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
+
+/// Most bytes of a row with the comments before it, and of all that stands before the first row.
+const MAX_RECORD: usize = 1 << 20;
+/// Most rows of a file of fewer bytes than that; a larger one may have one for each byte. Numbers do not
+/// compress further, and zeros are no catalogue.
+const FREE_ROWS: usize = 1 << 20;
+/// Bytes read at a time.
+const BUFFER: usize = 1 << 15;
+/// Most characters of a damaged field that a message shows.
+const SHOWN: usize = 40;
+/// What gzip-compressed files start with.
+const GZIP: [u8; 2] = [0x1f, 0x8b];
+
+/// What is wanted of a table.
+pub(super) struct Request<'a> {
+    /// Columns to read; all, with NaN for what is not a number, if `None`.
+    pub(super) wanted: Option<&'a [&'a str]>,
+    /// Names of the columns of a table without a header.
+    pub(super) default_names: &'a [&'a str],
+    /// Most rows.
+    pub(super) most_rows: usize,
+}
+
+/// Reads columns.
+///
+/// The first line that is neither empty nor a `#` comment names the columns if its first field that is
+/// not empty is not a number; otherwise a comment that holds all the names wanted does; otherwise the
+/// columns are the default ones, and further ones are left alone. Fields are separated by the first of
+/// `;`, `,` and tabs that the first row has, as often as the header does, and by blanks if it has none.
+/// An empty field is NaN. A file without a row is a table without rows.
+pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, FileError> {
+    let mut input = Input::open(path)?;
+    let size = std::fs::metadata(path).map_or(0, |about| about.len()) as usize;
+    let head = Head::read(&mut input, path)?;
+    let separator = Separator::of(head.header.as_deref(), head.first.as_deref());
+    let (names, named) = head.names(separator, request);
+    let mut rows = Rows::new(path, request, &names, named)?;
+    rows.most = rows.most.min(FREE_ROWS.max(size));
+    input.read_rows(head, separator, &mut rows)?;
+    rows.table()
+}
+
+/// The text of a file from some place on.
+struct Input {
+    text: BufReader<Metered>,
+    /// Bytes that may still be taken from the file for the present row.
+    left: Rc<Cell<usize>>,
+}
+
+/// A file, decompressed, that refuses to give more bytes than are left.
+struct Metered {
+    file: Box<dyn Read>,
+    left: Rc<Cell<usize>>,
+}
+
+impl Read for Metered {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        if self.left.get() == 0 {
+            let message =
+                format!("a row with what stands before it has more than {MAX_RECORD} bytes");
+            return Err(std::io::Error::new(ErrorKind::InvalidData, message));
+        }
+        let most = buffer.len().min(self.left.get());
+        let read = self.file.read(&mut buffer[..most])?;
+        self.left.set(self.left.get() - read);
+        Ok(read)
+    }
+}
+
+fn cannot_read<E: std::fmt::Display>(path: &Path) -> impl FnOnce(E) -> FileError {
+    FileError::doing(path, "cannot read the table")
+}
+
+impl Input {
+    fn open(path: &Path) -> Result<Self, FileError> {
+        let file = open::open(path).map_err(cannot_read(path))?;
+        let mut file = BufReader::with_capacity(BUFFER, file);
+        let start = file.fill_buf().map_err(cannot_read(path))?;
+        let file: Box<dyn Read> = if start.starts_with(&GZIP) {
+            Box::new(MultiGzDecoder::new(file))
+        } else {
+            Box::new(file)
+        };
+        let left = Rc::new(Cell::new(MAX_RECORD));
+        let metered = Metered {
+            file,
+            left: Rc::clone(&left),
+        };
+        Ok(Input {
+            text: BufReader::with_capacity(BUFFER, metered),
+            left,
+        })
+    }
+
+    /// Reads all rows: the first one, which `head` has, and what follows.
+    fn read_rows(
+        self,
+        head: Head,
+        separator: Separator,
+        rows: &mut Rows<'_>,
+    ) -> Result<(), FileError> {
+        let Input { text, left } = self;
+        let Some(first) = head.first else {
+            return Ok(());
+        };
+        let crlf = first.ends_with("\r\n");
+        let text = Cursor::new(first.into_bytes()).chain(text);
+        match separator {
+            Separator::Byte(byte) => read_delimited(text, byte, crlf, &left, head.before, rows),
+            Separator::Blanks => read_blanks(text, &left, head.before, rows),
+        }
+    }
+}
+
+type Rest = Chain<Cursor<Vec<u8>>, BufReader<Metered>>;
+
+/// Rows of fields between `delimiter`s, after `before` lines.
+fn read_delimited(
+    text: Rest,
+    delimiter: u8,
+    crlf: bool,
+    left: &Cell<usize>,
+    before: u64,
+    rows: &mut Rows<'_>,
+) -> Result<(), FileError> {
+    // The reader stands behind the line feed of a row, but before it where a carriage return ends the row.
+    // So that this holds for the last row, too, a line end is added.
+    let (end, after): (&[u8], u64) = if crlf { (b"\r\n", 0) } else { (b"\n", 1) };
+    let mut reader = delimited(delimiter).from_reader(text.chain(end));
+    let mut record = StringRecord::new();
+    left.set(MAX_RECORD);
+    loop {
+        let read = reader.read_record(&mut record);
+        let line = before + reader.position().line() - after;
+        match read {
+            Ok(true) => {}
+            Ok(false) => return Ok(()),
+            Err(error) => {
+                return Err(match error.kind() {
+                    csv::ErrorKind::Utf8 { .. } => not_text(rows.path, line),
+                    _ => cannot_read(rows.path)(error),
+                });
+            }
+        }
+        // Blank lines, and comments that blanks stand before.
+        let first = record.get(0).unwrap_or_default();
+        let start = first.trim_start();
+        if record.len() == 1 && start.is_empty() || first != start && start.starts_with('#') {
+            continue;
+        }
+        rows.add(line, record.iter())?;
+        left.set(MAX_RECORD);
+    }
+}
+
+/// Rows of fields between blanks, after `before` lines.
+fn read_blanks(
+    mut text: Rest,
+    left: &Cell<usize>,
+    before: u64,
+    rows: &mut Rows<'_>,
+) -> Result<(), FileError> {
+    let (mut bytes, mut number) = (Vec::new(), before);
+    loop {
+        let part = text.by_ref().take(BUFFER as u64).read_to_end(&mut bytes);
+        let last = part.map_err(cannot_read(rows.path))? == 0;
+        let end = match bytes.iter().rposition(|byte| *byte == b'\n') {
+            _ if last => bytes.len(),
+            Some(line_feed) => line_feed + 1,
+            None => continue,
+        };
+        let lines = std::str::from_utf8(&bytes[..end]).map_err(|error| {
+            let good = &bytes[..error.valid_up_to()];
+            let lines = good.iter().filter(|byte| **byte == b'\n').count();
+            not_text(rows.path, number + 1 + lines as u64)
+        })?;
+        let quotes = lines.contains('"');
+        let rows_before = rows.rows;
+        for line in lines.lines() {
+            number += 1;
+            let line = line.trim_ascii();
+            if line.is_empty() || line.starts_with('#') {
+                continue;
+            }
+            if quotes {
+                rows.add(number, quoted_blanks(line))?;
+            } else {
+                rows.add(number, line.split_ascii_whitespace())?;
+            }
+        }
+        if last {
+            return Ok(());
+        }
+        bytes.drain(..end);
+        if rows.rows > rows_before {
+            left.set(MAX_RECORD);
+        }
+    }
+}
+
+fn not_text(path: &Path, line: u64) -> FileError {
+    FileError::new(
+        path,
+        format!("this is not a text table: line {line} is not UTF-8"),
+    )
+}
+
+/// Fields between blanks, some of them in quotes.
+fn quoted_blanks(line: &str) -> impl Iterator<Item = &str> {
+    let mut quoted = false;
+    line.split(move |c: char| {
+        quoted ^= c == '"';
+        !quoted && c.is_ascii_whitespace()
+    })
+    .filter(|field| !field.is_empty())
+    .map(|field| {
+        let inner = field.strip_prefix('"').and_then(|f| f.strip_suffix('"'));
+        inner.unwrap_or(field)
+    })
+}
+
+/// How delimited text is read.
+fn delimited(delimiter: u8) -> ReaderBuilder {
+    let mut builder = ReaderBuilder::new();
+    builder
+        .delimiter(delimiter)
+        .has_headers(false)
+        .flexible(true)
+        .comment(Some(b'#'))
+        .buffer_capacity(BUFFER);
+    builder
+}
+
+/// What stands between the fields of a row.
+#[derive(Clone, Copy)]
+enum Separator {
+    /// One byte.
+    Byte(u8),
+    /// Any number of blanks.
+    Blanks,
+}
+
+impl Separator {
+    /// That of a table with these lines: one that splits both alike, or else any that splits the row.
+    fn of(header: Option<&str>, row: Option<&str>) -> Self {
+        let Some(row) = row.or(header) else {
+            return Separator::Blanks;
+        };
+        let count = |line: &str, separator: Separator| separator.split(line).len();
+        let alike = |separator: Separator| {
+            header.is_some_and(|header| count(header, separator) == count(row, separator))
+        };
+        // Tabs among blanks are blanks.
+        let blank = |separator: Separator| {
+            matches!(separator, Separator::Byte(b'\t'))
+                && count(row, Separator::Blanks) > count(row, separator)
+                && (header.is_none() || alike(Separator::Blanks))
+        };
+        let found: Vec<Separator> = [b';', b',', b'\t']
+            .into_iter()
+            .filter(|byte| row.as_bytes().contains(byte))
+            .map(Separator::Byte)
+            .filter(|separator| count(row, *separator) > 1 && !blank(*separator))
+            .collect();
+        let best = found.iter().find(|separator| alike(**separator));
+        best.or(found.first()).copied().unwrap_or(Separator::Blanks)
+    }
+
+    /// Fields of one line.
+    fn split(self, line: &str) -> Vec<String> {
+        match self {
+            Separator::Blanks => quoted_blanks(line.trim()).map(str::to_owned).collect(),
+            Separator::Byte(byte) => {
+                let mut record = StringRecord::new();
+                let mut reader = delimited(byte).from_reader(line.as_bytes());
+                match reader.read_record(&mut record) {
+                    Ok(_) => record.iter().map(|field| field.trim().to_owned()).collect(),
+                    // Reading text from memory does not fail.
+                    Err(_) => Vec::new(),
+                }
+            }
+        }
+    }
+}
+
+/// All up to the first row.
+#[derive(Default)]
+struct Head {
+    comments: Vec<String>,
+    header: Option<String>,
+    first: Option<String>,
+    /// Number of lines before the first row.
+    before: u64,
+}
+
+impl Head {
+    fn read(input: &mut Input, path: &Path) -> Result<Self, FileError> {
+        let mut head = Head::default();
+        loop {
+            let mut line = Vec::new();
+            let read = input.text.read_until(b'\n', &mut line);
+            if read.map_err(cannot_read(path))? == 0 {
+                return Ok(head);
+            }
+            let number = head.before + 1;
+            let line = String::from_utf8(line).map_err(|_| not_text(path, number))?;
+            let line = match line.strip_prefix('\u{feff}') {
+                Some(rest) if head.before == 0 => rest.to_owned(),
+                _ => line,
+            };
+            let text = line.trim();
+            if text.contains('\r') {
+                let message = format!(
+                    "line {number} holds carriage returns; expected lines that end in line feeds"
+                );
+                return Err(FileError::new(path, message));
+            }
+            if let Some(comment) = text.strip_prefix('#') {
+                let comment = comment.trim_start_matches('#').trim();
+                head.comments.push(comment.to_owned());
+            } else if head.header.is_none() && names_something(text) {
+                head.header = Some(text.to_owned());
+            } else if !text.is_empty() {
+                head.first = Some(line);
+                return Ok(head);
+            }
+            head.before += 1;
+        }
+    }
+
+    /// Names of the columns, and whether the file gives them.
+    fn names(&self, separator: Separator, request: &Request<'_>) -> (Vec<String>, bool) {
+        let count = |line: &String| separator.split(line).len();
+        let fits = |names: &Vec<String>| match request.wanted {
+            Some(wanted) => wanted.iter().all(|w| names.iter().any(|n| n == w)),
+            None => self.first.as_ref().map(count) == Some(names.len()),
+        };
+        if let Some(header) = &self.header {
+            // Names need not be separated like numbers.
+            let (names, others) = (separator.split(header), split_names(header));
+            let other = !fits(&names) && fits(&others);
+            return (if other { others } else { names }, true);
+        }
+        // The last comment that can be a header is one.
+        let comments = self.comments.iter().rev();
+        match comments.map(|line| split_names(line)).find(fits) {
+            Some(names) => (names, true),
+            None => (owned(request.default_names), false),
+        }
+    }
+}
+
+/// Whether a line is one of names: its first field that is not empty is not a number.
+fn names_something(line: &str) -> bool {
+    split_names(line)
+        .first()
+        .is_some_and(|field| field.parse::<f64>().is_err())
+}
+
+/// Names in a line, between any separators, quoted or not.
+fn split_names(line: &str) -> Vec<String> {
+    line.split([';', ',', ' ', '\t'])
+        .map(|name| name.trim().trim_matches('"'))
+        .filter(|name| !name.is_empty())
+        .map(str::to_owned)
+        .collect()
+}
+
+fn owned(names: &[&str]) -> Vec<String> {
+    names.iter().map(|&name| name.to_owned()).collect()
+}
+
+/// Columns being filled.
+struct Rows<'a> {
+    path: &'a Path,
+    names: &'a [String],
+    /// Whether the file names its columns, so that every row has a field for each.
+    named: bool,
+    /// Whether what is not a number is an error.
+    strict: bool,
+    most: usize,
+    /// Of the columns read, by place in the row.
+    slots: Vec<Option<usize>>,
+    places: Vec<usize>,
+    columns: Vec<Vec<f64>>,
+    rows: usize,
+}
+
+impl<'a> Rows<'a> {
+    fn new(
+        path: &'a Path,
+        request: &Request<'_>,
+        names: &'a [String],
+        named: bool,
+    ) -> Result<Self, FileError> {
+        let place = |name: &&str| {
+            let place = names.iter().position(|own| own == name);
+            place.ok_or_else(|| FileError::no_column(path, name, names))
+        };
+        let places: Vec<usize> = match request.wanted {
+            Some(wanted) => wanted.iter().map(place).collect::<Result<_, _>>()?,
+            None => (0..names.len()).collect(),
+        };
+        for &place in &places {
+            if names.iter().filter(|name| **name == names[place]).count() > 1 {
+                let message = format!("there are two columns named `{}`", names[place]);
+                return Err(FileError::new(path, message));
+            }
+        }
+        let slot = |column| places.iter().position(|&place| place == column);
+        Ok(Rows {
+            path,
+            names,
+            named,
+            strict: request.wanted.is_some(),
+            most: request.most_rows,
+            slots: (0..names.len()).map(slot).collect(),
+            columns: vec![Vec::new(); places.len()],
+            places,
+            rows: 0,
+        })
+    }
+
+    /// Adds the row in a line.
+    fn add<'f>(
+        &mut self,
+        line: u64,
+        fields: impl Iterator<Item = &'f str>,
+    ) -> Result<(), FileError> {
+        if self.rows == self.most {
+            let message = format!("line {line}: expected at most {} rows", self.most);
+            return Err(FileError::new(self.path, message));
+        }
+        self.rows += 1;
+        let mut count = 0;
+        for (column, field) in fields.enumerate() {
+            count += 1;
+            let Some(slot) = self.slots.get(column).copied().flatten() else {
+                continue;
+            };
+            let value = match number(field) {
+                None if self.strict => return Err(self.not_a_number(line, column, field)),
+                value => value.unwrap_or(f64::NAN),
+            };
+            self.columns[slot].push(value);
+        }
+        // Without a header, the columns after the known ones are nobody's.
+        let expected = self.names.len();
+        if count == expected || !self.named && count > expected {
+            return Ok(());
+        }
+        let names = names_of(self.names);
+        let message = format!("line {line}: {count} fields; expected {expected} ({names})");
+        Err(FileError::new(self.path, message))
+    }
+
+    #[cold]
+    fn not_a_number(&self, line: u64, column: usize, field: &str) -> FileError {
+        let field: String = field.trim().chars().take(SHOWN).collect();
+        let name = &self.names[column];
+        let message = format!("line {line}: `{field}` in column `{name}` is not a number");
+        FileError::new(self.path, message)
+    }
+
+    fn table(self) -> Result<DataFrame, FileError> {
+        let columns = self
+            .places
+            .iter()
+            .zip(self.columns)
+            .map(|(&place, values)| Column::new(self.names[place].as_str().into(), values))
+            .collect();
+        crate::frames::frame(columns).map_err(|error| FileError::new(self.path, error.to_string()))
+    }
+}
+
+/// The number in a field, NaN in an empty one.
+fn number(field: &str) -> Option<f64> {
+    field.parse().ok().or_else(|| match field.trim() {
+        "" => Some(f64::NAN),
+        field => field.parse().ok(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::frames::reals;
+
+    use super::*;
+
+    fn table(text: &str, wanted: Option<&[&str]>) -> Result<DataFrame, String> {
+        table_of(text.as_bytes(), wanted)
+    }
+
+    fn table_of(bytes: &[u8], wanted: Option<&[&str]>) -> Result<DataFrame, String> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("t.csv");
+        std::fs::write(&path, bytes).unwrap();
+        let request = Request {
+            wanted,
+            default_names: &CHALLENGE_COLUMNS,
+            most_rows: 10,
+        };
+        read(&path, &request).map_err(|e| e.to_string())
+    }
+
+    fn column(table: &DataFrame, name: &str) -> Vec<f64> {
+        reals(table.column(name).unwrap()).unwrap().into_owned()
+    }
+
+    #[test]
+    fn headers_and_separators_are_recognised() {
+        let columns = |text| {
+            let t = table(text, Some(&["y", "e1"])).unwrap();
+            (column(&t, "y"), column(&t, "e1"))
+        };
+        let expected = (vec![2.0, 6.0], vec![3.0, -7e-3]);
+        assert_eq!(columns("x,y,e1,e2\n1,2,3,4\n5,6,-7e-3,8\n"), expected);
+        assert_eq!(columns("1 2 3 4\n 5  6 -7e-3 8\n"), expected);
+        assert_eq!(
+            columns("# x y e1 e2\n1 2 3 4\n# note\n\n5\t6 -7e-3 8\n"),
+            expected
+        );
+        assert_eq!(columns("# made by hand\n1 2 3 4\n5 6 -7e-3 8\n"), expected);
+        assert_eq!(columns("e1,x,y\r\n3,1,2\r\n-7e-3,5,6\r\n"), expected);
+        assert_eq!(
+            columns("# my method version one\n1 2 3 4\n5 6 -7e-3 8\n"),
+            expected
+        );
+        assert_eq!(
+            columns("# made by hand, by me\n# x, y, e1, e2\n1 2 3 4\n5 6 -7e-3 8\n"),
+            expected
+        );
+        assert_eq!(
+            columns("# note\nx,y,e1,e2\n1,2,3,4\n5,6,-7e-3,8\n"),
+            expected
+        );
+        assert_eq!(
+            columns("\u{feff}x,y,e1,e2\n1,2,3,4\n5,6,-7e-3,8\n"),
+            expected
+        );
+        assert_eq!(columns("1 2 3 4 0\n5 6 -7e-3 8 0\n"), expected);
+        for blank in ["", "# no galaxies\n", "x,y,e1,e2\n"] {
+            assert_eq!(columns(blank), (vec![], vec![]), "{blank:?}");
+        }
+        assert_eq!(table("x,y,e1,e2\n", None).unwrap().height(), 0);
+        assert!(table("x,y,e1,e2\n1,2,NaN,nan\n", None).is_ok());
+    }
+
+    #[test]
+    fn catalogues_of_other_programs_are_read() {
+        let values = |text: &str| {
+            let t = table(text, Some(&["y", "e1"])).unwrap_or_else(|e| panic!("{text:?}: {e}"));
+            (column(&t, "y"), column(&t, "e1"))
+        };
+        let expected = (vec![2.0, 6.0], vec![3.0, -7e-3]);
+        for text in [
+            // An index without a name, as pandas writes it.
+            ",x,y,e1,e2\n0,1,2,3,4\n1,5,6,-7e-3,8\n",
+            "\"\" x y e1 e2\n0 1 2 3 4\n1 5 6 -7e-3 8\n",
+            "name,x,y,e1,e2\n\"a, b\",1,2,3,4\n\"c \"\"d\"\"\",5,\"6\",-7e-3,8\n",
+            "\"a, b\",x,y,\"e1\",e2\n,1,2,3,4\n0,5,6,-7e-3,8\n",
+            "x;y;e1;e2\n1;2;3;4\n5;6;-7e-3;8\n",
+            "1;2;3;4\n5;6;-7e-3;8\n",
+            "x\ty\te1\te2\n\t2\t3\t\n5\t6\t-7e-3\t8\n",
+            "name\tx\ty\te1\te2\nmy galaxy\t1\t2\t3\t4\nno. 2\t5\t6\t-7e-3\t8\n",
+            "5\t2 3 4\n5\t6 -7e-3 8\n",
+            "x,y,e1,e2\n# made by me\n1,2,3,4\n# \"half, of it\n  # more\n \n5,6,-7e-3,8",
+            "x y e1 e2\n# made by me, by hand\n1 2 3 4\n5 6 -7e-3 8\n",
+            "# made by me, by hand\n1 2 3 4\n# a, b; c\n5 6 -7e-3 8\n",
+            "x y e1 e2\n1,2,3,4\n5,6,-7e-3,8\n",
+            "x, y, e1, e2\n1 2 3 4\n5 6 -7e-3 8\n",
+            "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: x, datatype: float64}\nx y e1 e2 id\n\"\" 2 3 4 \"NGC 1\"\n5 6 -7e-3 8 b\n",
+            "\u{feff}x;y;e1;e2\r\n1;2;3;4\r\n5;6;-7e-3;8\r\n",
+        ] {
+            assert_eq!(values(text), expected, "{text:?}");
+        }
+        let gaps = table("x,y,e1,e2\n,2,,4\n5, ,\"\",8\n", Some(&["x", "e1", "e2"])).unwrap();
+        assert!(column(&gaps, "e1").iter().all(|v| v.is_nan()));
+        assert!(column(&gaps, "x")[0].is_nan());
+        assert_eq!(column(&gaps, "e2"), [4.0, 8.0]);
+    }
+
+    #[test]
+    fn compressed_tables_stream_and_are_bounded() {
+        use std::io::Write;
+        let gzip = |parts: &[&[u8]]| {
+            let mut bytes = Vec::new();
+            // One member after another, as compressors that work in parallel write them.
+            for part in parts {
+                let mut encoder = flate2::write::GzEncoder::new(&mut bytes, Default::default());
+                encoder.write_all(part).unwrap();
+                encoder.finish().unwrap();
+            }
+            bytes
+        };
+        let wanted: Option<&[&str]> = Some(&["x", "e2"]);
+        let of = |bytes: &[u8]| table_of(bytes, wanted).map(|t| t.height());
+        assert_eq!(of(&gzip(&[b"x,y,e1,e2\n1,2,", b"3,4\n5,6,7,8\n"])), Ok(2));
+        let whole = gzip(&[b"x,y,e1,e2\n1,2,3,4\n5,6,7,8\n"]);
+        assert!(
+            of(&whole[..whole.len() - 5])
+                .unwrap_err()
+                .contains("cannot read the table")
+        );
+        let many = b"1,2,3,4\n".repeat(11);
+        assert!(
+            of(&many)
+                .unwrap_err()
+                .contains("line 11: expected at most 10 rows")
+        );
+        let blanks = b"1 2 3 4\n".repeat(11);
+        assert!(
+            of(&gzip(&[&blanks]))
+                .unwrap_err()
+                .contains("line 11: expected at most 10 rows")
+        );
+        let long = vec![b' '; 2 * MAX_RECORD];
+        let zeros = vec![0; 2 * MAX_RECORD];
+        for start in [
+            "",
+            "#",
+            "x,y,e1,e2\n1,2,3,",
+            "x,y,e1,e2\n1,2,3,\"4\n5,6,7,8\n",
+            "1 2 3 ",
+        ] {
+            for filling in [&long, &zeros] {
+                let error = of(&gzip(&[start.as_bytes(), filling])).unwrap_err();
+                assert!(
+                    error.contains("more than 1048576 bytes"),
+                    "{start}: {error}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn mistakes_are_named_with_their_line() {
+        let message = |text| table(text, Some(&["x", "e2"])).unwrap_err();
+        assert!(message("x,y,e1,e2\n1,2,3\n").contains("line 2: 3 fields; expected 4"));
+        assert!(
+            message("x,y,e1,e2\n1,2,3,4\n1,2,3,four\n").contains("line 3: `four` in column `e2`")
+        );
+        for (text, line) in [
+            ("x,y,e1,e2\r\n\r\n# note\r\n1,2,3,4\r\n1,2,3,four\r\n", 5),
+            ("# note\nx,y,e1,e2\n1,2,3,4\n# note\n\n1,2,3,four", 6),
+            ("1 2 3 4\n# note\n\n1 2 3 four\n", 4),
+        ] {
+            let found = message(text);
+            assert!(found.contains(&format!("line {line}: `four`")), "{found}");
+        }
+        let bytes: [(&[u8], _); 4] = [
+            (b"x,y,e1,e2\n1,2,3,\xff\n", 2),
+            (b"x,y,e1,e2\n1,2,3,4\n1,2,\xff,4\n", 3),
+            (b"# note\r\n1,2,3,4\r\n1,2,\xff,4\r\n", 3),
+            (b"# note\n1 2 3 4\n\n1 2 3 \xff", 4),
+        ];
+        for (bytes, line) in bytes {
+            let found = table_of(bytes, Some(&["x"])).unwrap_err();
+            assert!(
+                found.contains(&format!("line {line} is not UTF-8")),
+                "{found}"
+            );
+        }
+        let missing = message("x,y,g1,g2\n1,2,3,4\n");
+        assert!(
+            missing.contains("no column `e2`") && missing.contains("g1, g2"),
+            "{missing}"
+        );
+    }
+}

@@ -1,0 +1,285 @@
+//! Tables written and read back, and files that are wrong in some way.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::frames::polars::{AnyValue, Column, DataFrame, df};
+use crate::frames::{
+    Metadata, TableError, frame, parquet_columns, parquet_metadata, read_parquet, reals,
+    write_parquet,
+};
+
+/// Every type, a NaN, an infinity, extreme integers, and text beyond ASCII.
+fn sample() -> DataFrame {
+    df!(
+        "g1" => [0.25, f64::NAN, f64::NEG_INFINITY],
+        "size" => [1.5_f32, -0.0, f32::NAN],
+        "id" => [i64::MIN, 0, i64::MAX],
+        "flag" => [0, 7, u32::MAX],
+        "name" => ["", "γ₁", "long long long long long long long long long"],
+    )
+    .expect("equal lengths")
+}
+
+fn metadata() -> Metadata {
+    [
+        ("set", "7"),
+        ("branch", "variable"),
+        ("note", "σ = 0.05\n\"quoted\""),
+    ]
+    .map(|(key, value)| (key.to_owned(), value.to_owned()))
+    .into()
+}
+
+fn encode(frame: &DataFrame) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    write_parquet(&mut bytes, frame, &metadata()).expect("writing to memory");
+    bytes
+}
+
+/// A file of these bytes in `folder`.
+fn place(folder: &Path, bytes: &[u8]) -> PathBuf {
+    let path = folder.join("table.parquet");
+    fs::write(&path, bytes).expect("temporary file");
+    path
+}
+
+/// Equality under which NaN equals NaN and −0 differs from 0.
+fn assert_same(left: &DataFrame, right: &DataFrame) {
+    assert_eq!(left.schema(), right.schema());
+    for (left, right) in left.columns().iter().zip(right.columns()) {
+        let bits = |column: &Column| {
+            let values = column.as_materialized_series().iter();
+            values
+                .map(|value| match value {
+                    AnyValue::Float64(value) => value.to_bits().to_string(),
+                    AnyValue::Float32(value) => value.to_bits().to_string(),
+                    value => value.to_string(),
+                })
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(bits(left), bits(right), "{}", left.name());
+    }
+}
+
+#[test]
+fn every_type_and_the_metadata_survive() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let path = place(folder.path(), &encode(&sample()));
+    assert_same(&read_parquet(&path, None).expect("readable"), &sample());
+    assert_eq!(parquet_metadata(&path).expect("readable"), metadata());
+    assert_eq!(
+        parquet_columns(&path).expect("readable"),
+        ["g1", "size", "id", "flag", "name"]
+    );
+}
+
+#[test]
+fn wanted_columns_come_in_the_order_asked_for() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let path = place(folder.path(), &encode(&sample()));
+    let table = read_parquet(&path, Some(&["flag", "g1"])).expect("readable");
+    assert_eq!(table.get_column_names(), ["flag", "g1"]);
+    assert_eq!(table.column("flag").ok(), sample().column("flag").ok());
+    let none = read_parquet(&path, Some(&[])).expect("readable");
+    assert_eq!(none.width(), 0);
+}
+
+#[test]
+fn many_rows_in_several_row_groups_and_none_at_all() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    for rows in [0, 1, 600_000] {
+        let numbers = 0..rows;
+        let sines: Vec<f64> = numbers.clone().map(|i| f64::from(i).sin()).collect();
+        let ids: Vec<i64> = numbers.clone().map(i64::from).collect();
+        let kinds: Vec<String> = numbers.clone().map(|i| format!("kind {}", i % 3)).collect();
+        let constant = vec![0.1; numbers.len()];
+        let table = df!("x" => sines, "constant" => constant, "id" => ids, "kind" => kinds)
+            .expect("equal lengths");
+        let path = place(folder.path(), &encode(&table));
+        assert_same(&read_parquet(&path, None).expect("readable"), &table);
+    }
+}
+
+#[test]
+fn equal_tables_give_equal_bytes() {
+    assert_eq!(encode(&sample()), encode(&sample()));
+}
+
+#[test]
+fn a_missing_column_is_named_with_the_file_and_the_columns_present() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let path = place(folder.path(), &encode(&sample()));
+    let error = read_parquet(&path, Some(&["g1", "g2"]))
+        .expect_err("no g2")
+        .to_string();
+    assert_eq!(
+        error,
+        format!(
+            "{}: no column `g2`; the file has `g1`, `size`, `id`, `flag`, `name`",
+            path.display()
+        )
+    );
+    let error = read_parquet(&path, Some(&["g1", "g1"])).expect_err("g1 twice");
+    assert!(matches!(error, TableError::DuplicateColumn { name } if name == "g1"));
+}
+
+#[test]
+fn frames_that_contradict_themselves_are_refused() {
+    let column = |name: &str, values: &[i64]| Column::new(name.into(), values);
+    let refused = |columns: [Column; 2]| frame(columns.into()).unwrap_err().to_string();
+    assert_eq!(
+        refused([column("a", &[1, 2]), column("b", &[1, 2, 3])]),
+        "column `b` has 3 rows; expected 2, as in the first column `a`"
+    );
+    let twice = refused([column("a", &[1, 2]), column("a", &[1, 2])]);
+    assert!(twice.contains("`a` is named twice"));
+    let reserved = Metadata::from([("ARROW:schema".to_owned(), String::new())]);
+    let error = write_parquet(Vec::new(), &sample(), &reserved).unwrap_err();
+    assert!(error.to_string().contains("reserved"));
+}
+
+#[test]
+fn a_failing_writer_gives_its_error() {
+    struct Full;
+    impl std::io::Write for Full {
+        fn write(&mut self, _: &[u8]) -> std::io::Result<usize> {
+            Err(std::io::Error::other("no space left"))
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+    let error = write_parquet(Full, &sample(), &metadata())
+        .expect_err("a full disk")
+        .to_string();
+    assert!(error.contains("no space left"), "{error}");
+}
+
+#[test]
+fn files_that_are_no_parquet_are_refused() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let absent = folder.path().join("absent.parquet");
+    assert!(matches!(
+        read_parquet(&absent, None),
+        Err(TableError::Io { .. })
+    ));
+    assert!(matches!(
+        read_parquet(folder.path(), None),
+        Err(TableError::Damaged { .. })
+    ));
+    let pipe = folder.path().join("pipe");
+    let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+    assert!(made.expect("mkfifo starts").success());
+    assert!(matches!(
+        read_parquet(&pipe, None),
+        Err(TableError::Damaged { .. })
+    ));
+    for garbage in [
+        &b""[..],
+        b"PAR1",
+        b"PAR1PAR1PAR1PAR1",
+        &[0xff; 5000],
+        b"id,g1\n1,0.02\n",
+    ] {
+        let path = place(folder.path(), garbage);
+        let error = read_parquet(&path, None).expect_err("garbage").to_string();
+        assert!(error.starts_with(&path.display().to_string()), "{error}");
+    }
+}
+
+#[test]
+fn rows_and_texts_that_take_next_to_nothing_in_a_file_are_counted() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let refusal = |table: DataFrame| {
+        let path = place(folder.path(), &encode(&table));
+        read_parquet(&path, None)
+            .err()
+            .map(|error| error.to_string())
+    };
+    assert_eq!(refusal(df!("a" => vec![7_i64; 1 << 20]).unwrap()), None);
+    let error = refusal(df!("a" => vec![7_i64; 5_000_000]).unwrap()).expect("too many rows");
+    assert!(
+        error.contains("found 5000000 rows of 1 columns, expected at most"),
+        "{error}"
+    );
+    let error =
+        refusal(df!("a" => vec!["x".repeat(10_000); 100_000]).unwrap()).expect("too much text");
+    assert!(
+        error.contains("too much text") || error.contains("unpack to"),
+        "{error}"
+    );
+}
+
+#[test]
+fn truncated_files_are_refused_at_any_length() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let bytes = encode(&sample());
+    for length in 0..bytes.len() {
+        let path = place(folder.path(), &bytes[..length]);
+        assert!(
+            read_parquet(&path, None).is_err(),
+            "{length} of {} bytes",
+            bytes.len()
+        );
+    }
+}
+
+#[test]
+fn a_wrong_byte_anywhere_never_panics() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    let bytes = encode(&sample());
+    for place_of_damage in 0..bytes.len() {
+        for mask in [0x01, 0x80, 0xff] {
+            let mut damaged = bytes.clone();
+            damaged[place_of_damage] ^= mask;
+            // Damaged values and names can still be read; only the return matters.
+            let _ = read_parquet(place(folder.path(), &damaged), None);
+        }
+    }
+}
+
+/// `tests/data/types.parquet` was written by pyarrow 26 with its defaults (Snappy, dictionaries):
+/// two rows of one column per type, `None` where a value is missing.
+#[test]
+fn files_of_other_writers_are_converted() {
+    let path = "tests/data/types.parquet";
+    let names = [
+        "i8", "i16", "i32", "u64", "u8", "u16", "flag", "category", "f32", "f64",
+    ];
+    let table = read_parquet(path, Some(&names)).expect("readable");
+    let metadata = parquet_metadata(path).expect("readable");
+    assert_eq!(metadata["written by"], "pyarrow");
+    let expected = [
+        [-128.0, 127.0],
+        [-300.0, 4.0],
+        [-70_000.0, 4.0],
+        [(1_u64 << 40) as f64, 4.0],
+        [255.0, 4.0],
+        [65_535.0, 4.0],
+        [1.0, 0.0],
+    ];
+    let column = |name: &str| table.column(name).expect("a column");
+    for (name, expected) in names.iter().zip(&expected) {
+        let found = reals(column(name)).expect("numbers");
+        assert_eq!(&*found, expected, "{name}");
+    }
+    let words = column("category").str().expect("text");
+    assert!(words.iter().eq([Some("disc"), Some("bulge")]) && reals(column("category")).is_none());
+    let (single, double) = (column("f32"), column("f64"));
+    // Not a number, and no gap.
+    assert_eq!(single.null_count() + double.null_count(), 0);
+    let (single, double) = (reals(single).unwrap(), reals(double).unwrap());
+    assert!(single[0] == 1.5 && single[1].is_nan() && double[0].is_nan() && double[1] == 2.5);
+    let beyond = read_parquet(path, Some(&["beyond"])).expect("readable");
+    let beyond = reals(beyond.column("beyond").expect("it")).expect("numbers");
+    assert_eq!(beyond[1], 9_223_372_036_854_775_808.0);
+
+    let error = |name: &str| {
+        read_parquet(path, Some(&[name]))
+            .expect_err(name)
+            .to_string()
+    };
+    assert!(error("gap").contains("column `gap` has 1 missing value(s)"));
+    assert!(error("day").contains("column `day` has type Date32"));
+}

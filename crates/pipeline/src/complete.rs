@@ -1,0 +1,249 @@
+//! Whether a folder holds every result that it should, whole and of its settings.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use shearq_quantities::units::{Degrees, Pixels};
+use shearq_scoring::Grid;
+
+use super::PipelineError;
+use super::engine::{self, Progress};
+use super::images::ImageId;
+use super::inputs::Inputs;
+use super::measure::{metadata, open_galaxies};
+use super::simulate::SimulationRecord;
+use crate::data::layout::{DataFolder, read_truth_rows};
+use crate::data::mosaic::Mosaic;
+use crate::data::psf_table;
+use crate::data::run::{Run, Source};
+use shearq_files::FileError;
+use shearq_files::fits::ImageReader;
+use shearq_files::table::{self, kept, most_rows, read_metadata};
+use shearq_simulate::set::STAMP;
+
+/// A folder of results to be checked.
+pub enum Results<'a> {
+    /// Catalogues in `out` of a run on `data`; the true shear lies in `data`.
+    Catalogues {
+        /// Record of the folder.
+        run: &'a Run,
+        /// What was measured: for a simulated run, `out` itself.
+        data: &'a DataFolder,
+        /// The folder.
+        out: &'a Path,
+    },
+    /// Simulated data.
+    Images {
+        /// Record of the folder.
+        record: &'a SimulationRecord,
+        /// The folder.
+        data: &'a DataFolder,
+    },
+}
+
+/// An image whose results are not there, or not as they should be.
+#[derive(Debug)]
+pub struct Fault {
+    /// The image.
+    pub id: ImageId,
+    /// Its place in the list of all images, from 0.
+    pub position: usize,
+    /// File, what was found, what was expected.
+    pub error: FileError,
+    /// The file without which the image is done again.
+    pub result: PathBuf,
+}
+
+impl Results<'_> {
+    /// Number of galaxies of `images`, for progress bars: an estimate from the first that can be read.
+    pub fn galaxies(&self, images: &[ImageId]) -> u64 {
+        let first = images.iter().find_map(|&id| self.cells(id).ok());
+        (images.len() * first.unwrap_or(0)) as u64
+    }
+
+    /// Every fault of the results of `images`, which are all that there should be, in their order.
+    ///
+    /// # Errors
+    /// Where threads cannot be started.
+    pub fn faults(
+        &self,
+        images: &[ImageId],
+        threads: usize,
+        progress: &mut dyn Progress,
+    ) -> Result<Vec<Fault>, PipelineError> {
+        let mut faults = Vec::new();
+        let inputs = match self {
+            Results::Catalogues { run, data, .. } => Some(Inputs::new(run, data, images)?),
+            Results::Images { .. } => None,
+        };
+        engine::ordered(
+            threads,
+            |feeder| {
+                for position in 0..images.len() {
+                    if !feeder.push(position) {
+                        break;
+                    }
+                }
+                Ok(())
+            },
+            || (),
+            |(), position| {
+                let first = position == 0 || images[position - 1].set != images[position].set;
+                Ok((
+                    position,
+                    self.check(images[position], first, inputs.as_ref()),
+                ))
+            },
+            |(position, checked)| {
+                match checked {
+                    Ok(cells) => progress.advance(cells as u64),
+                    Err(error) => {
+                        let id = images[position];
+                        let result = self.result(id);
+                        faults.push(Fault {
+                            id,
+                            position,
+                            error: match error {
+                                PipelineError::File(error) => error,
+                                other => FileError::new(&result, other),
+                            },
+                            result,
+                        });
+                    }
+                }
+                Ok(())
+            },
+        )?;
+        Ok(faults)
+    }
+
+    /// The file that is written last for an image.
+    fn result(&self, id: ImageId) -> PathBuf {
+        match self {
+            Results::Catalogues { run, out, .. } => run.catalogue(out, id.set, id.image),
+            Results::Images { data, .. } => data.galaxies(id.set, id.image),
+        }
+    }
+
+    /// Number of galaxies that an image should have.
+    fn cells(&self, id: ImageId) -> Result<usize, PipelineError> {
+        let settings = match self {
+            Results::Catalogues { run, data, .. } => match &run.source {
+                Source::Folder { .. } => return Ok(open_galaxies(data, id)?.1.galaxies),
+                Source::Simulated(settings) => settings,
+            },
+            Results::Images { record, .. } => &record.settings,
+        };
+        Ok(settings.grid.pow(2))
+    }
+
+    /// Number of galaxies of an image whose results are in order; with those of the `first` image of
+    /// a set, what the set shares is looked at. Catalogues are those of `inputs`.
+    fn check(
+        &self,
+        id: ImageId,
+        first: bool,
+        inputs: Option<&Inputs<'_>>,
+    ) -> Result<usize, PipelineError> {
+        let result = self.result(id);
+        if !result.is_file() {
+            return Err(FileError::new(result, "there is no such file").into());
+        }
+        let cells = self.cells(id)?;
+        let simulated = match self {
+            Results::Catalogues { run, .. } => {
+                let prints = inputs.map_or(Ok(BTreeMap::new()), |inputs| inputs.prints(id))?;
+                check_catalogue(run, id, prints, &result, cells)?;
+                matches!(run.source, Source::Simulated(_))
+            }
+            Results::Images { record, data } => {
+                check_image(record, data, id)?;
+                true
+            }
+        };
+        if let Results::Catalogues { data, .. } | Results::Images { data, .. } = self
+            && first
+            && simulated
+        {
+            let truth = data.truth(id.set);
+            check_rows(&truth, read_truth_rows(&truth)?.len(), cells)?;
+        }
+        Ok(cells)
+    }
+}
+
+fn check_catalogue(
+    run: &Run,
+    id: ImageId,
+    prints: BTreeMap<String, String>,
+    path: &Path,
+    cells: usize,
+) -> Result<(), PipelineError> {
+    let rows = table::read(path, None, cells.saturating_add(1))?.height();
+    check_rows(path, rows, cells)?;
+    let expected = kept(&metadata(run, id, prints)?, run.format);
+    let found = read_metadata(path, run.format, expected.keys())?;
+    let differing = expected
+        .iter()
+        .find(|(key, value)| found.get(*key) != Some(value));
+    match differing {
+        None => Ok(()),
+        Some((key, _)) => {
+            let message = format!(
+                "its `{key}` is not that of set {} image {} of this run; it belongs to another, or to other data",
+                id.set, id.image
+            );
+            Err(FileError::new(path, message).into())
+        }
+    }
+}
+
+/// Checks the files of one simulated image.
+fn check_image(
+    record: &SimulationRecord,
+    data: &DataFolder,
+    id: ImageId,
+) -> Result<(), PipelineError> {
+    let (n, path) = (record.settings.grid, data.galaxies(id.set, id.image));
+    let side = n * STAMP;
+    let image = ImageReader::open(&path)?;
+    if (image.width(), image.height()) != (side, side) {
+        let message = format!(
+            "the image is {} × {} pixels; expected {side} × {side}",
+            image.width(),
+            image.height()
+        );
+        return Err(FileError::new(&path, message).into());
+    }
+    let bytes = std::fs::metadata(&path)
+        .map_err(FileError::doing(&path, "cannot open the image"))?
+        .len();
+    let least = (side * side * size_of::<f32>()) as u64;
+    if bytes < least {
+        let message = format!("the file has {bytes} bytes; its pixels take {least}");
+        return Err(FileError::new(&path, message).into());
+    }
+    ImageReader::open(data.psf_star(id.set, id.image))?;
+    let field = Degrees(data.layout().field_degrees);
+    let grid =
+        Grid::new(n, Pixels(STAMP as f64), field).map_err(|error| FileError::new(&path, error))?;
+    psf_table::read(
+        &data.psf_functional(id.set, id.image),
+        &Mosaic::square(n, STAMP),
+    )?;
+    let intrinsic = data.intrinsic(id.set, id.image);
+    check_rows(
+        &intrinsic,
+        table::read(&intrinsic, None, most_rows(grid.cells()))?.height(),
+        grid.cells(),
+    )?;
+    Ok(())
+}
+
+fn check_rows(path: &Path, rows: usize, expected: usize) -> Result<(), FileError> {
+    if rows == expected {
+        return Ok(());
+    }
+    let message = format!("{rows} rows; expected {expected}, one for each galaxy");
+    Err(FileError::new(path, message))
+}

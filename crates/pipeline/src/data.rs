@@ -1,0 +1,9 @@
+//! Data folders and recorded runs: the layout of challenge data, and what made a result.
+
+pub mod fingerprint;
+pub mod layout;
+pub mod listing;
+pub mod mosaic;
+pub mod psf_table;
+mod relative;
+pub mod run;

@@ -1,0 +1,190 @@
+//! Short names for contents: what tells whether two results were made from the same data.
+//!
+//! Small files count as a whole. Of a large image counts a sample, as reading it once more would take as
+//! long as reading it to measure: its length, its beginning and blocks spread evenly over the rest. Other
+//! pixels (another image, noise, scale or region above a 64th of the file) always show; a change between the
+//! blocks, as of a few stamps, does not.
+
+use std::io::{Read, Seek, SeekFrom};
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+
+use crate::data::layout::{DataFolder, MAX_SET};
+use crate::data::run::Source;
+use shearq_files::FileError;
+use shearq_files::open;
+
+/// Bytes of the longest file that counts as a whole.
+const WHOLE: u64 = 1 << 20;
+/// Bytes at the beginning of a longer one that count: its headers.
+const HEAD: u64 = 16 * 1024;
+/// Blocks of the rest that count.
+const BLOCKS: u64 = 64;
+/// Bytes of such a block: what a system reads at once.
+const BLOCK: u64 = 4096;
+
+/// A SHA-256 on its way, of parts that cannot run into each other.
+#[derive(Default)]
+pub struct Fingerprint(Sha256);
+
+impl Fingerprint {
+    /// Adds a part.
+    pub fn add(&mut self, part: impl AsRef<[u8]>) {
+        let part = part.as_ref();
+        self.0.update((part.len() as u64).to_le_bytes());
+        self.0.update(part);
+    }
+
+    /// Its first 64 bits in hexadecimal: of a million contents, two are alike by chance once in
+    /// forty million cases.
+    pub fn finish(self) -> String {
+        let digest = self.0.finalize();
+        digest[..8]
+            .iter()
+            .map(|byte| format!("{byte:02x}"))
+            .collect()
+    }
+}
+
+/// Fingerprint of some bytes.
+pub fn of_bytes(bytes: &[u8]) -> String {
+    let mut print = Fingerprint::default();
+    print.add(bytes);
+    print.finish()
+}
+
+/// Fingerprint of a file as a whole.
+///
+/// # Errors
+/// Where it cannot be read.
+pub fn of_file(path: &Path) -> Result<String, FileError> {
+    Ok(of_bytes(&read(path)?))
+}
+
+/// Fingerprint of an image, or of what belongs to one: a sample of a large file.
+///
+/// # Errors
+/// Where it cannot be read.
+pub fn of_image(path: &Path) -> Result<String, FileError> {
+    sample(path).map_err(FileError::doing(path, "cannot open the file"))
+}
+
+fn sample(path: &Path) -> std::io::Result<String> {
+    let mut file = open::open(path)?;
+    let length = file.metadata()?.len();
+    let mut print = Fingerprint::default();
+    print.add(length.to_le_bytes());
+    let mut part = Vec::new();
+    let mut add = |file: &mut std::fs::File, bytes: u64| {
+        part.clear();
+        file.take(bytes).read_to_end(&mut part)?;
+        print.add(&part);
+        std::io::Result::Ok(())
+    };
+    if length <= WHOLE {
+        add(&mut file, WHOLE)?;
+        return Ok(print.finish());
+    }
+    add(&mut file, HEAD)?;
+    // The last block ends with the file.
+    let room = length - HEAD - BLOCK;
+    for block in 1..=BLOCKS {
+        let start = HEAD + (u128::from(room) * u128::from(block) / u128::from(BLOCKS)) as u64;
+        file.seek(SeekFrom::Start(start))?;
+        add(&mut file, BLOCK)?;
+    }
+    Ok(print.finish())
+}
+
+/// Fingerprint of one set: its true shear, the settings it is simulated from, and those of `images`
+/// that are there.
+///
+/// # Errors
+/// Where a file cannot be read.
+pub fn of_set(
+    source: &Source,
+    data: &DataFolder,
+    set: u32,
+    images: &[u32],
+) -> Result<String, FileError> {
+    let mut print = Fingerprint::default();
+    if let Source::Simulated(_) = source {
+        print.add(of_source(source, data)?);
+    }
+    print.add(read(&data.truth(set))?);
+    for &image in images {
+        let path = data.galaxies(set, image);
+        if open::is_there(&path) {
+            print.add(image.to_le_bytes());
+            print.add(of_image(&path)?);
+        }
+    }
+    Ok(print.finish())
+}
+
+/// Fingerprint of all data of a source, whichever sets are scored: the settings of a simulation, or
+/// the true shear of every set of a folder.
+///
+/// # Errors
+/// Where a file cannot be read.
+pub fn of_source(source: &Source, data: &DataFolder) -> Result<String, FileError> {
+    let mut print = Fingerprint::default();
+    match source {
+        Source::Simulated(settings) => {
+            let text = serde_json::to_vec(settings)
+                .map_err(FileError::doing(data.root(), "cannot store the settings"))?;
+            print.add(text);
+        }
+        Source::Folder { .. } => {
+            for set in 1..=MAX_SET {
+                let path = data.truth(set);
+                if open::is_there(&path) {
+                    print.add(set.to_le_bytes());
+                    print.add(read(&path)?);
+                }
+            }
+        }
+    }
+    Ok(print.finish())
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, FileError> {
+    open::read(path, open::DATA).map_err(FileError::doing(path, "cannot read the file"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_large_images_a_sample_tells_them_apart() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("galaxies-001.fits");
+        let print = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            of_image(&path).unwrap()
+        };
+        let small: Vec<u8> = (0..5000u32).map(|k| (k % 251) as u8).collect();
+        let mut other = small.clone();
+        other[4321] ^= 1;
+        assert_eq!(print(&small), print(&small));
+        assert_ne!(print(&small), print(&other));
+        let large: Vec<u8> = small.iter().copied().cycle().take(3 << 20).collect();
+        let whole = print(&large);
+        assert_eq!(whole, print(&large));
+        // The headers, the end, the length and any stretch longer than the way between blocks.
+        let between = large.len() / BLOCKS as usize;
+        for at in [100, 1 << 20, large.len() - between] {
+            let mut other = large.clone();
+            other[at..at + between]
+                .iter_mut()
+                .for_each(|byte| *byte ^= 1);
+            assert_ne!(print(&other), whole, "{at}");
+        }
+        assert_ne!(print(&large[..large.len() - 1]), whole);
+        let mut between_blocks = large.clone();
+        between_blocks[(HEAD + BLOCK) as usize] ^= 1;
+        assert_eq!(print(&between_blocks), whole);
+    }
+}

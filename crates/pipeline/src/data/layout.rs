@@ -1,0 +1,335 @@
+//! Where the files of a challenge lie, and which conventions they follow.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use shearq_files::frames::polars::DataFrame;
+use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
+
+use crate::data::listing::{self, Files};
+use shearq_files::FileError;
+use shearq_files::open::{self, is_there};
+use shearq_files::table;
+
+/// Highest set number.
+pub const MAX_SET: u32 = 99;
+/// Highest image number.
+pub const MAX_IMAGE: u32 = 999;
+
+/// Largest side of a postage stamp, in pixels.
+pub const MAX_STAMP: usize = 1024;
+
+/// Name of the layout file inside a data folder.
+pub const LAYOUT_FILE: &str = "layout.toml";
+
+/// Name of the table that says which stamp of a gathered image is which.
+const STAMPS: &str = "set{set:02}/stamps-{image:03}.csv";
+
+/// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for the plain
+/// numbers, `{set:02}` and `{image:03}` for zero-padded ones. Wherever it is read from, it is checked.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(remote = "Self", deny_unknown_fields, default)]
+pub struct Layout {
+    /// Galaxy images.
+    pub galaxies: String,
+    /// Star stamps.
+    pub psf_star: String,
+    /// Functional PSFs.
+    pub psf_functional: String,
+    /// True shear.
+    pub truth: String,
+    /// Intrinsic and observed ellipticities.
+    pub intrinsic: String,
+    /// Sign of g2 in the truth files.
+    pub truth_sign: TruthSign,
+    /// Side of the field in degrees.
+    pub field_degrees: f64,
+    /// Pixels a side of a stamp, where the image header has no STAMP.
+    pub stamp: usize,
+}
+
+impl Default for Layout {
+    fn default() -> Self {
+        Layout {
+            galaxies: "set{set:02}/galaxies-{image:03}.fits".into(),
+            psf_star: "set{set:02}/psf-{image:03}.fits".into(),
+            psf_functional: "set{set:02}/psf-{image:03}.csv".into(),
+            truth: "set{set:02}/truth.csv".into(),
+            intrinsic: "set{set:02}/intrinsic-{image:03}.csv".into(),
+            truth_sign: TruthSign::Standard,
+            field_degrees: 10.0,
+            stamp: 48,
+        }
+    }
+}
+
+impl Serialize for Layout {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived one.
+        Layout::serialize(self, serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for Layout {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        // The derived one.
+        let layout = Layout::deserialize(deserializer)?;
+        layout.validate().map_err(serde::de::Error::custom)?;
+        Ok(layout)
+    }
+}
+
+impl Layout {
+    /// Checks every value against its range.
+    fn validate(&self) -> Result<(), String> {
+        let Layout {
+            galaxies,
+            psf_star,
+            psf_functional,
+            truth,
+            intrinsic,
+            truth_sign: _,
+            field_degrees,
+            stamp,
+        } = self;
+        check_pattern("galaxies", galaxies, &PLACEHOLDERS)?;
+        // One of these may serve several sets or images.
+        for (key, pattern) in [
+            ("psf_star", psf_star),
+            ("psf_functional", psf_functional),
+            ("truth", truth),
+            ("intrinsic", intrinsic),
+        ] {
+            check_pattern(key, pattern, &[])?;
+        }
+        if !Grid::FIELDS.contains(field_degrees) {
+            let (least, most) = (Grid::FIELDS.start(), Grid::FIELDS.end());
+            return Err(format!(
+                "`field_degrees` is {field_degrees:?}; expected {least} to {most}"
+            ));
+        }
+        if !(1..=MAX_STAMP).contains(stamp) {
+            return Err(format!(
+                "`stamp` is {stamp}; expected 1 to {MAX_STAMP} pixels"
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// A data folder with its layout.
+#[derive(Debug, Clone)]
+pub struct DataFolder {
+    root: PathBuf,
+    layout: Layout,
+}
+
+impl DataFolder {
+    /// Opens a folder, with the layout of its `layout.toml` or the default one.
+    ///
+    /// # Errors
+    /// Where the folder does not exist or its layout file is not valid.
+    pub fn open(root: impl AsRef<Path>) -> Result<Self, FileError> {
+        let root = root.as_ref().to_owned();
+        if !root.is_dir() {
+            return Err(FileError::new(
+                &root,
+                "there is no such folder; expected a data folder",
+            ));
+        }
+        let path = root.join(LAYOUT_FILE);
+        let layout = if is_there(&path) {
+            let text = open::read_to_string(&path, open::SETTINGS)
+                .map_err(FileError::doing(&path, "cannot read the layout"))?;
+            toml::from_str(&text).map_err(|e| FileError::new(&path, e.to_string().trim_end()))?
+        } else {
+            Layout::default()
+        };
+        Ok(DataFolder { root, layout })
+    }
+
+    /// A folder to be written in the default layout.
+    pub fn new(root: impl AsRef<Path>) -> Self {
+        DataFolder {
+            root: root.as_ref().to_owned(),
+            layout: Layout::default(),
+        }
+    }
+
+    /// The folder.
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// The layout.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// The galaxy image of a set, as it is called if it is not there.
+    pub fn galaxies(&self, set: u32, image: u32) -> PathBuf {
+        self.image(&self.layout.galaxies, set, image)
+    }
+
+    /// The star stamps of an image.
+    pub fn psf_star(&self, set: u32, image: u32) -> PathBuf {
+        self.image(&self.layout.psf_star, set, image)
+    }
+
+    /// A FITS image, which may be compressed, by the pattern of its name.
+    fn image(&self, pattern: &str, set: u32, image: u32) -> PathBuf {
+        let plain = self.root.join(fill(pattern, set, image));
+        endings(pattern)
+            .iter()
+            .map(|ending| {
+                let mut path = plain.clone().into_os_string();
+                path.push(ending);
+                PathBuf::from(path)
+            })
+            .find(|path| is_there(path))
+            .unwrap_or(plain)
+    }
+
+    /// The PSF parameters of an image.
+    pub fn psf_functional(&self, set: u32, image: u32) -> PathBuf {
+        self.root
+            .join(fill(&self.layout.psf_functional, set, image))
+    }
+
+    /// Which stamp of an image gathered from others is which.
+    pub fn stamps(&self, set: u32, image: u32) -> PathBuf {
+        self.root.join(fill(STAMPS, set, image))
+    }
+
+    /// The true shear of a set.
+    pub fn truth(&self, set: u32) -> PathBuf {
+        self.root.join(fill(&self.layout.truth, set, 0))
+    }
+
+    /// The intrinsic ellipticities of an image.
+    pub fn intrinsic(&self, set: u32, image: u32) -> PathBuf {
+        self.root.join(fill(&self.layout.intrinsic, set, image))
+    }
+
+    /// The galaxy images of `sets` (of all if empty) that are there.
+    ///
+    /// # Errors
+    /// Where a folder cannot be listed.
+    pub fn images(&self, sets: &[u32]) -> Result<Files, FileError> {
+        let pattern = &self.layout.galaxies;
+        listing::find(&self.root, pattern, endings(pattern), sets)
+    }
+
+    /// True shear of a set on `grid`.
+    ///
+    /// # Errors
+    /// Where the file cannot be read or does not cover the grid.
+    pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
+        let path = self.truth(set);
+        if !path.exists() {
+            let message = "there is no true shear to score against; `shearq mean` gives the mean shear of a field";
+            return Err(FileError::new(&path, message));
+        }
+        let rows = read_truth_rows(&path)?;
+        TrueShear::from_rows(grid, self.layout.truth_sign, rows)
+            .map_err(|error| FileError::new(&path, error))
+    }
+}
+
+/// Endings of the names of images by `pattern` beyond its own: those of gzip and fpack.
+fn endings(pattern: &str) -> &'static [&'static str] {
+    match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
+        true => &["", ".gz", ".fz"],
+        false => &[""],
+    }
+}
+
+/// Rows (x, y, g1, g2) of a truth file: CSV with that header, or ASCII columns in that order.
+///
+/// # Errors
+/// Where the file cannot be read.
+pub fn read_truth_rows(path: &Path) -> Result<Vec<Row>, FileError> {
+    rows_of(path, &table::read_truth(path)?, &["x", "y", "g1", "g2"])
+}
+
+/// Rows of a catalogue, at most `most`, from four named columns.
+///
+/// # Errors
+/// Where the file cannot be read or a column is absent.
+pub fn read_rows(path: &Path, names: &[&str; 4], most: usize) -> Result<Vec<Row>, FileError> {
+    let hint = "`score --columns` or a description (--foreign) names others";
+    let table =
+        table::read(path, Some(names), most).map_err(|error| error.hint_of_columns(hint))?;
+    rows_of(path, &table, names)
+}
+
+fn rows_of(path: &Path, table: &DataFrame, names: &[&str; 4]) -> Result<Vec<Row>, FileError> {
+    let column = |name: &str| table::numbers(table, name, path);
+    let (x, y) = (column(names[0])?, column(names[1])?);
+    let (e1, e2) = (column(names[2])?, column(names[3])?);
+    Ok((0..x.len())
+        .map(|k| Row {
+            x: x[k],
+            y: y[k],
+            e1: e1[k],
+            e2: e2[k],
+        })
+        .collect())
+}
+
+/// What a pattern may hold for the number of a set.
+pub(super) const SET_PLACEHOLDERS: [&str; 2] = ["{set}", "{set:02}"];
+/// What a pattern may hold for the number of an image.
+pub const IMAGE_PLACEHOLDERS: [&str; 2] = ["{image}", "{image:03}"];
+const PLACEHOLDERS: [[&str; 2]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS];
+
+/// Replaces the numbers in a pattern.
+pub fn fill(pattern: &str, set: u32, image: u32) -> String {
+    let [[set_plain, set_padded], [image_plain, image_padded]] = PLACEHOLDERS;
+    pattern
+        .replace(set_padded, &format!("{set:02}"))
+        .replace(image_padded, &format!("{image:03}"))
+        .replace(set_plain, &set.to_string())
+        .replace(image_plain, &image.to_string())
+}
+
+/// Checks that the pattern of `key` has one of each of the `needed` placeholders, and no braces that
+/// stand for nothing.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_pattern(key: &str, pattern: &str, needed: &[[&str; 2]]) -> Result<(), String> {
+    for one_of in needed {
+        if !one_of.iter().any(|name| pattern.contains(name)) {
+            return Err(format!(
+                "`{key}` is \"{pattern}\"; expected a pattern with {}",
+                one_of.join(" or ")
+            ));
+        }
+    }
+    let filled = fill(pattern, 1, 1);
+    if filled.is_empty() || filled.contains(['{', '}']) {
+        return Err(format!(
+            "`{key}` is \"{pattern}\"; expected the name of a file, in which only {} stand for numbers",
+            PLACEHOLDERS.as_flattened().join(", ")
+        ));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn patterns_take_plain_and_padded_numbers() {
+        assert_eq!(
+            fill("set{set:02}/galaxies-{image:03}.fits", 7, 12),
+            "set07/galaxies-012.fits"
+        );
+        assert_eq!(
+            fill("g10_v1_objs_{set}_{image}.me.dat", 7, 12),
+            "g10_v1_objs_7_12.me.dat"
+        );
+    }
+}

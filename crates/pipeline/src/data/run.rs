@@ -1,0 +1,387 @@
+//! What made a folder of results: `run.json`, written before the first result.
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Deserializer, Serialize};
+use shearq_submissions::Submission;
+
+use crate::data::layout::{DataFolder, Layout, fill};
+use crate::data::listing::{self, Files};
+use crate::data::relative;
+use shearq_files::FileError;
+use shearq_files::atomic;
+use shearq_files::table::FileFormat;
+use shearq_simulate::set::SimulationSettings;
+
+/// Name of the record in a folder of results.
+pub const RUN_FILE: &str = "run.json";
+
+/// Where the galaxies of a run come from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Source {
+    /// Images of a data folder.
+    Folder {
+        /// The folder, from the one that holds the record.
+        path: PathBuf,
+        /// Its layout.
+        layout: Layout,
+    },
+    /// Simulated and measured in memory. The true shear lies beside the catalogues.
+    Simulated(SimulationSettings),
+}
+
+impl Source {
+    /// A data folder, for a record in the folder `beside`.
+    ///
+    /// # Errors
+    /// Where the way from one to the other is not known.
+    pub fn folder(data: &DataFolder, beside: &Path) -> Result<Self, FileError> {
+        Ok(Source::Folder {
+            path: way(beside, data.root())?,
+            layout: data.layout().clone(),
+        })
+    }
+
+    /// The same source, of a record in the folder `from`, for one in the folder `to`.
+    ///
+    /// # Errors
+    /// Where the way from one to the other is not known.
+    pub fn moved(&self, from: &Path, to: &Path) -> Result<Self, FileError> {
+        Ok(match self {
+            Source::Folder { path, layout } => Source::Folder {
+                path: way(to, &from.join(path))?,
+                layout: layout.clone(),
+            },
+            Source::Simulated(settings) => Source::Simulated(*settings),
+        })
+    }
+
+    /// Layout of the data, that of simulated ones included.
+    pub fn layout(&self) -> Layout {
+        match self {
+            Source::Folder { layout, .. } => layout.clone(),
+            Source::Simulated(_) => Layout::default(),
+        }
+    }
+
+    /// The data folder with the true shear of a run whose record and catalogues lie in `measured`.
+    ///
+    /// # Errors
+    /// Where it is not there any more.
+    pub fn data(&self, measured: &Path) -> Result<DataFolder, FileError> {
+        match self {
+            Source::Folder { path, .. } => DataFolder::open(measured.join(path)),
+            Source::Simulated(_) => DataFolder::open(measured),
+        }
+    }
+}
+
+/// The way from the folder of a record to a data folder.
+fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
+    relative::from(from, to).map_err(FileError::doing(to, "cannot tell where the folder is"))
+}
+
+impl std::fmt::Display for Source {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Source::Folder { path, .. } => path.display().fmt(f),
+            Source::Simulated(settings) => write!(f, "a simulation with seed {}", settings.seed),
+        }
+    }
+}
+
+/// Settings of a measurement, as stored with its catalogues.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Run {
+    /// Version of shearq.
+    pub version: String,
+    /// Where the galaxies come from.
+    pub source: Source,
+    /// All settings of the submission.
+    pub submission: Submission,
+    /// FileFormat of the catalogues.
+    pub format: FileFormat,
+}
+
+impl Run {
+    /// Reads the record of a folder; `None` where there is none.
+    ///
+    /// # Errors
+    /// Where it exists and cannot be read.
+    pub fn read(folder: &Path) -> Result<Option<Self>, FileError> {
+        read_record(&folder.join(RUN_FILE))
+    }
+
+    /// What this version makes of `source`.
+    pub fn new(source: Source, submission: Submission, format: FileFormat) -> Self {
+        Run {
+            version: crate::VERSION.into(),
+            source,
+            submission,
+            format,
+        }
+    }
+
+    /// Reads the record of a folder that must be one of catalogues.
+    ///
+    /// # Errors
+    /// Where there is none, or it cannot be read.
+    pub fn require(folder: &Path) -> Result<Self, FileError> {
+        Run::read(folder)?.ok_or_else(|| {
+            let message = format!(
+                "there is no {RUN_FILE}; expected a folder that `shearq measure` or `shearq run` wrote"
+            );
+            FileError::new(folder, message)
+        })
+    }
+
+    /// The catalogue of an image.
+    pub fn catalogue(&self, folder: &Path, set: u32, image: u32) -> PathBuf {
+        folder.join(fill(&self.pattern(), set, image))
+    }
+
+    /// The catalogues of `sets` (of all if empty) that are there.
+    ///
+    /// # Errors
+    /// Where a folder cannot be listed.
+    pub fn catalogues(&self, folder: &Path, sets: &[u32]) -> Result<Files, FileError> {
+        listing::find(folder, &self.pattern(), &[""], sets)
+    }
+
+    fn pattern(&self) -> String {
+        let ending = self.format.extension();
+        format!("set{{set:02}}/catalogue-{{image:03}}.{ending}")
+    }
+}
+
+/// Reads any record; `None` where there is none.
+///
+/// # Errors
+/// Where it exists and cannot be read.
+pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileError> {
+    let text = match shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS) {
+        Ok(text) => text,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),
+    };
+    serde_json::from_str(&text).map(Some).map_err(|error| {
+        // It is JSON that says something else.
+        let other = if error.is_data() {
+            "; the results of another version have to be made anew, in another folder"
+        } else {
+            ""
+        };
+        FileError::new(path, format!("not a record of this kind: {error}{other}"))
+    })
+}
+
+/// Writes any record as indented JSON.
+///
+/// # Errors
+/// Where it cannot be written.
+pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileError> {
+    atomic::write(path, record_text(path, record)?.as_bytes())
+}
+
+/// Any record as indented JSON, for a file at `path`.
+///
+/// # Errors
+/// Where it cannot be written as JSON.
+pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileError> {
+    let mut text = serde_json::to_string_pretty(record)
+        .map_err(FileError::doing(path, "cannot write the record"))?;
+    text.push('\n');
+    Ok(text)
+}
+
+/// Numbers of records that may be NaN, which JSON does not have.
+pub trait Numbers: Sized {
+    /// As they are read: null for NaN.
+    type Form: DeserializeOwned;
+    /// With NaN for null.
+    fn from_form(form: Self::Form) -> Self;
+}
+
+impl Numbers for f64 {
+    type Form = Option<f64>;
+    fn from_form(form: Option<f64>) -> Self {
+        form.unwrap_or(f64::NAN)
+    }
+}
+
+impl Numbers for Vec<f64> {
+    type Form = Vec<Option<f64>>;
+    fn from_form(form: Vec<Option<f64>>) -> Self {
+        form.into_iter().map(f64::from_form).collect()
+    }
+}
+
+impl<const N: usize> Numbers for [f64; N]
+where
+    [Option<f64>; N]: DeserializeOwned,
+{
+    type Form = [Option<f64>; N];
+    fn from_form(form: [Option<f64>; N]) -> Self {
+        form.map(f64::from_form)
+    }
+}
+
+/// For `#[serde(deserialize_with)]`: reads null as NaN.
+///
+/// # Errors
+/// Where there is anything but numbers and null.
+pub fn nan_for_null<'de, D: Deserializer<'de>, N: Numbers>(deserializer: D) -> Result<N, D::Error> {
+    N::Form::deserialize(deserializer).map(N::from_form)
+}
+
+/// A folder of results that this process writes to, alone or with others of the same settings, until
+/// it drops this.
+#[derive(Debug)]
+#[must_use]
+pub struct Claim {
+    /// The record, with a shared lock on it.
+    _record: File,
+}
+
+/// Makes the folder of `path` that of `record`: writes it where there is none, and refuses a folder
+/// with a different one, showing the differences. What killed processes left there is removed if no
+/// other process is at work.
+///
+/// # Errors
+/// Where the folder belongs to other settings, or the record cannot be read or written.
+pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result<Claim, FileError> {
+    let mut earlier: Option<R> = read_record(path)?;
+    if earlier.is_none() {
+        // Another process may be first; then its record is compared like any earlier one.
+        let _ = atomic::write_if_absent(path, record_text(path, record)?.as_bytes())?;
+        earlier = read_record(path)?;
+    }
+    let differences = differences(&earlier, &Some(record))
+        .map_err(|error| FileError::new(path, format!("cannot compare records: {error}")))?;
+    let folder = path.parent().unwrap_or(path);
+    if !differences.is_empty() {
+        return Err(FileError::new(
+            folder,
+            format!(
+                "this folder holds results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
+                differences.join("\n  ")
+            ),
+        ));
+    }
+    let file = open_to_lock(path).map_err(FileError::doing(path, "cannot open the record"))?;
+    // Whoever has the file for itself is the only process at work here.
+    if file.try_lock().is_ok() {
+        atomic::remove_leftovers(folder)?;
+    }
+    // Turns the lock into one that others may hold, too. File systems without locks have none to
+    // wait for: there leftovers stay, and do no harm.
+    let _ = file.unlock();
+    let _ = file.lock_shared();
+    Ok(Claim { _record: file })
+}
+
+/// Opens a record so that it can be locked: over NFS an exclusive lock needs the right to write.
+fn open_to_lock(path: &Path) -> std::io::Result<File> {
+    let writable = File::options().read(true).write(true).open(path);
+    writable.or_else(|_| File::open(path))
+}
+
+/// Lines in which two records differ, as `key: first ≠ second`; what one does not have is null.
+///
+/// # Errors
+/// Where a record cannot be put in JSON.
+pub fn differences(
+    first: &impl Serialize,
+    second: &impl Serialize,
+) -> Result<Vec<String>, serde_json::Error> {
+    let (first, second) = (serde_json::to_value(first)?, serde_json::to_value(second)?);
+    let mut found = Vec::new();
+    compare("", &first, &second, &mut found);
+    Ok(found)
+}
+
+fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut Vec<String>) {
+    if let (serde_json::Value::Array(a), serde_json::Value::Array(b)) = (a, b)
+        && let (Some(first), Some(second)) = (names(a), names(b))
+    {
+        if first != second {
+            let (first, second) = (first.join(", "), second.join(", "));
+            found.push(format!("{key}: {first} ≠ {second}"));
+            return;
+        }
+        for (k, (a, b)) in a.iter().zip(b).enumerate() {
+            compare(&format!("{key}[{k}]"), a, b, found);
+        }
+        return;
+    }
+    match (a, b) {
+        (serde_json::Value::Object(a), serde_json::Value::Object(b)) => {
+            let keys: std::collections::BTreeSet<&String> = a.keys().chain(b.keys()).collect();
+            for name in keys {
+                let null = serde_json::Value::Null;
+                let path = if key.is_empty() {
+                    name.clone()
+                } else {
+                    format!("{key}.{name}")
+                };
+                compare(
+                    &path,
+                    a.get(name).unwrap_or(&null),
+                    b.get(name).unwrap_or(&null),
+                    found,
+                );
+            }
+        }
+        _ if a != b => found.push(format!("{key}: {a} ≠ {b}")),
+        _ => {}
+    }
+}
+
+/// The names of objects that all have one.
+fn names(values: &[serde_json::Value]) -> Option<Vec<&str>> {
+    values
+        .iter()
+        .map(|value| value.get("name")?.as_str())
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn leftovers_are_removed_by_whoever_is_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("record.json");
+        let left = folder
+            .path()
+            .join("set01/.catalogue-001.fits.0123456789abcdef.part");
+        std::fs::create_dir(folder.path().join("set01")).unwrap();
+        std::fs::write(&left, "half").unwrap();
+        let first = claim(&path, &1).unwrap();
+        assert!(!left.exists());
+        std::fs::write(&left, "being written").unwrap();
+        let second = claim(&path, &1).unwrap();
+        assert!(left.exists());
+        drop((first, second));
+        let _third = claim(&path, &1).unwrap();
+        assert!(!left.exists());
+        let message = claim(&path, &2).unwrap_err().to_string();
+        assert!(message.contains(": 1 ≠ 2"), "{message}");
+    }
+
+    #[test]
+    fn lists_of_named_things_differ_by_their_names_or_else_by_what_differs() {
+        let of = |values: &[(&str, u32)]| -> Vec<serde_json::Value> {
+            let object = |&(name, size)| serde_json::json!({ "name": name, "size": size });
+            values.iter().map(object).collect()
+        };
+        let found = differences(&of(&[("a", 1), ("b", 2)]), &of(&[("a", 1)])).unwrap();
+        assert_eq!(found, [": a, b ≠ a"]);
+        let found = differences(&of(&[("a", 1), ("b", 2)]), &of(&[("a", 1), ("b", 3)])).unwrap();
+        assert_eq!(found, ["[1].size: 2 ≠ 3"]);
+    }
+}

@@ -1,0 +1,517 @@
+//! Stamps that people have, gathered into the image of a data folder: cubes, files of one or several images each, and
+//! cut-outs of an exposure.
+
+mod source;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use shearq_measure::parts::frame;
+use shearq_quantities::statistics::RunningMean;
+
+pub use self::source::{Content, Files};
+use self::source::{Exposure, Images, Origin, Planes, shown};
+use super::PipelineError;
+use super::images::ImageId;
+use super::measure::check_strip;
+use crate::data::layout::{DataFolder, MAX_STAMP};
+use crate::data::mosaic::Mosaic;
+use crate::data::psf_table;
+use shearq_files::FileError;
+use shearq_files::atomic;
+use shearq_files::fits::{ImageWriter, Value};
+use shearq_files::open::is_there;
+use shearq_files::table;
+
+/// Most stamps of one image: one for each galaxy of the largest grid.
+const MAX_STAMPS: usize = table::MAX_ROWS;
+/// Share of a star's light on the frame of its stamp, were it all as bright as the frame, that is told: a background
+/// of that size changes a deconvolved galaxy.
+const PEDESTAL: f64 = 0.02;
+/// Mean of the stamps' frames, in units of the scatter of their pixels, that is told: more than the wings of galaxies
+/// leave.
+const SKY: f64 = 1.0;
+/// Pixels that the frame of a star or a stamp is wide.
+const FRAME: usize = 2;
+
+/// Where stamps come from.
+#[derive(Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Stamps<'a> {
+    /// FITS files, each with one stamp, a cube of them, or several extensions with either.
+    Files(Files<'a>),
+    /// Squares of an exposure around positions.
+    Cutouts {
+        /// The exposure: the first image of one file.
+        exposure: Files<'a>,
+        /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
+        #[serde(serialize_with = "shown")]
+        positions: &'a Path,
+        /// Names of its columns for x and y.
+        columns: [&'a str; 2],
+        /// Pixels a side of a stamp.
+        side: usize,
+    },
+}
+
+/// What was gathered.
+#[derive(Debug)]
+pub struct Gathered {
+    /// How the stamps lie in the image.
+    pub mosaic: Mosaic,
+    /// Of the stamps, those with pixels that are not finite: beyond the exposure, masked, or missing in their file.
+    pub incomplete: usize,
+    /// What is worth a second look.
+    pub doubts: Vec<String>,
+}
+
+/// A row of the table that says which stamp is which.
+#[derive(Serialize)]
+struct Place<'a> {
+    x: f64,
+    y: f64,
+    #[serde(serialize_with = "shown")]
+    file: &'a Path,
+    image: usize,
+    plane: usize,
+    position_x: Option<f64>,
+    position_y: Option<f64>,
+}
+
+/// What an image is made of.
+#[derive(Serialize)]
+pub struct Gathering<'a> {
+    /// Its stamps.
+    pub stamps: Stamps<'a>,
+    /// Images like those of the stamps or the exposure: pixels are missing where these are not zero.
+    pub masks: Option<Files<'a>>,
+    /// One PSF, or one a stamp.
+    pub psfs: Files<'a>,
+    /// The image's NOISESIG.
+    pub noise: Option<f64>,
+}
+
+/// What made an image, kept beside it.
+#[derive(Serialize)]
+struct Record<'a> {
+    version: &'a str,
+    #[serde(flatten)]
+    gathering: &'a Gathering<'a>,
+}
+
+/// Gathers stamps and their PSFs into image `id` of `data`: the table of which stamp is which and the record of what
+/// made it, PSFs, and last the image. What a stopped process left of the image is
+/// replaced; others that gather into the same folder are waited for.
+///
+/// # Errors
+/// Where a file cannot be read, stamps are not square or of different sizes, masks are of others, there are neither one
+/// PSF nor as many as stamps, or the image is there already.
+pub fn gather(
+    data: &DataFolder,
+    id: ImageId,
+    gathering: &Gathering<'_>,
+) -> Result<Gathered, PipelineError> {
+    let which = data.stamps(id.set, id.image);
+    let folder = which.parent().unwrap_or(Path::new("."));
+    let (made, cannot) = (!folder.exists(), "cannot make the folder");
+    fs::create_dir_all(folder).map_err(FileError::doing(folder, cannot))?;
+    let alone = fs::File::open(folder).map_err(FileError::doing(folder, cannot))?;
+    // File systems without locks have none that could be waited for.
+    let _ = alone.lock();
+    let gathered = gather_alone(data, id, gathering);
+    if made && gathered.is_err() {
+        // Unless there is something in it.
+        let _ = fs::remove_dir(folder);
+    }
+    gathered
+}
+
+fn gather_alone(
+    data: &DataFolder,
+    id: ImageId,
+    gathering: &Gathering<'_>,
+) -> Result<Gathered, PipelineError> {
+    let &Gathering {
+        ref stamps,
+        masks,
+        psfs,
+        noise,
+    } = gathering;
+    let target = data.galaxies(id.set, id.image);
+    let which = data.stamps(id.set, id.image);
+    if is_there(&target) {
+        return Err(already(target).into());
+    }
+    let psfs_there = [
+        data.psf_star(id.set, id.image),
+        data.psf_functional(id.set, id.image),
+    ]
+    .into_iter()
+    .filter(|path| is_there(path));
+    // Nothing but this makes the table, and the image comes last: where there is one without the other, this was
+    // stopped, and the PSF is its own.
+    let stopped = is_there(&which);
+    for path in psfs_there {
+        if !stopped {
+            return Err(already(path).into());
+        }
+        fs::remove_file(&path).map_err(FileError::doing(&path, "cannot remove the leftover"))?;
+    }
+    let record = Record {
+        version: crate::VERSION,
+        gathering,
+    };
+    let record = serde_json::to_string_pretty(&record)
+        .map_err(FileError::doing(&which, "cannot tell what made it"))?;
+    let mut doubts = Vec::new();
+    let positions = match stamps {
+        Stamps::Files(_) => Vec::new(),
+        Stamps::Cutouts {
+            positions, columns, ..
+        } => read_positions(positions, *columns)?,
+    };
+    let (count, side) = match stamps {
+        Stamps::Files(files) => survey(*files)?,
+        Stamps::Cutouts { side, .. } => (positions.len(), *side),
+    };
+    let mosaic = Mosaic::of(count, side);
+    check_strip(&target, mosaic.columns, side)?;
+    let psf = gather_psfs(data, id, psfs, &mosaic, &mut doubts)?;
+    let mut keys = Vec::new();
+    keys.extend(noise.map(|sigma| ("NOISESIG", Value::Real(sigma))));
+    let mut image = Rows::create(&target, mosaic, &keys)?;
+    let (mut incomplete, mut frames) = (0, RunningMean::default());
+    let mut places = csv::Writer::from_writer(Vec::new());
+    let mut take = |origin: &Origin<'_>, pixels: &[f32]| -> Result<(), FileError> {
+        incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
+        frame_of(pixels, side).for_each(|value| frames.add(value));
+        let (x, y) = mosaic.position(image.next);
+        let place = Place {
+            x,
+            y,
+            file: origin.file,
+            image: origin.image,
+            plane: origin.plane,
+            position_x: origin.position.map(|(x, _)| x),
+            position_y: origin.position.map(|(_, y)| y),
+        };
+        places.serialize(place).map_err(FileError::doing(
+            &target,
+            "cannot tell which stamp is which",
+        ))?;
+        image.add(pixels)
+    };
+    match stamps {
+        Stamps::Files(files) => {
+            let (mut planes, mut masks) = (Planes::of(*files), masks.map(Planes::of));
+            while let Some((origin, mut pixels)) = planes.next()? {
+                if let Some(masks) = &mut masks {
+                    let Some((place, mask)) = masks.next()? else {
+                        return Err(origin.fault("there is no mask for this stamp").into());
+                    };
+                    let sides = masks.sides();
+                    if sides != [side; 2] {
+                        let message = format!(
+                            "the mask is {} × {} pixels; its stamp has {side} × {side}",
+                            sides[0], sides[1]
+                        );
+                        return Err(place.fault(&message).into());
+                    }
+                    another(&place, &origin)?;
+                    lose(&mut pixels, &mask);
+                }
+                take(&origin, &pixels)?;
+            }
+            if let Some((place, _)) = masks.as_mut().map_or(Ok(None), Planes::next)? {
+                return Err(place.fault("there is no stamp for this mask").into());
+            }
+        }
+        Stamps::Cutouts { exposure, .. } => {
+            let mut exposure = Exposure::open(*exposure)?;
+            let mut masks = masks.map(Exposure::open).transpose()?;
+            if let Some(mask) = &mut masks {
+                mask.like(&mut exposure)?;
+                another(&mask.origin, &exposure.origin)?;
+            }
+            for &(x, y) in &positions {
+                let mut pixels = exposure.square((x, y), side)?;
+                if let Some(mask) = &mut masks {
+                    lose(&mut pixels, &mask.square((x, y), side)?);
+                }
+                let origin = Origin {
+                    position: Some((x, y)),
+                    ..exposure.origin
+                };
+                take(&origin, &pixels)?;
+            }
+        }
+    }
+    if frames.mean().abs() > SKY * frames.deviation() {
+        doubts.push(format!(
+            "warning: the frames of the stamps have a mean of {:.3} where a pixel scatters by {:.3}: is sky left in them? It takes shear away",
+            frames.mean(),
+            frames.deviation()
+        ));
+    }
+    let text = places
+        .into_inner()
+        .map_err(|error| FileError::new(&which, error.to_string()))?;
+    atomic::write(
+        which.with_extension("json"),
+        format!("{record}\n").as_bytes(),
+    )?;
+    atomic::write(&which, &text)?;
+    psf.finish()?;
+    image.finish()?;
+    Ok(Gathered {
+        mosaic,
+        incomplete,
+        doubts,
+    })
+}
+
+fn already(path: PathBuf) -> FileError {
+    let message =
+        "this is there already; expected an image with a number of its own (--set and --image)";
+    FileError::new(path, message)
+}
+
+/// Whether a file was `named`, as none had the name of `path`.
+fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
+    match named {
+        true => Ok(()),
+        false => Err(already(path)),
+    }
+}
+
+/// The pixels of a stamp's frame, as far as they are finite.
+fn frame_of(pixels: &[f32], side: usize) -> impl Iterator<Item = f64> + '_ {
+    let all = frame(pixels, side, FRAME).flatten();
+    all.filter(|value| value.is_finite())
+        .map(|&value| f64::from(value))
+}
+
+/// Positions of galaxies on an exposure.
+fn read_positions(path: &Path, columns: [&str; 2]) -> Result<Vec<(f64, f64)>, FileError> {
+    let read = table::read_columns(path, &columns)
+        .map_err(|error| error.hint_of_columns("--columns names others"))?;
+    let of = |name| table::numbers(&read, name, path);
+    let (xs, ys) = (of(columns[0])?, of(columns[1])?);
+    let positions: Vec<_> = xs.iter().copied().zip(ys.iter().copied()).collect();
+    if positions.is_empty() {
+        return Err(FileError::new(
+            path,
+            "there is no position; expected one a row",
+        ));
+    }
+    let most = f64::from(i32::MAX);
+    match positions
+        .iter()
+        .position(|(x, y)| !(x.abs() < most && y.abs() < most))
+    {
+        None => Ok(positions),
+        Some(row) => {
+            let (x, y) = positions[row];
+            let message = format!(
+                "row {}: the position is ({x}, {y}); expected pixels of the exposure",
+                row + 1
+            );
+            Err(FileError::new(path, message))
+        }
+    }
+}
+
+/// Refuses an image that is its own mask.
+fn another(mask: &Origin<'_>, image: &Origin<'_>) -> Result<(), FileError> {
+    if (mask.file, mask.image) == (image.file, image.image) {
+        let message = "the mask is the image itself; expected another (--mask-extension)";
+        return Err(mask.fault(message));
+    }
+    Ok(())
+}
+
+/// Makes those pixels of a stamp missing whose `mask` is not zero.
+fn lose(pixels: &mut [f32], mask: &[f32]) {
+    for (pixel, mask) in pixels.iter_mut().zip(mask) {
+        if *mask != 0.0 {
+            *pixel = f32::NAN;
+        }
+    }
+}
+
+/// Number of stamps in files, and the pixels a side that all of them have.
+fn survey(files: Files<'_>) -> Result<(usize, usize), FileError> {
+    let (mut count, mut first) = (0usize, None);
+    let mut images = Images::of(files);
+    while let Some((origin, image)) = images.next()? {
+        let (width, height) = (image.width(), image.height());
+        if width != height || width > MAX_STAMP {
+            let message = format!(
+                "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP} (--exposure with --positions cuts stamps out of a large image)"
+            );
+            return Err(origin.fault(&message));
+        }
+        let side = *first.get_or_insert(width);
+        if width != side {
+            let message =
+                format!("the stamp is {width} × {height} pixels; the first has {side} × {side}");
+            return Err(origin.fault(&message));
+        }
+        count += image.planes();
+        if count > MAX_STAMPS {
+            return Err(origin.fault(&format!("there are more than {MAX_STAMPS} stamps")));
+        }
+    }
+    // No list of files is empty.
+    Ok((count, first.unwrap_or(1)))
+}
+
+/// Writes the PSFs of an image: functional ones of a table, or stars.
+fn gather_psfs(
+    data: &DataFolder,
+    id: ImageId,
+    files: Files<'_>,
+    mosaic: &Mosaic,
+    doubts: &mut Vec<String>,
+) -> Result<PsfFile, FileError> {
+    let check = |path: &Path, found: usize| {
+        if found == 1 || found == mosaic.galaxies {
+            return Ok(());
+        }
+        let message = format!(
+            "there are {found} PSFs; expected one, or one for each of the {} stamps",
+            mosaic.galaxies
+        );
+        Err(FileError::new(path, message))
+    };
+    if let [table] = files.paths
+        && table
+            .extension()
+            .is_some_and(|ending| ending.eq_ignore_ascii_case("csv"))
+    {
+        let mut rows = psf_table::read_all(table)?;
+        check(table, rows.len())?;
+        for (place, (position, _)) in rows.iter_mut().enumerate() {
+            *position = mosaic.position(place);
+        }
+        let path = data.psf_functional(id.set, id.image);
+        return Ok(PsfFile::Table(path, psf_table::text(&rows)));
+    }
+    let (count, side) = survey(files)?;
+    // No list of files is empty.
+    check(&files.paths[0], count)?;
+    // One, or as many as galaxies, which lie as these do.
+    let stars = Mosaic::of(count, side);
+    let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
+    let mut planes = Planes::of(files);
+    let mut dark = 0;
+    while let Some((origin, pixels)) = planes.next()? {
+        let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
+        if !(light > 0.0 && light.is_finite()) {
+            if count == 1 {
+                let message =
+                    format!("the pixels of the PSF add up to {light}; expected a positive sum");
+                return Err(origin.fault(&message));
+            }
+            dark += 1;
+        }
+        let pedestal = pedestal(&pixels, side);
+        if image.next == 0 && pedestal.abs() > PEDESTAL {
+            doubts.push(format!(
+                "warning: {}: the frame of the first PSF is as bright as {:.0} % of its light would make it if all of the stamp were: is a background left in it?",
+                origin.file.display(),
+                100.0 * pedestal
+            ));
+        }
+        image.add(&pixels)?;
+    }
+    if dark > 0 {
+        doubts.push(format!(
+            "warning: the pixels of {dark} of {count} PSFs add up to nothing, less or no number: galaxies with them will be flagged"
+        ));
+    }
+    Ok(PsfFile::Stars(Box::new(image)))
+}
+
+/// PSFs that are about to be written.
+enum PsfFile {
+    Stars(Box<Rows>),
+    Table(PathBuf, String),
+}
+
+impl PsfFile {
+    fn finish(self) -> Result<(), FileError> {
+        match self {
+            PsfFile::Stars(image) => image.finish(),
+            PsfFile::Table(path, text) => {
+                first(atomic::write_if_absent(&path, text.as_bytes())?, path)
+            }
+        }
+    }
+}
+
+/// The light of a star's stamp if all of it were as bright as its frame, in units of the light that it has.
+fn pedestal(pixels: &[f32], side: usize) -> f64 {
+    let mut frame = RunningMean::default();
+    frame_of(pixels, side).for_each(|value| frame.add(value));
+    let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
+    frame.mean() * pixels.len() as f64 / light
+}
+
+/// A mosaic that is written a row of stamps at a time.
+struct Rows {
+    path: PathBuf,
+    writer: ImageWriter,
+    mosaic: Mosaic,
+    /// Number of stamps that are there.
+    next: usize,
+    /// The row at hand.
+    pixels: Vec<f32>,
+}
+
+impl Rows {
+    fn create(path: &Path, mosaic: Mosaic, more: &[(&str, Value)]) -> Result<Self, FileError> {
+        let Mosaic {
+            columns,
+            galaxies,
+            stamp,
+        } = mosaic;
+        let mut keys = vec![
+            ("STAMP", Value::Int(stamp as i64)),
+            ("NSTAMPS", Value::Int(galaxies as i64)),
+        ];
+        keys.extend_from_slice(more);
+        atomic::sweep_beside(path);
+        Ok(Rows {
+            path: path.to_owned(),
+            writer: ImageWriter::create(path, columns * stamp, mosaic.rows() * stamp, &keys)?,
+            pixels: vec![0.0; columns * stamp * stamp],
+            mosaic,
+            next: 0,
+        })
+    }
+
+    fn add(&mut self, stamp: &[f32]) -> Result<(), FileError> {
+        let Mosaic {
+            columns,
+            stamp: side,
+            galaxies,
+        } = self.mosaic;
+        let start = self.next % columns * side;
+        let lines = self.pixels.chunks_exact_mut(columns * side);
+        for (line, from) in lines.zip(stamp.chunks_exact(side)) {
+            line[start..start + side].copy_from_slice(from);
+        }
+        self.next += 1;
+        if self.next.is_multiple_of(columns) || self.next == galaxies {
+            self.writer.write_rows(&self.pixels)?;
+            self.pixels.fill(0.0);
+        }
+        Ok(())
+    }
+
+    fn finish(self) -> Result<(), FileError> {
+        first(self.writer.finish_if_absent()?, self.path)
+    }
+}

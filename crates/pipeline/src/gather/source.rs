@@ -1,0 +1,305 @@
+//! Stamps and exposures in FITS files, image by image and plane by plane.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Serialize, Serializer};
+
+use shearq_files::FileError;
+use shearq_files::fits::ImageReader;
+
+/// Names by which instruments call what lies beside an image of the sky: without a choice, none of these is one.
+const COMPANIONS: [&str; 15] = [
+    "PSF",
+    "ERR",
+    "ERROR",
+    "DQ",
+    "MASK",
+    "FLAGS",
+    "SEG",
+    "VAR",
+    "VARIANCE",
+    "IVAR",
+    "WHT",
+    "WEIGHT",
+    "RMS",
+    "BKG",
+    "BACKGROUND",
+];
+
+/// Writes a path as it is shown: not all of them are Unicode.
+pub(super) fn shown<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&path.display())
+}
+
+fn all_shown<S: Serializer>(paths: &[PathBuf], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(paths.iter().map(|path| path.display().to_string()))
+}
+
+/// FITS files, and which of their images are meant.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Files<'a> {
+    /// At least one.
+    #[serde(serialize_with = "all_shown")]
+    pub paths: &'a [PathBuf],
+    /// Name of the images (EXTNAME, in any case); without, all of them.
+    pub extension: Option<&'a str>,
+    /// What they are images of.
+    #[serde(skip)]
+    pub content: Content,
+}
+
+/// What images are of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Content {
+    /// Galaxies.
+    Sky,
+    /// PSFs.
+    Psf,
+    /// Nothing: they are not zero where a pixel is bad.
+    Mask,
+}
+
+impl Content {
+    /// Whether an image of this name is of something else, for all that is known.
+    fn is_not(self, name: &str) -> bool {
+        let companion = COMPANIONS
+            .iter()
+            .any(|other| name.eq_ignore_ascii_case(other));
+        match self {
+            Content::Sky => companion,
+            Content::Psf => companion && !name.eq_ignore_ascii_case("PSF"),
+            Content::Mask => false,
+        }
+    }
+
+    /// The option that names images of this.
+    fn option(self) -> &'static str {
+        match self {
+            Content::Sky => "--extension",
+            Content::Psf => "--psf-extension",
+            Content::Mask => "--mask-extension",
+        }
+    }
+}
+
+/// Where a stamp was found.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Origin<'a> {
+    pub(super) file: &'a Path,
+    /// Image of the file, from 1.
+    pub(super) image: usize,
+    /// Plane of the image, from 1.
+    pub(super) plane: usize,
+    /// Its galaxy's position.
+    pub(super) position: Option<(f64, f64)>,
+}
+
+impl Origin<'_> {
+    pub(super) fn fault(&self, what: &str) -> FileError {
+        let Origin { image, plane, .. } = self;
+        FileError::new(self.file, format!("image {image}, plane {plane}: {what}"))
+    }
+}
+
+/// The images of files, in order.
+pub(super) struct Images<'a> {
+    files: Files<'a>,
+    /// Number of files begun.
+    begun: usize,
+    now: Option<ImageReader>,
+    /// Image of the file at hand, from 1.
+    number: usize,
+    /// Names of its images that were passed over, and whether one was not.
+    others: Vec<String>,
+    found: bool,
+}
+
+impl<'a> Images<'a> {
+    pub(super) fn of(files: Files<'a>) -> Self {
+        Images {
+            files,
+            begun: 0,
+            now: None,
+            number: 0,
+            others: Vec::new(),
+            found: false,
+        }
+    }
+
+    /// The next image that is meant, of whose planes the first comes next; `None` after the last.
+    ///
+    /// # Errors
+    /// Where a file cannot be read, has no image of the name asked for, or without one has what is no image of the
+    /// sky.
+    pub(super) fn next(&mut self) -> Result<Option<(Origin<'a>, &mut ImageReader)>, FileError> {
+        loop {
+            if let Some(image) = self.now.take() {
+                self.now = image.next_stack()?;
+                self.number += 1;
+            }
+            if self.now.is_none() {
+                self.all_there()?;
+                let Some(path) = self.files.paths.get(self.begun) else {
+                    return Ok(None);
+                };
+                self.now = Some(ImageReader::open_stack(path)?);
+                (self.begun, self.number) = (self.begun + 1, 1);
+                (self.found, self.others) = (false, Vec::new());
+            }
+            let origin = Origin {
+                file: &self.files.paths[self.begun - 1],
+                image: self.number,
+                plane: 1,
+                position: None,
+            };
+            let name = self.now.as_ref().map(ImageReader::name).unwrap_or_default();
+            match self.files.extension {
+                Some(wanted) if !name.eq_ignore_ascii_case(wanted) => {
+                    self.others.push(name);
+                    continue;
+                }
+                None if self.files.content.is_not(&name) => {
+                    return Err(origin.fault(&format!(
+                        "the image is called {name}; expected no such images, or the name of those that are meant ({})",
+                        self.files.content.option()
+                    )));
+                }
+                Some(_) | None => self.found = true,
+            }
+            return Ok(self.now.as_mut().map(|image| (origin, image)));
+        }
+    }
+
+    /// Looks whether the file that ends had an image that is meant.
+    fn all_there(&self) -> Result<(), FileError> {
+        match (
+            self.files.extension,
+            self.files.paths.get(self.begun.wrapping_sub(1)),
+        ) {
+            (Some(wanted), Some(path)) if !self.found => {
+                let names = self.others.iter().map(|name| format!("`{name}`"));
+                let names = names.collect::<Vec<_>>().join(", ");
+                let message = format!("there is no image called `{wanted}`; found {names}");
+                Err(FileError::new(path, message))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// The planes of the images of files, in order: stamps.
+pub(super) struct Planes<'a> {
+    images: Images<'a>,
+    /// The image at hand, and its planes that are left.
+    origin: Option<Origin<'a>>,
+    left: usize,
+}
+
+impl<'a> Planes<'a> {
+    pub(super) fn of(files: Files<'a>) -> Self {
+        Planes {
+            images: Images::of(files),
+            origin: None,
+            left: 0,
+        }
+    }
+
+    /// Columns and rows of the one at hand.
+    pub(super) fn sides(&self) -> [usize; 2] {
+        let now = self.images.now.as_ref();
+        now.map_or([0; 2], |image| [image.width(), image.height()])
+    }
+
+    /// The next one with its pixels, `None` after the last.
+    ///
+    /// # Errors
+    /// As [`Images::next`], and where its pixels cannot be read.
+    pub(super) fn next(&mut self) -> Result<Option<(Origin<'a>, Vec<f32>)>, FileError> {
+        let origin = match self.origin {
+            Some(origin) if self.left > 0 => Origin {
+                plane: origin.plane + 1,
+                ..origin
+            },
+            _ => match self.images.next()? {
+                None => return Ok(None),
+                Some((origin, image)) => {
+                    self.left = image.planes();
+                    origin
+                }
+            },
+        };
+        self.origin = Some(origin);
+        self.left -= 1;
+        let Some(image) = self.images.now.as_mut() else {
+            return Ok(None);
+        };
+        let pixels = image.read_rows(image.height())?;
+        Ok(Some((origin, pixels)))
+    }
+}
+
+/// The first image of a file, to cut squares out of.
+pub(super) struct Exposure<'a> {
+    images: Images<'a>,
+    pub(super) origin: Origin<'a>,
+}
+
+impl<'a> Exposure<'a> {
+    /// # Errors
+    /// As [`Images::next`], and where the image is a cube.
+    pub(super) fn open(files: Files<'a>) -> Result<Self, FileError> {
+        if let Some(more) = files.paths.get(1) {
+            return Err(FileError::new(
+                more,
+                "this is a second file; expected one, as the exposure is",
+            ));
+        }
+        let mut images = Images::of(files);
+        let (origin, planes) = match images.next()? {
+            Some((origin, image)) => (origin, image.planes()),
+            None => {
+                return Err(FileError::new(
+                    &files.paths[0],
+                    "there is no image in this file",
+                ));
+            }
+        };
+        if planes != 1 {
+            let message =
+                format!("the image has {planes} planes; expected an exposure, which has one");
+            return Err(origin.fault(&message));
+        }
+        Ok(Exposure { images, origin })
+    }
+
+    fn reader(&mut self) -> Result<&mut ImageReader, FileError> {
+        let none = || self.origin.fault("the image is no longer there");
+        self.images.now.as_mut().ok_or_else(none)
+    }
+
+    /// Refuses one whose sides are not those of `other`.
+    pub(super) fn like(&mut self, other: &mut Self) -> Result<(), FileError> {
+        let sides = |reader: &ImageReader| (reader.width(), reader.height());
+        let (own, expected) = (sides(self.reader()?), sides(other.reader()?));
+        if own != expected {
+            let message = format!(
+                "the mask is {} × {} pixels; the exposure has {} × {}",
+                own.0, own.1, expected.0, expected.1
+            );
+            return Err(self.origin.fault(&message));
+        }
+        Ok(())
+    }
+
+    /// The square of `side` pixels a side whose centre is nearest to a position in FITS pixels; NaN beyond the
+    /// image.
+    pub(super) fn square(
+        &mut self,
+        (x, y): (f64, f64),
+        side: usize,
+    ) -> Result<Vec<f32>, FileError> {
+        // Its first pixel, from 0.
+        let first = |at: f64| (at - (side as f64 + 1.0) / 2.0).round() as i64;
+        self.reader()?.read_square(first(x), first(y), side)
+    }
+}

@@ -1,0 +1,157 @@
+//! Which grid galaxies lie on: decided here for measuring, scoring, packing and checking alike.
+
+use std::path::Path;
+
+use shearq_quantities::units::{Degrees, Pixels};
+use shearq_scoring::{Grid, Row};
+
+use crate::data::layout::{DataFolder, MAX_STAMP};
+use crate::data::mosaic::Mosaic;
+use shearq_files::FileError;
+use shearq_files::fits::ImageReader;
+
+/// Pixels a side of a stamp of an image: its header's STAMP, or else that of the data's layout.
+///
+/// # Errors
+/// Where STAMP is not a whole number of pixels.
+fn stamp_of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<usize, FileError> {
+    Ok(whole(image, path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp))
+}
+
+/// The stamps of an image: n × n of them where its header has NGRID, NSTAMPS along rows as wide as the image is
+/// where it has that, and as many as there is room for otherwise.
+///
+/// # Errors
+/// Where the image is not made of whole stamps, as many as its header says.
+pub(super) fn of_image(
+    data: &DataFolder,
+    path: &Path,
+    image: &ImageReader,
+) -> Result<Mosaic, FileError> {
+    let stamp = stamp_of_image(data, path, image)?;
+    let (width, height) = (image.width(), image.height());
+    let (columns, rows) = match whole(image, path, "NGRID", width)? {
+        Some(n) => (n, n),
+        None => (width / stamp, height / stamp),
+    };
+    if columns == 0 || rows == 0 || (width, height) != (columns * stamp, rows * stamp) {
+        let (columns, rows) = (columns.max(1), rows.max(1));
+        let message = format!(
+            "the image is {width} × {height} pixels; expected {columns} × {rows} stamps of {stamp} pixels a side (the header key STAMP, or `stamp` in layout.toml, says how large they are)"
+        );
+        return Err(FileError::new(path, message));
+    }
+    let most = columns * rows;
+    let galaxies = whole(image, path, "NSTAMPS", most)?.unwrap_or(most);
+    let mosaic = Mosaic {
+        columns,
+        galaxies,
+        stamp,
+    };
+    if mosaic.rows() != rows {
+        let message = format!(
+            "the header key NSTAMPS is {galaxies}; expected more than {}, as there are {rows} rows of {columns} stamps",
+            most - columns
+        );
+        return Err(FileError::new(path, message));
+    }
+    Ok(mosaic)
+}
+
+/// The grid that an image's stamps are on, for scoring.
+///
+/// # Errors
+/// Where they are not as many in a row as there are rows, or too few or many.
+fn square(data: &DataFolder, path: &Path, mosaic: &Mosaic) -> Result<Grid, FileError> {
+    let (n, rows) = (mosaic.columns, mosaic.rows());
+    if mosaic.galaxies != n * n {
+        let message = format!(
+            "there are {} stamps in {rows} rows of {n}; scoring expects as many rows as columns, all of them full",
+            mosaic.galaxies
+        );
+        return Err(FileError::new(path, message));
+    }
+    let field = Degrees(data.layout().field_degrees);
+    Grid::new(n, Pixels(mosaic.stamp as f64), field).map_err(|error| FileError::new(path, error))
+}
+
+/// Pixels a side of the stamps of a set: those of its first image, or of the data's layout where there
+/// is no image.
+///
+/// # Errors
+/// Where that image cannot be read.
+pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
+    match data.images(&[set])?.of_set(set).first() {
+        Some((_, path)) => stamp_of_image(data, path, &ImageReader::open(path)?),
+        None => Ok(data.layout().stamp),
+    }
+}
+
+/// Grid of a set's first image, `None` where there is none.
+///
+/// # Errors
+/// Where it cannot be read.
+pub(super) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>, FileError> {
+    let images = data.images(&[set])?.of_set(set);
+    let first = images.first().map(|(_, path)| {
+        let image = ImageReader::open(path)?;
+        square(data, path, &of_image(data, path, &image)?)
+    });
+    first.transpose()
+}
+
+/// Grid of a catalogue of ours, which has a row for every cell at its centre, measured or not.
+///
+/// # Errors
+/// Where `rows`, in order, are not those of a grid.
+pub fn of_catalogue(path: &Path, rows: &[Row], field: Degrees) -> Result<Grid, FileError> {
+    let n = side(path, rows.len())?;
+    let whole = |cell: &Row| (cell.x == cell.y).then_some(2.0 * cell.x - 1.0);
+    let stamp = rows.first().and_then(whole).unwrap_or(f64::NAN);
+    let grid = Grid::new(n, Pixels(stamp), field).map_err(|error| FileError::new(path, error))?;
+    let at = |k: usize| grid.centre(k % n, k / n);
+    match (0..rows.len()).find(|&k| (rows[k].x, rows[k].y) != at(k)) {
+        None => Ok(grid),
+        Some(k) => {
+            let (x, y) = at(k);
+            let message = format!(
+                "row {} lies at ({}, {}); expected ({x}, {y}) on a grid of {stamp} px stamps",
+                k + 1,
+                rows[k].x,
+                rows[k].y
+            );
+            Err(FileError::new(path, message))
+        }
+    }
+}
+
+/// Side of the grid that a file with one row per cell fills.
+///
+/// # Errors
+/// Where the number of rows is no square.
+pub fn side(path: &Path, rows: usize) -> Result<usize, FileError> {
+    Grid::side_of(rows).ok_or_else(|| {
+        let message = format!("{rows} rows; expected the square of the grid's side");
+        FileError::new(path, message)
+    })
+}
+
+/// A header value that counts something, `None` where absent.
+///
+/// # Errors
+/// Where it is no whole number from 1 to `most`.
+pub(super) fn whole(
+    image: &ImageReader,
+    path: &Path,
+    key: &str,
+    most: usize,
+) -> Result<Option<usize>, FileError> {
+    let Some(value) = image.number(key)? else {
+        return Ok(None);
+    };
+    if value.fract() == 0.0 && (1.0..=most as f64).contains(&value) {
+        return Ok(Some(value as usize));
+    }
+    let message = format!("the header key {key} is {value}; expected a whole number, 1 to {most}");
+    Err(FileError::new(path, message))
+}

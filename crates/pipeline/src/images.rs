@@ -1,0 +1,136 @@
+//! Which images there are, and which of them one process works on.
+
+use std::str::FromStr;
+
+use super::PipelineError;
+use crate::data::layout::DataFolder;
+use shearq_files::FileError;
+
+/// One image of a data folder or a simulation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageId {
+    /// Set number.
+    pub set: u32,
+    /// Image number.
+    pub image: u32,
+}
+
+/// Images of `sets` of a data folder (of all its sets if empty), in order.
+///
+/// # Errors
+/// Where a set has no image, or the folder none at all, or a folder cannot be listed.
+pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, PipelineError> {
+    let files = data.images(sets)?;
+    let mut found = Vec::new();
+    for set in files.wanted(sets) {
+        let images = files.of_set(set);
+        if images.is_empty() {
+            let path = data.galaxies(set, 1);
+            let message = format!("there is no image of set {set}; expected this file");
+            return Err(FileError::new(path, message).into());
+        }
+        let id = |(image, _)| ImageId { set, image };
+        found.extend(images.into_iter().map(id));
+    }
+    if found.is_empty() {
+        let message = "there are no galaxy images here in the layout expected";
+        return Err(FileError::new(data.root(), message).into());
+    }
+    Ok(found)
+}
+
+/// Images 1 to `images` of each of `sets`, in order.
+pub fn of_simulation(sets: &[u32], images: u32) -> Vec<ImageId> {
+    sets.iter()
+        .flat_map(|&set| (1..=images).map(move |image| ImageId { set, image }))
+        .collect()
+}
+
+/// One of the parts that work on many images is split into. Images go round the parts in turn, so
+/// that each is in exactly one and their numbers differ by one at most.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Shard {
+    /// Number of this part, from 1.
+    number: u32,
+    /// Number of parts.
+    of: u32,
+}
+
+impl Shard {
+    /// All the work in one part.
+    pub const WHOLE: Shard = Shard { number: 1, of: 1 };
+
+    /// The images of this part, out of all.
+    pub fn part(&self, all: &[ImageId]) -> Vec<ImageId> {
+        all.iter()
+            .enumerate()
+            .filter(|(position, _)| Shard::holding(*position, self.of) == *self)
+            .map(|(_, &image)| image)
+            .collect()
+    }
+
+    /// The one of `of` parts that the image at `position` of the list of all, from 0, belongs to.
+    pub fn holding(position: usize, of: u32) -> Shard {
+        Shard {
+            number: (position % of as usize) as u32 + 1,
+            of,
+        }
+    }
+
+    /// Number of parts.
+    pub fn of(&self) -> u32 {
+        self.of
+    }
+
+    /// Number of this part, from 1.
+    pub fn number(&self) -> u32 {
+        self.number
+    }
+}
+
+impl FromStr for Shard {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        text.split_once('/')
+            .and_then(|(number, of)| Some((number.parse().ok()?, of.parse().ok()?)))
+            .filter(|&(number, of)| (1..=of).contains(&number))
+            .map(|(number, of)| Shard { number, of })
+            .ok_or_else(|| "expected K/N, the K-th of N parts, with K from 1 to N".into())
+    }
+}
+
+impl std::fmt::Display for Shard {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}/{}", self.number, self.of)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_image_is_in_exactly_one_of_equal_parts() {
+        let all = of_simulation(&[1, 7, 24], 5);
+        for of in [1, 2, 4, 15, 40] {
+            let parts: Vec<Vec<ImageId>> = (1..=of)
+                .map(|number| Shard { number, of }.part(&all))
+                .collect();
+            let mut together: Vec<ImageId> = parts.concat();
+            together.sort_by_key(|id| (id.set, id.image));
+            assert_eq!(together, all);
+            let sizes = parts.iter().map(Vec::len);
+            assert!(sizes.clone().max().unwrap() - sizes.min().unwrap() <= 1);
+        }
+    }
+
+    #[test]
+    fn parts_are_named_by_number_and_count() {
+        assert_eq!("1/1".parse(), Ok(Shard::WHOLE));
+        assert_eq!("3/20".parse::<Shard>().unwrap().to_string(), "3/20");
+        for wrong in ["0/3", "4/3", "3", "1/0", "-1/2", "1/2/3", "a/b", ""] {
+            assert!(wrong.parse::<Shard>().is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,162 @@
+//! What a catalogue was measured from: fingerprints of the image, its PSF and the true shear, kept with the
+//! catalogue and compared wherever it is used again.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use shearq_submissions::PsfForm;
+
+use super::PipelineError;
+use super::engine;
+use super::images::ImageId;
+use crate::data::fingerprint::{of_file, of_image};
+use crate::data::layout::{DataFolder, LAYOUT_FILE, Layout};
+use crate::data::run::{Run, Source};
+use shearq_files::FileError;
+use shearq_files::open::is_there;
+use shearq_files::table::read_metadata;
+
+/// Keys of a catalogue's metadata.
+const GALAXIES: &str = "galaxies";
+const PSF: &str = "psf";
+const TRUTH: &str = "truth";
+
+/// The files that a run measures, as far as they are there. Of simulated ones, which nobody can replace,
+/// there are none.
+pub struct Inputs<'a> {
+    run: &'a Run,
+    data: &'a DataFolder,
+    /// Fingerprint of the truth of each set.
+    truths: BTreeMap<u32, String>,
+}
+
+impl<'a> Inputs<'a> {
+    /// Those of `images` of a run on `data`.
+    ///
+    /// # Errors
+    /// Where the true shear of a set is there and cannot be read.
+    pub fn new(run: &'a Run, data: &'a DataFolder, images: &[ImageId]) -> Result<Self, FileError> {
+        let mut truths = BTreeMap::new();
+        if let Source::Folder { .. } = run.source {
+            for of_set in images.chunk_by(|a, b| a.set == b.set) {
+                let path = data.truth(of_set[0].set);
+                if is_there(&path) {
+                    truths.insert(of_set[0].set, of_file(&path)?);
+                }
+            }
+        }
+        Ok(Inputs { run, data, truths })
+    }
+
+    /// The files of an image, by their keys.
+    fn files(&self, id: ImageId) -> BTreeMap<&'static str, PathBuf> {
+        let psf = match self.run.submission.psf.form {
+            PsfForm::Star => self.data.psf_star(id.set, id.image),
+            PsfForm::Functional => self.data.psf_functional(id.set, id.image),
+        };
+        BTreeMap::from([
+            (GALAXIES, self.data.galaxies(id.set, id.image)),
+            (PSF, psf),
+            (TRUTH, self.data.truth(id.set)),
+        ])
+    }
+
+    /// The fingerprints of an image's files, by their keys.
+    ///
+    /// # Errors
+    /// Where a file is there and cannot be read.
+    pub fn prints(&self, id: ImageId) -> Result<BTreeMap<String, String>, FileError> {
+        let mut prints = BTreeMap::new();
+        if let Source::Simulated(_) = self.run.source {
+            return Ok(prints);
+        }
+        for (key, path) in self.files(id) {
+            let print = match key {
+                TRUTH => self.truths.get(&id.set).cloned(),
+                _ if is_there(&path) => Some(of_image(&path)?),
+                _ => None,
+            };
+            prints.extend(print.map(|print| (key.to_owned(), print)));
+        }
+        Ok(prints)
+    }
+
+    /// Checks that the catalogues in `out` of `images` were measured from the files that are there now.
+    ///
+    /// # Errors
+    /// Naming the first file that is another one, or that cannot be read.
+    pub fn verify(
+        &self,
+        out: &Path,
+        images: &[ImageId],
+        threads: usize,
+    ) -> Result<(), PipelineError> {
+        if let Source::Simulated(_) = self.run.source {
+            return Ok(());
+        }
+        engine::ordered(
+            threads,
+            |feeder| {
+                for &id in images {
+                    if !feeder.push(id) {
+                        break;
+                    }
+                }
+                Ok(())
+            },
+            || (),
+            |(), id| Ok(self.verify_one(out, id)?),
+            |()| Ok(()),
+        )
+    }
+
+    fn verify_one(&self, out: &Path, id: ImageId) -> Result<(), FileError> {
+        let catalogue = self.run.catalogue(out, id.set, id.image);
+        let now = self.prints(id)?;
+        let kept = read_metadata(&catalogue, self.run.format, now.keys())?;
+        for (key, path) in self.files(id) {
+            if let (Some(now), Some(kept)) = (now.get(key), kept.get(key))
+                && now != kept
+            {
+                let message = format!(
+                    "this is not the file that {} was measured with: its fingerprint is {now}, that one's {kept}; measure again into another folder",
+                    catalogue.display()
+                );
+                return Err(FileError::new(path, message));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Checks that every catalogue of `sets` (of all, if empty) of a results folder was measured from the files
+/// that are in `data` now.
+///
+/// # Errors
+/// Naming the first file that is another one.
+pub fn verify(
+    data: &DataFolder,
+    out: &Path,
+    run: &Run,
+    sets: &[u32],
+    threads: usize,
+) -> Result<(), PipelineError> {
+    if let Source::Folder { layout, .. } = &run.source {
+        let of = |layout: &Layout| (layout.field_degrees, layout.truth_sign);
+        let (then, now) = (of(layout), of(data.layout()));
+        if then != now {
+            let message = format!(
+                "field in degrees and sign of the truth are {now:?}; {} was measured with {then:?}",
+                out.display()
+            );
+            return Err(FileError::new(data.root().join(LAYOUT_FILE), message).into());
+        }
+    }
+    let files = run.catalogues(out, sets)?;
+    let of_set = |set| {
+        let images = files.of_set(set).into_iter();
+        images.map(move |(image, _)| ImageId { set, image })
+    };
+    let images: Vec<ImageId> = files.sets().into_iter().flat_map(of_set).collect();
+    Inputs::new(run, data, &images)?.verify(out, &images, threads)
+}

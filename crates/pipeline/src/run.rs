@@ -1,0 +1,330 @@
+//! Simulating and measuring in memory: no image is stored.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use ndarray::{Array2, ArrayView2, Axis};
+use shearq_measure::{
+    Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Worker, calibrate, star_psf, strip,
+};
+use shearq_quantities::Shear;
+use shearq_submissions::{PsfForm, Submission};
+
+use super::engine::{self, Feeder, Progress};
+use super::images::ImageId;
+use super::measure::{MeasuredRow, RowPsf, StampRow, Summary, measure_row, to_do, write_catalogue};
+use super::{PipelineError, simulate};
+use crate::data::layout::DataFolder;
+use crate::data::mosaic::Mosaic;
+use crate::data::run::{RUN_FILE, Run, claim};
+use shearq_simulate::render::RenderScratch;
+use shearq_simulate::set::{
+    ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
+};
+
+/// What an image's stamps tell of it, for each measurer that measures its noise.
+pub(crate) type Surveys = Arc<[Option<Arc<Survey>>]>;
+
+/// One row of stamps to draw and measure.
+pub struct RowJob {
+    /// The image's fields of PSF and ellipticity.
+    pub fields: Arc<ImageFields>,
+    /// Row of the mosaic, from 0.
+    pub iy: usize,
+    /// What the image's stamps tell of it, for each measurer that measures its noise.
+    pub surveys: Surveys,
+}
+
+/// A row of stamps, measured by each measurer.
+struct MeasuredJob {
+    /// Ellipticities after lensing.
+    observed: Vec<Shear>,
+    rows: Vec<MeasuredRow>,
+}
+
+/// A simulated image, measured.
+pub struct SimulatedImage<'a> {
+    /// Its number.
+    pub image: u32,
+    /// True ellipticities of the galaxies as lensed, row by row.
+    pub observed: &'a [Shear],
+    /// Rows of each measurer.
+    pub rows: &'a [Vec<MeasuredRow>],
+}
+
+/// One thread's buffers.
+struct Scratch {
+    render: RenderScratch,
+    workers: Vec<Worker>,
+}
+
+/// Plans the measurement of simulated stamps by each of `submissions`.
+///
+/// # Errors
+/// Where a submission's sizes cannot be worked with.
+pub fn measurers(submissions: &[Submission]) -> Result<Vec<Measurer>, PipelineError> {
+    submissions
+        .iter()
+        .map(|submission| Ok(Measurer::new(submission, STAMP)?))
+        .collect()
+}
+
+/// Simulates `images`, which are in the order of their sets, and measures them by the run's
+/// submission, into catalogues in `out` with the true shear beside them. No image is stored;
+/// catalogues that are there already, of the same settings, are kept.
+///
+/// # Errors
+/// Where a set does not exist, the folder holds results of other settings, or a file cannot be
+/// written.
+pub fn run_folder(
+    run: &Run,
+    settings: SimulationSettings,
+    images: &[ImageId],
+    out: &Path,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Summary, PipelineError> {
+    let _claim = claim(&out.join(RUN_FILE), run)?;
+    let measurers = measurers(std::slice::from_ref(&run.submission))?;
+    let truth = DataFolder::new(out);
+    let (todo, done) = to_do(run, out, images);
+    let mut summary = Summary {
+        already: done.len(),
+        ..Summary::default()
+    };
+    progress.skip((summary.already * settings.grid * settings.grid) as u64);
+    for of_set in todo.chunk_by(|a, b| a.set == b.set) {
+        let set = of_set[0].set;
+        let todo: Vec<u32> = of_set.iter().map(|id| id.image).collect();
+        let simulator = simulate::simulator(set, settings)?;
+        simulate::write_truth(&truth, &simulator)?;
+        progress.note(&format!("set {set:02}"));
+        run_set(&simulator, &todo, &measurers, threads, progress, |image| {
+            write_catalogue(run, out, &image.rows[0], BTreeMap::new())?;
+            summary.count(&image.rows[0]);
+            Ok(())
+        })?;
+    }
+    Ok(summary)
+}
+
+/// Simulates images of a set and measures each galaxy by all `measurers`; `done` gets the
+/// images in order.
+///
+/// The galaxies are those that `simulate` would write with the same settings, and the measurements
+/// those that `measure` would make of them.
+///
+/// # Errors
+/// What `done` returns, or threads that cannot be started.
+pub fn run_set(
+    set: &SetSimulator,
+    images: &[u32],
+    measurers: &[Measurer],
+    threads: usize,
+    progress: &mut dyn Progress,
+    mut done: impl FnMut(&SimulatedImage<'_>) -> Result<(), PipelineError>,
+) -> Result<(), PipelineError> {
+    let n = set.grid().n;
+    let mut rows: Vec<Vec<MeasuredRow>> = measurers.iter().map(|_| Vec::new()).collect();
+    let mut observed = Vec::with_capacity(n * n);
+    engine::ordered(
+        threads,
+        |feeder| feed(set, images, measurers, feeder),
+        || Scratch {
+            render: RenderScratch::new(),
+            workers: measurers.iter().map(Measurer::worker).collect(),
+        },
+        |scratch, job| draw_and_measure(set, scratch, &job),
+        |measured: MeasuredJob| {
+            progress.advance(n as u64);
+            let (image, iy) = (measured.rows[0].id.image, measured.rows[0].iy);
+            observed.extend(measured.observed);
+            for (rows, row) in rows.iter_mut().zip(measured.rows) {
+                rows.push(row);
+            }
+            if iy + 1 == n {
+                for (rows, measurer) in rows.iter_mut().zip(measurers) {
+                    calibrate(measurer.submission(), rows);
+                }
+                done(&SimulatedImage {
+                    image,
+                    observed: &observed,
+                    rows: &rows,
+                })?;
+                rows.iter_mut().for_each(Vec::clear);
+                observed.clear();
+            }
+            Ok(())
+        },
+    )
+}
+
+/// Hands out the rows of images of a set, in order, with what `measurers` find on their stamps.
+///
+/// # Errors
+/// Where a measurer is for stamps of another size.
+pub fn feed(
+    set: &SetSimulator,
+    images: &[u32],
+    measurers: &[Measurer],
+    feeder: &mut Feeder<'_, RowJob>,
+) -> Result<(), PipelineError> {
+    for &image in images {
+        let fields = Arc::new(set.image_fields(image));
+        let surveys = surveys(set, &fields, measurers, feeder)?;
+        for iy in 0..set.grid().n {
+            let fields = Arc::clone(&fields);
+            let surveys = Arc::clone(&surveys);
+            if !feeder.push(RowJob {
+                fields,
+                iy,
+                surveys,
+            }) {
+                return Ok(());
+            }
+        }
+    }
+    Ok(())
+}
+
+/// What the stamps of a simulated image tell each measurer that measures its noise, from the rows that it would look at.
+fn surveys(
+    set: &SetSimulator,
+    fields: &ImageFields,
+    measurers: &[Measurer],
+    feeder: &Feeder<'_, RowJob>,
+) -> Result<Surveys, PipelineError> {
+    let n = set.grid().n;
+    let empty = || -> Vec<Option<NoiseSurvey>> {
+        let plans = measurers.iter().map(Measurer::noise_plan);
+        plans.map(|plan| plan.map(NoisePlan::survey)).collect()
+    };
+    let Some(plan) = measurers.iter().find_map(Measurer::noise_plan) else {
+        return Ok(measurers.iter().map(|_| None).collect());
+    };
+    // Plans differ in their lags alone.
+    let rows = feeder.each(plan.rows(n, n), |iy| {
+        let (pixels, _) = simulate::draw_stamps(set, fields, iy, &mut RenderScratch::new());
+        let mut surveys = empty();
+        for stamp in strip(&pixels, n, STAMP)?.outer_iter() {
+            for survey in surveys.iter_mut().flatten() {
+                survey.add(stamp)?;
+            }
+        }
+        Ok::<_, PipelineError>(surveys)
+    });
+    let mut surveys = empty();
+    for row in rows {
+        let found = row?;
+        for (survey, more) in surveys.iter_mut().flatten().zip(found.iter().flatten()) {
+            survey.join(more);
+        }
+    }
+    let found = surveys
+        .iter()
+        .map(|survey| survey.as_ref()?.found().map(Arc::new));
+    Ok(found.collect())
+}
+
+fn draw_and_measure(
+    set: &SetSimulator,
+    scratch: &mut Scratch,
+    job: &RowJob,
+) -> Result<MeasuredJob, PipelineError> {
+    let (pixels, observed) = simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render);
+    let rows = measure_strip(
+        set,
+        &job.fields,
+        job.iy,
+        pixels,
+        &mut scratch.workers,
+        &job.surveys,
+    )?;
+    Ok(MeasuredJob { observed, rows })
+}
+
+/// Simulates galaxy `(ix, iy)` of an image and measures it, keeping the steps; `None` where it could
+/// not be measured. Returns the PSF with them.
+///
+/// # Errors
+/// Where the measurer is for stamps of another size.
+pub fn simulated_steps(
+    set: &SetSimulator,
+    measurer: &Measurer,
+    image: u32,
+    (ix, iy): (usize, usize),
+) -> Result<Option<(Array2<f64>, Steps)>, PipelineError> {
+    let fields = Arc::new(set.image_fields(image));
+    let mut pixels = vec![0.0; STAMP * STAMP];
+    set.draw(&fields, ix, iy, &mut RenderScratch::new(), &mut pixels);
+    let stamps = strip(&pixels, 1, STAMP)?;
+    let stamp = stamps.index_axis(Axis(0), 0);
+    let cut = measurer.submission().psf_cut();
+    let psf = fields.psf.at(ix, iy).stamp_beside(cut.size, STAMP);
+    let mut worker = measurer.worker();
+    worker.set_psf(psf.view())?;
+    let measured = worker.measure(stamp, Some(NOISE_SIGMA))?;
+    if measured.descent.is_none() {
+        return Ok(None);
+    }
+    let steps = worker.steps(stamp, psf.view(), &measured)?;
+    Ok(Some((psf, steps)))
+}
+
+/// Measures a strip of simulated stamps by each worker, with the noise that was measured for it: without one
+/// the noise that was drawn.
+pub fn measure_strip(
+    set: &SetSimulator,
+    fields: &ImageFields,
+    iy: usize,
+    pixels: Vec<f32>,
+    workers: &mut [Worker],
+    surveys: &[Option<Arc<Survey>>],
+) -> Result<Vec<MeasuredRow>, PipelineError> {
+    let mut row = StampRow {
+        id: ImageId {
+            set: set.kind().set,
+            image: fields.image,
+        },
+        iy,
+        mosaic: Mosaic::square(set.grid().n, STAMP),
+        pixels,
+        header_noise: Some(NOISE_SIGMA),
+        survey: None,
+        psf: RowPsf::Functional(Vec::new()),
+    };
+    let mut measured = Vec::with_capacity(workers.len());
+    for (k, worker) in workers.iter_mut().enumerate() {
+        row.survey = surveys.get(k).cloned().flatten();
+        row.psf = row_psf(set, fields, iy, worker.submission());
+        measured.push(measure_row(worker, &row)?);
+    }
+    Ok(measured)
+}
+
+/// The PSFs of a row in the form that a submission uses.
+fn row_psf(set: &SetSimulator, fields: &ImageFields, iy: usize, submission: &Submission) -> RowPsf {
+    let n = set.grid().n;
+    let (size, cut) = (submission.psf.size, submission.psf_cut());
+    match (&fields.psf, submission.psf.form) {
+        (PsfField::One(psf), PsfForm::Functional) => {
+            RowPsf::Shared(Arc::new(psf.stamp_beside(cut.size, STAMP)))
+        }
+        (PsfField::One(psf), PsfForm::Star) => {
+            let star = simulate::star(psf, STAMP);
+            let psf = ArrayView2::from_shape((STAMP, STAMP), &star)
+                .ok()
+                .and_then(|star| star_psf(star, cut).ok());
+            // A noise-free star of the simulator's can always be cut.
+            RowPsf::Shared(Arc::new(psf.unwrap_or_else(|| Array2::zeros((size, size)))))
+        }
+        (PsfField::PerGalaxy(_), PsfForm::Functional) => {
+            RowPsf::Functional((0..n).map(|ix| *fields.psf.at(ix, iy)).collect())
+        }
+        (PsfField::PerGalaxy(_), PsfForm::Star) => RowPsf::Stars {
+            pixels: simulate::draw_stars(set, fields, iy),
+            side: STAMP,
+        },
+    }
+}

@@ -1,0 +1,312 @@
+//! Simulating sets into a data folder.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use shearq_quantities::FunctionalPsf;
+use shearq_quantities::Shear;
+
+use super::PipelineError;
+use super::engine::{self, Feeder, Progress};
+use super::images::ImageId;
+use crate::data::layout::DataFolder;
+use crate::data::psf_table;
+use crate::data::run::claim;
+use shearq_files::atomic;
+use shearq_files::fits::{ImageWriter, Value};
+use shearq_simulate::kinds::{SETS, SetKind};
+use shearq_simulate::render::RenderScratch;
+use shearq_simulate::set::{
+    ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
+};
+
+/// Name of the record in a simulated data folder.
+pub const SIMULATION_FILE: &str = "simulation.json";
+
+/// Settings of a simulation, as stored with its data.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SimulationRecord {
+    /// Version of shearq.
+    pub version: String,
+    /// What the data are made from.
+    pub settings: SimulationSettings,
+}
+
+/// One row of stamps to draw.
+struct RowJob {
+    set: Arc<SetSimulator>,
+    fields: Arc<ImageFields>,
+    iy: usize,
+}
+
+/// A row of stamps, drawn.
+struct DrawnRow {
+    job: RowJob,
+    pixels: Vec<f32>,
+    /// Strip of star stamps, for one PSF per galaxy.
+    stars: Option<Vec<f32>>,
+    observed: Vec<Shear>,
+}
+
+/// Draws what all images of a set share.
+///
+/// # Errors
+/// Where there is no such set, or its shear would not be weak.
+pub fn simulator(set: u32, settings: SimulationSettings) -> Result<SetSimulator, PipelineError> {
+    let kind = SetKind::of(set).ok_or_else(|| {
+        PipelineError::Request(format!("there is no set {set}; expected 1 to {SETS}"))
+    })?;
+    SetSimulator::new(kind, settings).map_err(|source| PipelineError::Scoring {
+        set: Some(set),
+        source,
+    })
+}
+
+/// Simulates `images`, which are in the order of their sets, into `data`; returns how many were made
+/// and how many were there already.
+///
+/// # Errors
+/// Where a set does not exist, the folder holds data of other settings, or a file cannot be written.
+pub fn simulate_folder(
+    record: &SimulationRecord,
+    images: &[ImageId],
+    data: &DataFolder,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<(usize, usize), PipelineError> {
+    let _claim = claim(&data.root().join(SIMULATION_FILE), record)?;
+    let todo: Vec<ImageId> = images
+        .iter()
+        .filter(|id| !data.galaxies(id.set, id.image).is_file())
+        .copied()
+        .collect();
+    let already = images.len() - todo.len();
+    let mut simulators = Vec::new();
+    for of_set in todo.chunk_by(|a, b| a.set == b.set) {
+        let simulator = simulator(of_set[0].set, record.settings)?;
+        write_truth(data, &simulator)?;
+        simulators.push((Arc::new(simulator), of_set));
+    }
+    let mut made = 0;
+    let mut open: Option<OpenImage> = None;
+    engine::ordered(
+        threads,
+        |feeder| {
+            feed(&simulators, feeder);
+            Ok(())
+        },
+        RenderScratch::new,
+        |scratch, job| Ok(draw_row(scratch, job)),
+        |row: DrawnRow| {
+            progress.advance(row.observed.len() as u64);
+            let mut image = match open.take() {
+                Some(image) => image,
+                None => OpenImage::create(record, data, &row.job)?,
+            };
+            let last = row.job.iy + 1 == row.job.set.grid().n;
+            image.add(row)?;
+            if last {
+                image.finish(data)?;
+                made += 1;
+            } else {
+                open = Some(image);
+            }
+            Ok(())
+        },
+    )?;
+    Ok((made, already))
+}
+
+fn feed(simulators: &[(Arc<SetSimulator>, &[ImageId])], feeder: &mut Feeder<'_, RowJob>) {
+    for (set, images) in simulators {
+        for id in *images {
+            let fields = Arc::new(set.image_fields(id.image));
+            for iy in 0..set.grid().n {
+                let job = RowJob {
+                    set: Arc::clone(set),
+                    fields: Arc::clone(&fields),
+                    iy,
+                };
+                if !feeder.push(job) {
+                    return;
+                }
+            }
+        }
+    }
+}
+
+fn draw_row(scratch: &mut RenderScratch, job: RowJob) -> DrawnRow {
+    let (pixels, observed) = draw_stamps(&job.set, &job.fields, job.iy, scratch);
+    let stars = matches!(job.fields.psf, PsfField::PerGalaxy(_))
+        .then(|| draw_stars(&job.set, &job.fields, job.iy));
+    DrawnRow {
+        job,
+        pixels,
+        stars,
+        observed,
+    }
+}
+
+/// A strip of noisy stamps, and the galaxies' ellipticities after lensing.
+pub(super) fn draw_stamps(
+    set: &SetSimulator,
+    fields: &ImageFields,
+    iy: usize,
+    scratch: &mut RenderScratch,
+) -> (Vec<f32>, Vec<Shear>) {
+    let n = set.grid().n;
+    let mut pixels = vec![0.0; n * STAMP * STAMP];
+    let mut stamp = vec![0.0; STAMP * STAMP];
+    let mut observed = Vec::with_capacity(n);
+    for ix in 0..n {
+        observed.push(set.draw(fields, ix, iy, scratch, &mut stamp));
+        place(&stamp, STAMP, ix, n, &mut pixels);
+    }
+    (pixels, observed)
+}
+
+/// A strip of star stamps, one per galaxy.
+pub(super) fn draw_stars(set: &SetSimulator, fields: &ImageFields, iy: usize) -> Vec<f32> {
+    let n = set.grid().n;
+    let mut strip = vec![0.0; n * STAMP * STAMP];
+    for ix in 0..n {
+        let star = star(fields.psf.at(ix, iy), STAMP);
+        place(&star, STAMP, ix, n, &mut strip);
+    }
+    strip
+}
+
+/// Copies a stamp to its place in a strip of `n`.
+pub fn place(stamp: &[f32], side: usize, ix: usize, n: usize, strip: &mut [f32]) {
+    for (y, row) in stamp.chunks_exact(side).enumerate() {
+        let at = y * n * side + ix * side;
+        strip[at..at + side].copy_from_slice(row);
+    }
+}
+
+/// A noise-free star stamp with a sum of one.
+pub fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
+    psf.stamp(side).iter().map(|&v| v as f32).collect()
+}
+
+/// Writes the true shear of a set.
+pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {
+    let grid = set.grid();
+    let mut text = String::from("x,y,g1,g2\n");
+    for iy in 0..grid.n {
+        for ix in 0..grid.n {
+            let (x, y) = grid.centre(ix, iy);
+            let g = set.shear_at(ix, iy);
+            text.push_str(&format!("{x},{y},{},{}\n", g.e1, g.e2));
+        }
+    }
+    Ok(atomic::write(data.truth(set.kind().set), text.as_bytes())?)
+}
+
+/// Files of one image on their way.
+struct OpenImage {
+    galaxies: ImageWriter,
+    stars: Option<ImageWriter>,
+    job: RowJob,
+    intrinsic: String,
+}
+
+impl OpenImage {
+    fn create(
+        record: &SimulationRecord,
+        data: &DataFolder,
+        job: &RowJob,
+    ) -> Result<Self, PipelineError> {
+        let (set, image) = (job.set.kind().set, job.fields.image);
+        let n = job.set.grid().n;
+        let seed = i64::try_from(record.settings.seed);
+        let mut header = vec![
+            ("SET", Value::Int(i64::from(set))),
+            ("IMAGE", Value::Int(i64::from(image))),
+            ("STAMP", Value::Int(STAMP as i64)),
+            ("NGRID", Value::Int(n as i64)),
+            ("SNR", Value::Real(job.set.nominal_snr())),
+            ("NOISESIG", Value::Real(NOISE_SIGMA)),
+            ("CREATOR", Value::Text(format!("shearq {}", record.version))),
+            ("KIND", Value::Text(job.set.kind().image.label().into())),
+        ];
+        header.push(match seed {
+            Ok(seed) => ("SEED", Value::Int(seed)),
+            Err(_) => ("SEED", Value::Text(record.settings.seed.to_string())),
+        });
+        let side = n * STAMP;
+        let galaxies = ImageWriter::create(data.galaxies(set, image), side, side, &header)?;
+        let psf_path = data.psf_star(set, image);
+        let psf_header = [
+            ("SET", Value::Int(i64::from(set))),
+            ("IMAGE", Value::Int(i64::from(image))),
+            ("STAMP", Value::Int(STAMP as i64)),
+            ("CREATOR", Value::Text(format!("shearq {}", record.version))),
+        ];
+        let stars = match &job.fields.psf {
+            PsfField::One(psf) => {
+                let mut writer = ImageWriter::create(&psf_path, STAMP, STAMP, &psf_header)?;
+                writer.write_rows(&star(psf, STAMP))?;
+                writer.finish()?;
+                None
+            }
+            PsfField::PerGalaxy(_) => {
+                Some(ImageWriter::create(&psf_path, side, side, &psf_header)?)
+            }
+        };
+        write_psf_table(data, job)?;
+        Ok(OpenImage {
+            galaxies,
+            stars,
+            job: RowJob {
+                set: Arc::clone(&job.set),
+                fields: Arc::clone(&job.fields),
+                iy: 0,
+            },
+            intrinsic: String::from("x,y,e1,e2,observed_e1,observed_e2\n"),
+        })
+    }
+
+    fn add(&mut self, row: DrawnRow) -> Result<(), PipelineError> {
+        self.galaxies.write_rows(&row.pixels)?;
+        if let (Some(writer), Some(strip)) = (&mut self.stars, &row.stars) {
+            writer.write_rows(strip)?;
+        }
+        let iy = row.job.iy;
+        for (ix, observed) in row.observed.iter().enumerate() {
+            let (x, y) = self.job.set.grid().centre(ix, iy);
+            let e = self.job.fields.intrinsic[(ix, iy)];
+            self.intrinsic.push_str(&format!(
+                "{x},{y},{},{},{},{}\n",
+                e.re, e.im, observed.e1, observed.e2
+            ));
+        }
+        Ok(())
+    }
+
+    /// The galaxies get their name last: an image with galaxies is complete.
+    fn finish(self, data: &DataFolder) -> Result<(), PipelineError> {
+        let (set, image) = (self.job.set.kind().set, self.job.fields.image);
+        if let Some(stars) = self.stars {
+            stars.finish()?;
+        }
+        atomic::write(data.intrinsic(set, image), self.intrinsic.as_bytes())?;
+        self.galaxies.finish()?;
+        Ok(())
+    }
+}
+
+fn write_psf_table(data: &DataFolder, job: &RowJob) -> Result<(), PipelineError> {
+    let grid = job.set.grid();
+    let rows: Vec<_> = match &job.fields.psf {
+        PsfField::One(psf) => vec![(grid.centre(0, 0), *psf)],
+        PsfField::PerGalaxy(field) => (0..grid.cells())
+            .map(|k| {
+                let (ix, iy) = (k % grid.n, k / grid.n);
+                (grid.centre(ix, iy), field[(ix, iy)])
+            })
+            .collect(),
+    };
+    let path = data.psf_functional(job.set.kind().set, job.fields.image);
+    Ok(psf_table::write(&path, &rows)?)
+}

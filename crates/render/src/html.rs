@@ -1,0 +1,866 @@
+//! Reports as one HTML file that needs nothing else: style, script and pictures are inside.
+//!
+//! A [`Report`] is a list of sections of text, tables and figures, and the settings that made it. The
+//! page may fetch nothing: a content security policy in the file forbids it. Without scripts it
+//! reads the same, only that its tables cannot be sorted. The same report gives the same bytes.
+//!
+//! ```
+//! # use shearq::report::html::{Block, Report, Section};
+//! let report = Report {
+//!     title: "Scores".into(),
+//!     sections: vec![Section::new("q", "Q", vec![Block::Text("**Q** as in `score`.".into())])],
+//!     ..Report::default()
+//! };
+//! assert!(report.render().contains("<p><b>Q</b> as in <code>score</code>.</p>"));
+//! ```
+
+use std::collections::HashSet;
+use std::path::Path;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use maud::{DOCTYPE, Markup, PreEscaped, Render, html};
+
+use crate::escape::visible;
+use crate::figure::{Figure, FigureError, PIXELS_PER_POINT, PictureFormat};
+use crate::table::{Cell, Table, TableFormat};
+use shearq_files::{FileError, atomic};
+
+const STYLE: &str = include_str!("html/style.css");
+const SCRIPT: &str = include_str!("html/script.js");
+
+/// Characters above which the heading of a row may be folded.
+const LONG: usize = 16;
+
+/// Characters above which the words of a cell run over several lines.
+const SENTENCE: usize = 48;
+
+/// What replaces `DARK` in the style sheet, which needs it in two places.
+const DARK: &str = "color-scheme: dark; --paper: #15171a; --ink: #dddcd8; --muted: #a0a4a9; \
+     --rule: #34383d; --strong-rule: #8b9096; --link: #8fb8e0; --shade: #202327; --edge: #000a; --dim: brightness(.92);";
+
+/// A report.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Report {
+    /// Title of the page.
+    pub title: String,
+    /// One line below it; may be empty.
+    pub subtitle: String,
+    /// What it has to say.
+    pub sections: Vec<Section>,
+    /// What made it, by name: version, seed, inputs, resolved settings. Values of several lines are
+    /// shown as they are.
+    pub settings: Vec<(String, String)>,
+}
+
+/// A part of a report, with an entry in its contents.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Section {
+    /// Name in links. Characters other than ASCII letters, digits, `-` and `_` become hyphens, and
+    /// a name that is taken gets a number.
+    pub id: String,
+    /// Heading.
+    pub heading: String,
+    /// Contents, in order.
+    pub blocks: Vec<Block>,
+}
+
+impl Section {
+    /// A section.
+    pub fn new(id: impl Into<String>, heading: impl Into<String>, blocks: Vec<Block>) -> Self {
+        Section {
+            id: id.into(),
+            heading: heading.into(),
+            blocks,
+        }
+    }
+}
+
+/// A piece of a section.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Block {
+    /// Paragraphs, with blank lines between them. `` `code` `` and `**bold**` are understood and
+    /// nothing else.
+    Text(String),
+    /// A table, which readers can sort. Its columns of detail are folded away until asked for; its
+    /// values are in the page in full precision, as CSV.
+    Table(Table),
+    /// A figure.
+    Figure(Picture),
+    /// Lines in a typewriter font, as they are.
+    Code(String),
+}
+
+/// A figure as it stands in a report.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picture {
+    /// File name without extension, for links to the figure.
+    pub stem: String,
+    /// What it shows, in words, for those who cannot see it; the caption stands in where it is empty.
+    pub alt: String,
+    /// Caption, with the markup of [`Block::Text`].
+    pub caption: String,
+    /// PictureFormat of `bytes`.
+    pub format: PictureFormat,
+    /// The picture file. SVG is small and sharp for curves and bars, PNG is smaller for images.
+    pub bytes: Vec<u8>,
+    /// Labels and paths, relative to the report, of the same figure and its data in other formats.
+    pub links: Vec<(String, String)>,
+}
+
+impl Picture {
+    /// Draws a figure for a report.
+    ///
+    /// # Errors
+    /// Those of [`Figure::render`].
+    pub fn draw(
+        figure: &dyn Figure,
+        format: PictureFormat,
+        stem: impl Into<String>,
+        caption: impl Into<String>,
+    ) -> Result<Self, FigureError> {
+        Ok(Picture {
+            stem: stem.into(),
+            alt: String::new(),
+            caption: caption.into(),
+            format,
+            bytes: figure.render(format)?,
+            links: Vec::new(),
+        })
+    }
+
+    /// The same with a description in words.
+    pub fn described(self, alt: impl Into<String>) -> Self {
+        Picture {
+            alt: alt.into(),
+            ..self
+        }
+    }
+
+    /// The same with one more link.
+    pub fn link(mut self, label: impl Into<String>, path: impl Into<String>) -> Self {
+        self.links.push((label.into(), path.into()));
+        self
+    }
+
+    /// Width and height in points, where the file tells.
+    fn size(&self) -> Option<(f64, f64)> {
+        match self.format {
+            PictureFormat::Png => {
+                let number = |at: usize| {
+                    let bytes = self.bytes.get(at..at + 4)?.try_into().ok()?;
+                    Some(f64::from(u32::from_be_bytes(bytes)) / f64::from(PIXELS_PER_POINT))
+                };
+                self.bytes.starts_with(b"\x89PNG").then_some(())?;
+                Some((number(16)?, number(20)?))
+            }
+            PictureFormat::Svg => {
+                let text = str::from_utf8(&self.bytes).ok()?;
+                let (_, tag) = text.split_once("<svg")?;
+                let (tag, _) = tag.split_once('>')?;
+                let number = |name: &str| {
+                    let (_, rest) = tag.split_once(&format!(" {name}=\""))?;
+                    rest.split_once('"')?.0.parse::<f64>().ok()
+                };
+                Some((number("width")?, number("height")?))
+            }
+        }
+    }
+}
+
+impl Report {
+    /// The page.
+    pub fn render(&self) -> String {
+        let mut page = Page::new();
+        let ids: Vec<String> = self
+            .sections
+            .iter()
+            .map(|section| page.ids.give(&section.id))
+            .collect();
+        let mut contents: Vec<(&str, &str)> = ids
+            .iter()
+            .zip(&self.sections)
+            .map(|(id, section)| (id.as_str(), section.heading.as_str()))
+            .collect();
+        if !self.settings.is_empty() {
+            contents.push(SETTINGS);
+        }
+        let markup = html! {
+            (DOCTYPE) "\n"
+            html lang="en" {
+                (head(&self.title))
+                body { "\n"
+                    a.skip href="#main" { "Skip the contents" } "\n"
+                    header {
+                        div {
+                            h1 { (Words(&self.title)) }
+                            @if !self.subtitle.is_empty() {
+                                p.subtitle { (Words(&self.subtitle)) }
+                            }
+                        }
+                        button #theme type="button" title="Change between light and dark" hidden { "Dark" }
+                    } "\n"
+                    @if !contents.is_empty() {
+                        nav aria-label="Contents" {
+                            ol {
+                                @for (id, heading) in contents {
+                                    li { a href={ "#" (id) } { (Words(heading)) } }
+                                }
+                            }
+                        } "\n"
+                    }
+                    main #main { "\n"
+                        @for (id, part) in ids.iter().zip(&self.sections) {
+                            (section(id, &part.heading, html! {
+                                @for block in &part.blocks { (page.block(block)) "\n" }
+                            }))
+                        }
+                        @if !self.settings.is_empty() {
+                            (section(SETTINGS.0, SETTINGS.1, settings(&self.settings)))
+                        }
+                    } "\n"
+                } "\n"
+            } "\n"
+        };
+        markup.into_string()
+    }
+
+    /// Writes the page, whole or not at all.
+    ///
+    /// # Errors
+    /// Where the file cannot be written.
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<(), FileError> {
+        atomic::write(path, self.render().as_bytes())
+    }
+}
+
+/// Name and heading of the section of settings.
+const SETTINGS: (&str, &str) = ("settings", "What made this report");
+
+/// Names that are taken.
+#[derive(Debug)]
+struct Ids(HashSet<String>);
+
+impl Ids {
+    /// A name like `wish`, not given before.
+    fn give(&mut self, wish: &str) -> String {
+        let mut id = String::new();
+        for c in wish.chars() {
+            if c.is_ascii_alphanumeric() || c == '_' {
+                id.push(c);
+            } else if !id.is_empty() && !id.ends_with('-') {
+                id.push('-');
+            }
+        }
+        let stem = match id.trim_end_matches('-') {
+            "" => "part",
+            stem => stem,
+        };
+        let mut id = stem.to_owned();
+        let mut number = 1;
+        while !self.0.insert(id.clone()) {
+            number += 1;
+            id = format!("{stem}-{number}");
+        }
+        id
+    }
+}
+
+/// Words from elsewhere: escaped as all text is, with control characters, which no page can hold, written out.
+struct Words<'a>(&'a str);
+
+impl Render for Words<'_> {
+    fn render_to(&self, page: &mut String) {
+        visible(self.0).as_ref().render_to(page);
+    }
+}
+
+fn head(title: &str) -> Markup {
+    let policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; \
+                  script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'";
+    html! {
+        head { "\n"
+            meta charset="utf-8";
+            meta http-equiv="Content-Security-Policy" content=(policy);
+            meta name="viewport" content="width=device-width, initial-scale=1";
+            meta name="color-scheme" content="light dark";
+            meta name="generator" content={ "shearq " (env!("CARGO_PKG_VERSION")) };
+            link rel="icon" href="data:,"; "\n"
+            title { (Words(title)) } "\n"
+            style { (PreEscaped(STYLE.replace("DARK", DARK))) } "\n"
+            script { (PreEscaped(SCRIPT)) } "\n"
+        } "\n"
+    }
+}
+
+fn section(id: &str, heading: &str, contents: Markup) -> Markup {
+    html! {
+        section aria-labelledby=(id) { "\n"
+            h2 id=(id) {
+                (Words(heading)) " "
+                a.anchor href={ "#" (id) } aria-label="Link to this section" { "#" }
+            } "\n"
+            (contents)
+        } "\n"
+    }
+}
+
+fn code(code: &str) -> Markup {
+    // The parser drops one line break after the tag, so that the first of the code's own stays.
+    html! {
+        pre tabindex="0" { "\n" code { (Words(code.trim_end_matches('\n'))) } }
+    }
+}
+
+fn settings(settings: &[(String, String)]) -> Markup {
+    html! {
+        dl {
+            @for (name, value) in settings {
+                @let value = value.trim_end_matches('\n');
+                dt { (Words(name)) }
+                @if value.contains('\n') {
+                    dd.long { (code(value)) }
+                } @else {
+                    dd { (Words(value)) }
+                } "\n"
+            }
+        } "\n"
+    }
+}
+
+/// A page on its way: what is numbered in it, and the names that are taken.
+#[derive(Debug)]
+struct Page {
+    ids: Ids,
+    tables: usize,
+    figures: usize,
+}
+
+impl Page {
+    fn new() -> Self {
+        let taken = ["main", "theme", SETTINGS.0];
+        Page {
+            ids: Ids(taken.map(String::from).into()),
+            tables: 0,
+            figures: 0,
+        }
+    }
+
+    fn block(&mut self, block: &Block) -> Markup {
+        match block {
+            Block::Text(text) => html! {
+                @for paragraph in paragraphs(text) { p { (inline(&paragraph)) } }
+            },
+            Block::Table(table) => self.table(table),
+            Block::Figure(picture) => self.figure(picture),
+            Block::Code(text) => code(text),
+        }
+    }
+
+    fn figure(&mut self, picture: &Picture) -> Markup {
+        self.figures += 1;
+        let id = self.ids.give(&format!("figure-{}", picture.stem));
+        let mime = match picture.format {
+            PictureFormat::Png => "image/png",
+            PictureFormat::Svg => "image/svg+xml",
+        };
+        let size = picture.size().map(|(w, h)| (w.round(), h.round()));
+        let alt = match picture.alt.is_empty() {
+            true => plain(&picture.caption),
+            false => picture.alt.clone(),
+        };
+        // As an image, and not as elements of the page, an SVG keeps its names and styles to itself.
+        html! {
+            figure id=(id) {
+                div.plate {
+                    img src={ "data:" (mime) ";base64," (BASE64.encode(&picture.bytes)) } alt=(Words(&alt))
+                        width=[size.map(|s| s.0)] height=[size.map(|s| s.1)];
+                }
+                figcaption {
+                    p {
+                        span.number { "Figure " (self.figures) "." } " "
+                        (inline(&paragraphs(&picture.caption).join(" ")))
+                    }
+                    p.tools {
+                        @for (k, (label, path)) in picture.links.iter().enumerate() {
+                            @if k > 0 { " " }
+                            a href=(relative_url(path)) { (Words(label)) }
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    fn table(&mut self, table: &Table) -> Markup {
+        self.tables += 1;
+        let number = self.tables;
+        let id = self.ids.give(&format!("table-{number}"));
+        let title = self.ids.give(&format!("{id}-title"));
+        let columns: Vec<Column> = (0..table.headings.len())
+            .map(|k| Column::of(table, k))
+            .collect();
+        let csv = BASE64.encode(table.render(TableFormat::Csv));
+        // The caption stands outside what scrolls; the table is named by it.
+        html! {
+            div.table id=(id) {
+                p.title id=(title) { span.number { "Table " (number) "." } " " (Words(&table.title)) }
+                div.scroll role="region" tabindex="0" aria-labelledby=(title) {
+                    table aria-labelledby=(title) {
+                        thead {
+                            tr {
+                                @for (heading, column) in table.headings.iter().zip(&columns) {
+                                    th scope="col" class=[column.class(false)] { (Words(&heading.label)) }
+                                }
+                            }
+                        } "\n"
+                        tbody { "\n"
+                            @for row in &table.rows {
+                                tr {
+                                    @for (k, column) in columns.iter().enumerate() {
+                                        (column.cell(k, row.get(k)))
+                                    }
+                                } "\n"
+                            }
+                        }
+                    }
+                }
+                @if !table.notes.is_empty() {
+                    div.notes {
+                        @for note in &table.notes { p { (Words(note)) } }
+                    }
+                }
+                p.tools {
+                    a download={ (id) ".csv" } href={ "data:text/csv;charset=utf-8;base64," (csv) }
+                        aria-label={ "Table " (number) " as CSV" } { "CSV" }
+                }
+            }
+        }
+    }
+}
+
+/// How a column of a table is set.
+#[derive(Debug, Clone, Copy)]
+struct Column {
+    /// Holds numbers and stands on the right.
+    numbers: bool,
+    /// Width of the longest error, in digits; none where no cell has one.
+    error_width: Option<f64>,
+    /// Can be folded away.
+    detail: bool,
+}
+
+impl Column {
+    fn of(table: &Table, k: usize) -> Self {
+        let cells = || table.rows.iter().filter_map(|row| row.get(k));
+        Column {
+            numbers: cells().any(|cell| matches!(cell, Cell::Number { .. })),
+            error_width: cells()
+                .filter_map(error_text)
+                .map(|error| width_in_digits(&error))
+                .reduce(f64::max),
+            detail: table.headings[k].detail,
+        }
+    }
+
+    /// Classes of a cell; of one whose words may be folded on narrow screens if it is `long`.
+    fn class(self, long: bool) -> Option<String> {
+        let classes = [
+            ("long", long),
+            ("num", self.numbers),
+            ("detail", self.detail),
+        ];
+        let classes: Vec<&str> = classes
+            .iter()
+            .filter(|class| class.1)
+            .map(|class| class.0)
+            .collect();
+        (!classes.is_empty()).then(|| classes.join(" "))
+    }
+
+    /// A cell; words in the first column head their row, and stay while others scroll.
+    fn cell(self, k: usize, cell: Option<&Cell>) -> Markup {
+        let class = self.class(false);
+        match cell {
+            None | Some(Cell::Empty) => html! { td class=[class] {} },
+            Some(Cell::Text(words)) if k == 0 => {
+                let long = words.chars().count() > LONG;
+                html! { th scope="row" class=[self.class(long)] { (Words(words)) } }
+            }
+            Some(Cell::Text(words)) => {
+                let sentence = words.chars().count() > SENTENCE;
+                let classes = [class.as_deref(), sentence.then_some("sentence")];
+                let classes: Vec<&str> = classes.into_iter().flatten().collect();
+                let class = (!classes.is_empty()).then(|| classes.join(" "));
+                html! { td class=[class] { (Words(words)) } }
+            }
+            Some(number @ Cell::Number { value, .. }) => html! {
+                td class=[class] data-value=(sort_value(*value)) {
+                    (number.figures().map_or_else(String::new, |shown| shown.0.replace('-', "−")))
+                    @if let Some(width) = self.error_width {
+                        // The space of the error is kept where there is none, so that values align.
+                        @let error = error_text(number);
+                        span.pm style=[error.is_none().then_some("visibility:hidden")] { "\u{a0}±\u{a0}" }
+                        span.error style={ "min-width:" (width) "ch" } { (error.unwrap_or_default()) }
+                    }
+                }
+            },
+        }
+    }
+}
+
+/// The error of a cell as printed, where it has one.
+fn error_text(cell: &Cell) -> Option<String> {
+    cell.figures()?.1
+}
+
+/// The width of a number without sign, in digits; a decimal point takes about half of one.
+fn width_in_digits(number: &str) -> f64 {
+    let points = number.matches('.').count();
+    number.len() as f64 - 0.5 * points as f64
+}
+
+/// A number as scripts read it.
+fn sort_value(value: f64) -> String {
+    if value.is_infinite() {
+        return if value > 0.0 { "Infinity" } else { "-Infinity" }.into();
+    }
+    value.to_string()
+}
+
+/// The paragraphs of a text, each with its line breaks turned into spaces.
+fn paragraphs(text: &str) -> Vec<String> {
+    let mut paragraphs = vec![String::new()];
+    for line in text.lines().map(str::trim) {
+        let Some(last) = paragraphs.last_mut() else {
+            break;
+        };
+        if line.is_empty() {
+            paragraphs.push(String::new());
+        } else {
+            if !last.is_empty() {
+                last.push(' ');
+            }
+            last.push_str(line);
+        }
+    }
+    paragraphs.retain(|paragraph| !paragraph.is_empty());
+    paragraphs
+}
+
+/// A run of text of one kind.
+#[derive(Debug, PartialEq)]
+enum Run<'a> {
+    Plain(&'a str),
+    Bold(&'a str),
+    Code(&'a str),
+}
+
+/// Splits at `` `code` `` and `**bold**`; marks without a partner or with nothing between are text.
+fn runs(text: &str) -> Vec<Run<'_>> {
+    let mut runs = Vec::new();
+    let (mut start, mut at) = (0, 0);
+    while let Some(found) = text[at..].find(['`', '*']) {
+        let open = at + found;
+        let mark = if text[open..].starts_with('`') {
+            "`"
+        } else if text[open..].starts_with("**") {
+            "**"
+        } else {
+            at = open + 1;
+            continue;
+        };
+        let inner = open + mark.len();
+        match text[inner..].find(mark) {
+            Some(length) if length > 0 => {
+                if open > start {
+                    runs.push(Run::Plain(&text[start..open]));
+                }
+                let inside = &text[inner..inner + length];
+                runs.push(if mark == "`" {
+                    Run::Code(inside)
+                } else {
+                    Run::Bold(inside)
+                });
+                at = inner + length + mark.len();
+                start = at;
+            }
+            _ => at = inner,
+        }
+    }
+    if start < text.len() {
+        runs.push(Run::Plain(&text[start..]));
+    }
+    runs
+}
+
+/// A paragraph with its markup as HTML.
+fn inline(text: &str) -> Markup {
+    html! {
+        @for run in runs(text) {
+            @match run {
+                Run::Plain(words) => (Words(words)),
+                Run::Bold(words) => b { (Words(words)) },
+                Run::Code(words) => code { (Words(words)) },
+            }
+        }
+    }
+}
+
+/// A text without its markup.
+fn plain(text: &str) -> String {
+    let text = paragraphs(text).join(" ");
+    runs(&text)
+        .into_iter()
+        .map(|run| match run {
+            Run::Plain(words) | Run::Bold(words) | Run::Code(words) => words,
+        })
+        .collect()
+}
+
+/// A path as a URL that cannot be taken for anything but a path.
+fn relative_url(path: &str) -> String {
+    let mut url = String::new();
+    for byte in path.bytes() {
+        match byte {
+            // Two slashes at the start would name another machine.
+            b'/' if url == "/" => {}
+            b'/' | b'-' | b'_' | b'.' | b'~' => url.push(char::from(byte)),
+            byte if byte.is_ascii_alphanumeric() => url.push(char::from(byte)),
+            byte => url.push_str(&format!("%{byte:02X}")),
+        }
+    }
+    url
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+    use crate::figure::{LinePlot, Series, Style};
+    use crate::table::Heading;
+
+    const NASTY: &str = "<script>alert(\"x\" + 'y')</script> & </style>";
+
+    fn picture(format: PictureFormat) -> Picture {
+        let plot = LinePlot {
+            title: "Power".into(),
+            series: vec![Series::new(
+                "true",
+                vec![1.0, 2.0, 3.0],
+                vec![1.0, 4.0, 9.0],
+                Style::Line,
+                0,
+            )],
+            ..LinePlot::default()
+        };
+        Picture::draw(&plot, format, "power", "The `power`, **binned**.")
+            .unwrap()
+            .link("PNG", "figures/power 1.png")
+            .link("odd", "javascript:alert(1)")
+    }
+
+    fn table() -> Table {
+        Table {
+            title: NASTY.into(),
+            headings: vec![
+                Heading::new("name", NASTY),
+                Heading::new("q", "Q"),
+                Heading::new("m", "m").detail(),
+            ],
+            rows: vec![
+                vec![
+                    Cell::text(NASTY),
+                    Cell::with_error(-87.125, Some(1.5), 2),
+                    Cell::number(f64::INFINITY, 2),
+                ],
+                vec![
+                    Cell::text("b"),
+                    Cell::with_error(9.5e-7, Some(1.0), 1),
+                    Cell::number(0.25, 2),
+                ],
+                vec![Cell::text("c"), Cell::number(f64::NAN, 1)],
+            ],
+            notes: vec![NASTY.into()],
+        }
+    }
+
+    fn report() -> Report {
+        Report {
+            title: NASTY.into(),
+            subtitle: NASTY.into(),
+            sections: vec![
+                Section::new(
+                    "scores",
+                    NASTY,
+                    vec![
+                        Block::Text(format!("{NASTY} **{NASTY}**\n\n`{NASTY}`")),
+                        Block::Table(table()),
+                        Block::Table(table()),
+                    ],
+                ),
+                Section::new(
+                    "scores",
+                    "Again",
+                    vec![
+                        Block::Figure(picture(PictureFormat::Svg)),
+                        Block::Figure(picture(PictureFormat::Png).described(NASTY)),
+                        Block::Code(NASTY.into()),
+                    ],
+                ),
+                Section::new("settings", "", Vec::new()),
+                Section::new("\" onclick=\"", "", Vec::new()),
+            ],
+            settings: vec![
+                ("seed".into(), NASTY.into()),
+                (NASTY.into(), format!("[a]\nb = \"{NASTY}\"\n")),
+            ],
+        }
+    }
+
+    /// Elements as (name, attributes), after checking that they nest, that attributes are quoted and
+    /// that no bare `<`, `>` or `&` is in the text between.
+    fn elements(page: &str) -> Vec<(String, Vec<(String, String)>)> {
+        const VOID: [&str; 3] = ["meta", "link", "img"];
+        let mut rest = page.strip_prefix("<!DOCTYPE html>").unwrap();
+        let (mut open, mut all) = (Vec::<String>::new(), Vec::new());
+        while let Some((text, after)) = rest.split_once('<') {
+            assert!(!text.contains('>'), "bare > in {text:?}");
+            for part in text.split('&').skip(1) {
+                let (entity, _) = part.split_once(';').expect("an entity");
+                assert!(["amp", "lt", "gt", "quot", "#39"].contains(&entity));
+            }
+            if let Some(closing) = after.strip_prefix('/') {
+                let (name, after) = closing.split_once('>').unwrap();
+                assert_eq!(open.pop().as_deref(), Some(name));
+                rest = after;
+                continue;
+            }
+            let end = after.find([' ', '>']).unwrap();
+            let name = after[..end].to_owned();
+            let mut tag = &after[end..];
+            let mut attributes = Vec::new();
+            while let Some(attribute) = tag.strip_prefix(' ') {
+                let end = attribute.find(['=', ' ', '>']).unwrap();
+                let key = attribute[..end].to_owned();
+                tag = &attribute[end..];
+                let mut value = String::new();
+                if let Some(quoted) = tag.strip_prefix("=\"") {
+                    let (inside, after) = quoted.split_once('"').unwrap();
+                    assert!(!inside.contains(['<', '>']));
+                    value = inside.to_owned();
+                    tag = after;
+                }
+                assert!(attributes.iter().all(|(other, _)| *other != key));
+                attributes.push((key, value));
+            }
+            rest = tag.strip_prefix('>').expect("the end of a tag");
+            if name == "style" || name == "script" {
+                rest = rest.split_once(&format!("</{name}>")).unwrap().1;
+            } else if !VOID.contains(&name.as_str()) {
+                open.push(name.clone());
+            }
+            all.push((name, attributes));
+        }
+        assert!(open.is_empty() && rest == "\n");
+        all
+    }
+
+    #[test]
+    fn the_page_is_well_formed_whatever_the_words_are() {
+        let page = report().render();
+        let elements = elements(&page);
+        let count = |name: &str| elements.iter().filter(|(n, _)| n == name).count();
+        assert_eq!((count("script"), count("style"), count("h1")), (1, 1, 1));
+        assert_eq!((count("table"), count("img"), count("section")), (2, 2, 5));
+        let values = |key: &str| -> Vec<&str> {
+            elements
+                .iter()
+                .flat_map(|(_, attributes)| attributes)
+                .filter(|(k, _)| k == key)
+                .map(|(_, value)| value.as_str())
+                .collect()
+        };
+        let ids = values("id");
+        let unique: HashSet<&str> = ids.iter().copied().collect();
+        assert_eq!(ids.len(), unique.len());
+        for href in values("href") {
+            if let Some(id) = href.strip_prefix('#') {
+                assert!(unique.contains(id), "{href}");
+            }
+        }
+        for id in values("aria-labelledby") {
+            assert!(unique.contains(id), "{id}");
+        }
+        assert!(values("onclick").is_empty());
+        for (name, attributes) in &elements {
+            let has = |key: &str| attributes.iter().any(|(k, v)| k == key && !v.is_empty());
+            assert!(name != "th" || has("scope"));
+            assert!(name != "img" || (has("alt") && has("width") && has("height")));
+        }
+        assert!(!page.contains("<script>alert"));
+        assert_eq!(page, report().render());
+    }
+
+    #[test]
+    fn the_page_refers_to_nothing_outside() {
+        let page = report().render();
+        assert!(!page.contains("http://") && !page.contains("https://") && !page.contains("url("));
+        assert!(!page.contains("@import") && !page.contains("href=\"//"));
+        assert!(page.contains("href=\"figures/power%201.png\""));
+        assert!(page.contains("href=\"javascript%3Aalert%281%29\""));
+        assert_eq!(relative_url("//host/a"), "/host/a");
+        assert_eq!(relative_url("../größe#1.csv"), "../gr%C3%B6%C3%9Fe%231.csv");
+    }
+
+    #[test]
+    fn cells_sort_by_value_and_read_as_numbers() {
+        let page = report().render();
+        assert!(page.contains(
+            "<td class=\"num\" data-value=\"-87.125\">−87.1<span class=\"pm\">\u{a0}±\u{a0}</span>\
+             <span class=\"error\" style=\"min-width:2.5ch\">1.5</span></td>"
+        ));
+        assert!(page.contains("data-value=\"0.00000095\">0.0<"));
+        assert!(page.contains("data-value=\"NaN\">–<"));
+        assert!(page.contains("<td class=\"num detail\" data-value=\"Infinity\">∞</td>"));
+        assert!(page.contains("<th scope=\"col\" class=\"num detail\">m</th>"));
+        assert!(page.contains("<td class=\"num detail\"></td></tr>"));
+    }
+
+    #[test]
+    fn markup_is_code_and_bold_and_nothing_else() {
+        assert_eq!(
+            inline("a `b*c` **d & e** *f* ` ** g").into_string(),
+            "a <code>b*c</code> <b>d &amp; e</b> *f* ` ** g"
+        );
+        assert_eq!(inline("``** ** **").into_string(), "``<b> </b> **");
+        assert_eq!(plain("the `a`\n**b**"), "the a b");
+        assert_eq!(paragraphs("a\nb\n\n \nc\n"), ["a b", "c"]);
+        assert_eq!(
+            Words("a\u{0}\r\n<").render().into_string(),
+            "a\\u0000\\u000d\n&lt;"
+        );
+    }
+
+    #[test]
+    fn pictures_know_their_size() {
+        let size = picture(PictureFormat::Svg).size().unwrap();
+        assert_eq!(picture(PictureFormat::Png).size(), Some(size));
+        let broken = Picture {
+            bytes: b"\x89PNG".to_vec(),
+            ..picture(PictureFormat::Png)
+        };
+        assert_eq!(broken.size(), None);
+    }
+
+    #[test]
+    fn a_report_is_written_and_an_empty_one_too() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("new/report.html");
+        report().save(&path).unwrap();
+        assert_eq!(std::fs::read_to_string(path).unwrap(), report().render());
+        let empty = elements(&Report::default().render());
+        assert!(empty.iter().all(|(name, _)| name != "nav" && name != "h2"));
+    }
+}

@@ -1,0 +1,14 @@
+//! Tables, plots and HTML pages, independent of what they show.
+//!
+//! * [`table`]: rows and columns, as text for a terminal, Markdown, LaTeX, CSV or JSON; [`terminal`] fits them to a width.
+//! * [`figure`]: line plots, bars, heat maps and images, as SVG and PNG.
+//! * [`html`], [`page`]: pages that need no other file.
+//! * [`escape`]: text of unknown origin, made safe for each format.
+
+pub mod escape;
+pub mod figure;
+mod font;
+pub mod html;
+pub mod page;
+pub mod table;
+pub mod terminal;

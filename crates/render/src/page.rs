@@ -1,0 +1,123 @@
+//! A report with the pictures and data of its exhibits beside it.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use shearq_files::frames::TableError;
+use shearq_files::{FileError, atomic, table};
+use thiserror::Error;
+
+use crate::figure::{Figure, FigureError, PictureFormat};
+use crate::html::{Block, Picture, Report, Section};
+use crate::table::{Table, TableFormat};
+
+/// What can keep a page from being written.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum PageError {
+    /// A figure.
+    #[error(transparent)]
+    Figure(#[from] FigureError),
+    /// A file.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// Data that make no table.
+    #[error(transparent)]
+    Data(#[from] TableError),
+}
+
+/// The report on its way, and the files beside it.
+pub struct Page<'a> {
+    out: &'a Path,
+    made_by: BTreeMap<String, String>,
+    report: Report,
+}
+
+impl<'a> Page<'a> {
+    /// An empty report to be written to `out`. `settings` are what made it: shown at its end, and
+    /// stored with the data.
+    pub fn new(
+        out: &'a Path,
+        title: &str,
+        subtitle: &str,
+        settings: Vec<(String, String)>,
+    ) -> Self {
+        Page {
+            out,
+            made_by: settings.iter().cloned().collect(),
+            report: Report {
+                title: title.into(),
+                subtitle: subtitle.into(),
+                settings,
+                ..Report::default()
+            },
+        }
+    }
+
+    /// Begins a section with a paragraph; a bracket at the end of the heading stays out of its link.
+    pub fn section(&mut self, heading: &str, text: &str) {
+        let id = heading.split(" (").next().unwrap_or(heading).to_owned();
+        let blocks = vec![Block::Text(text.to_owned())];
+        self.report
+            .sections
+            .push(Section::new(&id, heading, blocks));
+    }
+
+    fn add(&mut self, block: Block) {
+        if let Some(section) = self.report.sections.last_mut() {
+            section.blocks.push(block);
+        }
+    }
+
+    /// Draws a figure as PNG and SVG and shows it.
+    ///
+    /// # Errors
+    /// Where it cannot be drawn or written.
+    pub fn figure(
+        &mut self,
+        name: &str,
+        figure: &impl Figure,
+        caption: &str,
+    ) -> Result<(), PageError> {
+        let mut picture = Picture::draw(figure, PictureFormat::Svg, name, caption)?;
+        for ending in ["png", "svg"] {
+            let path = format!("figures/{name}.{ending}");
+            figure.save(self.out.join(&path))?;
+            picture = picture.link(ending.to_uppercase(), &path);
+        }
+        self.add(Block::Figure(picture));
+        Ok(())
+    }
+
+    /// Writes a table's data and shows it.
+    ///
+    /// # Errors
+    /// Where they cannot be written.
+    pub fn table(&mut self, name: &str, exhibit: &Table) -> Result<(), PageError> {
+        self.data(name, exhibit)?;
+        self.add(Block::Table(exhibit.clone()));
+        Ok(())
+    }
+
+    /// Writes a table's data beside the report.
+    ///
+    /// # Errors
+    /// Where they cannot be written.
+    pub fn data(&self, name: &str, exhibit: &Table) -> Result<(), PageError> {
+        let text = exhibit.render(TableFormat::Csv);
+        atomic::write(self.out.join(format!("data/{name}.csv")), text.as_bytes())?;
+        let path = self.out.join(format!("data/{name}.parquet"));
+        let columns = exhibit.columns()?;
+        table::write(&path, table::FileFormat::Parquet, &columns, &self.made_by)?;
+        Ok(())
+    }
+
+    /// Writes the report.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn save(self) -> Result<(), PageError> {
+        self.report.save(self.out.join("report.html"))?;
+        Ok(())
+    }
+}

@@ -1,0 +1,584 @@
+//! Tables for terminals, papers and programs.
+
+use comfy_table::{CellAlignment, ContentArrangement, presets};
+use serde_json::{Map, Value, json};
+use shearq_files::frames::polars::{Column, DataFrame};
+use shearq_files::frames::{TableError, frame};
+
+use crate::{escape, terminal};
+
+/// How to print a table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum TableFormat {
+    /// For reading on a terminal.
+    #[default]
+    Table,
+    /// Machine-readable, full precision.
+    Json,
+    /// Comma-separated, full precision, value and error in columns of their own; words that a spreadsheet
+    /// would take for a formula have an apostrophe in front.
+    Csv,
+    /// Markdown.
+    Markdown,
+    /// A LaTeX tabular.
+    Latex,
+}
+
+/// One cell.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Cell {
+    /// Nothing, in a column of words or of numbers.
+    Empty,
+    /// Words.
+    Text(String),
+    /// A number, perhaps with an error, to be printed with so many decimals.
+    Number {
+        /// The value; not a number is printed as a dash.
+        value: f64,
+        /// Its standard error.
+        error: Option<f64>,
+        /// Decimals printed for people.
+        decimals: usize,
+    },
+}
+
+impl Cell {
+    /// Words.
+    pub fn text(words: impl Into<String>) -> Self {
+        Cell::Text(words.into())
+    }
+
+    /// A number without error.
+    pub fn number(value: f64, decimals: usize) -> Self {
+        Cell::Number {
+            value,
+            error: None,
+            decimals,
+        }
+    }
+
+    /// A number with an error.
+    pub fn with_error(value: f64, error: Option<f64>, decimals: usize) -> Self {
+        Cell::Number {
+            value,
+            error,
+            decimals,
+        }
+    }
+
+    /// A number and its error as people read them: where there is an error, both with as many decimals as
+    /// give it two significant digits. `None` where the cell holds no number.
+    pub fn figures(&self) -> Option<(String, Option<String>)> {
+        let Cell::Number {
+            value,
+            error,
+            decimals,
+        } = self
+        else {
+            return None;
+        };
+        if value.is_nan() {
+            return Some(("–".into(), None));
+        }
+        if value.is_infinite() {
+            return Some((if *value > 0.0 { "∞" } else { "-∞" }.into(), None));
+        }
+        let decimals = match *error {
+            Some(error) if error.is_finite() => decimals_of(error, *decimals),
+            // Of an error that is not known no digit is vouched for.
+            Some(_) => decimals_for(*value, UNSURE).min(*decimals),
+            None => *decimals,
+        };
+        let error = error.filter(|error| error.is_finite());
+        let shown = |number: f64| match format!("{number:.decimals$}") {
+            // What rounds to nothing has no sign.
+            zero if zero.starts_with('-') && !zero.contains(|c: char| ('1'..='9').contains(&c)) => {
+                zero[1..].to_owned()
+            }
+            number => number,
+        };
+        Some((shown(*value), error.map(shown)))
+    }
+
+    /// A number as a sentence has it: with its error, or the word that this is not known.
+    pub fn in_words(&self) -> String {
+        match self.figures() {
+            Some((number, Some(error))) => format!("{number} ± {error}"),
+            Some((number, None)) if number != "–" => format!("{number} (error unknown)"),
+            _ => "unknown".into(),
+        }
+    }
+
+    /// For people, words by `escape`; `latex` wraps numbers in mathematics.
+    fn print(&self, escape: fn(&str) -> String, latex: bool) -> String {
+        match (self, self.figures()) {
+            (Cell::Text(words), _) => escape(words),
+            (_, None) => String::new(),
+            (_, Some((number, None))) if number == "–" => number,
+            (_, Some((number, None))) if latex => format!("${}$", number.replace('∞', "\\infty")),
+            (_, Some((number, None))) => number,
+            (_, Some((number, Some(error)))) if latex => format!("${number} \\pm {error}$"),
+            (_, Some((number, Some(error)))) => format!("{number} ± {error}"),
+        }
+    }
+}
+
+/// The most decimals that are printed for the sake of an error.
+const MOST_DECIMALS: usize = 12;
+
+/// Significant digits of a number whose error is not known.
+const UNSURE: i32 = 3;
+
+/// Decimals that give `error` two significant digits; `otherwise` for an error of zero.
+fn decimals_of(error: f64, otherwise: usize) -> usize {
+    match error > 0.0 {
+        true => decimals_for(error, 2),
+        false => otherwise,
+    }
+}
+
+/// Decimals that give a number so many significant `digits`.
+fn decimals_for(number: f64, digits: i32) -> usize {
+    // Rounding can lengthen a number: 0.0996 is 0.10.
+    let before = usize::try_from(digits - 1).unwrap_or(0);
+    let rounded = format!("{number:.before$e}");
+    let exponent = rounded
+        .split_once('e')
+        .map(|(_, exponent)| exponent.parse::<i32>());
+    let Some(Ok(exponent)) = exponent else {
+        return MOST_DECIMALS;
+    };
+    let decimals = digits - 1 - exponent;
+    usize::try_from(decimals).unwrap_or(0).min(MOST_DECIMALS)
+}
+
+/// A column: its key for programs and its heading for people.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Heading {
+    /// Key in CSV and JSON.
+    pub key: &'static str,
+    /// Heading elsewhere.
+    pub label: String,
+    /// Left out of tables for people unless they are to be wide; CSV and JSON have every column.
+    pub detail: bool,
+}
+
+impl Heading {
+    /// A heading.
+    pub fn new(key: &'static str, label: impl Into<String>) -> Self {
+        Heading {
+            key,
+            label: label.into(),
+            detail: false,
+        }
+    }
+
+    /// The same, left out of narrow tables.
+    pub fn detail(self) -> Self {
+        Heading {
+            detail: true,
+            ..self
+        }
+    }
+}
+
+/// A table with a title and notes.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Table {
+    /// One line above.
+    pub title: String,
+    /// Columns.
+    pub headings: Vec<Heading>,
+    /// Cells, row by row.
+    pub rows: Vec<Vec<Cell>>,
+    /// Lines below.
+    pub notes: Vec<String>,
+}
+
+impl Table {
+    /// The columns at `places`, in that order.
+    fn picked(&self, places: &[usize]) -> Self {
+        let row = |row: &Vec<Cell>| {
+            places
+                .iter()
+                .map(|&k| row.get(k).cloned().unwrap_or(Cell::Empty))
+                .collect()
+        };
+        Table {
+            title: self.title.clone(),
+            headings: places.iter().map(|&k| self.headings[k].clone()).collect(),
+            rows: self.rows.iter().map(row).collect(),
+            notes: self.notes.clone(),
+        }
+    }
+
+    /// The table without its columns of detail.
+    pub fn narrow(&self) -> Self {
+        let all = 0..self.headings.len();
+        self.picked(
+            &all.filter(|&k| !self.headings[k].detail)
+                .collect::<Vec<_>>(),
+        )
+    }
+
+    /// How many columns come before the first with a number that is not that of a set: they name the rows.
+    fn names(&self) -> usize {
+        let number = |k: &usize| {
+            if self.headings[*k].key == "set" {
+                return false;
+            }
+            let mut cells = self.rows.iter().filter_map(|row| row.get(*k));
+            cells.any(|cell| matches!(cell, Cell::Number { .. }))
+        };
+        let all = self.headings.len();
+        (0..all).find(number).unwrap_or(all)
+    }
+
+    /// Keys of the columns after those that name the rows.
+    pub fn figures(&self) -> Vec<&'static str> {
+        let figures = self.headings.iter().skip(self.names());
+        figures.map(|heading| heading.key).collect()
+    }
+
+    /// The columns that name the rows, but for those of detail, and those of `figures`, in this order.
+    ///
+    /// # Errors
+    /// The first of `figures` that is no key of a figure.
+    pub fn chosen<'a>(&self, figures: &'a [String]) -> Result<Self, &'a str> {
+        let names = self.names();
+        let mut places: Vec<usize> = (0..names).filter(|&k| !self.headings[k].detail).collect();
+        for key in figures {
+            let place = self.place(key).filter(|&place| place >= names);
+            let place = place.ok_or(key.as_str())?;
+            if !places.contains(&place) {
+                places.push(place);
+            }
+        }
+        Ok(self.picked(&places))
+    }
+
+    /// Place of the column called `key`.
+    pub fn place(&self, key: &str) -> Option<usize> {
+        self.headings.iter().position(|heading| heading.key == key)
+    }
+
+    /// The columns of `keys`, of rows that have something in the last of them, under another title and
+    /// with some of the notes.
+    pub fn part(&self, keys: &[&str], title: &str, notes: &[String]) -> Self {
+        let all = 0..self.headings.len();
+        let kept: Vec<usize> = all
+            .filter(|&k| keys.contains(&self.headings[k].key))
+            .collect();
+        let mut part = self.picked(&kept);
+        part.title = title.to_owned();
+        part.rows.retain(|row| row.last() != Some(&Cell::Empty));
+        part.notes = notes.to_vec();
+        part
+    }
+
+    /// The table in a format, ending in a line break.
+    pub fn render(&self, format: TableFormat) -> String {
+        match format {
+            TableFormat::Table => terminal::fitted(self, None),
+            TableFormat::Markdown => self.markdown(),
+            TableFormat::Latex => self.latex(),
+            TableFormat::Csv => self.csv(),
+            TableFormat::Json => {
+                let mut text = serde_json::to_string_pretty(&self.json()).unwrap_or_default();
+                text.push('\n');
+                text
+            }
+        }
+    }
+
+    fn markdown(&self) -> String {
+        let mut table = comfy_table::Table::new();
+        table
+            .load_preset(presets::ASCII_MARKDOWN)
+            .set_content_arrangement(ContentArrangement::Disabled)
+            .set_header(self.headings.iter().map(|h| escape::markdown(&h.label)));
+        for row in &self.rows {
+            table.add_row(row.iter().map(|cell| cell.print(escape::markdown, false)));
+        }
+        for (k, column) in table.column_iter_mut().enumerate() {
+            if self.holds_numbers(k) {
+                column.set_cell_alignment(CellAlignment::Right);
+            }
+        }
+        let mut text = String::new();
+        if !self.title.is_empty() {
+            text.push_str(&format!("{}\n\n", escape::markdown(&self.title)));
+        }
+        text.push_str(&format!("{table}\n"));
+        for note in &self.notes {
+            text.push_str(&format!("\n{}\n", escape::markdown(note)));
+        }
+        text
+    }
+
+    fn latex(&self) -> String {
+        let columns: String = (0..self.headings.len())
+            .map(|k| if self.holds_numbers(k) { 'r' } else { 'l' })
+            .collect();
+        let line = |cells: Vec<String>| format!("{} \\\\\n", cells.join(" & "));
+        let mut text = format!(
+            "% {}\n% needs \\usepackage{{booktabs}}\n\\begin{{tabular}}{{@{{}}{columns}@{{}}}}\n\\toprule\n",
+            escape::line(&self.title)
+        );
+        text.push_str(&line(
+            self.headings
+                .iter()
+                .map(|h| escape::latex(&h.label))
+                .collect(),
+        ));
+        text.push_str("\\midrule\n");
+        for row in &self.rows {
+            text.push_str(&line(
+                row.iter()
+                    .map(|cell| cell.print(escape::latex, true))
+                    .collect(),
+            ));
+        }
+        text.push_str("\\bottomrule\n\\end{tabular}\n");
+        for note in &self.notes {
+            text.push_str(&format!("% {}\n", escape::line(note)));
+        }
+        text
+    }
+
+    /// Whether a column holds numbers, and stands on the right.
+    pub(super) fn holds_numbers(&self, k: usize) -> bool {
+        let mut cells = self.rows.iter().filter_map(|row| row.get(k));
+        cells.any(|cell| matches!(cell, Cell::Number { .. }))
+    }
+
+    /// Whether a column holds errors, and needs a second column in CSV.
+    fn has_errors(&self, k: usize) -> bool {
+        self.rows
+            .iter()
+            .any(|row| matches!(row.get(k), Some(Cell::Number { error: Some(_), .. })))
+    }
+
+    /// The table as columns of numbers or words, those of errors beside their values: what CSV has,
+    /// for other formats.
+    ///
+    /// # Errors
+    /// Where two headings share a key.
+    pub fn columns(&self) -> Result<DataFrame, TableError> {
+        let mut columns = Vec::new();
+        for (k, heading) in self.headings.iter().enumerate() {
+            let cells = || self.rows.iter().filter_map(|row| row.get(k));
+            let numbers: Option<Vec<(f64, f64)>> = cells()
+                .map(|cell| match cell {
+                    Cell::Text(_) => None,
+                    Cell::Empty => Some((f64::NAN, f64::NAN)),
+                    Cell::Number { value, error, .. } => Some((*value, error.unwrap_or(f64::NAN))),
+                })
+                .collect();
+            let unzipped = numbers.map(|pairs| pairs.into_iter().unzip());
+            let Some((values, errors)): Option<(Vec<f64>, Vec<f64>)> = unzipped else {
+                let words: Vec<String> = cells()
+                    .map(|cell| cell.print(str::to_owned, false))
+                    .collect();
+                columns.push(Column::new(heading.key.into(), words));
+                continue;
+            };
+            columns.push(Column::new(heading.key.into(), values));
+            if self.has_errors(k) {
+                columns.push(Column::new(format!("{}_error", heading.key).into(), errors));
+            }
+        }
+        frame(columns)
+    }
+
+    fn csv(&self) -> String {
+        let errors: Vec<bool> = (0..self.headings.len())
+            .map(|k| self.has_errors(k))
+            .collect();
+        let mut header = Vec::new();
+        for (heading, &errors) in self.headings.iter().zip(&errors) {
+            header.push(heading.key.to_owned());
+            if errors {
+                header.push(format!("{}_error", heading.key));
+            }
+        }
+        let mut text = header.join(",") + "\n";
+        for row in &self.rows {
+            let mut fields = Vec::new();
+            for (cell, &errors) in row.iter().zip(&errors) {
+                match cell {
+                    Cell::Empty => {
+                        fields.push(String::new());
+                        if errors {
+                            fields.push(String::new());
+                        }
+                    }
+                    Cell::Text(words) => fields.push(escape::csv(words)),
+                    Cell::Number { value, error, .. } => {
+                        fields.push(number(*value));
+                        if errors {
+                            fields.push(error.map_or(String::new(), number));
+                        }
+                    }
+                }
+            }
+            text.push_str(&(fields.join(",") + "\n"));
+        }
+        text
+    }
+
+    /// Title, rows as objects, and notes.
+    pub fn json(&self) -> Value {
+        let rows: Vec<Value> = self
+            .rows
+            .iter()
+            .map(|row| {
+                let mut object = Map::new();
+                for (heading, cell) in self.headings.iter().zip(row) {
+                    match cell {
+                        Cell::Empty => {
+                            object.insert(heading.key.into(), Value::Null);
+                        }
+                        Cell::Text(words) => {
+                            object.insert(heading.key.into(), json!(words));
+                        }
+                        Cell::Number {
+                            value,
+                            error,
+                            decimals,
+                        } => {
+                            object.insert(heading.key.into(), exact(*value, *decimals));
+                            if let Some(error) = error {
+                                object.insert(format!("{}_error", heading.key), json!(error));
+                            }
+                        }
+                    }
+                }
+                Value::Object(object)
+            })
+            .collect();
+        json!({ "title": self.title, "rows": rows, "notes": self.notes })
+    }
+}
+
+/// A number as JSON: counts without a decimal point.
+fn exact(value: f64, decimals: usize) -> Value {
+    const EXACT: f64 = 9_007_199_254_740_992.0;
+    if decimals == 0 && value.fract() == 0.0 && value.abs() < EXACT {
+        json!(value as i64)
+    } else {
+        json!(value)
+    }
+}
+
+fn number(value: f64) -> String {
+    if value.is_nan() {
+        String::new()
+    } else {
+        value.to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn table() -> Table {
+        Table {
+            title: "Scores".into(),
+            headings: vec![Heading::new("name", "Name"), Heading::new("q", "Q")],
+            rows: vec![
+                vec![Cell::text("a,b"), Cell::with_error(87.125, Some(1.5), 1)],
+                vec![Cell::text("c_d"), Cell::number(f64::NAN, 1)],
+            ],
+            notes: vec!["A note.".into()],
+        }
+    }
+
+    #[test]
+    fn every_format_holds_the_numbers() {
+        let people = table().render(TableFormat::Table);
+        assert!(people.contains("87.1 ± 1.5") && people.contains('–'));
+        assert!(
+            table()
+                .render(TableFormat::Markdown)
+                .contains("| 87.1 ± 1.5 |")
+        );
+        let latex = table().render(TableFormat::Latex);
+        assert!(latex.contains("a,b & $87.1 \\pm 1.5$ \\\\") && latex.contains("c\\_d"));
+        assert_eq!(
+            table().render(TableFormat::Csv),
+            "name,q,q_error\n\"a,b\",87.125,1.5\nc_d,,\n"
+        );
+        assert_eq!(escape::latex("√A×10⁴"), "$\\sqrt{A}\\times$10$^{4}$");
+        let columns = table().columns().unwrap();
+        assert_eq!(columns.get_column_names(), ["name", "q", "q_error"]);
+        let words = columns.column("name").unwrap().str().unwrap();
+        assert!(words.iter().eq([Some("a,b"), Some("c_d")]));
+        let json: Value = serde_json::from_str(&table().render(TableFormat::Json)).unwrap();
+        assert_eq!(json["rows"][0]["q_error"], 1.5);
+        assert!(json["rows"][1]["q"].is_null());
+    }
+
+    #[test]
+    fn numbers_without_the_error_they_ought_to_have_are_short() {
+        let shown = |value, error| Cell::with_error(value, error, 4).figures().unwrap().0;
+        for (value, expected) in [
+            (2.011, "2.01"),
+            (-0.020_914, "-0.0209"),
+            (123.456, "123"),
+            (9.999, "10.0"),
+            (0.0, "0.00"),
+        ] {
+            assert_eq!(shown(value, Some(f64::NAN)), expected);
+        }
+        assert_eq!(shown(2.011, None), "2.0110");
+    }
+
+    #[test]
+    fn empty_cells_leave_columns_of_numbers_and_parts_leave_out_their_rows() {
+        let mut whole = table();
+        whole.rows.push(vec![Cell::text("mean"), Cell::Empty]);
+        let columns = whole.columns().unwrap();
+        let values = shearq_files::frames::reals(columns.column("q").unwrap()).unwrap();
+        assert!(values[0] == 87.125 && values[2].is_nan());
+        assert!(whole.render(TableFormat::Csv).ends_with("mean,,\n"));
+        assert!(whole.json()["rows"][2]["q"].is_null());
+        let part = whole.part(&["name", "q"], "Part", &[]);
+        assert_eq!((part.rows.len(), part.headings.len()), (2, 2));
+    }
+
+    #[test]
+    fn figures_are_chosen_beside_the_names_of_the_rows() {
+        let mut whole = table();
+        whole.headings.push(Heading::new("m", "m").detail());
+        whole.rows[0].push(Cell::number(0.5, 1));
+        assert_eq!(whole.figures(), ["q", "m"]);
+        let keys = |figures: &[&str]| {
+            let figures: Vec<String> = figures.iter().map(|&key| key.to_owned()).collect();
+            whole
+                .chosen(&figures)
+                .map(|table| {
+                    table
+                        .headings
+                        .iter()
+                        .map(|heading| heading.key)
+                        .collect::<Vec<_>>()
+                })
+                .map_err(str::to_owned)
+        };
+        // A column of detail that is asked for is there.
+        assert_eq!(keys(&["m", "q", "m"]).unwrap(), ["name", "m", "q"]);
+        assert_eq!(keys(&["q", "name"]).unwrap_err(), "name");
+        assert_eq!(keys(&["Q"]).unwrap_err(), "Q");
+        // The number of a set names a row.
+        let mut sets = whole.clone();
+        sets.headings[1].key = "set";
+        assert_eq!(sets.figures(), ["m"]);
+        let csv = whole
+            .chosen(&["m".to_owned()])
+            .unwrap()
+            .render(TableFormat::Csv);
+        assert!(csv.starts_with("name,m"), "{csv}");
+    }
+}

@@ -1,0 +1,172 @@
+//! Measuring what a baseline holds.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use shearq_scoring::{Figures, Options};
+use shearq_submissions::Submission;
+
+use super::BaselineSet;
+use crate::row::SetRecord;
+use crate::score::{OWN, score_folder};
+use shearq_files::atomic::Scratch;
+use shearq_files::table::{self, FileFormat, MAX_ROWS};
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::data::fingerprint;
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::engine::{self, Progress};
+use shearq_pipeline::images::{self, ImageId};
+use shearq_pipeline::measure::measure_folder;
+use shearq_pipeline::run::run_folder;
+
+/// Names of the scatter of either component of the ellipticity.
+pub(super) const SCATTER: [&str; 2] = ["scatter_e1", "scatter_e2"];
+
+/// What a submission has of the sets and images it is to be measured on.
+pub struct Wanted {
+    /// Set number.
+    pub set: u32,
+    /// Number of images, which are numbered from 1.
+    pub images: u32,
+}
+
+/// Measures a submission into a folder that is removed again, and takes its figures. `source` is as in a
+/// record in the folder `beside`.
+///
+/// # Errors
+/// Where data are absent or damaged, or nothing can be written to the temporary folder.
+pub fn measure(
+    source: &Source,
+    beside: &Path,
+    submission: &Submission,
+    wanted: &[Wanted],
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Vec<BaselineSet>, PipelineError> {
+    let folder = Scratch::new()?;
+    let out = folder.path();
+    let source = source.moved(beside, out)?;
+    let run = Run::new(source, submission.clone(), FileFormat::default());
+    match &run.source {
+        Source::Simulated(settings) => {
+            let images: Vec<ImageId> = wanted
+                .iter()
+                .flat_map(|w| images::of_simulation(&[w.set], w.images))
+                .collect();
+            run_folder(&run, *settings, &images, out, threads, progress)?;
+        }
+        Source::Folder { .. } => {
+            let sets: Vec<u32> = wanted.iter().map(|w| w.set).collect();
+            let data = run.source.data(out)?;
+            let asked = |id: &ImageId| {
+                let mut of_set = wanted.iter().filter(|w| w.set == id.set);
+                of_set.any(|w| id.image <= w.images)
+            };
+            let mut images = images::of_folder(&data, &sets)?;
+            images.retain(asked);
+            measure_folder(&run, &data, out, &images, threads, progress)?;
+        }
+    }
+    figures_of(&run, &run.source.data(out)?, out, threads)
+}
+
+/// Figures of every set in a folder of catalogues.
+///
+/// # Errors
+/// Where a file cannot be read, or there is nothing to score.
+pub fn figures_of(
+    run: &Run,
+    data: &DataFolder,
+    out: &Path,
+    threads: usize,
+) -> Result<Vec<BaselineSet>, PipelineError> {
+    let options = Options {
+        choice: OWN,
+        ..Options::default()
+    };
+    let scored = score_folder(data, out, run, &[], options, threads)?;
+    scored
+        .iter()
+        .filter_map(|scored| Some((scored.set?, scored)))
+        .map(|(set, scored)| {
+            let print = fingerprint::of_set(&run.source, data, set, &scored.images)?;
+            let SetRecord {
+                set,
+                data,
+                images,
+                galaxies,
+                flagged,
+                figures,
+                errors,
+                ..
+            } = SetRecord::new(set, scored, print);
+            let mut all: BTreeMap<String, [f64; 2]> = Figures::ALL
+                .iter()
+                .zip(figures.values().into_iter().zip(errors.values()))
+                .map(|(figure, (value, error))| (figure.name.to_owned(), [value, error]))
+                .collect();
+            for (name, value) in SCATTER.iter().zip(scatter(run, out, set, threads)?) {
+                all.insert((*name).to_owned(), value);
+            }
+            Ok(BaselineSet {
+                set,
+                data,
+                images,
+                galaxies,
+                flagged,
+                figures: all,
+            })
+        })
+        .collect()
+}
+
+/// Rms of e1 and e2 over a set's galaxies that have an ellipticity, each with its standard error
+/// rms/√(2N).
+fn scatter(
+    run: &Run,
+    out: &Path,
+    set: u32,
+    threads: usize,
+) -> Result<[[f64; 2]; 2], PipelineError> {
+    let catalogues = run.catalogues(out, &[set])?.of_set(set);
+    let (mut squares, mut count) = ([0.0; 2], 0.0_f64);
+    engine::ordered(
+        threads,
+        |feeder| {
+            for (_, path) in catalogues {
+                if !feeder.push(path) {
+                    break;
+                }
+            }
+            Ok(())
+        },
+        || (),
+        |(), path| {
+            let table = table::read(&path, Some(&["e1", "e2"]), MAX_ROWS)?;
+            let (e1, e2) = (
+                table::numbers(&table, "e1", &path)?,
+                table::numbers(&table, "e2", &path)?,
+            );
+            let mut own = ([0.0; 2], 0.0);
+            for (e1, e2) in e1.iter().zip(e2.iter()) {
+                if e1.is_finite() && e2.is_finite() {
+                    own.0[0] += e1 * e1;
+                    own.0[1] += e2 * e2;
+                    own.1 += 1.0;
+                }
+            }
+            Ok(own)
+        },
+        |(more, galaxies): ([f64; 2], f64)| {
+            squares[0] += more[0];
+            squares[1] += more[1];
+            count += galaxies;
+            Ok(())
+        },
+    )?;
+    Ok(squares.map(|sum| {
+        let rms = (sum / count).sqrt();
+        [rms, rms / (2.0 * count).sqrt()]
+    }))
+}

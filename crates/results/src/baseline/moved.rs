@@ -1,0 +1,273 @@
+//! What moved since a baseline.
+
+use shearq_submissions::{Registry, Submission};
+
+use super::measured::{SCATTER, Wanted};
+use super::{Baseline, BaselineSet, BaselineSubmission};
+use shearq_pipeline::data::run::differences;
+
+/// Figures that must not move.
+const CHECKED: [&str; 5] = ["q", "m_half", "sqrt_a", SCATTER[0], SCATTER[1]];
+
+/// How far a figure may be off on the same data, relative to itself: a changed digit of Q as tables
+/// print it is seen.
+///
+/// The network works in f32, and instruction sets round its sums differently. On the project's own
+/// baseline, figures with fused multiply-add (AVX2, AVX-512) and without differ by less than 2e-6 of
+/// themselves and 1e-5 of their standard errors, a fiftieth of what is allowed.
+pub const TOLERANCE: f64 = 1e-4;
+
+/// The same in units of the figure's standard error, for figures that are nearly zero.
+pub const TOLERANCE_SIGMA: f64 = 1e-3;
+
+/// A figure of a baseline, and what it is now.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Shift {
+    /// Set number.
+    pub set: u32,
+    /// Name of the figure.
+    pub figure: &'static str,
+    /// Value and standard error in the baseline.
+    pub before: [f64; 2],
+    /// Value and standard error now.
+    pub now: [f64; 2],
+    /// The difference in units of its error: that of the baseline's figure on the same data, on
+    /// others that of both.
+    pub sigma: f64,
+    /// Whether it moved by more than may be.
+    pub moved: bool,
+}
+
+/// What became of the checked figures of a set.
+///
+/// On the same data a figure may be off by rounding alone: by [`TOLERANCE`] of itself or
+/// [`TOLERANCE_SIGMA`] of its error, whichever is more. On other data it may be off by `sigmas` standard errors of the
+/// difference.
+pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift> {
+    let same_data = before.data == now.data && before.images == now.images;
+    CHECKED
+        .iter()
+        .map(|&figure| {
+            let get = |set: &BaselineSet| set.figures.get(figure).copied();
+            let (old, new) = (
+                get(before).unwrap_or([f64::NAN; 2]),
+                get(now).unwrap_or([f64::NAN; 2]),
+            );
+            let difference = new[0] - old[0];
+            let error = if same_data {
+                old[1]
+            } else {
+                old[1].hypot(new[1])
+            };
+            let allowed = if same_data {
+                // The larger one; an unknown error leaves the other.
+                (TOLERANCE_SIGMA * error).max(TOLERANCE * old[0].abs())
+            } else {
+                sigmas * error
+            };
+            // On other data nothing can be told where an error is withheld; a figure that is lost is a change.
+            let untold = !same_data && error.is_nan() && difference.is_finite();
+            let within = untold || difference.abs() <= allowed;
+            let neither = old[0].is_nan() && new[0].is_nan();
+            Shift {
+                set: before.set,
+                figure,
+                before: old,
+                now: new,
+                sigma: difference / error,
+                moved: !neither && !within,
+            }
+        })
+        .collect()
+}
+
+/// Settings of a baseline that are others now, as `key: before ≠ now`; and those that it does not
+/// know, because they are newer.
+///
+/// # Errors
+/// Where settings cannot be compared.
+fn settings_moved(
+    before: &BaselineSubmission,
+    now: &Submission,
+) -> anyhow::Result<(Vec<String>, Vec<String>)> {
+    let mut current = toml::Table::try_from(now)?;
+    let mut earlier = before.settings.clone();
+    // Words do not change results.
+    for table in [&mut current, &mut earlier] {
+        table.remove("description");
+    }
+    let found = differences(&earlier, &current)?;
+    Ok(found
+        .into_iter()
+        .partition(|line| !line.contains(": null ≠ ")))
+}
+
+/// What a check found about one submission of a baseline.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Checked {
+    /// Name of the baseline.
+    pub baseline: String,
+    /// Name of the submission.
+    pub submission: String,
+    /// Every figure looked at.
+    pub shifts: Vec<Shift>,
+    /// Settings that are others now.
+    pub settings: Vec<String>,
+    /// What should be known and is no failure.
+    pub notes: Vec<String>,
+}
+
+impl Checked {
+    /// Whether anything moved.
+    pub fn failed(&self) -> bool {
+        !self.settings.is_empty() || self.shifts.iter().any(|shift| shift.moved)
+    }
+
+    /// What moved, a line each.
+    pub fn moved(&self) -> Vec<String> {
+        let settings = self
+            .settings
+            .iter()
+            .map(|line| format!("{}: setting {line}", self.submission));
+        let figures = self.shifts.iter().filter(|shift| shift.moved).map(|shift| {
+            format!(
+                "{} set {}: {} from {} to {}, {:+.2} σ",
+                self.submission,
+                shift.set,
+                shift.figure,
+                shift.before[0],
+                shift.now[0],
+                shift.sigma
+            )
+        });
+        settings.chain(figures).collect()
+    }
+}
+
+/// The submission that those with the method of `settings` rest on.
+fn base_of(settings: &toml::Table) -> &'static str {
+    match settings.get("method").and_then(toml::Value::as_str) {
+        Some("linear") => "48/linear/star",
+        _ => "paper",
+    }
+}
+
+/// The settings by which a submission of a baseline is measured again: the present ones of a named
+/// submission; those stored of another, in which what the baseline does not know is the base's.
+fn settings_now(
+    before: &BaselineSubmission,
+    registry: &Registry,
+) -> Result<Submission, anyhow::Error> {
+    if registry.names().contains(&before.name) {
+        return Ok(registry.get(&before.name)?.submission);
+    }
+    let base = registry.get(base_of(&before.settings))?.submission;
+    let mut all = toml::Table::try_from(&base)?;
+    for (key, value) in &before.settings {
+        match (all.get_mut(key), value) {
+            (Some(toml::Value::Table(section)), toml::Value::Table(own)) => {
+                section.extend(own.clone());
+            }
+            _ => {
+                all.insert(key.clone(), value.clone());
+            }
+        }
+    }
+    Ok(all.try_into()?)
+}
+
+/// Holds the submissions of the baseline `name` against what they are as `measure` measures them now; what
+/// was found, and the submissions as they are now.
+///
+/// # Errors
+/// Where settings are not valid, or something cannot be measured.
+pub fn check(
+    name: &str,
+    baseline: &Baseline,
+    sigmas: f64,
+    mut measure: impl FnMut(&Submission, &[Wanted]) -> anyhow::Result<Vec<BaselineSet>>,
+) -> anyhow::Result<(Vec<Checked>, Vec<BaselineSubmission>)> {
+    let registry = Registry::embedded()?;
+    let (mut checks, mut submissions) = (Vec::new(), Vec::new());
+    for before in &baseline.submissions {
+        let submission = settings_now(before, &registry)
+            .map_err(|error| error.context(format!("settings of {}", before.name)))?;
+        let (settings, new) = settings_moved(before, &submission)?;
+        let mut check = Checked {
+            baseline: name.to_owned(),
+            submission: before.name.clone(),
+            shifts: Vec::new(),
+            settings,
+            notes: new
+                .iter()
+                .map(|line| format!("a setting is new: {line}"))
+                .collect(),
+        };
+        let wanted: Vec<Wanted> = before
+            .sets
+            .iter()
+            .map(|set| Wanted {
+                set: set.set,
+                images: set.images.len() as u32,
+            })
+            .collect();
+        let sets = measure(&submission, &wanted)?;
+        for old in &before.sets {
+            let Some(now) = sets.iter().find(|now| now.set == old.set) else {
+                anyhow::bail!("set {} was not measured again", old.set);
+            };
+            if now.data != old.data || now.images != old.images {
+                check.notes.push(format!(
+                    "the data of set {} are not the baseline's ({} images then, {} now); its figures may differ by {sigmas} σ",
+                    old.set,
+                    old.images.len(),
+                    now.images.len(),
+                ));
+            }
+            check.shifts.extend(shifts(old, now, sigmas));
+        }
+        submissions.push(BaselineSubmission::new(&submission, sets)?);
+        checks.push(check);
+    }
+    Ok((checks, submissions))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn set(data: &str, q: f64) -> BaselineSet {
+        let figures = CHECKED.map(|name| (name.to_owned(), [q, 2.0]));
+        BaselineSet {
+            set: 1,
+            data: data.into(),
+            images: vec![1, 2],
+            galaxies: 10,
+            flagged: 0,
+            figures: figures.into(),
+        }
+    }
+
+    #[test]
+    fn on_the_same_data_rounding_passes_and_on_others_noise_does() {
+        let before = set("a", 80.0);
+        let moved = |now: &BaselineSet| shifts(&before, now, 3.0)[0].moved;
+        assert!(!moved(&set("a", 80.0 * (1.0 + 0.9 * TOLERANCE))));
+        assert!(moved(&set("a", 80.0 * (1.0 - 1.1 * TOLERANCE))));
+        // 3 σ of the difference of two figures with errors of 2 is 8.5.
+        assert!(!moved(&set("b", 88.0)) && moved(&set("b", 89.0)));
+        assert!(moved(&set("a", f64::NAN)) && moved(&set("b", f64::NAN)));
+        let mut unsure = set("b", 1e9);
+        for value in unsure.figures.values_mut() {
+            value[1] = f64::NAN;
+        }
+        assert!(!moved(&unsure));
+    }
+
+    #[test]
+    fn a_figure_near_zero_may_be_off_by_a_part_of_its_error() {
+        let before = set("a", 0.0);
+        let moved = |q: f64| shifts(&before, &set("a", q), 3.0)[0].moved;
+        assert!(!moved(1.9 * TOLERANCE_SIGMA) && moved(2.1 * TOLERANCE_SIGMA));
+    }
+}

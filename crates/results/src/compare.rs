@@ -1,0 +1,270 @@
+//! Results held against each other: which sets they share, means over them, and paired differences.
+
+use std::borrow::Borrow;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use shearq_scoring::resample::{PairedDifference, PairedSet, mean_over_sets, paired_difference};
+use shearq_scoring::{Choice, Definition, Figures, Grid, Options};
+use shearq_submissions::{Published, Registry};
+
+use super::foreign::Foreign;
+use super::row::SetRecord;
+use super::score::{Catalogues, ScoredSet, own_catalogue, score_variants, unscored};
+use shearq_files::FileError;
+use shearq_pipeline::data::layout::{DataFolder, MAX_SET};
+use shearq_pipeline::data::listing::Files;
+use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::{PipelineError, inputs};
+
+/// One variant in a comparison.
+pub struct Variant {
+    /// Name of the submission.
+    pub name: String,
+    /// Published figures.
+    pub published: Option<Published>,
+    /// Its sets, those that all variants have, in order.
+    pub sets: Vec<ScoredSet>,
+    /// What of these sets was not scored.
+    pub unscored: Vec<String>,
+}
+
+impl Variant {
+    /// What is kept of its sets.
+    pub fn records(&self) -> Vec<SetRecord> {
+        // All are scored against one truth, so their data need no fingerprint to be told apart.
+        let record = |scored: &ScoredSet| Some(SetRecord::new(scored.set?, scored, String::new()));
+        self.sets.iter().filter_map(record).collect()
+    }
+}
+
+/// Variants by name with what is kept of their sets, as pictures of several of them take it.
+pub fn by_name(variants: &[Variant]) -> Vec<(String, Vec<SetRecord>)> {
+    let named = |variant: &Variant| (variant.name.clone(), variant.records());
+    variants.iter().map(named).collect()
+}
+
+/// What one variant is before it is scored.
+struct Entrant<'a> {
+    name: String,
+    published: Option<Published>,
+    files: Files,
+    foreign: Option<&'a Foreign>,
+}
+
+/// How variants are scored.
+#[derive(Debug, Clone, Copy)]
+pub struct Way {
+    /// Bandpower definition.
+    pub definition: Definition,
+    /// Convention of what shearq measured.
+    pub own: Choice,
+    /// Convention of other programs' catalogues.
+    pub foreign: Choice,
+}
+
+/// Scores several results folders and other programs' catalogues, described by the files `foreign`, on the
+/// sets that all have, against the truth of `data` or of what the first folder was measured from.
+///
+/// # Errors
+/// Where a file cannot be read, the folders are not of one source, or no set is common.
+pub fn score_all(
+    folders: &[PathBuf],
+    foreign: &[PathBuf],
+    data: Option<&Path>,
+    way: Way,
+    threads: usize,
+) -> Result<Vec<Variant>, PipelineError> {
+    let foreign: Vec<Foreign> = foreign
+        .iter()
+        .map(|path| Foreign::read(path))
+        .collect::<Result<_, _>>()?;
+    let mut data = data.map(DataFolder::open).transpose()?;
+    let mut entrants = own_entrants(folders, &mut data, threads)?;
+    let data = data.ok_or_else(|| {
+        PipelineError::Request("--foreign alone needs --data DIR with the true shear".into())
+    })?;
+    for foreign in &foreign {
+        entrants.push(Entrant {
+            name: foreign.name.clone(),
+            published: None,
+            files: foreign.catalogues(&[])?,
+            foreign: Some(foreign),
+        });
+    }
+    if let Some(entrant) = entrants.iter().find(|e| e.files.sets().is_empty()) {
+        let message = format!("{}: there is no catalogue to score", entrant.name);
+        return Err(PipelineError::Request(message));
+    }
+    let common = |set: u32| entrants.iter().all(|e| e.files.sets().contains(&set));
+    if !(1..=MAX_SET).any(common) {
+        let message = "the variants have no set in common; there is nothing to compare".into();
+        return Err(PipelineError::Request(message));
+    }
+    let readers: Vec<_> = entrants
+        .iter()
+        .map(|entrant| {
+            let foreign = entrant.foreign;
+            move |grid: &Grid, path: &Path| match foreign {
+                Some(foreign) => foreign.sum(grid, path),
+                None => own_catalogue(grid, path),
+            }
+        })
+        .collect();
+    let of_set: Vec<_> = entrants
+        .iter()
+        .map(|entrant| |set: u32| entrant.files.of_set(set))
+        .collect();
+    let catalogues: Vec<Catalogues<'_>> = entrants
+        .iter()
+        .zip(of_set.iter().zip(&readers))
+        .map(|(entrant, (of_set, read))| Catalogues {
+            of_set,
+            read,
+            choice: match entrant.foreign {
+                Some(_) => way.foreign,
+                None => way.own,
+            },
+        })
+        .collect();
+    let options = Options {
+        definition: way.definition,
+        ..Options::default()
+    };
+    let scored = score_variants(&data, &catalogues, &[], options, threads)?;
+    entrants
+        .iter()
+        .zip(scored)
+        .map(|(entrant, sets)| {
+            let numbers: Vec<u32> = sets.iter().filter_map(|set| set.set).collect();
+            Ok(Variant {
+                name: entrant.name.clone(),
+                published: entrant.published,
+                unscored: unscored(&data, &sets, &numbers)?,
+                sets,
+            })
+        })
+        .collect()
+}
+
+/// The folders that we measured; where `data` is not given, it becomes that of the first.
+fn own_entrants(
+    folders: &[PathBuf],
+    data: &mut Option<DataFolder>,
+    threads: usize,
+) -> Result<Vec<Entrant<'static>>, PipelineError> {
+    let registry =
+        Registry::embedded().map_err(|error| PipelineError::Request(error.to_string()))?;
+    let given = data.is_some();
+    let mut first: Option<(&Path, Source)> = None;
+    let mut entrants = Vec::new();
+    for folder in folders {
+        let run = Run::require(folder)?;
+        if !given {
+            let (beside, source) = first.get_or_insert_with(|| (folder, run.source.clone()));
+            if *source != run.source.moved(folder, beside)? {
+                let message = format!(
+                    "it was measured from {}, the first from {source}; give --data DIR to score both against one truth",
+                    run.source
+                );
+                return Err(FileError::new(folder, message).into());
+            }
+        }
+        if data.is_none() {
+            let hinted = |FileError { path, message, .. }| {
+                let place = folder.display();
+                let hint = format!("{message} (the data folder of {place}; --data gives another)");
+                FileError::new(path, hint)
+            };
+            *data = Some(run.source.data(folder).map_err(hinted)?);
+        }
+        if let Some(data) = data {
+            inputs::verify(data, folder, &run, &[], threads)?;
+        }
+        entrants.push(Entrant {
+            // Published figures belong to the embedded settings, not to a file of the same name.
+            published: registry
+                .get(&run.submission.name)
+                .ok()
+                .filter(|entry| entry.submission == run.submission)
+                .and_then(|entry| entry.published),
+            name: run.submission.name.clone(),
+            files: run.catalogues(folder, &[])?,
+            foreign: None,
+        });
+    }
+    Ok(entrants)
+}
+
+/// Sets that all have.
+pub fn common_sets(all: &[Vec<SetRecord>]) -> BTreeSet<u32> {
+    all.iter()
+        .map(|sets| sets.iter().map(|set| set.set).collect())
+        .reduce(|all: BTreeSet<u32>, more| &all & &more)
+        .unwrap_or_default()
+}
+
+/// Mean over sets of the figure called `name`, and its error.
+pub fn mean_figure<R: Borrow<SetRecord>>(sets: &[R], name: &str) -> (f64, f64) {
+    let value =
+        |figures: &Figures| Figures::place(name).map_or(f64::NAN, |place| figures.values()[place]);
+    let pairs: Vec<(f64, f64)> = sets
+        .iter()
+        .map(Borrow::borrow)
+        .map(|set| (value(&set.figures), value(&set.errors)))
+        .collect();
+    mean_over_sets(&pairs)
+}
+
+/// A figure that is kept for every group of images left out, so that differences in it can be paired.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Paired {
+    /// Q.
+    Q,
+    /// Calibrated Q.
+    Calibrated,
+}
+
+impl Paired {
+    /// Its value of a set, and those with each group left out.
+    fn of(self, set: &SetRecord) -> (f64, &[f64]) {
+        match self {
+            Paired::Q => (set.figures.q, &set.q_replicates),
+            Paired::Calibrated => (set.figures.q_calibrated, &set.q_calibrated_replicates),
+        }
+    }
+}
+
+/// Paired difference in a figure of `second` from `first`; `None` where they are not of the same sets, data
+/// and images, or where noise may have chosen the convention of either.
+pub fn difference<R: Borrow<SetRecord>>(
+    figure: Paired,
+    first: &[R],
+    second: &[R],
+) -> Option<PairedDifference> {
+    let pairs = || {
+        let sets = first.iter().zip(second);
+        sets.map(|(a, b)| (a.borrow(), b.borrow()))
+    };
+    let same = |(a, b): (&SetRecord, &SetRecord)| {
+        let known = a.convention_known && b.convention_known;
+        known && a.set == b.set && a.data == b.data && a.images == b.images
+    };
+    if first.len() != second.len() || !pairs().all(same) {
+        return None;
+    }
+    let pairs: Vec<PairedSet<'_>> = pairs()
+        .map(|(a, b)| {
+            let ((first, first_replicates), (second, second_replicates)) =
+                (figure.of(a), figure.of(b));
+            PairedSet {
+                images: a.images.len(),
+                first,
+                first_replicates,
+                second,
+                second_replicates,
+            }
+        })
+        .collect();
+    paired_difference(&pairs)
+}

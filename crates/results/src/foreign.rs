@@ -1,0 +1,236 @@
+//! Catalogues of other programs, described by a small TOML file.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use shearq_quantities::{Distortion, Shear};
+use shearq_scoring::{FieldSum, Grid, Row, RowCounts};
+use shearq_submissions::{EllipticityType, checked_name};
+
+use shearq_files::FileError;
+use shearq_files::table::{self, most_rows};
+use shearq_pipeline::data::layout::{IMAGE_PLACEHOLDERS, check_pattern, read_rows};
+use shearq_pipeline::data::listing::{self, Files};
+
+/// How to read another program's catalogues.
+///
+/// ```toml
+/// name = "REGAUSS"
+/// catalogues = "set{set:02}/hsm-regauss-{image:03}.csv"   # beside this file, or absolute
+/// ellipticity = "distortion"      # what the columns hold: "distortion" or "shear"
+/// report = "shear"                # what is scored [default: shear]
+/// x = "x"                         # names of the columns [defaults: x, y, e1, e2, no flag]
+/// y = "y"
+/// e1 = "e1"
+/// e2 = "e2"
+/// flag = "flag"                   # rows with another value than 0 have no ellipticity
+/// missing = -99                   # rows with this value in e1 or e2 have none [default: no such value]
+/// max_modulus = 1.0               # rows with a larger |e| (as reported) have none [default: no limit]
+/// position_offset = 0.0           # added to x and y to make them FITS pixels (1 for 0-based ones)
+/// e2_sign = 1                     # -1 where e2 is positive along x = -y
+/// ```
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Foreign {
+    /// Name in tables.
+    #[serde(deserialize_with = "checked_name")]
+    pub name: String,
+    catalogues: String,
+    ellipticity: EllipticityType,
+    #[serde(default = "shear")]
+    report: EllipticityType,
+    #[serde(default = "x")]
+    x: String,
+    #[serde(default = "y")]
+    y: String,
+    #[serde(default = "e1")]
+    e1: String,
+    #[serde(default = "e2")]
+    e2: String,
+    flag: Option<String>,
+    missing: Option<f64>,
+    max_modulus: Option<f64>,
+    #[serde(default)]
+    position_offset: f64,
+    #[serde(default = "one")]
+    e2_sign: i8,
+    #[serde(skip)]
+    folder: PathBuf,
+}
+
+fn shear() -> EllipticityType {
+    EllipticityType::Shear
+}
+fn x() -> String {
+    "x".into()
+}
+fn y() -> String {
+    "y".into()
+}
+fn e1() -> String {
+    "e1".into()
+}
+fn e2() -> String {
+    "e2".into()
+}
+fn one() -> i8 {
+    1
+}
+
+impl Foreign {
+    /// Reads a description.
+    ///
+    /// # Errors
+    /// Where it cannot be read or is not valid.
+    pub fn read(path: &Path) -> Result<Self, FileError> {
+        let text = shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS).map_err(
+            FileError::doing(path, "cannot read the description of catalogues"),
+        )?;
+        let mut foreign: Foreign =
+            toml::from_str(&text).map_err(|e| FileError::new(path, e.to_string().trim_end()))?;
+        if foreign.e2_sign.abs() != 1 {
+            let message = format!("`e2_sign` is {}; expected 1 or -1", foreign.e2_sign);
+            return Err(FileError::new(path, message));
+        }
+        if let Some(most) = foreign.max_modulus.filter(|m| !(m.is_finite() && *m > 0.0)) {
+            let message = format!("`max_modulus` is {most}; expected a positive number");
+            return Err(FileError::new(path, message));
+        }
+        check_pattern("catalogues", &foreign.catalogues, &[IMAGE_PLACEHOLDERS])
+            .map_err(|message| FileError::new(path, message))?;
+        foreign.folder = path.parent().unwrap_or(Path::new("")).to_owned();
+        Ok(foreign)
+    }
+
+    /// The pattern of the catalogues' names, with the folder that it is relative to.
+    pub fn pattern(&self) -> PathBuf {
+        self.folder.join(&self.catalogues)
+    }
+
+    /// The catalogues of `sets` (of all if empty) that are there.
+    ///
+    /// # Errors
+    /// Where a folder cannot be listed.
+    pub fn catalogues(&self, sets: &[u32]) -> Result<Files, FileError> {
+        listing::find(&self.folder, &self.catalogues, &[""], sets)
+    }
+
+    /// One image's catalogue on the grid, as [`Foreign::rows`] has it.
+    ///
+    /// # Errors
+    /// Where it cannot be read, a column is absent, or the values are no ellipticities.
+    pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
+        sum_foreign(grid, path, self.rows(path, most_rows(grid.cells()))?)
+    }
+
+    /// One image's catalogue of at most `most` rows, converted to standard signs and the reported type.
+    /// Flagged rows and distortions above 1 have no ellipticity.
+    ///
+    /// # Errors
+    /// Where it cannot be read or a column is absent.
+    pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
+        let mut names = vec![
+            self.x.as_str(),
+            self.y.as_str(),
+            self.e1.as_str(),
+            self.e2.as_str(),
+        ];
+        names.extend(self.flag.as_deref());
+        let table = table::read(path, Some(&names), most).map_err(|error| {
+            error.hint_of_columns("the description of the catalogues names them")
+        })?;
+        let column = |name: &str| table::numbers(&table, name, path);
+        let flags = self.flag.as_deref().map(column).transpose()?;
+        let (x, y) = (column(&self.x)?, column(&self.y)?);
+        let (e1, e2) = (column(&self.e1)?, column(&self.e2)?);
+        let row = |k: usize| {
+            let good = flags.as_ref().is_none_or(|flags| flags[k] == 0.0)
+                && self.missing.is_none_or(|m| e1[k] != m && e2[k] != m);
+            let shape = if good {
+                self.convert(e1[k], f64::from(self.e2_sign) * e2[k])
+            } else {
+                None
+            };
+            let shape =
+                shape.filter(|(e1, e2)| self.max_modulus.is_none_or(|most| e1.hypot(*e2) <= most));
+            let (e1, e2) = shape.unwrap_or((f64::NAN, f64::NAN));
+            Row {
+                x: x[k] + self.position_offset,
+                y: y[k] + self.position_offset,
+                e1,
+                e2,
+            }
+        };
+        Ok((0..x.len()).map(row).collect())
+    }
+
+    fn convert(&self, e1: f64, e2: f64) -> Option<(f64, f64)> {
+        match (self.ellipticity, self.report) {
+            (EllipticityType::Distortion, EllipticityType::Shear) => {
+                let shear = Distortion::new(e1, e2).to_shear()?;
+                Some((shear.e1, shear.e2))
+            }
+            (EllipticityType::Shear, EllipticityType::Distortion) => {
+                let distortion = Shear::new(e1, e2).to_distortion();
+                Some((distortion.e1, distortion.e2))
+            }
+            _ => Some((e1, e2)),
+        }
+    }
+}
+
+/// Which values of other programs' ellipticities stand for "not measured".
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Deserialize)]
+pub struct Screen {
+    /// A value of either component.
+    pub missing: Option<f64>,
+    /// The largest |e| that is one.
+    pub max_modulus: Option<f64>,
+}
+
+impl Screen {
+    /// The row, without an ellipticity where its value stands for none.
+    pub fn apply(&self, row: Row) -> Row {
+        let missing = self.missing.is_some_and(|m| row.e1 == m || row.e2 == m);
+        if missing
+            || self
+                .max_modulus
+                .is_some_and(|max| row.e1.hypot(row.e2) > max)
+        {
+            return Row {
+                e1: f64::NAN,
+                e2: f64::NAN,
+                ..row
+            };
+        }
+        row
+    }
+}
+
+/// Sums rows of another program, of the catalogue `path`.
+///
+/// # Errors
+/// Where they are not what they are taken for: values that are no ellipticities, positions in other units.
+pub fn sum_foreign(
+    grid: &Grid,
+    path: &Path,
+    rows: impl IntoIterator<Item = Row>,
+) -> Result<(FieldSum, RowCounts), FileError> {
+    let mut sum = FieldSum::new(grid);
+    let counts = sum.add_image(grid, rows);
+    match counts.fault(grid) {
+        Some(fault) => Err(FileError::new(path, fault)),
+        None => Ok((sum, counts)),
+    }
+}
+
+/// A [`ReadImage`] for other programs' catalogues with the given columns.
+pub fn plain_columns<'a>(
+    columns: [&'a str; 4],
+    screen: Screen,
+) -> impl Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync + 'a {
+    move |grid, path| {
+        let rows = read_rows(path, &columns, most_rows(grid.cells()))?;
+        sum_foreign(grid, path, rows.into_iter().map(|row| screen.apply(row)))
+    }
+}

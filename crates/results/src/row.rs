@@ -1,0 +1,414 @@
+//! Rows of results: what is kept of every scored set, and of what made it.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use shearq_files::frames::TableError;
+use shearq_files::frames::polars::{Column, DataFrame};
+use shearq_scoring::{Choice, Definition, Figure, Figures, Noise, Options};
+use shearq_submissions::check_name;
+
+use super::score::ScoredSet;
+use shearq_files::FileError;
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::data::fingerprint::{self, Fingerprint};
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::run::{Run, Source, nan_for_null};
+use shearq_simulate::kinds::SetKind;
+
+/// What is kept of one set's score.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SetRecord {
+    /// Set number.
+    pub set: u32,
+    /// Fingerprint of the set's data ([`fingerprint::of_set`]).
+    pub data: String,
+    /// Numbers of the images scored.
+    pub images: Vec<u32>,
+    /// Galaxies in their catalogues.
+    pub galaxies: u64,
+    /// Of these, without an ellipticity.
+    pub flagged: u64,
+    /// Figures of the chosen convention.
+    pub figures: Figures,
+    /// Their standard errors; not a number where unknown.
+    pub errors: Figures,
+    /// Q with each group of images left out in turn, for paired differences.
+    pub q_replicates: Vec<f64>,
+    /// Calibrated Q likewise; empty in records of versions that did not keep it.
+    #[serde(default, deserialize_with = "nan_for_null")]
+    pub q_calibrated_replicates: Vec<f64>,
+    /// The leaderboard's Q: the best of the eight conventions.
+    pub q_leaderboard: f64,
+    /// Number of the chosen convention.
+    pub convention: u8,
+    /// Whether it is known: told, or clearly matched to the truth, and not chosen by its Q.
+    pub convention_known: bool,
+    /// Number of the leaderboard's convention.
+    pub convention_leaderboard: u8,
+}
+
+impl SetRecord {
+    /// What is kept of the scored set `set`, of data with the fingerprint `data`.
+    pub fn new(set: u32, scored: &ScoredSet, data: String) -> Self {
+        let ScoredSet {
+            set: _,
+            images,
+            score,
+            rows,
+            basis,
+        } = scored;
+        SetRecord {
+            set,
+            data,
+            images: images.clone(),
+            galaxies: (rows.used + rows.not_finite) as u64,
+            flagged: rows.not_finite as u64,
+            figures: score.figures,
+            errors: score.errors,
+            q_replicates: score.replicates.iter().map(|r| r.q).collect(),
+            q_calibrated_replicates: score.replicates.iter().map(|r| r.q_calibrated).collect(),
+            q_leaderboard: score.conventions[score.best.index()].quality.q,
+            convention: score.chosen.number(),
+            convention_known: basis.is_known(),
+            convention_leaderboard: score.best.number(),
+        }
+    }
+}
+
+/// What is kept of one scored run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RunRecord {
+    /// Name of the submission, or of another program's catalogues.
+    pub submission: String,
+    /// Version of shearq.
+    pub version: String,
+    /// All settings, as TOML.
+    pub settings: String,
+    /// Settings of the simulation as JSON, or the fingerprint of a data folder.
+    pub source: String,
+    /// Bandpower definition.
+    pub definition: String,
+    /// Convention asked for: `matched`, `best` or a number.
+    pub choice: String,
+    /// `measured`, or the noise variance given.
+    pub noise: String,
+    /// The sets, in order.
+    pub sets: Vec<SetRecord>,
+}
+
+/// What was measured, and by what.
+pub struct Measured<'a> {
+    /// Name of the submission, or of another program's catalogues.
+    pub name: &'a str,
+    /// All settings, as TOML.
+    pub settings: String,
+    /// Where the galaxies come from.
+    pub source: &'a Source,
+    /// Where the true shear is.
+    pub data: &'a DataFolder,
+}
+
+impl<'a> Measured<'a> {
+    /// A run of ours.
+    ///
+    /// # Errors
+    /// Where the settings cannot be written as TOML.
+    pub fn run(run: &'a Run, data: &'a DataFolder, folder: &Path) -> Result<Self, FileError> {
+        let settings = toml::to_string(&run.submission)
+            .map_err(FileError::doing(folder, "cannot store the settings"))?;
+        Ok(Measured {
+            name: &run.submission.name,
+            settings,
+            source: &run.source,
+            data,
+        })
+    }
+}
+
+impl RunRecord {
+    /// The record of a scored run.
+    ///
+    /// # Errors
+    /// Where the data cannot be read for their fingerprint.
+    pub fn new(
+        measured: Measured<'_>,
+        scored: &[ScoredSet],
+        options: Options,
+    ) -> Result<Self, PipelineError> {
+        let Measured {
+            name,
+            settings,
+            source,
+            data,
+        } = measured;
+        let sets = scored
+            .iter()
+            // One without a number is of no challenge.
+            .filter_map(|scored| Some((scored.set?, scored)))
+            .map(|(set, scored)| {
+                let print = fingerprint::of_set(source, data, set, &scored.images)?;
+                Ok(SetRecord::new(set, scored, print))
+            })
+            .collect::<Result<_, FileError>>()?;
+        Ok(RunRecord {
+            submission: name.to_owned(),
+            version: shearq_pipeline::VERSION.into(),
+            settings,
+            source: match source {
+                Source::Simulated(settings) => serde_json::to_string(settings)
+                    .map_err(FileError::doing(data.root(), "cannot store the settings"))?,
+                Source::Folder { .. } => fingerprint::of_source(source, data)?,
+            },
+            definition: match options.definition {
+                Definition::Leaderboard => "leaderboard".into(),
+                Definition::Corrected => "corrected".into(),
+            },
+            choice: match options.choice {
+                Choice::Matched => "matched".into(),
+                Choice::Best => "best".into(),
+                Choice::Insist(convention) => convention.number().to_string(),
+            },
+            noise: match options.noise {
+                Noise::Measured => "measured".into(),
+                Noise::Given(variance) => variance.to_string(),
+            },
+            sets,
+        })
+    }
+
+    /// Fingerprint of what made the run: version, settings, data and the way of scoring, but not
+    /// which sets and images. Parts of one run, from several processes, have it in common.
+    pub fn id(&self) -> String {
+        let RunRecord {
+            submission,
+            version,
+            settings,
+            source,
+            definition,
+            choice,
+            noise,
+            sets: _,
+        } = self;
+        let mut print = Fingerprint::default();
+        for part in [
+            submission, version, settings, source, definition, choice, noise,
+        ] {
+            print.add(part);
+        }
+        print.finish()
+    }
+
+    /// The run whose sets are the rows of the table `path`.
+    ///
+    /// # Errors
+    /// Where a column is absent or of another type, or the rows are not of one run.
+    pub fn from_table(table: &DataFrame, path: &Path) -> Result<Self, FileError> {
+        let rows = Rows { path, table };
+        let text = |name| rows.text(name, 0).map(str::to_owned);
+        let submission = text("submission")?;
+        check_name(&submission).map_err(|error| FileError::new(path, error.to_string()))?;
+        let run = RunRecord {
+            submission,
+            version: text("version")?,
+            settings: text("settings")?,
+            source: text("source")?,
+            definition: text("definition")?,
+            choice: text("choice")?,
+            noise: text("noise")?,
+            sets: (0..table.height())
+                .map(|row| rows.set(row))
+                .collect::<Result<_, _>>()?,
+        };
+        for row in 0..table.height() {
+            let found = rows.text("run", row)?;
+            if found != run.id() {
+                let message = format!(
+                    "row {}: `run` is {found}, but what made it amounts to {}; was the file edited?",
+                    row + 1,
+                    run.id()
+                );
+                return Err(FileError::new(path, message));
+            }
+        }
+        Ok(run)
+    }
+}
+
+/// A row for every set of every run, in order: what the files of a store hold, and what conditions and
+/// groups refer to.
+///
+/// # Errors
+/// Where polars cannot make it.
+pub fn table_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
+    let ids: Vec<String> = runs.iter().map(RunRecord::id).collect();
+    let rows: Vec<(&RunRecord, &str, &SetRecord)> = runs
+        .iter()
+        .zip(&ids)
+        .flat_map(|(run, id)| run.sets.iter().map(move |set| (run, id.as_str(), set)))
+        .collect();
+    let of_run = |name: &str, value: &dyn Fn(&RunRecord) -> &str| {
+        let values: Vec<&str> = rows.iter().map(|row| value(row.0)).collect();
+        Column::new(name.into(), values)
+    };
+    let kind = |name: &str, value: &dyn Fn(&SetKind) -> &'static str| {
+        let values = rows
+            .iter()
+            .map(|row| SetKind::of(row.2.set).as_ref().map_or("", value));
+        Column::new(name.into(), values.collect::<Vec<&str>>())
+    };
+    let text = |name: &str, value: &dyn Fn(&SetRecord) -> String| {
+        let values: Vec<String> = rows.iter().map(|row| value(row.2)).collect();
+        Column::new(name.into(), values)
+    };
+    let count = |name: &str, value: &dyn Fn(&SetRecord) -> u64| {
+        let values: Vec<i64> = rows.iter().map(|row| value(row.2) as i64).collect();
+        Column::new(name.into(), values)
+    };
+    let real = |name: &str, value: &dyn Fn(&SetRecord) -> f64| {
+        let values: Vec<f64> = rows.iter().map(|row| value(row.2)).collect();
+        Column::new(name.into(), values)
+    };
+    let run_ids: Vec<&str> = rows.iter().map(|row| row.1).collect();
+    let mut columns = vec![
+        Column::new("run".into(), run_ids),
+        of_run("submission", &|run| &run.submission),
+        of_run("version", &|run| &run.version),
+        of_run("settings", &|run| &run.settings),
+        of_run("source", &|run| &run.source),
+        of_run("definition", &|run| &run.definition),
+        of_run("choice", &|run| &run.choice),
+        of_run("noise", &|run| &run.noise),
+        count("set", &|set| u64::from(set.set)),
+        kind("set_kind", &|kind| kind.image.label()),
+        kind("psf", &|kind| kind.psf.label()),
+        kind("psf_profile", &|kind| kind.image.psf_profile()),
+        kind("ellipticity", &|kind| kind.ellipticity.label()),
+        kind("snr", &|kind| kind.image.snr_class()),
+        kind("size", &|kind| kind.image.size_class()),
+        text("data", &|set| set.data.clone()),
+        count("images", &|set| set.images.len() as u64),
+        text("image_numbers", &|set| list(&set.images)),
+        count("galaxies", &|set| set.galaxies),
+        count("flagged", &|set| set.flagged),
+    ];
+    for (k, Figure { name, .. }) in Figures::ALL.iter().enumerate() {
+        columns.push(real(name, &|set| set.figures.values()[k]));
+        columns.push(real(&error_of(name), &|set| set.errors.values()[k]));
+    }
+    columns.extend([
+        real("q_leaderboard", &|set| set.q_leaderboard),
+        count("convention", &|set| u64::from(set.convention)),
+        count("convention_known", &|set| u64::from(set.convention_known)),
+        count("convention_leaderboard", &|set| {
+            u64::from(set.convention_leaderboard)
+        }),
+        text("q_replicates", &|set| list(&set.q_replicates)),
+        text("q_calibrated_replicates", &|set| {
+            list(&set.q_calibrated_replicates)
+        }),
+    ]);
+    shearq_files::frames::frame(columns)
+}
+
+/// Name of the column with a figure's standard errors.
+fn error_of(figure: &str) -> String {
+    format!("{figure}_error")
+}
+
+/// Numbers as a JSON list, with all their digits; what is not finite is null.
+fn list<T: ToString>(numbers: &[T]) -> String {
+    let texts: Vec<String> = numbers
+        .iter()
+        .map(|number| match number.to_string() {
+            text if text.contains("NaN") || text.contains("inf") => "null".into(),
+            text => text,
+        })
+        .collect();
+    format!("[{}]", texts.join(","))
+}
+
+/// Rows of the table of a file.
+struct Rows<'a> {
+    path: &'a Path,
+    table: &'a DataFrame,
+}
+
+impl Rows<'_> {
+    fn wrong(&self, name: &str, row: usize, expected: &str) -> FileError {
+        let message = format!("row {}: column `{name}` has no {expected}", row + 1);
+        FileError::new(self.path, message)
+    }
+
+    fn text(&self, name: &str, row: usize) -> Result<&str, FileError> {
+        let column = self.table.column(name).ok();
+        column
+            .and_then(|column| column.str().ok()?.get(row))
+            .ok_or_else(|| self.wrong(name, row, "text"))
+    }
+
+    fn real(&self, name: &str, row: usize) -> Result<f64, FileError> {
+        let column = self.table.column(name).ok();
+        column
+            .and_then(|column| column.f64().ok()?.get(row))
+            .ok_or_else(|| self.wrong(name, row, "real number"))
+    }
+
+    fn count<T: TryFrom<i64>>(&self, name: &str, row: usize) -> Result<T, FileError> {
+        let column = self.table.column(name).ok();
+        column
+            .and_then(|column| T::try_from(column.i64().ok()?.get(row)?).ok())
+            .ok_or_else(|| self.wrong(name, row, "number that can be counted to"))
+    }
+
+    /// Numbers of a JSON list; null is NaN where `T` has it.
+    fn list<T: std::str::FromStr>(&self, name: &str, row: usize) -> Result<Vec<T>, FileError> {
+        let text = self.text(name, row)?;
+        text.strip_prefix('[')
+            .and_then(|rest| rest.strip_suffix(']'))
+            .and_then(|inner| {
+                let numbers = inner.split(',').filter(|part| !part.is_empty());
+                numbers
+                    .map(|part| if part == "null" { "NaN" } else { part })
+                    .map(|part| part.parse().ok())
+                    .collect()
+            })
+            .ok_or_else(|| self.wrong(name, row, "list of numbers"))
+    }
+
+    fn set(&self, row: usize) -> Result<SetRecord, FileError> {
+        let figures = |column: &dyn Fn(&str) -> String| -> Result<Figures, FileError> {
+            let mut values = [f64::NAN; Figures::ALL.len()];
+            for (value, Figure { name, .. }) in values.iter_mut().zip(Figures::ALL) {
+                let name = column(name);
+                if name == column(Figures::ALWAYS) || self.table.column(&name).is_ok() {
+                    *value = self.real(&name, row)?;
+                }
+            }
+            Ok(Figures::from_values(values))
+        };
+        Ok(SetRecord {
+            set: self.count("set", row)?,
+            data: self.text("data", row)?.to_owned(),
+            images: self.list("image_numbers", row)?,
+            galaxies: self.count("galaxies", row)?,
+            flagged: self.count("flagged", row)?,
+            figures: figures(&str::to_owned)?,
+            errors: figures(&error_of)?,
+            q_replicates: self.list("q_replicates", row)?,
+            // Earlier versions did not keep them.
+            q_calibrated_replicates: match self.table.column("q_calibrated_replicates") {
+                Ok(_) => self.list("q_calibrated_replicates", row)?,
+                Err(_) => Vec::new(),
+            },
+            q_leaderboard: self.real("q_leaderboard", row)?,
+            convention: self.count("convention", row)?,
+            // Earlier versions let each set choose.
+            convention_known: match self.table.column("convention_known") {
+                Ok(_) => self.count::<u8>("convention_known", row)? > 0,
+                Err(_) => self.text("choice", row)?.parse::<u8>().is_ok(),
+            },
+            convention_leaderboard: self.count("convention_leaderboard", row)?,
+        })
+    }
+}

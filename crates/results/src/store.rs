@@ -1,0 +1,143 @@
+//! A results store: a folder with one Parquet file per recorded run, one row per set.
+//!
+//! A file's name is made of what is in it, so that processes which write into one store never meet,
+//! and recording the same run twice changes nothing. docs/formats.md describes the columns.
+
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
+use std::path::{Path, PathBuf};
+
+use shearq_files::frames::{Metadata, TableError, parquet_metadata, read_parquet, write_parquet};
+
+use super::row::{RunRecord, table_of};
+use shearq_files::parquet::bare;
+use shearq_files::{FileError, atomic};
+use shearq_pipeline::data::fingerprint;
+
+/// Key and value in the footer that tell the files of a store.
+const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");
+
+/// Makes the folder of a store, so that a long run does not find out at its end that it cannot.
+///
+/// # Errors
+/// Where it cannot be made.
+pub fn prepare(store: &Path) -> Result<(), FileError> {
+    std::fs::create_dir_all(store)
+        .map_err(FileError::doing(store, "cannot make the results store"))?;
+    atomic::sweep(store);
+    Ok(())
+}
+
+/// Records a run; the file it is now in.
+///
+/// # Errors
+/// Where the file cannot be written.
+pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
+    let failed = |error: TableError| bare(store, &error);
+    let metadata = Metadata::from([(SCHEMA.0.to_owned(), SCHEMA.1.to_owned())]);
+    let table = table_of(std::slice::from_ref(run)).map_err(failed)?;
+    let mut bytes = Vec::new();
+    write_parquet(&mut bytes, &table, &metadata).map_err(failed)?;
+    let path = store.join(file_name(run, &bytes));
+    atomic::write(&path, &bytes)?;
+    Ok(path)
+}
+
+/// Name of the file that holds `bytes`.
+fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
+    let words: Vec<&str> = run
+        .submission
+        .split(|c: char| !c.is_ascii_alphanumeric())
+        .filter(|word| !word.is_empty())
+        .collect();
+    let print = fingerprint::of_bytes(bytes);
+    format!("{}-{}-{print}.parquet", words.join("-"), run.id())
+}
+
+/// Reads the run of one file.
+fn read_run(path: &Path) -> Result<RunRecord, FileError> {
+    let failed = |error: TableError| bare(path, &error);
+    let table = read_parquet(path, None).map_err(failed)?;
+    let metadata = parquet_metadata(path).map_err(failed)?;
+    let found = metadata.get(SCHEMA.0).map(String::as_str);
+    if found != Some(SCHEMA.1) {
+        let message = format!(
+            "found {}, expected a file of a results store: `{}` = \"{}\" in its metadata",
+            found.map_or("no schema".into(), |found| format!("schema \"{found}\"")),
+            SCHEMA.0,
+            SCHEMA.1
+        );
+        return Err(FileError::new(path, message));
+    }
+    let print = fingerprint::of_file(path)?;
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    // Whoever names a file anew has it without.
+    let named = stem
+        .rsplit('-')
+        .next()
+        .filter(|end| end.len() == print.len() && end.bytes().all(|byte| byte.is_ascii_hexdigit()));
+    if named.is_some_and(|named| named != print) {
+        let message = format!(
+            "the file was changed since it was recorded: its content is {print}, not what its name ends in"
+        );
+        return Err(FileError::new(path, message));
+    }
+    RunRecord::from_table(&table, path)
+}
+
+/// All runs of a store, by submission and id, and what should be known about them.
+///
+/// Where several files hold the same set of the same run, the one with most images counts: the
+/// others are earlier looks at it.
+///
+/// # Errors
+/// Where there is no such folder, or a Parquet file in it is not one of a store.
+pub fn read(store: &Path) -> Result<(Vec<RunRecord>, Vec<String>), FileError> {
+    let entries = std::fs::read_dir(store)
+        .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
+        .map_err(FileError::doing(store, "cannot read the results store"))?;
+    let mut paths: Vec<PathBuf> = entries
+        .into_iter()
+        .map(|entry| entry.path())
+        .filter(|path| {
+            let hidden = path
+                .file_name()
+                .is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
+            !hidden && path.extension().is_some_and(|ending| ending == "parquet")
+        })
+        .collect();
+    paths.sort();
+    let mut runs: BTreeMap<(String, String), RunRecord> = BTreeMap::new();
+    let mut notes = Vec::new();
+    for path in paths {
+        let run = read_run(&path)?;
+        match runs.entry((run.submission.clone(), run.id())) {
+            Entry::Vacant(place) => {
+                place.insert(run);
+            }
+            Entry::Occupied(mut place) => merge(place.get_mut(), run, &path, &mut notes),
+        }
+    }
+    Ok((runs.into_values().collect(), notes))
+}
+
+/// Adds the sets of another file of the same run.
+fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<String>) {
+    for set in more.sets {
+        match run.sets.iter_mut().find(|own| own.set == set.set) {
+            None => run.sets.push(set),
+            Some(own) => {
+                if own.images.len() == set.images.len() {
+                    notes.push(format!(
+                        "Warning: {} holds set {} of a run that another file holds too, with other results on as many images; that other one counts.",
+                        path.display(),
+                        set.set
+                    ));
+                } else if own.images.len() < set.images.len() {
+                    *own = set;
+                }
+            }
+        }
+    }
+    run.sets.sort_by_key(|set| set.set);
+}

@@ -1,0 +1,330 @@
+//! Submissions as one compressed archive (`.tar.gz`), the same bytes for the same files.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufReader, BufWriter, Read, Write};
+use std::path::Path;
+
+use flate2::bufread::GzDecoder;
+use flate2::write::GzEncoder;
+use flate2::{Compression, GzBuilder};
+use tar::{Archive, Builder, Header};
+
+use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
+use shearq_files::FileError;
+use shearq_files::atomic::{PartFile, PartFolder, sweep_beside};
+use shearq_files::open::open;
+use shearq_pipeline::data::layout;
+
+/// Largest manifest accepted, in bytes: some four times that of 999 images of 99 sets.
+const MAX_MANIFEST: u64 = 1 << 22;
+
+/// Most bytes that one byte of an archive may unpack to, beyond the first [`FREE`]: numbers in ASCII come
+/// to three, blank catalogues to a hundred or so.
+const MAX_RATIO: u64 = 300;
+/// Bytes that any archive may unpack to.
+const FREE: u64 = 1 << 24;
+/// Bytes that a file counts for in addition to its own, as it takes them on disk.
+const FILE: u64 = 1 << 12;
+/// Most files: a catalogue for every image of every set, and a manifest.
+const MAX_FILES: u64 = layout::MAX_SET as u64 * layout::MAX_IMAGE as u64 + 1;
+
+/// Whether a path's ending is that of an archive.
+pub fn is_archive(path: &Path) -> bool {
+    let name = path.to_string_lossy();
+    name.ends_with(".tar.gz") || name.ends_with(".tgz")
+}
+
+/// An archive being written.
+pub struct ArchiveWriter {
+    builder: Builder<GzEncoder<BufWriter<File>>>,
+    part: PartFile,
+}
+
+impl ArchiveWriter {
+    /// Starts an archive.
+    ///
+    /// # Errors
+    /// Where the file cannot be made.
+    pub fn create(path: &Path) -> Result<Self, FileError> {
+        sweep_beside(path);
+        let (part, file) = PartFile::create(path)?;
+        // Neither the time nor the system of its making.
+        let encoder = GzBuilder::new()
+            .mtime(0)
+            .operating_system(UNKNOWN_SYSTEM)
+            .write(BufWriter::new(file), Compression::default());
+        Ok(ArchiveWriter {
+            builder: Builder::new(encoder),
+            part,
+        })
+    }
+
+    /// Adds a file.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), FileError> {
+        let mut header = Header::new_gnu();
+        header.set_size(bytes.len() as u64);
+        header.set_mode(0o644);
+        header.set_mtime(0);
+        header.set_uid(0);
+        header.set_gid(0);
+        self.builder
+            .append_data(&mut header, name, bytes)
+            .map_err(cannot_write(self.part.target()))
+    }
+
+    /// Closes the archive and gives it its name.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn finish(self) -> Result<(), FileError> {
+        let ArchiveWriter { builder, part } = self;
+        builder
+            .into_inner()
+            .and_then(GzEncoder::finish)
+            .and_then(|mut file| file.flush())
+            .map_err(cannot_write(part.target()))?;
+        part.finish()
+    }
+}
+
+/// gzip's number for it.
+const UNKNOWN_SYSTEM: u8 = 255;
+
+fn cannot_write(path: &Path) -> impl FnOnce(std::io::Error) -> FileError {
+    FileError::doing(path, "cannot write the archive")
+}
+
+/// What an archive holds.
+pub struct Unpacked {
+    /// Its manifest, if it has one.
+    pub manifest: Option<Manifest>,
+    /// Its other files.
+    pub files: BTreeMap<String, FileSum>,
+}
+
+impl Unpacked {
+    /// Checks that the files are those of the manifest, which there must be if it is `required`.
+    ///
+    /// # Errors
+    /// Where they are not, or it is not there.
+    pub fn verify(&self, archive: &Path, required: bool) -> Result<(), FileError> {
+        let faults = match &self.manifest {
+            Some(manifest) => manifest.faults(&self.files),
+            None if required => {
+                let message = format!("there is no {MANIFEST_FILE} in it to verify the files by");
+                return Err(FileError::new(archive, message));
+            }
+            None => Vec::new(),
+        };
+        if faults.is_empty() {
+            return Ok(());
+        }
+        let lines: Vec<String> = faults
+            .iter()
+            .map(|(name, message)| format!("\n  {name}: {message}"))
+            .collect();
+        let message = format!("this is not what was packed:{}", lines.concat());
+        Err(FileError::new(archive, message))
+    }
+}
+
+/// Unpacks the archive at `path` into the new folder `out`, which appears whole and as its manifest
+/// says or not at all. Unless the manifest is `required`, there may be none.
+///
+/// # Errors
+/// As [`read`] and [`Unpacked::verify`], and where `out` exists or cannot be written.
+pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
+    let part = PartFolder::new(out)?;
+    let unpacked = read(path, Some(part.path()))?;
+    unpacked.verify(path, required)?;
+    part.finish()?;
+    Ok(unpacked)
+}
+
+/// Reads an archive from end to end; with `into`, its files are written to that folder.
+///
+/// # Errors
+/// Where it cannot be read to its end, holds anything but plain files without folders, or holds two
+/// of one name.
+pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
+    let cannot_read = || FileError::doing::<std::io::Error>(path, "cannot read the archive");
+    let file = open(path).map_err(cannot_read())?;
+    let most = FREE + MAX_RATIO * file.metadata().map_err(cannot_read())?.len();
+    let mut files = 0;
+    let mut archive = Archive::new(Bounded {
+        decoder: GzDecoder::new(BufReader::new(file)),
+        read: 0,
+        most,
+    });
+    let mut unpacked = Unpacked {
+        manifest: None,
+        files: BTreeMap::new(),
+    };
+    // Raw: extensions of tar, such as names of any length, are entries that are not plain files.
+    for entry in archive.entries().map_err(cannot_read())?.raw(true) {
+        let mut entry = entry.map_err(cannot_read())?;
+        let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
+        // As `tar czf … -C folder .` packs a folder.
+        if name == "./" && entry.header().entry_type().is_dir() {
+            continue;
+        }
+        let name = match name.strip_prefix("./") {
+            Some(rest) if is_plain_name(rest) => rest.to_owned(),
+            _ => name,
+        };
+        if !entry.header().entry_type().is_file() || !is_plain_name(&name) {
+            let message = format!("it holds `{name}`; expected plain files without folders");
+            return Err(FileError::new(path, message));
+        }
+        if unpacked.files.contains_key(&name)
+            || (name == MANIFEST_FILE && unpacked.manifest.is_some())
+        {
+            let message = format!("it holds `{name}` twice");
+            return Err(FileError::new(path, message));
+        }
+        files += 1;
+        if files > MAX_FILES.min(most / FILE) {
+            let message = format!("it holds more than {} files", files - 1);
+            return Err(FileError::new(path, message));
+        }
+        let mut bytes = Vec::new();
+        let mut target: Box<dyn Write> = match into {
+            _ if name == MANIFEST_FILE => Box::new(&mut bytes),
+            None => Box::new(std::io::sink()),
+            Some(folder) => {
+                let target = folder.join(&name);
+                Box::new(
+                    File::create_new(&target).map_err(FileError::doing(&target, "cannot write"))?,
+                )
+            }
+        };
+        if name == MANIFEST_FILE && entry.size() > MAX_MANIFEST {
+            let message = format!("its {MANIFEST_FILE} has {} bytes", entry.size());
+            return Err(FileError::new(path, message));
+        }
+        let sum = FileSum::copying(&mut entry, &mut target)
+            .map_err(|error| FileError::new(path, format!("cannot unpack `{name}`: {error}")))?;
+        drop(target);
+        if name != MANIFEST_FILE {
+            unpacked.files.insert(name, sum);
+            continue;
+        }
+        let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|error| {
+            FileError::new(
+                path,
+                format!("its {MANIFEST_FILE} is not one of a submission: {error}"),
+            )
+        })?;
+        unpacked.manifest = Some(manifest);
+        if let Some(folder) = into {
+            std::fs::write(folder.join(MANIFEST_FILE), &bytes)
+                .map_err(FileError::doing(folder, "cannot write the manifest"))?;
+        }
+    }
+    check_end(archive.into_inner()).map_err(cannot_read())?;
+    Ok(unpacked)
+}
+
+/// What an archive unpacks to, of which there is an end.
+struct Bounded {
+    decoder: GzDecoder<BufReader<File>>,
+    /// Bytes read.
+    read: u64,
+    /// Most bytes read.
+    most: u64,
+}
+
+impl Read for Bounded {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        let found = self.decoder.read(buffer)?;
+        self.read += found as u64;
+        if self.read > self.most {
+            let most = self.most;
+            let message =
+                format!("it unpacks to more than {most} bytes, {MAX_RATIO} times its own");
+            return Err(std::io::Error::new(
+                std::io::ErrorKind::FileTooLarge,
+                message,
+            ));
+        }
+        Ok(found)
+    }
+}
+
+/// Reads what follows the last file: blank blocks, gzip's own checksum and nothing else.
+fn check_end(mut archive: Bounded) -> std::io::Result<()> {
+    let wrong = |what| Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
+    let mut buffer = [0; 4096];
+    loop {
+        let read = archive.read(&mut buffer)?;
+        if read == 0 {
+            break;
+        }
+        if buffer[..read].iter().any(|byte| *byte != 0) {
+            return wrong("there are data after its end");
+        }
+    }
+    if archive.decoder.into_inner().read(&mut buffer)? > 0 {
+        return wrong("there are data after its end");
+    }
+    Ok(())
+}
+
+/// Whether a name is that of a file in the folder itself, on any system.
+fn is_plain_name(name: &str) -> bool {
+    !name.is_empty()
+        && !name.starts_with('.')
+        && !name.contains(|c: char| "/\\:".contains(c) || c.is_control())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The error of reading an archive of files, and bytes after its end.
+    fn refusal(files: &mut dyn Iterator<Item = (String, &[u8])>, after: u64) -> String {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.tar.gz");
+        let mut writer = ArchiveWriter::create(&path).unwrap();
+        for (name, bytes) in files {
+            writer.add(&name, bytes).unwrap();
+        }
+        writer.builder.finish().unwrap();
+        let zeros = std::io::repeat(0).take(after);
+        std::io::copy(&mut { zeros }, writer.builder.get_mut()).unwrap();
+        writer.finish().unwrap();
+        read(&path, None)
+            .err()
+            .map_or_else(String::new, |e| e.message)
+    }
+
+    #[test]
+    fn everything_in_an_archive_is_counted() {
+        let mut one = [("a".to_owned(), &b"x"[..])].into_iter();
+        assert_eq!(refusal(&mut one.clone(), 1 << 20), "");
+        let message = refusal(&mut one, 200 << 20);
+        assert!(message.contains("it unpacks to more than"), "{message}");
+        let mut empty = (0..30_000).map(|k| (format!("{k}"), &b""[..]));
+        let message = refusal(&mut empty, 0);
+        assert!(message.contains("it holds more than"), "{message}");
+        let zeros = vec![0; 64 << 20];
+        let message = refusal(&mut [("a".to_owned(), &zeros[..])].into_iter(), 0);
+        assert!(message.contains("it unpacks to more than"), "{message}");
+    }
+
+    #[test]
+    fn a_manifest_that_is_none_is_refused() {
+        for wrong in ["null", "[]", "{}", "1", "", "{\"method\": null}"] {
+            let mut files = [(MANIFEST_FILE.to_owned(), wrong.as_bytes())].into_iter();
+            let message = refusal(&mut files, 0);
+            assert!(
+                message.contains("is not one of a submission"),
+                "{wrong}: {message}"
+            );
+        }
+    }
+}

@@ -1,0 +1,274 @@
+//! Packing: measured catalogues become the files that a challenge takes, with a manifest.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use shearq_quantities::units::Degrees;
+use shearq_scoring::{
+    Convention, ConventionMatch, FieldSum, Grid, Options, Row, SetImages, SetScorer,
+    SpectrumCovariance,
+};
+
+use super::archive::{ArchiveWriter, is_archive};
+use super::challenge::{Kind, Spectrum, catalogue_text, spectrum_text};
+use super::manifest::{Contents, FileSum, MANIFEST_FILE, Manifest};
+use crate::foreign::Foreign;
+use crate::score::COLUMNS;
+use shearq_files::FileError;
+use shearq_files::atomic::PartFolder;
+use shearq_files::open::is_there;
+use shearq_files::table::{MAX_ROWS, most_rows};
+use shearq_pipeline::data::layout::{DataFolder, read_rows};
+use shearq_pipeline::data::listing::Files;
+use shearq_pipeline::data::run::Run;
+use shearq_pipeline::data::run::record_text;
+use shearq_pipeline::{Progress, grid, truth};
+
+/// The catalogues that are packed.
+pub enum Origin<'a> {
+    /// A folder that was measured.
+    Measured {
+        /// The folder.
+        folder: &'a Path,
+        /// Its record.
+        run: &'a Run,
+    },
+    /// Catalogues of another program.
+    Foreign {
+        /// Their description.
+        foreign: &'a Foreign,
+        /// What they were measured from, which gives the grid of spectra.
+        data: Option<&'a DataFolder>,
+    },
+}
+
+impl Origin<'_> {
+    fn catalogues(&self) -> Result<Files, FileError> {
+        match self {
+            Origin::Measured { folder, run } => run.catalogues(folder, &[]),
+            Origin::Foreign { foreign, .. } => {
+                let files = foreign.catalogues(&[])?;
+                if files.serve_all_sets() {
+                    let message = "the pattern of the catalogues has no {set}, by which packed files are called";
+                    return Err(FileError::new(foreign.pattern(), message));
+                }
+                Ok(files)
+            }
+        }
+    }
+
+    fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
+        match self {
+            Origin::Measured { .. } => read_rows(path, &COLUMNS, most),
+            Origin::Foreign { foreign, .. } => foreign.rows(path, most),
+        }
+    }
+
+    /// How well each convention goes with the true shear of a set, where another program's catalogues are
+    /// packed and it is known.
+    fn matching(
+        &self,
+        set: u32,
+        images: &SetImages,
+        grid: &Grid,
+    ) -> Result<ConventionMatch, FileError> {
+        match self {
+            Origin::Foreign {
+                data: Some(data), ..
+            } if is_there(&data.truth(set)) => {
+                let truth = data.read_truth(set, grid)?;
+                let scorer = SetScorer::new(*grid, truth, Options::default())
+                    .map_err(|error| FileError::new(data.truth(set), error))?;
+                Ok(scorer.match_convention(images))
+            }
+            _ => Ok(ConventionMatch::default()),
+        }
+    }
+
+    /// Grid of a set, of which `catalogue` is one.
+    fn grid(&self, set: u32, catalogue: &Path) -> Result<Grid, FileError> {
+        match self {
+            Origin::Measured { run, .. } => {
+                let field = Degrees(run.source.layout().field_degrees);
+                grid::of_catalogue(catalogue, &self.rows(catalogue, MAX_ROWS)?, field)
+            }
+            Origin::Foreign {
+                data: Some(data), ..
+            } => truth::grid_of_set(data, set),
+            Origin::Foreign { data: None, .. } => {
+                let message = "the grid is not known; --data DIR gives it for spectra";
+                Err(FileError::new(catalogue, message))
+            }
+        }
+    }
+}
+
+/// What is packed, and how.
+pub struct Packing<'a> {
+    /// The catalogues.
+    pub origin: Origin<'a>,
+    /// Method's name in file names.
+    pub method: String,
+    /// What the files are to hold.
+    pub contents: Contents,
+}
+
+impl Packing<'_> {
+    /// Number of galaxies to pack, for progress bars: an estimate from the first catalogue.
+    ///
+    /// # Errors
+    /// Where there is no catalogue, or it cannot be read.
+    pub fn galaxies(&self) -> Result<u64, FileError> {
+        let files = self.origin.catalogues()?;
+        let mut all = files.sets().into_iter().flat_map(|set| files.of_set(set));
+        let Some((_, first)) = all.next() else {
+            let place = match &self.origin {
+                Origin::Measured { folder, .. } => folder.to_path_buf(),
+                Origin::Foreign { foreign, .. } => foreign.pattern(),
+            };
+            return Err(FileError::new(place, "there is no catalogue here to pack"));
+        };
+        let rows = self.origin.rows(&first, MAX_ROWS)?.len();
+        Ok(((1 + all.count()) * rows) as u64)
+    }
+
+    /// Writes the files and their manifest to `out`, a new folder or, by its ending, an archive, which
+    /// appears whole or not at all. The same catalogues give the same bytes. Returns the number of
+    /// files without the manifest.
+    ///
+    /// # Errors
+    /// Where a catalogue cannot be read or `out` cannot be written.
+    pub fn write(&self, out: &Path, progress: &mut dyn Progress) -> Result<usize, FileError> {
+        let mut destination = Destination::create(out)?;
+        let mut files = BTreeMap::new();
+        let mut covariances = BTreeMap::new();
+        let mut matching = ConventionMatch::default();
+        let mut add = |kind: Kind, text: String| -> Result<(), FileError> {
+            let (name, mut bytes) = (kind.file_name(), text.as_bytes());
+            destination.add(&name, bytes)?;
+            let sum = FileSum::copying(&mut bytes, &mut std::io::sink())
+                .map_err(FileError::doing(out, "cannot add up"))?;
+            files.insert(name, sum);
+            Ok(())
+        };
+        let found = self.origin.catalogues()?;
+        for set in found.sets() {
+            let catalogues = found.of_set(set);
+            let method = self.method.clone();
+            let spectrum = match self.contents {
+                Contents::Catalogues => None,
+                Contents::Spectra => Some(Spectrum::Averaged),
+                Contents::CrossSpectra => Some(Spectrum::Cross),
+            };
+            if let Some(spectrum) = spectrum {
+                let kind = Kind::Spectrum { set, method };
+                let (text, covariance) =
+                    self.spectrum(set, &catalogues, spectrum, &mut matching, progress)?;
+                if let Some(covariance) = covariance {
+                    covariances.insert(kind.file_name(), covariance);
+                }
+                add(kind, text)?;
+                continue;
+            }
+            for (image, path) in catalogues {
+                let method = method.clone();
+                let rows = self.origin.rows(&path, MAX_ROWS)?;
+                add(
+                    Kind::Catalogue { set, image, method },
+                    catalogue_text(&rows),
+                )?;
+                progress.advance(rows.len() as u64);
+            }
+        }
+        if let (true, Origin::Foreign { foreign, .. }) = (matching.is_clear(), &self.origin)
+            && matching.convention() != Convention::STANDARD
+        {
+            let found = matching.convention();
+            let message = format!(
+                "by the true shear these catalogues are in convention {} ({}), of which no spectrum can tell; let the description exchange `x` and `y` or set `e2_sign`",
+                found.number(),
+                found.describe()
+            );
+            return Err(FileError::new(foreign.pattern(), message));
+        }
+        let count = files.len();
+        let (run, foreign) = match self.origin {
+            Origin::Measured { run, .. } => (Some(run.clone()), None),
+            Origin::Foreign { foreign, .. } => (None, Some(foreign.clone())),
+        };
+        let manifest = Manifest {
+            version: shearq_pipeline::VERSION.into(),
+            method: self.method.clone(),
+            contents: self.contents,
+            run,
+            foreign,
+            files,
+            covariances,
+        };
+        destination.add(MANIFEST_FILE, record_text(out, &manifest)?.as_bytes())?;
+        destination.finish()?;
+        Ok(count)
+    }
+
+    fn spectrum(
+        &self,
+        set: u32,
+        catalogues: &[(u32, PathBuf)],
+        spectrum: Spectrum,
+        matching: &mut ConventionMatch,
+        progress: &mut dyn Progress,
+    ) -> Result<(String, Option<SpectrumCovariance>), FileError> {
+        let first = &catalogues[0].1;
+        let grid = self.origin.grid(set, first)?;
+        let mut images = SetImages::new(&grid);
+        let mut used = 0;
+        for (_, path) in catalogues {
+            let mut sum = FieldSum::new(&grid);
+            let rows = self.origin.rows(path, most_rows(grid.cells()))?;
+            progress.advance(rows.len() as u64);
+            used += sum.add_image(&grid, rows).used;
+            images.add(&sum);
+        }
+        if used == 0 {
+            let message =
+                "neither this catalogue nor others of the set have an ellipticity on the grid";
+            return Err(FileError::new(first, message));
+        }
+        matching.merge(&self.origin.matching(set, &images, &grid)?);
+        spectrum_text(&grid, &images, spectrum).map_err(|error| FileError::new(first, error))
+    }
+}
+
+/// Where packed files go.
+enum Destination {
+    Folder(PartFolder),
+    Archive(Box<ArchiveWriter>),
+}
+
+impl Destination {
+    fn create(out: &Path) -> Result<Self, FileError> {
+        if is_archive(out) {
+            let archive = Box::new(ArchiveWriter::create(out)?);
+            return Ok(Destination::Archive(archive));
+        }
+        PartFolder::new(out).map(Destination::Folder)
+    }
+
+    fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), FileError> {
+        match self {
+            Destination::Archive(archive) => archive.add(name, bytes),
+            Destination::Folder(folder) => {
+                let path = folder.path().join(name);
+                std::fs::write(&path, bytes)
+                    .map_err(FileError::doing(&path, "cannot write the file"))
+            }
+        }
+    }
+
+    fn finish(self) -> Result<(), FileError> {
+        match self {
+            Destination::Archive(archive) => archive.finish(),
+            Destination::Folder(folder) => folder.finish(),
+        }
+    }
+}

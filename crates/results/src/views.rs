@@ -1,0 +1,9 @@
+//! Scores as tables, plots and pages.
+
+pub mod baseline;
+pub mod comparison;
+pub mod mean;
+pub mod pages;
+pub mod scores;
+pub mod spectrum;
+pub mod steps;

@@ -1,0 +1,325 @@
+//! Submissions and recorded runs side by side: the means of their figures, differences in Q and calibrated Q, and Q per set.
+
+use std::borrow::Borrow;
+use std::collections::BTreeSet;
+
+use ndarray::Array2;
+use shearq_files::frames::polars::AnyValue;
+use shearq_scoring::resample::PairedDifference;
+use shearq_scoring::{Definition, Figures};
+use shearq_submissions::Published;
+
+use crate::compare::{Paired, Variant, common_sets, difference, mean_figure};
+use crate::groups::{Group, Grouping};
+use crate::row::{RunRecord, SetRecord};
+use crate::views::scores::{best_is_another, definition_note, notes};
+use shearq_render::figure::{ColourMap, HeatMap};
+use shearq_render::table::{Cell, Heading, Table};
+
+/// The cell of a mean over sets of the figure called `name`.
+fn mean_cell(sets: &[&SetRecord], name: &str) -> Cell {
+    let (value, error) = mean_figure(sets, name);
+    let decimals = Figures::place(name).map_or(0, |place| Figures::ALL[place].decimals);
+    Cell::with_error(value, Some(error), decimals)
+}
+
+/// The heading of the figure called `name`.
+fn figure_heading(name: &'static str) -> Heading {
+    let label = Figures::place(name).map_or(name, |place| Figures::ALL[place].label);
+    Heading::new(name, label)
+}
+
+/// Heading of the leaderboard's Q, a detail where it is Q itself.
+fn leaderboard_heading<'a>(sets: impl Iterator<Item = &'a SetRecord>) -> Heading {
+    let apart = sets
+        .into_iter()
+        .any(|set| best_is_another(set.q_leaderboard, set.figures.q));
+    Heading {
+        detail: !apart,
+        ..Heading::new("q_leaderboard", "Q leaderboard")
+    }
+}
+
+/// The cell of the leaderboard's Q, the mean over sets.
+fn leaderboard_cell(sets: &[&SetRecord]) -> Cell {
+    let sum: f64 = sets.iter().map(|set| set.q_leaderboard).sum();
+    Cell::number(sum / sets.len() as f64, 2)
+}
+
+/// Differences from the first in Q and in calibrated Q; absent of the first itself.
+type Differences = Option<[Option<PairedDifference>; 2]>;
+
+/// Those of `sets` from `first`.
+fn differences<R: Borrow<SetRecord>>(first: &[R], sets: &[R]) -> [Option<PairedDifference>; 2] {
+    [Paired::Q, Paired::Calibrated].map(|figure| difference(figure, first, sets))
+}
+
+/// Headings of Q and calibrated Q, each with its difference and that one's significance.
+fn q_headings() -> [Heading; 6] {
+    [
+        figure_heading("q"),
+        Heading::new("q_difference", "ΔQ to first"),
+        Heading::new("sigma", "in σ"),
+        figure_heading("q_calibrated"),
+        Heading::new("q_calibrated_difference", "ΔQ cal."),
+        Heading::new("q_calibrated_sigma", "in σ"),
+    ]
+}
+
+/// Their cells.
+fn q_cells(sets: &[&SetRecord], differences: Differences) -> Vec<Cell> {
+    let differences = differences.unwrap_or_default();
+    let of = |(name, found): (&str, Option<PairedDifference>)| {
+        [
+            mean_cell(sets, name),
+            Cell::with_error(
+                found.map_or(f64::NAN, |d| d.difference),
+                found.map(|d| d.error),
+                2,
+            ),
+            Cell::number(found.map_or(f64::NAN, |d| d.sigma()), 1),
+        ]
+    };
+    ["q", "q_calibrated"]
+        .into_iter()
+        .zip(differences)
+        .flat_map(of)
+        .collect()
+}
+
+/// Why differences are absent, if any are.
+fn unpaired_note(names: &[&str]) -> Option<String> {
+    (!names.is_empty()).then(|| {
+        format!(
+            "No difference is given for {}: it needs the same images as the first, scored in one definition, and conventions that are known.",
+            names.join(", ")
+        )
+    })
+}
+
+/// Variants side by side over the sets that all of them have, with the significance of each one's
+/// difference in Q from the first, paired over the same images, and the published figures.
+pub fn compare(variants: &[Variant], definition: Definition) -> Table {
+    let records: Vec<Vec<SetRecord>> = variants.iter().map(Variant::records).collect();
+    let common = common_sets(&records);
+    let mut headings = vec![Heading::new("submission", "Submission")];
+    headings.extend(q_headings());
+    headings.extend([
+        figure_heading("galaxy_noise"),
+        figure_heading("m_cross"),
+        leaderboard_heading(records.iter().flatten()),
+        figure_heading("q_dn"),
+        figure_heading("m_half"),
+        figure_heading("sqrt_a"),
+        Heading::new("q_published", "Q publ."),
+        Heading::new("m_half_published", "M/2 publ."),
+        Heading::new("sqrt_a_published", "√A publ."),
+    ]);
+    let shown: Vec<&str> = headings.iter().map(|heading| heading.key).collect();
+    let others = || {
+        Figures::ALL
+            .iter()
+            .filter(|figure| !shown.contains(&figure.name))
+    };
+    let mut headings = headings.clone();
+    headings.extend(others().map(|figure| figure_heading(figure.name).detail()));
+    let mut rows = Vec::new();
+    let mut unpaired = Vec::new();
+    let mut first: Option<Vec<&SetRecord>> = None;
+    for (variant, records) in variants.iter().zip(&records) {
+        let sets: Vec<&SetRecord> = records
+            .iter()
+            .filter(|set| common.contains(&set.set))
+            .collect();
+        let differences = first.as_ref().map(|first| differences(first, &sets));
+        if matches!(differences, Some([None, _])) {
+            unpaired.push(variant.name.as_str());
+        }
+        let published = |value: fn(&Published) -> f64, decimals: usize| {
+            Cell::number(variant.published.as_ref().map_or(f64::NAN, value), decimals)
+        };
+        let mut row = vec![Cell::text(&variant.name)];
+        row.extend(q_cells(&sets, differences));
+        row.extend([
+            mean_cell(&sets, "galaxy_noise"),
+            mean_cell(&sets, "m_cross"),
+            leaderboard_cell(&sets),
+            mean_cell(&sets, "q_dn"),
+            mean_cell(&sets, "m_half"),
+            mean_cell(&sets, "sqrt_a"),
+            published(|p| p.q, 2),
+            published(|p| p.m_half, 4),
+            published(|p| p.sqrt_a, 4),
+        ]);
+        row.extend(others().map(|figure| mean_cell(&sets, figure.name)));
+        rows.push(row);
+        first.get_or_insert(sets);
+    }
+    let images: usize = first.iter().flatten().map(|set| set.images.len()).sum();
+    let list: Vec<String> = common.iter().map(u32::to_string).collect();
+    let mut lines = vec![
+        match list.as_slice() {
+            [one] => format!("Set {one}; {images} images."),
+            _ => format!("Means over sets {}; {images} images in all.", list.join(", ")),
+        },
+        definition_note(definition),
+        "ΔQ, ΔQ cal.: from the first, with the jackknife's error of the paired difference on the same images, without an error where a set has fewer than eight images. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
+    ];
+    lines.extend(unpaired_note(&unpaired));
+    for variant in variants {
+        for line in notes(&variant.sets).iter().chain(&variant.unscored) {
+            lines.push(format!("{}: {line}", variant.name));
+        }
+    }
+    Table {
+        title: "Comparison of submissions".into(),
+        headings,
+        rows,
+        notes: lines,
+    }
+}
+
+/// Runs side by side: means over their sets, or over groups of them, and the difference in Q from
+/// the first row, or the first of the same group, on the same images.
+pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<Grouping>) -> Table {
+    let mut headings = vec![
+        Heading::new("submission", "Submission"),
+        Heading::new("run", "Run"),
+        Heading::new("version", "Version").detail(),
+    ];
+    headings.extend(grouping.map(|grouping| {
+        let label = match grouping {
+            Grouping::Set => "Set",
+            Grouping::SetKind => "Kind",
+            Grouping::Psf => "PSF",
+            Grouping::Snr => "S/N",
+            Grouping::Size => "Size",
+        };
+        Heading::new(grouping.column(), label)
+    }));
+    headings.extend([
+        Heading::new("sets", "Sets"),
+        Heading::new("images", "Images"),
+    ]);
+    headings.extend(q_headings());
+    headings.extend([
+        figure_heading("galaxy_noise"),
+        figure_heading("m_cross"),
+        leaderboard_heading(groups.iter().flat_map(|group| group.sets.iter().copied())),
+        figure_heading("q_dn"),
+        figure_heading("m_half"),
+        figure_heading("sqrt_a"),
+    ]);
+    let mut rows = Vec::new();
+    let mut unpaired = Vec::new();
+    for (k, group) in groups.iter().enumerate() {
+        let first = groups[..k].iter().find(|other| other.value == group.value);
+        let differences = first.map(|first| match first.run.definition == group.run.definition {
+            true => differences(&first.sets, &group.sets),
+            false => [None; 2],
+        });
+        if matches!(differences, Some([None, _])) && !unpaired.contains(&group.id.as_str()) {
+            unpaired.push(group.id.as_str());
+        }
+        let mut row = vec![
+            Cell::text(&group.run.submission),
+            Cell::text(&group.id),
+            Cell::text(&group.run.version),
+        ];
+        row.extend(group.value.clone().map(|value| match value {
+            AnyValue::Int64(number) => Cell::number(number as f64, 0),
+            words => Cell::text(words.get_str().unwrap_or_default()),
+        }));
+        row.extend([
+            Cell::text(ranges(&group.sets)),
+            Cell::number(group.images() as f64, 0),
+        ]);
+        row.extend(q_cells(&group.sets, differences));
+        row.extend([
+            mean_cell(&group.sets, "galaxy_noise"),
+            mean_cell(&group.sets, "m_cross"),
+            leaderboard_cell(&group.sets),
+            mean_cell(&group.sets, "q_dn"),
+            mean_cell(&group.sets, "m_half"),
+            mean_cell(&group.sets, "sqrt_a"),
+        ]);
+        rows.push(row);
+    }
+    Table {
+        title: "Recorded runs".into(),
+        headings,
+        rows,
+        notes: run_notes(runs, grouping, &unpaired),
+    }
+}
+
+fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[&str]) -> Vec<String> {
+    let ways: BTreeSet<String> = runs
+        .iter()
+        .map(|run| {
+            format!(
+                "{} definition, {} convention, noise {}",
+                run.definition, run.choice, run.noise
+            )
+        })
+        .collect();
+    let several = ways.len() > 1;
+    let ways: Vec<String> = ways.into_iter().collect();
+    let mut notes = vec![format!(
+        "Means over the sets of each row. Figures: {}. √A in 10⁻⁴ for C_ℓ in steradian.",
+        ways.join("; ")
+    )];
+    if grouping.is_some() {
+        notes.push("ΔQ, ΔQ cal.: from the first row of the same group.".into());
+    }
+    if several {
+        notes.push("Warning: these runs were scored in different ways; choose one with --where definition=... or choice=...".into());
+    }
+    notes.extend(unpaired_note(unpaired));
+    notes
+}
+
+/// Sets as `1-3,7`.
+fn ranges(sets: &[&SetRecord]) -> String {
+    let texts = sets.chunk_by(|a, b| a.set + 1 == b.set).map(|run| {
+        let (first, last) = (run[0].set, run[run.len() - 1].set);
+        match first == last {
+            true => first.to_string(),
+            false => format!("{first}-{last}"),
+        }
+    });
+    texts.collect::<Vec<_>>().join(",")
+}
+
+/// Q of each set (column) and variant or run (row), and means over each row.
+pub fn q_heat_map<R: Borrow<SetRecord>>(variants: &[(String, Vec<R>)]) -> HeatMap {
+    let sets: BTreeSet<u32> = variants
+        .iter()
+        .flat_map(|(_, sets)| sets.iter().map(|set| set.borrow().set))
+        .collect();
+    let mut columns: Vec<String> = sets.iter().map(u32::to_string).collect();
+    columns.push("mean".into());
+    let mut values = Array2::from_elem((variants.len(), columns.len()), f64::NAN);
+    for (mut row, (_, own)) in values.rows_mut().into_iter().zip(variants) {
+        for (value, set) in row.iter_mut().zip(&sets) {
+            *value = own
+                .iter()
+                .map(Borrow::borrow)
+                .find(|own| own.set == *set)
+                .map_or(f64::NAN, |own| own.figures.q);
+        }
+        row[sets.len()] = mean_figure(own, "q").0;
+    }
+    let most = values.iter().copied().fold(f64::NAN, f64::max);
+    HeatMap {
+        title: "Quality factor per set".into(),
+        row_label: "submission".into(),
+        column_label: "set".into(),
+        rows: variants.iter().map(|(name, _)| name.clone()).collect(),
+        columns,
+        values,
+        decimals: if most < 10.0 { 2 } else { 1 },
+        value_label: "Q".into(),
+        map: ColourMap::Viridis,
+    }
+}

@@ -1,0 +1,488 @@
+//! Scores as tables and as JSON.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde_json::{Value, json};
+use shearq_scoring::resample::mean_over_sets;
+use shearq_scoring::{
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Figures, SetScore,
+    SpectrumScore,
+};
+
+use crate::score::{Basis, ScoredSet, means};
+use crate::views::spectrum;
+use shearq_render::table::{Cell, Heading, Table};
+use shearq_simulate::kinds::SetKind;
+
+fn figure_cells(figures: &Figures, errors: &Figures) -> Vec<Cell> {
+    let pairs = figures.values().into_iter().zip(errors.values());
+    let cells = pairs.zip(Figures::ALL);
+    cells
+        .map(|((value, error), figure)| Cell::with_error(value, Some(error), figure.decimals))
+        .collect()
+}
+
+/// Where kinds come from: catalogues of other sets may have the same numbers.
+const KINDS: &str = "Kinds are those of GREAT10's sets of these numbers.";
+
+/// What a set is called in tables.
+fn kind_label(set: Option<u32>) -> String {
+    set.and_then(SetKind::of)
+        .map_or_else(String::new, |kind| kind.image.label().to_owned())
+}
+
+/// One line that says what the figures are.
+pub(super) fn definition_note(definition: Definition) -> String {
+    let definition = match definition {
+        Definition::Leaderboard => "leaderboard definition (the challenge's own arithmetic)",
+        Definition::Corrected => "corrected definition (azimuthal averages, fixed bins)",
+    };
+    format!(
+        "Figures: {definition}. Errors: from what the truth leaves unexplained, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian; over its error it is twice as far from zero as A, and it has one where A is two of its own from zero."
+    )
+}
+
+/// Which convention the figures of a submission's sets are in, and why.
+pub fn convention_note(scored: &[ScoredSet]) -> String {
+    let Some(first) = scored.first() else {
+        return String::new();
+    };
+    let chosen = first.score.chosen;
+    let name = format!("{} ({})", chosen.number(), chosen.describe());
+    let constant = scored.iter().all(|set| set.score.constant.is_some());
+    match first.basis {
+        Basis::Told => format!("Convention {name}."),
+        Basis::HighestQ => {
+            "Convention: set by set the one with the highest Q, as the leaderboard took it.".into()
+        }
+        Basis::Matched(_) if constant => {
+            format!("Convention {name}: a shear that is the same everywhere does not tell it.")
+        }
+        Basis::Matched(matching) if matching.is_clear() => format!(
+            "Convention {name}, matched to the truth of all sets together (correlation {:.2}).",
+            matching.correlation(chosen)
+        ),
+        Basis::Matched(matching) => format!(
+            "Warning: the data do not tell the convention (best {}, correlation {:.2}; {:.2} more than any other would be clear); figures are in convention {name}, and differences from other submissions mean nothing. --convention sets one.",
+            matching.best().number(),
+            matching.correlation(matching.best()),
+            matching.least_clear()
+        ),
+    }
+}
+
+/// What readers of a submission's scores should know: its convention, sets whose leaderboard Q comes
+/// from another one, truth that looks misread, and what is odd about the catalogues.
+pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
+    let mut lines = vec![convention_note(scored)];
+    for ScoredSet {
+        set, score, rows, ..
+    } in scored
+    {
+        let name = set.map_or_else(|| "this set".to_owned(), |set| format!("set {set}"));
+        if rows.used == 0 {
+            lines.push(format!(
+                "Warning: no galaxy of {name} has an ellipticity; its figures are those of an empty submission."
+            ));
+        } else if let Some(mean) = &score.constant {
+            lines.push(format!(
+                "Note: the true shear of {name} is ({}, {}) everywhere, without power to compare: mean e = ({:.5} ± {:.5}, {:.5} ± {:.5}).",
+                mean.truth[0], mean.truth[1], mean.e[0], mean.error[0], mean.e[1], mean.error[1]
+            ));
+        } else if score.wrong_convention_wins() {
+            let [best, chosen] = [score.best, score.chosen].map(|k| {
+                let q = score.conventions[k.index()].quality.q;
+                format!(
+                    "convention {} ({}) with Q = {q:.2}",
+                    k.number(),
+                    k.describe()
+                )
+            });
+            lines.push(format!(
+                "Warning: in {name} the leaderboard takes {best}, where these figures are of {chosen}."
+            ));
+        }
+        if score.constant.is_none() && score.true_b_share() > 0.2 {
+            lines.push(format!(
+                "Warning: {:.0} % of the true power of {name} is in B modes; its g2 may have the other sign (--truth-sign).",
+                100.0 * score.true_b_share()
+            ));
+        }
+        lines.extend(rows.oddities(&name));
+    }
+    let blank = |set: &&ScoredSet| {
+        set.score.constant.is_none() && set.rows.used > 0 && set.score.figures.q_calibrated.is_nan()
+    };
+    let blank: Vec<String> = scored
+        .iter()
+        .filter(blank)
+        .filter_map(|set| Some(set.set?.to_string()))
+        .collect();
+    if !blank.is_empty() {
+        lines.push(format!(
+            "Note: no Q cal. and noise for set {}, whose response is less than three of its errors from zero: more galaxies tell.",
+            blank.join(", ")
+        ));
+    }
+    lines
+}
+
+/// What a set is called in a table's first column.
+fn set_cell(set: Option<u32>) -> Cell {
+    Cell::text(set.map_or_else(|| "–".into(), |set| format!("{set:02}")))
+}
+
+/// Figures per set, with a row of means where there are several sets.
+pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Table {
+    if scored.iter().all(|set| set.score.constant.is_some()) {
+        return constant_shear(scored, title);
+    }
+    let mut headings = vec![
+        Heading::new("set", "Set"),
+        Heading::new("kind", "Kind"),
+        Heading::new("images", "Images").detail(),
+    ];
+    headings.extend(Figures::ALL.iter().map(|figure| Heading {
+        detail: figure.detail,
+        ..Heading::new(figure.name, figure.label)
+    }));
+    headings.push(Heading::new("convention", "Conv.").detail());
+    let apart = scored
+        .iter()
+        .any(|set| best_is_another(q_leaderboard(&set.score), set.score.figures.q));
+    headings.push(Heading {
+        detail: !apart,
+        ..Heading::new("q_leaderboard", "Q leaderboard")
+    });
+    let mut rows = Vec::new();
+    for ScoredSet { set, score, .. } in scored {
+        let mut row = vec![
+            set_cell(*set),
+            Cell::text(kind_label(*set)),
+            Cell::number(score.images as f64, 0),
+        ];
+        row.extend(figure_cells(&score.figures, &score.errors));
+        row.push(Cell::text(score.chosen.number().to_string()));
+        row.push(Cell::number(q_leaderboard(score), 2));
+        rows.push(row);
+    }
+    if scored.len() > 1 {
+        let (mean, errors) = means(scored);
+        let mut row = vec![
+            Cell::text("mean"),
+            Cell::Empty,
+            Cell::number(scored.iter().map(|s| s.score.images as f64).sum(), 0),
+        ];
+        row.extend(figure_cells(&mean, &errors));
+        row.push(Cell::Empty);
+        let best: f64 = scored.iter().map(|s| q_leaderboard(&s.score)).sum();
+        row.push(Cell::number(best / scored.len() as f64, 2));
+        rows.push(row);
+    }
+    let counts: BTreeSet<usize> = scored.iter().map(|set| set.score.images).collect();
+    let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
+    let mut lines = vec![
+        format!("Images a set: {}. {KINDS}", counts.join(", ")),
+        definition_note(definition),
+    ];
+    lines.extend(notes(scored));
+    Table {
+        title: title.to_owned(),
+        headings,
+        rows,
+        notes: lines,
+    }
+}
+
+/// Whether the leaderboard's Q is of another class of conventions than the figures: within a class it is the
+/// same but for rounding, by 1e-7 at most.
+pub(super) fn best_is_another(q_leaderboard: f64, q: f64) -> bool {
+    (q_leaderboard / q - 1.0).abs() > 1e-6
+}
+
+/// Q of the best of the eight conventions; not a number where the truth has no power.
+fn q_leaderboard(score: &SetScore) -> f64 {
+    match score.constant {
+        None => score.conventions[score.best.index()].quality.q,
+        Some(_) => f64::NAN,
+    }
+}
+
+/// Means of sets whose true shear is the same everywhere.
+fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
+    let headings = [
+        ("set", "Set"),
+        ("images", "Images"),
+        ("e1", "mean e1"),
+        ("e2", "mean e2"),
+        ("g1", "true g1"),
+        ("g2", "true g2"),
+        ("c1", "c1"),
+        ("c2", "c2"),
+    ];
+    let rows = scored.iter().filter_map(|scored| {
+        let score = &scored.score;
+        let mean = score.constant?;
+        let shear = |value, error| Cell::with_error(value, Some(error), 5);
+        Some(vec![
+            set_cell(scored.set),
+            Cell::number(score.images as f64, 0),
+            shear(mean.e[0], mean.error[0]),
+            shear(mean.e[1], mean.error[1]),
+            Cell::number(mean.truth[0], 5),
+            Cell::number(mean.truth[1], 5),
+            shear(score.figures.c1, mean.error[0]),
+            shear(score.figures.c2, mean.error[1]),
+        ])
+    });
+    Table {
+        title: title.to_owned(),
+        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
+        rows: rows.collect(),
+        notes: notes(scored),
+    }
+}
+
+/// Figures of power-spectrum submissions, one row per set and one of means.
+pub fn spectra(
+    scored: &[(Option<u32>, SpectrumScore)],
+    title: &str,
+    definition: Definition,
+) -> Table {
+    let headings = vec![
+        Heading::new("set", "Set"),
+        Heading::new("kind", "Kind"),
+        Heading::new("q", "Q"),
+        Heading::new("sigma_sys_1e4", "σ_sys×10⁴"),
+        Heading::new("m_half", "M/2"),
+        Heading::new("sqrt_a", "√A×10⁴"),
+    ];
+    let figures = |score: &SpectrumScore| {
+        [
+            (score.quality.q, score.quality_error),
+            (score.quality.sigma_sys * 1e4, f64::NAN),
+            (score.m_half, score.m_half_error),
+            (score.sqrt_a, score.sqrt_a_error),
+        ]
+    };
+    let cells = |figures: [(f64, f64); 4]| {
+        let decimals = [2, 4, 4, 4];
+        let pairs = figures.into_iter().zip(decimals);
+        pairs.map(|((value, error), decimals)| Cell::with_error(value, Some(error), decimals))
+    };
+    let mut rows: Vec<Vec<Cell>> = scored
+        .iter()
+        .map(|(set, score)| {
+            let mut row = vec![set_cell(*set), Cell::text(kind_label(*set))];
+            row.extend(cells(figures(score)));
+            row
+        })
+        .collect();
+    if scored.len() > 1 {
+        let mean = |k: usize| {
+            let all: Vec<(f64, f64)> = scored.iter().map(|s| figures(&s.1)[k]).collect();
+            mean_over_sets(&all)
+        };
+        let mut row = vec![Cell::text("mean"), Cell::Empty];
+        row.extend(cells(std::array::from_fn(mean)));
+        rows.push(row);
+    }
+    let definition = match definition {
+        Definition::Leaderboard => "leaderboard",
+        Definition::Corrected => "corrected",
+    };
+    let errors = match scored.iter().all(|s| s.1.quality_error.is_nan()) {
+        true => "There are no errors: no covariance of the bandpowers is known.",
+        false => "Errors: from the covariance in the manifest, to first order.",
+    };
+    Table {
+        title: title.to_owned(),
+        headings,
+        rows,
+        notes: vec![format!(
+            "Figures: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian. {KINDS}"
+        )],
+    }
+}
+
+/// True and measured bandpowers of every set.
+pub fn bandpowers(scored: &[ScoredSet]) -> Table {
+    let power = |value: f64| Cell::number(value * 1e6, 4);
+    let mut rows = Vec::new();
+    for ScoredSet { set, score, .. } in scored {
+        let measured = score.spectra();
+        for b in spectrum::bins(&score.bins.l) {
+            rows.push(vec![
+                set.map_or(Cell::Empty, |set| Cell::number(f64::from(set), 0)),
+                Cell::number(b as f64 + 1.0, 0),
+                Cell::number(score.bins.l[b], 1),
+                power(score.true_ee[b]),
+                Cell::with_error(measured.ee[b] * 1e6, Some(score.ee_error[b] * 1e6), 4),
+                power(measured.bb[b]),
+                power(measured.eb[b]),
+            ]);
+        }
+    }
+    let headings = [
+        ("set", "Set"),
+        ("bin", "Bin"),
+        ("l", "ℓ"),
+        ("true_ee", "true EE×10⁶"),
+        ("ee", "EE×10⁶"),
+        ("bb", "BB×10⁶"),
+        ("eb", "EB×10⁶"),
+    ];
+    Table {
+        title: "Shear bandpowers ℓ²C_ℓ/2π of the scored bins".into(),
+        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
+        rows,
+        notes: vec!["Errors: from what the truth leaves unexplained, at fixed truth.".into()],
+    }
+}
+
+fn bias_json(bias: &Bias) -> Value {
+    json!({ "M": bias.M, "A": bias.A, "sqrtA": bias.sqrtA, "m": bias.m })
+}
+
+fn fits_json(fits: &BiasFits) -> Value {
+    json!({
+        "l2": bias_json(&fits.l2),
+        "mode": bias_json(&fits.mode),
+        "cl": bias_json(&fits.cl),
+        "cl_over_2pi": bias_json(&fits.cl_over_2pi),
+    })
+}
+
+fn class_json(score: &SetScore, representative: &ConventionScore, class: ConventionClass) -> Value {
+    let mut object = json!({
+        "EE": representative.ee,
+        "BB": representative.bb,
+        "EB": representative.eb,
+        "sigma_sys": representative.quality.sigma_sys,
+        "Q": representative.quality.q,
+        "corr": score.matching.class_correlation(class),
+        "M": representative.fit.cl.M,
+        "A": representative.fit.cl.A,
+        "sqrtA": representative.fit.cl.sqrtA,
+        "fit": fits_json(&representative.fit),
+    });
+    if let (Some(quality), Some(fit)) = (&representative.quality_dn, &representative.fit_dn) {
+        object["sigma_sys_dn"] = json!(quality.sigma_sys);
+        object["Q_dn"] = json!(quality.q);
+        object["fit_dn"] = fits_json(fit);
+    }
+    object
+}
+
+/// Keys of [`one_set_json`] that mean nothing where the true shear is the same everywhere.
+const OF_TRUE_POWER: [&str; 15] = [
+    "Q",
+    "sigma_sys",
+    "winner",
+    "winner_class",
+    "matched",
+    "matched_class",
+    "corr_matched",
+    "Q_matched",
+    "M",
+    "A",
+    "sqrtA",
+    "Q_dn",
+    "sigma_sys_dn",
+    "Q_per_convention",
+    "classes",
+];
+
+/// What one set's JSON says about its input.
+pub struct SetInput {
+    /// Name of the case.
+    pub case: String,
+    /// Truth file as given.
+    pub truth: String,
+    /// Catalogues as given.
+    pub catalogues: Vec<String>,
+    /// Bandpower definition.
+    pub definition: Definition,
+}
+
+/// Everything about one set scored from plain files, under the names that the public scoring cases
+/// use, with errors and null tests added.
+pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
+    let score = &scored.score;
+    let best = &score.conventions[score.best.index()];
+    let matched = &score.conventions[score.matching.best().index()];
+    let bins = &score.bins;
+    let per_convention: BTreeMap<String, f64> = score
+        .conventions
+        .iter()
+        .map(|c| (c.convention.number().to_string(), c.quality.q))
+        .collect();
+    let weights: Vec<f64> = (0..BINS).map(|b| bins.mode_weight(b)).collect();
+    let mut object = json!({
+        "case": input.case,
+        "description": format!(
+            "{} catalogue(s) scored by shearq {}",
+            input.catalogues.len(),
+            shearq_pipeline::VERSION
+        ),
+        "definition": input.definition,
+        "files": { "truth": input.truth, "catalogues": input.catalogues },
+        "n": score.grid.n,
+        "size_deg": score.grid.field.0,
+        "postage": score.grid.stamp.0,
+        "n_images": score.images,
+        "noise_var": score.noise_variance,
+        "l_min": score.grid.l_min().0,
+        "l_max": score.grid.l_max().0,
+        "dlogl": bins.width,
+        "n_modes": bins.modes,
+        "sum_l": bins.sum_l,
+        "W": weights,
+        "ll": bins.l,
+        "dll": bins.dln_l,
+        "P_noise": score.noise,
+        "truth": { "EE": score.true_ee, "BB": score.true_bb },
+        "submission": { "EE": best.ee, "BB": best.bb },
+        "Q": best.quality.q,
+        "sigma_sys": best.quality.sigma_sys,
+        "winner": score.best.number(),
+        "winner_class": score.best.class(),
+        "matched": matched.convention.number(),
+        "matched_class": matched.convention.class(),
+        "corr_matched": matched.correlation,
+        "Q_matched": matched.quality.q,
+        "M": best.fit.cl.M,
+        "A": best.fit.cl.A,
+        "sqrtA": best.fit.cl.sqrtA,
+        "Q_dn": best.quality_dn.map(|q| q.q),
+        "sigma_sys_dn": best.quality_dn.map(|q| q.sigma_sys),
+        "Q_per_convention": per_convention,
+        "classes": {
+            "A": class_json(score, &score.conventions[5], ConventionClass::A),
+            "B": class_json(score, &score.conventions[4], ConventionClass::B),
+        },
+    });
+    // What the public cases do not have.
+    let own = json!({
+        "chosen": score.chosen.number(),
+        "convention_known": scored.basis.is_known(),
+        "figures": score.figures,
+        "figure_errors": score.errors,
+        "error_method": "from the modes that the truth leaves unexplained, at fixed truth; c1 and c2 at least the jackknife over images",
+        "mean_shear": score.constant,
+        "rows": scored.rows,
+        "warnings": notes(std::slice::from_ref(scored)),
+    });
+    if let (Value::Object(object), Value::Object(own)) = (&mut object, own) {
+        object.extend(own);
+        if score.constant.is_some() {
+            // Nothing that needs a true power.
+            for (key, value) in object.iter_mut() {
+                if OF_TRUE_POWER.contains(&key.as_str()) {
+                    *value = Value::Null;
+                }
+            }
+        }
+    }
+    object
+}

@@ -1,0 +1,56 @@
+//! The picture of a set's shear power spectrum.
+
+use shearq_scoring::{BINS, SCORED};
+
+use shearq_render::figure::{LinePlot, Series, Style};
+use shearq_simulate::kinds::SetKind;
+
+/// Share of the highest power below which the truth has none.
+const ROUNDING: f64 = 1e-12;
+
+/// E-mode bandpowers of a set: (multipoles, truth, measured, standard errors).
+pub type Powers<'a> = [&'a [f64; BINS]; 4];
+
+/// The scored bins that have modes, of which small grids lack some: those with a multipole `l`.
+pub fn bins(l: &[f64; BINS]) -> impl Iterator<Item = usize> {
+    SCORED.filter(|&bin| l[bin] > 0.0)
+}
+
+/// The scored bandpowers of the true and of the measured shear, and the latter without those of its noise, where known.
+pub fn panel(
+    set: Option<u32>,
+    [l, truth, measured, errors]: Powers<'_>,
+    noise: Option<&[f64; BINS]>,
+) -> LinePlot {
+    // Small grids have at the highest multipole a truth that is rounding alone.
+    let highest = truth[SCORED].iter().copied().fold(0.0, f64::max);
+    let seen: Vec<usize> = bins(l)
+        .filter(|&bin| truth[bin] > ROUNDING * highest)
+        .collect();
+    let scored = |values: &[f64; BINS]| seen.iter().map(|&bin| values[bin]).collect::<Vec<_>>();
+    let title = set.map(|number| {
+        let kind = SetKind::of(number).map_or("", |kind| kind.image.label());
+        format!("Set {number} {kind}")
+    });
+    let mut series = vec![
+        Series::new("true", scored(l), scored(truth), Style::Line, 2),
+        Series::new("measured", scored(l), scored(measured), Style::Points, 5)
+            .with_errors(scored(errors)),
+    ];
+    if let Some(noise) = noise {
+        let rest = seen.iter().map(|&bin| measured[bin] - noise[bin]).collect();
+        series.push(
+            Series::new("less its noise", scored(l), rest, Style::Points, 0)
+                .with_errors(scored(errors)),
+        );
+    }
+    LinePlot {
+        title: title.unwrap_or_default(),
+        x_label: "ℓ".into(),
+        y_label: "ℓ²C_ℓ/2π".into(),
+        x_log: true,
+        y_log: true,
+        series,
+        ..LinePlot::default()
+    }
+}

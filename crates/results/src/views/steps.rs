@@ -1,0 +1,38 @@
+//! The steps of a measurement as pictures, after the paper's Fig. 3.
+
+use ndarray::Array2;
+use shearq_measure::Steps;
+
+use shearq_render::figure::{ColourMap, ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
+
+/// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, and the part of it that is used.
+pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
+    use ColourMap::{Diverging, Viridis};
+    let panel = |title: &str, image, map, stretch| ImagePanel {
+        title: title.into(),
+        image,
+        map,
+        stretch,
+        limits: None,
+    };
+    ImageRow {
+        label: label.into(),
+        panels: vec![
+            panel("Stamp", steps.stamp, Viridis, Stretch::Linear),
+            panel("PSF", psf, Viridis, Stretch::Asinh),
+            panel("Deconvolved", steps.deconvolved, Viridis, Stretch::Linear),
+            panel("Residual", steps.residual, Diverging, Stretch::Linear),
+            panel("ACF", steps.acf, Viridis, Stretch::Linear),
+            panel("ACF used", steps.used, Viridis, Stretch::Linear),
+        ],
+    }
+}
+
+/// Several galaxies, under a title to which the version is added.
+pub fn steps_figure(title: &str, rows: Vec<ImageRow>) -> ImageGrid {
+    ImageGrid {
+        title: format!("{title} (shearq {})", shearq_pipeline::VERSION),
+        rows,
+        scale: Scale::Own,
+    }
+}

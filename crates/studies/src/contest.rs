@@ -1,0 +1,214 @@
+//! Submissions held against each other and against what can be reached: scatter, bias, Q and cost.
+
+use serde::{Deserialize, Serialize};
+use shearq_scoring::resample::mean_over_sets;
+use shearq_submissions::Submission;
+
+use super::bias::{ShearBias, biases};
+use super::bound::{cramer_rao, sample_limit};
+use super::reproduce::{Plan, SetResult, Study, SubmissionResult};
+use super::speed;
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::data::run::{read_record, write_record};
+use shearq_pipeline::engine::Progress;
+use shearq_pipeline::run::measurers;
+use shearq_pipeline::simulate::simulator;
+use shearq_render::table::{Cell, Heading, Table};
+use shearq_simulate::kinds::SetKind;
+
+/// Biases of all submissions on one set, and the bound on their scatter.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SetBiases {
+    /// Set number.
+    pub set: u32,
+    /// Cramér–Rao bound on the scatter of ε per component, where there is one.
+    pub bound: Option<f64>,
+    /// Its standard error.
+    pub bound_error: Option<f64>,
+    /// Mean Q of spectra of the plan's images with a scatter at the bound.
+    pub limit: Option<f64>,
+    /// One per submission, in the plan's order.
+    pub biases: Vec<ShearBias>,
+}
+
+/// Measures biases on the galaxies of `images` images of each set, keeping each set's result.
+///
+/// # Errors
+/// Where a file cannot be written, or read back.
+pub fn bias_sets(
+    study: &Study<'_>,
+    sets: &[u32],
+    images: u32,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Vec<SetBiases>, PipelineError> {
+    let &Study { plan, folder, .. } = study;
+    let measurers = measurers(&plan.submissions)?;
+    let numbers: Vec<u32> = (1..=images).collect();
+    let mut found = Vec::new();
+    for &set in sets {
+        let path = folder.join(format!("bias/set{set:02}-{images}.json"));
+        if let Some(result) = read_record::<SetBiases>(&path)? {
+            found.push(result);
+            progress.skip(u64::from(images) * (plan.simulation.grid as u64).pow(2));
+            continue;
+        }
+        let simulator = simulator(set, plan.simulation)?;
+        progress.note(&format!("set {set:02}"));
+        let (bound, bound_error) = cramer_rao(&simulator).unzip();
+        let result = SetBiases {
+            set,
+            bound,
+            bound_error,
+            limit: bound.map(|bound| sample_limit(&simulator, bound, plan.images)),
+            biases: biases(&simulator, &numbers, &measurers, threads, progress)?,
+        };
+        write_record(&path, &result)?;
+        found.push(result);
+    }
+    Ok(found)
+}
+
+/// Everything about every submission on every set.
+///
+/// # Errors
+/// Where a submission's sizes cannot be worked with.
+pub fn contest_table(
+    plan: &Plan,
+    results: &[SetResult],
+    biases: &[SetBiases],
+) -> Result<Table, PipelineError> {
+    let costs = plan
+        .submissions
+        .iter()
+        .map(|submission| speed::whole(submission, plan.simulation))
+        .collect::<Result<Vec<f64>, _>>()?;
+    let mut rows = Vec::new();
+    for (result, bias) in results.iter().zip(biases) {
+        for (k, submission) in plan.submissions.iter().enumerate() {
+            rows.push(row(result, bias, k, submission, costs[k]));
+        }
+    }
+    if results.len() > 1 {
+        let limits: Vec<f64> = biases.iter().filter_map(|b| b.limit).collect();
+        let limit = limits.iter().sum::<f64>() / limits.len() as f64;
+        for (k, submission) in plan.submissions.iter().enumerate() {
+            let mean = |value: &dyn Fn(&SubmissionResult) -> (f64, f64), decimals: usize| {
+                let all: Vec<_> = results.iter().map(|r| value(&r.results[k])).collect();
+                let (mean, error) = mean_over_sets(&all);
+                Cell::with_error(mean, Some(error), decimals)
+            };
+            let mut row = vec![
+                Cell::text("mean"),
+                Cell::Empty,
+                Cell::text(&submission.name),
+            ];
+            row.extend((0..8).map(|_| Cell::Empty));
+            row.push(mean(&|r| (r.score.figures.q, r.score.errors.q), 1));
+            row.push(mean(&spectrum, 0));
+            row.push(Cell::number(limit, 0));
+            row.push(Cell::number(costs[k], 0));
+            rows.push(row);
+        }
+    }
+    let headings = [
+        ("set", "Set"),
+        ("kind", "Kind"),
+        ("submission", "Submission"),
+        ("scatter", "scatter"),
+        ("scatter_over_bound", "/ bound"),
+        ("m1", "m1×10³"),
+        ("m2", "m2×10³"),
+        ("c1", "c1×10⁴"),
+        ("c2", "c2×10⁴"),
+        ("leakage", "PSF leakage"),
+        ("unmeasured", "unmeasured"),
+        ("q", "Q catalogue"),
+        ("q_spectrum", "Q spectrum"),
+        ("q_limit", "limit"),
+        ("microseconds", "µs"),
+    ];
+    Ok(Table {
+        title: "Submissions against each other and the bound (simulated data)".into(),
+        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
+        rows,
+        notes: vec![
+            "Scatter of ε per component after dividing by its slope, and over the Cramér–Rao bound of the galaxies (none for bulges off their discs' centres), which is that of a sample of them. Where S/N differ galaxies of low S/N count less, and the scatter can be below it.".into(),
+            "m and c from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign; leakage: c along the PSF's ellipticity; unmeasured: galaxies without ellipticity, which all of these leave out.".into(),
+            "Q of the catalogues, and of cross-spectra between groups of images, in which noise has no mean; leaderboard definition, standard convention. limit: mean Q that noise at the bound leaves of a perfect spectrum.".into(),
+        ],
+    })
+}
+
+/// Two tables that fit on a page: scatter and biases; Q and cost.
+pub fn contest_parts(table: &Table) -> [Table; 2] {
+    let (biases, quality) = table.notes.split_at(2);
+    let shapes = [
+        "set",
+        "kind",
+        "submission",
+        "scatter",
+        "scatter_over_bound",
+        "m1",
+        "m2",
+        "c1",
+        "c2",
+        "leakage",
+        "unmeasured",
+    ];
+    let spectra = [
+        "set",
+        "kind",
+        "submission",
+        "q",
+        "q_spectrum",
+        "q_limit",
+        "microseconds",
+    ];
+    [
+        table.part(&shapes, "Scatter and biases (simulated data)", biases),
+        table.part(&spectra, "Quality and cost (simulated data)", quality),
+    ]
+}
+
+fn row(
+    result: &SetResult,
+    bias: &SetBiases,
+    k: usize,
+    submission: &Submission,
+    cost: f64,
+) -> Vec<Cell> {
+    let (own, biases) = (&result.results[k], &bias.biases[k]);
+    let scaled = |value: f64, error: f64, scale: f64| {
+        Cell::with_error(value * scale, Some(error * scale), 1)
+    };
+    let (scatter, scatter_error) = (own.response.rms_scatter(), own.response.rms_scatter_error());
+    let bound = bias.bound.unwrap_or(f64::NAN);
+    let relative = (scatter_error / scatter).hypot(bias.bound_error.unwrap_or(f64::NAN) / bound);
+    let (q_spectrum, q_spectrum_error) = spectrum(own);
+    vec![
+        Cell::text(format!("{:02}", result.set)),
+        Cell::text(SetKind::of(result.set).map_or("", |kind| kind.image.label())),
+        Cell::text(&submission.name),
+        Cell::with_error(scatter, Some(scatter_error), 5),
+        Cell::with_error(scatter / bound, Some(scatter / bound * relative), 3),
+        scaled(biases.m[0], biases.m_error[0], 1e3),
+        scaled(biases.m[1], biases.m_error[1], 1e3),
+        scaled(biases.c[0], biases.c_error[0], 1e4),
+        scaled(biases.c[1], biases.c_error[1], 1e4),
+        Cell::with_error(biases.leakage, Some(biases.leakage_error), 3),
+        Cell::number((own.response.flagged + biases.dropped) as f64, 0),
+        Cell::with_error(own.score.figures.q, Some(own.score.errors.q), 1),
+        Cell::with_error(q_spectrum, Some(q_spectrum_error), 0),
+        Cell::number(bias.limit.unwrap_or(f64::NAN), 0),
+        Cell::number(cost, 0),
+    ]
+}
+
+/// Q of a submission's cross-spectrum and its error.
+fn spectrum(result: &SubmissionResult) -> (f64, f64) {
+    (
+        result.q_spectrum.unwrap_or(f64::NAN),
+        result.q_spectrum_error.unwrap_or(f64::NAN),
+    )
+}

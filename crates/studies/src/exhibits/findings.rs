@@ -1,0 +1,312 @@
+//! The paper's qualitative statements, held against results.
+
+use shearq_scoring::Figures;
+use shearq_scoring::resample::mean_over_sets;
+
+use super::sets::{mean_of_24, weighted};
+use crate::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, LambdaSums, PAPER_LAMBDA, SNR_DB};
+use crate::reproduce::SetResult;
+use shearq_render::table::{Cell, Heading, Table};
+use shearq_results::compare::{Paired, difference};
+use shearq_simulate::kinds::{ImageType, SetKind};
+
+/// One qualitative statement of the paper and what the simulation says.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Finding {
+    /// What the paper says.
+    pub paper: &'static str,
+    /// What was found here.
+    pub here: String,
+    /// Whether they agree; `None` where the errors do not tell.
+    pub agrees: Option<bool>,
+}
+
+/// Mean difference in Q of `second` from `first` over the challenge's 24 sets: (ΔQ, error, Q of the first).
+fn q_difference(results: &[SetResult], first: usize, second: usize) -> Option<(f64, f64, f64)> {
+    let of_set = |set: &SetResult| {
+        let [a, b] = [first, second].map(|submission| &set.results[submission].score);
+        difference(Paired::Q, &[a], &[b]).map(|paired| (paired.difference, paired.error))
+    };
+    let differences = results.iter().map(of_set).collect::<Option<Vec<_>>>()?;
+    let (difference, error) = weighted(results, &differences);
+    Some((difference, error, mean_of_24(results, first, |f| f.q).0))
+}
+
+/// A value with its error as a sentence has them.
+fn with_error(value: f64, error: f64, decimals: usize) -> String {
+    Cell::with_error(value, Some(error), decimals).in_words()
+}
+
+/// The paper's qualitative findings (Sect. 5.3) held against `results`.
+pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
+    let place = |name: &str| names.iter().position(|n| n == name);
+    let mut found = Vec::new();
+    let mut compare = |paper, first: &str, second: &str, expected: fn(f64, f64) -> Option<bool>| {
+        let (Some(a), Some(b)) = (place(first), place(second)) else {
+            return;
+        };
+        let Some((difference, error, mean)) = q_difference(results, a, b) else {
+            return;
+        };
+        found.push(Finding {
+            paper,
+            here: format!(
+                "Q of {second} from that of {first}: {} %",
+                with_error(100.0 * difference / mean, 100.0 * error / mean, 1)
+            ),
+            agrees: expected(difference / mean, error / mean),
+        });
+    };
+    let higher: fn(f64, f64) -> Option<bool> = |d, e| {
+        // Without an error nothing is told.
+        (d.abs() >= 2.0 * e).then_some(d > 0.0)
+    };
+    compare(
+        "Denoising improves Q (star PSF)",
+        "23/raw/star",
+        "23/den/star",
+        higher,
+    );
+    compare("by 5 to 10 %", "23/raw/star", "23/den/star", |d, e| {
+        let inside = d - e > 0.05 && d + e < 0.10;
+        let outside = d + 2.0 * e < 0.05 || d - 2.0 * e > 0.10;
+        (inside || outside).then_some(inside)
+    });
+    compare(
+        "Denoising improves Q (functional PSF)",
+        "23/raw/func",
+        "23/den/func",
+        higher,
+    );
+    compare(
+        "Larger stamps improve Q",
+        "23/den/func",
+        "29/den/func",
+        higher,
+    );
+    compare(
+        "Star and functional PSF give much the same Q",
+        "23/den/func",
+        "23/den/star",
+        // The paper's own two differ by 4 %.
+        |d, _| Some(d.abs() < 0.05),
+    );
+    let Some(den) = place("23/den/star") else {
+        return found;
+    };
+    // Mean Q over the sets of a kind, and its error.
+    let mean_of = |wanted: ImageType| -> Option<(f64, f64)> {
+        let values: Vec<(f64, f64)> = results
+            .iter()
+            .filter(|set| SetKind::of(set.set).is_some_and(|kind| kind.image == wanted))
+            .map(|set| &set.results[den].score)
+            .map(|score| (score.figures.q, score.errors.q))
+            .collect();
+        (!values.is_empty()).then(|| mean_over_sets(&values))
+    };
+    let fiducial = mean_of(ImageType::Fiducial);
+    let mut kinds = |paper, label: &str, kind: ImageType, above: bool| {
+        if let (Some((q, error)), Some((base, base_error))) = (mean_of(kind), fiducial) {
+            let told = (q - base).abs() > 2.0 * error.hypot(base_error);
+            found.push(Finding {
+                paper,
+                here: format!(
+                    "{label}: Q {}, fiducial {}",
+                    with_error(q, error, 1),
+                    with_error(base, base_error, 1)
+                ),
+                agrees: told.then_some((q > base) == above),
+            });
+        }
+    };
+    kinds(
+        "Q is good for sets 10 and 11 (smooth S/N)",
+        "smooth S/N",
+        ImageType::SmoothSnr,
+        true,
+    );
+    kinds(
+        "Q is good for sets 17 and 18 (smooth galaxies)",
+        "smooth galaxies",
+        ImageType::SmoothGalaxy,
+        true,
+    );
+    kinds("Q is poor at low S/N", "low S/N", ImageType::LowSnr, false);
+    kinds(
+        "Q is poor for small galaxies",
+        "small galaxies",
+        ImageType::SmallGalaxy,
+        false,
+    );
+    kinds(
+        "Q is best for offset bulges (sets 23, 24)",
+        "offset bulges",
+        ImageType::OffsetBulge,
+        true,
+    );
+    kinds(
+        "Q is best for turbulent PSFs (set 20)",
+        "Kolmogorov PSF",
+        ImageType::Kolmogorov,
+        true,
+    );
+    if let Some(raw) = place("23/raw/star") {
+        let mut bias = |paper, figure: fn(&Figures) -> f64, name: &str, lower: bool| {
+            let mean = |place: usize| mean_of_24(results, place, figure);
+            let ((raw, raw_error), (den, den_error)) = (mean(raw), mean(den));
+            let error = raw_error.hypot(den_error);
+            let change = den.abs() - raw.abs();
+            found.push(Finding {
+                paper,
+                here: format!(
+                    "{name}: raw {}, denoised {}",
+                    with_error(raw, raw_error, 4),
+                    with_error(den, den_error, 4)
+                ),
+                agrees: (change.abs() > error).then_some((change < 0.0) == lower),
+            });
+        };
+        bias(
+            "Denoising decreases the multiplicative bias",
+            |f| f.m_half,
+            "M/2",
+            true,
+        );
+        bias(
+            "Denoising slightly increases the additive bias",
+            |f| f.sqrt_a,
+            "√A×10⁴",
+            false,
+        );
+    }
+    found
+}
+
+/// Ranges of values over curves, as words.
+fn range(values: impl Iterator<Item = f64>, decimals: usize) -> String {
+    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+        (low.min(v), high.max(v))
+    });
+    format!("{low:.decimals$} to {high:.decimals$}")
+}
+
+/// The paper's qualitative findings of Sect. 4 held against `curves`.
+pub fn lambda_findings(curves: &Curves) -> Vec<Finding> {
+    let [adaptive, constant] = [&curves.over_lambda[0], &curves.over_lambda[1]];
+    let over_snr = |rule: usize| curves.over_snr[rule].iter().map(LambdaSums::ctr);
+    let weak = PAPER_LAMBDA;
+    let rising = |values: Vec<f64>| values.windows(2).all(|pair| pair[1] > pair[0]);
+    let ctr_rises = rising(adaptive.iter().map(|curve| curve[weak].ctr()).collect());
+    let dsnr_rises = rising(adaptive.iter().map(|c| c[weak].mean_dsnr()).collect());
+    let strongest = LOG_LAMBDA.len() - 1;
+    let dsnr_falls = adaptive
+        .iter()
+        .all(|curve| curve[strongest].mean_dsnr() < curve[weak].mean_dsnr());
+    let best = |curve: &[LambdaSums]| {
+        let best = (0..curve.len()).max_by(|a, b| curve[*a].ctr().total_cmp(&curve[*b].ctr()));
+        LOG_LAMBDA[best.unwrap_or(0)]
+    };
+    // 1/RMSD of the adaptive rule over that of the constant one.
+    let gains = |snr: usize, from: usize, to: usize| -> Vec<f64> {
+        (from..=to)
+            .map(|k| adaptive[snr][k].inverse_rmsd() / constant[snr][k].inverse_rmsd())
+            .collect()
+    };
+    let small: Vec<f64> = (0..SNR_DB.len())
+        .flat_map(|snr| gains(snr, 0, weak))
+        .collect();
+    let large = |snr: usize| gains(snr, weak + 1, strongest);
+    let everywhere = |gains: &[f64]| gains.iter().all(|gain| *gain >= 1.0);
+    let quiet: Vec<f64> = (1..SNR_DB.len()).flat_map(large).collect();
+    vec![
+        Finding {
+            paper: "Whatever the S/N, the adaptive update has the higher CTR",
+            here: format!(
+                "CTR {} adaptive, {} constant, from {} to {} dB",
+                range(over_snr(0), 2),
+                range(over_snr(1), 2),
+                CTR_SNR_DB[0],
+                CTR_SNR_DB[CTR_SNR_DB.len() - 1]
+            ),
+            agrees: Some(over_snr(0).zip(over_snr(1)).all(|(a, c)| a > c)),
+        },
+        Finding {
+            paper: "CTR increases with S/N",
+            here: format!(
+                "at λ = 10⁻⁴ it is {} at 10, 20 and 40 dB",
+                adaptive
+                    .iter()
+                    .map(|curve| format!("{:.3}", curve[weak].ctr()))
+                    .collect::<Vec<_>>()
+                    .join(", ")
+            ),
+            agrees: Some(ctr_rises),
+        },
+        Finding {
+            paper: "CTR is highest at λ = 10^−3.5",
+            here: format!(
+                "highest at λ = 10^{} at 10, 20 and 40 dB",
+                adaptive
+                    .iter()
+                    .map(|curve| format!("{:.1}", best(curve)))
+                    .collect::<Vec<_>>()
+                    .join(", 10^")
+            ),
+            agrees: Some(adaptive.iter().all(|curve| best(curve) == -3.5)),
+        },
+        Finding {
+            paper: "dSNR is higher for higher S/N and decreases with λ",
+            here: format!(
+                "at λ = 10⁻⁴ {} dB, at 10⁶ {} dB",
+                range(adaptive.iter().map(|c| c[weak].mean_dsnr()), 2),
+                range(adaptive.iter().map(|c| c[strongest].mean_dsnr()), 2)
+            ),
+            agrees: Some(dsnr_rises && dsnr_falls),
+        },
+        Finding {
+            paper: "1/RMSD of the adaptive update is the better one for λ ≤ 10⁻⁴, whatever the S/N",
+            here: format!(
+                "{} times that of the constant one",
+                range(small.iter().copied(), 2)
+            ),
+            agrees: Some(everywhere(&small)),
+        },
+        Finding {
+            paper: "and beyond at 20 and 40 dB",
+            here: format!("{} times", range(quiet.iter().copied(), 2)),
+            agrees: Some(everywhere(&quiet)),
+        },
+        Finding {
+            paper: "but not at 10 dB",
+            here: format!("{} times", range(large(0).into_iter(), 2)),
+            agrees: Some(!everywhere(&large(0))),
+        },
+    ]
+}
+
+/// Findings as a table.
+pub fn findings_table(findings: &[Finding]) -> Table {
+    Table {
+        title: "The paper's findings".into(),
+        headings: vec![
+            Heading::new("agrees", "Agrees"),
+            Heading::new("paper", "The paper"),
+            Heading::new("here", "Here"),
+        ],
+        rows: findings
+            .iter()
+            .map(|f| {
+                vec![
+                    Cell::text(match f.agrees {
+                        Some(true) => "yes",
+                        Some(false) => "no",
+                        None => "not told",
+                    }),
+                    Cell::text(f.paper),
+                    Cell::text(&f.here),
+                ]
+            })
+            .collect(),
+        notes: Vec::new(),
+    }
+}

@@ -1,0 +1,172 @@
+//! How measured ellipticities follow the true ones, galaxy by galaxy.
+
+use serde::{Deserialize, Serialize};
+use shearq_measure::Measurement;
+use shearq_quantities::Shear;
+
+use shearq_pipeline::data::run::nan_for_null;
+
+/// Least squares of measured against true ellipticities, component by component:
+/// e = slope·ε + offset + noise.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Regression {
+    galaxies: u64,
+    flagged: u64,
+    components: [PairSums; 2],
+}
+
+/// PairSums over galaxies of one component.
+#[derive(Debug, Clone, Copy, Default)]
+struct PairSums {
+    t: f64,
+    e: f64,
+    tt: f64,
+    te: f64,
+    ee: f64,
+}
+
+/// What a regression finds.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Response {
+    /// Galaxies used.
+    pub galaxies: u64,
+    /// Galaxies left out because they are flagged.
+    pub flagged: u64,
+    /// Slope of the reported ellipticity against the true shear-type one, per component.
+    #[serde(deserialize_with = "nan_for_null")]
+    pub slope: [f64; 2],
+    /// Standard errors of the slopes.
+    #[serde(deserialize_with = "nan_for_null")]
+    pub slope_error: [f64; 2],
+    /// Reported ellipticity of a round galaxy.
+    #[serde(deserialize_with = "nan_for_null")]
+    pub offset: [f64; 2],
+    /// Standard errors of the offsets.
+    #[serde(deserialize_with = "nan_for_null")]
+    pub offset_error: [f64; 2],
+    /// Standard deviation of the ellipticity about the line, divided by the slope: the scatter of a
+    /// calibrated ε.
+    #[serde(deserialize_with = "nan_for_null")]
+    pub scatter: [f64; 2],
+}
+
+impl Regression {
+    /// Adds galaxies.
+    pub fn add<'a>(&mut self, galaxies: impl Iterator<Item = (Shear, &'a Measurement)>) {
+        for (truth, measured) in galaxies {
+            if !measured.flags.is_empty() {
+                self.flagged += 1;
+                continue;
+            }
+            self.galaxies += 1;
+            let pairs = [(truth.e1, measured.e1), (truth.e2, measured.e2)];
+            for (sums, (t, e)) in self.components.iter_mut().zip(pairs) {
+                sums.t += t;
+                sums.e += e;
+                sums.tt += t * t;
+                sums.te += t * e;
+                sums.ee += e * e;
+            }
+        }
+    }
+
+    /// The fit; not a number where there are too few galaxies.
+    pub fn response(&self) -> Response {
+        let n = self.galaxies as f64;
+        let mut response = Response {
+            galaxies: self.galaxies,
+            flagged: self.flagged,
+            slope: [0.0; 2],
+            slope_error: [0.0; 2],
+            offset: [0.0; 2],
+            offset_error: [0.0; 2],
+            scatter: [0.0; 2],
+        };
+        for (k, s) in self.components.iter().enumerate() {
+            let (mean_t, mean_e) = (s.t / n, s.e / n);
+            let tt = s.tt / n - mean_t * mean_t;
+            let te = s.te / n - mean_t * mean_e;
+            let ee = s.ee / n - mean_e * mean_e;
+            let slope = te / tt;
+            let noise = ((ee - slope * te) * n / (n - 2.0)).max(0.0).sqrt();
+            response.slope[k] = slope;
+            response.offset[k] = mean_e - slope * mean_t;
+            response.slope_error[k] = noise / (n * tt).sqrt();
+            response.offset_error[k] = noise / n.sqrt();
+            response.scatter[k] = noise / slope.abs();
+        }
+        response
+    }
+}
+
+impl Response {
+    /// Root mean square over the components of the calibrated scatter.
+    pub fn rms_scatter(&self) -> f64 {
+        (self.scatter.iter().map(|s| s * s).sum::<f64>() / 2.0).sqrt()
+    }
+
+    /// Standard error of [`Response::rms_scatter`] for Gaussian noise.
+    pub fn rms_scatter_error(&self) -> f64 {
+        self.rms_scatter() / (4.0 * self.galaxies as f64).sqrt()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+    use shearq_measure::{Flag, Flags};
+
+    #[test]
+    fn records_of_nothing_measured_can_be_read_back() {
+        let empty = Regression::default().response();
+        let text = serde_json::to_string(&empty).unwrap();
+        let read: Response = serde_json::from_str(&text).unwrap();
+        assert!(read.slope[0].is_nan() && read.scatter[1].is_nan());
+        assert_eq!(serde_json::to_string(&read).unwrap(), text);
+    }
+
+    #[test]
+    fn a_line_with_noise_is_found_and_flagged_galaxies_are_left_out() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut normal = |scale: f64| -> f64 {
+            let draw: f64 = StandardNormal.sample(&mut rng);
+            scale * draw
+        };
+        let mut regression = Regression::default();
+        let galaxies: Vec<(Shear, Measurement)> = (0..40_000)
+            .map(|k| {
+                let truth = Shear::new(normal(0.14), normal(0.14));
+                let measured = Measurement {
+                    e1: 0.5 * truth.e1 + 0.01 + normal(0.06),
+                    e2: 0.8 * truth.e2 - 0.02 + normal(0.06),
+                    flags: match k % 10 {
+                        0 => Flag::NoLight.into(),
+                        _ => Flags::NONE,
+                    },
+                    response: [f64::NAN; 2],
+                    descent: None,
+                    noise: 1.0,
+                    flux: 1.0,
+                    radius: 1.0,
+                    size: 1.0,
+                };
+                (truth, measured)
+            })
+            .collect();
+        regression.add(galaxies.iter().map(|(t, m)| (*t, m)));
+        let found = regression.response();
+        assert_eq!((found.galaxies, found.flagged), (36_000, 4_000));
+        for (k, (slope, offset)) in [(0.5, 0.01), (0.8, -0.02)].into_iter().enumerate() {
+            // Five of the errors that the fit itself states, and 1 % on them and on the scatter
+            // (1/√(2·36000) is 0.4 %).
+            assert!((found.slope[k] - slope).abs() < 5.0 * found.slope_error[k]);
+            assert!((found.offset[k] - offset).abs() < 5.0 * found.offset_error[k]);
+            let expected = 0.06 / (0.14 * 36_000f64.sqrt());
+            assert!((found.slope_error[k] / expected - 1.0).abs() < 0.02);
+            assert!((found.scatter[k] / (0.06 / slope) - 1.0).abs() < 0.02);
+        }
+    }
+}

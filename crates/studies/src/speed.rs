@@ -1,0 +1,623 @@
+//! Speed on the user's machine: stages of a measurement, stamp sizes, threads, scoring.
+
+use std::hint::black_box;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use ndarray::ArrayView2;
+use shearq_measure::parts::{
+    AdaptiveMoments, ClippedAcf, Matrices, Network, Rule, Spectral, StampFft, Step, WaveletWiener,
+    border_noise,
+};
+use shearq_measure::{Measurer, StampNoise};
+use shearq_quantities::units::{Degrees, Pixels};
+use shearq_scoring::{Options, TruthSign};
+use shearq_submissions::{
+    Clipping, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut, Start, Submission,
+    Update,
+};
+
+use shearq_files::frames::frame;
+use shearq_files::frames::polars::Column;
+
+use shearq_files::FileError;
+use shearq_files::atomic::{self, Scratch};
+use shearq_files::table::{self, FileFormat};
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::engine::Quiet;
+use shearq_pipeline::run::{measurers, run_set};
+use shearq_pipeline::simulate::simulator;
+use shearq_pipeline::truth::Reading;
+use shearq_render::figure::{LinePlot, Series, Style};
+use shearq_render::table::{Cell, Heading, Table};
+use shearq_results::foreign::{Screen, plain_columns};
+use shearq_results::score::{COLUMNS, score_files};
+use shearq_simulate::render::RenderScratch;
+use shearq_simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, SimulationSettings};
+
+/// Different noisy galaxies that a timing runs through, so that no branch is learnt by heart.
+const SAMPLE: usize = 64;
+/// Longest time spent on one figure.
+const BUDGET: Duration = Duration::from_millis(400);
+/// Stamp sizes of the table of costs.
+pub const SIZES: [usize; 8] = [11, 15, 19, 23, 29, 33, 39, 48];
+
+/// Microseconds a call: the fastest of several passes over `SAMPLE` galaxies, after a warm-up.
+pub(super) fn time(mut call: impl FnMut(usize)) -> f64 {
+    for k in 0..SAMPLE {
+        call(k);
+    }
+    let begin = Instant::now();
+    let mut best = f64::INFINITY;
+    while begin.elapsed() < BUDGET {
+        let start = Instant::now();
+        for k in 0..SAMPLE {
+            call(k);
+        }
+        best = best.min(start.elapsed().as_secs_f64() * 1e6 / SAMPLE as f64);
+    }
+    best
+}
+
+/// A full stamp.
+fn view(stamp: &[f32]) -> ArrayView2<'_, f32> {
+    ArrayView2::from_shape((STAMP, STAMP), stamp).expect("a stamp of the set's size")
+}
+
+/// Settings of a submission's network.
+///
+/// # Errors
+/// Where it has the linear method.
+pub(super) fn network_of(submission: &Submission) -> Result<&NetworkMethod, PipelineError> {
+    submission.network().ok_or_else(|| {
+        PipelineError::Request(format!(
+            "submission {} has method = \"linear\"; expected \"network\"",
+            submission.name
+        ))
+    })
+}
+
+/// Stamps of the fiducial set, and its PSF at a size.
+pub(super) struct Inputs {
+    set: SetSimulator,
+    stamps: Vec<Vec<f32>>,
+}
+
+impl Inputs {
+    pub(super) fn new(settings: SimulationSettings) -> Result<Self, PipelineError> {
+        let set = simulator(2, settings)?;
+        let fields = set.image_fields(1);
+        let mut scratch = RenderScratch::new();
+        let n = set.grid().n;
+        let stamps = (0..SAMPLE)
+            .map(|k| {
+                let mut stamp = vec![0.0; STAMP * STAMP];
+                set.draw(&fields, k % n, k / n, &mut scratch, &mut stamp);
+                stamp
+            })
+            .collect();
+        Ok(Inputs { set, stamps })
+    }
+
+    pub(super) fn psf(&self, cut: impl Into<PsfCut>) -> ndarray::Array2<f64> {
+        let fields = self.set.image_fields(1);
+        fields.psf.at(0, 0).stamp_beside(cut.into().size, STAMP)
+    }
+
+    /// Microseconds of a whole measurement, the PSF being taken already.
+    fn whole(&self, submission: &Submission) -> Result<f64, PipelineError> {
+        let psf = self.psf(submission.psf_cut());
+        let mut worker = Measurer::new(submission, STAMP)?.worker();
+        worker.set_psf(psf.view())?;
+        Ok(time(|k| {
+            let _ = black_box(worker.measure(view(&self.stamps[k]), Some(NOISE_SIGMA)));
+        }))
+    }
+
+    /// Microseconds of taking a PSF.
+    fn taking_a_psf(&self, submission: &Submission) -> Result<f64, PipelineError> {
+        let psf = self.psf(submission.psf_cut());
+        let mut worker = Measurer::new(submission, STAMP)?.worker();
+        Ok(time(|_| {
+            let _ = worker.set_psf(black_box(psf.view()));
+        }))
+    }
+
+    /// The stamps, cut to n×n.
+    pub(super) fn cuts(&self, n: usize) -> Vec<Vec<f32>> {
+        self.stamps.iter().map(|stamp| centre(stamp, n)).collect()
+    }
+}
+
+/// Microseconds of a whole measurement by `submission`, the PSF being taken already.
+///
+/// # Errors
+/// Where the submission's sizes cannot be worked with.
+pub fn whole(submission: &Submission, settings: SimulationSettings) -> Result<f64, PipelineError> {
+    Inputs::new(settings)?.whole(submission)
+}
+
+/// Cost of each stage of a measurement by `submission`, and of simulating the galaxy.
+///
+/// # Errors
+/// Where the submission's sizes cannot be worked with.
+pub fn stages(
+    submission: &Submission,
+    settings: SimulationSettings,
+) -> Result<Table, PipelineError> {
+    let inputs = Inputs::new(settings)?;
+    let (n, p) = (submission.stamp.size, submission.psf.size);
+    let psf = inputs.psf(p);
+    let fields = inputs.set.image_fields(1);
+    let grid = inputs.set.grid().n;
+    let mut render = RenderScratch::new();
+    let mut stamp = vec![0.0; STAMP * STAMP];
+    let mut rows: Vec<(&str, f64)> = Vec::new();
+    let before = rows.len();
+    if let NoiseSource::Border { border: width } = submission.noise {
+        let mut border = Vec::new();
+        rows.push((
+            "noise level",
+            time(|k| {
+                let stamp = &inputs.stamps[k];
+                black_box(border_noise(stamp, STAMP, width, &mut border));
+            }),
+        ));
+    }
+    if let Some(settings) = submission.wavelet() {
+        let filter = WaveletWiener::new(STAMP, settings);
+        let mut filter_scratch = filter.scratch();
+        rows.push((
+            "denoise",
+            time(|k| {
+                stamp.copy_from_slice(&inputs.stamps[k]);
+                filter.apply(black_box(&mut stamp), 1.0, &mut filter_scratch);
+            }),
+        ));
+    }
+    let cut = inputs.cuts(n);
+    let mut notes = vec![format!(
+        "One thread; fastest of several passes over {SAMPLE} galaxies."
+    )];
+    let linear = submission.linear().is_some();
+    match &submission.method {
+        Method::Linear(method) => linear_stages(method, n, psf.view(), &cut, &mut rows)?,
+        Method::Network(method) => {
+            notes.extend(network_stages(method, n, psf.view(), &cut, &mut rows)?);
+        }
+    }
+    let whole = inputs.whole(submission)?;
+    let stages: f64 = rows[before..].iter().map(|(_, time)| time).sum();
+    let rest = if linear {
+        "sheared noise (one galaxy in four) and the rest"
+    } else {
+        "the rest"
+    };
+    rows.push((rest, whole - stages));
+    rows.push(("whole measurement", whole));
+    let taken = inputs.taking_a_psf(submission)?;
+    rows.push(("take a PSF, where each galaxy has its own", taken));
+    rows.push((
+        "simulate",
+        time(|k| {
+            black_box(
+                inputs
+                    .set
+                    .draw(&fields, k % grid, k / grid, &mut render, &mut stamp),
+            );
+        }),
+    ));
+    Ok(Table {
+        title: format!("Stages of {}", submission.name),
+        headings: vec![
+            Heading::new("stage", "Stage"),
+            Heading::new("microseconds", "µs a galaxy"),
+            Heading::new("per_second", "galaxies a second"),
+        ],
+        rows: rows
+            .into_iter()
+            .map(|(stage, time)| {
+                vec![
+                    Cell::text(stage),
+                    Cell::number(time, 1),
+                    Cell::number(1e6 / time, 0),
+                ]
+            })
+            .collect(),
+        notes,
+    })
+}
+
+/// Stages of the network; returns notes.
+fn network_stages(
+    method: &NetworkMethod,
+    n: usize,
+    psf: ArrayView2<'_, f64>,
+    cut: &[Vec<f32>],
+    rows: &mut Vec<(&'static str, f64)>,
+) -> Result<Vec<String>, PipelineError> {
+    let settings = &method.deconvolution;
+    let lambda = settings.printed_lambda(settings.lambda);
+    let mut network = Network::<f32>::plan(n, psf.nrows(), lambda)?;
+    let factor = network.set_scaled_psf(psf, settings.psf_scale)?;
+    let mut scratch = network.scratch();
+    let mut out = vec![0.0; n * n];
+    let rules: Vec<Option<Rule>> = cut
+        .iter()
+        .map(|stamp| {
+            let peak = stamp.iter().copied().fold(0.0, f32::max);
+            Rule::new(settings, f64::from(peak), 1.0)
+        })
+        .collect();
+    let mut iterations = 0;
+    let network_time = time(|k| {
+        if let Some(rule) = &rules[k]
+            && let Ok(descent) =
+                network.deconvolve(rule, black_box(&cut[k]), &mut scratch, &mut out)
+        {
+            iterations = descent.iterations;
+        }
+    });
+    rows.push(("deconvolve", network_time));
+    let shape = ClippedAcf::new(n, &method.shape);
+    let acf = shape.autocorrelation();
+    let mut acf_scratch = acf.scratch();
+    let mut lags = vec![0.0; acf.len()];
+    rows.push((
+        "autocorrelation",
+        time(|k| {
+            let _ = acf.compute(black_box(&cut[k]), &mut acf_scratch, &mut lags);
+        }),
+    ));
+    acf.compute(&out, &mut acf_scratch, &mut lags)?;
+    let light = out.iter().map(|&v| f64::from(v)).sum();
+    let moments = shape.moments();
+    rows.push((
+        "moments",
+        time(|_| {
+            let _ = black_box(moments.measure(black_box(&lags), light));
+        }),
+    ));
+    let mut notes = vec![format!(
+        "The network made {iterations} iterations of the last galaxy."
+    )];
+    // The reference's matrices take n⁴ numbers.
+    if n <= 32 && settings.update != Update::Constant {
+        let scaled = psf.mapv(|value| value * factor);
+        let matrices = Matrices::new(n, scaled.view(), lambda);
+        let data: Vec<f64> = cut[0].iter().map(|&v| f64::from(v)).collect();
+        if let (Some(rule), Ok(view)) = (&rules[0], ArrayView2::from_shape((n, n), &data)) {
+            let start = Instant::now();
+            black_box(matrices.deconvolve(rule, view)?);
+            let plain = start.elapsed().as_secs_f64() * 1e6;
+            notes.push(format!(
+                "The plain reference (dense matrices, f64) takes {plain:.0} µs for the deconvolution, {:.0} times as long.",
+                plain / network_time
+            ));
+        }
+    }
+    Ok(notes)
+}
+
+/// Stages of the linear network.
+fn linear_stages(
+    method: &LinearMethod,
+    n: usize,
+    psf: ArrayView2<'_, f64>,
+    stamps: &[Vec<f32>],
+    rows: &mut Vec<(&'static str, f64)>,
+) -> Result<(), PipelineError> {
+    let spectral = Spectral::new(n, psf.nrows(), &method.deconvolution)?;
+    let (mut own, mut scratch) = (spectral.psf(), spectral.scratch());
+    let mut lags = spectral.lags();
+    let white = spectral.noise(&StampNoise::white(1.0));
+    spectral.set_psf(psf, &white, &mut scratch, &mut own)?;
+    rows.push((
+        "deconvolve and autocorrelate, with response",
+        time(|k| spectral.autocorrelate(&own, black_box(&stamps[k]), 1.0, &mut scratch, &mut lags)),
+    ));
+    let scale = method.shape.weight_scale;
+    let moments = AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach());
+    let mut values = moments.scratch();
+    rows.push((
+        "adaptive moments and response",
+        time(|_| {
+            if let Ok(shape) = black_box(moments.measure(black_box(&lags.acf), 0.0, &mut values)) {
+                black_box(moments.response(&shape, &lags.shear1, &mut values));
+                black_box(moments.response(&shape, &lags.shear2, &mut values));
+            }
+        }),
+    ));
+    Ok(())
+}
+
+/// Cost of one application of H by direct sums, as the network does it, and by transforms, against
+/// the sizes of stamp and PSF.
+///
+/// # Errors
+/// Where a size cannot be worked with.
+pub fn operator_forms(settings: SimulationSettings) -> Result<Table, PipelineError> {
+    let inputs = Inputs::new(settings)?;
+    let mut rows = Vec::new();
+    for (n, p) in [
+        (19, 15),
+        (23, 15),
+        (29, 15),
+        (29, 21),
+        (48, 15),
+        (48, 25),
+        (48, 48),
+    ] {
+        let psf = inputs.psf(p);
+        let cut = inputs.cuts(n);
+        let mut network = Network::<f32>::plan(n, p, 0.0)?;
+        network.set_psf(psf.view())?;
+        let mut scratch = network.scratch();
+        let mut out = vec![0.0; n * n];
+        let mut of = |max_iterations: usize| {
+            let rule = Rule {
+                step: Step::Adaptive(1.0),
+                unit: 1e-6,
+                max_iterations,
+                start: Start::ClippedData,
+                clipping: Clipping::BeforeTest,
+                kept: Kept::Lowest,
+            };
+            time(|k| {
+                let _ = black_box(network.deconvolve(&rule, &cut[k], &mut scratch, &mut out));
+            })
+        };
+        // An iteration applies H and its transpose.
+        let direct = (of(11) - of(1)) / 20.0;
+        let fft = StampFft::new(n + p - 1);
+        let (mut spectrum, mut buffers) = (fft.spectrum(), fft.scratch());
+        let kernel = spectrum.clone();
+        let transforms = time(|k| {
+            let rows = cut[k].chunks_exact(n).map(|row| row.iter().copied());
+            fft.rows(rows, &mut buffers, &mut spectrum);
+            fft.columns(&mut buffers, &mut spectrum);
+            for (value, factor) in spectrum.iter_mut().zip(&kernel) {
+                *value *= factor;
+            }
+            fft.columns_back(&mut buffers, &mut spectrum);
+            for y in 0..n {
+                black_box(fft.row_back(&spectrum, y, &mut buffers));
+            }
+        });
+        let rate = (n * n * p * p) as f64 / direct * 1e-3;
+        rows.push(vec![
+            Cell::number(n as f64, 0),
+            Cell::number(p as f64, 0),
+            Cell::number(direct, 2),
+            Cell::number(rate, 1),
+            Cell::number(transforms, 2),
+        ]);
+    }
+    Ok(Table {
+        title: "One application of the convolution H".into(),
+        headings: vec![
+            Heading::new("stamp", "Stamp [px]"),
+            Heading::new("psf", "PSF [px]"),
+            Heading::new("direct_microseconds", "direct [µs]"),
+            Heading::new("multiply_adds", "10⁹ multiply-adds/s"),
+            Heading::new("fft_microseconds", "by FFT [µs]"),
+        ],
+        rows,
+        notes: vec!["Direct sums count all p²n² products, of which the kernel skips those beyond the stamp. The FFT form has no room for the rest of an iteration.".into()],
+    })
+}
+
+fn centre(stamp: &[f32], n: usize) -> Vec<f32> {
+    let start = (STAMP - n) / 2;
+    (0..n)
+        .flat_map(|y| &stamp[(start + y) * STAMP + start..][..n])
+        .copied()
+        .collect()
+}
+
+/// Cost of a whole measurement against stamp size, in µs over [`SIZES`].
+///
+/// # Errors
+/// Where the submission's sizes cannot be worked with.
+pub fn size_costs(
+    submission: &Submission,
+    settings: SimulationSettings,
+) -> Result<Vec<f64>, PipelineError> {
+    let inputs = Inputs::new(settings)?;
+    SIZES
+        .iter()
+        .map(|&n| {
+            let mut sized = submission.clone();
+            sized.stamp.size = n;
+            inputs.whole(&sized)
+        })
+        .collect()
+}
+
+/// Costs against stamp size of several submissions as a table.
+pub fn sizes_table(costs: &[(&str, Vec<f64>)]) -> Table {
+    let mut rows = Vec::new();
+    for (name, costs) in costs {
+        for (n, cost) in SIZES.iter().zip(costs) {
+            rows.push(vec![
+                Cell::text(*name),
+                Cell::number(*n as f64, 0),
+                Cell::number(*cost, 1),
+                Cell::number(cost * 1e3 / (n * n) as f64, 1),
+            ]);
+        }
+    }
+    Table {
+        title: "Cost against stamp size".into(),
+        headings: vec![
+            Heading::new("submission", "Submission"),
+            Heading::new("stamp", "Stamp [px]"),
+            Heading::new("microseconds", "µs a galaxy"),
+            Heading::new("nanoseconds_per_pixel", "ns a pixel"),
+        ],
+        rows,
+        notes: Vec::new(),
+    }
+}
+
+/// The same as a plot.
+pub fn sizes_figure(costs: &[(&str, Vec<f64>)]) -> LinePlot {
+    let sizes: Vec<f64> = SIZES.iter().map(|n| *n as f64).collect();
+    LinePlot {
+        title: "Cost against stamp size".into(),
+        x_label: "stamp [px]".into(),
+        y_label: "µs a galaxy".into(),
+        series: costs
+            .iter()
+            .enumerate()
+            .map(|(k, (name, costs))| {
+                Series::new(name, sizes.clone(), costs.clone(), Style::Line, k)
+            })
+            .collect(),
+        ..LinePlot::default()
+    }
+}
+
+/// Rate of simulating and measuring in memory against the number of threads.
+///
+/// # Errors
+/// Where the submission's sizes cannot be worked with or threads cannot be started.
+pub fn scaling(
+    submission: &Submission,
+    settings: SimulationSettings,
+    threads: usize,
+) -> Result<Table, PipelineError> {
+    let inputs = Inputs::new(settings)?;
+    let measurers = measurers(std::slice::from_ref(submission))?;
+    let galaxies = inputs.set.grid().cells() as f64;
+    let rate = |threads: usize| -> Result<f64, PipelineError> {
+        let mut best = 0.0f64;
+        for _ in 0..3 {
+            let start = Instant::now();
+            run_set(&inputs.set, &[1], &measurers, threads, &mut Quiet, |_| {
+                Ok(())
+            })?;
+            best = best.max(galaxies / start.elapsed().as_secs_f64());
+        }
+        Ok(best)
+    };
+    let one = rate(1)?;
+    let mut rows = vec![vec![
+        Cell::number(1.0, 0),
+        Cell::number(one, 0),
+        Cell::number(1.0, 2),
+    ]];
+    for count in 2..=threads {
+        let many = rate(count)?;
+        rows.push(vec![
+            Cell::number(count as f64, 0),
+            Cell::number(many, 0),
+            Cell::number(many / one, 2),
+        ]);
+    }
+    Ok(Table {
+        title: format!("Simulating and measuring {} in memory", submission.name),
+        headings: vec![
+            Heading::new("threads", "Threads"),
+            Heading::new("per_second", "galaxies a second"),
+            Heading::new("speed_up", "speed-up"),
+        ],
+        rows,
+        notes: Vec::new(),
+    })
+}
+
+/// Rate of scoring a set of 10,000-row catalogues from each format, in a temporary folder.
+///
+/// # Errors
+/// Where the files cannot be written or read.
+pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
+    let folder = Scratch::new()?;
+    let side = 100;
+    let position = |k: usize| (k as f64).mul_add(48.0, 24.5);
+    let x: Vec<f64> = (0..side * side).map(|k| position(k % side)).collect();
+    let y: Vec<f64> = (0..side * side).map(|k| position(k / side)).collect();
+    // Any ellipticities do; these differ in every digit.
+    let e1: Vec<f64> = (0..side * side)
+        .map(|k| 0.1 * (k as f64 * 0.7).sin())
+        .collect();
+    let e2: Vec<f64> = (0..side * side)
+        .map(|k| 0.1 * (k as f64 * 1.3).cos())
+        .collect();
+    let ascii = |header: &str, separator: &str| -> String {
+        let mut text = header.to_owned();
+        for k in 0..side * side {
+            let fields = [x[k], y[k], e1[k], e2[k]].map(|v| format!("{v:.9}"));
+            text.push_str(&(fields.join(separator) + "\n"));
+        }
+        text
+    };
+    let truth = folder.path().join("truth.csv");
+    atomic::write(&truth, ascii("x,y,g1,g2\n", ",").as_bytes())?;
+    let dat = ascii("", " ");
+    let columns = [("x", &x), ("y", &y), ("e1", &e1), ("e2", &e2)];
+    let columns = columns.map(|(name, values)| Column::new(name.into(), values));
+    let table = frame(columns.into()).map_err(|error| FileError::new(&truth, error.to_string()))?;
+    let mut rows = Vec::new();
+    for (format, ending) in [("Parquet", "parquet"), ("FITS", "fits"), ("ASCII", "dat")] {
+        let mut paths = Vec::new();
+        for k in 0..images {
+            let path = folder.path().join(format!("{k}.{ending}"));
+            match ending {
+                "dat" => atomic::write(&path, dat.as_bytes())?,
+                _ => {
+                    let kind = if ending == "fits" {
+                        FileFormat::Fits
+                    } else {
+                        FileFormat::Parquet
+                    };
+                    table::write(&path, kind, &table, &Default::default())?;
+                }
+            }
+            paths.push(path);
+        }
+        let seconds = best_score(&truth, &paths, threads)?;
+        rows.push(vec![
+            Cell::text(format),
+            Cell::number(seconds, 3),
+            Cell::number((images * side * side) as f64 / seconds / 1e6, 1),
+        ]);
+    }
+    Ok(Table {
+        title: format!("Scoring {images} catalogues of 10,000 rows, {threads} thread(s)"),
+        headings: vec![
+            Heading::new("format", "FileFormat"),
+            Heading::new("seconds", "seconds"),
+            Heading::new("million_rows_per_second", "million rows a second"),
+        ],
+        rows,
+        notes: vec!["Reading, adding up, spectra of eight conventions, jackknife.".into()],
+    })
+}
+
+fn best_score(
+    truth: &Path,
+    paths: &[std::path::PathBuf],
+    threads: usize,
+) -> Result<f64, PipelineError> {
+    let reading = Reading {
+        field: Degrees(10.0),
+        stamp: Pixels(48.0),
+        sign: TruthSign::Standard,
+    };
+    let mut best = f64::INFINITY;
+    for _ in 0..3 {
+        let start = Instant::now();
+        let read = plain_columns(COLUMNS, Screen::default());
+        black_box(score_files(
+            truth,
+            paths,
+            &reading,
+            &read,
+            Options::default(),
+            threads,
+        )?);
+        best = best.min(start.elapsed().as_secs_f64());
+    }
+    Ok(best)
+}

@@ -1,0 +1,127 @@
+//! `shearq bench`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use shearq_submissions::{Registry, Submission};
+
+use crate::arguments::{Form, Threads};
+use crate::print;
+use shearq_render::page::Page;
+use shearq_render::table::Table;
+use shearq_simulate::set::SimulationSettings;
+use shearq_studies::convergence::convergence;
+use shearq_studies::speed;
+
+/// Measure the speed on this machine: stages of a measurement, stamp sizes, convergence, threads,
+/// scoring.
+///
+/// Takes about a minute. Other work on the machine disturbs it; ratios within one run are safer than
+/// absolute figures. docs/speed.md explains where the time goes.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// Name of a submission or a TOML file of your own. May be given several times.
+    #[arg(long, value_name = "NAME|FILE", default_values = ["23/den/star", "48/linear/star"])]
+    submission: Vec<String>,
+    /// Catalogues scored.
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u16).range(2..=2000))]
+    catalogues: u16,
+    /// Folder for a report with plots, their data beside it.
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    form: Form,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let registry = Registry::embedded()?;
+    let submissions = arguments
+        .submission
+        .iter()
+        .map(|name| Ok(registry.get(name)?.submission))
+        .collect::<anyhow::Result<Vec<Submission>>>()?;
+    let threads = arguments.threads.number();
+    let settings = SimulationSettings::new(1, 50);
+    let mut page = arguments.out.as_deref().map(|out| {
+        let made_by = vec![
+            (
+                "Version".into(),
+                format!("shearq {}", shearq_pipeline::VERSION),
+            ),
+            ("Threads".into(), threads.to_string()),
+            ("Seed".into(), settings.seed.to_string()),
+        ];
+        Page::new(out, "Speed of shearq", "Measured on this machine", made_by)
+    });
+    let show = |page: &mut Option<Page<'_>>, name: &str, table: Table| {
+        if let Some(page) = page {
+            page.table(name, &table)?;
+        }
+        arguments.form.print(&table)?;
+        print("\n")
+    };
+    if let Some(page) = &mut page {
+        page.section(
+            "Stages",
+            "Costs of one galaxy on one thread, and rates of many.",
+        );
+    }
+    for submission in &submissions {
+        let name = submission.name.replace('/', "-");
+        let stages = speed::stages(submission, settings)?;
+        show(&mut page, &format!("stages-{name}"), stages)?;
+        let scaling = speed::scaling(submission, settings, threads)?;
+        show(&mut page, &format!("threads-{name}"), scaling)?;
+    }
+    if let Some(page) = &mut page {
+        page.section(
+            "Sizes",
+            "Cost against the size of the stamp, and forms of the convolution.",
+        );
+    }
+    let costs = submissions
+        .iter()
+        .map(|s| Ok((s.name.as_str(), speed::size_costs(s, settings)?)))
+        .collect::<anyhow::Result<Vec<_>>>()?;
+    show(&mut page, "sizes", speed::sizes_table(&costs))?;
+    if let Some(page) = &mut page {
+        page.figure(
+            "sizes",
+            &speed::sizes_figure(&costs),
+            "Cost against stamp size.",
+        )?;
+    }
+    show(
+        &mut page,
+        "operator-forms",
+        speed::operator_forms(settings)?,
+    )?;
+    if let Some(page) = &mut page {
+        page.section(
+            "Convergence",
+            "Energy of the network with and without momentum.",
+        );
+    }
+    for submission in &submissions {
+        if submission.linear().is_some() {
+            continue;
+        }
+        let name = format!("energy-{}", submission.name.replace('/', "-"));
+        let energies = convergence(submission, settings)?;
+        show(&mut page, &name, energies.table())?;
+        if let Some(page) = &mut page {
+            page.figure(&name, &energies.figure(), "Energy above its minimum.")?;
+        }
+    }
+    if let Some(page) = &mut page {
+        page.section("Scoring", "Catalogues of 10,000 rows, read and scored.");
+    }
+    let scoring = speed::scoring(usize::from(arguments.catalogues), threads)?;
+    show(&mut page, "scoring", scoring)?;
+    match page {
+        Some(page) => Ok(page.save()?),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,89 @@
+//! `shearq calibrate`.
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+use shearq_submissions::Registry;
+
+use crate::arguments::{Form, Threads};
+use crate::progress::Bar;
+use crate::tell;
+use shearq_render::page::Page;
+use shearq_studies::calibration::calibrate;
+use shearq_studies::exhibits;
+
+/// Find the regularisation parameter λ for a submission, as in the paper's Sect. 4.
+///
+/// Synthetic Sérsic galaxies with a Moffat PSF each and noise of 10, 20 and 40 dB are deconvolved for
+/// λ from 1e-6 to 1e6 by both updating rules. Printed are the λ of the best 1/RMSD at each S/N and
+/// the λ chosen; with --out, the paper's Figs 4 to 7 are drawn and their data written.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// Name of a submission or a TOML file of your own.
+    #[arg(long, value_name = "NAME|FILE", default_value = "paper")]
+    submission: String,
+    /// Galaxies; the paper has 10000.
+    #[arg(long, value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u64).range(10..=1_000_000))]
+    galaxies: u64,
+    /// Seed of all random numbers.
+    #[arg(long, value_name = "SEED", default_value_t = 1)]
+    seed: u64,
+    /// Folder for figures and data.
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    form: Form,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let submission = Registry::embedded()?.get(&arguments.submission)?.submission;
+    anyhow::ensure!(
+        submission.network().is_some(),
+        "{} has method = \"linear\"; λ is calibrated for the network's adaptive and constant update",
+        submission.name
+    );
+    if let Some(out) = &arguments.out {
+        std::fs::create_dir_all(out)
+            .with_context(|| format!("{}: cannot make the folder", out.display()))?;
+    }
+    let mut bar = Bar::new("calibrating", arguments.galaxies);
+    let curves = calibrate(
+        &submission,
+        arguments.galaxies,
+        arguments.seed,
+        arguments.threads.number(),
+        &mut bar,
+    )?;
+    drop(bar);
+    let table = exhibits::calibration_table(&curves, &submission);
+    if let Some(out) = &arguments.out {
+        let made_by = vec![
+            (
+                "Version".into(),
+                format!("shearq {}", shearq_pipeline::VERSION),
+            ),
+            ("Seed".into(), arguments.seed.to_string()),
+            (
+                "Data".into(),
+                format!("{} synthetic galaxies", arguments.galaxies),
+            ),
+            ("Settings".into(), toml::to_string(&submission)?),
+        ];
+        let title = format!("Calibration of λ for {}", submission.name);
+        let mut page = Page::new(out, &title, "Simulated data", made_by);
+        page.section("Curves", "Figs 4 to 7 of the paper.");
+        exhibits::calibration_figures(&mut page, &curves)?;
+        page.data("curves", &exhibits::curves_table(&curves))?;
+        page.section("λ", "The best λ at each S/N, and the one chosen.");
+        page.table("lambda", &table)?;
+        page.save()?;
+        tell(format_args!(
+            "figures, data and report in {}",
+            out.display()
+        ));
+    }
+    arguments.form.print(&table)
+}

@@ -1,0 +1,132 @@
+//! `shearq compare`.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use clap::Args;
+
+use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
+use crate::choices::named;
+use crate::{print_heat_map, score};
+use shearq_pipeline::data::run::Run;
+use shearq_render::figure::{Figure, HeatMap};
+use shearq_render::table::{Table, TableFormat};
+use shearq_results::compare::{by_name, score_all};
+use shearq_results::conditions::Conditions;
+use shearq_results::groups::{Group, Grouping, Order};
+use shearq_results::store;
+use shearq_results::views::comparison::{compare, compare_runs, q_heat_map};
+use shearq_results::views::pages;
+
+/// Put measured submissions side by side, beside the published figures, or past runs of a store.
+///
+/// Each OUT is a folder that `measure` or `run` wrote. Differences in Q are taken from the first and
+/// paired over the same images, so that noise common to both cancels.
+///
+/// With --store the runs are those that `score --store` and `run --store` recorded. On a terminal Q
+/// per set follows as a heat map, in colours unless NO_COLOR is set.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// Folders of catalogues.
+    #[arg(value_name = "OUT", required_unless_present_any = ["foreign", "store"])]
+    measured: Vec<PathBuf>,
+    /// Data folder with the true shear [default: the one the first OUT was measured from].
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+    /// Catalogues of another program, described in a TOML file (docs/formats.md). May be given
+    /// several times.
+    #[arg(long, value_name = "FILE")]
+    foreign: Vec<PathBuf>,
+    /// Results store whose runs to compare, instead of folders.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["measured", "data", "foreign", "definition", "convention", "threads"])]
+    store: Option<PathBuf>,
+    /// Rows of the store to look at: conditions on its columns that all must hold, as in
+    /// `snr=low,submission=23/*,q>50`, with = != < <= > >= and `*` for any characters.
+    #[arg(long = "where", value_name = "CONDITIONS", requires = "store")]
+    conditions: Option<Conditions>,
+    /// Figure or column to sort by, as in `q:desc`.
+    #[arg(long, value_name = "FIELD[:desc]", requires = "store")]
+    sort: Option<Order>,
+    /// Means over groups of sets instead of all sets of a run.
+    #[arg(long, value_parser = named::<Grouping>(), requires = "store")]
+    group_by: Option<Grouping>,
+    /// Draw Q per run and set as PNG or SVG, by the file's ending.
+    #[arg(long, value_name = "FILE")]
+    heat_map: Option<PathBuf>,
+    #[command(flatten)]
+    printing: Printing,
+    #[command(flatten)]
+    report: ReportFile,
+    #[command(flatten)]
+    settings: ScoreSettings,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let (table, map) = match &arguments.store {
+        Some(store) => stored(arguments, store)?,
+        None => {
+            let variants = score_all(
+                &arguments.measured,
+                &arguments.foreign,
+                arguments.data.as_deref(),
+                arguments.settings.way(),
+                arguments.threads.number(),
+            )?;
+            let table = compare(&variants, arguments.settings.definition());
+            (table, q_heat_map(&by_name(&variants)))
+        }
+    };
+    arguments.printing.print(&table)?;
+    if let Some(path) = &arguments.heat_map {
+        map.save(path)?;
+    }
+    let sections = || Ok(vec![pages::comparison(table, &map)?]);
+    let title = "Comparison of submissions";
+    arguments
+        .report
+        .save(title, sections, || made_by(arguments))?;
+    if arguments.printing.format() == TableFormat::Table {
+        print_heat_map(map)?;
+    }
+    Ok(())
+}
+
+/// Where the figures come from: inputs, and settings of what shearq measured.
+fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
+    let mut made_by = Vec::new();
+    for folder in &arguments.measured {
+        made_by.extend(score::made_by(&Run::require(folder)?, folder)?);
+    }
+    let paths = arguments.store.iter().chain(&arguments.foreign);
+    let paths = paths.chain(&arguments.data);
+    made_by.extend(paths.map(|path| ("Input".to_owned(), path.display().to_string())));
+    Ok(made_by)
+}
+
+/// The comparison of a store's runs.
+fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)> {
+    let (mut runs, notes) = store::read(path)?;
+    if let Some(conditions) = &arguments.conditions {
+        runs = conditions.choose(runs).context("--where")?;
+    }
+    anyhow::ensure!(
+        !runs.is_empty(),
+        "{}: there is no recorded run{}",
+        path.display(),
+        match &arguments.conditions {
+            Some(_) => " for which the conditions hold",
+            None => "; `score --store` and `run --store` record them",
+        }
+    );
+    let order = arguments.sort.as_ref();
+    let groups = Group::of(&runs, arguments.group_by, order)?;
+    let mut table = compare_runs(&runs, &groups, arguments.group_by);
+    table.notes.extend(notes);
+    let rows: Vec<_> = Group::of(&runs, None, order)?
+        .into_iter()
+        .map(|run| (run.name(), run.sets))
+        .collect();
+    Ok((table, q_heat_map(&rows)))
+}

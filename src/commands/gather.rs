@@ -1,0 +1,163 @@
+//! `shearq gather`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use crate::{count, tell};
+use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE, MAX_SET};
+use shearq_pipeline::gather::{Content, Files, Gathered, Gathering, Stamps, gather};
+use shearq_pipeline::images::ImageId;
+
+/// Gather stamps of your own into a data folder that `measure` takes.
+///
+/// The sky has to be subtracted. Stamps come as FITS files of one stamp, a cube, or several extensions each, or are cut out of an exposure around
+/// positions. Pixels beyond it, those that are not finite and those that a mask is not zero for are missing: a linear
+/// submission fills some from the opposite side of the galaxy, a network flags it. The PSF is one star stamp for all, one
+/// for each galaxy in the same order, or a table of functional PSFs (x,y,profile,beta,fwhm,e1,e2; docs/formats.md),
+/// of which the positions do not matter. Beside the image a table tells which stamp is which, in the order of the
+/// catalogues.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// FITS files of stamps, in the order of the galaxies.
+    #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with = "exposure")]
+    stamps: Vec<PathBuf>,
+    /// Image to cut stamps out of: the first of its file.
+    #[arg(long, value_name = "FILE", requires = "positions")]
+    exposure: Option<PathBuf>,
+    /// Only images of this name (EXTNAME) of the files of stamps or the exposure, as SCI.
+    #[arg(long, value_name = "NAME")]
+    extension: Option<String>,
+    /// Masks like the stamps, one each in the same order, or like the exposure: pixels are missing where they are not
+    /// zero.
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    mask: Vec<PathBuf>,
+    /// Only images of this name of the files of masks [default: masks are in the files of the stamps or the exposure].
+    #[arg(long, value_name = "NAME")]
+    mask_extension: Option<String>,
+    /// Table of the galaxies' positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the
+    /// first is at 1).
+    #[arg(long, value_name = "FILE", requires = "exposure")]
+    positions: Option<PathBuf>,
+    /// Columns of the positions.
+    #[arg(
+        long,
+        value_name = "X,Y",
+        value_delimiter = ',',
+        num_args = 1,
+        default_value = "x,y",
+        requires = "exposure"
+    )]
+    columns: Vec<String>,
+    /// Pixels a side of a stamp that is cut out.
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure")]
+    size: u16,
+    /// FITS files of PSF stamps, or one table of functional PSFs (.csv).
+    #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
+    psf: Vec<PathBuf>,
+    /// Only images of this name of the files of PSFs.
+    #[arg(long, value_name = "NAME")]
+    psf_extension: Option<String>,
+    /// Standard deviation of the noise of a pixel, where a submission is to take it from the header.
+    #[arg(long, value_name = "SIGMA")]
+    noise: Option<f64>,
+    /// Set that the image belongs to.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_SET)))]
+    set: u32,
+    /// Number of the image in its set.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    image: u32,
+    /// Data folder; images of other numbers may be there.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let Arguments {
+        stamps,
+        exposure,
+        extension,
+        mask,
+        mask_extension,
+        positions,
+        columns,
+        size,
+        psf,
+        psf_extension,
+        noise,
+        set,
+        image,
+        out,
+    } = arguments;
+    if let Some(sigma) = noise {
+        anyhow::ensure!(
+            *sigma > 0.0 && sigma.is_normal(),
+            "--noise is {sigma:e}; expected a positive number"
+        );
+    }
+    let images = Files {
+        paths: exposure.as_ref().map_or(stamps, std::slice::from_ref),
+        extension: extension.as_deref(),
+        content: Content::Sky,
+    };
+    let masks = Files {
+        paths: if mask.is_empty() { images.paths } else { mask },
+        extension: mask_extension.as_deref(),
+        content: Content::Mask,
+    };
+    let masked = !mask.is_empty() || mask_extension.is_some();
+    let psfs = Files {
+        paths: psf,
+        extension: psf_extension.as_deref(),
+        content: Content::Psf,
+    };
+    let stamps = match (exposure, positions, columns.as_slice()) {
+        (Some(_), Some(positions), [x, y]) => Stamps::Cutouts {
+            exposure: images,
+            positions,
+            columns: [x, y],
+            side: usize::from(*size),
+        },
+        (Some(_), ..) => anyhow::bail!(
+            "--columns is `{}`; expected the names of two columns, as in `x,y`",
+            columns.join(",")
+        ),
+        (None, ..) => Stamps::Files(images),
+    };
+    let gathering = Gathering {
+        stamps,
+        masks: masked.then_some(masks),
+        psfs,
+        noise: *noise,
+    };
+    let data = if out.is_dir() {
+        DataFolder::open(out)?
+    } else {
+        DataFolder::new(out)
+    };
+    let id = ImageId {
+        set: *set,
+        image: *image,
+    };
+    let Gathered {
+        mosaic,
+        incomplete,
+        doubts,
+    } = gather(&data, id, &gathering)?;
+    for doubt in doubts {
+        tell(format_args!("{doubt}"));
+    }
+    if incomplete > 0 {
+        tell(format_args!(
+            "{} with pixels that are missing or beyond the edge: flagged by networks, and by linear submissions where too much is missing",
+            count(incomplete, "stamp")
+        ));
+    }
+    tell(format_args!(
+        "{} of {1} × {1} pixels in {2}",
+        count(mosaic.galaxies, "stamp"),
+        mosaic.stamp,
+        data.galaxies(id.set, id.image).display()
+    ));
+    Ok(())
+}

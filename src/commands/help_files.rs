@@ -1,0 +1,53 @@
+//! `shearq completions` and `shearq manual`: help for shells and for `man`.
+
+use std::path::PathBuf;
+
+use clap::{Args, CommandFactory};
+use clap_complete::Shell;
+
+use crate::{Cli, tell, write};
+use shearq_files::atomic;
+
+/// Print the completions of a shell.
+#[derive(Debug, Args)]
+pub(crate) struct Completions {
+    /// The shell.
+    #[arg(value_enum)]
+    shell: Shell,
+}
+
+/// Write the manual pages.
+#[derive(Debug, Args)]
+pub(crate) struct Manual {
+    /// Folder to write to.
+    #[arg(value_name = "DIR")]
+    out: PathBuf,
+}
+
+pub(crate) fn completions(arguments: &Completions) -> anyhow::Result<()> {
+    let mut text = Vec::new();
+    clap_complete::generate(arguments.shell, &mut Cli::command(), "shearq", &mut text);
+    write(&String::from_utf8(text)?)
+}
+
+pub(crate) fn manual(arguments: &Manual) -> anyhow::Result<()> {
+    let mut cli = Cli::command();
+    cli.build();
+    let mut pages = vec![("shearq.1".to_owned(), cli.clone())];
+    for command in cli.get_subcommands() {
+        let name = format!("shearq-{}", command.get_name());
+        // A page is found by the name of its command.
+        pages.push((format!("{name}.1"), command.clone().name(name)));
+    }
+    for (file, command) in &pages {
+        let mut page = Vec::new();
+        clap_mangen::Man::new(command.clone()).render(&mut page)?;
+        atomic::write(arguments.out.join(file), &page)?;
+    }
+    tell(format_args!(
+        "{} pages in {}",
+        pages.len(),
+        arguments.out.display()
+    ));
+    Ok(())
+}

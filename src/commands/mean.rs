@@ -1,0 +1,61 @@
+//! `shearq mean`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use crate::arguments::{Form, SetList, Threads};
+use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::inputs;
+use shearq_results::mean::mean_shears;
+use shearq_results::score::without_catalogue;
+use shearq_results::views::mean::mean_table;
+
+/// Mean ellipticity of each set: the shear, where a set has one shear.
+///
+/// The ellipticities are those of the catalogues, divided by their response where the submission does so. Each
+/// galaxy with an ellipticity counts alike, flagged ones have none. The error is the scatter over the root of their
+/// number, which holds for galaxies that are independent of one another; of pairs turned by 90 degrees it is too
+/// large.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// Folder of catalogues that `measure` or `run` wrote.
+    #[arg(long, value_name = "DIR")]
+    measured: PathBuf,
+    /// Sets [default: all there are].
+    #[arg(long, value_name = "LIST")]
+    sets: Option<SetList>,
+    #[command(flatten)]
+    form: Form,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let Arguments {
+        measured,
+        sets,
+        form,
+        threads,
+    } = arguments;
+    let run = Run::require(measured)?;
+    let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
+    // The data need not be there any more.
+    let data = match &run.source {
+        Source::Folder { .. } => run.source.data(measured).ok(),
+        Source::Simulated(_) => None,
+    };
+    if let Some(data) = &data {
+        inputs::verify(data, measured, &run, sets, threads.number())?;
+    }
+    let means = mean_shears(&run, measured, sets)?;
+    let name = measured.display().to_string();
+    let mut table = mean_table(&means, &run.submission, &name);
+    if let Some(data) = &data {
+        let used = means.iter().map(|mean| (mean.set, mean.images.as_slice()));
+        table
+            .notes
+            .extend(without_catalogue(data, &used.collect(), sets)?);
+    }
+    form.print(&table)
+}

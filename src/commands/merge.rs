@@ -1,0 +1,175 @@
+//! `shearq merge`.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use clap::Args;
+
+use crate::arguments::{SetList, Threads};
+use crate::progress::{Bar, goes_on};
+use crate::{Findings, count, print, run, tell};
+use shearq_files::open::is_there;
+use shearq_pipeline::complete::{Fault, Results};
+use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE};
+use shearq_pipeline::data::run::{RUN_FILE, Run, Source, claim, read_record};
+use shearq_pipeline::images::{self, ImageId, Shard};
+use shearq_pipeline::simulate::{SIMULATION_FILE, SimulationRecord};
+
+/// Check that a folder written by shards is complete, and score it as `run` does.
+///
+/// Every image that should have results is looked at: whether they are there, can be read, have a row
+/// for every galaxy and were made by the folder's settings. What is missing or damaged is printed, one
+/// image a line as SET/IMAGE, and nothing is scored. The same command as before, with or without
+/// --shard, does again what is missing.
+///
+/// Scores and bandpowers are kept beside the catalogues as scores.csv and bandpowers.csv. A folder that
+/// `simulate` wrote is checked only, and so are catalogues of data without true shear.
+///
+/// Exit code 0: complete; 1: something is missing or damaged.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// Folder that `run`, `measure` or `simulate` wrote with --shard.
+    out: PathBuf,
+    /// Sets that should be there, as given to `run` or `simulate` [default with images of a data
+    /// folder: all it has].
+    #[arg(long, value_name = "LIST")]
+    sets: Option<SetList>,
+    /// Images per set that should be there, as given to `run --simulate` or `simulate`.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    images: Option<u32>,
+    /// Number of shards: says which of them are to be run again.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    shards: Option<u32>,
+    /// Remove damaged results, so that they are made again. Files that are there are kept otherwise.
+    #[arg(long)]
+    discard_damaged: bool,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
+    let out = &arguments.out;
+    if let Some(run) = Run::read(out)? {
+        return merge_run(arguments, &run);
+    }
+    let path = out.join(SIMULATION_FILE);
+    let record: SimulationRecord = read_record(&path)?.with_context(|| {
+        format!(
+            "{}: there is neither {RUN_FILE} nor {SIMULATION_FILE}; expected a folder that `run`, `measure` or `simulate` wrote",
+            out.display()
+        )
+    })?;
+    let _claim = claim(&path, &record)?;
+    let data = DataFolder::open(out)?;
+    let results = Results::Images {
+        record: &record,
+        data: &data,
+    };
+    require_complete(arguments, &results, &simulated_images(arguments)?)
+}
+
+fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
+    let out = &arguments.out;
+    let _claim = claim(&out.join(RUN_FILE), run)?;
+    let data = run.source.data(out)?;
+    let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
+    let images = match &run.source {
+        Source::Simulated(_) => simulated_images(arguments)?,
+        Source::Folder { .. } => {
+            anyhow::ensure!(
+                arguments.images.is_none(),
+                "--images is for simulated data; here every image of {} is expected",
+                run.source
+            );
+            images::of_folder(&data, sets)?
+        }
+    };
+    let results = Results::Catalogues {
+        run,
+        data: &data,
+        out,
+    };
+    require_complete(arguments, &results, &images)?;
+    if images.iter().any(|id| is_there(&data.truth(id.set))) {
+        run::score(run, out, sets, None, arguments.threads.number())?;
+        return Ok(());
+    }
+    tell(format_args!(
+        "not scored: {} has no true shear",
+        data.root().display()
+    ));
+    Ok(())
+}
+
+/// The images that a simulation should have, as the arguments say: its record does not.
+fn simulated_images(arguments: &Arguments) -> anyhow::Result<Vec<ImageId>> {
+    match (&arguments.sets, arguments.images) {
+        (Some(sets), Some(images)) => Ok(images::of_simulation(&sets.0, images)),
+        _ => anyhow::bail!(
+            "{}: the data were simulated; give the --sets and --images that should be there",
+            arguments.out.display()
+        ),
+    }
+}
+
+/// Prints what is missing or damaged.
+fn require_complete(
+    arguments: &Arguments,
+    results: &Results<'_>,
+    images: &[ImageId],
+) -> anyhow::Result<()> {
+    let out = arguments.out.display();
+    let mut bar = Bar::new("checking", results.galaxies(images));
+    let faults = results.faults(images, arguments.threads.number(), &mut bar)?;
+    drop(bar);
+    if faults.is_empty() {
+        tell(format_args!(
+            "{} complete in {out}",
+            count(images.len(), "image")
+        ));
+        return Ok(());
+    }
+    let mut text = String::new();
+    for fault in &faults {
+        let ImageId { set, image } = fault.id;
+        let shard = shard_of(fault, arguments.shards);
+        let shard = shard.map_or_else(String::new, |shard| format!(" (shard {shard})"));
+        text.push_str(&format!("{set}/{image}{shard}: {}\n", fault.error));
+    }
+    text.push_str(&format!(
+        "{out}: {} of {} images are missing or damaged\n",
+        faults.len(),
+        images.len()
+    ));
+    let mut shards: Vec<u32> = faults
+        .iter()
+        .filter_map(|fault| Some(shard_of(fault, arguments.shards)?.number()))
+        .collect();
+    shards.sort_unstable();
+    shards.dedup();
+    if !shards.is_empty() {
+        let list: Vec<String> = shards.iter().map(u32::to_string).collect();
+        text.push_str(&format!("shards to run again: {}\n", list.join(",")));
+    }
+    print(&text)?;
+    if arguments.discard_damaged {
+        discard(&faults)?;
+    }
+    Err(Findings.into())
+}
+
+/// The shard that an image belongs to, where their number is known.
+fn shard_of(fault: &Fault, shards: Option<u32>) -> Option<Shard> {
+    shards.map(|of| Shard::holding(fault.position, of))
+}
+
+fn discard(faults: &[Fault]) -> anyhow::Result<()> {
+    let there = |path: &&Path| path.is_file();
+    for path in faults.iter().map(|f| f.result.as_path()).filter(there) {
+        std::fs::remove_file(path)
+            .with_context(|| format!("{}: cannot remove the file", path.display()))?;
+        tell(format_args!("removed {}", path.display()));
+    }
+    Ok(())
+}

@@ -1,0 +1,246 @@
+//! `shearq reproduce`.
+
+use std::path::PathBuf;
+
+use anyhow::bail;
+use clap::Args;
+use shearq_submissions::{Published, Registry, Submission};
+
+use crate::arguments::{SetList, Threads};
+use crate::progress::{Bar, goes_on};
+use crate::{print, print_table, tell};
+use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::run::{measurers, simulated_steps};
+use shearq_pipeline::simulate::simulator;
+use shearq_render::page::Page;
+use shearq_results::views::steps::{steps_figure, steps_row};
+use shearq_simulate::set::SimulationSettings;
+use shearq_studies::calibration::calibrate;
+use shearq_studies::exhibits;
+use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
+
+/// Reproduce the paper's figures and tables on simulated data.
+///
+/// Sect. 4: calibration of λ on synthetic galaxies (Figs 4 to 7). Sect. 5: the seven submissions of
+/// Table 1 on the 24 sets (Table 1, Figs 8 to 11), simulated and measured in memory, set by set;
+/// each finished set is kept, so a stopped run goes on where it was. The result is one HTML report,
+/// with every figure beside it as PNG and SVG and its data as CSV and Parquet. The default takes
+/// minutes; --images 200 is the challenge's size and takes hours.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// Folder to write to.
+    #[arg(long, value_name = "DIR", default_value = "shearq-reproduce")]
+    out: PathBuf,
+    /// Images per set.
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(2..=i64::from(MAX_IMAGE)))]
+    images: u32,
+    /// Galaxies a side of an image.
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u16).range(8..=400))]
+    grid: u16,
+    /// Sets.
+    #[arg(long, value_name = "LIST", default_value = "all")]
+    sets: SetList,
+    /// Submissions of Table 1; repeat it for several. All seven where none is named.
+    #[arg(long, value_name = "NAME")]
+    submission: Vec<String>,
+    /// Galaxies of the calibration; the paper has 10000.
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(10..=1_000_000))]
+    galaxies: u64,
+    /// Seed of all random numbers.
+    #[arg(long, value_name = "SEED", default_value_t = 2013)]
+    seed: u64,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
+    let Arguments {
+        out,
+        images,
+        grid,
+        sets,
+        submission,
+        galaxies,
+        seed,
+        threads,
+    } = arguments;
+    let threads = threads.number();
+    let sets = sets.simulated()?;
+    let registry = Registry::embedded()?;
+    let submissions = of_table_one(&registry, submission)?;
+    let plan = Plan {
+        version: shearq_pipeline::VERSION.into(),
+        simulation: SimulationSettings::new(*seed, usize::from(*grid)),
+        images: *images,
+        submissions: submissions.iter().map(|(s, _)| s.clone()).collect(),
+    };
+    let total = sets.len() as u64 * u64::from(*images) * u64::from(*grid).pow(2);
+    let mut bar = Bar::new("simulating and measuring", total);
+    let study = Study::open(&plan, out)?;
+    let results = run_sets(&study, sets, threads, &mut bar)?;
+    drop(bar);
+    let mut bar = Bar::new("calibrating", *galaxies);
+    let base = registry.get("paper")?.submission;
+    let curves = calibrate(&base, *galaxies, *seed, threads, &mut bar)?;
+    drop(bar);
+
+    let settings = vec![
+        (
+            "Version".into(),
+            format!("shearq {}", shearq_pipeline::VERSION),
+        ),
+        ("Seed".into(), seed.to_string()),
+        (
+            "Data".into(),
+            format!(
+                "simulated: {} sets, {images} images of {grid} × {grid} galaxies",
+                sets.len()
+            ),
+        ),
+        (
+            "Calibration".into(),
+            format!("{galaxies} synthetic galaxies"),
+        ),
+        (
+            "Settings of the calibration".into(),
+            toml::to_string(&base)?,
+        ),
+    ];
+    let mut page = Page::new(
+        out,
+        "Hopfield Neural Network deconvolution, reproduced",
+        "Figures and tables of Nurbaeva et al. from simulated data",
+        settings,
+    );
+    let table_one = exhibits::table_one(&results, &submissions);
+    let names: Vec<String> = names(&submissions);
+    let findings = exhibits::findings_table(&exhibits::findings(&results, &names));
+    let calibration = exhibits::calibration_table(&curves, &base);
+    let of_lambda = exhibits::findings_table(&exhibits::lambda_findings(&curves));
+    method(&mut page, &plan)?;
+    page.section("Calibration of λ (Sect. 4)", SECT_FOUR);
+    exhibits::calibration_figures(&mut page, &curves)?;
+    page.table("calibration", &calibration)?;
+    page.table("findings-lambda", &of_lambda)?;
+    page.data("fig5-7-lambda", &exhibits::curves_table(&curves))?;
+    page.section("Submissions (Sect. 5)", SECT_FIVE);
+    page.table("table1", &table_one)?;
+    // Few submissions or sets may decide none.
+    let findings = (!findings.rows.is_empty()).then_some(findings);
+    if let Some(findings) = &findings {
+        page.table("findings", findings)?;
+    }
+    sect_five(&mut page, &results, &names)?;
+    page.save()?;
+    print_table(&table_one)?;
+    for table in findings.iter().chain([&of_lambda, &calibration]) {
+        print("\n")?;
+        print_table(table)?;
+    }
+    tell(format_args!(
+        "report, figures and data in {}",
+        out.display()
+    ));
+    Ok(())
+}
+
+const SECT_THREE: &str = "A stamp is deconvolved by the network; the ellipticity is measured on the autocorrelation (ACF) of the result, less the mean of its edge, clipped at the radius that holds 89 % of the light that a radius encloses at most.";
+const SECT_FOUR: &str = "Exponential galaxies on stamps, convolved with a Moffat PSF each, with white noise of 10, 20 and 40 dB, deconvolved for λ from 10⁻⁶ to 10⁶ by both updating rules. Everything here is simulated.";
+const SECT_FIVE: &str = "Submissions of Table 1 on sets of Table 2. The images are simulated, not the challenge's own: distributions of S/N and size, PSF fields and shear spectra that were not published are chosen here. Figures are for the standard convention, in which the ellipticities are measured, by the leaderboard's definition; errors come from what the truth leaves unexplained.";
+
+/// The submissions of Table 1 with these names, in its order; all where there are none.
+fn of_table_one(
+    registry: &Registry,
+    wanted: &[String],
+) -> anyhow::Result<Vec<(Submission, Published)>> {
+    let all = registry.published()?;
+    let known = names(&all);
+    if let Some(name) = wanted.iter().find(|name| !known.contains(name)) {
+        bail!(
+            "`{name}` is not in Table 1, which has {}; `study` and `run` take any other",
+            known.join(", ")
+        );
+    }
+    let chosen = |name: &String| wanted.is_empty() || wanted.contains(name);
+    Ok(all.into_iter().filter(|(s, _)| chosen(&s.name)).collect())
+}
+
+/// Fig. 3: the steps of one galaxy at S/N 10, 20 and 40.
+fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {
+    page.section("The method (Sect. 3)", SECT_THREE);
+    let name = "23/raw/star";
+    let Some(submission) = plan.submissions.iter().find(|s| s.name == name) else {
+        return Ok(());
+    };
+    let mut rows = Vec::new();
+    for (set, snr) in [(5, 10), (2, 20), (8, 40)] {
+        let simulator = simulator(set, plan.simulation)?;
+        let measurer = &measurers(std::slice::from_ref(submission))?[0];
+        if let Some((psf, steps)) = simulated_steps(&simulator, measurer, 1, (1, 1))? {
+            rows.push(steps_row(&format!("S/N {snr}"), psf, steps));
+        }
+    }
+    page.figure(
+        "fig3-steps",
+        &steps_figure(name, rows),
+        "As Fig. 3 of the paper: from a stamp to its clipped autocorrelation, for a galaxy at S/N 10, 20 and 40.",
+    )?;
+    Ok(())
+}
+
+fn names(submissions: &[(Submission, Published)]) -> Vec<String> {
+    submissions.iter().map(|(s, _)| s.name.clone()).collect()
+}
+
+/// Figs 8 to 11, and the tables beside them.
+fn sect_five(page: &mut Page<'_>, results: &[SetResult], names: &[String]) -> anyhow::Result<()> {
+    let images = results.first().map_or(0, |set| set.images);
+    page.figure(
+        "fig8-q-per-set",
+        &exhibits::q_per_set(results, names),
+        "As Fig. 8 of the paper: quality factor per set and submission.",
+    )?;
+    let place = |name: &str| names.iter().position(|n| n == name);
+    if let (Some(raw), Some(den)) = (place("23/raw/star"), place("23/den/star")) {
+        let both = [(raw, "23/raw/star"), (den, "23/den/star")];
+        page.table("denoising", &exhibits::denoising_table(results, &both))?;
+    }
+    if let (Some(raw), Some(den)) = (place("23/raw/star"), place("23/den/star")) {
+        page.figure(
+            "fig9-power-spectra",
+            &exhibits::power_spectra(results, den, "23/den/star"),
+            &format!("As Fig. 9 of the paper: true and measured shear power spectra of 23/den/star. The measured ones hold the noise that {images} images leave."),
+        )?;
+        page.data(
+            "fig9-power-spectra",
+            &exhibits::power_spectra_table(results, den),
+        )?;
+        let both = [(raw, "23/raw/star"), (den, "23/den/star")];
+        page.figure(
+            "fig10-multiplicative",
+            &exhibits::bias_per_set(
+                results,
+                &both,
+                |f| f.m_half,
+                "Multiplicative bias per set",
+                "M/2",
+            ),
+            "As Fig. 10 of the paper: multiplicative bias per set.",
+        )?;
+        page.figure(
+            "fig11-additive",
+            &exhibits::bias_per_set(
+                results,
+                &both,
+                |f| f.sqrt_a,
+                "Additive bias per set",
+                "√A × 10⁴",
+            ),
+            "As Fig. 11 of the paper: additive bias per set.",
+        )?;
+    }
+    page.section("Every set", "The data of the figures per set.");
+    page.table("fig8-11-per-set", &exhibits::per_set_table(results))?;
+    Ok(())
+}

@@ -1,0 +1,172 @@
+//! `shearq run`.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use shearq_scoring::Options;
+use shearq_submissions::Registry;
+
+use crate::arguments::{ReportFile, SetList, Sharding, SimulationArguments, Threads};
+use crate::choices::named;
+use crate::progress::{Bar, goes_on};
+use crate::{measure, print_table, score, tell};
+use shearq_files::atomic;
+use shearq_files::table::FileFormat;
+use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE};
+use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::images;
+use shearq_pipeline::run::run_folder;
+use shearq_render::table::{Table, TableFormat};
+use shearq_results::row::Measured;
+use shearq_results::score::{OWN, ScoredSet, score_folder};
+use shearq_results::store;
+use shearq_results::views::pages;
+use shearq_results::views::scores::{bandpowers, per_set};
+
+/// Measure and score in one go, on a data folder or on sets that are simulated on the way.
+///
+/// With --simulate no image is ever stored: stamps are drawn, measured and forgotten, so that a whole
+/// challenge (`--sets all --images 200`, 48 million galaxies) needs the room of its catalogues alone.
+/// They are those that `simulate` and `measure` would make of the same settings. Scores and
+/// bandpowers are printed and kept beside the catalogues as scores.csv and bandpowers.csv. A stopped
+/// run goes on where it was, image by image. With --shard nothing is scored until `merge`.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// Name of a submission (see `shearq submissions list`) or a TOML file of your own.
+    #[arg(long, value_name = "NAME|FILE")]
+    submission: String,
+    /// Data folder to measure.
+    #[arg(long, value_name = "DIR", required_unless_present = "simulate")]
+    data: Option<PathBuf>,
+    /// Simulate the data in memory.
+    #[arg(long, conflicts_with = "data", requires_all = ["sets", "images"])]
+    simulate: bool,
+    /// Sets, as `1,2,7-9` or `all` [default with --data: all there are].
+    #[arg(long, value_name = "LIST")]
+    sets: Option<SetList>,
+    /// Images per set, with --simulate.
+    #[arg(long, value_name = "N", conflicts_with = "data", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    images: Option<u32>,
+    #[command(flatten)]
+    simulation: SimulationArguments,
+    /// Folder to write to.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Format of the catalogues [default: parquet].
+    #[arg(long, value_parser = named::<FileFormat>())]
+    catalogue_format: Option<FileFormat>,
+    /// Record the scores in this results store, which `compare --store` reads.
+    #[arg(long, value_name = "DIR")]
+    store: Option<PathBuf>,
+    #[command(flatten)]
+    report: ReportFile,
+    #[command(flatten)]
+    sharding: Sharding,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    goes_on();
+    let Arguments {
+        submission,
+        data,
+        simulate: _,
+        sets,
+        images,
+        simulation,
+        out,
+        catalogue_format,
+        store,
+        report,
+        sharding,
+        threads,
+    } = arguments;
+    if let Some(store) = store {
+        store::prepare(store)?;
+    }
+    let threads = threads.number();
+    let wanted = match sets {
+        None => &[],
+        Some(list) if data.is_none() => list.simulated()?,
+        Some(list) => &list.0[..],
+    };
+    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let source = match &data {
+        Some(data) => {
+            simulation.must_be_unused()?;
+            Source::folder(data, out)?
+        }
+        None => Source::Simulated(simulation.settings()?),
+    };
+    let submission = Registry::embedded()?.get(submission)?.submission;
+    let run = Run::new(source, submission, catalogue_format.unwrap_or_default());
+    match (&run.source, &data) {
+        (Source::Simulated(settings), _) => {
+            let images = sharding.part(&images::of_simulation(wanted, images.unwrap_or(1)));
+            let galaxies = images.len() as u64 * (settings.grid as u64).pow(2);
+            let mut bar = Bar::new("simulating and measuring", galaxies);
+            let start = std::time::Instant::now();
+            let summary = run_folder(&run, *settings, &images, out, threads, &mut bar)?;
+            drop(bar);
+            measure::report(&run, &summary, start.elapsed(), threads, out);
+        }
+        (Source::Folder { .. }, Some(data)) => {
+            let images = sharding.part(&images::of_folder(data, wanted)?);
+            measure::measure(&run, data, out, &images, threads)?;
+        }
+        (Source::Folder { .. }, None) => {}
+    }
+    if let Some(shard) = sharding.shard {
+        let expected = [
+            sets.as_ref().map(|list| format!(" --sets {list}")),
+            images.map(|images| format!(" --images {images}")),
+        ];
+        tell(format_args!(
+            "shard {shard} is done; `shearq merge {}{} --shards {}` scores when all are",
+            out.display(),
+            expected.map(Option::unwrap_or_default).concat(),
+            shard.of()
+        ));
+        return Ok(());
+    }
+    let scored = score(&run, out, wanted, store.as_deref(), threads)?;
+    let title = format!("Scores of {}", run.submission.name);
+    let sections = || {
+        Ok(vec![pages::scores(
+            &run.submission.name,
+            &scored.0,
+            scored.1,
+        )?])
+    };
+    report.save(&title, sections, || score::made_by(&run, out))
+}
+
+/// Scores a folder of catalogues (those of `sets`, or all), prints the scores and keeps them and the
+/// bandpowers beside the catalogues, and in the results store if there is one.
+pub(super) fn score(
+    run: &Run,
+    out: &Path,
+    sets: &[u32],
+    store: Option<&Path>,
+    threads: usize,
+) -> anyhow::Result<(Vec<ScoredSet>, Table)> {
+    let options = Options {
+        choice: OWN,
+        ..Options::default()
+    };
+    let truth = run.source.data(out)?;
+    let scored = score_folder(&truth, out, run, sets, options, threads)?;
+    if let Some(store) = store {
+        let made = Measured::run(run, &truth, out)?;
+        score::record(store, made, &scored, options)?;
+    }
+    let title = format!("Scores of {}", run.submission.name);
+    let table = per_set(&scored, &title, options.definition);
+    for (name, table) in [("scores", &table), ("bandpowers", &bandpowers(&scored))] {
+        let text = table.render(TableFormat::Csv);
+        atomic::write(out.join(format!("{name}.csv")), text.as_bytes())?;
+    }
+    print_table(&table.narrow())?;
+    Ok((scored, table))
+}

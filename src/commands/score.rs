@@ -1,0 +1,471 @@
+//! `shearq score`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use clap::{ArgGroup, Args, ValueEnum};
+use shearq_quantities::units::{Degrees, Pixels};
+use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore, TrueShear, TruthSign};
+
+use crate::arguments::{Printing, ReportFile, ScoreSettings, SetList, Threads, positive};
+use crate::{print, tell};
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::truth::{Reading, read_truth, reading_of};
+use shearq_render::table::TableFormat;
+use shearq_results::foreign::{Foreign, Screen, plain_columns};
+use shearq_results::row::{Measured, RunRecord};
+use shearq_results::score::{
+    COLUMNS, ReadImage, ScoredSet, own_catalogue, score_files, score_folder, score_sets, unscored,
+};
+use shearq_results::store;
+use shearq_results::submit::challenge::{Kind, read_bandpowers};
+use shearq_results::submit::manifest::Manifest;
+use shearq_results::submit::packed::{Packed, Sent, Submission};
+use shearq_results::views::pages;
+use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
+
+/// Score ellipticities against the true shear: Q, Q_dn, M/2, √A.
+///
+/// Either a folder that `measure` wrote (`--data DATA --measured OUT`), other programs' catalogues
+/// (`--data DATA --foreign FILE`), or one set from plain files (`--truth truth.csv CATALOGUE...`, one
+/// catalogue per image; CSV with a header, ASCII `x y e1 e2`, FITS or Parquet by the file's ending).
+/// Power-spectrum submissions are given by --spectra, packed submissions of either kind by --packed. With `--format json` and plain files everything about the
+/// set is printed, all eight conventions included.
+#[derive(Debug, Args)]
+#[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "spectra", "packed", "catalogues"]))]
+pub(crate) struct Arguments {
+    /// Data folder with the true shear [default with --measured: the one measured].
+    #[arg(long, value_name = "DIR", conflicts_with = "truth")]
+    data: Option<PathBuf>,
+    /// Folder of catalogues that `measure` wrote.
+    #[arg(long, value_name = "DIR", conflicts_with = "truth")]
+    measured: Option<PathBuf>,
+    /// True shear of one set: x, y, g1, g2.
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+    /// Catalogues of that set, one per image.
+    #[arg(value_name = "CATALOGUE", requires = "truth")]
+    catalogues: Vec<PathBuf>,
+    /// Catalogues of another program, described in a TOML file (docs/formats.md), instead of
+    /// --measured.
+    #[arg(long, value_name = "FILE", requires = "data")]
+    foreign: Option<PathBuf>,
+    /// Power-spectrum submission (`index l power`): a file with --truth, a folder of
+    /// `{method}_set{set}.dat` with --data.
+    #[arg(long, value_name = "PATH", conflicts_with = "noise_var")]
+    spectra: Option<PathBuf>,
+    /// Packed submission, catalogues or power spectra: the folder or the archive (.tar.gz) as it is sent.
+    #[arg(long, value_name = "PATH", requires = "data")]
+    packed: Option<PathBuf>,
+    /// Sets to score [default: all that were measured].
+    #[arg(long, value_name = "LIST", conflicts_with = "truth")]
+    sets: Option<SetList>,
+    /// Noise variance per component, galaxy and image, for Q_dn [default: measured from the scatter
+    /// between images].
+    #[arg(long, value_name = "V", allow_negative_numbers = true)]
+    noise_var: Option<f64>,
+    /// Sign of g2 in the truth file [default: challenge for --truth, the layout's for --data].
+    #[arg(long, value_enum)]
+    truth_sign: Option<SignArgument>,
+    /// Pixels a side of a grid cell, for --truth.
+    #[arg(
+        long,
+        value_name = "PX",
+        default_value_t = 48.0,
+        allow_negative_numbers = true
+    )]
+    stamp: f64,
+    /// Side of the field in degrees, for --truth.
+    #[arg(long, value_name = "DEG", default_value_t = 10.0)]
+    field: f64,
+    /// Columns of the catalogues, for --truth.
+    #[arg(
+        long,
+        value_name = "X,Y,E1,E2",
+        default_value = "x,y,e1,e2",
+        value_delimiter = ',',
+        num_args = 1
+    )]
+    columns: Vec<String>,
+    /// A value of either component that stands for "not measured", as -99; for --truth.
+    #[arg(
+        long,
+        value_name = "VALUE",
+        requires = "truth",
+        allow_negative_numbers = true
+    )]
+    missing: Option<f64>,
+    /// Rows with a larger |e| have no ellipticity; for --truth [default: no limit].
+    #[arg(long, value_name = "E", requires = "truth", value_parser = positive)]
+    max_modulus: Option<f64>,
+    /// Record the scores in this results store, which `compare --store` reads.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra", "packed"])]
+    store: Option<PathBuf>,
+    #[command(flatten)]
+    printing: Printing,
+    #[command(flatten)]
+    report: ReportFile,
+    #[command(flatten)]
+    settings: ScoreSettings,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+/// Sign of g2 on the command line.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum SignArgument {
+    /// Minus the standard g2, as the challenge's truth files hold it.
+    Challenge,
+    /// Positive along x = y.
+    Standard,
+}
+
+impl From<SignArgument> for TruthSign {
+    fn from(sign: SignArgument) -> Self {
+        match sign {
+            SignArgument::Challenge => TruthSign::Challenge,
+            SignArgument::Standard => TruthSign::Standard,
+        }
+    }
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let options = Options {
+        definition: arguments.settings.definition(),
+        noise: arguments.noise_var.map_or(Noise::Measured, Noise::Given),
+        choice: match arguments.measured {
+            Some(_) => arguments.settings.own_choice(),
+            None => arguments.settings.choice(),
+        },
+    };
+    let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
+    if let (Some(path), Some(data)) = (&arguments.packed, &data) {
+        return packed(arguments, data, path, options);
+    }
+    match (&arguments.truth, &arguments.spectra, data) {
+        (Some(truth), Some(spectrum), _) => spectrum_file(arguments, truth, spectrum, options),
+        (Some(truth), None, _) => files(arguments, truth, options),
+        (None, Some(spectra), Some(data)) => spectrum_folder(arguments, &data, spectra, options),
+        (None, Some(_), None) => {
+            bail!("--spectra needs the true shear: --data DIR or --truth FILE")
+        }
+        (None, None, data) => folder(arguments, data, options),
+    }
+}
+
+fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> anyhow::Result<()> {
+    if let Some(store) = &arguments.store {
+        store::prepare(store)?;
+    }
+    let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
+    let threads = arguments.threads.number();
+    let (name, made_by, scored, unscored) = match (&arguments.measured, &arguments.foreign, data) {
+        (Some(measured), _, data) => {
+            let run = Run::require(measured)?;
+            let data = data.map_or_else(|| run.source.data(measured), Ok)?;
+            let scored = score_folder(&data, measured, &run, sets, options, threads)?;
+            if let Some(store) = &arguments.store {
+                let made = Measured::run(&run, &data, measured)?;
+                record_printable(arguments, store, made, &scored, options)?;
+            }
+            let unscored = unscored(&data, &scored, sets)?;
+            let made_by = made_by(&run, measured)?;
+            (run.submission.name, made_by, scored, unscored)
+        }
+        (None, Some(path), Some(data)) => {
+            let foreign = Foreign::read(path)?;
+            let read = |grid: &Grid, path: &Path| foreign.sum(grid, path);
+            let files = foreign.catalogues(sets)?;
+            let catalogues = |set| files.of_set(set);
+            let scored = score_sets(&data, sets, catalogues, &read, options, threads)
+                .with_context(|| path.display().to_string())?;
+            if let Some(store) = &arguments.store {
+                let made = Measured {
+                    name: &foreign.name,
+                    settings: shearq_files::open::read_to_string(
+                        path,
+                        shearq_files::open::SETTINGS,
+                    )
+                    .with_context(|| path.display().to_string())?,
+                    source: &Source::folder(&data, path.parent().unwrap_or(path))?,
+                    data: &data,
+                };
+                record_printable(arguments, store, made, &scored, options)?;
+            }
+            let unscored = unscored(&data, &scored, sets)?;
+            let made_by = [("Catalogues", path.as_path()), ("Data", data.root())]
+                .map(|(what, path)| (what.to_owned(), path.display().to_string()));
+            (foreign.name.clone(), made_by.into(), scored, unscored)
+        }
+        (None, _, _) => bail!("--foreign needs the true shear: --data DIR"),
+    };
+    let title = format!("Scores of {name}");
+    let mut table = per_set(&scored, &title, options.definition);
+    table.notes.extend(unscored);
+    arguments.printing.print(&table)?;
+    let sections = || Ok(vec![pages::scores(&name, &scored, table)?]);
+    arguments.report.save(&title, sections, || Ok(made_by))
+}
+
+/// Records scores that can be printed as asked for: nothing is kept of a command that fails after it.
+fn record_printable(
+    arguments: &Arguments,
+    store: &Path,
+    measured: Measured<'_>,
+    scored: &[ScoredSet],
+    options: Options,
+) -> anyhow::Result<()> {
+    let table = per_set(scored, "", options.definition);
+    arguments.printing.check(&table)?;
+    record(store, measured, scored, options)
+}
+
+/// What made the catalogues of a run, for reports.
+pub(super) fn made_by(run: &Run, out: &Path) -> anyhow::Result<Vec<(String, String)>> {
+    Ok(vec![
+        ("Catalogues".into(), out.display().to_string()),
+        ("Source".into(), serde_json::to_string(&run.source)?),
+        (
+            run.submission.name.clone(),
+            toml::to_string(&run.submission)?,
+        ),
+    ])
+}
+
+/// Records a scored run in a results store and says where.
+pub(super) fn record(
+    store: &Path,
+    measured: Measured<'_>,
+    scored: &[ScoredSet],
+    options: Options,
+) -> anyhow::Result<()> {
+    let path = store::write(store, &RunRecord::new(measured, scored, options)?)?;
+    tell(format_args!("recorded in {}", path.display()));
+    Ok(())
+}
+
+/// Scores a submission as it is sent.
+fn packed(
+    arguments: &Arguments,
+    data: &DataFolder,
+    path: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
+    let sent = Sent::open(path)?;
+    let submission = Submission::read(&sent)?;
+    let manifest = submission.manifest.as_ref();
+    let catalogues = match submission.packed {
+        Packed::Catalogues(catalogues) => catalogues,
+        Packed::Spectra(files) => {
+            anyhow::ensure!(
+                arguments.noise_var.is_none(),
+                "--noise-var is for catalogues; {} holds power spectra",
+                path.display()
+            );
+            return spectra_of_sets(arguments, data, files, manifest, path, options).map_err(
+                |error| {
+                    let named = |error| sent.named(error).into();
+                    error.downcast().map_or_else(|other| other, named)
+                },
+            );
+        }
+    };
+    let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
+    let of_set = |set| {
+        let images = catalogues.get(&set).into_iter().flatten();
+        images.map(|(image, path)| (*image, path.clone())).collect()
+    };
+    // What we measured is in our convention.
+    let own = manifest.is_some_and(|manifest| manifest.run.is_some());
+    let options = Options {
+        choice: match own {
+            true => arguments.settings.own_choice(),
+            false => arguments.settings.choice(),
+        },
+        ..options
+    };
+    let foreign = plain_columns(COLUMNS, Screen::default());
+    let read: ReadImage<'_> = if own { &own_catalogue } else { &foreign };
+    let threads = arguments.threads.number();
+    let scored =
+        score_sets(data, sets, of_set, read, options, threads).map_err(|error| match error {
+            PipelineError::File(error) => sent.named(error).into(),
+            other => other,
+        })?;
+    let title = format!("Scores of {}", submission.method);
+    let mut table = per_set(&scored, &title, options.definition);
+    table.notes.extend(unscored(data, &scored, sets)?);
+    arguments.printing.print(&table)
+}
+
+/// Scores the power spectra of a folder, one file per set.
+fn spectrum_folder(
+    arguments: &Arguments,
+    data: &DataFolder,
+    folder: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
+    let mut files = BTreeMap::<u32, PathBuf>::new();
+    let cannot_read = || format!("{}: cannot read the folder", folder.display());
+    for entry in std::fs::read_dir(folder).with_context(cannot_read)? {
+        let path = entry.with_context(cannot_read)?.path();
+        let Some(Kind::Spectrum { set, .. }) = Kind::of(&path) else {
+            continue;
+        };
+        if let Some(other) = files.insert(set, path.clone()) {
+            bail!(
+                "{}: {} is a spectrum of set {set} too; expected one method",
+                path.display(),
+                other.display()
+            );
+        }
+    }
+    anyhow::ensure!(
+        !files.is_empty(),
+        "{}: there is no file named {{method}}_set{{set}}.dat",
+        folder.display()
+    );
+    let manifest = Manifest::read(folder)?;
+    spectra_of_sets(arguments, data, files, manifest.as_ref(), folder, options)
+}
+
+/// Scores the power spectra of `files`, by set, of a submission at `place`.
+fn spectra_of_sets(
+    arguments: &Arguments,
+    data: &DataFolder,
+    mut files: BTreeMap<u32, PathBuf>,
+    manifest: Option<&Manifest>,
+    place: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
+    if let Some(wanted) = &arguments.sets {
+        if let Some(set) = wanted.0.iter().find(|set| !files.contains_key(set)) {
+            bail!("{}: there is no spectrum of set {set}", place.display());
+        }
+        files.retain(|set, _| wanted.0.contains(set));
+    }
+    let mut scored = Vec::new();
+    for (set, path) in &files {
+        let (grid, truth) = read_truth(&data.truth(*set), &reading_of(data, *set)?)?;
+        let score = score_spectrum(grid, truth, path, manifest, options)?;
+        scored.push((Some(*set), score));
+    }
+    print_spectra(arguments, &scored, place, options)
+}
+
+fn spectrum_file(
+    arguments: &Arguments,
+    truth: &Path,
+    spectrum: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
+    let (grid, shear) = read_truth(truth, &plain_reading(arguments))?;
+    let manifest = Manifest::read(spectrum.parent().unwrap_or(Path::new("")))?;
+    let score = score_spectrum(grid, shear, spectrum, manifest.as_ref(), options)?;
+    let scored = [(None, score)];
+    print_spectra(arguments, &scored, spectrum, options)
+}
+
+fn score_spectrum(
+    grid: Grid,
+    truth: TrueShear,
+    path: &Path,
+    manifest: Option<&Manifest>,
+    options: Options,
+) -> anyhow::Result<SpectrumScore> {
+    let powers = read_bandpowers(path, &grid)?;
+    let covariance = manifest.and_then(|manifest| {
+        let name = path.file_name()?.to_str()?;
+        manifest.covariances.get(name)
+    });
+    Ok(SetScorer::new(grid, truth, options)?.score_spectrum(&powers, covariance)?)
+}
+
+fn print_spectra(
+    arguments: &Arguments,
+    scored: &[(Option<u32>, SpectrumScore)],
+    path: &Path,
+    options: Options,
+) -> anyhow::Result<()> {
+    let title = format!("Scores of the power spectra of {}", path.display());
+    let table = spectra(scored, &title, options.definition);
+    arguments.printing.print(&table)
+}
+
+/// How the truth given by `--truth` is to be read.
+fn plain_reading(arguments: &Arguments) -> Reading {
+    Reading {
+        field: Degrees(arguments.field),
+        stamp: Pixels(arguments.stamp),
+        sign: arguments
+            .truth_sign
+            .map_or(TruthSign::Challenge, Into::into),
+    }
+}
+
+fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Result<()> {
+    let columns: Vec<&str> = arguments.columns.iter().map(String::as_str).collect();
+    let columns: [&str; 4] = columns.as_slice().try_into().map_err(|_| {
+        anyhow::anyhow!(
+            "--columns names {} columns; expected four: x, y and the two components",
+            columns.len()
+        )
+    })?;
+    let screen = Screen {
+        missing: arguments.missing,
+        max_modulus: arguments.max_modulus,
+    };
+    let mut seen = BTreeSet::new();
+    for path in &arguments.catalogues {
+        let same = path.canonicalize().unwrap_or_else(|_| path.clone());
+        anyhow::ensure!(
+            seen.insert(same),
+            "{}: this catalogue is given twice; expected one for each image",
+            path.display()
+        );
+    }
+    let scored = score_files(
+        truth,
+        &arguments.catalogues,
+        &plain_reading(arguments),
+        &plain_columns(columns, screen),
+        options,
+        arguments.threads.number(),
+    )?;
+    if arguments.printing.format() == TableFormat::Json {
+        anyhow::ensure!(
+            !arguments.printing.chooses(),
+            "--figures: JSON of one set from plain files has everything; use --format csv for some figures"
+        );
+        let name = |path: &Path| path.display().to_string();
+        let input = SetInput {
+            case: truth
+                .parent()
+                .and_then(|folder| folder.file_name())
+                .map_or_else(|| name(truth), |n| n.to_string_lossy().into_owned()),
+            truth: name(truth),
+            catalogues: arguments.catalogues.iter().map(|path| name(path)).collect(),
+            definition: options.definition,
+        };
+        let mut text = serde_json::to_string_pretty(&one_set_json(&scored, &input))?;
+        text.push('\n');
+        return print(&text);
+    }
+    let title = format!("Scores against {}", truth.display());
+    let scored = [scored];
+    let table = per_set(&scored, &title, options.definition);
+    arguments.printing.print(&table)?;
+    let mut made_by = vec![("Truth".to_owned(), truth.display().to_string())];
+    made_by.extend(
+        arguments
+            .catalogues
+            .iter()
+            .enumerate()
+            .map(|(k, path)| (format!("Catalogue {}", k + 1), path.display().to_string())),
+    );
+    let sections = || Ok(vec![pages::scores("catalogues", &scored, table)?]);
+    arguments.report.save(&title, sections, || Ok(made_by))
+}

@@ -1,0 +1,126 @@
+//! What is shown of long work: a progress bar on standard error, none when it is not a terminal, and a word
+//! where the work is stopped.
+
+use std::fmt::Write;
+use std::io::IsTerminal;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use indicatif::{
+    HumanCount, HumanDuration, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle,
+};
+
+use crate::tell;
+use shearq_pipeline::Progress;
+
+/// Galaxies done, rate and time left.
+pub(super) struct Bar {
+    bar: ProgressBar,
+    /// Of the galaxies done, those that were found done and are no measure of speed.
+    skipped: Arc<AtomicU64>,
+}
+
+impl Bar {
+    /// A bar over `galaxies`, with `what` in front.
+    pub(super) fn new(what: &'static str, galaxies: u64) -> Self {
+        let target = if std::io::stderr().is_terminal() {
+            ProgressDrawTarget::stderr_with_hz(5)
+        } else {
+            ProgressDrawTarget::hidden()
+        };
+        let bar = ProgressBar::with_draw_target(Some(galaxies), target);
+        let skipped = Arc::new(AtomicU64::new(0));
+        // The bar takes what the words leave of the line.
+        let template = "{prefix} {wide_bar} {percent}% of {human_len} galaxies{pace}{msg}";
+        if let Ok(style) = ProgressStyle::with_template(template) {
+            let skipped = Arc::clone(&skipped);
+            let pace = move |state: &ProgressState, out: &mut dyn Write| {
+                let left = state.len().unwrap_or(0).saturating_sub(state.pos());
+                let done = state.pos().saturating_sub(skipped.load(Ordering::Relaxed));
+                // A formatter of a bar has nobody to tell.
+                let _ = out.write_str(&pace(done, left, state.elapsed().as_secs_f64()));
+            };
+            bar.set_style(style.with_key("pace", pace));
+        }
+        bar.set_prefix(what);
+        Bar { bar, skipped }
+    }
+}
+
+/// Rate and time left, after `done` galaxies in so many seconds.
+fn pace(done: u64, left: u64, seconds: f64) -> String {
+    if done == 0 || seconds <= 0.0 {
+        return String::new();
+    }
+    let rate = done as f64 / seconds;
+    let time = std::time::Duration::from_secs_f64((left as f64 / rate).min(1e9));
+    format!(
+        ", {}/s, {} left",
+        HumanCount(rate.round() as u64),
+        HumanDuration(time)
+    )
+}
+
+impl Progress for Bar {
+    fn advance(&mut self, galaxies: u64) {
+        self.bar.inc(galaxies);
+    }
+
+    fn skip(&mut self, galaxies: u64) {
+        self.skipped.fetch_add(galaxies, Ordering::Relaxed);
+        self.bar.inc(galaxies);
+    }
+
+    fn note(&mut self, line: &str) {
+        self.bar.set_message(format!("  {line}"));
+    }
+
+    fn warn(&mut self, line: &str) {
+        self.bar.suspend(|| tell(format_args!("{line}")));
+    }
+}
+
+impl Drop for Bar {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+/// Whether the command of this process goes on where it was stopped.
+static GOES_ON: AtomicBool = AtomicBool::new(false);
+
+/// Says that the command of this process, given again, goes on where it was stopped.
+pub(super) fn goes_on() {
+    GOES_ON.store(true, Ordering::Relaxed);
+}
+
+/// Exit code of what Ctrl-C stopped, as shells have it.
+const INTERRUPTED: i32 = 130;
+
+/// Ends the process at Ctrl-C with a word of what is to be done. Files are whole or not there at any moment.
+pub(super) fn end_at_interrupt() {
+    let handler = || {
+        let goes_on = GOES_ON.load(Ordering::Relaxed);
+        tell(format_args!(
+            "\nstopped{}",
+            match goes_on {
+                true => "; the same command goes on from what is done",
+                false => "",
+            }
+        ));
+        std::process::exit(INTERRUPTED);
+    };
+    // Without it, Ctrl-C ends the process without a word.
+    let _ = ctrlc::set_handler(handler);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_pace_is_that_of_work_done_now() {
+        assert_eq!(pace(0, 10, 1.0), "");
+        assert_eq!(pace(5506, 11012, 1.0), ", 5,506/s, 2 seconds left");
+    }
+}
