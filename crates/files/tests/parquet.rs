@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::frames::polars::{AnyValue, Column, DataFrame, df};
-use crate::frames::{
+use shearq_files::frames::polars::{AnyValue, Column, DataFrame, df};
+use shearq_files::frames::{
     Metadata, TableError, frame, parquet_columns, parquet_metadata, read_parquet, reals,
     write_parquet,
 };
