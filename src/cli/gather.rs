@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::{count, tell};
 use crate::io::layout::{DataFolder, MAX_IMAGE, MAX_SET};
-use crate::pipeline::gather::{Content, Files, Gathered, Gathering, Stamps, gather};
+use crate::pipeline::gather::{Content, Files, Gathered, Gathering, Stamps, Table, gather};
 use crate::pipeline::images::ImageId;
 
 /// Gather stamps of your own into a data folder that `measure` takes.
@@ -36,19 +36,23 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
     /// Table of the galaxies' positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the
-    /// first is at 1).
+    /// first is at 1). `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file.
     #[arg(long, value_name = "FILE", requires = "exposure")]
     positions: Option<PathBuf>,
-    /// Columns of the positions.
+    /// Table of the positions in a FITS file: its name (EXTNAME), or its number from 1 [default: the one that has the
+    /// columns].
+    #[arg(long, value_name = "NAME|NUMBER", requires = "positions")]
+    table: Option<String>,
+    /// Columns of the positions: names, or numbers from 1 if the table has no names [default: x and y, or the names of
+    /// SExtractor such as X_IMAGE and Y_IMAGE, or the two columns of a table without names].
     #[arg(
         long,
         value_name = "X,Y",
         value_delimiter = ',',
         num_args = 1,
-        default_value = "x,y",
-        requires = "exposure"
+        requires = "positions"
     )]
-    columns: Vec<String>,
+    columns: Option<Vec<String>>,
     /// Pixels a side of a stamp that is cut out.
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure")]
     size: u16,
@@ -80,6 +84,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         mask,
         mask_extension,
         positions,
+        table,
         columns,
         size,
         psf,
@@ -111,18 +116,25 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         extension: psf_extension.as_deref(),
         content: Content::Psf,
     };
-    let stamps = match (exposure, positions, columns.as_slice()) {
-        (Some(_), Some(positions), [x, y]) => Stamps::Cutouts {
-            exposure: images,
-            positions,
-            columns: [x, y],
-            side: usize::from(*size),
-        },
-        (Some(_), ..) => anyhow::bail!(
-            "--columns is `{}`; expected the names of two columns, as in `x,y`",
+    let columns = match columns.as_deref() {
+        None => None,
+        Some([x, y]) if !x.is_empty() && !y.is_empty() => Some([x.as_str(), y.as_str()]),
+        Some(columns) => anyhow::bail!(
+            "--columns is `{}`; expected two columns, as in `x,y` or `2,3`",
             columns.join(",")
         ),
-        (None, ..) => Stamps::Files(images),
+    };
+    let stamps = match positions {
+        Some(path) => Stamps::Cutouts {
+            exposure: images,
+            positions: Table {
+                path,
+                table: table.as_deref(),
+                columns,
+            },
+            side: usize::from(*size),
+        },
+        None => Stamps::Files(images),
     };
     let gathering = Gathering {
         stamps,

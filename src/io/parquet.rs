@@ -25,6 +25,11 @@ pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<DataFrame, Fi
     Ok(table)
 }
 
+/// The names of the columns.
+pub(super) fn columns(path: &Path) -> Result<Vec<String>, FileError> {
+    tables::parquet_columns(path).map_err(|error| bare(path, &error))
+}
+
 /// The metadata in the footer.
 pub(super) fn metadata(path: &Path) -> Result<Metadata, FileError> {
     tables::parquet_metadata(path).map_err(|error| bare(path, &error))

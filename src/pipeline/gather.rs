@@ -1,6 +1,7 @@
 //! Stamps that people have, gathered into the image of a data folder: cubes, files of one or several images each, and
 //! cut-outs of an exposure.
 
+mod positions;
 mod source;
 
 use std::fs;
@@ -10,6 +11,8 @@ use serde::Serialize;
 use shearq_measure::parts::frame;
 use shearq_scoring::resample::RunningMean;
 
+use self::positions::Positions;
+pub use self::positions::Table;
 pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, Origin, Planes, shown};
 use super::PipelineError;
@@ -31,6 +34,10 @@ const PEDESTAL: f64 = 0.02;
 /// Mean of the stamps' frames, in units of the scatter of their pixels, that is told: more than the wings of galaxies
 /// leave.
 const SKY: f64 = 1.0;
+/// Pixels a side from which on a single stamp is taken for a mosaic or an exposure: four times the default stamp.
+const LARGE: usize = 192;
+/// How to read a mosaic or an exposure.
+const MOSAIC: &str = "--exposure FILE --positions TABLE cuts stamps out of an exposure; a mosaic is an image of a data folder as it is, DATA/set01/galaxies-001.fits, if DATA/layout.toml has the line `stamp = 48` with the side of its stamps";
 /// Pixels that the frame of a star or a stamp is wide.
 const FRAME: usize = 2;
 
@@ -45,10 +52,7 @@ pub enum Stamps<'a> {
         /// The exposure: the first image of one file.
         exposure: Files<'a>,
         /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
-        #[serde(serialize_with = "shown")]
-        positions: &'a Path,
-        /// Names of its columns for x and y.
-        columns: [&'a str; 2],
+        positions: Table<'a>,
         /// Pixels a side of a stamp.
         side: usize,
     },
@@ -167,11 +171,28 @@ fn gather_alone(
     let positions = match stamps {
         Stamps::Files(_) => Vec::new(),
         Stamps::Cutouts {
-            positions, columns, ..
-        } => read_positions(positions, *columns)?,
+            positions,
+            exposure,
+            ..
+        } => {
+            let positions = Positions::read(*positions)?;
+            let sides = Exposure::open(*exposure)?.sides()?;
+            doubts.extend(positions.note.clone());
+            doubts.extend(positions.examine(&exposure.paths[0], sides)?);
+            positions.all
+        }
     };
     let (count, side) = match stamps {
-        Stamps::Files(files) => survey(*files)?,
+        Stamps::Files(files) => {
+            let (count, side) = survey(*files)?;
+            if count == 1 && side >= LARGE {
+                doubts.push(format!(
+                    "warning: {}: the only stamp is {side} × {side} px, which looks like a mosaic of stamps or an exposure. Try: {MOSAIC}",
+                    files.paths[0].display()
+                ));
+            }
+            (count, side)
+        }
         Stamps::Cutouts { side, .. } => (positions.len(), *side),
     };
     let mosaic = Mosaic::of(count, side);
@@ -291,36 +312,6 @@ fn frame_of(pixels: &[f32], side: usize) -> impl Iterator<Item = f64> + '_ {
         .map(|&value| f64::from(value))
 }
 
-/// Positions of galaxies on an exposure.
-fn read_positions(path: &Path, columns: [&str; 2]) -> Result<Vec<(f64, f64)>, FileError> {
-    let read = table::read_columns(path, &columns)
-        .map_err(|error| error.hint_of_columns("--columns names others"))?;
-    let of = |name| table::numbers(&read, name, path);
-    let (xs, ys) = (of(columns[0])?, of(columns[1])?);
-    let positions: Vec<_> = xs.iter().copied().zip(ys.iter().copied()).collect();
-    if positions.is_empty() {
-        return Err(FileError::new(
-            path,
-            "there is no position; expected one a row",
-        ));
-    }
-    let most = f64::from(i32::MAX);
-    match positions
-        .iter()
-        .position(|(x, y)| !(x.abs() < most && y.abs() < most))
-    {
-        None => Ok(positions),
-        Some(row) => {
-            let (x, y) = positions[row];
-            let message = format!(
-                "row {}: the position is ({x}, {y}); expected pixels of the exposure",
-                row + 1
-            );
-            Err(FileError::new(path, message))
-        }
-    }
-}
-
 /// Refuses an image that is its own mask.
 fn another(mask: &Origin<'_>, image: &Origin<'_>) -> Result<(), FileError> {
     if (mask.file, mask.image) == (image.file, image.image) {
@@ -346,8 +337,12 @@ fn survey(files: Files<'_>) -> Result<(usize, usize), FileError> {
     while let Some((origin, image)) = images.next()? {
         let (width, height) = (image.width(), image.height());
         if width != height || width > MAX_STAMP {
+            let advice = match files.content {
+                Content::Sky => format!(". Try: {MOSAIC}"),
+                Content::Psf | Content::Mask => String::new(),
+            };
             let message = format!(
-                "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP} (--exposure with --positions cuts stamps out of a large image)"
+                "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP}{advice}"
             );
             return Err(origin.fault(&message));
         }

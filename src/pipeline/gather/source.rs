@@ -277,14 +277,19 @@ impl<'a> Exposure<'a> {
         self.images.now.as_mut().ok_or_else(none)
     }
 
+    /// Columns and rows.
+    pub(super) fn sides(&mut self) -> Result<[usize; 2], FileError> {
+        let reader = self.reader()?;
+        Ok([reader.width(), reader.height()])
+    }
+
     /// Refuses one whose sides are not those of `other`.
     pub(super) fn like(&mut self, other: &mut Self) -> Result<(), FileError> {
-        let sides = |reader: &ImageReader| (reader.width(), reader.height());
-        let (own, expected) = (sides(self.reader()?), sides(other.reader()?));
+        let (own, expected) = (self.sides()?, other.sides()?);
         if own != expected {
             let message = format!(
                 "the mask is {} × {} pixels; the exposure has {} × {}",
-                own.0, own.1, expected.0, expected.1
+                own[0], own[1], expected[0], expected[1]
             );
             return Err(self.origin.fault(&message));
         }
