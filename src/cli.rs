@@ -30,6 +30,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+use crate::io::listing::Files;
 use crate::report::escape::visible;
 use crate::report::figure::HeatMap;
 use crate::report::table::Table;
@@ -208,6 +209,13 @@ fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
 fn tell(line: std::fmt::Arguments<'_>) {
     use std::io::Write;
     let _ = writeln!(std::io::stderr(), "{}", visible(&line.to_string()));
+}
+
+/// Reports what looks like files of data and is not read.
+fn tell_unread(files: &Files) {
+    for line in files.unread() {
+        tell(format_args!("warning: {line}"));
+    }
 }
 
 /// A number of things.

@@ -8,8 +8,7 @@ use shearq_scoring::Grid;
 use shearq_scoring::units::{Degrees, Pixels};
 
 use super::{Findings, count, print};
-use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, MAX_SET, read_truth_rows};
-use crate::io::open::is_there;
+use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, read_truth_rows};
 use crate::pipeline::grid;
 use crate::submit::check::{Expected, Severity, check};
 
@@ -54,11 +53,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         json,
     } = arguments;
     let data = data.as_ref().map(DataFolder::open).transpose()?;
-    let sets: Vec<u32> = data.as_ref().map_or_else(Vec::new, |data| {
-        (1..=MAX_SET)
-            .filter(|set| is_there(&data.truth(*set)))
-            .collect()
-    });
+    let sets = data
+        .as_ref()
+        .map_or_else(|| Ok(Vec::new()), DataFolder::sets_with_truth)?;
     let mut side = *grid;
     if let (None, Some(data), Some(&set)) = (side, &data, sets.first()) {
         let rows = read_truth_rows(&data.truth(set))?.len();

@@ -9,7 +9,7 @@ use shearq_submissions::Registry;
 
 use super::arguments::{SetList, Sharding, Threads};
 use super::progress::{Bar, goes_on};
-use super::{count, tell};
+use super::{count, tell, tell_unread};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::io::table::FileFormat;
@@ -58,6 +58,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let submission = Registry::embedded()?.get(submission)?.submission;
     let data = DataFolder::open(data)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
+    let images = sharding.part(&images::of_folder(&data, sets)?);
+    tell_unread(&data.images(sets)?);
     measure(
         &Run::new(
             Source::folder(&data, out)?,
@@ -66,7 +68,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ),
         &data,
         out,
-        &sharding.part(&images::of_folder(&data, sets)?),
+        &images,
         threads.number(),
     )
 }

@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::arguments::{SetList, Threads};
 use super::progress::{Bar, goes_on};
-use super::{Findings, count, print, run, tell};
+use super::{Findings, count, print, run, tell, tell_unread};
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::open::is_there;
 use crate::io::run::{RUN_FILE, Run, Source, claim, read_record};
@@ -82,7 +82,9 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
                 "--images is for simulated data; here every image of {} is expected",
                 run.source
             );
-            images::of_folder(&data, sets)?
+            let images = images::of_folder(&data, sets)?;
+            tell_unread(&data.images(sets)?);
+            images
         }
     };
     let results = Results::Catalogues {

@@ -8,7 +8,7 @@ use shearq_submissions::Registry;
 
 use super::arguments::{ReportFile, SetList, Sharding, SimulationArguments, Threads};
 use super::progress::{Bar, goes_on};
-use super::{measure, print_table, score, tell};
+use super::{measure, print_table, score, tell, tell_unread};
 use crate::io::atomic;
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::run::{Run, Source};
@@ -112,6 +112,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         (Source::Folder { .. }, Some(data)) => {
             let images = sharding.part(&images::of_folder(data, wanted)?);
+            tell_unread(&data.images(wanted)?);
             measure::measure(&run, data, out, &images, threads)?;
         }
         (Source::Folder { .. }, None) => {}

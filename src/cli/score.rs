@@ -9,7 +9,7 @@ use shearq_scoring::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore, TrueShear, TruthSign};
 
 use super::arguments::{Printing, ReportFile, ScoreSettings, SetList, Threads, positive};
-use super::{print, tell};
+use super::{print, tell, tell_unread};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::pipeline::PipelineError;
@@ -179,6 +179,12 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             let foreign = Foreign::read(path)?;
             let read = |grid: &Grid, path: &Path| foreign.sum(grid, path);
             let files = foreign.catalogues(sets)?;
+            anyhow::ensure!(
+                !files.serve_all_sets() || !sets.is_empty(),
+                "{}: `catalogues` has no number of the set (expected {{set}}, or the sets to score). Try: --sets 1",
+                path.display()
+            );
+            tell_unread(&files);
             let catalogues = |set| files.of_set(set);
             let scored = score_sets(&data, sets, catalogues, &read, options, threads)
                 .with_context(|| path.display().to_string())?;

@@ -11,7 +11,7 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 
 use super::error::FileError;
-use super::layout::{DataFolder, MAX_SET};
+use super::layout::DataFolder;
 use super::open;
 use super::run::Source;
 
@@ -137,12 +137,9 @@ pub fn of_source(source: &Source, data: &DataFolder) -> Result<String, FileError
             print.add(text);
         }
         Source::Folder { .. } => {
-            for set in 1..=MAX_SET {
-                let path = data.truth(set);
-                if open::is_there(&path) {
-                    print.add(set.to_le_bytes());
-                    print.add(read(&path)?);
-                }
+            for set in data.sets_with_truth()? {
+                print.add(set.to_le_bytes());
+                print.add(read(&data.truth(set))?);
             }
         }
     }

@@ -12,9 +12,9 @@ use super::open::{self, is_there};
 use super::table;
 
 /// Highest set number.
-pub const MAX_SET: u32 = 99;
+pub const MAX_SET: u32 = 9_999;
 /// Highest image number.
-pub const MAX_IMAGE: u32 = 999;
+pub const MAX_IMAGE: u32 = 999_999;
 
 /// Largest side of a postage stamp, in pixels.
 pub const MAX_STAMP: usize = 1024;
@@ -26,7 +26,7 @@ pub const LAYOUT_FILE: &str = "layout.toml";
 const STAMPS: &str = "set{set:02}/stamps-{image:03}.csv";
 
 /// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for the plain
-/// numbers, `{set:02}` and `{image:03}` for zero-padded ones. Wherever it is read from, it is checked.
+/// numbers, `{set:02}` and `{image:03}` for those with zeros in front up to two and three digits. Wherever it is read from, it is checked.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(remote = "Self", deny_unknown_fields, default)]
 pub struct Layout {
@@ -218,6 +218,37 @@ impl DataFolder {
     pub fn images(&self, sets: &[u32]) -> Result<Files, FileError> {
         let pattern = &self.layout.galaxies;
         listing::find(&self.root, pattern, endings(pattern), sets)
+    }
+
+    /// The folder in which this one would be that of a set, with images where the layout has them.
+    pub fn folder_above(&self) -> Option<PathBuf> {
+        let (first, rest) = self.layout.galaxies.split_once('/')?;
+        let root = self.root.canonicalize().ok()?;
+        let above = self
+            .root
+            .parent()
+            .filter(|path| !path.as_os_str().is_empty());
+        let here = listing::find(root.parent()?, first, &[""], &[]).ok()?;
+        let is_set = here
+            .sets()
+            .into_iter()
+            .any(|set| root.ends_with(fill(first, set, 0)));
+        let images = listing::find(&root, rest, endings(rest), &[]).ok()?;
+        (is_set && !images.is_empty()).then(|| above.map_or_else(|| "..".into(), Path::to_owned))
+    }
+
+    /// Sets that have a file of true shear. If one file serves all sets, these are the sets that have images.
+    ///
+    /// # Errors
+    /// If a folder cannot be listed.
+    pub fn sets_with_truth(&self) -> Result<Vec<u32>, FileError> {
+        let [plain, padded] = IMAGE_PLACEHOLDERS;
+        let pattern = &self.layout.truth.replace(padded, "000").replace(plain, "0");
+        let truths = listing::find(&self.root, pattern, &[""], &[])?;
+        if truths.serve_all_sets() {
+            return Ok(self.images(&[])?.sets());
+        }
+        Ok(truths.sets())
     }
 
     /// True shear of a set on `grid`.

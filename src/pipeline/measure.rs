@@ -126,14 +126,8 @@ impl ImageSource {
         let (image, mosaic) = open_galaxies(data, id)?;
         let stamp = mosaic.stamp;
         if stamp < submission.stamp.size {
-            return Err(FileError::new(
-                data.galaxies(id.set, id.image),
-                format!(
-                    "the stamps have {stamp} pixels a side; submission {} needs {} (`[stamp] size` of one of your own says otherwise)",
-                    submission.name, submission.stamp.size
-                ),
-            )
-            .into());
+            let path = data.galaxies(id.set, id.image);
+            return Err(FileError::new(path, too_small(stamp, submission)).into());
         }
         let header_noise = image.number("NOISESIG")?;
         if submission.noise == NoiseSource::Header
@@ -239,6 +233,26 @@ impl ImageSource {
             },
         }))
     }
+}
+
+/// Why stamps of `stamp` pixels a side cannot be measured, with the lines of a configuration that measures them.
+fn too_small(stamp: usize, submission: &Submission) -> String {
+    let Submission { name, .. } = submission;
+    let needed = submission.stamp.size;
+    let mut lines = format!("  extends = \"{name}\"\n  stamp.size = {stamp}");
+    if let Some(linear) = submission.linear() {
+        // The linear method asks for a window of at most a quarter of the stamp, and for a PSF that is even or odd as it.
+        let window = stamp as f64 / 4.0;
+        if linear.deconvolution.window_sigma > window {
+            lines += &format!("\n  deconvolution.window_sigma = {window}");
+        }
+        if submission.psf.size % 2 != stamp % 2 {
+            lines += &format!("\n  psf.size = {}", submission.psf.size - 1);
+        }
+    }
+    format!(
+        "the stamps are too small for the configuration {name} (found {stamp} px a side, expected {needed} or more). Try: --submission own.toml, with the file own.toml of these lines:\n{lines}"
+    )
 }
 
 /// Opens the galaxies of an image, whose stamps are those of its header, or of the data's layout.

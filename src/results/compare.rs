@@ -92,11 +92,15 @@ pub fn score_all(
             foreign: Some(foreign),
         });
     }
+    if entrants.iter().all(|e| e.files.serve_all_sets()) {
+        let message = "no pattern of the catalogues has a number of the set (expected {set} in `catalogues`); nothing says which sets to compare";
+        return Err(PipelineError::Request(message.into()));
+    }
     if let Some(entrant) = entrants.iter().find(|e| e.files.sets().is_empty()) {
         let message = format!("{}: there is no catalogue to score", entrant.name);
         return Err(PipelineError::Request(message));
     }
-    let common = |set: u32| entrants.iter().all(|e| e.files.sets().contains(&set));
+    let common = |set: u32| entrants.iter().all(|e| e.files.has(set));
     if !(1..=MAX_SET).any(common) {
         let message = "the variants have no set in common; there is nothing to compare".into();
         return Err(PipelineError::Request(message));

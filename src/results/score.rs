@@ -216,8 +216,9 @@ fn sets_to_score(
         if !wanted.is_empty() && !wanted.contains(&set) {
             continue;
         }
-        let files: Vec<_> = variants.iter().map(|v| (v.of_set)(set)).collect();
-        if files.iter().all(|files| !files.is_empty()) {
+        let files = variants.iter().map(|v| (v.of_set)(set));
+        let files: Vec<_> = files.take_while(|files| !files.is_empty()).collect();
+        if files.len() == variants.len() {
             sets.push((set, files));
         } else if wanted.contains(&set) {
             let message = format!("there is no catalogue of set {set} to score");
@@ -343,7 +344,9 @@ pub fn without_catalogue(
     sets: &[u32],
 ) -> Result<Vec<String>, FileError> {
     let images = data.images(sets)?;
-    let (mut absent, mut lines) = (Vec::new(), Vec::new());
+    let mut absent = Vec::new();
+    let unread = images.unread().into_iter();
+    let mut lines: Vec<String> = unread.map(|line| format!("Warning: {line}.")).collect();
     for set in images.sets() {
         let there = images.of_set(set);
         let Some(used) = used.get(&set) else {

@@ -11,12 +11,12 @@ use flate2::{Compression, GzBuilder};
 use tar::{Archive, Builder, Header};
 
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
+use crate::io::FileError;
 use crate::io::atomic::{PartFile, PartFolder, sweep_beside};
 use crate::io::open::open;
-use crate::io::{FileError, layout};
 
-/// Largest manifest accepted, in bytes: some four times that of 999 images of 99 sets.
-const MAX_MANIFEST: u64 = 1 << 22;
+/// Largest manifest accepted, in bytes: some two hundred for each file.
+const MAX_MANIFEST: u64 = 1 << 26;
 
 /// Most bytes that one byte of an archive may unpack to, beyond the first [`FREE`]: numbers in ASCII come
 /// to three, blank catalogues to a hundred or so.
@@ -25,8 +25,8 @@ const MAX_RATIO: u64 = 300;
 const FREE: u64 = 1 << 24;
 /// Bytes that a file counts for in addition to its own, as it takes them on disk.
 const FILE: u64 = 1 << 12;
-/// Most files: a catalogue for every image of every set, and a manifest.
-const MAX_FILES: u64 = layout::MAX_SET as u64 * layout::MAX_IMAGE as u64 + 1;
+/// Most files, the manifest included: 8,000 images of each of 24 sets and some more.
+pub const MAX_FILES: u64 = 200_000;
 
 /// Whether a path's ending is that of an archive.
 pub fn is_archive(path: &Path) -> bool {
