@@ -182,12 +182,8 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
             unnamed: Vec::new(),
         }),
         Ending::Fits => {
-            let tables = fits::tables(path)?.into_iter();
-            let meant = |head: &fits::TableHead| match &place.table {
-                Some(table) => head.is_called(table),
-                None => true,
-            };
-            let named = tables.filter(meant).map(|head| Named {
+            let tables = fits::tables(path, place.table.as_deref())?.into_iter();
+            let named = tables.map(|head| Named {
                 table: Some((head.number, head.shown())),
                 names: head.columns,
                 doubtful: false,

@@ -338,12 +338,31 @@ fn list_of(tables: &[TableHead]) -> String {
     names_of(&shown)
 }
 
-/// The tables of a file, in order.
+/// The tables of a file, in order; if `table` is a name or a number, those that have it.
 ///
 /// # Errors
-/// If the file cannot be read or has no table.
-pub fn tables(path: &Path) -> Result<Vec<TableHead>, FileError> {
-    all_tables(&mut File::open(path, "table")?)
+/// If the file cannot be read or has no such table.
+pub fn tables(path: &Path, table: Option<&str>) -> Result<Vec<TableHead>, FileError> {
+    let mut file = File::open(path, "table")?;
+    let all = all_tables(&mut file)?;
+    let Some(table) = table else {
+        return Ok(all);
+    };
+    let list = list_of(&all);
+    let called: Vec<_> = all
+        .into_iter()
+        .filter(|head| head.is_called(table))
+        .collect();
+    match called.is_empty() {
+        true => Err(no_table(&file, table, &list)),
+        false => Ok(called),
+    }
+}
+
+fn no_table(file: &File, table: &str, found: &str) -> FileError {
+    file.fault(format!(
+        "there is no table `{table}` in this file; tables found: {found}"
+    ))
 }
 
 fn all_tables(file: &mut File) -> Result<Vec<TableHead>, FileError> {
@@ -387,10 +406,7 @@ fn go_to_table(
             first.unwrap_or(&tables[0]).number
         }
         ([], Some(table)) => {
-            let list = list_of(&tables);
-            return Err(file.fault(format!(
-                "there is no table `{table}` in this file; tables found: {list}"
-            )));
+            return Err(no_table(file, table, &list_of(&tables)));
         }
         ([first, .., last], _) => {
             let what = match table {
