@@ -37,7 +37,7 @@ const SKY: f64 = 1.0;
 /// Pixels a side from which on a single stamp is taken for a mosaic or an exposure: four times the default stamp.
 const LARGE: usize = 192;
 /// How to read a mosaic or an exposure.
-const MOSAIC: &str = "--exposure FILE --positions TABLE cuts stamps out of an exposure; a mosaic is an image of a data folder as it is, DATA/set01/galaxies-001.fits, if DATA/layout.toml has the line `stamp = 48` with the side of its stamps";
+const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
 /// Pixels that the frame of a star or a stamp is wide.
 const FRAME: usize = 2;
 

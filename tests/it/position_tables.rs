@@ -8,7 +8,7 @@ use shearq::io::fits::write_table;
 use shearq_tables::frame;
 use shearq_tables::polars::Column;
 
-use crate::support::{fail, fits_image, floats, pixels_of, shearq, succeed, text};
+use crate::support::{Small, fail, fits_image, floats, pixels_of, shearq, succeed, text};
 
 /// Centres of 24 px stamps of an exposure of 96 × 96 pixels, whose pixels number its stamps.
 const PLACES: [(f64, f64); 3] = [(36.5, 12.5), (84.5, 60.5), (12.5, 84.5)];
@@ -423,15 +423,19 @@ fn a_mosaic_given_as_a_stamp_is_reported() {
     let done = shearq(&gather);
     let said = String::from_utf8(done.stderr).unwrap();
     assert!(
-        said.contains("mosaic.fits: the only stamp is 768 × 768 px, which looks like a mosaic of stamps or an exposure. Try: --exposure FILE --positions TABLE"),
+        said.contains("mosaic.fits: the only stamp is 768 × 768 px, which looks like a mosaic of stamps or an exposure. Try: --exposure with --positions"),
         "{said}"
     );
-    // A mosaic is read where it is said to be.
-    fs::create_dir_all(at("other/set01")).unwrap();
-    fs::write(at("other/layout.toml"), "stamp = 48\n").unwrap();
-    fs::copy(&stamps, at("other/set01/galaxies-001.fits")).unwrap();
-    fs::copy(&psf, at("other/set01/psf-001.fits")).unwrap();
-    let (data, measured) = (at("other"), at("measured"));
+    // A mosaic without STAMP in its header is read where the advice puts it.
+    let small = Small::new("2");
+    let set = small.at("data/set02");
+    let (pixels, side) = pixels_of(&set.join("galaxies-001.fits"));
+    fs::create_dir_all(small.at("own/set01")).unwrap();
+    fs::write(small.at("own/layout.toml"), "stamp = 48\n").unwrap();
+    let mosaic = fits_image(-32, &[side, side], &[], &floats(&pixels));
+    fs::write(small.at("own/set01/galaxies-001.fits"), mosaic).unwrap();
+    fs::copy(set.join("psf-001.fits"), small.at("own/set01/psf-001.fits")).unwrap();
+    let (data, measured) = (small.at("own"), small.at("out"));
     let measure = [
         "measure",
         "--submission",
@@ -439,7 +443,8 @@ fn a_mosaic_given_as_a_stamp_is_reported() {
         "--data",
         text(&data),
     ];
-    let _ = shearq(&[&measure[..], &["--out", text(&measured)]].concat());
+    succeed(&[&measure[..], &["--out", text(&measured)]].concat());
+    assert_eq!(small.measured("01", "e1").len(), 64);
     let _ = fs::remove_dir_all(&out);
     fs::write(&stamps, image(768, 480)).unwrap();
     let message = fail(&gather);
