@@ -135,7 +135,7 @@ fn a_submission_is_scored_as_it_is_sent() {
         ("NN_set8.dat", "catalogues and spectra; expected one kind"),
         ("g10_v1_objs_8_2.MM.dat", "several methods: MM, NN"),
         (
-            "g10_v1_objs_100_2.NN.dat",
+            "g10_v1_objs_10000_2.NN.dat",
             "the name is neither g10_v1_objs_",
         ),
     ] {
