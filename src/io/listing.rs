@@ -242,10 +242,7 @@ impl Search<'_> {
         let of_set = |piece: &&Piece<'_>| matches!(piece, Piece::Number { of_set: true, .. });
         let known = |run: &&str| run.parse().is_ok_and(|set| self.sets.contains(&set));
         // One of a set that is not wanted.
-        if !self.sets.is_empty()
-            && pattern.iter().any(|p| of_set(&p))
-            && !runs.iter().any(|r| known(&r))
-        {
+        if !self.sets.is_empty() && pattern.iter().any(|p| of_set(&p)) && !runs.iter().any(known) {
             return;
         }
         let reason = match folder {
