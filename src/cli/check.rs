@@ -10,6 +10,7 @@ use shearq_scoring::units::{Degrees, Pixels};
 use super::{Findings, count, print};
 use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, MAX_SET, read_truth_rows};
 use crate::io::open::is_there;
+use crate::io::table::MAX_ROWS;
 use crate::pipeline::grid;
 use crate::submit::check::{Expected, Severity, check};
 
@@ -61,7 +62,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     });
     let mut side = *grid;
     if let (None, Some(data), Some(&set)) = (side, &data, sets.first()) {
-        let rows = read_truth_rows(&data.truth(set))?.len();
+        let rows = read_truth_rows(&data.truth(set), MAX_ROWS)?.len();
         side = Some(grid::side(&data.truth(set), rows)?);
     }
     let layout = data

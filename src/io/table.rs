@@ -88,7 +88,7 @@ pub fn most_rows(grid: &Grid) -> usize {
 }
 
 /// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending. A
-/// text table has at most `most_rows`.
+/// table of text or in Parquet has at most `most_rows`.
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
@@ -111,18 +111,22 @@ pub fn read(
         most_rows,
     };
     match Ending::of(path) {
-        Ending::Parquet => parquet::read(path, wanted),
+        Ending::Parquet => parquet::read(path, wanted, most_rows),
         Ending::Fits => fits::read_table(path, wanted),
         Ending::Text => text::read(path, &request),
     }
 }
 
-/// Reads a truth file's x, y, g1, g2.
+/// Reads a truth file's x, y, g1, g2, of at most `most_rows`.
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
-pub fn read_truth(path: &Path) -> Result<DataFrame, FileError> {
-    read_columns(path, &["x", "y", "g1", "g2"])
+pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
+    let names = ["x", "y", "g1", "g2"];
+    match Ending::of(path) {
+        Ending::Text => read_text(path, &names),
+        Ending::Parquet | Ending::Fits => read(path, Some(&names), most_rows),
+    }
 }
 
 /// Reads the columns `names`: of a text table, which has these and no others where it has no header, or of another

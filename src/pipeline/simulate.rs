@@ -74,7 +74,7 @@ pub fn simulate_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
-    let _claim = claim(&data.root().join(SIMULATION_FILE), record)?;
+    let claim = claim(&data.root().join(SIMULATION_FILE), record)?;
     let todo: Vec<ImageId> = images
         .iter()
         .filter(|id| !data.galaxies(id.set, id.image).is_file())
@@ -101,7 +101,11 @@ pub fn simulate_folder(
             progress.advance(row.observed.len() as u64);
             let mut image = match open.take() {
                 Some(image) => image,
-                None => OpenImage::create(record, data, &row.job)?,
+                None => {
+                    // Writing would make the folder again, without the earlier images.
+                    claim.check()?;
+                    OpenImage::create(record, data, &row.job)?
+                }
             };
             let last = row.job.iy + 1 == row.job.set.grid().n;
             image.add(row)?;
@@ -114,6 +118,7 @@ pub fn simulate_folder(
             Ok(())
         },
     )?;
+    claim.check_results(images.iter().map(|id| data.galaxies(id.set, id.image)))?;
     Ok((made, already))
 }
 
