@@ -249,7 +249,11 @@ fn endings(pattern: &str) -> &'static [&'static str] {
 /// # Errors
 /// Where the file cannot be read.
 pub fn read_truth_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
-    rows_of(path, &table::read_truth(path, most)?, &["x", "y", "g1", "g2"])
+    rows_of(
+        path,
+        &table::read_truth(path, most)?,
+        &["x", "y", "g1", "g2"],
+    )
 }
 
 /// Rows of a catalogue, at most `most`, from four named columns.

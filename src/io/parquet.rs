@@ -14,7 +14,8 @@ pub(super) fn read(
     wanted: Option<&[&str]>,
     most_rows: usize,
 ) -> Result<DataFrame, FileError> {
-    let mut table = tables::read_parquet(path, wanted, most_rows).map_err(|error| bare(path, &error))?;
+    let mut table =
+        tables::read_parquet(path, wanted, most_rows).map_err(|error| bare(path, &error))?;
     let texts: Vec<String> = table
         .columns()
         .iter()

@@ -30,7 +30,7 @@ pub(super) fn from(folder: &Path, path: &Path) -> Result<PathBuf> {
 }
 
 /// `path` without the `folder/..` in it, if that is the same folder: a short name for messages.
-pub(super) fn shortened(path: PathBuf) -> PathBuf {
+pub(crate) fn shortened(path: PathBuf) -> PathBuf {
     let mut short = PathBuf::new();
     for part in path.components() {
         match (part, short.components().next_back()) {

@@ -81,8 +81,11 @@ impl Source {
     }
 }
 
-/// The way from the folder of a record to a data folder.
-fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
+/// The way from the folder of a record to a data folder or a file.
+///
+/// # Errors
+/// Where the current folder is not known.
+pub(crate) fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
     relative::from(from, to).map_err(FileError::doing(to, "cannot tell where the folder is"))
 }
 
@@ -179,7 +182,10 @@ pub fn check_folder(folder: &Path, expected: &str) -> Result<(), FileError> {
     } else {
         "there is no such folder"
     };
-    Err(FileError::new(folder, format!("{found}; expected {expected}")))
+    Err(FileError::new(
+        folder,
+        format!("{found}; expected {expected}"),
+    ))
 }
 
 /// Opens the data folder that a command is to read images from.
@@ -200,7 +206,9 @@ pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
             let data = relative::shortened(folder.join(path));
             format!(". Try: --data {}", data.display())
         }
-        Source::Simulated(_) => "; they were simulated in memory, and `shearq simulate` writes images".into(),
+        Source::Simulated(_) => {
+            "; they were simulated in memory, and `shearq simulate` writes images".into()
+        }
     };
     let message = format!(
         "this folder contains catalogues ({RUN_FILE}) and no galaxy images; expected the data folder that they were measured from{advice}"
@@ -332,7 +340,10 @@ impl Claim {
     ///
     /// # Errors
     /// Where one of them is not.
-    pub fn check_results(&self, results: impl IntoIterator<Item = PathBuf>) -> Result<(), FileError> {
+    pub fn check_results(
+        &self,
+        results: impl IntoIterator<Item = PathBuf>,
+    ) -> Result<(), FileError> {
         self.check()?;
         match results.into_iter().find(|path| !path.is_file()) {
             None => Ok(()),
@@ -411,7 +422,10 @@ fn most_important(mut differences: Vec<String>) -> Vec<String> {
             key.strip_prefix(*first)
                 .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
         };
-        FIRST.iter().position(|first| of(first)).unwrap_or(FIRST.len())
+        FIRST
+            .iter()
+            .position(|first| of(first))
+            .unwrap_or(FIRST.len())
     });
     let more = differences.len().saturating_sub(SHOWN);
     differences.truncate(SHOWN);
@@ -519,7 +533,9 @@ mod tests {
 
     #[test]
     fn the_differences_that_explain_most_come_first_and_others_are_counted() {
-        let mut lines: Vec<String> = (0..34).map(|k| format!("submission.a.k{k}: 1 ≠ 2")).collect();
+        let mut lines: Vec<String> = (0..34)
+            .map(|k| format!("submission.a.k{k}: 1 ≠ 2"))
+            .collect();
         lines.insert(0, "submission.description: \"a\" ≠ \"b\"".into());
         lines.push("submission.name: \"a\" ≠ \"b\"".into());
         lines.push("version: \"1\" ≠ \"2\"".into());
@@ -528,7 +544,10 @@ mod tests {
         assert!(shown[0].starts_with("version") && shown[1].starts_with("submission.name"));
         assert_eq!(shown[2], "submission.a.k0: 1 ≠ 2");
         assert_eq!(shown[SHOWN], "and 31 more");
-        assert_eq!(most_important(vec!["images: 1 ≠ 2".into()]), ["images: 1 ≠ 2"]);
+        assert_eq!(
+            most_important(vec!["images: 1 ≠ 2".into()]),
+            ["images: 1 ≠ 2"]
+        );
     }
 
     #[test]
@@ -547,7 +566,10 @@ mod tests {
         assert!(claimed.check().is_err());
         let _other = claim(&path, &1).unwrap();
         let message = claimed.check().unwrap_err().to_string();
-        assert!(message.contains("out: the folder was removed or replaced"), "{message}");
+        assert!(
+            message.contains("out: the folder was removed or replaced"),
+            "{message}"
+        );
     }
 
     #[test]

@@ -613,9 +613,7 @@ pub(super) fn catalogues(
     out: &Path,
     images: &[ImageId],
 ) -> impl Iterator<Item = PathBuf> {
-    images
-        .iter()
-        .map(|id| run.catalogue(out, id.set, id.image))
+    images.iter().map(|id| run.catalogue(out, id.set, id.image))
 }
 
 /// Those of `images` that have no catalogue yet, and those that have one.

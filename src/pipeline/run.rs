@@ -13,7 +13,9 @@ use shearq_submissions::{PsfForm, Submission};
 
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
-use super::measure::{MeasuredRow, RowPsf, StampRow, Summary, catalogues, measure_row, to_do, write_catalogue};
+use super::measure::{
+    MeasuredRow, RowPsf, StampRow, Summary, catalogues, measure_row, to_do, write_catalogue,
+};
 use super::{PipelineError, simulate};
 use crate::io::layout::DataFolder;
 use crate::io::mosaic::Mosaic;

@@ -12,8 +12,9 @@ use super::images::ImageId;
 use crate::io::atomic;
 use crate::io::fits::{ImageWriter, Value};
 use crate::io::layout::DataFolder;
+use crate::io::open::is_there;
 use crate::io::psf_table;
-use crate::io::run::claim;
+use crate::io::run::{Run, Source, claim};
 use crate::simulate::kinds::{SETS, SetKind};
 use crate::simulate::render::RenderScratch;
 use crate::simulate::set::{
@@ -30,6 +31,19 @@ pub struct SimulationRecord {
     pub version: String,
     /// What the data are made from.
     pub settings: SimulationSettings,
+}
+
+/// The kind of a set by its number if the data were simulated; other data may have the same numbers.
+pub fn kind_of(data: &DataFolder, set: u32) -> Option<SetKind> {
+    let in_memory = || {
+        let run = Run::read(data.root()).ok().flatten();
+        run.is_some_and(|run| matches!(run.source, Source::Simulated(_)))
+    };
+    if is_there(&data.root().join(SIMULATION_FILE)) || in_memory() {
+        SetKind::of(set)
+    } else {
+        None
+    }
 }
 
 /// One row of stamps to draw.

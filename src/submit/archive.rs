@@ -11,9 +11,9 @@ use flate2::{Compression, GzBuilder};
 use tar::{Archive, Builder, Header};
 
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
+use crate::io::FileError;
 use crate::io::atomic::{PartFile, PartFolder, sweep_beside};
-use crate::io::open::open;
-use crate::io::{FileError, layout};
+use crate::io::open::{is_there, open};
 
 /// Largest manifest accepted, in bytes: some four times that of 999 images of 99 sets.
 const MAX_MANIFEST: u64 = 1 << 22;
@@ -25,8 +25,8 @@ const MAX_RATIO: u64 = 300;
 const FREE: u64 = 1 << 24;
 /// Bytes that a file counts for in addition to its own, as it takes them on disk.
 const FILE: u64 = 1 << 12;
-/// Most files: a catalogue for every image of every set, and a manifest.
-const MAX_FILES: u64 = layout::MAX_SET as u64 * layout::MAX_IMAGE as u64 + 1;
+/// Most files: two hundred times those of the challenge's 24 sets of 200 images.
+const MAX_FILES: u64 = 1_000_000;
 
 /// Whether a path's ending is that of an archive.
 pub fn is_archive(path: &Path) -> bool {
@@ -41,11 +41,14 @@ pub struct ArchiveWriter {
 }
 
 impl ArchiveWriter {
-    /// Starts an archive.
+    /// Starts an archive, which must be new.
     ///
     /// # Errors
-    /// Where the file cannot be made.
+    /// Where the file exists or cannot be made.
     pub fn create(path: &Path) -> Result<Self, FileError> {
+        if is_there(path) {
+            return Err(exists(path));
+        }
         sweep_beside(path);
         let (part, file) = PartFile::create(path)?;
         // Neither the time nor the system of its making.
@@ -86,8 +89,19 @@ impl ArchiveWriter {
             .and_then(GzEncoder::finish)
             .and_then(|mut file| file.flush())
             .map_err(cannot_write(part.target()))?;
-        part.finish()
+        let path = part.target().to_owned();
+        match part.finish_if_absent()? {
+            true => Ok(()),
+            false => Err(exists(&path)),
+        }
     }
+}
+
+fn exists(path: &Path) -> FileError {
+    FileError::new(
+        path,
+        "the archive exists already; expected a new file. Remove it or choose another name",
+    )
 }
 
 /// gzip's number for it.
@@ -137,6 +151,8 @@ impl Unpacked {
 /// # Errors
 /// As [`read`] and [`Unpacked::verify`], and where `out` exists or cannot be written.
 pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
+    // All of it, before anything is written.
+    read(path, None)?.verify(path, required)?;
     let part = PartFolder::new(out)?;
     let unpacked = read(path, Some(part.path()))?;
     unpacked.verify(path, required)?;

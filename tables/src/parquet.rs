@@ -295,7 +295,8 @@ impl<'a> Source<'a> {
             let bytes = self
                 .read_bytes(start, chunk.compressed_size())
                 .map_err(damaged)?;
-            let most = unpacked_bytes(self.length).max(number_bytes(&field.dtype, group.num_rows()));
+            let most =
+                unpacked_bytes(self.length).max(number_bytes(&field.dtype, group.num_rows()));
             let series = guarded(path, &place, || decode(chunk, bytes, &field, most))?;
             if series.len() != group.num_rows() {
                 return Err(damaged(format!(

@@ -69,7 +69,10 @@ fn assert_same(left: &DataFrame, right: &DataFrame) {
 fn every_type_and_the_metadata_survive() {
     let folder = tempfile::tempdir().expect("temporary folder");
     let path = place(folder.path(), &encode(&sample()));
-    assert_same(&read_parquet(&path, None, MOST).expect("readable"), &sample());
+    assert_same(
+        &read_parquet(&path, None, MOST).expect("readable"),
+        &sample(),
+    );
     assert_eq!(parquet_metadata(&path).expect("readable"), metadata());
     assert_eq!(
         parquet_columns(&path).expect("readable"),
@@ -186,7 +189,9 @@ fn files_that_are_no_parquet_are_refused() {
         b"id,g1\n1,0.02\n",
     ] {
         let path = place(folder.path(), garbage);
-        let error = read_parquet(&path, None, MOST).expect_err("garbage").to_string();
+        let error = read_parquet(&path, None, MOST)
+            .expect_err("garbage")
+            .to_string();
         assert!(error.starts_with(&path.display().to_string()), "{error}");
     }
 }
@@ -230,7 +235,10 @@ fn as_many_rows_are_read_as_the_caller_expects_however_small_the_file_is() {
         let error = read_parquet(&path, Some(wanted), 1_600).expect_err("too many rows");
         assert_eq!(
             error.to_string(),
-            format!("{}: found 4410000 rows, expected at most 1600", path.display())
+            format!(
+                "{}: found 4410000 rows, expected at most 1600",
+                path.display()
+            )
         );
     }
 }
