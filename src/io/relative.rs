@@ -44,7 +44,7 @@ pub(crate) fn shortened(path: PathBuf) -> PathBuf {
         short.push(".");
     }
     // Behind a link, `..` leads elsewhere.
-    match (short.canonicalize(), path.canonicalize()) {
+    match (resolve(&short), resolve(&path)) {
         (Ok(one), Ok(other)) if one == other => short,
         _ => path,
     }

@@ -320,6 +320,11 @@ impl Claim {
         Err(FileError::new(folder, message))
     }
 
+    /// The error of work in the folder: that the folder is gone, if it is, else `error`.
+    pub fn explain<E: From<FileError>>(&self, error: E) -> E {
+        self.check().map_or_else(E::from, |()| error)
+    }
+
     /// Whether the record is the file that was claimed.
     #[cfg(unix)]
     fn is_there(&self) -> bool {

@@ -496,7 +496,8 @@ pub fn measure_folder(
             }
             Ok(())
         },
-    )?;
+    )
+    .map_err(|error| claim.explain(error))?;
     claim.check_results(catalogues(run, out, images))?;
     Ok(summary)
 }

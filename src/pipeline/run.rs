@@ -106,7 +106,8 @@ pub fn run_folder(
             write_catalogue(run, out, &image.rows[0], BTreeMap::new())?;
             summary.count(&image.rows[0]);
             Ok(())
-        })?;
+        })
+        .map_err(|error| claim.explain(error))?;
     }
     claim.check_results(catalogues(run, out, images))?;
     Ok(summary)

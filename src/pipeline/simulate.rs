@@ -131,7 +131,8 @@ pub fn simulate_folder(
             }
             Ok(())
         },
-    )?;
+    )
+    .map_err(|error| claim.explain(error))?;
     claim.check_results(images.iter().map(|id| data.galaxies(id.set, id.image)))?;
     Ok((made, already))
 }

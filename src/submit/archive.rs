@@ -25,8 +25,8 @@ const MAX_RATIO: u64 = 300;
 const FREE: u64 = 1 << 24;
 /// Bytes that a file counts for in addition to its own, as it takes them on disk.
 const FILE: u64 = 1 << 12;
-/// Most files: two hundred times those of the challenge's 24 sets of 200 images.
-const MAX_FILES: u64 = 1_000_000;
+/// Most files: forty times those of the challenge's 24 sets of 200 images.
+const MAX_FILES: u64 = 200_000;
 
 /// Whether a path's ending is that of an archive.
 pub fn is_archive(path: &Path) -> bool {
@@ -151,9 +151,9 @@ impl Unpacked {
 /// # Errors
 /// As [`read`] and [`Unpacked::verify`], and where `out` exists or cannot be written.
 pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
-    // All of it, before anything is written.
-    read(path, None)?.verify(path, required)?;
     let part = PartFolder::new(out)?;
+    // All of it, before any file is written.
+    read(path, None)?.verify(path, required)?;
     let unpacked = read(path, Some(part.path()))?;
     unpacked.verify(path, required)?;
     part.finish()?;

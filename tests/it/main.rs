@@ -26,6 +26,7 @@ mod orientation;
 mod own_images;
 mod packed;
 mod printed;
+mod refused;
 mod reproduced;
 mod scoring_cases;
 mod shards;
