@@ -154,8 +154,8 @@ mod tests {
 
     #[test]
     fn the_error_of_the_scatter_covers_repeated_draws() {
-        const DRAWS: usize = 1_000;
-        const GALAXIES: usize = 400;
+        const DRAWS: usize = 600;
+        const GALAXIES: usize = 2_000;
         const SHAPES: f64 = 0.14;
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         let mut normal = |scale: f64| -> f64 {
@@ -181,9 +181,9 @@ mod tests {
             let (n, galaxies) = (DRAWS as f64, GALAXIES as f64);
             let spread = (squares / n - (sum / n).powi(2)).sqrt();
             let stated = (variances / n).sqrt();
-            // The spread of 1000 draws has an error of 2.2 %; second order in the slope's error adds 2 % at most.
+            // Three errors of the spread of 600 draws, which is known to 2.9 %.
             assert!(
-                (stated / spread - 1.0).abs() < 0.08,
+                (stated / spread - 1.0).abs() < 0.09,
                 "{scatter}: {stated} {spread}"
             );
             let expected = (0.25 / galaxies + (scatter / SHAPES).powi(2) / (2.0 * galaxies)).sqrt();

@@ -385,3 +385,22 @@ fn an_output_folder_that_is_taken_away_is_an_error() {
         );
     }
 }
+
+#[test]
+fn the_name_of_a_file_is_no_formula_in_the_table_of_stamps() {
+    let small = Small::new("2");
+    let folder = small.at("data");
+    let from = folder.join("set02");
+    fs::copy(from.join("galaxies-001.fits"), folder.join("=cmd.fits")).unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_shearq"))
+        .current_dir(&folder)
+        .args(["gather", "--exposure", "=cmd.fits", "--out", "own"])
+        .args(["--positions", "set02/intrinsic-001.csv"])
+        .args(["--psf", "set02/psf-001.fits"])
+        .output()
+        .unwrap();
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{message}");
+    let table = fs::read_to_string(folder.join("own/set01/stamps-001.csv")).unwrap();
+    has(table.lines().nth(1).unwrap(), &[",'=cmd.fits,"]);
+}
