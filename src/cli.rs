@@ -109,7 +109,7 @@ enum Command {
     #[command(after_help = "Example:\n  shearq bench --submission 48/linear/star")]
     Bench(bench::Arguments),
     #[command(
-        after_help = "Examples:\n  shearq submissions show 48/linear/star\n  shearq submissions init own.toml --method linear"
+        after_help = "Examples:\n  shearq submissions show 48/linear/star\n  shearq submissions init own.toml"
     )]
     Submissions(submissions::Arguments),
     #[command(
@@ -130,7 +130,18 @@ const MISUSED: u8 = 2;
 /// Runs the command that this process was started with.
 pub fn main() -> ExitCode {
     progress::end_at_interrupt();
+    fail_at_size_limits();
     ExitCode::from(run_with(std::env::args_os()))
+}
+
+/// Makes writing beyond a limit of file sizes (`ulimit -f`) an error like any other. By default the signal ends the
+/// process without a message, and with files half written.
+fn fail_at_size_limits() {
+    #[cfg(unix)]
+    // SAFETY: ignoring a signal runs no code of ours, and no other thread has been started.
+    unsafe {
+        libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
+    }
 }
 
 /// Parses the arguments, of which the first is the program's name, runs the command and reports its error, if
@@ -167,10 +178,25 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Ok(()) => DONE,
         Err(error) if error.is::<Findings>() => FAILED,
         Err(error) => {
-            tell(format_args!("error: {error:#}"));
+            tell(format_args!("error: {}", causes(&error)));
             FAILED
         }
     }
+}
+
+/// An error with its causes, of which those that it mentions itself are not repeated.
+fn causes(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain() {
+        let cause = cause.to_string();
+        if text.is_empty() {
+            text = cause;
+        } else if !text.ends_with(&cause) {
+            text.push_str(": ");
+            text.push_str(&cause);
+        }
+    }
+    text
 }
 
 /// Prints help, the version or what is wrong with the arguments.
@@ -178,7 +204,7 @@ fn usage(message: &clap::Error) -> u8 {
     match written(|| message.print()) {
         Ok(()) => u8::try_from(message.exit_code()).unwrap_or(MISUSED),
         Err(error) => {
-            tell(format_args!("error: {error:#}"));
+            tell(format_args!("error: {}", causes(&error)));
             FAILED
         }
     }
@@ -301,6 +327,15 @@ mod tests {
             }
         }
         found
+    }
+
+    #[test]
+    fn a_cause_that_an_error_mentions_is_not_repeated() {
+        let error = anyhow::anyhow!("no space")
+            .context("cannot write: no space")
+            .context("out.csv");
+        assert_eq!(causes(&error), "out.csv: cannot write: no space");
+        assert_eq!(causes(&anyhow::anyhow!("a").context("b")), "b: a");
     }
 
     #[test]

@@ -12,9 +12,9 @@ pub mod mosaic;
 pub mod open;
 pub(crate) mod parquet;
 pub mod psf_table;
-mod relative;
+pub(crate) mod relative;
 pub mod run;
 pub mod table;
-mod text;
+pub(crate) mod text;
 
 pub use error::FileError;

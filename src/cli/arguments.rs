@@ -332,6 +332,17 @@ impl ScoreSettings {
     }
 }
 
+/// Refuses a submission that is named twice, which would be measured twice.
+pub(super) fn given_once(submissions: &[String]) -> anyhow::Result<()> {
+    for (k, name) in submissions.iter().enumerate() {
+        anyhow::ensure!(
+            !submissions[..k].contains(name),
+            "--submission {name} is given twice"
+        );
+    }
+    Ok(())
+}
+
 /// A positive number.
 pub(super) fn positive(text: &str) -> Result<f64, String> {
     let number = text.parse().ok();

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use shearq_submissions::{Registry, Submission};
 
-use super::arguments::{Form, Threads};
+use super::arguments::{Form, Threads, given_once};
 use super::print;
 use crate::report::page::Page;
 use crate::report::table::Table;
@@ -36,6 +36,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    given_once(&arguments.submission)?;
     let registry = Registry::embedded()?;
     let submissions = arguments
         .submission

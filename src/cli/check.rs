@@ -9,6 +9,7 @@ use shearq_scoring::units::{Degrees, Pixels};
 
 use super::{Findings, count, print};
 use crate::io::layout::{DataFolder, Layout, MAX_IMAGE, read_truth_rows};
+use crate::io::table::MAX_ROWS;
 use crate::pipeline::grid;
 use crate::submit::check::{Expected, Severity, check};
 
@@ -58,7 +59,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .map_or_else(|| Ok(Vec::new()), DataFolder::sets_with_truth)?;
     let mut side = *grid;
     if let (None, Some(data), Some(&set)) = (side, &data, sets.first()) {
-        let rows = read_truth_rows(&data.truth(set))?.len();
+        let rows = read_truth_rows(&data.truth(set), MAX_ROWS)?.len();
         side = Some(grid::side(&data.truth(set), rows)?);
     }
     let layout = data

@@ -11,7 +11,7 @@ use super::arguments::{SetList, Sharding, Threads};
 use super::progress::{Bar, goes_on};
 use super::{count, tell, tell_unread};
 use crate::io::layout::DataFolder;
-use crate::io::run::{Run, Source};
+use crate::io::run::{Run, Source, open_data};
 use crate::io::table::FileFormat;
 use crate::pipeline::images::{self, ImageId};
 use crate::pipeline::measure::{Summary, galaxies_to_do, measure_folder};
@@ -56,7 +56,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
     } = arguments;
     let submission = Registry::embedded()?.get(submission)?.submission;
-    let data = DataFolder::open(data)?;
+    let data = open_data(data)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
     let images = sharding.part(&images::of_folder(&data, sets)?);
     tell_unread(&data.images(sets)?);

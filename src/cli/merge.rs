@@ -10,7 +10,7 @@ use super::progress::{Bar, goes_on};
 use super::{Findings, count, print, run, tell, tell_unread};
 use crate::io::layout::{DataFolder, MAX_IMAGE};
 use crate::io::open::is_there;
-use crate::io::run::{RUN_FILE, Run, Source, claim, read_record};
+use crate::io::run::{RUN_FILE, Run, Source, check_folder, claim, read_record};
 use crate::pipeline::complete::{Fault, Results};
 use crate::pipeline::images::{self, ImageId, Shard};
 use crate::pipeline::simulate::{SIMULATION_FILE, SimulationRecord};
@@ -50,6 +50,10 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     goes_on();
     let out = &arguments.out;
+    check_folder(
+        out,
+        "a folder that `run`, `measure` or `simulate` wrote with --shard",
+    )?;
     if let Some(run) = Run::read(out)? {
         return merge_run(arguments, &run);
     }

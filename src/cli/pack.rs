@@ -7,8 +7,7 @@ use shearq_submissions::is_control;
 
 use super::progress::Bar;
 use super::{count, tell};
-use crate::io::layout::DataFolder;
-use crate::io::run::Run;
+use crate::io::run::{Run, open_data};
 use crate::results::foreign::Foreign;
 use crate::submit::archive::is_archive;
 use crate::submit::manifest::Contents;
@@ -69,7 +68,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     );
     let run = measured.as_deref().map(Run::require).transpose()?;
     let foreign = foreign.as_deref().map(Foreign::read).transpose()?;
-    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let data = data.as_deref().map(open_data).transpose()?;
     let (origin, name) = match (measured, &run, &foreign) {
         (Some(folder), Some(run), _) => (Origin::Measured { folder, run }, &run.submission.name),
         (_, _, Some(foreign)) => {

@@ -215,6 +215,7 @@ mod tests {
         };
         let record = SetRecord {
             set: 2,
+            simulated: true,
             data: String::new(),
             images: (1..=8).collect(),
             galaxies: 8,

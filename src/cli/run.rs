@@ -10,8 +10,8 @@ use super::arguments::{ReportFile, SetList, Sharding, SimulationArguments, Threa
 use super::progress::{Bar, goes_on};
 use super::{measure, print_table, score, tell, tell_unread};
 use crate::io::atomic;
-use crate::io::layout::{DataFolder, MAX_IMAGE};
-use crate::io::run::{Run, Source};
+use crate::io::layout::MAX_IMAGE;
+use crate::io::run::{Run, Source, open_data};
 use crate::io::table::FileFormat;
 use crate::pipeline::images;
 use crate::pipeline::run::run_folder;
@@ -90,7 +90,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Some(list) if data.is_none() => list.simulated()?,
         Some(list) => &list.0[..],
     };
-    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let data = data.as_deref().map(open_data).transpose()?;
     let source = match &data {
         Some(data) => {
             simulation.must_be_unused()?;

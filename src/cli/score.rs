@@ -13,6 +13,7 @@ use super::{print, tell, tell_unread};
 use crate::io::layout::DataFolder;
 use crate::io::run::{Run, Source};
 use crate::pipeline::PipelineError;
+use crate::pipeline::simulate::kind_of;
 use crate::pipeline::truth::{Reading, read_truth, reading_of};
 use crate::report::pages;
 use crate::report::scores::{SetInput, one_set_json, per_set, spectra};
@@ -23,6 +24,7 @@ use crate::results::score::{
     COLUMNS, ReadImage, ScoredSet, own_catalogue, score_files, score_folder, score_sets, unscored,
 };
 use crate::results::store;
+use crate::simulate::kinds::SetKind;
 use crate::submit::challenge::{Kind, read_bandpowers};
 use crate::submit::manifest::Manifest;
 use crate::submit::packed::{Packed, Sent, Submission};
@@ -356,7 +358,7 @@ fn spectra_of_sets(
         let score = score_spectrum(grid, truth, path, manifest, options)?;
         scored.push((Some(*set), score));
     }
-    print_spectra(arguments, &scored, place, options)
+    print_spectra(arguments, &scored, |set| kind_of(data, set), place, options)
 }
 
 fn spectrum_file(
@@ -369,7 +371,7 @@ fn spectrum_file(
     let manifest = Manifest::read(spectrum.parent().unwrap_or(Path::new("")))?;
     let score = score_spectrum(grid, shear, spectrum, manifest.as_ref(), options)?;
     let scored = [(None, score)];
-    print_spectra(arguments, &scored, spectrum, options)
+    print_spectra(arguments, &scored, |_| None, spectrum, options)
 }
 
 fn score_spectrum(
@@ -390,11 +392,12 @@ fn score_spectrum(
 fn print_spectra(
     arguments: &Arguments,
     scored: &[(Option<u32>, SpectrumScore)],
+    kind_of: impl Fn(u32) -> Option<SetKind>,
     path: &Path,
     options: Options,
 ) -> anyhow::Result<()> {
     let title = format!("Scores of the power spectra of {}", path.display());
-    let table = spectra(scored, &title, options.definition);
+    let table = spectra(scored, kind_of, &title, options.definition);
     arguments.printing.print(&table)
 }
 

@@ -10,8 +10,8 @@ use shearq_measure::{Measurement, Measurer, Stop, strip};
 use shearq_submissions::Registry;
 
 use super::{print, tell};
-use crate::io::layout::DataFolder;
 use crate::io::mosaic::Mosaic;
+use crate::io::run::open_data;
 use crate::pipeline::images::ImageId;
 use crate::pipeline::measure::{ImageSource, psf_of};
 use crate::report::figure::{Figure, PictureFormat};
@@ -74,7 +74,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     } = arguments;
     PictureFormat::of(out)?;
     let submission = Registry::embedded()?.get(submission)?.submission;
-    let data = DataFolder::open(data)?;
+    let data = open_data(data)?;
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;

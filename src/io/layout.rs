@@ -261,7 +261,7 @@ impl DataFolder {
             let message = "there is no true shear to score against; `shearq mean` gives the mean shear of a field";
             return Err(FileError::new(&path, message));
         }
-        let rows = read_truth_rows(&path)?;
+        let rows = read_truth_rows(&path, table::most_rows(grid))?;
         TrueShear::from_rows(grid, self.layout.truth_sign, rows)
             .map_err(|error| FileError::new(&path, error))
     }
@@ -275,12 +275,16 @@ fn endings(pattern: &str) -> &'static [&'static str] {
     }
 }
 
-/// Rows (x, y, g1, g2) of a truth file: CSV with that header, or ASCII columns in that order.
+/// Rows (x, y, g1, g2) of a truth file, at most `most`: CSV with that header, or ASCII columns in that order.
 ///
 /// # Errors
 /// Where the file cannot be read.
-pub fn read_truth_rows(path: &Path) -> Result<Vec<Row>, FileError> {
-    rows_of(path, &table::read_truth(path)?, &["x", "y", "g1", "g2"])
+pub fn read_truth_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
+    rows_of(
+        path,
+        &table::read_truth(path, most)?,
+        &["x", "y", "g1", "g2"],
+    )
 }
 
 /// Rows of a catalogue, at most `most`, from four named columns.

@@ -8,9 +8,14 @@ use shearq_tables::{self as tables, Metadata};
 use super::atomic;
 use super::error::FileError;
 
-/// Reads columns of numbers: those of `wanted`, or all there are.
-pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<DataFrame, FileError> {
-    let mut table = tables::read_parquet(path, wanted).map_err(|error| bare(path, &error))?;
+/// Reads columns of numbers, at most `most_rows` of each: those of `wanted`, or all there are.
+pub(super) fn read(
+    path: &Path,
+    wanted: Option<&[&str]>,
+    most_rows: usize,
+) -> Result<DataFrame, FileError> {
+    let mut table =
+        tables::read_parquet(path, wanted, most_rows).map_err(|error| bare(path, &error))?;
     let texts: Vec<String> = table
         .columns()
         .iter()

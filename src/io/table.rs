@@ -210,7 +210,7 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
 }
 
 /// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending. A
-/// text table has at most `most_rows`. Columns of a text table without names have numbers, from 1.
+/// table of text or in Parquet has at most `most_rows`. Columns of a text table without names have numbers, from 1.
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
@@ -247,18 +247,22 @@ pub fn read_from(
         most_rows,
     };
     match Ending::of(path) {
-        Ending::Parquet => parquet::read(path, wanted),
+        Ending::Parquet => parquet::read(path, wanted, most_rows),
         Ending::Fits => fits::read_table(path, wanted, place.table.as_deref()),
         Ending::Text => text::read(path, &request),
     }
 }
 
-/// Reads a truth file's x, y, g1, g2.
+/// Reads a truth file's x, y, g1, g2, of at most `most_rows`.
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
-pub fn read_truth(path: &Path) -> Result<DataFrame, FileError> {
-    read_columns(path, &["x", "y", "g1", "g2"])
+pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
+    let names = ["x", "y", "g1", "g2"];
+    match Ending::of(path) {
+        Ending::Text => read_text(path, &names),
+        Ending::Parquet | Ending::Fits => read(path, Some(&names), most_rows),
+    }
 }
 
 /// Reads the columns `names`: of a text table, which has these and no others where it has no header, or of another

@@ -28,6 +28,14 @@ const SHOWN: usize = 40;
 /// What gzip-compressed files start with.
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 
+/// What a cell of CSV starts with so that a spreadsheet does not take `text` for a formula.
+pub(crate) fn formula_mark(text: &str) -> &'static str {
+    match text.starts_with(['=', '+', '-', '@', '\t', '\r']) {
+        true => "'",
+        false => "",
+    }
+}
+
 /// What is wanted of a table.
 pub(super) struct Request<'a> {
     /// Columns to read; all, with NaN for what is not a number, if `None`.

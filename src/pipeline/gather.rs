@@ -7,7 +7,7 @@ mod source;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 use shearq_measure::parts::frame;
 use shearq_scoring::resample::RunningMean;
 
@@ -24,6 +24,7 @@ use crate::io::fits::{ImageWriter, Value};
 use crate::io::layout::{DataFolder, MAX_STAMP};
 use crate::io::mosaic::Mosaic;
 use crate::io::open::is_there;
+use crate::io::text::formula_mark;
 use crate::io::{psf_table, table};
 
 /// Most stamps of one image: one for each galaxy of the largest grid.
@@ -74,12 +75,18 @@ pub struct Gathered {
 struct Place<'a> {
     x: f64,
     y: f64,
-    #[serde(serialize_with = "shown")]
+    #[serde(serialize_with = "cell")]
     file: &'a Path,
     image: usize,
     plane: usize,
     position_x: Option<f64>,
     position_y: Option<f64>,
+}
+
+/// Writes a path as a cell of CSV, without formulas.
+fn cell<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    let path = path.display().to_string();
+    serializer.collect_str(&format_args!("{}{path}", formula_mark(&path)))
 }
 
 /// What an image is made of.

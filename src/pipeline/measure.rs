@@ -1,7 +1,7 @@
 //! Measuring a data folder: rows of stamps in, one catalogue per image out.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis, Slice};
@@ -459,7 +459,7 @@ pub fn measure_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    let _claim = claim(&out.join(RUN_FILE), run)?;
+    let claim = claim(&out.join(RUN_FILE), run)?;
     let inputs = Inputs::new(run, data, images)?;
     let (todo, done) = to_do(run, out, images);
     inputs.verify(out, &done, threads)?;
@@ -501,6 +501,8 @@ pub fn measure_folder(
             if rows.len() == mosaic.rows() {
                 calibrate(&run.submission, &mut rows);
                 let prints = receive.recv().unwrap_or_default();
+                // Writing would make the folder again, without the earlier catalogues.
+                claim.check()?;
                 write_catalogue(run, out, &rows, prints)?;
                 summary.count(&rows);
                 rows.clear();
@@ -508,7 +510,9 @@ pub fn measure_folder(
             }
             Ok(())
         },
-    )?;
+    )
+    .map_err(|error| claim.explain(error))?;
+    claim.check_results(catalogues(run, out, images))?;
     Ok(summary)
 }
 
@@ -616,6 +620,15 @@ pub fn galaxies_to_do(
     };
     let mosaic = ImageSource::open(data, first, &run.submission)?.mosaic;
     Ok((todo.len() * mosaic.galaxies) as u64)
+}
+
+/// The catalogues of `images`, as they are called.
+pub(super) fn catalogues(
+    run: &Run,
+    out: &Path,
+    images: &[ImageId],
+) -> impl Iterator<Item = PathBuf> {
+    images.iter().map(|id| run.catalogue(out, id.set, id.image))
 }
 
 /// Those of `images` that have no catalogue yet, and those that have one.

@@ -13,7 +13,9 @@ use shearq_submissions::{PsfForm, Submission};
 
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
-use super::measure::{MeasuredRow, RowPsf, StampRow, Summary, measure_row, to_do, write_catalogue};
+use super::measure::{
+    MeasuredRow, RowPsf, StampRow, Summary, catalogues, measure_row, to_do, write_catalogue,
+};
 use super::{PipelineError, simulate};
 use crate::io::layout::DataFolder;
 use crate::io::mosaic::Mosaic;
@@ -83,7 +85,7 @@ pub fn run_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    let _claim = claim(&out.join(RUN_FILE), run)?;
+    let claim = claim(&out.join(RUN_FILE), run)?;
     let measurers = measurers(std::slice::from_ref(&run.submission))?;
     let truth = DataFolder::new(out);
     let (todo, done) = to_do(run, out, images);
@@ -99,11 +101,15 @@ pub fn run_folder(
         simulate::write_truth(&truth, &simulator)?;
         progress.note(&format!("set {set:02}"));
         run_set(&simulator, &todo, &measurers, threads, progress, |image| {
+            // Writing would make the folder again, without the earlier catalogues.
+            claim.check()?;
             write_catalogue(run, out, &image.rows[0], BTreeMap::new())?;
             summary.count(&image.rows[0]);
             Ok(())
-        })?;
+        })
+        .map_err(|error| claim.explain(error))?;
     }
+    claim.check_results(catalogues(run, out, images))?;
     Ok(summary)
 }
 

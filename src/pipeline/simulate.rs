@@ -12,8 +12,9 @@ use super::images::ImageId;
 use crate::io::atomic;
 use crate::io::fits::{ImageWriter, Value};
 use crate::io::layout::DataFolder;
+use crate::io::open::is_there;
 use crate::io::psf_table;
-use crate::io::run::claim;
+use crate::io::run::{Run, Source, claim};
 use crate::simulate::kinds::{SETS, SetKind};
 use crate::simulate::render::RenderScratch;
 use crate::simulate::set::{
@@ -30,6 +31,19 @@ pub struct SimulationRecord {
     pub version: String,
     /// What the data are made from.
     pub settings: SimulationSettings,
+}
+
+/// The kind of a set by its number if the data were simulated; other data may have the same numbers.
+pub fn kind_of(data: &DataFolder, set: u32) -> Option<SetKind> {
+    let in_memory = || {
+        let run = Run::read(data.root()).ok().flatten();
+        run.is_some_and(|run| matches!(run.source, Source::Simulated(_)))
+    };
+    if is_there(&data.root().join(SIMULATION_FILE)) || in_memory() {
+        SetKind::of(set)
+    } else {
+        None
+    }
 }
 
 /// One row of stamps to draw.
@@ -74,7 +88,7 @@ pub fn simulate_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
-    let _claim = claim(&data.root().join(SIMULATION_FILE), record)?;
+    let claim = claim(&data.root().join(SIMULATION_FILE), record)?;
     let todo: Vec<ImageId> = images
         .iter()
         .filter(|id| !data.galaxies(id.set, id.image).is_file())
@@ -101,7 +115,11 @@ pub fn simulate_folder(
             progress.advance(row.observed.len() as u64);
             let mut image = match open.take() {
                 Some(image) => image,
-                None => OpenImage::create(record, data, &row.job)?,
+                None => {
+                    // Writing would make the folder again, without the earlier images.
+                    claim.check()?;
+                    OpenImage::create(record, data, &row.job)?
+                }
             };
             let last = row.job.iy + 1 == row.job.set.grid().n;
             image.add(row)?;
@@ -113,7 +131,9 @@ pub fn simulate_folder(
             }
             Ok(())
         },
-    )?;
+    )
+    .map_err(|error| claim.explain(error))?;
+    claim.check_results(images.iter().map(|id| data.galaxies(id.set, id.image)))?;
     Ok((made, already))
 }
 

@@ -8,6 +8,7 @@ use shearq_scoring::{Grid, TrueShear, TruthSign};
 use super::grid;
 use crate::io::FileError;
 use crate::io::layout::{DataFolder, read_truth_rows};
+use crate::io::table::MAX_ROWS;
 
 /// How a truth file is to be read.
 #[derive(Debug, Clone, Copy)]
@@ -25,7 +26,7 @@ pub struct Reading {
 /// # Errors
 /// Where the file cannot be read or does not fill a square grid.
 pub fn read_truth(truth: &Path, reading: &Reading) -> Result<(Grid, TrueShear), FileError> {
-    let rows = read_truth_rows(truth)?;
+    let rows = read_truth_rows(truth, MAX_ROWS)?;
     let side = grid::side(truth, rows.len())?;
     let bad = |error: shearq_scoring::ScoringError| FileError::new(truth, error);
     let grid = Grid::new(side, reading.stamp, reading.field).map_err(bad)?;

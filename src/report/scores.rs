@@ -22,13 +22,17 @@ fn figure_cells(figures: &Figures, errors: &Figures) -> Vec<Cell> {
         .collect()
 }
 
-/// Where kinds come from: catalogues of other sets may have the same numbers.
-const KINDS: &str = "Kinds are those of GREAT10's sets of these numbers.";
+/// What the kind of a set is called in tables.
+fn kind_label(kind: Option<SetKind>) -> String {
+    kind.map_or_else(String::new, |kind| kind.image.label().to_owned())
+}
 
-/// What a set is called in tables.
-fn kind_label(set: Option<u32>) -> String {
-    set.and_then(SetKind::of)
-        .map_or_else(String::new, |kind| kind.image.label().to_owned())
+/// Where kinds come from, if there are any.
+fn kinds_note(mut kinds: impl Iterator<Item = Option<SetKind>>) -> &'static str {
+    match kinds.any(|kind| kind.is_some()) {
+        true => " Kinds are those of GREAT10's sets of these numbers.",
+        false => "",
+    }
 }
 
 /// One line that says what the figures are.
@@ -155,10 +159,13 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
         ..Heading::new("q_leaderboard", "Q leaderboard")
     });
     let mut rows = Vec::new();
-    for ScoredSet { set, score, .. } in scored {
+    for ScoredSet {
+        set, kind, score, ..
+    } in scored
+    {
         let mut row = vec![
             set_cell(*set),
-            Cell::text(kind_label(*set)),
+            Cell::text(kind_label(*kind)),
             Cell::number(score.images as f64, 0),
         ];
         row.extend(figure_cells(&score.figures, &score.errors));
@@ -182,7 +189,11 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     let counts: BTreeSet<usize> = scored.iter().map(|set| set.score.images).collect();
     let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
     let mut lines = vec![
-        format!("Images a set: {}. {KINDS}", counts.join(", ")),
+        format!(
+            "Images a set: {}.{}",
+            counts.join(", "),
+            kinds_note(scored.iter().map(|set| set.kind))
+        ),
         definition_note(definition),
     ];
     lines.extend(notes(scored));
@@ -243,9 +254,10 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
     }
 }
 
-/// Figures of power-spectrum submissions, one row per set and one of means.
+/// Figures of power-spectrum submissions, one row per set and one of means. `kind_of` tells the kind of a set.
 pub fn spectra(
     scored: &[(Option<u32>, SpectrumScore)],
+    kind_of: impl Fn(u32) -> Option<SetKind>,
     title: &str,
     definition: Definition,
 ) -> Table {
@@ -273,7 +285,8 @@ pub fn spectra(
     let mut rows: Vec<Vec<Cell>> = scored
         .iter()
         .map(|(set, score)| {
-            let mut row = vec![set_cell(*set), Cell::text(kind_label(*set))];
+            let kind = set.and_then(&kind_of);
+            let mut row = vec![set_cell(*set), Cell::text(kind_label(kind))];
             row.extend(cells(figures(score)));
             row
         })
@@ -300,7 +313,8 @@ pub fn spectra(
         headings,
         rows,
         notes: vec![format!(
-            "Figures: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian. {KINDS}"
+            "Figures: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian.{}",
+            kinds_note(scored.iter().map(|(set, _)| set.and_then(&kind_of)))
         )],
     }
 }

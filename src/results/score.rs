@@ -13,8 +13,10 @@ use crate::io::FileError;
 use crate::io::layout::{DataFolder, MAX_SET, read_rows};
 use crate::io::run::Run;
 use crate::io::table::most_rows;
+use crate::pipeline::simulate::kind_of;
 use crate::pipeline::truth::{Reading, read_truth, reading_of};
 use crate::pipeline::{PipelineError, engine, inputs};
+use crate::simulate::kinds::SetKind;
 
 /// Columns of our catalogues that are scored.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
@@ -26,6 +28,8 @@ pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
 pub struct ScoredSet {
     /// Its number; a set given as plain files has none.
     pub set: Option<u32>,
+    /// Its kind, if the data were simulated.
+    pub kind: Option<SetKind>,
     /// Numbers of the images scored.
     pub images: Vec<u32>,
     /// The score.
@@ -91,6 +95,7 @@ pub fn score_files(
     let score = scorer.score(&images).map_err(scoring)?;
     Ok(ScoredSet {
         set: None,
+        kind: None,
         images: (1..=catalogues.len() as u32).collect(),
         basis: match options.choice {
             Choice::Matched => Basis::Matched(score.matching),
@@ -195,6 +200,7 @@ pub fn score_variants(
                 prepare(data, *set, &files[k], variant.read, options, threads)?;
             own.push(ScoredSet {
                 set: Some(*set),
+                kind: kind_of(data, *set),
                 images: files[k].iter().map(|file| file.0).collect(),
                 score: scorer.score(&images).map_err(scoring)?,
                 rows,

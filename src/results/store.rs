@@ -16,6 +16,9 @@ use crate::io::{FileError, atomic, fingerprint};
 /// Key and value in the footer that tell the files of a store.
 const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");
 
+/// Most sets of one run: ten times the highest number that file names have room for.
+const MAX_SETS: usize = 100_000;
+
 /// Makes the folder of a store, so that a long run does not find out at its end that it cannot.
 ///
 /// # Errors
@@ -56,7 +59,7 @@ fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
 /// Reads the run of one file.
 fn read_run(path: &Path) -> Result<RunRecord, FileError> {
     let failed = |error: TableError| bare(path, &error);
-    let table = read_parquet(path, None).map_err(failed)?;
+    let table = read_parquet(path, None, MAX_SETS).map_err(failed)?;
     let metadata = parquet_metadata(path).map_err(failed)?;
     let found = metadata.get(SCHEMA.0).map(String::as_str);
     if found != Some(SCHEMA.1) {

@@ -20,6 +20,7 @@ use crate::pipeline::run::{measurers, run_set};
 use crate::pipeline::simulate::simulator;
 use crate::results::row::SetRecord;
 use crate::results::score::{Basis, OWN, ScoredSet};
+use crate::simulate::kinds::SetKind;
 use crate::simulate::set::SimulationSettings;
 
 /// What a run is made from.
@@ -166,6 +167,7 @@ pub fn run_sets(
         let scored = |(sum, rows): &(SetImages, RowCounts)| {
             Ok(ScoredSet {
                 set: Some(set),
+                kind: SetKind::of(set),
                 images: images.clone(),
                 score: scorer.score(sum)?,
                 rows: *rows,

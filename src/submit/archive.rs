@@ -13,7 +13,7 @@ use tar::{Archive, Builder, Header};
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
 use crate::io::FileError;
 use crate::io::atomic::{PartFile, PartFolder, sweep_beside};
-use crate::io::open::open;
+use crate::io::open::{is_there, open};
 
 /// Largest manifest accepted, in bytes: some two hundred for each file.
 const MAX_MANIFEST: u64 = 1 << 26;
@@ -41,11 +41,14 @@ pub struct ArchiveWriter {
 }
 
 impl ArchiveWriter {
-    /// Starts an archive.
+    /// Starts an archive, which must be new.
     ///
     /// # Errors
-    /// Where the file cannot be made.
+    /// Where the file exists or cannot be made.
     pub fn create(path: &Path) -> Result<Self, FileError> {
+        if is_there(path) {
+            return Err(exists(path));
+        }
         sweep_beside(path);
         let (part, file) = PartFile::create(path)?;
         // Neither the time nor the system of its making.
@@ -86,8 +89,19 @@ impl ArchiveWriter {
             .and_then(GzEncoder::finish)
             .and_then(|mut file| file.flush())
             .map_err(cannot_write(part.target()))?;
-        part.finish()
+        let path = part.target().to_owned();
+        match part.finish_if_absent()? {
+            true => Ok(()),
+            false => Err(exists(&path)),
+        }
     }
+}
+
+fn exists(path: &Path) -> FileError {
+    FileError::new(
+        path,
+        "the archive exists already; expected a new file. Remove it or choose another name",
+    )
 }
 
 /// gzip's number for it.
@@ -138,6 +152,8 @@ impl Unpacked {
 /// As [`read`] and [`Unpacked::verify`], and where `out` exists or cannot be written.
 pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
     let part = PartFolder::new(out)?;
+    // All of it, before any file is written.
+    read(path, None)?.verify(path, required)?;
     let unpacked = read(path, Some(part.path()))?;
     unpacked.verify(path, required)?;
     part.finish()?;

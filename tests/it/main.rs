@@ -27,6 +27,7 @@ mod own_images;
 mod packed;
 mod position_tables;
 mod printed;
+mod refused;
 mod reproduced;
 mod scoring_cases;
 mod shards;
