@@ -264,10 +264,24 @@ impl TrueShear {
         Some([value(&self.g1)?, value(&self.g2)?])
     }
 
+    /// The shear with the other sign of g₂.
+    pub fn flipped(&self) -> Self {
+        TrueShear {
+            g1: self.g1.clone(),
+            g2: -&self.g2,
+        }
+    }
+
+    /// Root mean square of |g|.
+    pub fn rms(&self) -> f64 {
+        let squares = |g: &Array2<f64>| g.iter().map(|g| g * g).sum::<f64>();
+        ((squares(&self.g1) + squares(&self.g2)) / self.g1.len() as f64).sqrt()
+    }
+
     /// From rows of (x, y, g₁, g₂), in any order.
     ///
     /// # Errors
-    /// Where a cell is absent, given twice or not finite.
+    /// If a cell is absent or given twice, or its shear is not finite or |g| ≥ 1.
     pub fn from_rows(
         grid: &Grid,
         sign: TruthSign,
@@ -297,6 +311,14 @@ impl TrueShear {
                 return Err(ScoringError::TruthNotFinite {
                     ix: cell.0 + 1,
                     iy: cell.1 + 1,
+                });
+            }
+            let modulus = row.e1.hypot(row.e2);
+            if modulus >= 1.0 {
+                return Err(ScoringError::TruthTooLarge {
+                    ix: cell.0 + 1,
+                    iy: cell.1 + 1,
+                    found: modulus,
                 });
             }
             truth.g1[cell] = row.e1;
