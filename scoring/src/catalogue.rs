@@ -101,34 +101,34 @@ impl RowCounts {
         let mut lines = Vec::new();
         if self.outside + self.excess > 0 {
             lines.push(format!(
-                "Warning: {whose} has {} outside the grid and {} beyond the number of cells; they do not count.",
+                "warning: {whose} has {} outside the grid and {} beyond the number of cells; they do not count.",
                 rows(self.outside),
                 self.excess
             ));
         }
         if self.repeated > 0 {
             lines.push(format!(
-                "Warning: {} of {whose} of galaxies that have one already; they add up.",
+                "warning: {} of {whose} of galaxies that have one already; they add up.",
                 rows(self.repeated)
             ));
         }
         if self.missing > 0 {
             lines.push(format!(
-                "Warning: {} of {} galaxies of {whose} are not in the catalogues; each counts as zero.",
+                "warning: {} of {} galaxies of {whose} are not in the catalogues; each counts as zero.",
                 self.missing,
                 self.missing + self.used + self.not_finite - self.repeated
             ));
         }
         if self.above_one > 0 {
             lines.push(format!(
-                "Warning: {} of {whose} with |e| > 1, {} with |e| > {ABSURD}; scored as they are.",
+                "warning: {} of {whose} with |e| > 1, {} with |e| > {ABSURD}; scored as they are.",
                 rows(self.above_one),
                 self.absurd
             ));
         }
         if self.not_finite > 0 {
             lines.push(format!(
-                "Note: {} of {} galaxies of {whose} have no ellipticity and count as missing.",
+                "note: {} of {} galaxies of {whose} have no ellipticity and count as missing.",
                 self.not_finite,
                 self.not_finite + self.used
             ));

@@ -36,7 +36,7 @@ const SIGN_CLEAR: f64 = 4.0;
 
 /// A probable fault of a set's ellipticities, or of its true shear.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Finding {
+pub enum Fault {
     /// The true shear is too strong for weak lensing.
     StrongTruth {
         /// Root mean square of |g|.
@@ -121,7 +121,9 @@ impl ImageFaults {
         let mut hasher = DefaultHasher::new();
         for values in [&image.e1, &image.e2, &image.count] {
             // Adding zero makes one zero of both.
-            values.iter().for_each(|v| (v + 0.0).to_bits().hash(&mut hasher));
+            values
+                .iter()
+                .for_each(|v| (v + 0.0).to_bits().hash(&mut hasher));
         }
         let first = *self.seen.entry(hasher.finish()).or_insert(place);
         if first != place {
@@ -148,38 +150,35 @@ impl SetScorer {
         images: &crate::SetImages,
         score: &SetScore,
         convention: Convention,
-    ) -> Vec<Finding> {
+    ) -> Vec<Fault> {
         let mut findings = Vec::new();
         let rms = self.truth().rms();
         if rms > STRONG_SHEAR {
-            findings.push(Finding::StrongTruth { rms });
+            findings.push(Fault::StrongTruth { rms });
         }
         if score.constant.is_some() {
             return findings;
         }
         match self.misplaced(images.total(), score, convention) {
             Some(finding) => findings.push(finding),
-            None if convention == score.chosen => findings.extend(biased(score)),
+            None if convention == score.chosen => {
+                findings.extend(Fault::of_bias(score.figures.m_cross, score.errors.m_cross))
+            }
             None => {}
         }
         findings
     }
 
     /// What is wrong with the order of a set's rows or components, if anything.
-    fn misplaced(
-        &self,
-        sum: &FieldSum,
-        score: &SetScore,
-        convention: Convention,
-    ) -> Option<Finding> {
+    fn misplaced(&self, sum: &FieldSum, score: &SetScore, convention: Convention) -> Option<Fault> {
         let correlation = score.conventions[convention.index()].correlation;
         if !correlation.is_finite() {
             return None;
         }
         let modes: usize = SCORED.map(|b| score.bins.modes[b]).sum();
         let better = |with: f64| gain(correlation, with, modes) > CLEAR * CLEAR;
-        let mut best: Option<(f64, Finding)> = None;
-        let mut offer = |with: f64, finding: Finding| {
+        let mut best: Option<(f64, Fault)> = None;
+        let mut offer = |with: f64, finding: Fault| {
             if better(with) && best.as_ref().is_none_or(|(other, _)| with > *other) {
                 best = Some((with, finding));
             }
@@ -187,7 +186,7 @@ impl SetScorer {
         let matching = &score.matching;
         if matching.is_clear() && matching.best() != convention {
             let (other, with) = (matching.best(), matching.correlation(matching.best()));
-            let finding = Finding::Convention {
+            let finding = Fault::Convention {
                 scored: convention,
                 correlation,
                 better: other,
@@ -204,9 +203,9 @@ impl SetScorer {
             .map(|k| self.correlation_of(&swapped, k))
             .into_iter()
             .fold(f64::NEG_INFINITY, f64::max);
-        offer(with, Finding::Swapped { correlation, with });
+        offer(with, Fault::Swapped { correlation, with });
         for ((x, y), with) in self.shifted(sum, convention) {
-            let finding = Finding::Shifted {
+            let finding = Fault::Shifted {
                 x,
                 y,
                 correlation,
@@ -219,7 +218,7 @@ impl SetScorer {
             // Of correlations that chance alone makes, less than this is believed.
             let chance = 2.0 * score.matching.least_clear();
             let shortfall = allowed - correlation.max(0.0);
-            (shortfall > SHORTFALL.max(chance)).then_some(Finding::Uncorrelated {
+            (shortfall > SHORTFALL.max(chance)).then_some(Fault::Uncorrelated {
                 correlation,
                 allowed,
             })
@@ -278,14 +277,15 @@ fn allowed(score: &SetScore, convention: Convention) -> Option<f64> {
     (signal > 0.0).then(|| signal.min(1.0).sqrt())
 }
 
-/// Whether the response is that of a distortion, or far from one.
-fn biased(score: &SetScore) -> Option<Finding> {
-    let (m, error) = (score.figures.m_cross, score.errors.m_cross);
-    let (large, sigmas) = LARGE_BIAS;
-    if m - OF_DISTORTION > sigmas * error {
-        return Some(Finding::Distortion { m, error });
+impl Fault {
+    /// Whether a multiplicative bias is that of a distortion, or large.
+    pub fn of_bias(m: f64, error: f64) -> Option<Self> {
+        let (large, sigmas) = LARGE_BIAS;
+        if m - OF_DISTORTION > sigmas * error {
+            return Some(Fault::Distortion { m, error });
+        }
+        (m.abs() - large > sigmas * error).then_some(Fault::Biased { m, error })
     }
-    (m.abs() - large > sigmas * error).then_some(Finding::Biased { m, error })
 }
 
 /// The sign of g₂ in a truth, read as `standard`, whose power is E mode in one sign only.

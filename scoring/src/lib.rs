@@ -49,7 +49,7 @@ pub use bandpower::{BINS, Bins, Definition, SCORED};
 pub use catalogue::{FieldSum, Row, RowCounts, TrueShear, TruthSign};
 pub use convention::{Convention, ConventionClass};
 pub use cross::{CrossSpectrum, cross_spectrum};
-pub use diagnosis::{Finding, ImageFaults, sign_by_correlation, sign_by_modes};
+pub use diagnosis::{Fault, ImageFaults, sign_by_correlation, sign_by_modes};
 pub use ellipticity::{Distortion, Shear};
 pub use error::ScoringError;
 pub use figures::{Figure, Figures};

@@ -130,10 +130,18 @@ impl Run {
     /// # Errors
     /// Where there is none, or it cannot be read.
     pub fn require(folder: &Path) -> Result<Self, FileError> {
+        if !folder.is_dir() {
+            let message = "there is no such folder; expected a folder that `shearq measure` or `shearq run` wrote";
+            return Err(FileError::new(folder, message));
+        }
         Run::read(folder)?.ok_or_else(|| {
-            let message = format!(
-                "there is no {RUN_FILE}; expected a folder that `shearq measure` or `shearq run` wrote"
-            );
+            let images = DataFolder::open(folder).and_then(|data| data.images(&[]));
+            let message = match images.is_ok_and(|images| !images.sets().is_empty()) {
+                true => "this is a data folder with images; expected a folder of catalogues that `shearq measure` or `shearq run` wrote. Try: shearq measure --data DATA --out OUT, or --data for this folder".to_owned(),
+                false => format!(
+                    "there is no {RUN_FILE}; expected a folder that `shearq measure` or `shearq run` wrote"
+                ),
+            };
             FileError::new(folder, message)
         })
     }

@@ -57,6 +57,11 @@ pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, File
     rows.table()
 }
 
+/// The comments before the first row, without their `#`.
+pub(super) fn comments(path: &Path) -> Result<Vec<String>, FileError> {
+    Ok(Head::read(&mut Input::open(path)?, path)?.comments)
+}
+
 /// The text of a file from some place on.
 struct Input {
     text: BufReader<Metered>,

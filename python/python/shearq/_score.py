@@ -72,7 +72,7 @@ class Score:
         matched, meaning = found["matched"]
         if found["matched_clearly"] and matched != self.convention:
             self.notes.append(
-                f"Warning: the ellipticities match the truth in convention {matched} ({meaning}), and are scored in"
+                f"warning: the ellipticities match the truth in convention {matched} ({meaning}), and are scored in"
                 f" {self.convention}: mind the signs of e1 and e2 and the order of the axes."
             )
 
