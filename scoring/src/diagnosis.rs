@@ -106,6 +106,11 @@ pub struct ImageFaults {
 }
 
 impl ImageFaults {
+    /// Number of images looked at.
+    pub fn images(&self) -> usize {
+        self.images
+    }
+
     /// Looks at the next image. Images without any galaxy are not compared.
     pub fn add(&mut self, image: &FieldSum) {
         let place = self.images;

@@ -81,6 +81,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         sharding,
         threads,
     } = arguments;
+    anyhow::ensure!(
+        sharding.shard.is_none() || (store.is_none() && !report.is_wanted()),
+        "--shard: a part of a run is not scored, so that --store and --report have nothing to write. Try: shearq score --measured {} --store DIR, after `shearq merge`",
+        out.display()
+    );
     let _prepared = store.as_deref().map(store::prepare).transpose()?;
     let threads = threads.number();
     let wanted = match sets {

@@ -48,18 +48,18 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// Catalogues of that set, one per image.
-    #[arg(value_name = "CATALOGUE", requires = "truth")]
+    #[arg(value_name = "CATALOGUE", requires = "truth", conflicts_with = "data")]
     catalogues: Vec<PathBuf>,
     /// Catalogues of another program, described in a TOML file (docs/formats.md), instead of
     /// --measured.
-    #[arg(long, value_name = "FILE", requires = "data")]
+    #[arg(long, value_name = "FILE", requires = "data", conflicts_with = "truth")]
     foreign: Option<PathBuf>,
     /// Power-spectrum submission (`index l power`): a file with --truth, a folder of
     /// `{method}_set{set}.dat` with --data.
-    #[arg(long, value_name = "PATH", conflicts_with = "noise_var")]
+    #[arg(long, value_name = "PATH", conflicts_with_all = ["noise_var", "convention", "path"])]
     spectra: Option<PathBuf>,
     /// Packed submission, catalogues or power spectra: the folder or the archive (.tar.gz) as it is sent.
-    #[arg(long, value_name = "PATH", requires = "data")]
+    #[arg(long, value_name = "PATH", requires = "data", conflicts_with_all = ["truth", "path"])]
     packed: Option<PathBuf>,
     /// Sets to score [default: all that were measured].
     #[arg(long, value_name = "LIST", conflicts_with = "truth")]
@@ -290,11 +290,14 @@ fn packed(
     let foreign = plain_columns(COLUMNS, Screen::default());
     let read: ReadImage<'_> = if own { &own_catalogue } else { &foreign };
     let threads = arguments.threads.number();
-    let scored =
+    let mut scored =
         score_sets(data, sets, of_set, read, options, threads).map_err(|error| match error {
             PipelineError::File(error) => sent.named(error).into(),
             other => other,
         })?;
+    for set in &mut scored {
+        set.odd_images.renamed(|path| sent.as_given(path));
+    }
     let title = format!("Scores of {}", submission.method);
     let mut table = per_set(&scored, &title, options.definition);
     table.notes.extend(unscored(data, &scored, sets)?);
@@ -444,6 +447,10 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         options,
         arguments.threads.number(),
     )?;
+    let title = format!("Scores against {}", truth.display());
+    let scored = [scored];
+    let mut table = per_set(&scored, &title, options.definition);
+    table.notes.extend(verdict_line("The catalogues", &scored));
     if arguments.printing.format() == TableFormat::Json {
         anyhow::ensure!(
             !arguments.printing.chooses(),
@@ -459,15 +466,12 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
             catalogues: arguments.catalogues.iter().map(|path| name(path)).collect(),
             definition: options.definition,
         };
-        let mut text = serde_json::to_string_pretty(&one_set_json(&scored, &input))?;
+        let mut text = serde_json::to_string_pretty(&one_set_json(&scored[0], &input))?;
         text.push('\n');
-        return print(&text);
+        print(&text)?;
+    } else {
+        arguments.printing.print(&table)?;
     }
-    let title = format!("Scores against {}", truth.display());
-    let scored = [scored];
-    let mut table = per_set(&scored, &title, options.definition);
-    table.notes.extend(verdict_line("The catalogues", &scored));
-    arguments.printing.print(&table)?;
     let mut made_by = vec![("Truth".to_owned(), truth.display().to_string())];
     made_by.extend(
         arguments

@@ -70,6 +70,10 @@ pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileErro
         (Some(sign), _) | (None, Some(sign)) => (sign, SignBasis::Specified),
         (None, None) => match sign_by_modes(&grid, &standard) {
             Some(sign) => (sign, SignBasis::Modes(sign)),
+            // Zero has no sign.
+            None if standard.g2.iter().all(|g2| *g2 == 0.0) => {
+                (TruthSign::Standard, SignBasis::Specified)
+            }
             None => (TruthSign::Challenge, SignBasis::Unknown),
         },
     };

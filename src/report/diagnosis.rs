@@ -1,6 +1,8 @@
 //! Probable faults of ellipticities and of the true shear, in words.
 
-use shearq_scoring::{Fault, TruthSign};
+use std::path::PathBuf;
+
+use shearq_scoring::{Fault, ImageFaults, TruthSign};
 
 use crate::pipeline::truth::SignBasis;
 use crate::results::score::OddImages;
@@ -40,7 +42,7 @@ pub fn words(finding: &Fault) -> String {
             "the ellipticities correlate with the true shear by only {correlation:.2}, but their noise allows {allowed:.2}. Check the order of the rows, the positions, the columns, and that truth and catalogues belong together"
         ),
         Fault::Distortion { m, error } => format!(
-            "the ellipticities respond to shear by a factor of {:.2} ± {error:.2}, expected 1: they seem to be distortions χ, not shear-type ε. Try: --ellipticity distortion, or `ellipticity = \"distortion\"` with --foreign",
+            "the ellipticities respond to shear by a factor of {:.2} ± {error:.2}, expected 1: they seem to be distortions χ, not shear-type ε",
             1.0 + m
         ),
         Fault::Biased { m, error } => format!(
@@ -49,13 +51,20 @@ pub fn words(finding: &Fault) -> String {
     }
 }
 
+/// Faults of the images of arrays, counted from 1, a sentence each.
+pub fn odd_arrays(faults: &ImageFaults) -> Vec<String> {
+    let name = |place: usize| PathBuf::from(format!("image {}", place + 1));
+    let images: Vec<PathBuf> = (0..faults.images()).map(name).collect();
+    odd_images(&OddImages::new(faults, &images))
+}
+
 /// Faults of single images, a sentence each.
 pub fn odd_images(odd: &OddImages) -> Vec<String> {
     let mut lines = Vec::new();
     let more = |count: usize| match count {
         1 => String::new(),
-        2 => ", and 1 more file likewise".to_owned(),
-        _ => format!(", and {} more files likewise", count - 1),
+        2 => ", and 1 more likewise".to_owned(),
+        _ => format!(", and {} more likewise", count - 1),
     };
     if let Some((copy, first)) = odd.copies.first() {
         lines.push(format!(
@@ -118,7 +127,13 @@ pub fn of_sets<'a>(sets: impl Iterator<Item = (Option<u32>, &'a [Fault])>) -> Ve
                 true => String::new(),
                 false => format!(" (likewise in set {})", others.join(", ")),
             };
-            format!("{}{}{others}.", prefix(sets[0]), words(finding))
+            let advice = match finding {
+                Fault::Distortion { .. } => {
+                    " Try: --ellipticity distortion, or `ellipticity = \"distortion\"` with --foreign."
+                }
+                _ => "",
+            };
+            format!("{}{}{others}.{advice}", prefix(sets[0]), words(finding))
         })
         .collect()
 }

@@ -141,11 +141,13 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
     lines
 }
 
-/// Findings of a set, except those that copies of catalogues explain: copies seem to have no noise.
+/// Findings of a set, except those that odd images explain: copies seem to have no noise, and constant
+/// ellipticities no response.
 fn believable(set: &ScoredSet) -> &[Fault] {
-    let noisy = set.odd_images.copies.is_empty();
+    let odd = &set.odd_images;
     match set.findings.as_slice() {
-        [Fault::Uncorrelated { .. }] if !noisy => &[],
+        [Fault::Uncorrelated { .. }] if !odd.copies.is_empty() => &[],
+        [Fault::Biased { .. }] if !odd.constant.is_empty() => &[],
         all => all,
     }
 }

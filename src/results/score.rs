@@ -69,6 +69,18 @@ impl OddImages {
     }
 }
 
+impl OddImages {
+    /// With other names of the files, for those of an unpacked archive.
+    pub fn renamed(&mut self, name: impl Fn(&Path) -> PathBuf) {
+        for (copy, first) in &mut self.copies {
+            (*copy, *first) = (name(copy), name(first));
+        }
+        for (path, _) in &mut self.constant {
+            *path = name(path);
+        }
+    }
+}
+
 /// Probable faults of a scored set.
 fn findings(
     scorer: &SetScorer,
