@@ -20,7 +20,7 @@ const CLEAR: f64 = 5.0;
 /// Least gain in correlation with the truth for which another order is reported.
 const LEAST_GAIN: f64 = 0.02;
 /// Least shortfall of the correlation below the value that the noise allows. Errors common to all images of a
-/// set, as those of a poor PSF correction, can reach half of it.
+/// set also lower the correlation, as a poor PSF correction does.
 const SHORTFALL: f64 = 0.3;
 /// |m| from which ellipticities are called biased, and its significance.
 const LARGE_BIAS: (f64, f64) = (0.1, 3.0);
@@ -62,9 +62,9 @@ pub enum Fault {
     },
     /// The galaxies lie in neighbouring cells of those that they belong to.
     Shifted {
-        /// Cells along x by which they are too far right.
+        /// Cells along x that they are too far right.
         x: i32,
-        /// Cells along y by which they are too far up.
+        /// Cells along y that they are too far up.
         y: i32,
         /// Correlation with the truth as scored.
         correlation: f64,
@@ -78,7 +78,7 @@ pub enum Fault {
         /// Correlation that the noise between images allows.
         allowed: f64,
     },
-    /// The response is that of a distortion.
+    /// The response to shear is too large for a shear-type ellipticity.
     Distortion {
         /// Multiplicative bias.
         m: f64,
@@ -283,7 +283,7 @@ fn allowed(score: &SetScore, convention: Convention) -> Option<f64> {
 }
 
 impl Fault {
-    /// Whether a multiplicative bias is that of a distortion, or large.
+    /// The finding about a multiplicative bias: as large as for a distortion, or large in either direction.
     pub fn of_bias(m: f64, error: f64) -> Option<Self> {
         let (large, sigmas) = LARGE_BIAS;
         if m - OF_DISTORTION > sigmas * error {

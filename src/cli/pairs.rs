@@ -75,7 +75,7 @@ const WAYS: [(&str, &[&str]); 26] = [
     ("submissions init", &["FILE method"]),
     ("completions", &["SHELL"]),
     ("manual", &["DIR"]),
-    // Of these only the names are compared; their ways depend on more than two options.
+    // Only the names of these options are compared; their ways depend on more than two options.
     (
         NAMES_ONLY[0],
         &[
@@ -90,7 +90,7 @@ const WAYS: [(&str, &[&str]); 26] = [
     ("baseline help", &[]),
 ];
 
-/// Commands of which the pairs are not compared.
+/// Commands whose pairs are not compared.
 const NAMES_ONLY: [&str; 2] = ["baseline record", "baseline check"];
 
 /// Pairs that the command itself refuses, with an error, when it runs.

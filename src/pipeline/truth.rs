@@ -97,7 +97,7 @@ pub fn reading_of(data: &DataFolder, set: u32) -> Result<Reading, FileError> {
     })
 }
 
-/// Grid of a set: that of its first image, or of its true shear if there is no image.
+/// Grid of a set, from its first image, or from its true shear if there is no image.
 ///
 /// # Errors
 /// If neither can be read.

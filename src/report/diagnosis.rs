@@ -46,7 +46,7 @@ pub fn words(finding: &Fault) -> String {
             1.0 + m
         ),
         Fault::Biased { m, error } => format!(
-            "m = {m:.2} ± {error:.2}, expected |m| below 0.1: a high Q does not make such ellipticities fit for use. Calibrate them"
+            "m = {m:.3} ± {error:.3}, expected |m| below 0.1: a high Q does not make such ellipticities fit for use. Calibrate them"
         ),
     }
 }
@@ -104,7 +104,7 @@ pub fn sign(basis: SignBasis) -> Option<String> {
     }
 }
 
-/// Findings of several sets, a line per kind: that of the first set in words, and the numbers of the others.
+/// Findings of several sets, a line per kind: the first set with its finding in words, and the numbers of the other sets.
 pub fn of_sets<'a>(sets: impl Iterator<Item = (Option<u32>, &'a [Fault])>) -> Vec<String> {
     let mut kinds: Vec<(Fault, Vec<Option<u32>>)> = Vec::new();
     for (set, findings) in sets {

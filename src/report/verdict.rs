@@ -108,7 +108,7 @@ mod tests {
     use super::*;
     use shearq_scoring::Figures;
 
-    /// A submission with one set of eight images, whose calibrated Q is that of `replicates` without any.
+    /// A submission with one set of eight images, whose calibrated Q scatters as `replicates`.
     fn submission(
         name: &str,
         q: f64,

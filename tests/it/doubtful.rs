@@ -162,7 +162,7 @@ fn probable_faults_of_catalogues_are_named_by_score_compare_and_check() {
                 let (e1, e2) = sound(cell, image);
                 (0.5 * e1, 0.5 * e2)
             },
-            "m = -0.50 ±",
+            "expected |m| below 0.1",
             "bias",
         ),
     ];
