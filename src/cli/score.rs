@@ -48,7 +48,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// Catalogues of that set, one per image.
-    #[arg(value_name = "CATALOGUE", requires = "truth", conflicts_with = "data")]
+    #[arg(value_name = "CATALOGUE", requires = "truth", conflicts_with_all = ["data", "sets", "store"])]
     catalogues: Vec<PathBuf>,
     /// Catalogues of another program, described in a TOML file (docs/formats.md), instead of
     /// --measured.
@@ -105,9 +105,11 @@ pub(super) struct Arguments {
 }
 
 /// Input that comes with a data folder, whose layout specifies the sign of g2, the stamps and the field.
-const FOLDERS: [&str; 4] = ["data", "measured", "foreign", "packed"];
+const FOLDERS: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
 /// Input other than plain catalogues.
-const NOT_PLAIN: [&str; 5] = ["data", "measured", "foreign", "packed", "spectra"];
+const NOT_PLAIN: [&str; 7] = [
+    "data", "measured", "foreign", "packed", "spectra", "sets", "store",
+];
 
 fn parse_ellipticity(text: &str) -> Result<EllipticityType, String> {
     match text {
