@@ -14,6 +14,8 @@ mod mean;
 mod measure;
 mod merge;
 mod pack;
+#[cfg(test)]
+mod pairs;
 mod progress;
 mod quickstart;
 mod reproduce;

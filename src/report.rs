@@ -2,6 +2,7 @@
 
 pub mod baseline;
 pub mod comparison;
+pub mod diagnosis;
 pub mod escape;
 pub mod figure;
 mod font;
@@ -14,3 +15,4 @@ pub mod spectrum;
 pub mod steps;
 pub mod table;
 pub mod terminal;
+pub mod verdict;

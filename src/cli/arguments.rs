@@ -153,6 +153,11 @@ pub(super) struct ReportFile {
 }
 
 impl ReportFile {
+    /// Whether a page was asked for.
+    pub(super) fn is_wanted(&self) -> bool {
+        self.path.is_some()
+    }
+
     /// Writes the page, if one was asked for.
     pub(super) fn save(
         &self,

@@ -37,7 +37,12 @@ pub(super) struct Arguments {
     mask_extension: Option<String>,
     /// Table of the galaxies' positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the
     /// first is at 1). `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file.
-    #[arg(long, value_name = "FILE", requires = "exposure")]
+    #[arg(
+        long,
+        value_name = "FILE",
+        requires = "exposure",
+        conflicts_with = "stamps"
+    )]
     positions: Option<PathBuf>,
     /// Table of the positions in a FITS file: its name (EXTNAME), or its number from 1 [default: the one that has the
     /// columns].
@@ -50,11 +55,12 @@ pub(super) struct Arguments {
         value_name = "X,Y",
         value_delimiter = ',',
         num_args = 1,
-        requires = "positions"
+        requires = "positions",
+        conflicts_with = "stamps"
     )]
     columns: Option<Vec<String>>,
     /// Pixels a side of a stamp that is cut out.
-    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure")]
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure", conflicts_with = "stamps")]
     size: u16,
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv).
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]

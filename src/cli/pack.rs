@@ -38,7 +38,12 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "FILE", conflicts_with = "measured")]
     foreign: Option<PathBuf>,
     /// Data folder that they were measured from, which gives the grid of spectra.
-    #[arg(long, value_name = "DIR", requires = "foreign")]
+    #[arg(
+        long,
+        value_name = "DIR",
+        requires = "foreign",
+        conflicts_with = "measured"
+    )]
     data: Option<PathBuf>,
     /// New folder to write to, or an archive ending in .tar.gz or .tgz.
     #[arg(long, value_name = "PATH")]

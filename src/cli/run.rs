@@ -16,7 +16,7 @@ use crate::io::table::FileFormat;
 use crate::pipeline::images;
 use crate::pipeline::run::run_folder;
 use crate::report::pages;
-use crate::report::scores::{bandpowers, per_set};
+use crate::report::scores::{bandpowers, per_set, verdict_line};
 use crate::report::table::{Table, TableFormat};
 use crate::results::row::Measured;
 use crate::results::score::{OWN, ScoredSet, score_folder};
@@ -81,9 +81,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         sharding,
         threads,
     } = arguments;
-    if let Some(store) = store {
-        store::prepare(store)?;
-    }
+    anyhow::ensure!(
+        sharding.shard.is_none() || (store.is_none() && !report.is_wanted()),
+        "--shard: a part of a run is not scored, so that --store and --report have nothing to write. Try: shearq score --measured {} --store DIR, after `shearq merge`",
+        out.display()
+    );
+    let _prepared = store.as_deref().map(store::prepare).transpose()?;
     let threads = threads.number();
     let wanted = match sets {
         None => &[],
@@ -162,7 +165,9 @@ pub(super) fn score(
         score::record(store, made, &scored, options)?;
     }
     let title = format!("Scores of {}", run.submission.name);
-    let table = per_set(&scored, &title, options.definition);
+    let mut table = per_set(&scored, &title, options.definition);
+    let verdict = verdict_line(&run.submission.name, &scored);
+    table.notes.extend(verdict);
     for (name, table) in [("scores", &table), ("bandpowers", &bandpowers(&scored))] {
         let text = table.render(TableFormat::Csv);
         atomic::write(out.join(format!("{name}.csv")), text.as_bytes())?;

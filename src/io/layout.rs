@@ -257,14 +257,40 @@ impl DataFolder {
     /// Where the file cannot be read or does not cover the grid.
     pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
         let path = self.truth(set);
-        if !path.exists() {
-            let message = "there is no true shear to score against; `shearq mean` gives the mean shear of a field";
-            return Err(FileError::new(&path, message));
-        }
+        truth_is_there(&path)?;
         let rows = read_truth_rows(&path, table::most_rows(grid))?;
-        TrueShear::from_rows(grid, self.layout.truth_sign, rows)
+        TrueShear::from_rows(grid, self.truth_sign(set)?, rows)
             .map_err(|error| FileError::new(&path, error))
     }
+
+    /// Sign of g2 in the truth of a set: the one that the file states, or else the layout's.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or states the standard sign and the layout the challenge's.
+    pub fn truth_sign(&self, set: u32) -> Result<TruthSign, FileError> {
+        let (path, layout) = (self.truth(set), self.layout.truth_sign);
+        match stated_sign(&path)? {
+            Some(TruthSign::Standard) if layout == TruthSign::Challenge => {
+                let message = format!(
+                    "the file states `{SIGN_KEY}: standard`, but `truth_sign` in {LAYOUT_FILE} is `challenge`; remove the wrong one"
+                );
+                Err(FileError::new(&path, message))
+            }
+            stated => Ok(stated.unwrap_or(layout)),
+        }
+    }
+}
+
+/// Checks that there is a truth file.
+///
+/// # Errors
+/// If there is none; the message names the command for data without a true shear.
+pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
+    if is_there(path) {
+        return Ok(());
+    }
+    let message = "there is no true shear to score against. Try: shearq mean --measured OUT, for the mean shear of images of your own";
+    Err(FileError::new(path, message))
 }
 
 /// Endings of the names of images by `pattern` beyond its own: those of gzip and fpack.
@@ -272,6 +298,25 @@ fn endings(pattern: &str) -> &'static [&'static str] {
     match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
         true => &["", ".gz", ".fz"],
         false => &[""],
+    }
+}
+
+/// Key under which a truth file states the sign of its g2: `standard` or `challenge`.
+pub const SIGN_KEY: &str = "g2sign";
+
+/// The sign of g2 that a truth file states, if it does.
+///
+/// # Errors
+/// If the file cannot be read, or states another word.
+pub fn stated_sign(path: &Path) -> Result<Option<TruthSign>, FileError> {
+    match table::stated(path, SIGN_KEY)?.as_deref() {
+        None => Ok(None),
+        Some("standard") => Ok(Some(TruthSign::Standard)),
+        Some("challenge") => Ok(Some(TruthSign::Challenge)),
+        Some(other) => {
+            let message = format!("{SIGN_KEY} is `{other}`; expected `standard` or `challenge`");
+            Err(FileError::new(path, message))
+        }
     }
 }
 

@@ -290,6 +290,28 @@ pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
     text::read(path, &request)
 }
 
+/// The value of `key` that a table of any format states: in a comment `# key: value ...` before the first row of
+/// a text table, in the header of a FITS table, or in the metadata of a Parquet file.
+///
+/// # Errors
+/// If the file cannot be read.
+pub fn stated(path: &Path, key: &str) -> Result<Option<String>, FileError> {
+    let format = match Ending::of(path) {
+        Ending::Text => {
+            let value = |comment: &String| {
+                let rest = comment.strip_prefix(key)?.trim_start();
+                let rest = rest.strip_prefix(['=', ':'])?;
+                rest.split_whitespace().next().map(str::to_owned)
+            };
+            return Ok(text::comments(path)?.iter().find_map(value));
+        }
+        Ending::Parquet => FileFormat::Parquet,
+        Ending::Fits => FileFormat::Fits,
+    };
+    let mut found = read_metadata(path, format, std::iter::once(&key.to_owned()))?;
+    Ok(found.remove(key).map(|value| value.trim().to_owned()))
+}
+
 /// What is left of `metadata` in a table written as `format`: all in Parquet; in FITS what fits into a
 /// header, which is keys of at most eight characters with values of at most 68.
 pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {

@@ -102,6 +102,11 @@ pub(super) fn columns(path: &Path) -> Result<Columns, FileError> {
     })
 }
 
+/// The comments before the first row, without their `#`.
+pub(super) fn comments(path: &Path) -> Result<Vec<String>, FileError> {
+    Ok(Head::read(&mut Input::open(path)?, path)?.comments)
+}
+
 /// The text of a file from some place on.
 struct Input {
     text: BufReader<Metered>,

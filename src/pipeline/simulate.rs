@@ -11,7 +11,7 @@ use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
 use crate::io::atomic;
 use crate::io::fits::{ImageWriter, Value};
-use crate::io::layout::DataFolder;
+use crate::io::layout::{DataFolder, SIGN_KEY};
 use crate::io::open::is_there;
 use crate::io::psf_table;
 use crate::io::run::{Run, Source, claim};
@@ -212,7 +212,8 @@ pub fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
 /// Writes the true shear of a set.
 pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {
     let grid = set.grid();
-    let mut text = String::from("x,y,g1,g2\n");
+    // The comment follows the header, so that readers which skip one line or a `#` read the columns.
+    let mut text = format!("x,y,g1,g2\n# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)\n");
     for iy in 0..grid.n {
         for ix in 0..grid.n {
             let (x, y) = grid.centre(ix, iy);

@@ -71,6 +71,9 @@ impl SetRecord {
             score,
             rows,
             basis,
+            sign: _,
+            findings: _,
+            odd_images: _,
         } = scored;
         SetRecord {
             set,
@@ -110,6 +113,23 @@ pub struct RunRecord {
     pub noise: String,
     /// The sets, in order.
     pub sets: Vec<SetRecord>,
+}
+
+/// A bandpower definition in records.
+pub(super) fn definition_word(definition: Definition) -> &'static str {
+    match definition {
+        Definition::Leaderboard => "leaderboard",
+        Definition::Corrected => "corrected",
+    }
+}
+
+/// A choice of a convention in records.
+pub(super) fn choice_word(choice: Choice) -> String {
+    match choice {
+        Choice::Matched => "matched".into(),
+        Choice::Best => "best".into(),
+        Choice::Insist(convention) => convention.number().to_string(),
+    }
 }
 
 /// What was measured, and by what.
@@ -175,15 +195,8 @@ impl RunRecord {
                     .map_err(FileError::doing(data.root(), "cannot store the settings"))?,
                 Source::Folder { .. } => fingerprint::of_source(source, data)?,
             },
-            definition: match options.definition {
-                Definition::Leaderboard => "leaderboard".into(),
-                Definition::Corrected => "corrected".into(),
-            },
-            choice: match options.choice {
-                Choice::Matched => "matched".into(),
-                Choice::Best => "best".into(),
-                Choice::Insist(convention) => convention.number().to_string(),
-            },
+            definition: definition_word(options.definition).into(),
+            choice: choice_word(options.choice),
             noise: match options.noise {
                 Noise::Measured => "measured".into(),
                 Noise::Given(variance) => variance.to_string(),

@@ -18,16 +18,29 @@ const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");
 
 /// Most sets of one run: ten times the highest number that file names have room for.
 const MAX_SETS: usize = 100_000;
+/// A store's folder. If it was made for this and is still empty in the end, it is removed.
+#[must_use]
+pub struct Prepared(Option<PathBuf>);
+
+impl Drop for Prepared {
+    fn drop(&mut self) {
+        if let Some(made) = &self.0 {
+            // Fails for a folder that has files, as it should.
+            let _ = std::fs::remove_dir(made);
+        }
+    }
+}
 
 /// Makes the folder of a store, so that a long run does not find out at its end that it cannot.
 ///
 /// # Errors
-/// Where it cannot be made.
-pub fn prepare(store: &Path) -> Result<(), FileError> {
+/// If it cannot be made.
+pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
+    let absent = !store.exists();
     std::fs::create_dir_all(store)
         .map_err(FileError::doing(store, "cannot make the results store"))?;
     atomic::sweep(store);
-    Ok(())
+    Ok(Prepared(absent.then(|| store.to_owned())))
 }
 
 /// Records a run; the file it is now in.
@@ -131,7 +144,7 @@ fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<Stri
             Some(own) => {
                 if own.images.len() == set.images.len() {
                     notes.push(format!(
-                        "Warning: {} holds set {} of a run that another file holds too, with other results on as many images; that other one counts.",
+                        "warning: {} holds set {} of a run that another file holds too, with other results on as many images; that other one counts.",
                         path.display(),
                         set.set
                     ));

@@ -18,8 +18,9 @@ use crate::pipeline::engine::Progress;
 use crate::pipeline::measure::MeasuredRow;
 use crate::pipeline::run::{measurers, run_set};
 use crate::pipeline::simulate::simulator;
+use crate::pipeline::truth::SignBasis;
 use crate::results::row::SetRecord;
-use crate::results::score::{Basis, OWN, ScoredSet};
+use crate::results::score::{Basis, OWN, OddImages, ScoredSet};
 use crate::simulate::kinds::SetKind;
 use crate::simulate::set::SimulationSettings;
 
@@ -172,6 +173,9 @@ pub fn run_sets(
                 score: scorer.score(sum)?,
                 rows: *rows,
                 basis: Basis::Told,
+                sign: SignBasis::Specified,
+                findings: Vec::new(),
+                odd_images: OddImages::default(),
             })
         };
         let scored: Vec<ScoredSet> = sums

@@ -12,6 +12,7 @@ mod bad_settings;
 mod baselines;
 mod chain;
 mod documents;
+mod doubtful;
 mod examined;
 mod figures;
 mod fuzz;

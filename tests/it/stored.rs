@@ -54,6 +54,9 @@ impl Recorded {
 }
 
 fn files(store: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    if !store.exists() {
+        return Vec::new();
+    }
     let mut files: Vec<_> = fs::read_dir(store)
         .unwrap()
         .map(|entry| entry.unwrap().path())
