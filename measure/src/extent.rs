@@ -10,6 +10,11 @@ use crate::denoise::frame;
 
 /// σ of the weight in pixels.
 const WEIGHT: f64 = 5.0;
+/// σ in pixels of the narrow weight for the core: light that was blurred by a PSF has no narrower core than the PSF. The
+/// cores of galaxies with cusps are hardly broader, so that they show a PSF that is too broad where extents do not.
+const CORE: f64 = 1.0;
+/// Places beyond so many σ of the narrow weight do not count.
+const CORE_REACH: f64 = 5.0;
 /// Pixels that a stamp's frame is wide, whose mean is taken for the sky.
 const FRAME: usize = 2;
 /// Fewest stamps that tell the extent of their galaxies: of thirty at S/N 10 it is good to a tenth.
@@ -25,7 +30,73 @@ const MOST: f64 = 4.0;
 pub(crate) struct Light {
     /// Σ W I and Σ W r² I of each stamp.
     stamps: Vec<[f64; 2]>,
+    /// The same under the narrow weight.
+    cores: Vec<[f64; 2]>,
     moments: Moments,
+}
+
+/// How broad the core of light is: the mean square of its radii per axis, were it a Gaussian.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Core {
+    /// In px².
+    pub(crate) extent: f64,
+    /// Standard error in px².
+    pub(crate) error: f64,
+}
+
+impl Core {
+    /// Of light with `q` under the narrow weight, known to `error`.
+    fn of(q: f64, error: f64) -> Option<Core> {
+        let extent = 1.0 / (1.0 / q - 1.0 / (CORE * CORE));
+        let good = extent > 0.0 && extent.is_finite() && error.is_finite();
+        good.then(|| Core {
+            extent,
+            error: error * (extent / q).powi(2),
+        })
+    }
+
+    /// FWHM in pixels of a Gaussian with this core.
+    pub(crate) fn fwhm(&self) -> f64 {
+        (8.0 * std::f64::consts::LN_2 * self.extent).sqrt()
+    }
+}
+
+/// Σ W I and Σ W r² I under the narrow weight about `centre`, (x, y) in pixels from the middle.
+fn core_sums(value: impl Fn(usize, usize) -> f64, sides: [usize; 2], centre: [f64; 2]) -> [f64; 2] {
+    let at = [0, 1].map(|k| (sides[k] as f64 - 1.0) / 2.0 + centre[k]);
+    let range = |k: usize| {
+        let first = (at[k] - CORE_REACH * CORE).ceil().max(0.0) as usize;
+        let last = (at[k] + CORE_REACH * CORE).floor().max(0.0) as usize;
+        first..(last + 1).min(sides[k])
+    };
+    let mut sums = [0.0; 2];
+    for y in range(1) {
+        for x in range(0) {
+            let square = (x as f64 - at[0]).powi(2) + (y as f64 - at[1]).powi(2);
+            let light = (-0.5 * square / (CORE * CORE)).exp() * value(x, y);
+            sums[0] += light;
+            sums[1] += square * light;
+        }
+    }
+    sums
+}
+
+/// The core of a PSF stamp with its star at `centre`, (x, y) in pixels from the middle, a background of `level` and noise
+/// of `sigma` per pixel.
+pub(crate) fn core_of_psf(
+    psf: ArrayView2<'_, f64>,
+    centre: [f64; 2],
+    level: f64,
+    sigma: f64,
+) -> Option<Core> {
+    let sides = [psf.ncols(), psf.nrows()];
+    let [light, squares] = core_sums(|x, y| psf[(y, x)] - level, sides, centre);
+    let q = 0.5 * squares / light;
+    // Var(Σ W (r²/2 − q) n) = σ² ∫ W² (r²/2 − q)² d²x, of which W² is a Gaussian of half the variance.
+    let half = CORE * CORE / 2.0;
+    let spread = 2.0 * half * half - 2.0 * half * q + q * q;
+    let error = sigma * (std::f64::consts::PI * CORE * CORE * spread).sqrt() / light.abs();
+    Core::of(q, error)
 }
 
 /// Room for sums over a stamp: W and x² of each of its columns, and of its rows.
@@ -73,9 +144,13 @@ impl Moments {
 }
 
 impl Light {
-    /// Adds a stamp of `n` × `n` pixels with a galaxy at `centre`, (x, y) in pixels from the middle.
-    pub(crate) fn add(&mut self, pixels: &[f32], n: usize, centre: [f32; 2]) {
+    /// Adds a stamp of `n` × `n` pixels with a galaxy at `found`, (x, y) in pixels from the middle, for which the window is
+    /// at `centre`.
+    pub(crate) fn add(&mut self, pixels: &[f32], n: usize, centre: [f32; 2], found: [f32; 2]) {
         let sky = sky(pixels, n);
+        let value = |x: usize, y: usize| f64::from(pixels[y * n + x]) - sky;
+        let core = core_sums(value, [n; 2], found.map(f64::from));
+        self.cores.push(core);
         let rows = pixels.chunks_exact(n);
         let rows = rows.map(|row| row.iter().map(|value| f64::from(*value) - sky));
         let sums = self.moments.of([n; 2], centre.map(f64::from), rows);
@@ -85,6 +160,21 @@ impl Light {
     /// Adds the stamps of another, as if they had come after its own.
     pub(crate) fn join(&mut self, other: &Self) {
         self.stamps.extend_from_slice(&other.stamps);
+        self.cores.extend_from_slice(&other.cores);
+    }
+
+    /// The core of the galaxies, with the PSF's; `None` of few stamps, and if their light has none.
+    pub(crate) fn core(&self) -> Option<Core> {
+        if self.cores.len() < FEWEST {
+            return None;
+        }
+        let shares = shares(&self.cores);
+        let counted = || self.cores.iter().zip(&shares);
+        let sum = |k: usize| counted().map(|(sums, share)| share * sums[k]).sum::<f64>();
+        let light = sum(0);
+        let q = 0.5 * sum(1) / light;
+        let rest = counted().map(|(sums, share)| (share * (0.5 * sums[1] - q * sums[0])).powi(2));
+        Core::of(q, rest.sum::<f64>().sqrt() / light.abs())
     }
 
     /// The extent of the galaxies, with the PSF's, in px²; `None` of few stamps, and where their light has none.
@@ -92,21 +182,28 @@ impl Light {
         if self.stamps.len() < FEWEST {
             return None;
         }
-        let most = [0, 1].map(|k| {
-            let mut moduli: Vec<f64> = self.stamps.iter().map(|sums| sums[k].abs()).collect();
-            let middle = moduli.len() / 2;
-            MOST * *moduli.select_nth_unstable_by(middle, f64::total_cmp).1
-        });
         let mut sums = [0.0; 2];
-        for stamp in &self.stamps {
-            let share = (most[0] / stamp[0].abs()).min(most[1] / stamp[1].abs());
-            // Of a blank stamp it is no number.
-            let share = if share < 1.0 { share } else { 1.0 };
+        for (stamp, share) in self.stamps.iter().zip(shares(&self.stamps)) {
             sums[0] += share * stamp[0];
             sums[1] += share * stamp[1];
         }
         of_sums(sums)
     }
+}
+
+/// How much each stamp counts: in full up to [`MOST`] times the median of all.
+fn shares(stamps: &[[f64; 2]]) -> Vec<f64> {
+    let most = [0, 1].map(|k| {
+        let mut moduli: Vec<f64> = stamps.iter().map(|sums| sums[k].abs()).collect();
+        let middle = moduli.len() / 2;
+        MOST * *moduli.select_nth_unstable_by(middle, f64::total_cmp).1
+    });
+    let share = |stamp: &[f64; 2]| {
+        let share = (most[0] / stamp[0].abs()).min(most[1] / stamp[1].abs());
+        // Of a blank stamp it is no number.
+        if share < 1.0 { share } else { 1.0 }
+    };
+    stamps.iter().map(share).collect()
 }
 
 /// The extent of light with these Σ W I and Σ W r² I.
@@ -156,7 +253,8 @@ mod tests {
                     (value + level * noise + sky) as f32
                 })
                 .collect();
-            light.add(&stamp, N, centre.map(|c| c as f32));
+            let centre = centre.map(|c| c as f32);
+            light.add(&stamp, N, centre, centre);
         }
         light.extent()
     }
@@ -176,18 +274,39 @@ mod tests {
     }
 
     #[test]
+    fn the_core_of_a_gaussian_is_its_variance_and_noise_is_in_its_error() {
+        for extent in [2.0, 6.0] {
+            let psf = gaussian(extent, [0.3, -0.2]);
+            let core = core_of_psf(psf.view(), [0.3, -0.2], 0.0, 0.0).unwrap();
+            assert!((core.extent / extent - 1.0).abs() < 1e-3, "{core:?}");
+            // The mean square of errors is that of 300 fields of noise, to a tenth.
+            let (sigma, mut rng) = (0.01, ChaCha8Rng::seed_from_u64(4));
+            let square = (0..300).map(|_| {
+                let noisy = psf.mapv(|value| {
+                    let noise: f64 = StandardNormal.sample(&mut rng);
+                    value + sigma * noise
+                });
+                let found = core_of_psf(noisy.view(), [0.3, -0.2], 0.0, sigma).unwrap();
+                ((found.extent - extent) / found.error).powi(2)
+            });
+            let square = square.sum::<f64>() / 300.0;
+            assert!((0.7..1.4).contains(&square), "{extent} {square}");
+        }
+    }
+
+    #[test]
     fn a_wild_stamp_counts_like_a_few() {
         let mut light = Light::default();
         let stamp: Vec<f32> = gaussian(10.0, [0.0; 2]).iter().map(|v| *v as f32).collect();
         for wild in [1e6, -1e6, 0.0] {
             for _ in 0..333 {
-                light.add(&stamp, N, [0.0; 2]);
+                light.add(&stamp, N, [0.0; 2], [0.0; 2]);
             }
             // Where W r² is largest.
             let mut stamp = stamp.clone();
             stamp[24 * N + 31] = wild;
-            light.add(&stamp, N, [0.0; 2]);
-            light.add(&vec![0.0; N * N], N, [0.0; 2]);
+            light.add(&stamp, N, [0.0; 2], [0.0; 2]);
+            light.add(&vec![0.0; N * N], N, [0.0; 2], [0.0; 2]);
         }
         // Four parts in a thousand of a light of r² = 56 in place of 20 px² move the extent by 2 %, once each way.
         let found = light.extent().unwrap();
