@@ -4,6 +4,8 @@ use shearq_scoring::Shear;
 use shearq_submissions::SubmissionError;
 use thiserror::Error;
 
+use crate::warning::Warning;
+
 /// What can be wrong with stamps, PSFs or settings. A galaxy that cannot be measured is no error: it has
 /// [`Flags`](crate::Flags).
 #[derive(Debug, Error)]
@@ -67,6 +69,9 @@ pub enum MeasureError {
         /// The profile of the PSF.
         found: String,
     },
+    /// Data from which no result should be made.
+    #[error("{0}")]
+    Data(Warning),
     /// A submission that does not exist or is not valid.
     #[error(transparent)]
     Submission(#[from] SubmissionError),

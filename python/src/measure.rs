@@ -9,8 +9,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq::pipeline::engine;
 use shearq_measure::{
-    Flag, FunctionalPsf, MeasureError, Measurement, Measurer, NoisePlan, Pixel, PsfProfile, Psfs,
-    Survey, Worker, calibrate, star_psf,
+    Examination, Flag, FunctionalPsf, MeasureError, Measurement, Measurer, NoisePlan, Pixel,
+    PsfProfile, Psfs, Survey, Warning, Worker, calibrate, examined_rows, star_psf,
 };
 use shearq_scoring::Shear;
 
@@ -62,7 +62,8 @@ struct Job<'a> {
 
 /// Measures stamps `(n, ny, nx)` with a star stamp for all, star stamps one each, or formulas (FWHM, e1, e2 and
 /// β, which is not a number for Kolmogorov), one or one each; and a noise level for all or one each, or none where the
-/// submission measures it on the stamps. Returns the catalogue's columns and the mean response that the ellipticities were divided by.
+/// submission measures it on the stamps. Returns the catalogue's columns, the mean response that the ellipticities were
+/// divided by, and what is wrong with the data.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
 pub(crate) fn measure<'py>(
@@ -76,7 +77,7 @@ pub(crate) fn measure<'py>(
     submission: &Bound<'py, Submission>,
     threads_asked: Option<u16>,
     progress: Option<Py<PyAny>>,
-) -> PyResult<(Bound<'py, PyDict>, Option<[f64; 2]>)> {
+) -> PyResult<(Bound<'py, PyDict>, Option<[f64; 2]>, Vec<String>)> {
     let submission = &submission.get().entry.submission;
     let stamps = Borrowed::new(stamps)?;
     let (count, rows, columns) = stamps.dim();
@@ -193,7 +194,30 @@ pub(crate) fn measure<'py>(
     failure.or(result)?;
     let mut galaxies = [galaxies];
     let response = calibrate(submission, &mut galaxies);
-    Ok((catalogue(py, &galaxies[0])?, response))
+    let mut warnings = examine(&stamps, count, rows)?.warnings();
+    warnings.extend(Warning::of_flags(&galaxies));
+    if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {
+        return Err(of_measuring(MeasureError::Data(
+            warnings.swap_remove(fatal),
+        )));
+    }
+    let warnings = warnings.iter().map(Warning::to_string).collect();
+    Ok((catalogue(py, &galaxies[0])?, response, warnings))
+}
+
+/// Examines as many of the stamps as are enough.
+fn examine(stamps: &Stamps<'_>, count: usize, side: usize) -> PyResult<Examination> {
+    let chosen = examined_rows(1, count);
+    let mut examination = Examination::new(side, chosen.len());
+    for at in chosen {
+        match stamps.piece(at, at + 1)? {
+            Piece::Single(one) => examination.add(one.index_axis(Axis(0), 0)),
+            Piece::Double(one) => examination.add(one.index_axis(Axis(0), 0)),
+            Piece::Copied(one) => examination.add(one.index_axis(Axis(0), 0)),
+        }
+        .map_err(of_measuring)?;
+    }
+    Ok(examination)
 }
 
 /// What the stamps tell of their image, from as many as are enough.

@@ -6,12 +6,14 @@ mod source;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use ndarray::ArrayView2;
 use serde::Serialize;
 use shearq_measure::parts::frame;
+use shearq_measure::{Examination, examined_rows};
 use shearq_scoring::resample::RunningMean;
 
 pub use self::source::{Content, Files};
-use self::source::{Exposure, Images, Origin, Planes, shown};
+use self::source::{Exposure, Images, Origin, Planes, off_middle, shown};
 use super::PipelineError;
 use super::images::ImageId;
 use super::measure::check_strip;
@@ -28,10 +30,7 @@ const MAX_STAMPS: usize = table::MAX_ROWS;
 /// Share of a star's light on the frame of its stamp, were it all as bright as the frame, that is told: a background
 /// of that size changes a deconvolved galaxy.
 const PEDESTAL: f64 = 0.02;
-/// Mean of the stamps' frames, in units of the scatter of their pixels, that is told: more than the wings of galaxies
-/// leave.
-const SKY: f64 = 1.0;
-/// Pixels that the frame of a star or a stamp is wide.
+/// Pixels that the frame of a star is wide.
 const FRAME: usize = 2;
 
 /// Where stamps come from.
@@ -180,11 +179,20 @@ fn gather_alone(
     let mut keys = Vec::new();
     keys.extend(noise.map(|sigma| ("NOISESIG", Value::Real(sigma))));
     let mut image = Rows::create(&target, mosaic, &keys)?;
-    let (mut incomplete, mut frames) = (0, RunningMean::default());
+    let examined = examined_rows(mosaic.columns, mosaic.rows());
+    let mut examination = Examination::new(side, examined.len() * mosaic.columns);
+    let mut incomplete = 0;
     let mut places = csv::Writer::from_writer(Vec::new());
     let mut take = |origin: &Origin<'_>, pixels: &[f32]| -> Result<(), FileError> {
         incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
-        frame_of(pixels, side).for_each(|value| frames.add(value));
+        if examined.contains(&(image.next / mosaic.columns)) {
+            let stamp = ArrayView2::from_shape((side, side), pixels)
+                .map_err(|error| FileError::new(&target, error))?;
+            let place = origin.position.map_or([0.0; 2], |at| off_middle(at, side));
+            examination
+                .add_at(stamp, place)
+                .map_err(|error| FileError::new(&target, error))?;
+        }
         let (x, y) = mosaic.position(image.next);
         let place = Place {
             x,
@@ -246,13 +254,11 @@ fn gather_alone(
             }
         }
     }
-    if frames.mean().abs() > SKY * frames.deviation() {
-        doubts.push(format!(
-            "warning: the frames of the stamps have a mean of {:.3} where a pixel scatters by {:.3}: is sky left in them? It takes shear away",
-            frames.mean(),
-            frames.deviation()
-        ));
-    }
+    let warnings = examination.warnings();
+    doubts.extend(warnings.iter().map(|warning| {
+        let ImageId { set, image } = id;
+        format!("warning: set {set:02} image {image:03}: {warning}")
+    }));
     let text = places
         .into_inner()
         .map_err(|error| FileError::new(&which, error.to_string()))?;

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2, Axis, Slice};
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Slice};
 use shearq_measure::{
-    Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, Survey, Worker, calibrate,
-    star_psf, strip,
+    Examination, Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, Survey, Warning,
+    Worker, calibrate, examined_rows, star_psf, strip,
 };
 use shearq_submissions::{EllipticityType, NoiseSource, PsfCut, PsfForm, Submission};
 use shearq_tables::polars::{Column, DataFrame};
@@ -18,6 +18,7 @@ use super::engine::{self, Feeder, Progress};
 use super::grid::{self, whole};
 use super::images::ImageId;
 use super::inputs::Inputs;
+use super::warned::Warned;
 use crate::io::FileError;
 use crate::io::fits::ImageReader;
 use crate::io::layout::{DataFolder, MAX_STAMP};
@@ -35,6 +36,8 @@ const MAX_STRIP: usize = 1 << 24;
 const CORRELATION: usize = 2;
 /// Least difference between a header's noise level and the measured one, in units of either, that is told.
 const LEAST_DOUBT: f64 = 0.01;
+/// The same in units of its standard error.
+const CLEAR: f64 = 5.0;
 
 /// PSFs of one row of stamps.
 pub enum RowPsf {
@@ -67,6 +70,8 @@ pub struct StampRow {
     pub survey: Option<Arc<Survey>>,
     /// PSFs.
     pub psf: RowPsf,
+    /// What was found wrong with the image when it was opened, with its first row.
+    pub warnings: Vec<Warning>,
 }
 
 /// Measurements of one row of stamps.
@@ -79,6 +84,10 @@ pub struct MeasuredRow {
     pub mosaic: Mosaic,
     /// One per galaxy.
     pub galaxies: Vec<Measurement>,
+    /// What was found wrong with the image when it was opened, with its first row.
+    pub warnings: Vec<Warning>,
+    /// Of the rows that are examined.
+    pub examination: Option<Examination>,
 }
 
 impl AsRef<[Measurement]> for MeasuredRow {
@@ -101,6 +110,7 @@ pub struct ImageSource {
     header_noise: Option<f64>,
     survey: Option<Arc<Survey>>,
     psf: PsfSource,
+    warnings: Vec<Warning>,
     next: usize,
 }
 
@@ -157,6 +167,7 @@ impl ImageSource {
             mosaic,
             header_noise,
             survey: None,
+            warnings: Vec::new(),
             next: 0,
         })
     }
@@ -237,6 +248,7 @@ impl ImageSource {
                     RowPsf::Functional(field[first..first + mosaic.of_row(iy)].to_vec())
                 }
             },
+            warnings: std::mem::take(&mut self.warnings),
         }))
     }
 }
@@ -382,7 +394,38 @@ pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, P
         iy: row.iy,
         mosaic: row.mosaic,
         galaxies: galaxies?,
+        warnings: row.warnings.clone(),
+        examination: examine(row, stamps)?,
     })
+}
+
+/// Examines the stamps of a row, if it is one of those that are enough for its image.
+fn examine(
+    row: &StampRow,
+    stamps: ArrayView3<'_, f32>,
+) -> Result<Option<Examination>, PipelineError> {
+    let Mosaic { columns, stamp, .. } = row.mosaic;
+    if !examined_rows(columns, row.mosaic.rows()).contains(&row.iy) {
+        return Ok(None);
+    }
+    let mut examination = Examination::new(stamp, columns);
+    for stamp in stamps.outer_iter() {
+        examination.add(stamp)?;
+    }
+    Ok(Some(examination))
+}
+
+/// What is wrong with an image whose rows have been measured and calibrated.
+pub(crate) fn warnings(rows: &[MeasuredRow]) -> Vec<Warning> {
+    let mut found: Vec<Warning> = rows.iter().flat_map(|row| row.warnings.clone()).collect();
+    let mut examinations = rows.iter().filter_map(|row| row.examination.as_ref());
+    if let Some(first) = examinations.next() {
+        let mut all = first.clone();
+        examinations.for_each(|more| all.join(more));
+        found.extend(all.warnings());
+    }
+    found.extend(Warning::of_flags(rows));
+    found
 }
 
 /// The PSF of galaxy `ix` of a row as it is deconvolved with.
@@ -461,10 +504,8 @@ pub fn measure_folder(
         .mosaic
         .stamp;
     let measurer = Measurer::new(&run.submission, stamp)?;
-    let (noise, doubts) = first_noise(data, first, &measurer)?;
-    for doubt in doubts {
-        progress.warn(&doubt);
-    }
+    let first = first_noise(data, first, &measurer)?;
+    let mut warned = Warned::default();
     let mut rows = Vec::new();
     // Of each image as it was when it was opened, in the images' order.
     let (send, receive) = std::sync::mpsc::channel();
@@ -476,7 +517,7 @@ pub fn measure_folder(
                 let _ = send.send(inputs.prints(id)?);
                 Ok(())
             };
-            read_images(data, &todo, &measurer, noise, print, feeder)
+            read_images(data, &todo, &measurer, first, print, feeder)
         },
         || measurer.worker(),
         |worker, row: StampRow| measure_row(worker, &row),
@@ -486,6 +527,7 @@ pub fn measure_folder(
             rows.push(row);
             if rows.len() == mosaic.rows() {
                 calibrate(&run.submission, &mut rows);
+                warned.add(id, warnings(&rows), progress)?;
                 let prints = receive.recv().unwrap_or_default();
                 write_catalogue(run, out, &rows, prints)?;
                 summary.count(&rows);
@@ -495,6 +537,7 @@ pub fn measure_folder(
             Ok(())
         },
     )?;
+    warned.finish(progress);
     Ok(summary)
 }
 
@@ -504,7 +547,7 @@ fn first_noise(
     data: &DataFolder,
     first: ImageId,
     measurer: &Measurer,
-) -> Result<(Option<Arc<Survey>>, Vec<String>), PipelineError> {
+) -> Result<(Option<Arc<Survey>>, Vec<Warning>), PipelineError> {
     let submission = measurer.submission();
     let nothing = (None, Vec::new());
     if submission.linear().is_none() {
@@ -524,16 +567,11 @@ fn first_noise(
     };
     let mut source = ImageSource::open(data, first, submission)?;
     let asked = measurer.noise_plan().is_some();
-    let image = format!("set {:02} image {:03}", first.set, first.image);
+    let given = source.header_noise;
     let survey = match source.look(data, plan) {
         Ok(Some(survey)) => survey,
         Err(error) if asked => return Err(error),
-        Ok(None) if asked => {
-            let doubt = format!(
-                "warning: {image}: no stamp has enough pixels that differ to measure the noise on: its galaxies are flagged; noise.source \"header\" takes NOISESIG"
-            );
-            return Ok((None, vec![doubt]));
-        }
+        Ok(None) if asked => return Ok((None, vec![Warning::NoNoise])),
         Ok(None) | Err(_) => return Ok(nothing),
     };
     let white = !matches!(submission.noise, NoiseSource::Image { correlation } if correlation > 0);
@@ -544,45 +582,26 @@ fn first_noise(
         None
     };
     let coloured = &coloured.as_ref().unwrap_or(&survey).noise;
-    let noise = &survey.noise;
-    let mut doubts = Vec::new();
-    if let Some(header) = source.header_noise {
-        let apart = noise.sigma() / header - 1.0;
-        let doubtful = apart.abs() > (5.0 * noise.error()).max(LEAST_DOUBT);
-        // A header of zero or of no number.
-        if doubtful || apart.is_nan() {
-            let taken = if asked {
-                "the measured one is used"
-            } else {
-                "NOISESIG is not what is there"
-            };
-            doubts.push(format!(
-                "warning: {image}: NOISESIG is {}, the noise of the stamps' frames {}: {taken}",
-                level(header),
-                level(noise.sigma())
-            ));
-        }
-    }
+    let mut warnings: Vec<Warning> = doubtful(given, &survey, asked).into_iter().collect();
     if white && coloured.is_correlated() {
-        doubts.push(format!(
-            "warning: {image}: neighbouring pixels have noise correlated by {:.2} along x and {:.2} along y, which is taken as white; set noise.source to \"image\" and noise.correlation above 0",
-            coloured.correlation(1, 0),
-            coloured.correlation(0, 1)
-        ));
+        warnings.push(Warning::CorrelatedNoise {
+            correlation: [coloured.correlation(1, 0), coloured.correlation(0, 1)],
+        });
     }
-    Ok((asked.then_some(survey), doubts))
+    Ok((asked.then_some(survey), warnings))
 }
 
-/// A level of noise to five digits, in whatever unit pixels have.
-fn level(sigma: f64) -> String {
-    if sigma == 0.0 {
-        return "0".into();
-    }
-    if !(1e-3..1e5).contains(&sigma) {
-        return format!("{sigma:.4e}");
-    }
-    let decimals = 4.0 - sigma.log10().floor();
-    format!("{sigma:.*}", decimals.max(0.0) as usize)
+/// A warning if the header's noise level is not the measured one, which may be `used`.
+fn doubtful(given: Option<f64>, survey: &Survey, used: bool) -> Option<Warning> {
+    let (given, noise) = (given?, &survey.noise);
+    let apart = noise.sigma() / given - 1.0;
+    let differs = apart.abs() > (CLEAR * noise.error()).max(LEAST_DOUBT);
+    // A header of zero or of no number.
+    (differs || apart.is_nan()).then_some(Warning::NoiseLevel {
+        given,
+        measured: noise.sigma(),
+        used,
+    })
 }
 
 /// Number of galaxies that `measure_folder` will measure, for progress bars: an estimate from the
@@ -615,10 +634,11 @@ fn read_images(
     data: &DataFolder,
     todo: &[ImageId],
     measurer: &Measurer,
-    mut first: Option<Arc<Survey>>,
+    (first, mut warnings): (Option<Arc<Survey>>, Vec<Warning>),
     mut opened: impl FnMut(ImageId) -> Result<(), FileError>,
     feeder: &mut Feeder<'_, StampRow>,
 ) -> Result<(), PipelineError> {
+    let mut first = Some(first);
     for &id in todo {
         opened(id)?;
         let mut source = ImageSource::open(data, id, measurer.submission())?;
@@ -631,12 +651,21 @@ fn read_images(
             );
             return Err(FileError::new(path, message).into());
         }
-        if let Some(plan) = measurer.noise_plan() {
-            match first.take() {
-                Some(survey) => source.survey = Some(survey),
-                None => {
-                    source.look(data, plan)?;
-                }
+        source.warnings = std::mem::take(&mut warnings);
+        match (measurer.noise_plan(), first.take()) {
+            (None, _) => {}
+            (Some(_), Some(found)) => {
+                // Without noise the header's does not take its place.
+                source.header_noise = source.header_noise.filter(|_| found.is_some());
+                source.survey = found;
+            }
+            (Some(plan), None) => {
+                let given = source.header_noise;
+                let found = source.look(data, plan)?;
+                source.warnings.extend(match found {
+                    Some(survey) => doubtful(given, &survey, true),
+                    None => Some(Warning::NoNoise),
+                });
             }
         }
         while let Some(row) = source.next_row()? {
@@ -743,24 +772,4 @@ pub(super) fn metadata(
         .map(|(key, value)| (key.to_owned(), value)),
     );
     Ok(all)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::level;
-
-    #[test]
-    fn levels_have_five_digits_in_any_unit() {
-        let shown = [0.0, 0.00121, 0.12345678, 1.0, 12345.67, 123456.7, 3.2e-7].map(level);
-        let expected = [
-            "0",
-            "0.0012100",
-            "0.12346",
-            "1.0000",
-            "12346",
-            "1.2346e5",
-            "3.2000e-7",
-        ];
-        assert_eq!(shown, expected);
-    }
 }

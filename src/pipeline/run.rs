@@ -13,7 +13,10 @@ use shearq_submissions::{PsfForm, Submission};
 
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
-use super::measure::{MeasuredRow, RowPsf, StampRow, Summary, measure_row, to_do, write_catalogue};
+use super::measure::{
+    MeasuredRow, RowPsf, StampRow, Summary, measure_row, to_do, warnings, write_catalogue,
+};
+use super::warned::Warned;
 use super::{PipelineError, simulate};
 use crate::io::layout::DataFolder;
 use crate::io::mosaic::Mosaic;
@@ -91,6 +94,7 @@ pub fn run_folder(
         already: done.len(),
         ..Summary::default()
     };
+    let mut warned = Warned::default();
     progress.skip((summary.already * settings.grid * settings.grid) as u64);
     for of_set in todo.chunk_by(|a, b| a.set == b.set) {
         let set = of_set[0].set;
@@ -98,12 +102,23 @@ pub fn run_folder(
         let simulator = simulate::simulator(set, settings)?;
         simulate::write_truth(&truth, &simulator)?;
         progress.note(&format!("set {set:02}"));
+        // The bar is busy meanwhile.
+        let mut found = Vec::new();
         run_set(&simulator, &todo, &measurers, threads, progress, |image| {
+            let id = ImageId {
+                set,
+                image: image.image,
+            };
+            found.extend(warnings(&image.rows[0]).into_iter().map(|one| (id, one)));
             write_catalogue(run, out, &image.rows[0], BTreeMap::new())?;
             summary.count(&image.rows[0]);
             Ok(())
         })?;
+        for (id, warning) in found {
+            warned.add(id, vec![warning], progress)?;
+        }
     }
+    warned.finish(progress);
     Ok(summary)
 }
 
@@ -291,6 +306,7 @@ pub(crate) fn measure_strip(
         header_noise: Some(NOISE_SIGMA),
         survey: None,
         psf: RowPsf::Functional(Vec::new()),
+        warnings: Vec::new(),
     };
     let mut measured = Vec::with_capacity(workers.len());
     for (k, worker) in workers.iter_mut().enumerate() {

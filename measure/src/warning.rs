@@ -1,0 +1,282 @@
+//! What is wrong with data that can be measured all the same.
+
+use std::fmt;
+
+use crate::flag::Flag;
+use crate::measurement::Measurement;
+
+/// Something in the data of an image that biases shears, or is likely a mistake.
+///
+/// The text of [`Display`](fmt::Display) is one line without the name of the image.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum Warning {
+    /// The corners of the stamps are brighter or darker than zero.
+    Sky {
+        /// Mean level in image units.
+        level: f64,
+        /// Its standard error.
+        error: f64,
+        /// Noise of a pixel in image units.
+        noise: f64,
+        /// Light of this sky within 8 px of a galaxy, in units of the galaxy's.
+        share: f64,
+    },
+    /// The level of the stamps' corners changes along x or y.
+    Gradient {
+        /// Change per pixel along x and y, in image units.
+        slope: [f64; 2],
+        /// Standard error of either.
+        error: f64,
+        /// Noise of a pixel in image units.
+        noise: f64,
+    },
+    /// The galaxies are not in the middle of their stamps.
+    OffCentre {
+        /// Median of their centroids from the middle, along x and y in pixels.
+        offset: [f64; 2],
+        /// Standard error of either.
+        error: f64,
+    },
+    /// The galaxies are at different places of their stamps.
+    Wandering {
+        /// Scatter of their centroids along x and y in pixels.
+        scatter: [f64; 2],
+    },
+    /// Most galaxies are darker than their surroundings.
+    Negative {
+        /// Stamps with a negative flux.
+        count: usize,
+        /// Stamps examined.
+        of: usize,
+    },
+    /// The noise differs from stamp to stamp.
+    Depths {
+        /// Scatter of the stamps' noise, in units of their median.
+        scatter: f64,
+    },
+    /// Noise is correlated over more pixels than can be measured.
+    LongCorrelation {
+        /// Mean correlation of pixels four and five apart along an axis.
+        correlation: f64,
+    },
+    /// Stamps are copies of other stamps.
+    Copies {
+        /// Stamps that are copies.
+        count: usize,
+        /// Stamps examined.
+        of: usize,
+    },
+    /// All pixels of a stamp are equal, on every stamp examined.
+    Blank {
+        /// Stamps examined.
+        of: usize,
+    },
+    /// Pixel values are too small or large for single precision.
+    Brightness {
+        /// Median of the stamps' brightest pixels.
+        peak: f64,
+    },
+    /// The noise of the stamps disagrees with the one that was given.
+    NoiseLevel {
+        /// The header key NOISESIG.
+        given: f64,
+        /// The noise measured on the stamps.
+        measured: f64,
+        /// Whether the measured noise is used.
+        used: bool,
+    },
+    /// Noise is correlated, and the configuration treats it as white.
+    CorrelatedNoise {
+        /// Correlation of neighbours along x and y.
+        correlation: [f64; 2],
+    },
+    /// No stamp is good enough to measure the noise on.
+    NoNoise,
+    /// Most galaxies could not be measured.
+    Flagged {
+        /// The most frequent reason.
+        flag: Flag,
+        /// Galaxies that are flagged.
+        count: usize,
+        /// All galaxies.
+        of: usize,
+    },
+}
+
+impl Warning {
+    /// A warning if more than half of the galaxies of an image, given in parts such as rows, are flagged.
+    pub fn of_flags<P: AsRef<[Measurement]>>(parts: &[P]) -> Option<Warning> {
+        let galaxies = || parts.iter().flat_map(AsRef::as_ref);
+        let of = galaxies().count();
+        let count = galaxies().filter(|g| !g.flags.is_empty()).count();
+        let with = |flag: &Flag| galaxies().filter(|g| g.flags.contains(*flag)).count();
+        // Of equal numbers the first reason.
+        let flag = Flag::ALL.into_iter().rev().max_by_key(with)?;
+        (2 * count > of).then_some(Warning::Flagged { flag, count, of })
+    }
+
+    /// A name for each kind of warning, for counting.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Warning::Sky { .. } => "sky",
+            Warning::Gradient { .. } => "gradient",
+            Warning::OffCentre { .. } => "off-centre",
+            Warning::Wandering { .. } => "wandering",
+            Warning::Negative { .. } => "negative",
+            Warning::Depths { .. } => "depths",
+            Warning::LongCorrelation { .. } => "long-correlation",
+            Warning::Copies { .. } => "copies",
+            Warning::Blank { .. } => "blank",
+            Warning::Brightness { .. } => "brightness",
+            Warning::NoiseLevel { .. } => "noise-level",
+            Warning::CorrelatedNoise { .. } => "correlated-noise",
+            Warning::NoNoise => "no-noise",
+            Warning::Flagged { .. } => "flagged",
+        }
+    }
+
+    /// Whether no result should be made from such data.
+    pub fn is_fatal(&self) -> bool {
+        false
+    }
+}
+
+/// A value with the digits that its error allows, in any unit.
+struct Shown(f64);
+
+impl fmt::Display for Shown {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Shown(value) = *self;
+        if value != 0.0 && !(1e-3..1e5).contains(&value.abs()) {
+            return write!(f, "{value:.2e}");
+        }
+        let decimals = if value == 0.0 {
+            0.0
+        } else {
+            2.0 - value.abs().log10().floor()
+        };
+        write!(f, "{value:.*}", decimals.max(0.0) as usize)
+    }
+}
+
+/// A level of noise to five digits, in whatever unit pixels have.
+fn level(sigma: f64) -> String {
+    if sigma == 0.0 {
+        return "0".into();
+    }
+    if !(1e-3..1e5).contains(&sigma) {
+        return format!("{sigma:.4e}");
+    }
+    let decimals = 4.0 - sigma.log10().floor();
+    format!("{sigma:.*}", decimals.max(0.0) as usize)
+}
+
+impl fmt::Display for Warning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Warning::Sky {
+                level,
+                error,
+                noise,
+                share,
+            } => write!(
+                f,
+                "the stamps contain sky (found a level of {} ± {} in their corners, {} of the noise; expected 0). It adds {:.1} % to a galaxy's light within 8 px and biases shears. Try: subtract the sky",
+                Shown(*level),
+                Shown(*error),
+                Shown(*level / *noise),
+                100.0 * share
+            ),
+            Warning::Gradient {
+                slope,
+                error,
+                noise,
+            } => write!(
+                f,
+                "the background has a gradient (found {} along x and {} along y, ± {}, in units of the noise per pixel; expected 0). It biases shears. Try: subtract the sky",
+                Shown(slope[0] / noise),
+                Shown(slope[1] / noise),
+                Shown(error / noise)
+            ),
+            Warning::OffCentre { offset, error } => write!(
+                f,
+                "the galaxies are off the centre of their stamps (found a median of {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected less than a pixel). Try: cut the stamps around the galaxies",
+                offset[0], offset[1]
+            ),
+            Warning::Wandering { scatter } => write!(
+                f,
+                "the galaxies are scattered over their stamps (found {:.1} px along x and {:.1} px along y; expected less than 2 px). Try: cut the stamps around the galaxies",
+                scatter[0], scatter[1]
+            ),
+            Warning::Negative { count, of } => write!(
+                f,
+                "galaxies are darker than their surroundings (found negative flux on {count} of {of} stamps; expected positive flux). Try: check the sign of the image"
+            ),
+            Warning::Depths { scatter } => write!(
+                f,
+                "the noise differs between stamps (found a scatter of {:.0} %; expected one level). Try: put stamps of one depth into an image",
+                100.0 * scatter
+            ),
+            Warning::LongCorrelation { correlation } => write!(
+                f,
+                "the noise is correlated over more than 3 px (found {correlation:.2} for pixels 4 and 5 px apart; expected 0). The response is corrected for shorter correlations only. Try: use images before resampling or smoothing"
+            ),
+            Warning::Copies { count, of } => write!(
+                f,
+                "stamps are copies of each other (found {count} of {of}; expected none). Copies make errors too small. Try: remove repeated galaxies"
+            ),
+            Warning::Blank { of } => write!(
+                f,
+                "the stamps are blank (found equal pixels on each of {of} stamps; expected a galaxy and noise). Try: check the file and its extension"
+            ),
+            Warning::Brightness { peak } => write!(
+                f,
+                "pixel values are out of range (found brightest pixels of about {peak:.1e}; expected 1e-18 to 1e17). Try: divide the image and its noise by a constant"
+            ),
+            Warning::NoiseLevel {
+                given,
+                measured,
+                used,
+            } => write!(
+                f,
+                "NOISESIG disagrees with the measured noise (found {}, expected {}): {}",
+                level(*given),
+                level(*measured),
+                if *used {
+                    "the measured noise is used"
+                } else {
+                    "NOISESIG is used"
+                }
+            ),
+            Warning::CorrelatedNoise { correlation } => write!(
+                f,
+                "the noise of neighbouring pixels is correlated, but is treated as white (found {:.2} along x and {:.2} along y, expected 0). Try: set noise.source to \"image\" and noise.correlation above 0",
+                correlation[0], correlation[1]
+            ),
+            Warning::NoNoise => f.write_str(
+                "cannot measure the noise: no stamp has enough pixels that differ. All galaxies are flagged. Try: set noise.source to \"header\" to use NOISESIG",
+            ),
+            Warning::Flagged { flag, count, of } => write!(
+                f,
+                "{count} of {of} galaxies are flagged, most of them for this reason: {flag}. Try: {}",
+                advice(*flag)
+            ),
+        }
+    }
+}
+
+/// What to look at if most galaxies have this flag.
+pub(crate) fn advice(flag: Flag) -> &'static str {
+    match flag {
+        Flag::NotFinite => "check masks, and positions outside the image (are they degrees?)",
+        Flag::BadPsf => "check the PSF stamps: sum, centre and finite pixels",
+        Flag::NoScale => "check that the stamps are not blank and that the noise is known",
+        Flag::NoLight | Flag::NoExtent => "check the sky, the sign of the image and its units",
+        Flag::NoShear => "check that there is a galaxy on the stamps",
+        Flag::NoResponse => {
+            "check that the PSF has the pixel scale of the galaxies, and that there are galaxies"
+        }
+        Flag::Neighbour => "check sky gradients and that the stamps are centred on the galaxies",
+    }
+}
