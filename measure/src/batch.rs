@@ -7,7 +7,7 @@ use shearq_submissions::{Method, NoiseSource, Submission};
 
 use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
-use crate::examine::{Examination, examined_rows};
+use crate::examine::{EXAMINED_PSFS, Examination, examined_rows};
 use crate::flag::Flag;
 use crate::galaxy::{Measurer, Worker};
 use crate::measurement::Measurement;
@@ -109,7 +109,10 @@ impl Measurer {
         }
         let mut galaxies = [worker.measure_each(stamps, psfs, noise)?];
         let response = calibrate(self.submission(), &mut galaxies);
-        let mut warnings = examine(stamps)?.warnings();
+        let mut examination = examine(stamps)?;
+        examination.add_psfs(psfs, self.submission().psf_cut(), EXAMINED_PSFS);
+        let mut warnings = examination.warnings();
+        warnings.extend(Warning::of_settings(self.submission()));
         warnings.extend(Warning::of_flags(&galaxies));
         if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {
             return Err(MeasureError::Data(warnings.swap_remove(fatal)));

@@ -4,11 +4,16 @@
 //! All numbers are medians over stamps, so that neighbours on a few of them do not matter. The sky is measured in
 //! the corners, where a galaxy has least light.
 
-use ndarray::ArrayView2;
+use ndarray::{ArrayView2, Axis};
+use shearq_submissions::PsfCut;
 
+use crate::batch::Psfs;
 use crate::error::MeasureError;
+use crate::extent::{Core, core_sums};
 use crate::galaxy::highest;
 use crate::pixel::Pixel;
+use crate::psf::examine::{self, PsfLook};
+use crate::psf::{Star, star};
 use crate::surroundings::centre;
 use crate::warning::Warning;
 
@@ -21,6 +26,13 @@ const INNER: f64 = 8.0;
 const LONG: [usize; 2] = [4, 5];
 /// Stamps of an image that are examined: 1.2 million pixels in frames of 48 px, which know the variance to 0.15 %.
 const ENOUGH: usize = 1000;
+
+/// Fewest galaxies whose core is compared with the core of the PSF, and how many times the median of all a galaxy's light
+/// may count.
+const FEWEST: usize = 30;
+const MOST: f64 = 4.0;
+/// PSFs of single galaxies of an image that are examined.
+pub const EXAMINED_PSFS: usize = 100;
 
 /// Significance that every warning requires, in standard errors.
 const CLEAR: f64 = 5.0;
@@ -71,6 +83,8 @@ struct Look {
     /// Light within `INNER`, without sky.
     flux: f64,
     peak: f64,
+    /// Sums under the narrow weight of [`Core`].
+    core: [f64; 2],
     /// Equal for equal stamps.
     trace: u64,
 }
@@ -83,6 +97,9 @@ pub struct Examination {
     pixels: Vec<f32>,
     looks: Vec<Look>,
     blank: usize,
+    psfs: Vec<PsfLook>,
+    /// Whether each PSF is that of one galaxy.
+    each: bool,
 }
 
 /// A block's mean, variance about its plane, and sums over pairs.
@@ -102,6 +119,43 @@ impl Examination {
             pixels: vec![0.0; full * full],
             looks: Vec::with_capacity(count),
             blank: 0,
+            psfs: Vec::new(),
+            each: false,
+        }
+    }
+
+    /// Examines the PSF of all galaxies, of sum one, which was `moved` by so many pixels to be in the middle.
+    pub fn add_psf(&mut self, psf: ArrayView2<'_, f64>, moved: Option<[f64; 2]>) {
+        self.psfs.extend(PsfLook::of(psf, moved));
+    }
+
+    /// Examines the PSF of all galaxies, or up to `most` of those for one galaxy each, as a configuration cuts them for
+    /// stamps of `full` pixels a side. PSFs that cannot be used are left out.
+    pub fn add_psfs<P: Pixel>(&mut self, psfs: Psfs<'_, P>, cut: PsfCut, most: usize) {
+        let count = match psfs {
+            Psfs::Star(given) => return self.add_star(given, cut),
+            Psfs::Prepared(psf) => return self.add_psf(psf, None),
+            Psfs::Stars(stars) => stars.len_of(Axis(0)),
+            Psfs::Functional(formulas) => formulas.len(),
+        };
+        self.each = true;
+        let some = most.min(count);
+        for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
+            match psfs {
+                Psfs::Stars(stars) => self.add_star(stars.index_axis(Axis(0), at), cut),
+                Psfs::Functional(formulas) => {
+                    if let Ok(psf) = formulas[at].checked_stamp(cut, self.full) {
+                        self.add_psf(psf.view(), None);
+                    }
+                }
+                Psfs::Star(_) | Psfs::Prepared(_) => {}
+            }
+        }
+    }
+
+    fn add_star<P: Pixel>(&mut self, stamp: ArrayView2<'_, P>, cut: PsfCut) {
+        if let Ok(Star { psf, moved }) = star(stamp, cut) {
+            self.add_psf(psf.view(), moved);
         }
     }
 
@@ -163,6 +217,7 @@ impl Examination {
             trace: trace(&self.pixels),
             place: [0.0; 2],
             flux: 0.0,
+            core: [0.0; 2],
         };
         for value in &mut self.pixels {
             // Missing pixels are as bright as the sky.
@@ -176,6 +231,11 @@ impl Examination {
         self.looks.push(Look {
             place: [0, 1].map(|k| f64::from(found[k]) - place[k]),
             flux: inner(&self.pixels, n),
+            core: core_sums(
+                |x, y| f64::from(self.pixels[y * n + x]),
+                [n; 2],
+                found.map(f64::from),
+            ),
             ..look
         });
         Ok(())
@@ -185,6 +245,8 @@ impl Examination {
     pub fn join(&mut self, other: &Self) {
         self.looks.extend_from_slice(&other.looks);
         self.blank += other.blank;
+        self.psfs.extend_from_slice(&other.psfs);
+        self.each |= other.each;
     }
 
     /// What is wrong with the stamps.
@@ -195,6 +257,7 @@ impl Examination {
             if self.blank > 0 {
                 found.push(Warning::Blank { of: self.blank });
             }
+            found.extend(self.psfs(None));
             return found;
         }
         let (peak, _) = self.median(|look| look.peak, 0.0);
@@ -225,7 +288,30 @@ impl Examination {
         }
         found.extend(self.depths());
         found.extend(self.copies(examined));
+        let galaxies = self.core().filter(|_| lit && flux > 0.0);
+        found.extend(self.psfs(galaxies));
         found
+    }
+
+    fn psfs(&self, galaxies: Option<Core>) -> Vec<Warning> {
+        examine::warnings(&self.psfs, !self.each, galaxies)
+    }
+
+    /// How broad the core of the galaxies is, with the PSF.
+    fn core(&self) -> Option<Core> {
+        let mut lights: Vec<f64> = self.looks.iter().map(|look| look.core[0].abs()).collect();
+        let most = MOST * median(&mut lights).filter(|_| lights.len() >= FEWEST)?;
+        let sums = || {
+            self.looks.iter().map(|look| {
+                // Bright stars and bad pixels count no more than a few galaxies.
+                let share = (most / look.core[0].abs()).min(1.0);
+                look.core.map(|sum| share * sum)
+            })
+        };
+        let light: f64 = sums().map(|core| core[0]).sum();
+        let q = 0.5 * sums().map(|core| core[1]).sum::<f64>() / light;
+        let rest = sums().map(|core| (0.5 * core[1] - q * core[0]).powi(2));
+        Core::of(q, rest.sum::<f64>().sqrt() / light.abs())
     }
 
     fn sky(&self, noise: f64, flux: f64) -> Option<Warning> {

@@ -30,8 +30,6 @@ const MOST: f64 = 4.0;
 pub(crate) struct Light {
     /// Σ W I and Σ W r² I of each stamp.
     stamps: Vec<[f64; 2]>,
-    /// The same under the narrow weight.
-    cores: Vec<[f64; 2]>,
     moments: Moments,
 }
 
@@ -46,7 +44,7 @@ pub(crate) struct Core {
 
 impl Core {
     /// Of light with `q` under the narrow weight, known to `error`.
-    fn of(q: f64, error: f64) -> Option<Core> {
+    pub(crate) fn of(q: f64, error: f64) -> Option<Core> {
         let extent = 1.0 / (1.0 / q - 1.0 / (CORE * CORE));
         let good = extent > 0.0 && extent.is_finite() && error.is_finite();
         good.then(|| Core {
@@ -62,7 +60,11 @@ impl Core {
 }
 
 /// Σ W I and Σ W r² I under the narrow weight about `centre`, (x, y) in pixels from the middle.
-fn core_sums(value: impl Fn(usize, usize) -> f64, sides: [usize; 2], centre: [f64; 2]) -> [f64; 2] {
+pub(crate) fn core_sums(
+    value: impl Fn(usize, usize) -> f64,
+    sides: [usize; 2],
+    centre: [f64; 2],
+) -> [f64; 2] {
     let at = [0, 1].map(|k| (sides[k] as f64 - 1.0) / 2.0 + centre[k]);
     let range = |k: usize| {
         let first = (at[k] - CORE_REACH * CORE).ceil().max(0.0) as usize;
@@ -144,13 +146,9 @@ impl Moments {
 }
 
 impl Light {
-    /// Adds a stamp of `n` × `n` pixels with a galaxy at `found`, (x, y) in pixels from the middle, for which the window is
-    /// at `centre`.
-    pub(crate) fn add(&mut self, pixels: &[f32], n: usize, centre: [f32; 2], found: [f32; 2]) {
+    /// Adds a stamp of `n` × `n` pixels with a galaxy at `centre`, (x, y) in pixels from the middle.
+    pub(crate) fn add(&mut self, pixels: &[f32], n: usize, centre: [f32; 2]) {
         let sky = sky(pixels, n);
-        let value = |x: usize, y: usize| f64::from(pixels[y * n + x]) - sky;
-        let core = core_sums(value, [n; 2], found.map(f64::from));
-        self.cores.push(core);
         let rows = pixels.chunks_exact(n);
         let rows = rows.map(|row| row.iter().map(|value| f64::from(*value) - sky));
         let sums = self.moments.of([n; 2], centre.map(f64::from), rows);
@@ -160,21 +158,6 @@ impl Light {
     /// Adds the stamps of another, as if they had come after its own.
     pub(crate) fn join(&mut self, other: &Self) {
         self.stamps.extend_from_slice(&other.stamps);
-        self.cores.extend_from_slice(&other.cores);
-    }
-
-    /// The core of the galaxies, with the PSF's; `None` of few stamps, and if their light has none.
-    pub(crate) fn core(&self) -> Option<Core> {
-        if self.cores.len() < FEWEST {
-            return None;
-        }
-        let shares = shares(&self.cores);
-        let counted = || self.cores.iter().zip(&shares);
-        let sum = |k: usize| counted().map(|(sums, share)| share * sums[k]).sum::<f64>();
-        let light = sum(0);
-        let q = 0.5 * sum(1) / light;
-        let rest = counted().map(|(sums, share)| (share * (0.5 * sums[1] - q * sums[0])).powi(2));
-        Core::of(q, rest.sum::<f64>().sqrt() / light.abs())
     }
 
     /// The extent of the galaxies, with the PSF's, in px²; `None` of few stamps, and where their light has none.
@@ -182,28 +165,21 @@ impl Light {
         if self.stamps.len() < FEWEST {
             return None;
         }
+        let most = [0, 1].map(|k| {
+            let mut moduli: Vec<f64> = self.stamps.iter().map(|sums| sums[k].abs()).collect();
+            let middle = moduli.len() / 2;
+            MOST * *moduli.select_nth_unstable_by(middle, f64::total_cmp).1
+        });
         let mut sums = [0.0; 2];
-        for (stamp, share) in self.stamps.iter().zip(shares(&self.stamps)) {
+        for stamp in &self.stamps {
+            let share = (most[0] / stamp[0].abs()).min(most[1] / stamp[1].abs());
+            // Of a blank stamp it is no number.
+            let share = if share < 1.0 { share } else { 1.0 };
             sums[0] += share * stamp[0];
             sums[1] += share * stamp[1];
         }
         of_sums(sums)
     }
-}
-
-/// How much each stamp counts: in full up to [`MOST`] times the median of all.
-fn shares(stamps: &[[f64; 2]]) -> Vec<f64> {
-    let most = [0, 1].map(|k| {
-        let mut moduli: Vec<f64> = stamps.iter().map(|sums| sums[k].abs()).collect();
-        let middle = moduli.len() / 2;
-        MOST * *moduli.select_nth_unstable_by(middle, f64::total_cmp).1
-    });
-    let share = |stamp: &[f64; 2]| {
-        let share = (most[0] / stamp[0].abs()).min(most[1] / stamp[1].abs());
-        // Of a blank stamp it is no number.
-        if share < 1.0 { share } else { 1.0 }
-    };
-    stamps.iter().map(share).collect()
 }
 
 /// The extent of light with these Σ W I and Σ W r² I.
@@ -253,8 +229,7 @@ mod tests {
                     (value + level * noise + sky) as f32
                 })
                 .collect();
-            let centre = centre.map(|c| c as f32);
-            light.add(&stamp, N, centre, centre);
+            light.add(&stamp, N, centre.map(|c| c as f32));
         }
         light.extent()
     }
@@ -300,13 +275,13 @@ mod tests {
         let stamp: Vec<f32> = gaussian(10.0, [0.0; 2]).iter().map(|v| *v as f32).collect();
         for wild in [1e6, -1e6, 0.0] {
             for _ in 0..333 {
-                light.add(&stamp, N, [0.0; 2], [0.0; 2]);
+                light.add(&stamp, N, [0.0; 2]);
             }
             // Where W r² is largest.
             let mut stamp = stamp.clone();
             stamp[24 * N + 31] = wild;
-            light.add(&stamp, N, [0.0; 2], [0.0; 2]);
-            light.add(&vec![0.0; N * N], N, [0.0; 2], [0.0; 2]);
+            light.add(&stamp, N, [0.0; 2]);
+            light.add(&vec![0.0; N * N], N, [0.0; 2]);
         }
         // Four parts in a thousand of a light of r² = 56 in place of 20 px² move the extent by 2 %, once each way.
         let found = light.extent().unwrap();

@@ -286,7 +286,7 @@ impl NoiseSurvey {
     fn compare(&mut self) {
         let full = self.plan.full;
         let found = centre(&self.pixels, full);
-        self.light.add(&self.pixels, full, followed(found), found);
+        self.light.add(&self.pixels, full, followed(found));
         let turn = turn(found, full);
         self.contrasts.compare(&self.pixels, turn);
         let places = &self.contrasts.blocks;

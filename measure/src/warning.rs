@@ -2,8 +2,11 @@
 
 use std::fmt;
 
+use shearq_submissions::Submission;
+
 use crate::flag::Flag;
 use crate::measurement::Measurement;
+use crate::psf::examine::{C_PER_NOISE, M_PER_NOISE};
 
 /// Something in the data of an image that biases shears, or is likely a mistake.
 ///
@@ -93,6 +96,59 @@ pub enum Warning {
     },
     /// No stamp is good enough to measure the noise on.
     NoNoise,
+    /// The star was not in the middle of its stamp, and was cut around itself.
+    PsfOffCentre {
+        /// Offset along x and y in pixels.
+        offset: [f64; 2],
+        /// PSFs.
+        of: Of,
+    },
+    /// The PSF image contains a background.
+    PsfBackground {
+        /// Level in units of the peak.
+        level: f64,
+        /// Its light in units of the star's.
+        share: f64,
+        /// PSFs.
+        of: Of,
+    },
+    /// The background of the PSF image changes along x or y.
+    PsfGradient {
+        /// Change per pixel along x and y in units of the peak.
+        slope: [f64; 2],
+        /// PSFs.
+        of: Of,
+    },
+    /// The noise of the star biases shears.
+    PsfNoise {
+        /// √(Σ p²)/σ.
+        snr: f64,
+        /// The same that is enough.
+        enough: f64,
+        /// PSFs.
+        of: Of,
+    },
+    /// The PSF is narrower than pixels can show.
+    PsfNarrow {
+        /// Noise-equivalent area in px².
+        area: f64,
+        /// PSFs.
+        of: Of,
+    },
+    /// The PSF is broader than the galaxies that were blurred by it.
+    PsfBroad {
+        /// FWHM of its core in pixels.
+        psf: f64,
+        /// FWHM of the core of the galaxies in pixels.
+        galaxies: f64,
+        /// Whether the difference is too large for stars that are measured as galaxies.
+        fatal: bool,
+    },
+    /// The configuration uses so little of the PSF that its wings are missing.
+    PsfSize {
+        /// Pixels a side that are used.
+        size: usize,
+    },
     /// Most galaxies could not be measured.
     Flagged {
         /// The most frequent reason.
@@ -104,7 +160,36 @@ pub enum Warning {
     },
 }
 
+/// How many of the PSFs examined a warning is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Of {
+    /// Their number.
+    pub count: usize,
+    /// PSFs examined.
+    pub of: usize,
+}
+
+impl fmt::Display for Of {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Of { of: 1, .. } => Ok(()),
+            Of { count, of } => write!(f, " on {count} of {of} PSFs examined"),
+        }
+    }
+}
+
+/// Pixels a side of a PSF below which a linear configuration loses too much of the wings: of a Moffat profile of FWHM
+/// 3.4 px, m changes by 0.002 at 20 px and 0.01 at 16 px.
+const LEAST_PSF_SIZE: usize = 32;
+
 impl Warning {
+    /// A warning if the configuration uses too little of the PSF.
+    pub fn of_settings(submission: &Submission) -> Option<Warning> {
+        let size = submission.psf.size;
+        let cut = submission.linear().is_some() && size < LEAST_PSF_SIZE;
+        cut.then_some(Warning::PsfSize { size })
+    }
+
     /// A warning if more than half of the galaxies of an image, given in parts such as rows, are flagged.
     pub fn of_flags<P: AsRef<[Measurement]>>(parts: &[P]) -> Option<Warning> {
         let galaxies = || parts.iter().flat_map(AsRef::as_ref);
@@ -132,13 +217,20 @@ impl Warning {
             Warning::NoiseLevel { .. } => "noise-level",
             Warning::CorrelatedNoise { .. } => "correlated-noise",
             Warning::NoNoise => "no-noise",
+            Warning::PsfOffCentre { .. } => "psf-off-centre",
+            Warning::PsfBackground { .. } => "psf-background",
+            Warning::PsfGradient { .. } => "psf-gradient",
+            Warning::PsfNoise { .. } => "psf-noise",
+            Warning::PsfNarrow { .. } => "psf-narrow",
+            Warning::PsfBroad { .. } => "psf-broad",
+            Warning::PsfSize { .. } => "psf-size",
             Warning::Flagged { .. } => "flagged",
         }
     }
 
     /// Whether no result should be made from such data.
     pub fn is_fatal(&self) -> bool {
-        false
+        matches!(self, Warning::PsfBroad { fatal: true, .. })
     }
 }
 
@@ -256,6 +348,52 @@ impl fmt::Display for Warning {
             ),
             Warning::NoNoise => f.write_str(
                 "cannot measure the noise: no stamp has enough pixels that differ. All galaxies are flagged. Try: set noise.source to \"header\" to use NOISESIG",
+            ),
+            Warning::PsfOffCentre { offset, of } => write!(
+                f,
+                "the star is off the centre of its stamp (found ({:+.1}, {:+.1}) px{of}; expected at most 1 px). It was moved to the centre by whole pixels",
+                offset[0], offset[1]
+            ),
+            Warning::PsfBackground { level, share, of } => write!(
+                f,
+                "the PSF contains a background (found {} % of its peak{of}; expected 0). It adds {:.0} % to the star's light and biases shears. Try: subtract the background, or use a larger PSF stamp if the PSF fills it",
+                Shown(100.0 * level),
+                100.0 * share
+            ),
+            Warning::PsfGradient { slope, of } => write!(
+                f,
+                "the background of the PSF has a gradient (found {} % of the peak per pixel along x and {} % along y{of}; expected 0). It biases shears. Try: subtract the background",
+                Shown(100.0 * slope[0]),
+                Shown(100.0 * slope[1])
+            ),
+            Warning::PsfNoise { snr, enough, of } => write!(
+                f,
+                "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). The noise of one star changes m by about {:.3} and c by about {:.3}. Try: average several stars, or fit a model",
+                M_PER_NOISE / snr,
+                C_PER_NOISE / snr
+            ),
+            Warning::PsfNarrow { area, of } => write!(
+                f,
+                "the PSF is narrower than the pixels can show (found light on {area:.1} px{of}; expected 5 px or more, a FWHM of about 1.2 px). Try: check that the file is a PSF with the pixel scale of the galaxies"
+            ),
+            Warning::PsfBroad {
+                psf,
+                galaxies,
+                fatal,
+            } => {
+                let (relation, expected) = if *fatal {
+                    ("broader than", "less than")
+                } else {
+                    ("nearly as broad as", "clearly less than")
+                };
+                write!(
+                    f,
+                    "the PSF is {relation} the galaxies (found a FWHM of {psf:.2} px in the core, expected {expected} the {galaxies:.2} px of the galaxies). A PSF sampled with another pixel scale biases m by up to 10. Try: check the sampling of the PSF, and that the objects are not stars"
+                )
+            }
+            Warning::PsfSize { size } => write!(
+                f,
+                "psf.size is {size} (expected {LEAST_PSF_SIZE} or more). The wings of the PSF that are cut off bias m, by about 0.002 at 20 px and 0.01 at 16 px for a FWHM of 3.4 px. Try: psf.size = {LEAST_PSF_SIZE}"
             ),
             Warning::Flagged { flag, count, of } => write!(
                 f,

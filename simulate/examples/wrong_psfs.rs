@@ -8,11 +8,11 @@
 
 use std::error::Error;
 
-use ndarray::{Array2, Array3, ArrayView3};
+use ndarray::{Array2, Array3, ArrayView3, Axis};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_measure::{FunctionalPsf, Measurer, Psfs, star_psf};
+use shearq_measure::{Examination, FunctionalPsf, Measurer, Psfs, Warning, star_psf};
 use shearq_scoring::Shear;
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::render::RenderScratch;
@@ -98,6 +98,20 @@ fn measured(
     Ok([m(0), m(1), c(0), c(1), lost / all])
 }
 
+/// The warnings about a PSF.
+fn warned(measurer: &Measurer, galaxies: &Galaxies, star: &Array2<f64>) -> Vec<Warning> {
+    let stamps = galaxies.sides[0].view();
+    let mut examination = Examination::new(STAMP, stamps.len_of(Axis(0)));
+    for stamp in stamps.outer_iter().take(1000) {
+        if let Err(error) = examination.add(stamp) {
+            println!("{error}");
+        }
+    }
+    let psf = Psfs::Star(star.view());
+    examination.add_psfs(psf, measurer.submission().psf_cut(), 1);
+    examination.warnings()
+}
+
 fn noisy(psf: &Array2<f64>, snr: f64, rng: &mut ChaCha8Rng) -> Array2<f64> {
     let sigma = psf.iter().map(|v| v * v).sum::<f64>().sqrt() / snr;
     psf.mapv(|value| {
@@ -128,9 +142,14 @@ fn main() -> Result<(), Box<dyn Error>> {
             let [m1, m2, c1, c2, lost] = found;
             println!("| {set} | {name} | {m1:+.4} | {m2:+.4} | {c1:+.4} | {c2:+.4} | {lost:.3} |");
         };
-        let one = |name: &str, star: &Array2<f64>| match measured(&measurer, &galaxies, star) {
-            Ok(found) => print(name, found),
-            Err(error) => println!("| {set} | {name} | {error} |"),
+        let one = |name: &str, star: &Array2<f64>| {
+            match measured(&measurer, &galaxies, star) {
+                Ok(found) => print(name, found),
+                Err(error) => println!("| {set} | {name} | {error} |"),
+            }
+            for warning in warned(&measurer, &galaxies, star) {
+                println!("    {warning}");
+            }
         };
         let middle = psf.stamp(STAMP);
         let peak = middle.iter().copied().fold(0.0, f64::max);
