@@ -67,6 +67,6 @@ pub use galaxy::{Measurer, Worker};
 pub use measurement::Measurement;
 pub use noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
 pub use pixel::Pixel;
-pub use psf::{FunctionalPsf, PsfProfile, Star, star, star_psf};
+pub use psf::{FunctionalPsf, PsfProfile, Star, average_stars, star, star_psf};
 pub use steps::Steps;
 pub use warning::{Of, Warning};

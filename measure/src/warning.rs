@@ -190,6 +190,14 @@ impl Warning {
         cut.then_some(Warning::PsfSize { size })
     }
 
+    /// A warning about the star for all galaxies, which was `moved` by so many pixels to be in the middle.
+    pub fn of_moved(moved: [f64; 2]) -> Warning {
+        Warning::PsfOffCentre {
+            offset: moved,
+            of: Of { count: 1, of: 1 },
+        }
+    }
+
     /// A warning if more than half of the galaxies of an image, given in parts such as rows, are flagged.
     pub fn of_flags<P: AsRef<[Measurement]>>(parts: &[P]) -> Option<Warning> {
         let galaxies = || parts.iter().flat_map(AsRef::as_ref);
@@ -356,25 +364,25 @@ impl fmt::Display for Warning {
             ),
             Warning::PsfBackground { level, share, of } => write!(
                 f,
-                "the PSF contains a background (found {} % of its peak{of}; expected 0). It adds {:.0} % to the star's light and biases shears. Try: subtract the background, or use a larger PSF stamp if the PSF fills it",
+                "the PSF contains a background (found {} % of its peak{of}; expected 0). It changes the star's light by {:+.0} % and biases shears. Try: subtract the background, or use a larger PSF stamp if the PSF fills it",
                 Shown(100.0 * level),
                 100.0 * share
             ),
             Warning::PsfGradient { slope, of } => write!(
                 f,
-                "the background of the PSF has a gradient (found {} % of the peak per pixel along x and {} % along y{of}; expected 0). It biases shears. Try: subtract the background",
-                Shown(100.0 * slope[0]),
-                Shown(100.0 * slope[1])
+                "the background of the PSF has a gradient (found {:.3} % of the peak per pixel along x and {:.3} % along y{of}; expected 0). It biases shears. Try: subtract the background",
+                100.0 * slope[0],
+                100.0 * slope[1]
             ),
             Warning::PsfNoise { snr, enough, of } => write!(
                 f,
                 "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). The noise of one star changes m by about {:.3} and c by about {:.3}. Try: average several stars, or fit a model",
-                M_PER_NOISE / snr,
-                C_PER_NOISE / snr
+                M_PER_NOISE / snr.max(1.0),
+                C_PER_NOISE / snr.max(1.0)
             ),
             Warning::PsfNarrow { area, of } => write!(
                 f,
-                "the PSF is narrower than the pixels can show (found light on {area:.1} px{of}; expected 5 px or more, a FWHM of about 1.2 px). Try: check that the file is a PSF with the pixel scale of the galaxies"
+                "the PSF is narrower than the pixels can show (found light on {area:.1} px{of}; expected 6 px or more, a FWHM of about 1 px). Try: check that the file is a PSF with the pixel scale of the galaxies"
             ),
             Warning::PsfBroad {
                 psf,

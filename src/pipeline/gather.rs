@@ -8,9 +8,8 @@ use std::path::{Path, PathBuf};
 
 use ndarray::ArrayView2;
 use serde::Serialize;
-use shearq_measure::parts::frame;
-use shearq_measure::{Examination, examined_rows};
-use shearq_scoring::resample::RunningMean;
+use shearq_measure::{Examination, Star, examined_rows, star};
+use shearq_submissions::PsfCut;
 
 pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, Origin, Planes, off_middle, shown};
@@ -27,11 +26,8 @@ use crate::io::{psf_table, table};
 
 /// Most stamps of one image: one for each galaxy of the largest grid.
 const MAX_STAMPS: usize = table::MAX_ROWS;
-/// Share of a star's light on the frame of its stamp, were it all as bright as the frame, that is told: a background
-/// of that size changes a deconvolved galaxy.
-const PEDESTAL: f64 = 0.02;
-/// Pixels that the frame of a star is wide.
-const FRAME: usize = 2;
+/// Pixels a side of a PSF that are examined: as many as configurations use.
+const EXAMINED_SIDE: usize = 48;
 
 /// Where stamps come from.
 #[derive(Serialize)]
@@ -290,13 +286,6 @@ fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
     }
 }
 
-/// The pixels of a stamp's frame, as far as they are finite.
-fn frame_of(pixels: &[f32], side: usize) -> impl Iterator<Item = f64> + '_ {
-    let all = frame(pixels, side, FRAME).flatten();
-    all.filter(|value| value.is_finite())
-        .map(|&value| f64::from(value))
-}
-
 /// Positions of galaxies on an exposure.
 fn read_positions(path: &Path, columns: [&str; 2]) -> Result<Vec<(f64, f64)>, FileError> {
     let read = table::read_columns(path, &columns)
@@ -410,6 +399,13 @@ fn gather_psfs(
     let stars = Mosaic::of(count, side);
     let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
     let mut planes = Planes::of(files);
+    let size = side - side.saturating_sub(EXAMINED_SIDE).next_multiple_of(2);
+    let cut = PsfCut {
+        size,
+        // So that a star off the centre can be cut around itself.
+        least: size - (size / 3).next_multiple_of(2),
+    };
+    let mut examination = Examination::new(side, 0);
     let mut dark = 0;
     while let Some((origin, pixels)) = planes.next()? {
         let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
@@ -421,16 +417,19 @@ fn gather_psfs(
             }
             dark += 1;
         }
-        let pedestal = pedestal(&pixels, side);
-        if image.next == 0 && pedestal.abs() > PEDESTAL {
-            doubts.push(format!(
-                "warning: {}: the frame of the first PSF is as bright as {:.0} % of its light would make it if all of the stamp were: is a background left in it?",
-                origin.file.display(),
-                100.0 * pedestal
-            ));
+        if let Ok(stamp) = ArrayView2::from_shape((side, side), &pixels)
+            && let Ok(Star { psf, moved }) = star(stamp, cut)
+        {
+            examination.add_psf(psf.view(), moved);
         }
         image.add(&pixels)?;
     }
+    let found = examination.warnings();
+    doubts.extend(
+        found
+            .iter()
+            .map(|warning| format!("warning: {}: {warning}", files.paths[0].display())),
+    );
     if dark > 0 {
         doubts.push(format!(
             "warning: the pixels of {dark} of {count} PSFs add up to nothing, less or no number: galaxies with them will be flagged"
@@ -454,14 +453,6 @@ impl PsfFile {
             }
         }
     }
-}
-
-/// The light of a star's stamp if all of it were as bright as its frame, in units of the light that it has.
-fn pedestal(pixels: &[f32], side: usize) -> f64 {
-    let mut frame = RunningMean::default();
-    frame_of(pixels, side).for_each(|value| frame.add(value));
-    let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
-    frame.mean() * pixels.len() as f64 / light
 }
 
 /// A mosaic that is written a row of stamps at a time.

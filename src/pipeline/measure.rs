@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Slice};
 use shearq_measure::{
-    Examination, Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, Survey, Warning,
-    Worker, calibrate, examined_rows, star_psf, strip,
+    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, Star,
+    Survey, Warning, Worker, calibrate, examined_rows, star, star_psf, strip,
 };
 use shearq_submissions::{EllipticityType, NoiseSource, PsfCut, PsfForm, Submission};
 use shearq_tables::polars::{Column, DataFrame};
@@ -160,14 +160,17 @@ impl ImageSource {
             );
             return Err(FileError::new(data.galaxies(id.set, id.image), message).into());
         }
+        let (psf, moved) = open_psf(data, id, submission, &mosaic)?;
+        let mut warnings: Vec<Warning> = Warning::of_settings(submission).into_iter().collect();
+        warnings.extend(moved.map(Warning::of_moved));
         Ok(ImageSource {
-            psf: open_psf(data, id, submission, &mosaic)?,
+            psf,
             id,
             image,
             mosaic,
             header_noise,
             survey: None,
-            warnings: Vec::new(),
+            warnings,
             next: 0,
         })
     }
@@ -277,12 +280,13 @@ pub(super) fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), File
     Err(FileError::new(path, message))
 }
 
+/// The PSFs of an image, and the offset of a star for all galaxies that was moved to the middle of its stamp.
 fn open_psf(
     data: &DataFolder,
     id: ImageId,
     submission: &Submission,
     mosaic: &Mosaic,
-) -> Result<PsfSource, PipelineError> {
+) -> Result<(PsfSource, Option<[f64; 2]>), PipelineError> {
     let cut = submission.psf_cut();
     let PsfCut { size, least } = cut;
     match submission.psf.form {
@@ -296,7 +300,7 @@ fn open_psf(
                 );
                 return Err(FileError::new(&path, message).into());
             }
-            Ok(match rows.as_slice() {
+            let source = match rows.as_slice() {
                 [psf] => {
                     let stamp = psf.stamp_beside(cut, mosaic.stamp);
                     if stamp.iter().any(|value| !value.is_finite()) {
@@ -309,7 +313,8 @@ fn open_psf(
                     PsfSource::Shared(Arc::new(stamp))
                 }
                 _ => PsfSource::Functional(rows),
-            })
+            };
+            Ok((source, None))
         }
         PsfForm::Star => {
             let path = data.psf_star(id.set, id.image);
@@ -343,10 +348,8 @@ fn open_psf(
             let one = (width, height) == (side, side);
             if mosaic.galaxies > 1 && (width, height) == (columns * side, rows * side) {
                 check_strip(&path, columns, side)?;
-                return Ok(PsfSource::Stars {
-                    image: Box::new(image),
-                    side,
-                });
+                let image = Box::new(image);
+                return Ok((PsfSource::Stars { image, side }, None));
             }
             if !one || side > MAX_STAMP {
                 let message = format!(
@@ -358,8 +361,9 @@ fn open_psf(
             let pixels = image.read_rows(height)?;
             let stamp = ArrayView2::from_shape((height, width), &pixels)
                 .map_err(|error| FileError::new(&path, error))?;
-            let psf = star_psf(stamp, cut).map_err(|error| FileError::new(&path, error))?;
-            Ok(PsfSource::Shared(Arc::new(psf)))
+            let Star { psf, moved } =
+                star(stamp, cut).map_err(|error| FileError::new(&path, error))?;
+            Ok((PsfSource::Shared(Arc::new(psf)), moved))
         }
     }
 }
@@ -395,7 +399,7 @@ pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, P
         mosaic: row.mosaic,
         galaxies: galaxies?,
         warnings: row.warnings.clone(),
-        examination: examine(row, stamps)?,
+        examination: examine(row, stamps, worker.submission().psf_cut())?,
     })
 }
 
@@ -403,14 +407,32 @@ pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, P
 fn examine(
     row: &StampRow,
     stamps: ArrayView3<'_, f32>,
+    cut: PsfCut,
 ) -> Result<Option<Examination>, PipelineError> {
     let Mosaic { columns, stamp, .. } = row.mosaic;
-    if !examined_rows(columns, row.mosaic.rows()).contains(&row.iy) {
+    let rows = examined_rows(columns, row.mosaic.rows());
+    if !rows.contains(&row.iy) {
         return Ok(None);
     }
     let mut examination = Examination::new(stamp, columns);
     for stamp in stamps.outer_iter() {
         examination.add(stamp)?;
+    }
+    let most = EXAMINED_PSFS.div_ceil(rows.len());
+    match &row.psf {
+        // Once for the image.
+        RowPsf::Shared(psf) if rows.first() == Some(&row.iy) => {
+            examination.add_psf(psf.view(), None);
+        }
+        RowPsf::Shared(_) => {}
+        RowPsf::Stars { pixels, side } => {
+            let stars = strip(pixels, columns, *side)?;
+            let here = Slice::from(..stamps.len_of(Axis(0)));
+            examination.add_psfs(Psfs::Stars(stars.slice_axis(Axis(0), here)), cut, most);
+        }
+        RowPsf::Functional(field) => {
+            examination.add_psfs(Psfs::<f32>::Functional(field), cut, most);
+        }
     }
     Ok(Some(examination))
 }
@@ -651,7 +673,7 @@ fn read_images(
             );
             return Err(FileError::new(path, message).into());
         }
-        source.warnings = std::mem::take(&mut warnings);
+        source.warnings.append(&mut warnings);
         match (measurer.noise_plan(), first.take()) {
             (None, _) => {}
             (Some(_), Some(found)) => {

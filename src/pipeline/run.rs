@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis};
 use shearq_measure::{
-    Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Worker, calibrate, star_psf, strip,
+    Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Warning, Worker, calibrate, star_psf, strip,
 };
 use shearq_scoring::Shear;
 use shearq_submissions::{PsfForm, Submission};
@@ -312,6 +312,12 @@ pub(crate) fn measure_strip(
     for (k, worker) in workers.iter_mut().enumerate() {
         row.survey = surveys.get(k).cloned().flatten();
         row.psf = row_psf(set, fields, iy, worker.submission());
+        row.warnings = match iy {
+            0 => Warning::of_settings(worker.submission())
+                .into_iter()
+                .collect(),
+            _ => Vec::new(),
+        };
         measured.push(measure_row(worker, &row)?);
     }
     Ok(measured)

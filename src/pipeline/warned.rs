@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use shearq_measure::{MeasureError, Warning};
+use shearq_measure::Warning;
 
 use super::PipelineError;
 use super::engine::Progress;
@@ -27,7 +27,10 @@ impl Warned {
     ) -> Result<(), PipelineError> {
         for warning in warnings {
             if warning.is_fatal() {
-                return Err(MeasureError::Data(warning).into());
+                let ImageId { set, image } = id;
+                return Err(PipelineError::Request(format!(
+                    "set {set:02} image {image:03}: {warning}"
+                )));
             }
             match self.kinds.get_mut(warning.kind()) {
                 Some(more) => *more += 1,

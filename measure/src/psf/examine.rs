@@ -32,8 +32,8 @@ const ENOUGH_SNR_EACH: f64 = 100.0;
 /// Scatter of m and of c with a star's noise, times its S/N (docs/linear.md).
 pub(crate) const M_PER_NOISE: f64 = 5.3;
 pub(crate) const C_PER_NOISE: f64 = 2.4;
-/// Noise-equivalent area in px² of the narrowest PSF that is sampled well enough: of a FWHM of about 1.2 px.
-const LEAST_AREA: f64 = 5.0;
+/// Noise-equivalent area in px² of the narrowest PSF that pixels can show: of a FWHM of about 1 px.
+const LEAST_AREA: f64 = 6.0;
 /// Mean square of the PSF's core in units of the mean square of the galaxies' core, above which a warning and an error are
 /// due. It is 0.48 to 0.53 for simulated galaxies behind a PSF of FWHM 3.4 px, 0.75 with a PSF 1.3 times too wide
 /// (m = +0.6), 0.86 to 0.93 at 1.4 times (m = +1.1) and 0.97 to 1.06 at 1.5 times (m = +2). Stars have one.
@@ -60,6 +60,11 @@ pub(crate) struct PsfLook {
 }
 
 impl PsfLook {
+    /// S/N of the star; infinite without noise.
+    pub(super) fn snr(&self) -> f64 {
+        self.snr
+    }
+
     /// At a PSF of sum one, which was `moved` by so much to be in the middle; `None` if its sides are too short to tell
     /// anything, or a pixel is not finite.
     pub(crate) fn of(psf: ArrayView2<'_, f64>, moved: Option<[f64; 2]>) -> Option<PsfLook> {
@@ -70,7 +75,7 @@ impl PsfLook {
         let middle = (n as f64 - 1.0) / 2.0;
         let (mut outer, mut inner, mut edges) =
             (Mean::default(), Mean::default(), [Mean::default(); 4]);
-        let mut peak = ([0, 0], f64::NEG_INFINITY);
+        let mut peak = f64::NEG_INFINITY;
         for ((y, x), &value) in psf.indexed_iter() {
             let away = (x as f64 - middle).abs().max((y as f64 - middle).abs());
             for (edge, at) in edges.iter_mut().zip([x, n - 1 - x, y, n - 1 - y]) {
@@ -83,9 +88,7 @@ impl PsfLook {
             } else if HALFWAY.contains(&(away / (middle + 0.5))) {
                 inner.add(value, away);
             }
-            if value > peak.1 {
-                peak = ([x, y], value);
-            }
+            peak = peak.max(value);
         }
         let sigma = noise(psf);
         let share = (inner.radius() / outer.radius()).powf(FALL);
@@ -110,19 +113,24 @@ impl PsfLook {
         let slope = [(right - left) / across, (top - bottom) / across];
         let steep = slope[0].hypot(slope[1]);
         let steep = if steep > CLEAR * error { steep } else { 0.0 };
-        let power = psf
-            .iter()
-            .map(|value| (value - outer.mean()).powi(2))
-            .sum::<f64>();
-        let bright = (peak.1 - outer.mean()).max(f64::MIN_POSITIVE);
+        // Without the outer pixels, which hold more noise than light.
+        let (mut power, mut count) = (0.0, 0.0);
+        for ((y, x), &value) in psf.indexed_iter() {
+            let away = (x as f64 - middle).abs().max((y as f64 - middle).abs());
+            if away < HALFWAY.start * (middle + 0.5) {
+                power += (value - outer.mean()).powi(2);
+                count += 1.0;
+            }
+        }
+        let bright = (peak - outer.mean()).max(f64::MIN_POSITIVE);
         Some(PsfLook {
-            snr: (power - pixels * sigma * sigma).max(0.0).sqrt() / sigma,
+            snr: (power - count * sigma * sigma).max(0.0).sqrt() / sigma,
             level: level / bright,
             background: level * pixels / star,
             slope: slope.map(|slope| slope / bright),
             gradient: steep * 0.5 * n as f64 * pixels / star,
             area: breadth::area(psf),
-            core: core_of_psf(psf, star::offset(psf, peak.0), outer.mean(), sigma),
+            core: core_of_psf(psf, star::place(psf), outer.mean(), sigma),
             moved,
         })
     }
@@ -234,4 +242,107 @@ fn broad(looks: &[PsfLook], galaxies: Core) -> Option<Warning> {
         galaxies: galaxies.fwhm(),
         fatal: beyond(BROADER),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array2;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+    use shearq_scoring::Shear;
+
+    use super::*;
+    use crate::psf::{FunctionalPsf, PsfProfile, star_psf};
+
+    const MOFFAT: PsfProfile = PsfProfile::Moffat { beta: 3.0 };
+
+    fn drawn(profile: PsfProfile, fwhm: f64, side: usize) -> Array2<f64> {
+        let psf = FunctionalPsf::new(profile, fwhm, Shear::new(0.05, -0.03));
+        psf.unwrap().stamp(side)
+    }
+
+    /// Kinds of warnings about a PSF of any sum.
+    fn kinds(stamp: &Array2<f64>) -> Vec<&'static str> {
+        let psf = star_psf(stamp.view(), stamp.nrows()).unwrap();
+        let look = PsfLook::of(psf.view(), None).unwrap();
+        let found = warnings(&[look], true, None);
+        found.iter().map(Warning::kind).collect()
+    }
+
+    /// An Airy disc, (2 J₁(x)/x)² at pixel centres.
+    fn airy(fwhm: f64, side: usize) -> Array2<f64> {
+        let middle = (side as f64 - 1.0) / 2.0;
+        Array2::from_shape_fn((side, side), |(y, x)| {
+            let r = (x as f64 - middle).hypot(y as f64 - middle);
+            let x = 3.2327 * r / fwhm;
+            (2.0 * puruspe::bessel::Jn(1, x) / x).powi(2)
+        })
+    }
+
+    #[test]
+    fn wings_are_neither_background_nor_noise() {
+        for side in [32, 48, 64] {
+            for fwhm in [1.6, 2.4, 3.4, 6.0] {
+                for profile in [
+                    MOFFAT,
+                    PsfProfile::Moffat { beta: 2.2 },
+                    PsfProfile::Kolmogorov,
+                ] {
+                    let found = kinds(&drawn(profile, fwhm, side));
+                    assert!(found.is_empty(), "{profile:?} {fwhm} {side}: {found:?}");
+                }
+            }
+            for fwhm in [2.4, 3.4] {
+                let found = kinds(&airy(fwhm, side));
+                assert!(found.is_empty(), "Airy {fwhm} {side}: {found:?}");
+            }
+        }
+        for side in [15, 23] {
+            let found = kinds(&drawn(MOFFAT, 3.4, side));
+            assert!(found.is_empty(), "{side}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn wrong_psfs_have_their_warning() {
+        let good = drawn(MOFFAT, 3.4, 48);
+        let peak = good.iter().copied().fold(0.0, f64::max);
+        for (share, expected) in [(0.01, 1), (0.05, 1), (-0.002, 1), (0.0003, 0)] {
+            let found = kinds(&(&good + share * peak));
+            assert_eq!(found, vec!["psf-background"; expected], "{share}");
+        }
+        let slope = |y: f64| {
+            let gradient = |(_, x): (usize, usize)| y * peak * (x as f64 - 23.5) / 23.5;
+            &good + &Array2::from_shape_fn((48, 48), gradient)
+        };
+        assert_eq!(kinds(&slope(0.005)), ["psf-gradient"]);
+        assert!(kinds(&slope(0.0005)).is_empty());
+        let mut delta = Array2::zeros((48, 48));
+        delta[(24, 23)] = 3.0;
+        assert_eq!(kinds(&delta), ["psf-narrow"]);
+        assert_eq!(kinds(&drawn(MOFFAT, 0.3, 48)), ["psf-narrow"]);
+    }
+
+    #[test]
+    fn the_noise_of_a_star_is_measured_and_is_not_taken_for_more() {
+        let good = drawn(MOFFAT, 3.4, 48);
+        let power = good.iter().map(|value| value * value).sum::<f64>().sqrt();
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        for snr in [20.0, 50.0, 100.0, 500.0, 3000.0] {
+            for _ in 0..20 {
+                let star = good.mapv(|value| {
+                    let noise: f64 = StandardNormal.sample(&mut rng);
+                    100.0 * (value + power / snr * noise)
+                });
+                let psf = star_psf(star.view(), 48).unwrap();
+                let look = PsfLook::of(psf.view(), None).unwrap();
+                // 370 pixels know σ to 6 %, and Σ p² is known to 2/(S/N).
+                assert!((look.snr / snr - 1.0).abs() < 0.25 + 10.0 / snr, "{look:?}");
+                let found = kinds(&star);
+                let expected = vec!["psf-noise"; usize::from(snr < 1000.0)];
+                assert_eq!(found, expected, "{look:?}");
+            }
+        }
+    }
 }

@@ -76,6 +76,11 @@ pub fn star<P: Pixel>(
         .iter()
         .map(|&value| -> f64 { value.into() })
         .sum();
+    let all: f64 = stamp.iter().map(|&value| -> f64 { value.into() }).sum();
+    if all <= 0.0 {
+        // There is nothing to look for elsewhere.
+        light(inner)?;
+    }
     let [dx, dy] = offset(stamp, brightest);
     let centred = dx.abs() <= MAX_CENTROID_OFFSET && dy.abs() <= MAX_CENTROID_OFFSET;
     let (x0, y0, moved) = if centred {
@@ -143,6 +148,11 @@ fn brightest<P: Pixel>(stamp: ArrayView2<'_, P>) -> Result<[usize; 2], MeasureEr
         }
     }
     Ok(best.0)
+}
+
+/// Where the star of a PSF is, (x, y) from the centre of its stamp.
+pub(super) fn place(psf: ArrayView2<'_, f64>) -> [f64; 2] {
+    brightest(psf).map_or([0.0; 2], |brightest| offset(psf, brightest))
 }
 
 /// Where the star is, (x, y) from the centre of the stamp: around the centre, unless the brightest pixel is elsewhere.
