@@ -165,27 +165,39 @@ pub(super) fn offset<P: Pixel>(stamp: ArrayView2<'_, P>, brightest: [usize; 2]) 
         let apart = [0, 1].map(|k| (at[k] - brightest[k] as f64).abs());
         apart[0].max(apart[1]) <= FARTHEST
     };
-    if near(here) && off(here).iter().all(|off| off.abs() <= MAX_CENTROID_OFFSET) {
+    let centred = off(here).iter().all(|off| off.abs() <= MAX_CENTROID_OFFSET);
+    if centred && near(here) {
         return off(here);
     }
     // Noise makes single pixels bright, but not nine together.
-    off(centroid(stamp, brightest_nine(stamp)))
+    let there = brightest_nine(stamp);
+    if centred && nine(stamp, here.map(|at| at.round() as usize)) >= nine(stamp, there) {
+        return off(here);
+    }
+    off(centroid(stamp, there.map(|at| at as f64)))
 }
 
 /// The middle (x, y) of the 3 × 3 pixels that are brightest together.
-fn brightest_nine<P: Pixel>(stamp: ArrayView2<'_, P>) -> [f64; 2] {
-    let mut best = ([0.0; 2], f64::NEG_INFINITY);
+fn brightest_nine<P: Pixel>(stamp: ArrayView2<'_, P>) -> [usize; 2] {
+    let mut best = ([0; 2], f64::NEG_INFINITY);
     let (rows, columns) = stamp.dim();
     for y in 1..rows.saturating_sub(1) {
         for x in 1..columns.saturating_sub(1) {
-            let nine = stamp.slice(s![y - 1..=y + 1, x - 1..=x + 1]);
-            let sum: f64 = nine.iter().map(|&value| -> f64 { value.into() }).sum();
+            let sum = nine(stamp, [x, y]);
             if sum > best.1 {
-                best = ([x as f64, y as f64], sum);
+                best = ([x, y], sum);
             }
         }
     }
     best.0
+}
+
+/// The sum of the 3 × 3 pixels around (x, y), as far as the stamp has them.
+fn nine<P: Pixel>(stamp: ArrayView2<'_, P>, [x, y]: [usize; 2]) -> f64 {
+    let around = |at: usize, side: usize| at.saturating_sub(1)..(at + 2).min(side);
+    let (rows, columns) = stamp.dim();
+    let nine = stamp.slice(s![around(y, rows), around(x, columns)]);
+    nine.iter().map(|&value| -> f64 { value.into() }).sum()
 }
 
 /// The place (x, y) near `start` about which the weighted centroid of a stamp is zero; `start` if there is none.
@@ -312,7 +324,7 @@ mod tests {
         stamp[(4, 4)] = 1.0;
         refused(&stamp, 15, "of 9 × 9 pixels; expected at least 15 × 15");
         stamp[(4, 8)] = 3.0;
-        refused(&stamp, 5, "(+3.0, +0.0)");
+        refused(&stamp, 5, "(+3.8, ");
         stamp[(0, 1)] = f32::INFINITY;
         refused(&stamp, 5, "(2, 1)");
     }
