@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use ndarray::ArrayView2;
 use serde::Serialize;
 use shearq_measure::parts::frame;
-use shearq_measure::{Examination, examined_rows};
+use shearq_measure::{Examination, Warning, examined_rows};
 use shearq_scoring::resample::RunningMean;
 
 pub use self::source::{Content, Files};
@@ -30,6 +30,8 @@ const MAX_STAMPS: usize = table::MAX_ROWS;
 /// Share of a star's light on the frame of its stamp, were it all as bright as the frame, that is told: a background
 /// of that size changes a deconvolved galaxy.
 const PEDESTAL: f64 = 0.02;
+/// Pixels by which an offset may differ from a whole pixel.
+const HALF: f64 = 0.5;
 /// Pixels that the frame of a star is wide.
 const FRAME: usize = 2;
 
@@ -46,6 +48,8 @@ pub enum Stamps<'a> {
         /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
         #[serde(serialize_with = "shown")]
         positions: &'a Path,
+        /// Number of the first pixel's centre in the table, 0 or 1.
+        first_pixel: u8,
         /// Names of its columns for x and y.
         columns: [&'a str; 2],
         /// Pixels a side of a stamp.
@@ -166,8 +170,16 @@ fn gather_alone(
     let positions = match stamps {
         Stamps::Files(_) => Vec::new(),
         Stamps::Cutouts {
-            positions, columns, ..
-        } => read_positions(positions, *columns)?,
+            positions,
+            columns,
+            first_pixel,
+            ..
+        } => {
+            // From here on the first pixel is 1.
+            let shift = 1.0 - f64::from(*first_pixel);
+            let read = read_positions(positions, *columns)?;
+            read.iter().map(|(x, y)| (x + shift, y + shift)).collect()
+        }
     };
     let (count, side) = match stamps {
         Stamps::Files(files) => survey(*files)?,
@@ -257,7 +269,8 @@ fn gather_alone(
     let warnings = examination.warnings();
     doubts.extend(warnings.iter().map(|warning| {
         let ImageId { set, image } = id;
-        format!("warning: set {set:02} image {image:03}: {warning}")
+        let hint = one_pixel_off(stamps, warning).unwrap_or_default();
+        format!("warning: set {set:02} image {image:03}: {warning}{hint}")
     }));
     let text = places
         .into_inner()
@@ -295,6 +308,19 @@ fn frame_of(pixels: &[f32], side: usize) -> impl Iterator<Item = f64> + '_ {
     let all = frame(pixels, side, FRAME).flatten();
     all.filter(|value| value.is_finite())
         .map(|&value| f64::from(value))
+}
+
+/// Advice if positions are counted from another first pixel than specified.
+fn one_pixel_off(stamps: &Stamps<'_>, warning: &Warning) -> Option<String> {
+    let (Stamps::Cutouts { first_pixel, .. }, Warning::OffCentre { offset, .. }) =
+        (stamps, warning)
+    else {
+        return None;
+    };
+    let other = 1 - first_pixel.min(&1);
+    let expected = f64::from(*first_pixel) - f64::from(other);
+    let off = offset.iter().all(|found| (found - expected).abs() < HALF);
+    off.then(|| format!(". Are the positions counted from {other}? Try: --first-pixel {other}"))
 }
 
 /// Positions of galaxies on an exposure.
