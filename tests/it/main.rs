@@ -33,3 +33,4 @@ mod stored;
 mod submitted;
 mod support;
 mod terminal;
+mod wrong_data;
