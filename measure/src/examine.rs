@@ -36,14 +36,18 @@ pub const EXAMINED_PSFS: usize = 100;
 
 /// Significance that every warning requires, in standard errors.
 const CLEAR: f64 = 5.0;
-/// Light of the sky within 8 px, in units of the galaxy's, above which |m| exceeds 5·10⁻³.
-const SKY_SHARE: f64 = 0.05;
+/// Light of the sky within 8 px, in units of the galaxy's, that changes m by less than 5·10⁻³: measured for the
+/// simulated galaxies, of which a share of 0.48 makes m = −0.006,
+/// −0.013 if they are large and −0.011 at S/N 10.
+const SKY_SHARE: f64 = 0.15;
 /// A galaxy's wings fall from the sides of a stamp to its corners; a sky is equal in both.
 const FALLING: f64 = 0.6;
-/// Gradient per pixel, in units of the noise, above which |c| exceeds 5·10⁻³.
-const GRADIENT: f64 = 0.005;
-/// Offset of the galaxies in pixels.
-const OFFSET: f64 = 1.0;
+/// Change of that share over 8 px that changes c by less than 5·10⁻³: at 0.076 the simulated
+/// galaxies have c = 0.0035, and at S/N 10 m = −0.009.
+const GRADIENT_SHARE: f64 = 0.04;
+/// Offset of the galaxies in pixels: stamps that are cut half a pixel off along x and y are silent, those a whole
+/// pixel off are not.
+const OFFSET: f64 = 0.85;
 /// Scatter of the galaxies' places in pixels.
 const SCATTER: f64 = 2.0;
 /// Scatter of the noise between stamps.
@@ -58,12 +62,21 @@ pub(crate) const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
 const FROM_MODULI: f64 = 1.482_602_2;
 const OF_MEDIAN: f64 = 1.253_314;
 
-/// Which of `rows` rows of `columns` stamps are examined, evenly spread: enough for a thousand stamps, or all.
+/// Which of `rows` rows of `columns` stamps are examined: enough for a thousand stamps, or all. They are spread
+/// evenly but not regularly, so that they do not miss what differs from row to row.
 pub fn examined_rows(columns: usize, rows: usize) -> Vec<usize> {
-    let count = ENOUGH.div_ceil(columns.max(1)).min(rows);
+    // The golden ratio's multiples fill an interval without a period.
+    const STEP: f64 = 0.618_033_988_749_895;
+    let count = enough(columns, rows);
+    let place = |k: usize| (k as f64 + (STEP * k as f64).fract()) * rows as f64 / count as f64;
     (0..count)
-        .map(|k| (2 * k + 1) * rows / (2 * count))
+        .map(|k| (place(k) as usize).min(rows - 1))
         .collect()
+}
+
+/// How many of `rows` rows of `columns` stamps are enough.
+pub(crate) fn enough(columns: usize, rows: usize) -> usize {
+    ENOUGH.div_ceil(columns.max(1)).min(rows)
 }
 
 /// What one stamp shows.
@@ -277,7 +290,7 @@ impl Examination {
             });
         }
         let sky = self.sky(noise, flux);
-        let gradient = self.gradient(noise);
+        let gradient = self.gradient(noise, flux);
         if sky.is_none() && gradient.is_none() {
             found.extend(self.long_correlation(noise));
         }
@@ -319,7 +332,7 @@ impl Examination {
         // The median of four corners is about the mean of two.
         let (level, error) = self.median(|look| look.corner, noise / (2.0 * pixels).sqrt());
         let (side, _) = self.median(|look| look.side, 0.0);
-        let share = level * std::f64::consts::PI * INNER * INNER / flux.abs();
+        let share = level * disc() / flux.abs();
         let wings = level > 0.0 && level < FALLING * side;
         let clear = level.abs() > CLEAR * error && share.abs() > SKY_SHARE && !wings;
         clear.then_some(Warning::Sky {
@@ -330,14 +343,15 @@ impl Examination {
         })
     }
 
-    fn gradient(&self, noise: f64) -> Option<Warning> {
+    fn gradient(&self, noise: f64, flux: f64) -> Option<Warning> {
         let edge = (self.full - self.block) as f64;
         let floor = noise / (self.block as f64 * edge);
         let found = [0, 1].map(|k| self.median(|look| look.slope[k], floor));
         let error = found[0].1.max(found[1].1);
         let slope = found.map(|(slope, _)| slope);
         let steep = slope[0].hypot(slope[1]);
-        (steep > CLEAR * error && steep > GRADIENT * noise).then_some(Warning::Gradient {
+        let share = steep * INNER * disc() / flux.abs();
+        (steep > CLEAR * error && share > GRADIENT_SHARE).then_some(Warning::Gradient {
             slope,
             error,
             noise,
@@ -470,18 +484,24 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
     }
 }
 
+/// Pixels within `INNER` of the middle.
+fn disc() -> f64 {
+    std::f64::consts::PI * INNER * INNER
+}
+
 /// Light within `INNER` of the middle.
 fn inner(pixels: &[f32], n: usize) -> f64 {
     let middle = (n as f64 - 1.0) / 2.0;
     let mut sum = 0.0;
     for (y, row) in pixels.chunks_exact(n).enumerate() {
         let dy = y as f64 - middle;
-        for (x, value) in row.iter().enumerate() {
-            let dx = x as f64 - middle;
-            if dx * dx + dy * dy <= INNER * INNER {
-                sum += f64::from(*value);
-            }
+        let half = (INNER * INNER - dy * dy).max(-1.0).sqrt();
+        if half.is_nan() {
+            continue;
         }
+        let first = (middle - half).ceil().max(0.0) as usize;
+        let last = ((middle + half).floor() as usize).min(n - 1);
+        sum += row[first..=last].iter().map(|v| f64::from(*v)).sum::<f64>();
     }
     sum
 }

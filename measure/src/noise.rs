@@ -22,7 +22,7 @@ use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2};
 
 use crate::error::MeasureError;
-use crate::examine::examined_rows;
+use crate::examine::enough;
 use crate::extent::Light;
 use crate::pixel::Pixel;
 use crate::robust::{SCATTER, median};
@@ -178,7 +178,10 @@ impl NoisePlan {
     /// Which of `rows` rows of `columns` stamps are looked at, evenly spread: enough for a thousand stamps,
     /// or all.
     pub fn rows(&self, columns: usize, rows: usize) -> Vec<usize> {
-        examined_rows(columns, rows)
+        let count = enough(columns, rows);
+        (0..count)
+            .map(|k| (2 * k + 1) * rows / (2 * count))
+            .collect()
     }
 
     /// A survey of no stamps.

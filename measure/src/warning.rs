@@ -203,9 +203,18 @@ impl Warning {
         let galaxies = || parts.iter().flat_map(AsRef::as_ref);
         let of = galaxies().count();
         let count = galaxies().filter(|g| !g.flags.is_empty()).count();
-        let with = |flag: &Flag| galaxies().filter(|g| g.flags.contains(*flag)).count();
+        let with = |flag: Flag| galaxies().filter(|g| g.flags.contains(flag)).count();
+        Warning::of_counts(with, count, of)
+    }
+
+    /// The same if `count` galaxies of so many are flagged, each number of them `with` a flag.
+    pub fn of_counts(with: impl Fn(Flag) -> usize, count: usize, of: usize) -> Option<Warning> {
+        // Galaxies without a usable mean response have this flag beside the one that explains it.
+        let explains = |flag: &Flag| *flag != Flag::NoResponse && 2 * with(*flag) > of;
+        let flag = Flag::ALL.into_iter().find(explains);
         // Of equal numbers the first reason.
-        let flag = Flag::ALL.into_iter().rev().max_by_key(with)?;
+        let most = || Flag::ALL.into_iter().rev().max_by_key(|flag| with(*flag));
+        let flag = flag.or_else(most)?;
         (2 * count > of).then_some(Warning::Flagged { flag, count, of })
     }
 
@@ -282,10 +291,10 @@ impl fmt::Display for Warning {
                 share,
             } => write!(
                 f,
-                "the stamps contain sky (found a level of {} ± {} in their corners, {} of the noise; expected 0). It adds {:.1} % to a galaxy's light within 8 px and biases shears. Try: subtract the sky",
+                "the stamps contain sky (found {} ± {} in their corners, or {:.2} of the noise; expected 0). Its light within 8 px of a galaxy is {:.0} % of the galaxy's, which biases shears. Try: subtract the sky",
                 Shown(*level),
                 Shown(*error),
-                Shown(*level / *noise),
+                *level / *noise,
                 100.0 * share
             ),
             Warning::Gradient {
@@ -294,14 +303,14 @@ impl fmt::Display for Warning {
                 noise,
             } => write!(
                 f,
-                "the background has a gradient (found {} along x and {} along y, ± {}, in units of the noise per pixel; expected 0). It biases shears. Try: subtract the sky",
-                Shown(slope[0] / noise),
-                Shown(slope[1] / noise),
-                Shown(error / noise)
+                "the sky has a gradient (found {:+.4} along x and {:+.4} along y, ± {:.4}, in units of the noise per pixel; expected 0), which biases shears. Try: subtract the sky",
+                slope[0] / noise,
+                slope[1] / noise,
+                error / noise
             ),
             Warning::OffCentre { offset, error } => write!(
                 f,
-                "the galaxies are off the centre of their stamps (found a median of {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected less than a pixel). Try: cut the stamps around the galaxies",
+                "the galaxies are off the centre of their stamps (found a median of {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected the middle). Try: cut the stamps around the galaxies",
                 offset[0], offset[1]
             ),
             Warning::Wandering { scatter } => write!(
@@ -405,7 +414,7 @@ impl fmt::Display for Warning {
             ),
             Warning::Flagged { flag, count, of } => write!(
                 f,
-                "{count} of {of} galaxies are flagged, most of them for this reason: {flag}. Try: {}",
+                "{count} of {of} galaxies are flagged (most frequent reason: {flag}). Try: {}",
                 advice(*flag)
             ),
         }

@@ -39,6 +39,9 @@ pub(super) struct Arguments {
     /// first is at 1).
     #[arg(long, value_name = "FILE", requires = "exposure")]
     positions: Option<PathBuf>,
+    /// Number of the first pixel's centre in the positions: 1 for FITS and SExtractor, 0 for NumPy and sep.
+    #[arg(long, value_name = "0|1", default_value_t = 1, value_parser = clap::value_parser!(u8).range(0..=1), requires = "exposure")]
+    first_pixel: u8,
     /// Columns of the positions.
     #[arg(
         long,
@@ -80,6 +83,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         mask,
         mask_extension,
         positions,
+        first_pixel,
         columns,
         size,
         psf,
@@ -115,6 +119,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         (Some(_), Some(positions), [x, y]) => Stamps::Cutouts {
             exposure: images,
             positions,
+            first_pixel: *first_pixel,
             columns: [x, y],
             side: usize::from(*size),
         },

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use ndarray::ArrayView2;
 use serde::Serialize;
-use shearq_measure::{Examination, Star, examined_rows, star};
+use shearq_measure::{Examination, Star, Warning, examined_rows, star};
 use shearq_submissions::PsfCut;
 
 pub use self::source::{Content, Files};
@@ -28,6 +28,8 @@ use crate::io::{psf_table, table};
 const MAX_STAMPS: usize = table::MAX_ROWS;
 /// Pixels a side of a PSF that are examined: as many as configurations use.
 const EXAMINED_SIDE: usize = 48;
+/// Pixels by which an offset may differ from a whole pixel.
+const HALF: f64 = 0.5;
 
 /// Where stamps come from.
 #[derive(Serialize)]
@@ -42,6 +44,8 @@ pub enum Stamps<'a> {
         /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
         #[serde(serialize_with = "shown")]
         positions: &'a Path,
+        /// Number of the first pixel's centre in the table, 0 or 1.
+        first_pixel: u8,
         /// Names of its columns for x and y.
         columns: [&'a str; 2],
         /// Pixels a side of a stamp.
@@ -162,8 +166,16 @@ fn gather_alone(
     let positions = match stamps {
         Stamps::Files(_) => Vec::new(),
         Stamps::Cutouts {
-            positions, columns, ..
-        } => read_positions(positions, *columns)?,
+            positions,
+            columns,
+            first_pixel,
+            ..
+        } => {
+            // From here on the first pixel is 1.
+            let shift = 1.0 - f64::from(*first_pixel);
+            let read = read_positions(positions, *columns)?;
+            read.iter().map(|(x, y)| (x + shift, y + shift)).collect()
+        }
     };
     let (count, side) = match stamps {
         Stamps::Files(files) => survey(*files)?,
@@ -253,7 +265,8 @@ fn gather_alone(
     let warnings = examination.warnings();
     doubts.extend(warnings.iter().map(|warning| {
         let ImageId { set, image } = id;
-        format!("warning: set {set:02} image {image:03}: {warning}")
+        let hint = one_pixel_off(stamps, warning).unwrap_or_default();
+        format!("warning: set {set:02} image {image:03}: {warning}{hint}")
     }));
     let text = places
         .into_inner()
@@ -284,6 +297,19 @@ fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
         true => Ok(()),
         false => Err(already(path)),
     }
+}
+
+/// Advice if positions are counted from another first pixel than specified.
+fn one_pixel_off(stamps: &Stamps<'_>, warning: &Warning) -> Option<String> {
+    let (Stamps::Cutouts { first_pixel, .. }, Warning::OffCentre { offset, .. }) =
+        (stamps, warning)
+    else {
+        return None;
+    };
+    let other = 1 - first_pixel.min(&1);
+    let expected = f64::from(*first_pixel) - f64::from(other);
+    let off = offset.iter().all(|found| (found - expected).abs() < HALF);
+    off.then(|| format!(". Are the positions counted from {other}? Try: --first-pixel {other}"))
 }
 
 /// Positions of galaxies on an exposure.

@@ -33,4 +33,5 @@ mod stored;
 mod submitted;
 mod support;
 mod terminal;
+mod wrong_data;
 mod wrong_psfs;
