@@ -22,6 +22,7 @@ use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2};
 
 use crate::error::MeasureError;
+use crate::examine::enough;
 use crate::extent::Light;
 use crate::pixel::Pixel;
 use crate::robust::{SCATTER, median};
@@ -34,8 +35,6 @@ const PIXELS: usize = BLOCK * BLOCK;
 const POLYNOMIALS: usize = 6;
 /// Pixels a side of the smallest stamps whose frame is told from the galaxy.
 const LEAST_STAMP: usize = 24;
-/// Stamps of an image that are enough: 1.2 million pixels in frames of 48 px, which know the variance to 0.15 %.
-const ENOUGH: usize = 1000;
 /// Cube root of a block's power, over the median's, beyond which it is left out, in units of the lower half's scatter. These
 /// roots scatter nearly like a Gaussian, whether noise is white or blocks have few modes of their own: what is left out of
 /// noise alone is less than 10⁻⁴ of its power where it is white, and 2·10⁻³ of that of its long waves where it is smoothed
@@ -179,7 +178,7 @@ impl NoisePlan {
     /// Which of `rows` rows of `columns` stamps are looked at, evenly spread: enough for a thousand stamps,
     /// or all.
     pub fn rows(&self, columns: usize, rows: usize) -> Vec<usize> {
-        let count = ENOUGH.div_ceil(columns.max(1)).min(rows);
+        let count = enough(columns, rows);
         (0..count)
             .map(|k| (2 * k + 1) * rows / (2 * count))
             .collect()

@@ -48,6 +48,9 @@ pub(super) struct Arguments {
     /// columns].
     #[arg(long, value_name = "NAME|NUMBER", requires = "positions")]
     table: Option<String>,
+    /// Number of the first pixel's centre in the positions: 1 for FITS and SExtractor, 0 for NumPy and sep.
+    #[arg(long, value_name = "0|1", default_value_t = 1, value_parser = clap::value_parser!(u8).range(0..=1), requires = "exposure", conflicts_with = "stamps")]
+    first_pixel: u8,
     /// Columns of the positions: names, or numbers from 1 if the table has no names [default: x and y, or the names of
     /// SExtractor such as X_IMAGE and Y_IMAGE, or the two columns of a table without names].
     #[arg(
@@ -91,6 +94,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         mask_extension,
         positions,
         table,
+        first_pixel,
         columns,
         size,
         psf,
@@ -138,6 +142,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 table: table.as_deref(),
                 columns,
             },
+            first_pixel: *first_pixel,
             side: usize::from(*size),
         },
         None => Stamps::Files(images),

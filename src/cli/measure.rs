@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use shearq_measure::Flag;
+use shearq_measure::{Flag, Warning};
 use shearq_submissions::Registry;
 
 use super::arguments::{SetList, Sharding, Threads};
@@ -86,7 +86,29 @@ pub(super) fn measure(
     let summary = measure_folder(run, data, out, images, threads, &mut bar)?;
     drop(bar);
     report(run, &summary, start.elapsed(), threads, out);
-    Ok(())
+    measured_any(&summary)
+}
+
+/// Refuses results without a single galaxy that could be measured.
+pub(super) fn measured_any(summary: &Summary) -> anyhow::Result<()> {
+    if summary.galaxies == 0 || summary.flagged < summary.galaxies {
+        return Ok(());
+    }
+    let with = |flag: Flag| {
+        let mut counts = summary.flags.iter().zip(Flag::ALL);
+        counts
+            .find(|(_, other)| *other == flag)
+            .map_or(0, |(count, _)| *count as usize)
+    };
+    all_flagged(with, summary.galaxies as usize)
+}
+
+/// The error if all of `galaxies` are flagged, numbers of them `with` each flag.
+pub(super) fn all_flagged(with: impl Fn(Flag) -> usize, galaxies: usize) -> anyhow::Result<()> {
+    match Warning::of_counts(with, galaxies, galaxies) {
+        Some(warning) => anyhow::bail!("no galaxy could be measured: {warning}"),
+        None => Ok(()),
+    }
 }
 
 /// Says on standard error what was done and how fast.

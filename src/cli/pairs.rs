@@ -16,7 +16,7 @@ const WAYS: [(&str, &[&str]); 26] = [
         "gather",
         &[
             "stamps extension mask mask-extension psf psf-extension noise set image out",
-            "exposure positions columns size extension mask mask-extension psf psf-extension noise set image out",
+            "exposure positions table first-pixel columns size extension mask mask-extension psf psf-extension noise set image out",
         ],
     ),
     (
@@ -84,7 +84,7 @@ const WAYS: [(&str, &[&str]); 26] = [
     ),
     (
         NAMES_ONLY[1],
-        &["NAME data sigma update reason junit folder format threads"],
+        &["NAME data stored sigma update reason junit folder format threads"],
     ),
     ("help", &[]),
     ("baseline help", &[]),

@@ -112,6 +112,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             let summary = run_folder(&run, *settings, &images, out, threads, &mut bar)?;
             drop(bar);
             measure::report(&run, &summary, start.elapsed(), threads, out);
+            measure::measured_any(&summary)?;
         }
         (Source::Folder { .. }, Some(data)) => {
             let images = sharding.part(&images::of_folder(data, wanted)?);

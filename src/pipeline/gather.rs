@@ -7,14 +7,15 @@ mod source;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use ndarray::ArrayView2;
 use serde::{Serialize, Serializer};
-use shearq_measure::parts::frame;
-use shearq_scoring::resample::RunningMean;
+use shearq_measure::{Examination, Star, Warning, examined_rows, star};
+use shearq_submissions::PsfCut;
 
 use self::positions::Positions;
 pub use self::positions::Table;
 pub use self::source::{Content, Files};
-use self::source::{Exposure, Images, Origin, Planes, shown};
+use self::source::{Exposure, Images, Origin, Planes, off_middle, shown};
 use super::PipelineError;
 use super::images::ImageId;
 use super::measure::check_strip;
@@ -29,18 +30,14 @@ use crate::io::{psf_table, table};
 
 /// Most stamps of one image: one for each galaxy of the largest grid.
 const MAX_STAMPS: usize = table::MAX_ROWS;
-/// Share of a star's light on the frame of its stamp, were it all as bright as the frame, that is told: a background
-/// of that size changes a deconvolved galaxy.
-const PEDESTAL: f64 = 0.02;
-/// Mean of the stamps' frames, in units of the scatter of their pixels, that is told: more than the wings of galaxies
-/// leave.
-const SKY: f64 = 1.0;
 /// Pixels a side from which on a single stamp is taken for a mosaic or an exposure: four times the default stamp.
 const LARGE: usize = 192;
 /// How to read a mosaic or an exposure.
 const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
-/// Pixels that the frame of a star or a stamp is wide.
-const FRAME: usize = 2;
+/// Pixels a side of a PSF that are examined: as many as configurations use.
+const EXAMINED_SIDE: usize = 48;
+/// Pixels by which an offset may differ from a whole pixel.
+const HALF: f64 = 0.5;
 
 /// Where stamps come from.
 #[derive(Serialize)]
@@ -54,6 +51,8 @@ pub enum Stamps<'a> {
         exposure: Files<'a>,
         /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
         positions: Table<'a>,
+        /// Number of the first pixel's centre in the table, 0 or 1.
+        first_pixel: u8,
         /// Pixels a side of a stamp.
         side: usize,
     },
@@ -180,9 +179,15 @@ fn gather_alone(
         Stamps::Cutouts {
             positions,
             exposure,
+            first_pixel,
             ..
         } => {
-            let positions = Positions::read(*positions)?;
+            // From here on the first pixel is 1.
+            let shift = 1.0 - f64::from(*first_pixel);
+            let mut positions = Positions::read(*positions)?;
+            for (x, y) in &mut positions.all {
+                (*x, *y) = (*x + shift, *y + shift);
+            }
             let sides = Exposure::open(*exposure)?.sides()?;
             doubts.extend(positions.note.clone());
             doubts.extend(positions.examine(&exposure.paths[0], sides)?);
@@ -208,11 +213,20 @@ fn gather_alone(
     let mut keys = Vec::new();
     keys.extend(noise.map(|sigma| ("NOISESIG", Value::Real(sigma))));
     let mut image = Rows::create(&target, mosaic, &keys)?;
-    let (mut incomplete, mut frames) = (0, RunningMean::default());
+    let examined = examined_rows(mosaic.columns, mosaic.rows());
+    let mut examination = Examination::new(side, examined.len() * mosaic.columns);
+    let mut incomplete = 0;
     let mut places = csv::Writer::from_writer(Vec::new());
     let mut take = |origin: &Origin<'_>, pixels: &[f32]| -> Result<(), FileError> {
         incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
-        frame_of(pixels, side).for_each(|value| frames.add(value));
+        if examined.contains(&(image.next / mosaic.columns)) {
+            let stamp = ArrayView2::from_shape((side, side), pixels)
+                .map_err(|error| FileError::new(&target, error))?;
+            let place = origin.position.map_or([0.0; 2], |at| off_middle(at, side));
+            examination
+                .add_at(stamp, place)
+                .map_err(|error| FileError::new(&target, error))?;
+        }
         let (x, y) = mosaic.position(image.next);
         let place = Place {
             x,
@@ -274,13 +288,12 @@ fn gather_alone(
             }
         }
     }
-    if frames.mean().abs() > SKY * frames.deviation() {
-        doubts.push(format!(
-            "warning: the frames of the stamps have a mean of {:.3} where a pixel scatters by {:.3}: is sky left in them? It takes shear away",
-            frames.mean(),
-            frames.deviation()
-        ));
-    }
+    let warnings = examination.warnings();
+    doubts.extend(warnings.iter().map(|warning| {
+        let ImageId { set, image } = id;
+        let hint = one_pixel_off(stamps, warning).unwrap_or_default();
+        format!("warning: set {set:02} image {image:03}: {warning}{hint}")
+    }));
     let text = places
         .into_inner()
         .map_err(|error| FileError::new(&which, error.to_string()))?;
@@ -312,11 +325,17 @@ fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
     }
 }
 
-/// The pixels of a stamp's frame, as far as they are finite.
-fn frame_of(pixels: &[f32], side: usize) -> impl Iterator<Item = f64> + '_ {
-    let all = frame(pixels, side, FRAME).flatten();
-    all.filter(|value| value.is_finite())
-        .map(|&value| f64::from(value))
+/// Advice if positions are counted from another first pixel than specified.
+fn one_pixel_off(stamps: &Stamps<'_>, warning: &Warning) -> Option<String> {
+    let (Stamps::Cutouts { first_pixel, .. }, Warning::OffCentre { offset, .. }) =
+        (stamps, warning)
+    else {
+        return None;
+    };
+    let other = 1 - first_pixel.min(&1);
+    let expected = f64::from(*first_pixel) - f64::from(other);
+    let off = offset.iter().all(|found| (found - expected).abs() < HALF);
+    off.then(|| format!(". Are the positions counted from {other}? Try: --first-pixel {other}"))
 }
 
 /// Refuses an image that is its own mask.
@@ -406,6 +425,13 @@ fn gather_psfs(
     let stars = Mosaic::of(count, side);
     let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
     let mut planes = Planes::of(files);
+    let size = side - side.saturating_sub(EXAMINED_SIDE).next_multiple_of(2);
+    let cut = PsfCut {
+        size,
+        // So that a star off the centre can be cut around itself.
+        least: size - (size / 3).next_multiple_of(2),
+    };
+    let mut examination = Examination::new(side, 0);
     let mut dark = 0;
     while let Some((origin, pixels)) = planes.next()? {
         let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
@@ -417,16 +443,19 @@ fn gather_psfs(
             }
             dark += 1;
         }
-        let pedestal = pedestal(&pixels, side);
-        if image.next == 0 && pedestal.abs() > PEDESTAL {
-            doubts.push(format!(
-                "warning: {}: the frame of the first PSF is as bright as {:.0} % of its light would make it if all of the stamp were: is a background left in it?",
-                origin.file.display(),
-                100.0 * pedestal
-            ));
+        if let Ok(stamp) = ArrayView2::from_shape((side, side), &pixels)
+            && let Ok(Star { psf, moved }) = star(stamp, cut)
+        {
+            examination.add_psf(psf.view(), moved);
         }
         image.add(&pixels)?;
     }
+    let found = examination.warnings();
+    doubts.extend(
+        found
+            .iter()
+            .map(|warning| format!("warning: {}: {warning}", files.paths[0].display())),
+    );
     if dark > 0 {
         doubts.push(format!(
             "warning: the pixels of {dark} of {count} PSFs add up to nothing, less or no number: galaxies with them will be flagged"
@@ -450,14 +479,6 @@ impl PsfFile {
             }
         }
     }
-}
-
-/// The light of a star's stamp if all of it were as bright as its frame, in units of the light that it has.
-fn pedestal(pixels: &[f32], side: usize) -> f64 {
-    let mut frame = RunningMean::default();
-    frame_of(pixels, side).for_each(|value| frame.add(value));
-    let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
-    frame.mean() * pixels.len() as f64 / light
 }
 
 /// A mosaic that is written a row of stamps at a time.

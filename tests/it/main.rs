@@ -37,3 +37,5 @@ mod submitted;
 mod support;
 mod terminal;
 mod unread_files;
+mod wrong_data;
+mod wrong_psfs;
