@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Slice};
 use shearq_measure::{
-    Examination, Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, Survey, Warning,
-    Worker, calibrate, examined_rows, star_psf, strip,
+    Examination, Flag, FunctionalPsf, MeasureError, Measurement, Measurer, NoisePlan, Psfs, Survey,
+    Warning, Worker, calibrate, examined_rows, star_psf, strip,
 };
 use shearq_submissions::{EllipticityType, NoiseSource, PsfCut, PsfForm, Submission};
 use shearq_tables::polars::{Column, DataFrame};
@@ -202,7 +202,10 @@ impl ImageSource {
                 survey.add(stamp)?;
             }
         }
-        self.survey = survey.shared().map_err(|_| {
+        self.survey = survey.shared().map_err(|error| {
+            if let MeasureError::Data(wrong) = error {
+                return FileError::new(&path, wrong);
+            }
             let missing = match survey.incomplete() {
                 0 => String::new(),
                 count => format!(", {count} of which have missing pixels"),
