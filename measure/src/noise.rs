@@ -22,11 +22,13 @@ use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2};
 
 use crate::error::MeasureError;
-use crate::examine::enough;
+use crate::examine::{PEAKS, enough};
 use crate::extent::Light;
+use crate::galaxy::highest;
 use crate::pixel::Pixel;
 use crate::robust::{SCATTER, median};
 use crate::surroundings::{Contrasts, Missing, centre, followed, turn};
+use crate::warning::Warning;
 
 /// Pixels a side of a block.
 const BLOCK: usize = 8;
@@ -197,6 +199,7 @@ impl NoisePlan {
             brightest: Vec::new(),
             typical: Vec::new(),
             light: Light::default(),
+            peak: 0.0,
             counts: [0; 3],
         }
     }
@@ -220,6 +223,8 @@ pub struct NoiseSurvey {
     /// Of each frame, the median over all places.
     typical: Vec<f32>,
     light: Light,
+    /// The brightest pixel.
+    peak: f32,
     /// Number of stamps looked at, of those with missing pixels, and of those that were left out.
     counts: [usize; 3],
 }
@@ -241,6 +246,7 @@ impl NoiseSurvey {
         }
         let whole = self.pixels.iter().all(|value| value.is_finite());
         let flat = self.pixels.iter().all(|value| *value == self.pixels[0]);
+        self.peak = self.peak.max(highest(&self.pixels));
         self.counts[0] += 1;
         self.counts[1] += usize::from(!whole);
         if flat || !(whole || self.missing.mend(&mut self.pixels, full)) {
@@ -280,6 +286,7 @@ impl NoiseSurvey {
         self.brightest.extend_from_slice(&other.brightest);
         self.typical.extend_from_slice(&other.typical);
         self.light.join(&other.light);
+        self.peak = self.peak.max(other.peak);
         for (count, more) in self.counts.iter_mut().zip(other.counts) {
             *count += more;
         }
@@ -353,6 +360,11 @@ impl NoiseSurvey {
         match self.found() {
             Some(found) => Ok(Some(Arc::new(found))),
             None if self.is_blind() => Ok(None),
+            None if self.peak > 0.0 && !PEAKS.contains(&self.peak) => {
+                Err(MeasureError::Data(Warning::Brightness {
+                    peak: f64::from(self.peak),
+                }))
+            }
             None => Err(MeasureError::Noise(
                 "not to be seen on the stamps' frames".into(),
             )),

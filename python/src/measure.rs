@@ -198,7 +198,7 @@ pub(crate) fn measure<'py>(
     let mut galaxies = [galaxies];
     let response = calibrate(submission, &mut galaxies);
     let mut examination = examine(&stamps, count, rows)?;
-    add_psfs(&mut examination, &psfs, moved, cut)?;
+    add_psfs(&mut examination, &psfs, count, moved, cut)?;
     let mut warnings = examination.warnings();
     warnings.extend(Warning::of_settings(submission));
     warnings.extend(Warning::of_flags(&galaxies));
@@ -211,11 +211,12 @@ pub(crate) fn measure<'py>(
     Ok((catalogue(py, &galaxies[0])?, response, warnings))
 }
 
-/// Examines the PSF of all stamps, which was `moved` to the middle of its stamp, or as many of those for one each as are
+/// Examines the PSF of all `count` stamps, which was `moved` to the middle of its stamp, or as many of those for one each as are
 /// enough.
 fn add_psfs(
     examination: &mut Examination,
     psfs: &AllPsfs<'_>,
+    count: usize,
     moved: Option<[f64; 2]>,
     cut: PsfCut,
 ) -> PyResult<()> {
@@ -225,7 +226,6 @@ fn add_psfs(
             examination.add_psfs(Psfs::<f64>::Functional(formulas), cut, EXAMINED_PSFS);
         }
         AllPsfs::Stars(stars) => {
-            let (count, ..) = stars.dim();
             let some = EXAMINED_PSFS.min(count);
             for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
                 match stars.piece(at, at + 1)? {

@@ -6,8 +6,9 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Slice};
 use shearq_measure::{
-    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, Measurement, Measurer, NoisePlan, Psfs, Star,
-    Survey, Warning, Worker, calibrate, examined_rows, star, star_psf, strip,
+    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, MeasureError, Measurement, Measurer,
+    NoisePlan, Psfs, Star, Survey, Warning, Worker, calibrate, examined_rows, star, star_psf,
+    strip,
 };
 use shearq_submissions::{EllipticityType, NoiseSource, PsfCut, PsfForm, Submission};
 use shearq_tables::polars::{Column, DataFrame};
@@ -199,7 +200,10 @@ impl ImageSource {
                 survey.add(stamp)?;
             }
         }
-        self.survey = survey.shared().map_err(|_| {
+        self.survey = survey.shared().map_err(|error| {
+            if let MeasureError::Data(wrong) = error {
+                return FileError::new(&path, wrong);
+            }
             let missing = match survey.incomplete() {
                 0 => String::new(),
                 count => format!(", {count} of which have missing pixels"),
