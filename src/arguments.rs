@@ -154,6 +154,11 @@ pub(super) struct ReportFile {
 }
 
 impl ReportFile {
+    /// Whether a page was asked for.
+    pub(super) fn is_wanted(&self) -> bool {
+        self.path.is_some()
+    }
+
     /// Writes the page, if one was asked for.
     pub(super) fn save(
         &self,
@@ -333,6 +338,17 @@ impl ScoreSettings {
     }
 }
 
+/// Refuses a submission that is named twice, which would be measured twice.
+pub(super) fn given_once(submissions: &[String]) -> anyhow::Result<()> {
+    for (k, name) in submissions.iter().enumerate() {
+        anyhow::ensure!(
+            !submissions[..k].contains(name),
+            "--submission {name} is given twice"
+        );
+    }
+    Ok(())
+}
+
 /// A positive number.
 pub(super) fn positive(text: &str) -> Result<f64, String> {
     let number = text.parse().ok();
@@ -363,7 +379,7 @@ mod tests {
         let parse = |text: &str| text.parse::<SetList>().map(|list| list.0);
         assert_eq!(parse("7-9,1,2,8"), Ok(vec![1, 2, 7, 8, 9]));
         assert_eq!(parse("all").unwrap().len(), 24);
-        for wrong in ["", "0", "x", "3-1", "1,,2", "100"] {
+        for wrong in ["", "0", "x", "3-1", "1,,2", "10000"] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }
     }

@@ -4,6 +4,8 @@
 mod arguments;
 mod choices;
 mod commands;
+#[cfg(test)]
+mod pairs;
 mod progress;
 
 use std::ffi::OsString;
@@ -15,6 +17,7 @@ use commands::{
     baseline, bench, calibrate, check, compare, gather, help_files, mean, measure, merge, pack,
     quickstart, reproduce, run, score, show, simulate, study, submissions, unpack,
 };
+use shearq_pipeline::data::listing::Files;
 use shearq_render::escape::visible;
 use shearq_render::figure::HeatMap;
 use shearq_render::table::Table;
@@ -93,7 +96,7 @@ enum Command {
     #[command(after_help = "Example:\n  shearq bench --submission 48/linear/star")]
     Bench(bench::Arguments),
     #[command(
-        after_help = "Examples:\n  shearq submissions show 48/linear/star\n  shearq submissions init own.toml --method linear"
+        after_help = "Examples:\n  shearq submissions show 48/linear/star\n  shearq submissions init own.toml"
     )]
     Submissions(submissions::Arguments),
     #[command(
@@ -114,7 +117,18 @@ const MISUSED: u8 = 2;
 /// Runs the command that this process was started with.
 pub fn main() -> ExitCode {
     progress::end_at_interrupt();
+    fail_at_size_limits();
     ExitCode::from(run_with(std::env::args_os()))
+}
+
+/// Makes writing beyond a limit of file sizes (`ulimit -f`) an error like any other. By default the signal ends the
+/// process without a message, and with files half written.
+fn fail_at_size_limits() {
+    #[cfg(unix)]
+    // SAFETY: ignoring a signal runs no code of ours, and no other thread has been started.
+    unsafe {
+        libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
+    }
 }
 
 /// Parses the arguments, of which the first is the program's name, runs the command and reports its error, if
@@ -151,10 +165,25 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Ok(()) => DONE,
         Err(error) if error.is::<Findings>() => FAILED,
         Err(error) => {
-            tell(format_args!("error: {error:#}"));
+            tell(format_args!("error: {}", causes(&error)));
             FAILED
         }
     }
+}
+
+/// An error with its causes, of which those that it mentions itself are not repeated.
+fn causes(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain() {
+        let cause = cause.to_string();
+        if text.is_empty() {
+            text = cause;
+        } else if !text.ends_with(&cause) {
+            text.push_str(": ");
+            text.push_str(&cause);
+        }
+    }
+    text
 }
 
 /// Prints help, the version or what is wrong with the arguments.
@@ -162,7 +191,7 @@ fn usage(message: &clap::Error) -> u8 {
     match written(|| message.print()) {
         Ok(()) => u8::try_from(message.exit_code()).unwrap_or(MISUSED),
         Err(error) => {
-            tell(format_args!("error: {error:#}"));
+            tell(format_args!("error: {}", causes(&error)));
             FAILED
         }
     }
@@ -193,6 +222,13 @@ fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
 fn tell(line: std::fmt::Arguments<'_>) {
     use std::io::Write;
     let _ = writeln!(std::io::stderr(), "{}", visible(&line.to_string()));
+}
+
+/// Reports what looks like files of data and is not read.
+fn tell_unread(files: &Files) {
+    for line in files.unread() {
+        tell(format_args!("warning: {line}"));
+    }
 }
 
 /// A number of things.
@@ -278,6 +314,15 @@ mod tests {
             }
         }
         found
+    }
+
+    #[test]
+    fn a_cause_that_an_error_mentions_is_not_repeated() {
+        let error = anyhow::anyhow!("no space")
+            .context("cannot write: no space")
+            .context("out.csv");
+        assert_eq!(causes(&error), "out.csv: cannot write: no space");
+        assert_eq!(causes(&anyhow::anyhow!("a").context("b")), "b: a");
     }
 
     #[test]

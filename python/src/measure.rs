@@ -8,12 +8,12 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_measure::{
-    Flag, MeasureError, Measurement, Measurer, NoisePlan, Pixel, Psfs, Survey, Worker, calibrate,
-    star_psf,
+    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, MeasureError, Measurement, Measurer,
+    NoisePlan, Pixel, PsfProfile, Psfs, Survey, Warning, Worker, calibrate, examined_rows,
 };
 use shearq_pipeline::engine;
 use shearq_quantities::Shear;
-use shearq_quantities::{FunctionalPsf, PsfProfile};
+use shearq_submissions::PsfCut;
 
 use crate::errors::{no_memory, of_measuring};
 use crate::stamps::{Borrowed, Piece, Stamps};
@@ -63,7 +63,8 @@ struct Job<'a> {
 
 /// Measures stamps `(n, ny, nx)` with a star stamp for all, star stamps one each, or formulas (FWHM, e1, e2 and
 /// β, which is not a number for Kolmogorov), one or one each; and a noise level for all or one each, or none where the
-/// submission measures it on the stamps. Returns the catalogue's columns and the mean response that the ellipticities were divided by.
+/// submission measures it on the stamps. Returns the catalogue's columns, the mean response that the ellipticities were
+/// divided by, and what is wrong with the data.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
 pub(crate) fn measure<'py>(
@@ -77,7 +78,7 @@ pub(crate) fn measure<'py>(
     submission: &Bound<'py, Submission>,
     threads_asked: Option<u16>,
     progress: Option<Py<PyAny>>,
-) -> PyResult<(Bound<'py, PyDict>, Option<[f64; 2]>)> {
+) -> PyResult<(Bound<'py, PyDict>, Option<[f64; 2]>, Vec<String>)> {
     let submission = &submission.get().entry.submission;
     let stamps = Borrowed::new(stamps)?;
     let (count, rows, columns) = stamps.dim();
@@ -114,10 +115,12 @@ pub(crate) fn measure<'py>(
         measurer.batch(none.view(), psfs, level).map(|_| ())
     };
     let prepared;
+    let mut moved = None;
     let psfs = match (star, &stars, formulas) {
         (Some(star), None, None) => {
             look(Psfs::Star(star.as_array())).map_err(of_measuring)?;
-            prepared = star_psf(star.as_array(), cut).map_err(of_measuring)?;
+            let found = shearq_measure::star(star.as_array(), cut).map_err(of_measuring)?;
+            (prepared, moved) = (found.psf, found.moved);
             AllPsfs::Shared(prepared.view())
         }
         (None, Some(stars), None) => {
@@ -194,7 +197,61 @@ pub(crate) fn measure<'py>(
     failure.or(result)?;
     let mut galaxies = [galaxies];
     let response = calibrate(submission, &mut galaxies);
-    Ok((catalogue(py, &galaxies[0])?, response))
+    let mut examination = examine(&stamps, count, rows)?;
+    add_psfs(&mut examination, &psfs, count, moved, cut)?;
+    let mut warnings = examination.warnings();
+    warnings.extend(Warning::of_settings(submission));
+    warnings.extend(Warning::of_flags(&galaxies));
+    if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {
+        return Err(of_measuring(MeasureError::Data(
+            warnings.swap_remove(fatal),
+        )));
+    }
+    let warnings = warnings.iter().map(Warning::to_string).collect();
+    Ok((catalogue(py, &galaxies[0])?, response, warnings))
+}
+
+/// Examines the PSF of all `count` stamps, which was `moved` to the middle of its stamp, or as many of those for one each as are
+/// enough.
+fn add_psfs(
+    examination: &mut Examination,
+    psfs: &AllPsfs<'_>,
+    count: usize,
+    moved: Option<[f64; 2]>,
+    cut: PsfCut,
+) -> PyResult<()> {
+    match psfs {
+        AllPsfs::Shared(psf) => examination.add_psf(psf.view(), moved),
+        AllPsfs::Formulas(formulas) => {
+            examination.add_psfs(Psfs::<f64>::Functional(formulas), cut, EXAMINED_PSFS);
+        }
+        AllPsfs::Stars(stars) => {
+            let some = EXAMINED_PSFS.min(count);
+            for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
+                match stars.piece(at, at + 1)? {
+                    Piece::Single(one) => examination.add_psfs(Psfs::Stars(one.view()), cut, 1),
+                    Piece::Double(one) => examination.add_psfs(Psfs::Stars(one.view()), cut, 1),
+                    Piece::Copied(one) => examination.add_psfs(Psfs::Stars(one.view()), cut, 1),
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Examines as many of the stamps as are enough.
+fn examine(stamps: &Stamps<'_>, count: usize, side: usize) -> PyResult<Examination> {
+    let chosen = examined_rows(1, count);
+    let mut examination = Examination::new(side, chosen.len());
+    for at in chosen {
+        match stamps.piece(at, at + 1)? {
+            Piece::Single(one) => examination.add(one.index_axis(Axis(0), 0)),
+            Piece::Double(one) => examination.add(one.index_axis(Axis(0), 0)),
+            Piece::Copied(one) => examination.add(one.index_axis(Axis(0), 0)),
+        }
+        .map_err(of_measuring)?;
+    }
+    Ok(examination)
 }
 
 /// What the stamps tell of their image, from as many as are enough.

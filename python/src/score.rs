@@ -6,11 +6,12 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_quantities::units::{Degrees, Pixels};
+use shearq_results::views::diagnosis;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
 use shearq_scoring::{
-    BINS, Bins, Choice, Convention, Definition, FieldSum, Figures, Grid, Noise, Options, Row,
-    RowCounts, SCORED, SetImages, SetScorer, TrueShear, TruthSign,
+    BINS, Bins, Choice, Convention, Definition, Fault, FieldSum, Figures, Grid, ImageFaults, Noise,
+    Options, Row, RowCounts, SCORED, SetImages, SetScorer, TrueShear, TruthSign, sign_by_modes,
 };
 
 use crate::errors::of_scoring;
@@ -73,7 +74,7 @@ impl<'a> Rows<'a> {
     }
 
     /// Sums the images onto the grid; also how their rows were used.
-    fn sum(&self, grid: &Grid) -> PyResult<(SetImages, RowCounts)> {
+    fn sum(&self, grid: &Grid) -> PyResult<(SetImages, RowCounts, ImageFaults)> {
         let count = self.e1.len();
         let fits = self
             .lengths
@@ -90,6 +91,7 @@ impl<'a> Rows<'a> {
             ));
         }
         let (mut images, mut counts) = (SetImages::new(grid), RowCounts::default());
+        let mut faults = ImageFaults::default();
         let mut start = 0;
         for length in &self.lengths {
             let mut sum = FieldSum::new(grid);
@@ -108,10 +110,11 @@ impl<'a> Rows<'a> {
                     }
                 }),
             );
+            faults.add(&sum);
             images.add(&sum);
             start += length;
         }
-        Ok((images, counts))
+        Ok((images, counts, faults))
     }
 }
 
@@ -141,7 +144,7 @@ pub(crate) fn score<'py>(
     };
     let (g1, g2) = (truth.0.as_array(), truth.1.as_array());
     let rows = Rows::new(&e, positions.as_ref(), lengths);
-    let (scored, counts) = py.detach(|| {
+    let (scored, mut warnings) = py.detach(|| {
         let truth = g1.iter().zip(&g2).take(grid.cells() + 1).enumerate();
         let truth = truth.map(|(k, (&e1, &e2))| {
             let (x, y) = grid.centre(k % n, k / n);
@@ -152,13 +155,43 @@ pub(crate) fn score<'py>(
             false => TruthSign::Standard,
         };
         let truth = TrueShear::from_rows(&grid, sign, truth).map_err(of_scoring)?;
-        let (images, counts) = rows.sum(&grid)?;
+        let (images, counts, faults) = rows.sum(&grid)?;
+        if counts.used == 0 {
+            return Err(PyValueError::new_err(format!(
+                "e1, e2: no galaxy has an ellipticity on the grid ({} are not finite, {} lie outside); expected numbers",
+                counts.not_finite, counts.outside
+            )));
+        }
         if let Some(fault) = counts.fault(&grid) {
             return Err(PyValueError::new_err(format!("e1, e2: {fault}")));
         }
+        let mut warnings = counts.oddities("e1, e2");
+        if sign_by_modes(&grid, &truth) == Some(TruthSign::Challenge) {
+            let other = if challenge_sign { "standard" } else { "challenge" };
+            warnings.push(format!(
+                "warning: truth_g2 seems to have the other sign: with it the shear is an E-mode field. Try: truth_sign=\"{other}\""
+            ));
+        }
+        let odd = diagnosis::odd_arrays(&faults).into_iter();
+        warnings.extend(odd.map(|line| format!("warning: {line}.")));
         let scorer = SetScorer::new(grid, truth, options).map_err(of_scoring)?;
-        Ok((scorer.score(&images).map_err(of_scoring)?, counts))
+        let scored = scorer.score(&images).map_err(of_scoring)?;
+        for fault in scorer.diagnose(&images, &scored, scored.chosen) {
+            let told = match fault {
+                // The Python package words it.
+                Fault::Convention { .. } => true,
+                Fault::Uncorrelated { .. } => !faults.copies.is_empty(),
+                _ => false,
+            };
+            if !told {
+                warnings.push(format!("warning: {}.", diagnosis::words(&fault)));
+            }
+        }
+        PyResult::Ok((scored, warnings))
     })?;
+    if scored.constant.is_some() {
+        warnings.push("note: the true shear is the same everywhere, so that only `mean`, c1 and c2 are known; other metrics are NaN.".into());
+    }
 
     let spectra = scored.spectra();
     let found = PyDict::new(py);
@@ -201,7 +234,7 @@ pub(crate) fn score<'py>(
     let leaderboard = &scored.conventions[scored.best.index()];
     found.set_item("q_leaderboard", leaderboard.quality.q)?;
     found.set_item("correlation", spectra.correlation)?;
-    found.set_item("warnings", counts.oddities("e1, e2"))?;
+    found.set_item("warnings", warnings)?;
     found.set_item(
         "constant",
         scored.constant.map(|mean| (mean.e, mean.error, mean.truth)),
@@ -240,7 +273,7 @@ pub(crate) fn spectrum<'py>(
     let definition = self::definition(definition)?;
     let rows = Rows::new(&e, positions.as_ref(), lengths);
     let (all, modes) = py.detach(|| {
-        let (images, _) = rows.sum(&grid)?;
+        let (images, ..) = rows.sum(&grid)?;
         let total = images.total();
         let scale = 1.0 / total.images.max(1) as f64;
         let standard = Convention::STANDARD;

@@ -11,6 +11,9 @@ use crate::errors::of_submission;
 /// What a text of settings is called where it does not name itself.
 const OWN: &str = "own";
 
+/// Settings as JSON, what they extend, and Q, M/2 and √A·10⁴ as published.
+type Parts = (String, Option<String>, Option<(f64, f64, f64)>);
+
 /// Settings of a submission, resolved.
 #[pyclass(frozen)]
 pub(crate) struct Submission {
@@ -48,6 +51,32 @@ impl Submission {
             serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
         let text = toml::to_string(&value).map_err(|error| wrong(error.to_string()))?;
         Self::text(&text)
+    }
+
+    /// The submission of which `parts` are the parts.
+    #[staticmethod]
+    fn restored(parts: Parts) -> PyResult<Self> {
+        let (settings, extends, published) = parts;
+        let submission: shearq_submissions::Submission = serde_json::from_str(&settings)
+            .map_err(|error| PyValueError::new_err(format!("submission: {error}")))?;
+        let published = published.map(|(q, m_half, sqrt_a)| Published { q, m_half, sqrt_a });
+        Ok(Submission {
+            entry: Entry {
+                submission,
+                published,
+                extends,
+            },
+        })
+    }
+
+    /// All that it consists of, for pickle.
+    #[getter]
+    fn parts(&self) -> PyResult<Parts> {
+        Ok((
+            self.settings()?,
+            self.entry.extends.clone(),
+            self.published(),
+        ))
     }
 
     #[getter]

@@ -1,5 +1,6 @@
 """Measuring arrays of any kind."""
 
+import copy
 import pickle
 import subprocess
 import sys
@@ -24,6 +25,17 @@ def again(image, stamps=None, psf=None, noise=None, **options):
         noise=image.noise if noise is None else noise,
         **options,
     )
+
+
+def test_submissions_can_be_pickled_and_copied(image):
+    own = shearq.submission({"extends": "48/linear/star", "noise": {"source": "border", "border": 4}})
+    for submission in [shearq.submission("23/den/star"), own]:
+        for again in [pickle.loads(pickle.dumps(submission)), copy.deepcopy(submission), copy.copy(submission)]:
+            assert isinstance(again, shearq.Submission)
+            for name in ("name", "description", "extends", "settings", "toml", "published"):
+                assert getattr(again, name) == getattr(submission, name), name
+    measured = [shearq.measure(image.stamps, image.psf, submission=own) for own in (own, pickle.loads(pickle.dumps(own)))]
+    assert same_bits(*measured)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

@@ -209,3 +209,45 @@ def test_catalogues_are_compared_over_the_same_images():
 def test_simulations_that_cannot_be_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         shearq.simulate(**arguments)
+
+
+def _images(n=32, images=4, noise=0.01):
+    """A shear field and noisy images of it."""
+    g1, g2 = _field(n)
+    rng = np.random.default_rng(7)
+    e1, e2 = (np.stack([g + rng.normal(0, noise, (n, n)) for _ in range(images)]) for g in (g1, g2))
+    return e1, e2, g1, g2
+
+
+def test_sound_ellipticities_are_scored_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert shearq.score(*_images()).notes == []
+
+
+def test_probable_faults_are_warned_of():
+    e1, e2, g1, g2 = _images()
+    copies = [np.concatenate([e[:1]] * 4) for e in (e1, e2)]
+    for faulty, expected in (
+        ((2 * e1, 2 * e2), "seem to be distortions"),
+        ((np.roll(e1, 1, 2), np.roll(e2, 1, 2)), r"shifted by \(\+1, \+0\) cells"),
+        ((e2, e1), "e1 and e2 seem to be swapped"),
+        ((0.5 * e1, 0.5 * e2), "expected .m. below 0.1"),
+        (copies, "image 2 has the ellipticities of image 1, and 2 more likewise"),
+        ((0 * e1, 0 * e2), r"all galaxies of image 1 have the ellipticity \(0, 0\)"),
+    ):
+        with pytest.warns(UserWarning, match=expected):
+            shearq.score(*faulty, g1, g2)
+    with pytest.warns(UserWarning, match='Try: truth_sign="challenge"'):
+        shearq.score(e1, e2, g1, -g2)
+
+
+def test_nothing_to_score_is_an_error_and_a_constant_truth_is_noted():
+    e1, e2, g1, g2 = _images()
+    with pytest.raises(ValueError, match="no galaxy has an ellipticity"):
+        shearq.score(np.full_like(e1, np.nan), e2, g1, g2)
+    with pytest.raises(ValueError, match="expected less than 1"):
+        shearq.score(e1, e2, 100 * g1, 100 * g2)
+    constant = np.full_like(g1, 0.01)
+    scored = shearq.score(e1 - g1 + constant, e2 - g2 + constant, constant, constant)
+    assert np.isnan(scored["q"]) and any("the true shear is the same everywhere" in note for note in scored.notes)

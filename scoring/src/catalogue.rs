@@ -101,34 +101,34 @@ impl RowCounts {
         let mut lines = Vec::new();
         if self.outside + self.excess > 0 {
             lines.push(format!(
-                "Warning: {whose} has {} outside the grid and {} beyond the number of cells; they do not count.",
+                "warning: {whose} has {} outside the grid and {} beyond the number of cells; they do not count.",
                 rows(self.outside),
                 self.excess
             ));
         }
         if self.repeated > 0 {
             lines.push(format!(
-                "Warning: {} of {whose} of galaxies that have one already; they add up.",
+                "warning: {} of {whose} of galaxies that have one already; they add up.",
                 rows(self.repeated)
             ));
         }
         if self.missing > 0 {
             lines.push(format!(
-                "Warning: {} of {} galaxies of {whose} are not in the catalogues; each counts as zero.",
+                "warning: {} of {} galaxies of {whose} are not in the catalogues; each counts as zero.",
                 self.missing,
                 self.missing + self.used + self.not_finite - self.repeated
             ));
         }
         if self.above_one > 0 {
             lines.push(format!(
-                "Warning: {} of {whose} with |e| > 1, {} with |e| > {ABSURD}; scored as they are.",
+                "warning: {} of {whose} with |e| > 1, {} with |e| > {ABSURD}; scored as they are.",
                 rows(self.above_one),
                 self.absurd
             ));
         }
         if self.not_finite > 0 {
             lines.push(format!(
-                "Note: {} of {} galaxies of {whose} have no ellipticity and count as missing.",
+                "note: {} of {} galaxies of {whose} have no ellipticity and count as missing.",
                 self.not_finite,
                 self.not_finite + self.used
             ));
@@ -264,10 +264,24 @@ impl TrueShear {
         Some([value(&self.g1)?, value(&self.g2)?])
     }
 
+    /// The shear with the other sign of g₂.
+    pub fn flipped(&self) -> Self {
+        TrueShear {
+            g1: self.g1.clone(),
+            g2: -&self.g2,
+        }
+    }
+
+    /// Root mean square of |g|.
+    pub fn rms(&self) -> f64 {
+        let squares = |g: &Array2<f64>| g.iter().map(|g| g * g).sum::<f64>();
+        ((squares(&self.g1) + squares(&self.g2)) / self.g1.len() as f64).sqrt()
+    }
+
     /// From rows of (x, y, g₁, g₂), in any order.
     ///
     /// # Errors
-    /// Where a cell is absent, given twice or not finite.
+    /// If a cell is absent or given twice, or its shear is not finite or |g| ≥ 1.
     pub fn from_rows(
         grid: &Grid,
         sign: TruthSign,
@@ -297,6 +311,14 @@ impl TrueShear {
                 return Err(ScoringError::TruthNotFinite {
                     ix: cell.0 + 1,
                     iy: cell.1 + 1,
+                });
+            }
+            let modulus = row.e1.hypot(row.e2);
+            if modulus >= 1.0 {
+                return Err(ScoringError::TruthTooLarge {
+                    ix: cell.0 + 1,
+                    iy: cell.1 + 1,
+                    found: modulus,
                 });
             }
             truth.g1[cell] = row.e1;

@@ -63,6 +63,18 @@ pub enum ScoringError {
         /// Row, 1-based.
         iy: usize,
     },
+    /// A truth value that no shear has.
+    #[error(
+        "the true shear of cell ({ix}, {iy}) is |g| = {found:.4}; expected less than 1. Is it in percent, or an angle in degrees?"
+    )]
+    TruthTooLarge {
+        /// Column, 1-based.
+        ix: usize,
+        /// Row, 1-based.
+        iy: usize,
+        /// |g|.
+        found: f64,
+    },
     /// No image was added.
     #[error("no image to score")]
     NoImages,

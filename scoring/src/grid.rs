@@ -13,9 +13,16 @@ pub(crate) const MODE_OFFSET: f64 = 1e-10;
 
 /// 0-based place along an axis of the stamp that holds the FITS pixel position `position`, `None` before the first.
 ///
-/// The 1-based index is round(x/stamp + ½), halves away from zero, as the original takes it.
+/// The 1-based index is round(x/stamp + ½), halves away from zero, as in the original. That is half a pixel
+/// less than the stamp's edge in FITS pixels. A stamp of one pixel has its centre there. Stamps from one to two
+/// pixels therefore use the edge itself: round((x − ½)/stamp + ½).
 pub fn cell_at(position: f64, stamp: Pixels) -> Option<usize> {
-    let index = (position / stamp.0 + 0.5).round();
+    let from = if (1.0..2.0).contains(&stamp.0) {
+        0.5
+    } else {
+        0.0
+    };
+    let index = ((position - from) / stamp.0 + 0.5).round();
     (index >= 1.0).then(|| index as usize - 1)
 }
 
@@ -152,6 +159,16 @@ mod tests {
         assert_eq!(grid.cell(-0.1, 24.5), None);
         assert_eq!(grid.cell(4800.0, 24.5), None);
         assert_eq!(grid.cell(f64::NAN, 24.5), None);
+    }
+
+    #[test]
+    fn stamps_of_one_pixel_have_fits_pixels_as_cells() {
+        let grid = Grid::new(8, Pixels(1.0), Degrees(10.0)).unwrap();
+        for (ix, iy) in [(0, 0), (3, 7), (7, 5)] {
+            assert_eq!(grid.cell(ix as f64 + 1.0, iy as f64 + 1.0), Some((ix, iy)));
+        }
+        assert_eq!(grid.cell(0.0, 1.0), None);
+        assert_eq!(grid.cell(9.0, 1.0), None);
     }
 
     #[test]

@@ -387,11 +387,27 @@ impl SetScorer {
     /// How well each convention of a submission's field correlates with the truth over bins 2 to 9.
     pub fn match_convention(&self, images: &SetImages) -> ConventionMatch {
         let total = &images.total;
-        let correlations = Convention::ALL.map(|k| {
-            let (modes, truth) = (self.modes(total, k), self.true_modes(total, k));
-            self.correlation(&modes, &truth)
-        });
+        let correlations = Convention::ALL.map(|k| self.correlation_of(total, k));
         ConventionMatch::new(correlations, self.scored_modes())
+    }
+
+    /// The true shear.
+    pub(crate) fn truth(&self) -> &TrueShear {
+        &self.truth
+    }
+
+    /// Modes of a submission's averaged field under a convention, and those of the truth beside it.
+    pub(crate) fn both_modes(&self, sum: &FieldSum, convention: Convention) -> (Modes, Modes) {
+        (
+            self.modes(sum, convention),
+            self.true_modes(sum, convention),
+        )
+    }
+
+    /// Correlation of a submission's E modes with the true ones over the scored bins, under a convention.
+    pub(crate) fn correlation_of(&self, sum: &FieldSum, convention: Convention) -> f64 {
+        let (modes, truth) = self.both_modes(sum, convention);
+        self.correlation(&modes, &truth)
     }
 
     fn scored_modes(&self) -> usize {

@@ -6,15 +6,16 @@ use anyhow::Context;
 use clap::{ArgGroup, Args, Subcommand};
 use shearq_submissions::{Registry, Submission};
 
-use crate::arguments::{Form, SetList, SimulationArguments, Threads, positive};
+use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once, positive};
 use crate::progress::Bar;
 use crate::{print, tell};
 use shearq_files::atomic;
-use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE};
-use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::data::run::{Run, Source, open_data, way};
 use shearq_render::table::TableFormat;
 use shearq_results::baseline::{
-    self, Baseline, BaselineSet, BaselineSubmission, Change, Checked, Wanted, figures_of, measure,
+    self, Baseline, BaselineSet, BaselineSubmission, Change, Checked, Settings, Wanted, figures_of,
+    measure,
 };
 use shearq_results::views::baseline::{junit, shift_table};
 
@@ -79,8 +80,9 @@ struct RecordArguments {
 
 /// Measure baselines again and compare.
 ///
-/// Named submissions are measured with their present settings, others with those stored. On the same
-/// data a figure must be the same but for rounding; on other data (--data) within noise. Q, M/2, √A
+/// Named submissions and configuration files are measured with their present settings, and settings that
+/// changed are listed. A file is known if `record` measured it (--submission FILE); catalogues (--measured)
+/// have the settings stored. On the same data a figure must be the same but for rounding; on other data (--data) within noise. Q, M/2, √A
 /// and the scatter of e1 and e2 are looked at; CSV and JSON have every one, the other formats those
 /// that moved.
 ///
@@ -93,6 +95,9 @@ struct CheckArguments {
     /// Data folder to measure instead of the one recorded.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
+    /// Measure with the settings stored in the baseline, not with those of your configuration files.
+    #[arg(long)]
+    stored: bool,
     /// Standard errors by which a figure may be off on other data than the baseline's.
     #[arg(long, value_name = "K", default_value_t = 3.0, value_parser = positive)]
     sigma: f64,
@@ -160,7 +165,7 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
         }
         Some(data) => {
             arguments.simulation.must_be_unused()?;
-            let data = DataFolder::open(data)?;
+            let data = open_data(data)?;
             let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
             let files = data.images(sets)?;
             let there = |set| files.of_set(set).len() as u32;
@@ -192,18 +197,19 @@ fn of_source(
     wanted: Vec<Wanted>,
 ) -> anyhow::Result<(Source, Vec<BaselineSubmission>)> {
     let (folder, threads) = (&arguments.place.folder, arguments.threads.number());
-    let submissions = chosen(&arguments.submission)?
-        .iter()
-        .map(|submission| {
-            let sets = measured(&source, folder, submission, &wanted, threads)?;
-            Ok(BaselineSubmission::new(submission, sets)?)
+    let submissions = chosen(&arguments.submission, folder)?
+        .into_iter()
+        .map(|(submission, file)| {
+            let sets = measured(&source, folder, &submission, &wanted, threads)?;
+            Ok(BaselineSubmission::new(&submission, file, sets)?)
         })
         .collect::<anyhow::Result<_>>()?;
     Ok((source, submissions))
 }
 
-/// The submissions called `names`, or all named ones.
-fn chosen(names: &[String]) -> anyhow::Result<Vec<Submission>> {
+/// The submissions called `names`, or all named ones, with their files from the folder `beside`.
+fn chosen(names: &[String], beside: &Path) -> anyhow::Result<Vec<(Submission, Option<PathBuf>)>> {
+    given_once(names)?;
     let registry = Registry::embedded()?;
     let names = if names.is_empty() {
         registry.names()
@@ -212,7 +218,13 @@ fn chosen(names: &[String]) -> anyhow::Result<Vec<Submission>> {
     };
     names
         .iter()
-        .map(|name| Ok(registry.get(name)?.submission))
+        .map(|name| {
+            let path = Path::new(name);
+            let file = (!registry.names().contains(name) && path.is_file())
+                .then(|| way(beside, path))
+                .transpose()?;
+            Ok((registry.get(name)?.submission, file))
+        })
         .collect()
 }
 
@@ -235,7 +247,7 @@ fn of_folders(
             folder.display(),
         );
         let sets = figures_of(&run, &run.source.data(folder)?, folder, threads)?;
-        submissions.push(BaselineSubmission::new(&run.submission, sets)?);
+        submissions.push(BaselineSubmission::new(&run.submission, None, sets)?);
     }
     Ok((first.context("--measured names no folder")?, submissions))
 }
@@ -301,15 +313,27 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
     let baseline = Baseline::read(path)?;
     let beside = &arguments.place.folder;
     let source = match &arguments.data {
-        Some(data) => Source::folder(&DataFolder::open(data)?, beside)?,
+        Some(data) => Source::folder(&open_data(data)?, beside)?,
         None => baseline.source.clone(),
     };
     let threads = arguments.threads.number();
     let measure = |submission: &Submission, wanted: &[Wanted]| {
         measured(&source, beside, submission, wanted, threads)
     };
-    let (checks, submissions) = baseline::check(name, &baseline, arguments.sigma, measure)
-        .with_context(|| path.display().to_string())?;
+    let settings = match arguments.stored {
+        true => Settings::Stored,
+        false => Settings::Files(beside),
+    };
+    let (checks, submissions) =
+        baseline::check(name, &baseline, arguments.sigma, settings, measure)
+            .with_context(|| path.display().to_string())?;
+    for check in checks.iter().filter(|check| check.stored) {
+        tell(format_args!(
+            "{}: {}: measured with the stored settings; the baseline does not name a configuration file",
+            path.display(),
+            check.submission
+        ));
+    }
     let moved: Vec<String> = checks.iter().flat_map(Checked::moved).collect();
     if let (true, Some(reason)) = (arguments.update, &arguments.reason) {
         if moved.is_empty() && checks.iter().all(|check| check.notes.is_empty()) {
@@ -318,13 +342,13 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
                 path.display()
             ));
         } else {
-            let mut history = baseline.history;
+            let mut history = baseline.history.clone();
             history.push(Change {
                 reason: reason.clone(),
-                from_version: baseline.version,
+                from_version: baseline.version.clone(),
                 moved,
             });
-            Baseline::new(source, history, submissions).replace(path)?;
+            Baseline::new(source, history, submissions).replace(path, &baseline)?;
             tell(format_args!("updated {}", path.display()));
         }
     }

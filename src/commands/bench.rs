@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use shearq_submissions::{Registry, Submission};
 
-use crate::arguments::{Form, Threads};
+use crate::arguments::{Form, Threads, given_once};
 use crate::print;
 use shearq_render::page::Page;
 use shearq_render::table::Table;
@@ -36,6 +36,7 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    given_once(&arguments.submission)?;
     let registry = Registry::embedded()?;
     let submissions = arguments
         .submission

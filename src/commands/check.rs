@@ -1,26 +1,27 @@
 //! `shearq check`.
 
-use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::Grid;
 
 use crate::{Findings, count, print};
-use shearq_files::open::is_there;
-use shearq_pipeline::data::layout::{DataFolder, Layout, MAX_IMAGE, MAX_SET, read_truth_rows};
+use shearq_files::table::MAX_ROWS;
+use shearq_pipeline::data::layout::{DataFolder, Layout, MAX_IMAGE, read_truth_rows};
 use shearq_pipeline::grid;
-use shearq_results::submit::check::{Expected, Severity, check};
+use shearq_pipeline::truth::grid_of_set;
+use shearq_results::submit::check::{Expected, Finding, Severity, check};
 
-/// Validate a submission before it is sent: one line per finding.
+/// Validate a submission before it is sent: one line per problem, with the number of files that have it.
 ///
 /// PATH is a catalogue, a power-spectrum file, or a folder or archive (.tar.gz) of either, in the
 /// challenge's formats (catalogues may also be CSV, FITS or Parquet with columns x, y, e1, e2). Checked:
 /// the manifest's checksums, if there is one; readability,
 /// names, completeness against the grid, duplicates, rows outside or in excess, positions off the
-/// cells' centres, NaN, |e| > 1, constant values, missing images, bins, multipoles; and, with --data,
-/// sign and axis conventions, type of ellipticity and unit of power against the true shear.
+/// cells' centres, NaN, |e| > 1, constant values, copies, missing images, bins, multipoles; and, with --data,
+/// sign and axis conventions, order of rows, type of ellipticity, bias and unit of power against the true shear.
 ///
 /// Exit code 0: no errors (perhaps warnings); 1: errors were found.
 #[derive(Debug, Args)]
@@ -54,22 +55,30 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         json,
     } = arguments;
     let data = data.as_ref().map(DataFolder::open).transpose()?;
-    let sets: Vec<u32> = data.as_ref().map_or_else(Vec::new, |data| {
-        (1..=MAX_SET)
-            .filter(|set| is_there(&data.truth(*set)))
-            .collect()
-    });
+    let sets = data
+        .as_ref()
+        .map_or_else(|| Ok(Vec::new()), DataFolder::sets_with_truth)?;
+    // Without a truth, the images of the data have the grid.
+    let first = match (&data, sets.first()) {
+        (Some(data), None) => data.images(&[])?.sets().first().copied(),
+        (_, first) => first.copied(),
+    };
     let mut side = *grid;
-    if let (None, Some(data), Some(&set)) = (side, &data, sets.first()) {
-        let rows = read_truth_rows(&data.truth(set))?.len();
-        side = Some(grid::side(&data.truth(set), rows)?);
+    if let (None, Some(data), Some(set)) = (side, &data, first) {
+        side = Some(match sets.is_empty() {
+            true => grid_of_set(data, set)?.n,
+            false => {
+                let rows = read_truth_rows(&data.truth(set), MAX_ROWS)?.len();
+                grid::side(&data.truth(set), rows)?
+            }
+        });
     }
     let layout = data
         .as_ref()
         .map_or_else(Layout::default, |data| data.layout().clone());
-    let stamp = match (*stamp, &data, sets.first()) {
+    let stamp = match (*stamp, &data, first) {
         (Some(given), ..) => given,
-        (None, Some(data), Some(&set)) => grid::stamp_of_set(data, set)? as f64,
+        (None, Some(data), Some(set)) => grid::stamp_of_set(data, set)? as f64,
         _ => layout.stamp as f64,
     };
     let grid = Grid::new(
@@ -96,13 +105,17 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if *json {
         print(&(serde_json::to_string_pretty(&findings)? + "\n"))?;
     } else {
-        for finding in &findings {
+        for (finding, files) in problems(&findings) {
             let severity = match finding.severity {
                 Severity::Error => "error",
                 Severity::Warning => "warning",
             };
+            let others = match files {
+                1 => String::new(),
+                _ => format!(" ({files} files; this is the first)"),
+            };
             print(&format!(
-                "{}: {severity} [{}]: {}\n",
+                "{}: {severity} [{}]: {}{others}\n",
                 finding.path.display(),
                 finding.check,
                 finding.message
@@ -122,4 +135,22 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         return Err(Findings.into());
     }
     Ok(())
+}
+
+/// The first finding of each problem, in order, and the number of files that have it.
+fn problems(findings: &[Finding]) -> Vec<(&Finding, usize)> {
+    let mut problems: Vec<(&Finding, BTreeSet<&Path>)> = Vec::new();
+    for finding in findings {
+        let same = |(first, _): &&mut (&Finding, BTreeSet<&Path>)| {
+            first.check == finding.check && first.severity == finding.severity
+        };
+        match problems.iter_mut().find(same) {
+            Some((_, files)) => _ = files.insert(&finding.path),
+            None => problems.push((finding, BTreeSet::from([finding.path.as_path()]))),
+        }
+    }
+    problems
+        .into_iter()
+        .map(|(finding, files)| (finding, files.len()))
+        .collect()
 }

@@ -11,12 +11,15 @@ use crate::{print_heat_map, score};
 use shearq_pipeline::data::run::Run;
 use shearq_render::figure::{Figure, HeatMap};
 use shearq_render::table::{Table, TableFormat};
-use shearq_results::compare::{by_name, score_all};
+use shearq_results::compare::{Variant, by_name, chosen, score_all};
 use shearq_results::conditions::Conditions;
 use shearq_results::groups::{Group, Grouping, Order};
+use shearq_results::row::RunRecord;
 use shearq_results::store;
 use shearq_results::views::comparison::{compare, compare_runs, q_heat_map};
 use shearq_results::views::pages;
+use shearq_results::views::scores::notes;
+use shearq_results::views::verdict::verdict;
 
 /// Put measured submissions side by side, beside the published figures, or past runs of a store.
 ///
@@ -40,15 +43,15 @@ pub(crate) struct Arguments {
     /// Results store whose runs to compare, instead of folders.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["measured", "data", "foreign", "definition", "convention", "threads"])]
     store: Option<PathBuf>,
-    /// Rows of the store to look at: conditions on its columns that all must hold, as in
+    /// Sets to compare: conditions on the columns of a results store that all must hold, as in
     /// `snr=low,submission=23/*,q>50`, with = != < <= > >= and `*` for any characters.
-    #[arg(long = "where", value_name = "CONDITIONS", requires = "store")]
+    #[arg(long = "where", value_name = "CONDITIONS")]
     conditions: Option<Conditions>,
-    /// Figure or column to sort by, as in `q:desc`.
-    #[arg(long, value_name = "FIELD[:desc]", requires = "store")]
+    /// Metric or column to sort by, as in `q:desc`.
+    #[arg(long, value_name = "FIELD[:desc]")]
     sort: Option<Order>,
     /// Means over groups of sets instead of all sets of a run.
-    #[arg(long, value_parser = named::<Grouping>(), requires = "store")]
+    #[arg(long, value_parser = named::<Grouping>())]
     group_by: Option<Grouping>,
     /// Draw Q per run and set as PNG or SVG, by the file's ending.
     #[arg(long, value_name = "FILE")]
@@ -74,8 +77,15 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 arguments.settings.way(),
                 arguments.threads.number(),
             )?;
-            let table = compare(&variants, arguments.settings.definition());
-            (table, q_heat_map(&by_name(&variants)))
+            let variants = chosen(
+                variants,
+                arguments.conditions.as_ref(),
+                arguments.sort.as_ref(),
+            )?;
+            (
+                folders(arguments, &variants)?,
+                q_heat_map(&by_name(&variants)),
+            )
         }
     };
     arguments.printing.print(&table)?;
@@ -103,6 +113,27 @@ fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
     let paths = paths.chain(&arguments.data);
     made_by.extend(paths.map(|path| ("Input".to_owned(), path.display().to_string())));
     Ok(made_by)
+}
+
+/// The comparison of folders, or of groups of their sets.
+fn folders(arguments: &Arguments, variants: &[Variant]) -> anyhow::Result<Table> {
+    if arguments.group_by.is_none() {
+        return Ok(compare(variants, arguments.settings.definition()));
+    }
+    let runs: Vec<RunRecord> = variants.iter().map(|variant| variant.run.clone()).collect();
+    let groups = Group::of(&runs, arguments.group_by, arguments.sort.as_ref())?;
+    let mut table = compare_runs(&runs, &groups, arguments.group_by);
+    table.title = "Comparison of submissions".into();
+    for variant in variants {
+        for line in notes(&variant.sets).iter().chain(&variant.unscored) {
+            let line = format!("{}: {line}", variant.name);
+            if !table.notes.contains(&line) {
+                table.notes.push(line);
+            }
+        }
+    }
+    table.notes.extend(verdict(&by_name(variants)));
+    Ok(table)
 }
 
 /// The comparison of a store's runs.

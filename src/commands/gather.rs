@@ -6,7 +6,7 @@ use clap::Args;
 
 use crate::{count, tell};
 use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE, MAX_SET};
-use shearq_pipeline::gather::{Content, Files, Gathered, Gathering, Stamps, gather};
+use shearq_pipeline::gather::{Content, Files, Gathered, Gathering, Stamps, Table, gather};
 use shearq_pipeline::images::ImageId;
 
 /// Gather stamps of your own into a data folder that `measure` takes.
@@ -36,21 +36,34 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
     /// Table of the galaxies' positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the
-    /// first is at 1).
-    #[arg(long, value_name = "FILE", requires = "exposure")]
+    /// first is at 1). `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file.
+    #[arg(
+        long,
+        value_name = "FILE",
+        requires = "exposure",
+        conflicts_with = "stamps"
+    )]
     positions: Option<PathBuf>,
-    /// Columns of the positions.
+    /// Table of the positions in a FITS file: its name (EXTNAME), or its number from 1 [default: the one that has the
+    /// columns].
+    #[arg(long, value_name = "NAME|NUMBER", requires = "positions")]
+    table: Option<String>,
+    /// Number of the first pixel's centre in the positions: 1 for FITS and SExtractor, 0 for NumPy and sep.
+    #[arg(long, value_name = "0|1", default_value_t = 1, value_parser = clap::value_parser!(u8).range(0..=1), requires = "exposure", conflicts_with = "stamps")]
+    first_pixel: u8,
+    /// Columns of the positions: names, or numbers from 1 if the table has no names [default: x and y, or the names of
+    /// SExtractor such as X_IMAGE and Y_IMAGE, or the two columns of a table without names].
     #[arg(
         long,
         value_name = "X,Y",
         value_delimiter = ',',
         num_args = 1,
-        default_value = "x,y",
-        requires = "exposure"
+        requires = "positions",
+        conflicts_with = "stamps"
     )]
-    columns: Vec<String>,
+    columns: Option<Vec<String>>,
     /// Pixels a side of a stamp that is cut out.
-    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure")]
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure", conflicts_with = "stamps")]
     size: u16,
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv).
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
@@ -80,6 +93,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         mask,
         mask_extension,
         positions,
+        table,
+        first_pixel,
         columns,
         size,
         psf,
@@ -111,18 +126,26 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         extension: psf_extension.as_deref(),
         content: Content::Psf,
     };
-    let stamps = match (exposure, positions, columns.as_slice()) {
-        (Some(_), Some(positions), [x, y]) => Stamps::Cutouts {
-            exposure: images,
-            positions,
-            columns: [x, y],
-            side: usize::from(*size),
-        },
-        (Some(_), ..) => anyhow::bail!(
-            "--columns is `{}`; expected the names of two columns, as in `x,y`",
+    let columns = match columns.as_deref() {
+        None => None,
+        Some([x, y]) if !x.is_empty() && !y.is_empty() => Some([x.as_str(), y.as_str()]),
+        Some(columns) => anyhow::bail!(
+            "--columns is `{}`; expected two columns, as in `x,y` or `2,3`",
             columns.join(",")
         ),
-        (None, ..) => Stamps::Files(images),
+    };
+    let stamps = match positions {
+        Some(path) => Stamps::Cutouts {
+            exposure: images,
+            positions: Table {
+                path,
+                table: table.as_deref(),
+                columns,
+            },
+            first_pixel: *first_pixel,
+            side: usize::from(*size),
+        },
+        None => Stamps::Files(images),
     };
     let gathering = Gathering {
         stamps,

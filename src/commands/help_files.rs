@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, CommandFactory};
+use clap::{Args, Command, CommandFactory};
 use clap_complete::Shell;
 
 use crate::{Cli, tell, write};
@@ -31,14 +31,11 @@ pub(crate) fn completions(arguments: &Completions) -> anyhow::Result<()> {
 }
 
 pub(crate) fn manual(arguments: &Manual) -> anyhow::Result<()> {
-    let mut cli = Cli::command();
+    // `--help` does the same, and has no page.
+    let mut cli = Cli::command().disable_help_subcommand(true);
     cli.build();
-    let mut pages = vec![("shearq.1".to_owned(), cli.clone())];
-    for command in cli.get_subcommands() {
-        let name = format!("shearq-{}", command.get_name());
-        // A page is found by the name of its command.
-        pages.push((format!("{name}.1"), command.clone().name(name)));
-    }
+    let mut pages = Vec::new();
+    add_pages("shearq", &cli, &mut pages);
     for (file, command) in &pages {
         let mut page = Vec::new();
         clap_mangen::Man::new(command.clone()).render(&mut page)?;
@@ -50,4 +47,17 @@ pub(crate) fn manual(arguments: &Manual) -> anyhow::Result<()> {
         arguments.out.display()
     ));
     Ok(())
+}
+
+/// The page of a command and those of its subcommands, to which it refers, each by the name of its file.
+fn add_pages(name: &str, command: &Command, pages: &mut Vec<(String, Command)>) {
+    // A page is found by the name of its command.
+    pages.push((format!("{name}.1"), command.clone().name(name.to_owned())));
+    for subcommand in command.get_subcommands() {
+        add_pages(
+            &format!("{name}-{}", subcommand.get_name()),
+            subcommand,
+            pages,
+        );
+    }
 }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::arguments::{Form, SetList, Threads};
+use crate::tell;
 use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::inputs;
 use shearq_results::mean::mean_shears;
@@ -49,6 +50,19 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         inputs::verify(data, measured, &run, sets, threads.number())?;
     }
     let means = mean_shears(&run, measured, sets)?;
+    for mean in &means {
+        let set = mean.set;
+        if let Some(flagged) = mean.mostly_flagged() {
+            anyhow::ensure!(mean.galaxies > 0, "set {set:02}: {flagged}");
+            tell(format_args!("warning: set {set:02}: {flagged}"));
+        }
+        if mean.is_constant() {
+            tell(format_args!(
+                "warning: set {set:02}: all {} galaxies have the same ellipticity (found a scatter of 0, expected noise), so the error is meaningless. Try: check the stamps for copies",
+                mean.galaxies
+            ));
+        }
+    }
     let name = measured.display().to_string();
     let mut table = mean_table(&means, &run.submission, &name);
     if let Some(data) = &data {

@@ -3,17 +3,17 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use crate::choices::named;
 use clap::Args;
-use shearq_measure::Flag;
+use shearq_measure::{Flag, Warning};
 use shearq_submissions::Registry;
 
 use crate::arguments::{SetList, Sharding, Threads};
-use crate::choices::named;
 use crate::progress::{Bar, goes_on};
-use crate::{count, tell};
+use crate::{count, tell, tell_unread};
 use shearq_files::table::FileFormat;
 use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::data::run::{Run, Source, open_data};
 use shearq_pipeline::images::{self, ImageId};
 use shearq_pipeline::measure::{Summary, galaxies_to_do, measure_folder};
 
@@ -57,8 +57,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
     } = arguments;
     let submission = Registry::embedded()?.get(submission)?.submission;
-    let data = DataFolder::open(data)?;
+    let data = open_data(data)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
+    let images = sharding.part(&images::of_folder(&data, sets)?);
+    tell_unread(&data.images(sets)?);
     measure(
         &Run::new(
             Source::folder(&data, out)?,
@@ -67,7 +69,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ),
         &data,
         out,
-        &sharding.part(&images::of_folder(&data, sets)?),
+        &images,
         threads.number(),
     )
 }
@@ -85,7 +87,29 @@ pub(super) fn measure(
     let summary = measure_folder(run, data, out, images, threads, &mut bar)?;
     drop(bar);
     report(run, &summary, start.elapsed(), threads, out);
-    Ok(())
+    measured_any(&summary)
+}
+
+/// Refuses results without a single galaxy that could be measured.
+pub(super) fn measured_any(summary: &Summary) -> anyhow::Result<()> {
+    if summary.galaxies == 0 || summary.flagged < summary.galaxies {
+        return Ok(());
+    }
+    let with = |flag: Flag| {
+        let mut counts = summary.flags.iter().zip(Flag::ALL);
+        counts
+            .find(|(_, other)| *other == flag)
+            .map_or(0, |(count, _)| *count as usize)
+    };
+    all_flagged(with, summary.galaxies as usize)
+}
+
+/// The error if all of `galaxies` are flagged, numbers of them `with` each flag.
+pub(super) fn all_flagged(with: impl Fn(Flag) -> usize, galaxies: usize) -> anyhow::Result<()> {
+    match Warning::of_counts(with, galaxies, galaxies) {
+        Some(warning) => anyhow::bail!("no galaxy could be measured: {warning}"),
+        None => Ok(()),
+    }
 }
 
 /// Says on standard error what was done and how fast.

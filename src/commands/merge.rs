@@ -7,11 +7,11 @@ use clap::Args;
 
 use crate::arguments::{SetList, Threads};
 use crate::progress::{Bar, goes_on};
-use crate::{Findings, count, print, run, tell};
+use crate::{Findings, count, print, run, tell, tell_unread};
 use shearq_files::open::is_there;
 use shearq_pipeline::complete::{Fault, Results};
 use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE};
-use shearq_pipeline::data::run::{RUN_FILE, Run, Source, claim, read_record};
+use shearq_pipeline::data::run::{RUN_FILE, Run, Source, check_folder, claim, read_record};
 use shearq_pipeline::images::{self, ImageId, Shard};
 use shearq_pipeline::simulate::{SIMULATION_FILE, SimulationRecord};
 
@@ -50,6 +50,10 @@ pub(crate) struct Arguments {
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     goes_on();
     let out = &arguments.out;
+    check_folder(
+        out,
+        "a folder that `run`, `measure` or `simulate` wrote with --shard",
+    )?;
     if let Some(run) = Run::read(out)? {
         return merge_run(arguments, &run);
     }
@@ -82,7 +86,9 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
                 "--images is for simulated data; here every image of {} is expected",
                 run.source
             );
-            images::of_folder(&data, sets)?
+            let images = images::of_folder(&data, sets)?;
+            tell_unread(&data.images(sets)?);
+            images
         }
     };
     let results = Results::Catalogues {

@@ -2,14 +2,13 @@
 
 use std::path::PathBuf;
 
+use crate::choices::named;
 use clap::Args;
 use shearq_submissions::is_control;
 
-use crate::choices::named;
 use crate::progress::Bar;
 use crate::{count, tell};
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::Run;
+use shearq_pipeline::data::run::{Run, open_data};
 use shearq_results::foreign::Foreign;
 use shearq_results::submit::archive::is_archive;
 use shearq_results::submit::manifest::Contents;
@@ -40,7 +39,12 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE", conflicts_with = "measured")]
     foreign: Option<PathBuf>,
     /// Data folder that they were measured from, which gives the grid of spectra.
-    #[arg(long, value_name = "DIR", requires = "foreign")]
+    #[arg(
+        long,
+        value_name = "DIR",
+        requires = "foreign",
+        conflicts_with = "measured"
+    )]
     data: Option<PathBuf>,
     /// New folder to write to, or an archive ending in .tar.gz or .tgz.
     #[arg(long, value_name = "PATH")]
@@ -70,7 +74,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     );
     let run = measured.as_deref().map(Run::require).transpose()?;
     let foreign = foreign.as_deref().map(Foreign::read).transpose()?;
-    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let data = data.as_deref().map(open_data).transpose()?;
     let (origin, name) = match (measured, &run, &foreign) {
         (Some(folder), Some(run), _) => (Origin::Measured { folder, run }, &run.submission.name),
         (_, _, Some(foreign)) => {

@@ -6,7 +6,7 @@ use anyhow::bail;
 use clap::Args;
 use shearq_submissions::{Published, Registry, Submission};
 
-use crate::arguments::{SetList, Threads};
+use crate::arguments::{SetList, Threads, given_once};
 use crate::progress::{Bar, goes_on};
 use crate::{print, print_table, tell};
 use shearq_pipeline::data::layout::MAX_IMAGE;
@@ -31,7 +31,7 @@ pub(crate) struct Arguments {
     /// Folder to write to.
     #[arg(long, value_name = "DIR", default_value = "shearq-reproduce")]
     out: PathBuf,
-    /// Images per set.
+    /// Images per set, at least 2: the noise of spectra is measured between images.
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(2..=i64::from(MAX_IMAGE)))]
     images: u32,
     /// Galaxies a side of an image.
@@ -66,6 +66,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
     } = arguments;
     let threads = threads.number();
+    given_once(submission)?;
     let sets = sets.simulated()?;
     let registry = Registry::embedded()?;
     let submissions = of_table_one(&registry, submission)?;

@@ -2,18 +2,18 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::choices::named;
 use clap::Args;
 use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
 use crate::arguments::{ReportFile, SetList, Sharding, SimulationArguments, Threads};
-use crate::choices::named;
 use crate::progress::{Bar, goes_on};
-use crate::{measure, print_table, score, tell};
+use crate::{measure, print_table, score, tell, tell_unread};
 use shearq_files::atomic;
 use shearq_files::table::FileFormat;
-use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE};
-use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::data::run::{Run, Source, open_data};
 use shearq_pipeline::images;
 use shearq_pipeline::run::run_folder;
 use shearq_render::table::{Table, TableFormat};
@@ -21,7 +21,7 @@ use shearq_results::row::Measured;
 use shearq_results::score::{OWN, ScoredSet, score_folder};
 use shearq_results::store;
 use shearq_results::views::pages;
-use shearq_results::views::scores::{bandpowers, per_set};
+use shearq_results::views::scores::{bandpowers, per_set, verdict_line};
 
 /// Measure and score in one go, on a data folder or on sets that are simulated on the way.
 ///
@@ -82,16 +82,19 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         sharding,
         threads,
     } = arguments;
-    if let Some(store) = store {
-        store::prepare(store)?;
-    }
+    anyhow::ensure!(
+        sharding.shard.is_none() || (store.is_none() && !report.is_wanted()),
+        "--shard: a part of a run is not scored, so that --store and --report have nothing to write. Try: shearq score --measured {} --store DIR, after `shearq merge`",
+        out.display()
+    );
+    let _prepared = store.as_deref().map(store::prepare).transpose()?;
     let threads = threads.number();
     let wanted = match sets {
         None => &[],
         Some(list) if data.is_none() => list.simulated()?,
         Some(list) => &list.0[..],
     };
-    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let data = data.as_deref().map(open_data).transpose()?;
     let source = match &data {
         Some(data) => {
             simulation.must_be_unused()?;
@@ -110,9 +113,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             let summary = run_folder(&run, *settings, &images, out, threads, &mut bar)?;
             drop(bar);
             measure::report(&run, &summary, start.elapsed(), threads, out);
+            measure::measured_any(&summary)?;
         }
         (Source::Folder { .. }, Some(data)) => {
             let images = sharding.part(&images::of_folder(data, wanted)?);
+            tell_unread(&data.images(wanted)?);
             measure::measure(&run, data, out, &images, threads)?;
         }
         (Source::Folder { .. }, None) => {}
@@ -162,7 +167,9 @@ pub(super) fn score(
         score::record(store, made, &scored, options)?;
     }
     let title = format!("Scores of {}", run.submission.name);
-    let table = per_set(&scored, &title, options.definition);
+    let mut table = per_set(&scored, &title, options.definition);
+    let verdict = verdict_line(&run.submission.name, &scored);
+    table.notes.extend(verdict);
     for (name, table) in [("scores", &table), ("bandpowers", &bandpowers(&scored))] {
         let text = table.render(TableFormat::Csv);
         atomic::write(out.join(format!("{name}.csv")), text.as_bytes())?;

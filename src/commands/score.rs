@@ -6,16 +6,18 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use clap::{ArgGroup, Args, ValueEnum};
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore, TrueShear, TruthSign};
+use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore, TruthSign};
+use shearq_submissions::EllipticityType;
 
 use crate::arguments::{Printing, ReportFile, ScoreSettings, SetList, Threads, positive};
-use crate::{print, tell};
+use crate::{print, tell, tell_unread};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::run::{Run, Source};
-use shearq_pipeline::truth::{Reading, read_truth, reading_of};
+use shearq_pipeline::simulate::kind_of;
+use shearq_pipeline::truth::{ReadTruth, Reading, read_truth, reading_of};
 use shearq_render::table::TableFormat;
-use shearq_results::foreign::{Foreign, Screen, plain_columns};
+use shearq_results::foreign::{Foreign, Screen, folder_of, plain_columns};
 use shearq_results::row::{Measured, RunRecord};
 use shearq_results::score::{
     COLUMNS, ReadImage, ScoredSet, own_catalogue, score_files, score_folder, score_sets, unscored,
@@ -24,8 +26,9 @@ use shearq_results::store;
 use shearq_results::submit::challenge::{Kind, read_bandpowers};
 use shearq_results::submit::manifest::Manifest;
 use shearq_results::submit::packed::{Packed, Sent, Submission};
-use shearq_results::views::pages;
-use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
+use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra, verdict_line};
+use shearq_results::{views::diagnosis, views::pages};
+use shearq_simulate::kinds::SetKind;
 
 /// Score ellipticities against the true shear: Q, Q_dn, M/2, √A.
 ///
@@ -47,18 +50,18 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// Catalogues of that set, one per image.
-    #[arg(value_name = "CATALOGUE", requires = "truth")]
+    #[arg(value_name = "CATALOGUE", requires = "truth", conflicts_with_all = ["data", "sets", "store"])]
     catalogues: Vec<PathBuf>,
     /// Catalogues of another program, described in a TOML file (docs/formats.md), instead of
     /// --measured.
-    #[arg(long, value_name = "FILE", requires = "data")]
+    #[arg(long, value_name = "FILE", requires = "data", conflicts_with = "truth")]
     foreign: Option<PathBuf>,
     /// Power-spectrum submission (`index l power`): a file with --truth, a folder of
     /// `{method}_set{set}.dat` with --data.
-    #[arg(long, value_name = "PATH", conflicts_with = "noise_var")]
+    #[arg(long, value_name = "PATH", conflicts_with_all = ["noise_var", "convention", "path"])]
     spectra: Option<PathBuf>,
     /// Packed submission, catalogues or power spectra: the folder or the archive (.tar.gz) as it is sent.
-    #[arg(long, value_name = "PATH", requires = "data")]
+    #[arg(long, value_name = "PATH", requires = "data", conflicts_with_all = ["truth", "path"])]
     packed: Option<PathBuf>,
     /// Sets to score [default: all that were measured].
     #[arg(long, value_name = "LIST", conflicts_with = "truth")]
@@ -67,39 +70,28 @@ pub(crate) struct Arguments {
     /// between images].
     #[arg(long, value_name = "V", allow_negative_numbers = true)]
     noise_var: Option<f64>,
-    /// Sign of g2 in the truth file [default: challenge for --truth, the layout's for --data].
-    #[arg(long, value_enum)]
+    /// Sign of g2 in the file given by --truth [default: the one that the file states; else the one that the
+    /// data determine; else the challenge's]. Data folders have a layout.toml for it.
+    #[arg(long, value_enum, requires = "truth", conflicts_with_all = FOLDERS)]
     truth_sign: Option<SignArgument>,
-    /// Pixels a side of a grid cell, for --truth.
-    #[arg(
-        long,
-        value_name = "PX",
-        default_value_t = 48.0,
-        allow_negative_numbers = true
-    )]
-    stamp: f64,
-    /// Side of the field in degrees, for --truth.
-    #[arg(long, value_name = "DEG", default_value_t = 10.0)]
-    field: f64,
-    /// Columns of the catalogues, for --truth.
-    #[arg(
-        long,
-        value_name = "X,Y,E1,E2",
-        default_value = "x,y,e1,e2",
-        value_delimiter = ',',
-        num_args = 1
-    )]
-    columns: Vec<String>,
+    /// Pixels a side of a grid cell, for --truth [default: 48].
+    #[arg(long, value_name = "PX", allow_negative_numbers = true, requires = "truth", conflicts_with_all = FOLDERS)]
+    stamp: Option<f64>,
+    /// Side of the field in degrees, for --truth [default: 10].
+    #[arg(long, value_name = "DEG", requires = "truth", conflicts_with_all = FOLDERS)]
+    field: Option<f64>,
+    /// Columns of the catalogues, for --truth [default: x,y,e1,e2].
+    #[arg(long, value_name = "X,Y,E1,E2", value_delimiter = ',', num_args = 1, requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    columns: Option<Vec<String>>,
+    /// Type of the ellipticities in the catalogues, for --truth. Distortions are converted to shear-type
+    /// ellipticities [default: shear].
+    #[arg(long, value_name = "TYPE", value_parser = parse_ellipticity, requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    ellipticity: Option<EllipticityType>,
     /// A value of either component that stands for "not measured", as -99; for --truth.
-    #[arg(
-        long,
-        value_name = "VALUE",
-        requires = "truth",
-        allow_negative_numbers = true
-    )]
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     missing: Option<f64>,
     /// Rows with a larger |e| have no ellipticity; for --truth [default: no limit].
-    #[arg(long, value_name = "E", requires = "truth", value_parser = positive)]
+    #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
     /// Record the scores in this results store, which `compare --store` reads.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra", "packed"])]
@@ -112,6 +104,21 @@ pub(crate) struct Arguments {
     settings: ScoreSettings,
     #[command(flatten)]
     threads: Threads,
+}
+
+/// Input that comes with a data folder, whose layout specifies the sign of g2, the stamps and the field.
+const FOLDERS: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
+/// Input other than plain catalogues.
+const NOT_PLAIN: [&str; 7] = [
+    "data", "measured", "foreign", "packed", "spectra", "sets", "store",
+];
+
+fn parse_ellipticity(text: &str) -> Result<EllipticityType, String> {
+    match text {
+        "shear" => Ok(EllipticityType::Shear),
+        "distortion" => Ok(EllipticityType::Distortion),
+        _ => Err("expected `shear` or `distortion`".into()),
+    }
 }
 
 /// Sign of g2 on the command line.
@@ -157,9 +164,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 }
 
 fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> anyhow::Result<()> {
-    if let Some(store) = &arguments.store {
-        store::prepare(store)?;
-    }
+    let store = arguments.store.as_deref();
+    let _prepared = store.map(store::prepare).transpose()?;
     let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
     let threads = arguments.threads.number();
     let (name, made_by, scored, unscored) = match (&arguments.measured, &arguments.foreign, data) {
@@ -179,6 +185,12 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             let foreign = Foreign::read(path)?;
             let read = |grid: &Grid, path: &Path| foreign.sum(grid, path);
             let files = foreign.catalogues(sets)?;
+            anyhow::ensure!(
+                !files.serve_all_sets() || !sets.is_empty(),
+                "{}: `catalogues` has no number of the set (expected {{set}}, or the sets to score). Try: --sets 1",
+                path.display()
+            );
+            tell_unread(&files);
             let catalogues = |set| files.of_set(set);
             let scored = score_sets(&data, sets, catalogues, &read, options, threads)
                 .with_context(|| path.display().to_string())?;
@@ -190,7 +202,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
                         shearq_files::open::SETTINGS,
                     )
                     .with_context(|| path.display().to_string())?,
-                    source: &Source::folder(&data, path.parent().unwrap_or(path))?,
+                    source: &Source::folder(&data, folder_of(path))?,
                     data: &data,
                 };
                 record_printable(arguments, store, made, &scored, options)?;
@@ -205,6 +217,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
     let title = format!("Scores of {name}");
     let mut table = per_set(&scored, &title, options.definition);
     table.notes.extend(unscored);
+    table.notes.extend(verdict_line(&name, &scored));
     arguments.printing.print(&table)?;
     let sections = || Ok(vec![pages::scores(&name, &scored, table)?]);
     arguments.report.save(&title, sections, || Ok(made_by))
@@ -290,14 +303,20 @@ fn packed(
     let foreign = plain_columns(COLUMNS, Screen::default());
     let read: ReadImage<'_> = if own { &own_catalogue } else { &foreign };
     let threads = arguments.threads.number();
-    let scored =
+    let mut scored =
         score_sets(data, sets, of_set, read, options, threads).map_err(|error| match error {
             PipelineError::File(error) => sent.named(error).into(),
             other => other,
         })?;
+    for set in &mut scored {
+        set.odd_images.renamed(|path| sent.as_given(path));
+    }
     let title = format!("Scores of {}", submission.method);
     let mut table = per_set(&scored, &title, options.definition);
     table.notes.extend(unscored(data, &scored, sets)?);
+    table
+        .notes
+        .extend(verdict_line(&submission.method, &scored));
     arguments.printing.print(&table)
 }
 
@@ -349,11 +368,11 @@ fn spectra_of_sets(
     }
     let mut scored = Vec::new();
     for (set, path) in &files {
-        let (grid, truth) = read_truth(&data.truth(*set), &reading_of(data, *set)?)?;
-        let score = score_spectrum(grid, truth, path, manifest, options)?;
+        let truth = read_truth(&data.truth(*set), &reading_of(data, *set)?)?;
+        let score = score_spectrum(truth, path, manifest, options)?;
         scored.push((Some(*set), score));
     }
-    print_spectra(arguments, &scored, place, options)
+    print_spectra(arguments, &scored, |set| kind_of(data, set), place, options)
 }
 
 fn spectrum_file(
@@ -362,52 +381,58 @@ fn spectrum_file(
     spectrum: &Path,
     options: Options,
 ) -> anyhow::Result<()> {
-    let (grid, shear) = read_truth(truth, &plain_reading(arguments))?;
-    let manifest = Manifest::read(spectrum.parent().unwrap_or(Path::new("")))?;
-    let score = score_spectrum(grid, shear, spectrum, manifest.as_ref(), options)?;
+    let truth = read_truth(truth, &plain_reading(arguments))?;
+    if let Some(line) = diagnosis::sign(truth.basis) {
+        tell(format_args!("{line}"));
+    }
+    let manifest = Manifest::read(folder_of(spectrum))?;
+    let score = score_spectrum(truth, spectrum, manifest.as_ref(), options)?;
     let scored = [(None, score)];
-    print_spectra(arguments, &scored, spectrum, options)
+    print_spectra(arguments, &scored, |_| None, spectrum, options)
 }
 
 fn score_spectrum(
-    grid: Grid,
-    truth: TrueShear,
+    truth: ReadTruth,
     path: &Path,
     manifest: Option<&Manifest>,
     options: Options,
 ) -> anyhow::Result<SpectrumScore> {
+    let ReadTruth { grid, shear, .. } = truth;
     let powers = read_bandpowers(path, &grid)?;
     let covariance = manifest.and_then(|manifest| {
         let name = path.file_name()?.to_str()?;
         manifest.covariances.get(name)
     });
-    Ok(SetScorer::new(grid, truth, options)?.score_spectrum(&powers, covariance)?)
+    Ok(SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?)
 }
 
 fn print_spectra(
     arguments: &Arguments,
     scored: &[(Option<u32>, SpectrumScore)],
+    kind_of: impl Fn(u32) -> Option<SetKind>,
     path: &Path,
     options: Options,
 ) -> anyhow::Result<()> {
     let title = format!("Scores of the power spectra of {}", path.display());
-    let table = spectra(scored, &title, options.definition);
+    let table = spectra(scored, kind_of, &title, options.definition);
     arguments.printing.print(&table)
 }
 
 /// How the truth given by `--truth` is to be read.
 fn plain_reading(arguments: &Arguments) -> Reading {
     Reading {
-        field: Degrees(arguments.field),
-        stamp: Pixels(arguments.stamp),
-        sign: arguments
-            .truth_sign
-            .map_or(TruthSign::Challenge, Into::into),
+        field: Degrees(arguments.field.unwrap_or(10.0)),
+        stamp: Pixels(arguments.stamp.unwrap_or(48.0)),
+        sign: arguments.truth_sign.map(Into::into),
     }
 }
 
 fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Result<()> {
-    let columns: Vec<&str> = arguments.columns.iter().map(String::as_str).collect();
+    let columns = arguments.columns.as_deref();
+    let columns: Vec<&str> = columns.map_or_else(
+        || COLUMNS.to_vec(),
+        |given| given.iter().map(String::as_str).collect(),
+    );
     let columns: [&str; 4] = columns.as_slice().try_into().map_err(|_| {
         anyhow::anyhow!(
             "--columns names {} columns; expected four: x, y and the two components",
@@ -417,6 +442,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     let screen = Screen {
         missing: arguments.missing,
         max_modulus: arguments.max_modulus,
+        distortion: arguments.ellipticity == Some(EllipticityType::Distortion),
     };
     let mut seen = BTreeSet::new();
     for path in &arguments.catalogues {
@@ -435,6 +461,10 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         options,
         arguments.threads.number(),
     )?;
+    let title = format!("Scores against {}", truth.display());
+    let scored = [scored];
+    let mut table = per_set(&scored, &title, options.definition);
+    table.notes.extend(verdict_line("The catalogues", &scored));
     if arguments.printing.format() == TableFormat::Json {
         anyhow::ensure!(
             !arguments.printing.chooses(),
@@ -450,14 +480,12 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
             catalogues: arguments.catalogues.iter().map(|path| name(path)).collect(),
             definition: options.definition,
         };
-        let mut text = serde_json::to_string_pretty(&one_set_json(&scored, &input))?;
+        let mut text = serde_json::to_string_pretty(&one_set_json(&scored[0], &input))?;
         text.push('\n');
-        return print(&text);
+        print(&text)?;
+    } else {
+        arguments.printing.print(&table)?;
     }
-    let title = format!("Scores against {}", truth.display());
-    let scored = [scored];
-    let table = per_set(&scored, &title, options.definition);
-    arguments.printing.print(&table)?;
     let mut made_by = vec![("Truth".to_owned(), truth.display().to_string())];
     made_by.extend(
         arguments

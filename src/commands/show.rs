@@ -10,8 +10,8 @@ use shearq_measure::{Measurement, Measurer, Stop, strip};
 use shearq_submissions::Registry;
 
 use crate::{print, tell};
-use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::mosaic::Mosaic;
+use shearq_pipeline::data::run::open_data;
 use shearq_pipeline::images::ImageId;
 use shearq_pipeline::measure::{ImageSource, psf_of};
 use shearq_render::figure::{Figure, PictureFormat};
@@ -74,7 +74,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     } = arguments;
     PictureFormat::of(out)?;
     let submission = Registry::embedded()?.get(submission)?.submission;
-    let data = DataFolder::open(data)?;
+    let data = open_data(data)?;
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use shearq_submissions::{Registry, Submission};
 
-use crate::arguments::{Form, SetList, SimulationArguments, Threads};
+use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once};
 use crate::print;
 use crate::progress::{Bar, goes_on};
 use shearq_pipeline::data::layout::MAX_IMAGE;
@@ -33,7 +33,7 @@ pub(crate) struct Arguments {
         default_value = "2,5,8,11,14,16,18,20,22,24"
     )]
     sets: SetList,
-    /// Images per set for Q and scatter; the challenge has 200.
+    /// Images per set for Q and scatter, at least 2; the challenge has 200.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=i64::from(MAX_IMAGE)))]
     images: u32,
     /// Images per set whose galaxies are drawn eight times for the biases.
@@ -63,12 +63,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
     } = arguments;
     let sets = sets.simulated()?;
-    for (k, name) in submission.iter().enumerate() {
-        anyhow::ensure!(
-            !submission[..k].contains(name),
-            "--submission {name} is given twice"
-        );
-    }
+    given_once(submission)?;
     let registry = Registry::embedded()?;
     let submissions = submission
         .iter()

@@ -33,13 +33,13 @@ enum Command {
         name: String,
     },
     /// Write a commented configuration of your own to start from.
-    #[command(after_help = "Example:\n  shearq submissions init own.toml --method linear")]
+    #[command(after_help = "Example:\n  shearq submissions init own.toml")]
     Init {
         /// File to write; it must not exist.
         #[arg(value_name = "FILE")]
         file: PathBuf,
         /// Method whose settings it has.
-        #[arg(long, value_enum, default_value_t = Method::Network)]
+        #[arg(long, value_enum, default_value_t = Method::Linear)]
         method: Method,
     },
 }
@@ -47,10 +47,10 @@ enum Command {
 /// A method to start with.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Method {
+    /// The linear network in closed form, which is recommended.
+    Linear,
     /// The Hopfield network of the paper.
     Network,
-    /// The linear network in closed form.
-    Linear,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {

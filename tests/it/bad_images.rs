@@ -577,10 +577,14 @@ fn stars_that_cannot_be_used_are_refused_with_the_reason() {
             &["pixel (5, 10)", "not a finite number"],
         ),
         (
-            image(&|x, y| at(x + 2, y)),
-            &["(-1.9, -0.0) px off the centre", "expected at most 1 px"],
+            image(&|x, y| at(x + 20, y)),
+            &[
+                "(-20.0, ",
+                "px off the centre",
+                "expected 15 × 15 pixels around the star",
+            ],
         ),
-        (image(&|x, y| at(x, y + 39)), &["+8.5) px off the centre"]),
+        (image(&|x, y| at(x, y + 28)), &["+20.0) px off the centre"]),
         (
             fits_image(-32, &[14, 14], &[], &[0; 784]),
             &["14 pixels a side; the submission needs 15"],

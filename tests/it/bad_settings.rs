@@ -158,7 +158,7 @@ fn layouts_with_mistakes_are_refused_with_file_and_place() {
     assert!(
         small
             .fail_to_measure(&raw)
-            .contains("no galaxy images here in the layout expected")
+            .contains("expected a/{set}-{image}.fits, as in a/1-1.fits)")
     );
     let usage = shearq(&["measure", "--submission", "23/raw/star"]);
     assert_eq!(usage.status.code(), Some(2));

@@ -307,3 +307,76 @@ fn a_baseline_of_a_data_folder_has_the_images_asked_for() {
             .all(|row| row["difference"] == 0.0)
     );
 }
+
+#[test]
+fn a_check_reads_the_configuration_file_unless_it_is_to_use_what_is_stored() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let (own, folder) = (at("own.toml"), at("baselines"));
+    let write = |size: u32| {
+        let text = format!("extends = \"23/raw/star\"\n[stamp]\nsize = {size}\n");
+        fs::write(&own, text).unwrap();
+    };
+    write(23);
+    let place = ["--folder", text(&folder)];
+    let record = [
+        "baseline",
+        "record",
+        "mine",
+        "--simulate",
+        "--sets",
+        "2",
+        "--images",
+        "3",
+        "--grid",
+        "12",
+        "--submission",
+        text(&own),
+    ];
+    succeed(&[&record[..], &place].concat());
+    let check = [&["baseline", "check", "--format", "json"], &place[..]].concat();
+    succeed(&check);
+    write(19);
+    let output = shearq(&check);
+    assert_eq!(output.status.code(), Some(1));
+    let table = String::from_utf8(output.stdout).unwrap();
+    assert!(table.contains("stamp.size: 23 ≠ 19"), "{table}");
+    let table: Value = serde_json::from_str(&table).unwrap();
+    let rows = table["rows"].as_array().unwrap();
+    assert!(rows.iter().any(|row| row["moved"] == "yes"), "{rows:?}");
+    succeed(&[&check[..], &["--stored"]].concat());
+    // An update takes the file's settings, and goes on reading it.
+    succeed(&[&check[..], &["--update", "--reason", "smaller"]].concat());
+    succeed(&check);
+    fs::remove_file(&own).unwrap();
+    let message = fail(&check);
+    assert!(
+        message.contains("own.toml: the configuration file is not there any more")
+            && message.contains("--stored"),
+        "{message}"
+    );
+    succeed(&[&check[..], &["--stored"]].concat());
+}
+
+#[test]
+fn messages_of_a_check_name_the_data_as_they_were_given() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let (data, folder) = (at("data"), at("baselines"));
+    let simulate = [
+        "simulate", "--sets", "2", "--grid", "8", "--images", "2", "--out",
+    ];
+    succeed(&[&simulate[..], &[text(&data)]].concat());
+    let place = ["--folder", text(&folder), "--data", text(&data)];
+    let record = ["baseline", "record", "mine", "--submission", "23/raw/star"];
+    succeed(&[&record[..], &place].concat());
+    let image = data.join("set02/galaxies-002.fits");
+    let whole = fs::read(&image).unwrap();
+    fs::write(&image, &whole[..whole.len() / 2]).unwrap();
+    let message = fail(&[&["baseline", "check", "mine"], &place[..]].concat());
+    assert!(message.contains(text(&image)), "{message}");
+    assert!(
+        !message.contains(".part") && !message.contains(".."),
+        "{message}"
+    );
+}

@@ -194,7 +194,7 @@ fn submissions_can_be_listed_shown_and_started() {
     assert!(succeed(&["submissions", "list"]).contains("29/den/func"));
     let shown = succeed(&["submissions", "show", "23/den/star"]);
     assert!(shown.contains("q = 87.06") && shown.contains("method = \"wavelet-wiener\""));
-    succeed(&["submissions", "init", text(&own)]);
+    succeed(&["submissions", "init", text(&own), "--method", "network"]);
     let settings = |text: &str| text.split_once("[stamp]").unwrap().1.to_owned();
     let base = shearq_submissions::Registry::embedded()
         .unwrap()
@@ -205,7 +205,7 @@ fn submissions_can_be_listed_shown_and_started() {
     assert_eq!(started, base);
     assert!(fail(&["submissions", "init", text(&own)]).contains("exists"));
     let linear = root.path().join("linear.toml");
-    succeed(&["submissions", "init", text(&linear), "--method", "linear"]);
+    succeed(&["submissions", "init", text(&linear)]);
     let started = settings(&succeed(&["submissions", "show", text(&linear)]));
     assert!(started.contains("target_sigma = 1.5") && !started.contains("unit_divisor"));
     let named = settings(&succeed(&["submissions", "show", "48/linear/star"]));

@@ -257,7 +257,7 @@ fn submissions_are_compared_in_conventions_that_are_known_or_not_at_all() {
     let other = foreign(folder.path(), &small, |k, _, _| (noise(k), noise(k + 77)));
     let unknown = compare(&small, &other);
     assert!(
-        notes(&unknown).contains("the data do not tell the convention"),
+        notes(&unknown).contains("cannot determine the sign and axis convention"),
         "{unknown}"
     );
     assert!(unknown["rows"][1]["sigma"].is_null(), "{unknown}");

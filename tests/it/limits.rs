@@ -160,7 +160,7 @@ fn footers_of_parquet_files_are_bounded() {
     let frame = df!("x" => [1.0]).unwrap();
     let metadata = Metadata::from([("a".to_owned(), "x".repeat(1 << 24))]);
     write_parquet(fs::File::create(&path).unwrap(), &frame, &metadata).unwrap();
-    let error = read_parquet(&path, None).unwrap_err().to_string();
+    let error = read_parquet(&path, None, 1).unwrap_err().to_string();
     has(&error, &["long.parquet", "expected at most 16777216"]);
 }
 

@@ -66,8 +66,12 @@ fn archives_are_reproducible_and_unpack_to_the_folder_that_is_packed() {
         assert!(fail(&arguments).contains("exists already"));
     }
     let (measured, sent) = (packed.at("out"), packed.at("sent"));
-    let again = ["pack", "--measured", text(&measured), "--out", text(&sent)];
-    assert!(fail(&again).contains("exists already"));
+    let before = fs::read(&one).unwrap();
+    for there in [&sent, &one] {
+        let again = ["pack", "--measured", text(&measured), "--out", text(there)];
+        assert!(fail(&again).contains("exists already; expected a new"));
+    }
+    assert_eq!(fs::read(&one).unwrap(), before);
 }
 
 /// What `score` prints of a submission or catalogues, as numbers by name.
@@ -135,7 +139,7 @@ fn a_submission_is_scored_as_it_is_sent() {
         ("NN_set8.dat", "catalogues and spectra; expected one kind"),
         ("g10_v1_objs_8_2.MM.dat", "several methods: MM, NN"),
         (
-            "g10_v1_objs_100_2.NN.dat",
+            "g10_v1_objs_10000_2.NN.dat",
             "the name is neither g10_v1_objs_",
         ),
     ] {
@@ -386,4 +390,22 @@ fn archives_that_are_not_what_was_packed_are_refused_and_leave_nothing() {
     archive(&path, &bare);
     assert!(fail(&["unpack", text(&path), "--verify"]).contains("no manifest.json"));
     succeed(&["unpack", text(&path), "--out", text(&packed.at("bare"))]);
+}
+
+#[test]
+fn an_archive_of_too_many_files_is_refused_before_it_is_unpacked() {
+    let root = tempfile::tempdir().unwrap();
+    let (path, out) = (root.path().join("many.tar.gz"), root.path().join("out"));
+    let names: Vec<String> = (0..300_000).map(|k| format!("{k}")).collect();
+    let files: Vec<(&str, &[u8])> = names.iter().map(|name| (name.as_str(), &b""[..])).collect();
+    archive(&path, &files);
+    let start = std::time::Instant::now();
+    let message = fail(&["unpack", text(&path), "--out", text(&out)]);
+    assert!(
+        message.contains("many.tar.gz: it holds more than"),
+        "{message}"
+    );
+    // Making so many files takes longer.
+    assert!(start.elapsed().as_secs() < 20, "{:?}", start.elapsed());
+    assert_eq!(contents(root.path()).len(), 1);
 }

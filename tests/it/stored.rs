@@ -54,6 +54,9 @@ impl Recorded {
 }
 
 fn files(store: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    if !store.exists() {
+        return Vec::new();
+    }
     let mut files: Vec<_> = fs::read_dir(store)
         .unwrap()
         .map(|entry| entry.unwrap().path())
@@ -207,4 +210,32 @@ fn figures_are_chosen_beside_what_names_a_row_and_unknown_ones_refused_before_an
     );
     assert!(message.contains("q_dn"), "{message}");
     assert!(files(&new).is_empty());
+}
+
+#[test]
+fn numbers_that_no_catalogues_have_are_refused() {
+    use shearq_files::frames::polars::Column;
+
+    let recorded = Recorded::new();
+    let path = files(&recorded.at("store"))[0].0.clone();
+    let metadata = shearq_files::frames::parquet_metadata(&path).unwrap();
+    for (column, most) in [
+        ("images", "at most 3"),
+        ("galaxies", "at most"),
+        ("flagged", "at most"),
+    ] {
+        let mut table = shearq_files::frames::read_parquet(&path, None, 1_000).unwrap();
+        let values = vec![1_i64 << 62; table.height()];
+        table
+            .with_column(Column::new(column.into(), values))
+            .unwrap();
+        let other = recorded.at("other");
+        let _ = fs::remove_dir_all(&other);
+        fs::create_dir(&other).unwrap();
+        let file = fs::File::create(other.join("edited.parquet")).unwrap();
+        shearq_files::frames::write_parquet(file, &table, &metadata).unwrap();
+        let message = fail(&["compare", "--store", text(&other)]);
+        let expected = format!("row 1: column `{column}` is 4611686018427387904; expected {most}");
+        assert!(message.contains(&expected), "{message}");
+    }
 }

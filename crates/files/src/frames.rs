@@ -18,7 +18,7 @@
 //! # let path = folder.path().join("shear.parquet");
 //! write_parquet(std::fs::File::create(&path)?, &galaxies, &metadata)?;
 //!
-//! let shear = read_parquet(&path, Some(&["g1"]))?;
+//! let shear = read_parquet(&path, Some(&["g1"]), 1_000)?;
 //! assert_eq!(shear.height(), 2);
 //! assert_eq!(reals(shear.column("g1")?).unwrap()[0], 0.02);
 //! assert_eq!(parquet_metadata(&path)?["branch"], "constant");

@@ -11,6 +11,6 @@ pub mod frames;
 pub mod open;
 pub mod parquet;
 pub mod table;
-mod text;
+pub mod text;
 
 pub use error::{FileError, names_of};

@@ -8,9 +8,14 @@ use crate::frames::{self as tables, Metadata};
 use crate::atomic;
 use crate::error::FileError;
 
-/// Reads columns of numbers: those of `wanted`, or all there are.
-pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<DataFrame, FileError> {
-    let mut table = tables::read_parquet(path, wanted).map_err(|error| bare(path, &error))?;
+/// Reads columns of numbers, at most `most_rows` of each: those of `wanted`, or all there are.
+pub(super) fn read(
+    path: &Path,
+    wanted: Option<&[&str]>,
+    most_rows: usize,
+) -> Result<DataFrame, FileError> {
+    let mut table =
+        tables::read_parquet(path, wanted, most_rows).map_err(|error| bare(path, &error))?;
     let texts: Vec<String> = table
         .columns()
         .iter()
@@ -23,6 +28,11 @@ pub(super) fn read(path: &Path, wanted: Option<&[&str]>) -> Result<DataFrame, Fi
     }
     table = table.drop_many(texts);
     Ok(table)
+}
+
+/// The names of the columns.
+pub(super) fn columns(path: &Path) -> Result<Vec<String>, FileError> {
+    tables::parquet_columns(path).map_err(|error| bare(path, &error))
 }
 
 /// The metadata in the footer.

@@ -4,15 +4,20 @@
 //! |---|---|
 //! | `.fits`, `.fit`, these with `.gz`, `.fits.fz` | FITS binary table |
 //! | `.parquet`, `.pq` | Parquet |
-//! | anything else (`.csv`, `.dat`, `.txt`, `.cat`, `.csv.gz`) | text, plain or compressed by gzip: numbers between commas, semicolons, tabs or blanks, as the content has them; columns `x y e1 e2` unless a header names them |
+//! | anything else that starts like a FITS file (`.cat`, `.ldac`) | FITS binary table |
+//! | anything else (`.csv`, `.dat`, `.txt`, `.cat`, `.csv.gz`) | text, plain or compressed by gzip: numbers between commas, semicolons, tabs or blanks, as the content has them; columns `x y e1 e2` unless a header or the comments of SExtractor name them |
+//!
+//! `FILE[TABLE]` is a table of a FITS file, by name or number.
 
 use std::borrow::Cow;
-use std::path::Path;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 
 use crate::frames::polars::DataFrame;
 use crate::frames::{Metadata, reals};
 
 use crate::error::FileError;
+use crate::open::{is_there, open};
 use crate::{fits, parquet, text};
 
 /// A column of numbers of the table of `path`; missing ones are NaN.
@@ -70,7 +75,18 @@ impl Ending {
         } else if ends(&[".fits", ".fit", ".fits.gz", ".fit.gz", ".fits.fz"]) {
             Ending::Fits
         } else {
-            Ending::Text
+            Ending::of_content(path)
+        }
+    }
+
+    /// What a file is by its first bytes: SExtractor writes FITS into `.cat` and `.ldac`. One that cannot be opened is
+    /// reported when it is read.
+    fn of_content(path: &Path) -> Self {
+        let mut start = [0; 9];
+        let read = open(path).and_then(|mut file| file.read_exact(&mut start));
+        match read {
+            Ok(()) if start == *b"SIMPLE  =" => Ending::Fits,
+            _ => Ending::Text,
         }
     }
 }
@@ -86,8 +102,114 @@ pub fn most_rows(cells: usize) -> usize {
     cells + SPARE_ROWS
 }
 
+/// A file, and which of its tables is meant.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Place {
+    /// The file.
+    pub path: PathBuf,
+    /// Name (EXTNAME) or number (the first extension is 1) of a table of a FITS file.
+    pub table: Option<String>,
+}
+
+impl Place {
+    /// The place that `FILE[TABLE]` names, if no file has all of that for its name and one is called `FILE`.
+    pub fn of(path: &Path) -> Self {
+        let whole = Place {
+            path: path.to_owned(),
+            table: None,
+        };
+        if is_there(path) {
+            return whole;
+        }
+        let inner = path.to_str().and_then(|text| text.strip_suffix(']'));
+        match inner.and_then(|text| text.rsplit_once('[')) {
+            Some((file, table)) if !table.is_empty() && is_there(Path::new(file)) => Place {
+                path: PathBuf::from(file),
+                table: Some(table.to_owned()),
+            },
+            _ => whole,
+        }
+    }
+
+    /// Refuses a table of a file that has but one.
+    fn check(&self) -> Result<(), FileError> {
+        match (&self.table, Ending::of(&self.path)) {
+            (Some(table), Ending::Text | Ending::Parquet) => {
+                let message = format!(
+                    "the file is no FITS file (found table `{table}`, expected the file's name alone)"
+                );
+                Err(FileError::new(&self.path, message))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// What a table contains of its columns, before any is chosen.
+pub struct Columns {
+    /// Lists of names, of which one has to be chosen: a header, comments that may be one, or tables of a FITS file.
+    pub named: Vec<Named>,
+    /// Fields of the first row of a text table that has no header.
+    pub unnamed: Vec<String>,
+}
+
+/// Names of columns.
+pub struct Named {
+    /// The columns.
+    pub names: Vec<String>,
+    /// The table of a FITS file that has them: its number, and how it is shown.
+    pub table: Option<(usize, String)>,
+    /// Whether they are words of a comment, which may be no names at all.
+    pub doubtful: bool,
+}
+
+/// The columns that the table of a file has, of one table if `place` names it.
+///
+/// # Errors
+/// If the file cannot be read.
+pub fn columns(place: &Place) -> Result<Columns, FileError> {
+    place.check()?;
+    let path = &place.path;
+    let plain = |names, doubtful| Named {
+        names,
+        table: None,
+        doubtful,
+    };
+    match Ending::of(path) {
+        Ending::Parquet => Ok(Columns {
+            named: vec![plain(parquet::columns(path)?, false)],
+            unnamed: Vec::new(),
+        }),
+        Ending::Fits => {
+            let tables = fits::tables(path, place.table.as_deref())?.into_iter();
+            let named = tables.map(|head| Named {
+                table: Some((head.number, head.shown())),
+                names: head.columns,
+                doubtful: false,
+            });
+            Ok(Columns {
+                named: named.collect(),
+                unnamed: Vec::new(),
+            })
+        }
+        Ending::Text => {
+            let found = text::columns(path)?;
+            Ok(match found.names {
+                Some(names) => Columns {
+                    named: vec![plain(names, false)],
+                    unnamed: Vec::new(),
+                },
+                None => Columns {
+                    named: found.comments.into_iter().map(|c| plain(c, true)).collect(),
+                    unnamed: found.fields,
+                },
+            })
+        }
+    }
+}
+
 /// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending. A
-/// text table has at most `most_rows`.
+/// table of text or in Parquet has at most `most_rows`. Columns of a text table without names have numbers, from 1.
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
@@ -96,6 +218,20 @@ pub fn read(
     wanted: Option<&[&str]>,
     most_rows: usize,
 ) -> Result<DataFrame, FileError> {
+    read_from(&Place::of(path), wanted, most_rows)
+}
+
+/// The same of a place.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_from(
+    place: &Place,
+    wanted: Option<&[&str]>,
+    most_rows: usize,
+) -> Result<DataFrame, FileError> {
+    place.check()?;
+    let path = &place.path;
     if let Some(wanted) = wanted {
         for (k, column) in wanted.iter().enumerate() {
             if wanted[..k].contains(column) {
@@ -110,18 +246,22 @@ pub fn read(
         most_rows,
     };
     match Ending::of(path) {
-        Ending::Parquet => parquet::read(path, wanted),
-        Ending::Fits => fits::read_table(path, wanted),
+        Ending::Parquet => parquet::read(path, wanted, most_rows),
+        Ending::Fits => fits::read_table(path, wanted, place.table.as_deref()),
         Ending::Text => text::read(path, &request),
     }
 }
 
-/// Reads a truth file's x, y, g1, g2.
+/// Reads a truth file's x, y, g1, g2, of at most `most_rows`.
 ///
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
-pub fn read_truth(path: &Path) -> Result<DataFrame, FileError> {
-    read_columns(path, &["x", "y", "g1", "g2"])
+pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
+    let names = ["x", "y", "g1", "g2"];
+    match Ending::of(path) {
+        Ending::Text => read_text(path, &names),
+        Ending::Parquet | Ending::Fits => read(path, Some(&names), most_rows),
+    }
 }
 
 /// Reads the columns `names`: of a text table, which has these and no others where it has no header, or of another
@@ -130,7 +270,7 @@ pub fn read_truth(path: &Path) -> Result<DataFrame, FileError> {
 /// # Errors
 /// Where the file cannot be read, or lacks a column.
 pub fn read_columns(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
-    match Ending::of(path) {
+    match Ending::of(&Place::of(path).path) {
         Ending::Text => read_text(path, names),
         Ending::Parquet | Ending::Fits => read(path, Some(names), MAX_ROWS),
     }
@@ -147,6 +287,28 @@ pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
         most_rows: MAX_ROWS,
     };
     text::read(path, &request)
+}
+
+/// The value of `key` that a table of any format states: in a comment `# key: value ...` before the first row of
+/// a text table, in the header of a FITS table, or in the metadata of a Parquet file.
+///
+/// # Errors
+/// If the file cannot be read.
+pub fn stated(path: &Path, key: &str) -> Result<Option<String>, FileError> {
+    let format = match Ending::of(path) {
+        Ending::Text => {
+            let value = |comment: &String| {
+                let rest = comment.strip_prefix(key)?.trim_start();
+                let rest = rest.strip_prefix(['=', ':'])?;
+                rest.split_whitespace().next().map(str::to_owned)
+            };
+            return Ok(text::comments(path)?.iter().find_map(value));
+        }
+        Ending::Parquet => FileFormat::Parquet,
+        Ending::Fits => FileFormat::Fits,
+    };
+    let mut found = read_metadata(path, format, std::iter::once(&key.to_owned()))?;
+    Ok(found.remove(key).map(|value| value.trim().to_owned()))
 }
 
 /// What is left of `metadata` in a table written as `format`: all in Parquet; in FITS what fits into a

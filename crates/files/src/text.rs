@@ -28,6 +28,14 @@ const SHOWN: usize = 40;
 /// What gzip-compressed files start with.
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 
+/// What a cell of CSV starts with so that a spreadsheet does not take `text` for a formula.
+pub fn formula_mark(text: &str) -> &'static str {
+    match text.starts_with(['=', '+', '-', '@', '\t', '\r']) {
+        true => "'",
+        false => "",
+    }
+}
+
 /// What is wanted of a table.
 pub(super) struct Request<'a> {
     /// Columns to read; all, with NaN for what is not a number, if `None`.
@@ -41,8 +49,9 @@ pub(super) struct Request<'a> {
 /// Reads columns.
 ///
 /// The first line that is neither empty nor a `#` comment names the columns if its first field that is
-/// not empty is not a number; otherwise a comment that holds all the names wanted does; otherwise the
-/// columns are the default ones, and further ones are left alone. Fields are separated by the first of
+/// not empty is not a number; otherwise the numbered comments of SExtractor do; otherwise a comment that
+/// holds all the names wanted does; otherwise the columns have numbers, from 1, if those are wanted;
+/// otherwise they are the default ones, and further ones are left alone. Fields are separated by the first of
 /// `;`, `,` and tabs that the first row has, as often as the header does, and by blanks if it has none.
 /// An empty field is NaN. A file without a row is a table without rows.
 pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, FileError> {
@@ -55,6 +64,47 @@ pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, File
     rows.most = rows.most.min(FREE_ROWS.max(size));
     input.read_rows(head, separator, &mut rows)?;
     rows.table()
+}
+
+/// What a text table contains of its columns, before any is chosen.
+pub(super) struct Columns {
+    /// Names, if a header or the comments of SExtractor give them.
+    pub(super) names: Option<Vec<String>>,
+    /// Comments with as many words as the first row has fields: each may be a header.
+    pub(super) comments: Vec<Vec<String>>,
+    /// Fields of the first row.
+    pub(super) fields: Vec<String>,
+}
+
+/// The columns of a table.
+///
+/// # Errors
+/// If the file cannot be read or is no text table.
+pub(super) fn columns(path: &Path) -> Result<Columns, FileError> {
+    let head = Head::read(&mut Input::open(path)?, path)?;
+    let separator = Separator::of(head.header.as_deref(), head.first.as_deref());
+    let fields = head.fields(separator);
+    let names = match &head.header {
+        Some(header) => {
+            let (names, others) = (separator.split(header), split_names(header));
+            let other = names.len() != fields.len() && others.len() == fields.len();
+            Some(if other { others } else { names })
+        }
+        None => head.sextractor_names(&fields),
+    };
+    let comments = head.comments.iter().rev().map(|line| split_names(line));
+    Ok(Columns {
+        names,
+        comments: comments
+            .filter(|words| words.len() == fields.len())
+            .collect(),
+        fields,
+    })
+}
+
+/// The comments before the first row, without their `#`.
+pub(super) fn comments(path: &Path) -> Result<Vec<String>, FileError> {
+    Ok(Head::read(&mut Input::open(path)?, path)?.comments)
 }
 
 /// The text of a file from some place on.
@@ -215,6 +265,29 @@ fn read_blanks(
     }
 }
 
+/// Formats that are no text tables although they are text: what their first line starts with, and how to convert them.
+const OTHER_FORMATS: [(&str, &str); 2] = [
+    ("<?xml", "XML, such as a VOTable"),
+    ("<VOTABLE", "a VOTable"),
+];
+
+/// Refuses a first line of another format.
+fn check_format(path: &Path, line: &str) -> Result<(), FileError> {
+    match OTHER_FORMATS.iter().find(|(start, _)| {
+        let first = line.get(..start.len());
+        first.is_some_and(|first| first.eq_ignore_ascii_case(start))
+    }) {
+        None => Ok(()),
+        Some((_, format)) => Err(FileError::new(
+            path,
+            format!(
+                "the file is {format}, which is not read; expected a text, FITS or Parquet table. Try: stilts tcopy ifmt=votable in={} out=table.fits",
+                path.display()
+            ),
+        )),
+    }
+}
+
 fn not_text(path: &Path, line: u64) -> FileError {
     FileError::new(
         path,
@@ -326,6 +399,9 @@ impl Head {
                 _ => line,
             };
             let text = line.trim();
+            if head.before == 0 {
+                check_format(path, text)?;
+            }
             if text.contains('\r') {
                 let message = format!(
                     "line {number} holds carriage returns; expected lines that end in line feeds"
@@ -345,18 +421,71 @@ impl Head {
         }
     }
 
+    /// Fields of the first row.
+    fn fields(&self, separator: Separator) -> Vec<String> {
+        let first = self.first.as_ref();
+        first.map_or_else(Vec::new, |line| separator.split(line))
+    }
+
+    /// Names of the columns by SExtractor's comments, `# NUMBER NAME description [unit]`, if there are some. The columns
+    /// of an array have one comment, for the first of them: the second one is called `NAME_1`.
+    fn sextractor_names(&self, fields: &[String]) -> Option<Vec<String>> {
+        let mut names: Vec<String> = Vec::new();
+        let mut named: (usize, &str) = (0, "");
+        let mut lines = 0;
+        let fill = |names: &mut Vec<String>, (first, name): (usize, &str), end: usize| {
+            while names.len() < end {
+                names.push(format!("{name}_{}", names.len() + 1 - first));
+            }
+        };
+        for comment in &self.comments {
+            let mut words = comment.split_ascii_whitespace();
+            let number = words.next().and_then(|word| word.parse::<usize>().ok());
+            let (Some(number), Some(name)) = (number, words.next()) else {
+                continue;
+            };
+            let letters = |c: char| c.is_ascii_alphanumeric() || c == '_';
+            let identifier = name.starts_with(|c: char| c.is_ascii_alphabetic());
+            // Numbers go up from 1, to that of a column that there is.
+            let next = number > names.len() && (number == 1) == names.is_empty();
+            if !next || number > fields.len().max(1) || !identifier || !name.chars().all(letters) {
+                return None;
+            }
+            fill(&mut names, named, number - 1);
+            names.push(name.to_owned());
+            named = (number, name);
+            lines += 1;
+        }
+        if lines < 2 {
+            return None;
+        }
+        fill(&mut names, named, fields.len());
+        Some(names)
+    }
+
     /// Names of the columns, and whether the file gives them.
     fn names(&self, separator: Separator, request: &Request<'_>) -> (Vec<String>, bool) {
-        let count = |line: &String| separator.split(line).len();
+        let fields = self.fields(separator);
         let fits = |names: &Vec<String>| match request.wanted {
             Some(wanted) => wanted.iter().all(|w| names.iter().any(|n| n == w)),
-            None => self.first.as_ref().map(count) == Some(names.len()),
+            None => fields.len() == names.len(),
         };
         if let Some(header) = &self.header {
             // Names need not be separated like numbers.
             let (names, others) = (separator.split(header), split_names(header));
             let other = !fits(&names) && fits(&others);
             return (if other { others } else { names }, true);
+        }
+        if let Some(names) = self.sextractor_names(&fields) {
+            return (names, true);
+        }
+        let numbers: Vec<String> = (1..=fields.len()).map(|k| k.to_string()).collect();
+        let number = |name: &&str| name.parse::<usize>().is_ok();
+        if request
+            .wanted
+            .is_some_and(|wanted| wanted.iter().all(number))
+        {
+            return (numbers, false);
         }
         // The last comment that can be a header is one.
         let comments = self.comments.iter().rev();

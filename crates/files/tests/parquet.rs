@@ -9,6 +9,9 @@ use shearq_files::frames::{
     write_parquet,
 };
 
+/// More rows than any of the files has.
+const MOST: usize = 10_000_000;
+
 /// Every type, a NaN, an infinity, extreme integers, and text beyond ASCII.
 fn sample() -> DataFrame {
     df!(
@@ -66,7 +69,10 @@ fn assert_same(left: &DataFrame, right: &DataFrame) {
 fn every_type_and_the_metadata_survive() {
     let folder = tempfile::tempdir().expect("temporary folder");
     let path = place(folder.path(), &encode(&sample()));
-    assert_same(&read_parquet(&path, None).expect("readable"), &sample());
+    assert_same(
+        &read_parquet(&path, None, MOST).expect("readable"),
+        &sample(),
+    );
     assert_eq!(parquet_metadata(&path).expect("readable"), metadata());
     assert_eq!(
         parquet_columns(&path).expect("readable"),
@@ -78,10 +84,10 @@ fn every_type_and_the_metadata_survive() {
 fn wanted_columns_come_in_the_order_asked_for() {
     let folder = tempfile::tempdir().expect("temporary folder");
     let path = place(folder.path(), &encode(&sample()));
-    let table = read_parquet(&path, Some(&["flag", "g1"])).expect("readable");
+    let table = read_parquet(&path, Some(&["flag", "g1"]), MOST).expect("readable");
     assert_eq!(table.get_column_names(), ["flag", "g1"]);
     assert_eq!(table.column("flag").ok(), sample().column("flag").ok());
-    let none = read_parquet(&path, Some(&[])).expect("readable");
+    let none = read_parquet(&path, Some(&[]), MOST).expect("readable");
     assert_eq!(none.width(), 0);
 }
 
@@ -97,7 +103,7 @@ fn many_rows_in_several_row_groups_and_none_at_all() {
         let table = df!("x" => sines, "constant" => constant, "id" => ids, "kind" => kinds)
             .expect("equal lengths");
         let path = place(folder.path(), &encode(&table));
-        assert_same(&read_parquet(&path, None).expect("readable"), &table);
+        assert_same(&read_parquet(&path, None, MOST).expect("readable"), &table);
     }
 }
 
@@ -110,7 +116,7 @@ fn equal_tables_give_equal_bytes() {
 fn a_missing_column_is_named_with_the_file_and_the_columns_present() {
     let folder = tempfile::tempdir().expect("temporary folder");
     let path = place(folder.path(), &encode(&sample()));
-    let error = read_parquet(&path, Some(&["g1", "g2"]))
+    let error = read_parquet(&path, Some(&["g1", "g2"]), MOST)
         .expect_err("no g2")
         .to_string();
     assert_eq!(
@@ -120,7 +126,7 @@ fn a_missing_column_is_named_with_the_file_and_the_columns_present() {
             path.display()
         )
     );
-    let error = read_parquet(&path, Some(&["g1", "g1"])).expect_err("g1 twice");
+    let error = read_parquet(&path, Some(&["g1", "g1"]), MOST).expect_err("g1 twice");
     assert!(matches!(error, TableError::DuplicateColumn { name } if name == "g1"));
 }
 
@@ -161,18 +167,18 @@ fn files_that_are_no_parquet_are_refused() {
     let folder = tempfile::tempdir().expect("temporary folder");
     let absent = folder.path().join("absent.parquet");
     assert!(matches!(
-        read_parquet(&absent, None),
+        read_parquet(&absent, None, MOST),
         Err(TableError::Io { .. })
     ));
     assert!(matches!(
-        read_parquet(folder.path(), None),
+        read_parquet(folder.path(), None, MOST),
         Err(TableError::Damaged { .. })
     ));
     let pipe = folder.path().join("pipe");
     let made = std::process::Command::new("mkfifo").arg(&pipe).status();
     assert!(made.expect("mkfifo starts").success());
     assert!(matches!(
-        read_parquet(&pipe, None),
+        read_parquet(&pipe, None, MOST),
         Err(TableError::Damaged { .. })
     ));
     for garbage in [
@@ -183,7 +189,9 @@ fn files_that_are_no_parquet_are_refused() {
         b"id,g1\n1,0.02\n",
     ] {
         let path = place(folder.path(), garbage);
-        let error = read_parquet(&path, None).expect_err("garbage").to_string();
+        let error = read_parquet(&path, None, MOST)
+            .expect_err("garbage")
+            .to_string();
         assert!(error.starts_with(&path.display().to_string()), "{error}");
     }
 }
@@ -193,12 +201,12 @@ fn rows_and_texts_that_take_next_to_nothing_in_a_file_are_counted() {
     let folder = tempfile::tempdir().expect("temporary folder");
     let refusal = |table: DataFrame| {
         let path = place(folder.path(), &encode(&table));
-        read_parquet(&path, None)
+        read_parquet(&path, None, MOST)
             .err()
             .map(|error| error.to_string())
     };
     assert_eq!(refusal(df!("a" => vec![7_i64; 1 << 20]).unwrap()), None);
-    let error = refusal(df!("a" => vec![7_i64; 5_000_000]).unwrap()).expect("too many rows");
+    let error = refusal(df!("a" => vec![7_i64; 5_000_000]).unwrap()).expect("too many values");
     assert!(
         error.contains("found 5000000 rows of 1 columns, expected at most"),
         "{error}"
@@ -212,13 +220,38 @@ fn rows_and_texts_that_take_next_to_nothing_in_a_file_are_counted() {
 }
 
 #[test]
+fn as_many_rows_are_read_as_the_caller_expects_however_small_the_file_is() {
+    let folder = tempfile::tempdir().expect("temporary folder");
+    // As a truth file of 2100 × 2100 cells without shear.
+    let rows = 2100 * 2100;
+    let path = place(
+        folder.path(),
+        &encode(&df!("g1" => vec![0_i64; rows], "g2" => vec![0_i64; rows]).unwrap()),
+    );
+    // Fewer bytes than values.
+    assert!(fs::metadata(&path).unwrap().len() < 2 * rows as u64);
+    for wanted in [&["g1"][..], &["g1", "g2"]] {
+        let table = read_parquet(&path, Some(wanted), rows).expect("readable");
+        assert_eq!(table.height(), rows);
+        let error = read_parquet(&path, Some(wanted), 1_600).expect_err("too many rows");
+        assert_eq!(
+            error.to_string(),
+            format!(
+                "{}: found 4410000 rows, expected at most 1600",
+                path.display()
+            )
+        );
+    }
+}
+
+#[test]
 fn truncated_files_are_refused_at_any_length() {
     let folder = tempfile::tempdir().expect("temporary folder");
     let bytes = encode(&sample());
     for length in 0..bytes.len() {
         let path = place(folder.path(), &bytes[..length]);
         assert!(
-            read_parquet(&path, None).is_err(),
+            read_parquet(&path, None, MOST).is_err(),
             "{length} of {} bytes",
             bytes.len()
         );
@@ -234,7 +267,7 @@ fn a_wrong_byte_anywhere_never_panics() {
             let mut damaged = bytes.clone();
             damaged[place_of_damage] ^= mask;
             // Damaged values and names can still be read; only the return matters.
-            let _ = read_parquet(place(folder.path(), &damaged), None);
+            let _ = read_parquet(place(folder.path(), &damaged), None, MOST);
         }
     }
 }
@@ -247,7 +280,7 @@ fn files_of_other_writers_are_converted() {
     let names = [
         "i8", "i16", "i32", "u64", "u8", "u16", "flag", "category", "f32", "f64",
     ];
-    let table = read_parquet(path, Some(&names)).expect("readable");
+    let table = read_parquet(path, Some(&names), MOST).expect("readable");
     let metadata = parquet_metadata(path).expect("readable");
     assert_eq!(metadata["written by"], "pyarrow");
     let expected = [
@@ -271,12 +304,12 @@ fn files_of_other_writers_are_converted() {
     assert_eq!(single.null_count() + double.null_count(), 0);
     let (single, double) = (reals(single).unwrap(), reals(double).unwrap());
     assert!(single[0] == 1.5 && single[1].is_nan() && double[0].is_nan() && double[1] == 2.5);
-    let beyond = read_parquet(path, Some(&["beyond"])).expect("readable");
+    let beyond = read_parquet(path, Some(&["beyond"]), MOST).expect("readable");
     let beyond = reals(beyond.column("beyond").expect("it")).expect("numbers");
     assert_eq!(beyond[1], 9_223_372_036_854_775_808.0);
 
     let error = |name: &str| {
-        read_parquet(path, Some(&[name]))
+        read_parquet(path, Some(&[name]), MOST)
             .expect_err(name)
             .to_string()
     };

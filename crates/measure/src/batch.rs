@@ -3,17 +3,19 @@
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
+use shearq_quantities::FunctionalPsf;
 use shearq_submissions::{Method, NoiseSource, Submission};
 
 use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
+use crate::examine::{EXAMINED_PSFS, Examination, examined_rows};
 use crate::flag::Flag;
 use crate::galaxy::{Measurer, Worker};
 use crate::measurement::Measurement;
 use crate::noise::Survey;
 use crate::pixel::Pixel;
 use crate::psf::star_psf;
-use shearq_quantities::FunctionalPsf;
+use crate::warning::Warning;
 
 /// PSFs of the galaxies of a batch.
 #[derive(Debug, Clone, Copy)]
@@ -38,6 +40,8 @@ pub struct Batch {
     /// the submission asks for no calibration, or (then all galaxies are flagged) where it is not
     /// positive.
     pub response: Option<[f64; 2]>,
+    /// What is wrong with the stamps, as far as they can be measured all the same.
+    pub warnings: Vec<Warning>,
 }
 
 impl Measurer {
@@ -106,8 +110,20 @@ impl Measurer {
         }
         let mut galaxies = [worker.measure_each(stamps, psfs, noise)?];
         let response = calibrate(self.submission(), &mut galaxies);
+        let mut examination = examine(stamps)?;
+        examination.add_psfs(psfs, self.submission().psf_cut(), EXAMINED_PSFS);
+        let mut warnings = examination.warnings();
+        warnings.extend(Warning::of_settings(self.submission()));
+        warnings.extend(Warning::of_flags(&galaxies));
+        if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {
+            return Err(MeasureError::Data(warnings.swap_remove(fatal)));
+        }
         let [galaxies] = galaxies;
-        Ok(Batch { galaxies, response })
+        Ok(Batch {
+            galaxies,
+            response,
+            warnings,
+        })
     }
 
     /// What `stamps`, one each along the first axis, tell of their image, where the submission asks for noise to be
@@ -189,6 +205,17 @@ impl Worker {
             self.lose_psf();
         }
     }
+}
+
+/// Examines as many of the stamps, one each along the first axis, as are enough.
+fn examine<T: Pixel>(stamps: ArrayView3<'_, T>) -> Result<Examination, MeasureError> {
+    let (count, side, _) = stamps.dim();
+    let rows = examined_rows(1, count);
+    let mut examination = Examination::new(side, rows.len());
+    for at in rows {
+        examination.add(stamps.index_axis(Axis(0), at))?;
+    }
+    Ok(examination)
 }
 
 /// Views an image of `count` stamps of `side` pixels next to each other, row-major, as stamps one each along

@@ -4,6 +4,8 @@ use shearq_quantities::ProfileError;
 use shearq_submissions::SubmissionError;
 use thiserror::Error;
 
+use crate::warning::Warning;
+
 /// What can be wrong with stamps, PSFs or settings. A galaxy that cannot be measured is no error: it has
 /// [`Flags`](crate::Flags).
 #[derive(Debug, Error)]
@@ -34,21 +36,28 @@ pub enum MeasureError {
     /// No light to normalise a PSF by.
     #[error("the pixels of the PSF stamp sum to {0}; expected a positive sum")]
     DarkPsf(f64),
-    /// A star that is not where it should be.
+    /// A star so near an edge of its stamp that it cannot be cut around itself.
     #[error(
-        "the PSF is centred ({dx:+.1}, {dy:+.1}) px off the centre of its stamp; expected at most {most} px"
+        "the star is centred ({dx:+.1}, {dy:+.1}) px off the centre of its stamp of {columns} × {rows} pixels; expected {size} × {size} pixels around the star. Try: a larger PSF stamp, or one that is centred on the star to within 1 px"
     )]
     OffCentre {
         /// Offset along x.
         dx: f64,
         /// Offset along y.
         dy: f64,
-        /// Largest offset along either.
-        most: f64,
+        /// Pixels a side that are needed around the star.
+        size: usize,
+        /// Pixels of the stamp along y.
+        rows: usize,
+        /// Pixels of the stamp along x.
+        columns: usize,
     },
     /// A PSF profile that does not exist.
     #[error(transparent)]
     Profile(#[from] ProfileError),
+    /// Data from which no result should be made.
+    #[error("{0}")]
+    Data(Warning),
     /// A submission that does not exist or is not valid.
     #[error(transparent)]
     Submission(#[from] SubmissionError),

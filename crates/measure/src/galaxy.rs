@@ -8,6 +8,7 @@ use shearq_submissions::{EllipticityType, Method, NoiseSource, Registry, Submiss
 
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::MeasureError;
+use crate::examine::PEAKS;
 use crate::flag::{Flag, Flags};
 use crate::measurement::Measurement;
 use crate::method::{CutWorker, Found, MethodPlan, ResponseMatrix};
@@ -15,10 +16,6 @@ use crate::noise::{NoisePlan, StampNoise, Survey};
 use crate::pixel::Pixel;
 use crate::psf::cut_start;
 use crate::surroundings::Missing;
-
-/// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
-/// away from the smallest and largest numbers there are.
-const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
 
 /// Everything planned for one submission and one size of full stamps. Not changed by measuring, so
 /// one serves all threads, each with a [`Worker`] of its own.
@@ -317,7 +314,7 @@ fn reported(
 }
 
 /// The largest of the pixels, or zero: of 16 running maxima, which vector instructions take at a time.
-fn highest(pixels: &[f32]) -> f32 {
+pub(crate) fn highest(pixels: &[f32]) -> f32 {
     const LANES: usize = 16;
     let mut lanes = [0.0f32; LANES];
     let chunks = pixels.chunks_exact(LANES);

@@ -20,12 +20,15 @@ use std::sync::Arc;
 
 use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2};
+use shearq_quantities::statistics::{SCATTER, median};
 
 use crate::error::MeasureError;
+use crate::examine::{PEAKS, enough};
 use crate::extent::Light;
+use crate::galaxy::highest;
 use crate::pixel::Pixel;
 use crate::surroundings::{Contrasts, Missing, centre, followed, turn};
-use shearq_quantities::statistics::{SCATTER, median};
+use crate::warning::Warning;
 
 /// Pixels a side of a block.
 const BLOCK: usize = 8;
@@ -34,8 +37,6 @@ const PIXELS: usize = BLOCK * BLOCK;
 const POLYNOMIALS: usize = 6;
 /// Pixels a side of the smallest stamps whose frame is told from the galaxy.
 const LEAST_STAMP: usize = 24;
-/// Stamps of an image that are enough: 1.2 million pixels in frames of 48 px, which know the variance to 0.15 %.
-const ENOUGH: usize = 1000;
 /// Cube root of a block's power, over the median's, beyond which it is left out, in units of the lower half's scatter. These
 /// roots scatter nearly like a Gaussian, whether noise is white or blocks have few modes of their own: what is left out of
 /// noise alone is less than 10⁻⁴ of its power where it is white, and 2·10⁻³ of that of its long waves where it is smoothed
@@ -179,7 +180,7 @@ impl NoisePlan {
     /// Which of `rows` rows of `columns` stamps are looked at, evenly spread: enough for a thousand stamps,
     /// or all.
     pub fn rows(&self, columns: usize, rows: usize) -> Vec<usize> {
-        let count = ENOUGH.div_ceil(columns.max(1)).min(rows);
+        let count = enough(columns, rows);
         (0..count)
             .map(|k| (2 * k + 1) * rows / (2 * count))
             .collect()
@@ -198,6 +199,7 @@ impl NoisePlan {
             brightest: Vec::new(),
             typical: Vec::new(),
             light: Light::default(),
+            peak: 0.0,
             counts: [0; 3],
         }
     }
@@ -221,6 +223,8 @@ pub struct NoiseSurvey {
     /// Of each frame, the median over all places.
     typical: Vec<f32>,
     light: Light,
+    /// The brightest pixel.
+    peak: f32,
     /// Number of stamps looked at, of those with missing pixels, and of those that were left out.
     counts: [usize; 3],
 }
@@ -242,6 +246,7 @@ impl NoiseSurvey {
         }
         let whole = self.pixels.iter().all(|value| value.is_finite());
         let flat = self.pixels.iter().all(|value| *value == self.pixels[0]);
+        self.peak = self.peak.max(highest(&self.pixels));
         self.counts[0] += 1;
         self.counts[1] += usize::from(!whole);
         if flat || !(whole || self.missing.mend(&mut self.pixels, full)) {
@@ -281,6 +286,7 @@ impl NoiseSurvey {
         self.brightest.extend_from_slice(&other.brightest);
         self.typical.extend_from_slice(&other.typical);
         self.light.join(&other.light);
+        self.peak = self.peak.max(other.peak);
         for (count, more) in self.counts.iter_mut().zip(other.counts) {
             *count += more;
         }
@@ -354,6 +360,11 @@ impl NoiseSurvey {
         match self.found() {
             Some(found) => Ok(Some(Arc::new(found))),
             None if self.is_blind() => Ok(None),
+            None if self.peak > 0.0 && !PEAKS.contains(&self.peak) => {
+                Err(MeasureError::Data(Warning::Brightness {
+                    peak: f64::from(self.peak),
+                }))
+            }
             None => Err(MeasureError::Noise(
                 "not to be seen on the stamps' frames".into(),
             )),

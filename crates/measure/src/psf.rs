@@ -1,7 +1,10 @@
 //! Point-spread functions: star stamps and functional forms.
 
+mod average;
 pub(crate) mod breadth;
+pub(crate) mod examine;
 mod star;
 
+pub use average::average_stars;
 pub(crate) use star::cut_start;
-pub use star::star_psf;
+pub use star::{Star, star, star_psf};

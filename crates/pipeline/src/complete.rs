@@ -166,7 +166,11 @@ impl Results<'_> {
             && simulated
         {
             let truth = data.truth(id.set);
-            check_rows(&truth, read_truth_rows(&truth)?.len(), cells)?;
+            check_rows(
+                &truth,
+                read_truth_rows(&truth, cells.saturating_add(1))?.len(),
+                cells,
+            )?;
         }
         Ok(cells)
     }

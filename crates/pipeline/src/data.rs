@@ -5,5 +5,5 @@ pub mod layout;
 pub mod listing;
 pub mod mosaic;
 pub mod psf_table;
-mod relative;
+pub mod relative;
 pub mod run;

@@ -1,17 +1,21 @@
 //! Stamps that people have, gathered into the image of a data folder: cubes, files of one or several images each, and
 //! cut-outs of an exposure.
 
+mod positions;
 mod source;
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
-use shearq_measure::parts::frame;
-use shearq_quantities::statistics::RunningMean;
+use ndarray::ArrayView2;
+use serde::{Serialize, Serializer};
+use shearq_measure::{Examination, Star, Warning, examined_rows, star};
+use shearq_submissions::PsfCut;
 
+use self::positions::Positions;
+pub use self::positions::Table;
 pub use self::source::{Content, Files};
-use self::source::{Exposure, Images, Origin, Planes, shown};
+use self::source::{Exposure, Images, Origin, Planes, off_middle, shown};
 use super::PipelineError;
 use super::images::ImageId;
 use super::measure::check_strip;
@@ -23,17 +27,18 @@ use shearq_files::atomic;
 use shearq_files::fits::{ImageWriter, Value};
 use shearq_files::open::is_there;
 use shearq_files::table;
+use shearq_files::text::formula_mark;
 
 /// Most stamps of one image: one for each galaxy of the largest grid.
 const MAX_STAMPS: usize = table::MAX_ROWS;
-/// Share of a star's light on the frame of its stamp, were it all as bright as the frame, that is told: a background
-/// of that size changes a deconvolved galaxy.
-const PEDESTAL: f64 = 0.02;
-/// Mean of the stamps' frames, in units of the scatter of their pixels, that is told: more than the wings of galaxies
-/// leave.
-const SKY: f64 = 1.0;
-/// Pixels that the frame of a star or a stamp is wide.
-const FRAME: usize = 2;
+/// Pixels a side from which on a single stamp is taken for a mosaic or an exposure: four times the default stamp.
+const LARGE: usize = 192;
+/// How to read a mosaic or an exposure.
+const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
+/// Pixels a side of a PSF that are examined: as many as configurations use.
+const EXAMINED_SIDE: usize = 48;
+/// Pixels by which an offset may differ from a whole pixel.
+const HALF: f64 = 0.5;
 
 /// Where stamps come from.
 #[derive(Serialize)]
@@ -46,10 +51,9 @@ pub enum Stamps<'a> {
         /// The exposure: the first image of one file.
         exposure: Files<'a>,
         /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
-        #[serde(serialize_with = "shown")]
-        positions: &'a Path,
-        /// Names of its columns for x and y.
-        columns: [&'a str; 2],
+        positions: Table<'a>,
+        /// Number of the first pixel's centre in the table, 0 or 1.
+        first_pixel: u8,
         /// Pixels a side of a stamp.
         side: usize,
     },
@@ -71,12 +75,18 @@ pub struct Gathered {
 struct Place<'a> {
     x: f64,
     y: f64,
-    #[serde(serialize_with = "shown")]
+    #[serde(serialize_with = "cell")]
     file: &'a Path,
     image: usize,
     plane: usize,
     position_x: Option<f64>,
     position_y: Option<f64>,
+}
+
+/// Writes a path as a cell of CSV, without formulas.
+fn cell<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    let path = path.display().to_string();
+    serializer.collect_str(&format_args!("{}{path}", formula_mark(&path)))
 }
 
 /// What an image is made of.
@@ -168,11 +178,34 @@ fn gather_alone(
     let positions = match stamps {
         Stamps::Files(_) => Vec::new(),
         Stamps::Cutouts {
-            positions, columns, ..
-        } => read_positions(positions, *columns)?,
+            positions,
+            exposure,
+            first_pixel,
+            ..
+        } => {
+            // From here on the first pixel is 1.
+            let shift = 1.0 - f64::from(*first_pixel);
+            let mut positions = Positions::read(*positions)?;
+            for (x, y) in &mut positions.all {
+                (*x, *y) = (*x + shift, *y + shift);
+            }
+            let sides = Exposure::open(*exposure)?.sides()?;
+            doubts.extend(positions.note.clone());
+            doubts.extend(positions.examine(&exposure.paths[0], sides)?);
+            positions.all
+        }
     };
     let (count, side) = match stamps {
-        Stamps::Files(files) => survey(*files)?,
+        Stamps::Files(files) => {
+            let (count, side) = survey(*files)?;
+            if count == 1 && side >= LARGE {
+                doubts.push(format!(
+                    "warning: {}: the only stamp is {side} × {side} px, which looks like a mosaic of stamps or an exposure. Try: {MOSAIC}",
+                    files.paths[0].display()
+                ));
+            }
+            (count, side)
+        }
         Stamps::Cutouts { side, .. } => (positions.len(), *side),
     };
     let mosaic = Mosaic::of(count, side);
@@ -181,11 +214,20 @@ fn gather_alone(
     let mut keys = Vec::new();
     keys.extend(noise.map(|sigma| ("NOISESIG", Value::Real(sigma))));
     let mut image = Rows::create(&target, mosaic, &keys)?;
-    let (mut incomplete, mut frames) = (0, RunningMean::default());
+    let examined = examined_rows(mosaic.columns, mosaic.rows());
+    let mut examination = Examination::new(side, examined.len() * mosaic.columns);
+    let mut incomplete = 0;
     let mut places = csv::Writer::from_writer(Vec::new());
     let mut take = |origin: &Origin<'_>, pixels: &[f32]| -> Result<(), FileError> {
         incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
-        frame_of(pixels, side).for_each(|value| frames.add(value));
+        if examined.contains(&(image.next / mosaic.columns)) {
+            let stamp = ArrayView2::from_shape((side, side), pixels)
+                .map_err(|error| FileError::new(&target, error))?;
+            let place = origin.position.map_or([0.0; 2], |at| off_middle(at, side));
+            examination
+                .add_at(stamp, place)
+                .map_err(|error| FileError::new(&target, error))?;
+        }
         let (x, y) = mosaic.position(image.next);
         let place = Place {
             x,
@@ -247,13 +289,12 @@ fn gather_alone(
             }
         }
     }
-    if frames.mean().abs() > SKY * frames.deviation() {
-        doubts.push(format!(
-            "warning: the frames of the stamps have a mean of {:.3} where a pixel scatters by {:.3}: is sky left in them? It takes shear away",
-            frames.mean(),
-            frames.deviation()
-        ));
-    }
+    let warnings = examination.warnings();
+    doubts.extend(warnings.iter().map(|warning| {
+        let ImageId { set, image } = id;
+        let hint = one_pixel_off(stamps, warning).unwrap_or_default();
+        format!("warning: set {set:02} image {image:03}: {warning}{hint}")
+    }));
     let text = places
         .into_inner()
         .map_err(|error| FileError::new(&which, error.to_string()))?;
@@ -285,41 +326,17 @@ fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
     }
 }
 
-/// The pixels of a stamp's frame, as far as they are finite.
-fn frame_of(pixels: &[f32], side: usize) -> impl Iterator<Item = f64> + '_ {
-    let all = frame(pixels, side, FRAME).flatten();
-    all.filter(|value| value.is_finite())
-        .map(|&value| f64::from(value))
-}
-
-/// Positions of galaxies on an exposure.
-fn read_positions(path: &Path, columns: [&str; 2]) -> Result<Vec<(f64, f64)>, FileError> {
-    let read = table::read_columns(path, &columns)
-        .map_err(|error| error.hint_of_columns("--columns names others"))?;
-    let of = |name| table::numbers(&read, name, path);
-    let (xs, ys) = (of(columns[0])?, of(columns[1])?);
-    let positions: Vec<_> = xs.iter().copied().zip(ys.iter().copied()).collect();
-    if positions.is_empty() {
-        return Err(FileError::new(
-            path,
-            "there is no position; expected one a row",
-        ));
-    }
-    let most = f64::from(i32::MAX);
-    match positions
-        .iter()
-        .position(|(x, y)| !(x.abs() < most && y.abs() < most))
-    {
-        None => Ok(positions),
-        Some(row) => {
-            let (x, y) = positions[row];
-            let message = format!(
-                "row {}: the position is ({x}, {y}); expected pixels of the exposure",
-                row + 1
-            );
-            Err(FileError::new(path, message))
-        }
-    }
+/// Advice if positions are counted from another first pixel than specified.
+fn one_pixel_off(stamps: &Stamps<'_>, warning: &Warning) -> Option<String> {
+    let (Stamps::Cutouts { first_pixel, .. }, Warning::OffCentre { offset, .. }) =
+        (stamps, warning)
+    else {
+        return None;
+    };
+    let other = 1 - first_pixel.min(&1);
+    let expected = f64::from(*first_pixel) - f64::from(other);
+    let off = offset.iter().all(|found| (found - expected).abs() < HALF);
+    off.then(|| format!(". Are the positions counted from {other}? Try: --first-pixel {other}"))
 }
 
 /// Refuses an image that is its own mask.
@@ -347,8 +364,12 @@ fn survey(files: Files<'_>) -> Result<(usize, usize), FileError> {
     while let Some((origin, image)) = images.next()? {
         let (width, height) = (image.width(), image.height());
         if width != height || width > MAX_STAMP {
+            let advice = match files.content {
+                Content::Sky => format!(". Try: {MOSAIC}"),
+                Content::Psf | Content::Mask => String::new(),
+            };
             let message = format!(
-                "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP} (--exposure with --positions cuts stamps out of a large image)"
+                "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP}{advice}"
             );
             return Err(origin.fault(&message));
         }
@@ -405,6 +426,13 @@ fn gather_psfs(
     let stars = Mosaic::of(count, side);
     let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
     let mut planes = Planes::of(files);
+    let size = side - side.saturating_sub(EXAMINED_SIDE).next_multiple_of(2);
+    let cut = PsfCut {
+        size,
+        // So that a star off the centre can be cut around itself.
+        least: size - (size / 3).next_multiple_of(2),
+    };
+    let mut examination = Examination::new(side, 0);
     let mut dark = 0;
     while let Some((origin, pixels)) = planes.next()? {
         let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
@@ -416,16 +444,19 @@ fn gather_psfs(
             }
             dark += 1;
         }
-        let pedestal = pedestal(&pixels, side);
-        if image.next == 0 && pedestal.abs() > PEDESTAL {
-            doubts.push(format!(
-                "warning: {}: the frame of the first PSF is as bright as {:.0} % of its light would make it if all of the stamp were: is a background left in it?",
-                origin.file.display(),
-                100.0 * pedestal
-            ));
+        if let Ok(stamp) = ArrayView2::from_shape((side, side), &pixels)
+            && let Ok(Star { psf, moved }) = star(stamp, cut)
+        {
+            examination.add_psf(psf.view(), moved);
         }
         image.add(&pixels)?;
     }
+    let found = examination.warnings();
+    doubts.extend(
+        found
+            .iter()
+            .map(|warning| format!("warning: {}: {warning}", files.paths[0].display())),
+    );
     if dark > 0 {
         doubts.push(format!(
             "warning: the pixels of {dark} of {count} PSFs add up to nothing, less or no number: galaxies with them will be flagged"
@@ -449,14 +480,6 @@ impl PsfFile {
             }
         }
     }
-}
-
-/// The light of a star's stamp if all of it were as bright as its frame, in units of the light that it has.
-fn pedestal(pixels: &[f32], side: usize) -> f64 {
-    let mut frame = RunningMean::default();
-    frame_of(pixels, side).for_each(|value| frame.add(value));
-    let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
-    frame.mean() * pixels.len() as f64 / light
 }
 
 /// A mosaic that is written a row of stamps at a time.

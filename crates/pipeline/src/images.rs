@@ -3,7 +3,8 @@
 use std::str::FromStr;
 
 use super::PipelineError;
-use crate::data::layout::DataFolder;
+use crate::data::layout::{DataFolder, fill};
+use crate::data::listing::{self, Files};
 use shearq_files::FileError;
 
 /// One image of a data folder or a simulation.
@@ -26,17 +27,37 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, Pipeli
         let images = files.of_set(set);
         if images.is_empty() {
             let path = data.galaxies(set, 1);
-            let message = format!("there is no image of set {set}; expected this file");
+            let advice = advice(data, &files);
+            let message = format!("there is no image of set {set}; expected this file{advice}");
             return Err(FileError::new(path, message).into());
         }
         let id = |(image, _)| ImageId { set, image };
         found.extend(images.into_iter().map(id));
     }
     if found.is_empty() {
-        let message = "there are no galaxy images here in the layout expected";
+        let pattern = &data.layout().galaxies;
+        let (example, found) = (fill(pattern, 1, 1), listing::sample(data.root())?);
+        let advice = advice(data, &files);
+        let message = format!(
+            "there are no galaxy images here (found {found}, expected {pattern}, as in {example}){advice}"
+        );
         return Err(FileError::new(data.root(), message).into());
     }
     Ok(found)
+}
+
+/// What to try if a folder has no images: another name of what has nearly the right one, or the folder above that of a set.
+fn advice(data: &DataFolder, files: &Files) -> String {
+    if let Some(line) = files.unread().first() {
+        return format!(". {line}");
+    }
+    match data.folder_above() {
+        Some(folder) => format!(
+            ". This is the folder of one set. Try: --data {}",
+            folder.display()
+        ),
+        None => String::new(),
+    }
 }
 
 /// Images 1 to `images` of each of `sets`, in order.

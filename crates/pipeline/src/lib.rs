@@ -15,6 +15,7 @@ pub mod measure;
 pub mod run;
 pub mod simulate;
 pub mod truth;
+mod warned;
 
 pub use engine::{Progress, Quiet};
 

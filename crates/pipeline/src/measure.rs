@@ -1,16 +1,17 @@
 //! Measuring a data folder: rows of stamps in, one catalogue per image out.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2, Axis, Slice};
+use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Slice};
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
 use shearq_measure::{
-    Flag, Measurement, Measurer, NoisePlan, Psfs, Survey, Worker, calibrate, star_psf, strip,
+    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, MeasureError, Measurement, Measurer,
+    NoisePlan, Psfs, Star, Survey, Warning, Worker, calibrate, examined_rows, star, star_psf,
+    strip,
 };
-use shearq_quantities::FunctionalPsf;
 use shearq_submissions::{EllipticityType, NoiseSource, PsfCut, PsfForm, Submission};
 
 use super::PipelineError;
@@ -18,6 +19,7 @@ use super::engine::{self, Feeder, Progress};
 use super::grid::{self, whole};
 use super::images::ImageId;
 use super::inputs::Inputs;
+use super::warned::Warned;
 use crate::data::layout::{DataFolder, MAX_STAMP};
 use crate::data::mosaic::Mosaic;
 use crate::data::psf_table;
@@ -35,6 +37,8 @@ const MAX_STRIP: usize = 1 << 24;
 const CORRELATION: usize = 2;
 /// Least difference between a header's noise level and the measured one, in units of either, that is told.
 const LEAST_DOUBT: f64 = 0.01;
+/// The same in units of its standard error.
+const CLEAR: f64 = 5.0;
 
 /// PSFs of one row of stamps.
 pub enum RowPsf {
@@ -67,6 +71,8 @@ pub struct StampRow {
     pub survey: Option<Arc<Survey>>,
     /// PSFs.
     pub psf: RowPsf,
+    /// What was found wrong with the image when it was opened, with its first row.
+    pub warnings: Vec<Warning>,
 }
 
 /// Measurements of one row of stamps.
@@ -79,6 +85,10 @@ pub struct MeasuredRow {
     pub mosaic: Mosaic,
     /// One per galaxy.
     pub galaxies: Vec<Measurement>,
+    /// What was found wrong with the image when it was opened, with its first row.
+    pub warnings: Vec<Warning>,
+    /// Of the rows that are examined.
+    pub examination: Option<Examination>,
 }
 
 impl AsRef<[Measurement]> for MeasuredRow {
@@ -101,6 +111,7 @@ pub struct ImageSource {
     header_noise: Option<f64>,
     survey: Option<Arc<Survey>>,
     psf: PsfSource,
+    warnings: Vec<Warning>,
     next: usize,
 }
 
@@ -126,14 +137,8 @@ impl ImageSource {
         let (image, mosaic) = open_galaxies(data, id)?;
         let stamp = mosaic.stamp;
         if stamp < submission.stamp.size {
-            return Err(FileError::new(
-                data.galaxies(id.set, id.image),
-                format!(
-                    "the stamps have {stamp} pixels a side; submission {} needs {} (`[stamp] size` of one of your own says otherwise)",
-                    submission.name, submission.stamp.size
-                ),
-            )
-            .into());
+            let path = data.galaxies(id.set, id.image);
+            return Err(FileError::new(path, too_small(stamp, submission)).into());
         }
         let header_noise = image.number("NOISESIG")?;
         if submission.noise == NoiseSource::Header
@@ -150,13 +155,17 @@ impl ImageSource {
             );
             return Err(FileError::new(data.galaxies(id.set, id.image), message).into());
         }
+        let (psf, moved) = open_psf(data, id, submission, &mosaic)?;
+        let mut warnings: Vec<Warning> = Warning::of_settings(submission).into_iter().collect();
+        warnings.extend(moved.map(Warning::of_moved));
         Ok(ImageSource {
-            psf: open_psf(data, id, submission, &mosaic)?,
+            psf,
             id,
             image,
             mosaic,
             header_noise,
             survey: None,
+            warnings,
             next: 0,
         })
     }
@@ -191,7 +200,10 @@ impl ImageSource {
                 survey.add(stamp)?;
             }
         }
-        self.survey = survey.shared().map_err(|_| {
+        self.survey = survey.shared().map_err(|error| {
+            if let MeasureError::Data(wrong) = error {
+                return FileError::new(&path, wrong);
+            }
             let missing = match survey.incomplete() {
                 0 => String::new(),
                 count => format!(", {count} of which have missing pixels"),
@@ -237,8 +249,29 @@ impl ImageSource {
                     RowPsf::Functional(field[first..first + mosaic.of_row(iy)].to_vec())
                 }
             },
+            warnings: std::mem::take(&mut self.warnings),
         }))
     }
+}
+
+/// Why stamps of `stamp` pixels a side cannot be measured, with the lines of a configuration that measures them.
+fn too_small(stamp: usize, submission: &Submission) -> String {
+    let Submission { name, .. } = submission;
+    let needed = submission.stamp.size;
+    let mut lines = format!("  extends = \"{name}\"\n  stamp.size = {stamp}");
+    if let Some(linear) = submission.linear() {
+        // The linear method asks for a window of at most a quarter of the stamp, and for a PSF that is even or odd as it.
+        let window = stamp as f64 / 4.0;
+        if linear.deconvolution.window_sigma > window {
+            lines += &format!("\n  deconvolution.window_sigma = {window}");
+        }
+        if submission.psf.size % 2 != stamp % 2 {
+            lines += &format!("\n  psf.size = {}", submission.psf.size - 1);
+        }
+    }
+    format!(
+        "the stamps are too small for the configuration {name} (found {stamp} px a side, expected {needed} or more). Try: --submission own.toml, with the file own.toml of these lines:\n{lines}"
+    )
 }
 
 /// Opens the galaxies of an image, whose stamps are those of its header, or of the data's layout.
@@ -265,12 +298,13 @@ pub(super) fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), File
     Err(FileError::new(path, message))
 }
 
+/// The PSFs of an image, and the offset of a star for all galaxies that was moved to the middle of its stamp.
 fn open_psf(
     data: &DataFolder,
     id: ImageId,
     submission: &Submission,
     mosaic: &Mosaic,
-) -> Result<PsfSource, PipelineError> {
+) -> Result<(PsfSource, Option<[f64; 2]>), PipelineError> {
     let cut = submission.psf_cut();
     let PsfCut { size, least } = cut;
     match submission.psf.form {
@@ -284,7 +318,7 @@ fn open_psf(
                 );
                 return Err(FileError::new(&path, message).into());
             }
-            Ok(match rows.as_slice() {
+            let source = match rows.as_slice() {
                 [psf] => {
                     let stamp = psf.stamp_beside(cut.size, mosaic.stamp);
                     if stamp.iter().any(|value| !value.is_finite()) {
@@ -297,7 +331,8 @@ fn open_psf(
                     PsfSource::Shared(Arc::new(stamp))
                 }
                 _ => PsfSource::Functional(rows),
-            })
+            };
+            Ok((source, None))
         }
         PsfForm::Star => {
             let path = data.psf_star(id.set, id.image);
@@ -331,10 +366,8 @@ fn open_psf(
             let one = (width, height) == (side, side);
             if mosaic.galaxies > 1 && (width, height) == (columns * side, rows * side) {
                 check_strip(&path, columns, side)?;
-                return Ok(PsfSource::Stars {
-                    image: Box::new(image),
-                    side,
-                });
+                let image = Box::new(image);
+                return Ok((PsfSource::Stars { image, side }, None));
             }
             if !one || side > MAX_STAMP {
                 let message = format!(
@@ -346,8 +379,9 @@ fn open_psf(
             let pixels = image.read_rows(height)?;
             let stamp = ArrayView2::from_shape((height, width), &pixels)
                 .map_err(|error| FileError::new(&path, error))?;
-            let psf = star_psf(stamp, cut).map_err(|error| FileError::new(&path, error))?;
-            Ok(PsfSource::Shared(Arc::new(psf)))
+            let Star { psf, moved } =
+                star(stamp, cut).map_err(|error| FileError::new(&path, error))?;
+            Ok((PsfSource::Shared(Arc::new(psf)), moved))
         }
     }
 }
@@ -382,7 +416,56 @@ pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, P
         iy: row.iy,
         mosaic: row.mosaic,
         galaxies: galaxies?,
+        warnings: row.warnings.clone(),
+        examination: examine(row, stamps, worker.submission().psf_cut())?,
     })
+}
+
+/// Examines the stamps of a row, if it is one of those that are enough for its image.
+fn examine(
+    row: &StampRow,
+    stamps: ArrayView3<'_, f32>,
+    cut: PsfCut,
+) -> Result<Option<Examination>, PipelineError> {
+    let Mosaic { columns, stamp, .. } = row.mosaic;
+    let rows = examined_rows(columns, row.mosaic.rows());
+    if !rows.contains(&row.iy) {
+        return Ok(None);
+    }
+    let mut examination = Examination::new(stamp, columns);
+    for stamp in stamps.outer_iter() {
+        examination.add(stamp)?;
+    }
+    let most = EXAMINED_PSFS.div_ceil(rows.len());
+    match &row.psf {
+        // Once for the image.
+        RowPsf::Shared(psf) if rows.first() == Some(&row.iy) => {
+            examination.add_psf(psf.view(), None);
+        }
+        RowPsf::Shared(_) => {}
+        RowPsf::Stars { pixels, side } => {
+            let stars = strip(pixels, columns, *side)?;
+            let here = Slice::from(..stamps.len_of(Axis(0)));
+            examination.add_psfs(Psfs::Stars(stars.slice_axis(Axis(0), here)), cut, most);
+        }
+        RowPsf::Functional(field) => {
+            examination.add_psfs(Psfs::<f32>::Functional(field), cut, most);
+        }
+    }
+    Ok(Some(examination))
+}
+
+/// What is wrong with an image whose rows have been measured and calibrated.
+pub(crate) fn warnings(rows: &[MeasuredRow]) -> Vec<Warning> {
+    let mut found: Vec<Warning> = rows.iter().flat_map(|row| row.warnings.clone()).collect();
+    let mut examinations = rows.iter().filter_map(|row| row.examination.as_ref());
+    if let Some(first) = examinations.next() {
+        let mut all = first.clone();
+        examinations.for_each(|more| all.join(more));
+        found.extend(all.warnings());
+    }
+    found.extend(Warning::of_flags(rows));
+    found
 }
 
 /// The PSF of galaxy `ix` of a row as it is deconvolved with.
@@ -445,7 +528,7 @@ pub fn measure_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    let _claim = claim(&out.join(RUN_FILE), run)?;
+    let claim = claim(&out.join(RUN_FILE), run)?;
     let inputs = Inputs::new(run, data, images)?;
     let (todo, done) = to_do(run, out, images);
     inputs.verify(out, &done, threads)?;
@@ -461,10 +544,8 @@ pub fn measure_folder(
         .mosaic
         .stamp;
     let measurer = Measurer::new(&run.submission, stamp)?;
-    let (noise, doubts) = first_noise(data, first, &measurer)?;
-    for doubt in doubts {
-        progress.warn(&doubt);
-    }
+    let first = first_noise(data, first, &measurer)?;
+    let mut warned = Warned::default();
     let mut rows = Vec::new();
     // Of each image as it was when it was opened, in the images' order.
     let (send, receive) = std::sync::mpsc::channel();
@@ -476,7 +557,7 @@ pub fn measure_folder(
                 let _ = send.send(inputs.prints(id)?);
                 Ok(())
             };
-            read_images(data, &todo, &measurer, noise, print, feeder)
+            read_images(data, &todo, &measurer, first, print, feeder)
         },
         || measurer.worker(),
         |worker, row: StampRow| measure_row(worker, &row),
@@ -486,7 +567,10 @@ pub fn measure_folder(
             rows.push(row);
             if rows.len() == mosaic.rows() {
                 calibrate(&run.submission, &mut rows);
+                warned.add(id, warnings(&rows), progress)?;
                 let prints = receive.recv().unwrap_or_default();
+                // Writing would make the folder again, without the earlier catalogues.
+                claim.check()?;
                 write_catalogue(run, out, &rows, prints)?;
                 summary.count(&rows);
                 rows.clear();
@@ -494,7 +578,10 @@ pub fn measure_folder(
             }
             Ok(())
         },
-    )?;
+    )
+    .map_err(|error| claim.explain(error))?;
+    claim.check_results(catalogues(run, out, images))?;
+    warned.finish(progress);
     Ok(summary)
 }
 
@@ -504,7 +591,7 @@ fn first_noise(
     data: &DataFolder,
     first: ImageId,
     measurer: &Measurer,
-) -> Result<(Option<Arc<Survey>>, Vec<String>), PipelineError> {
+) -> Result<(Option<Arc<Survey>>, Vec<Warning>), PipelineError> {
     let submission = measurer.submission();
     let nothing = (None, Vec::new());
     if submission.linear().is_none() {
@@ -524,16 +611,11 @@ fn first_noise(
     };
     let mut source = ImageSource::open(data, first, submission)?;
     let asked = measurer.noise_plan().is_some();
-    let image = format!("set {:02} image {:03}", first.set, first.image);
+    let given = source.header_noise;
     let survey = match source.look(data, plan) {
         Ok(Some(survey)) => survey,
         Err(error) if asked => return Err(error),
-        Ok(None) if asked => {
-            let doubt = format!(
-                "warning: {image}: no stamp has enough pixels that differ to measure the noise on: its galaxies are flagged; noise.source \"header\" takes NOISESIG"
-            );
-            return Ok((None, vec![doubt]));
-        }
+        Ok(None) if asked => return Ok((None, vec![Warning::NoNoise])),
         Ok(None) | Err(_) => return Ok(nothing),
     };
     let white = !matches!(submission.noise, NoiseSource::Image { correlation } if correlation > 0);
@@ -544,45 +626,26 @@ fn first_noise(
         None
     };
     let coloured = &coloured.as_ref().unwrap_or(&survey).noise;
-    let noise = &survey.noise;
-    let mut doubts = Vec::new();
-    if let Some(header) = source.header_noise {
-        let apart = noise.sigma() / header - 1.0;
-        let doubtful = apart.abs() > (5.0 * noise.error()).max(LEAST_DOUBT);
-        // A header of zero or of no number.
-        if doubtful || apart.is_nan() {
-            let taken = if asked {
-                "the measured one is used"
-            } else {
-                "NOISESIG is not what is there"
-            };
-            doubts.push(format!(
-                "warning: {image}: NOISESIG is {}, the noise of the stamps' frames {}: {taken}",
-                level(header),
-                level(noise.sigma())
-            ));
-        }
-    }
+    let mut warnings: Vec<Warning> = doubtful(given, &survey, asked).into_iter().collect();
     if white && coloured.is_correlated() {
-        doubts.push(format!(
-            "warning: {image}: neighbouring pixels have noise correlated by {:.2} along x and {:.2} along y, which is taken as white; set noise.source to \"image\" and noise.correlation above 0",
-            coloured.correlation(1, 0),
-            coloured.correlation(0, 1)
-        ));
+        warnings.push(Warning::CorrelatedNoise {
+            correlation: [coloured.correlation(1, 0), coloured.correlation(0, 1)],
+        });
     }
-    Ok((asked.then_some(survey), doubts))
+    Ok((asked.then_some(survey), warnings))
 }
 
-/// A level of noise to five digits, in whatever unit pixels have.
-fn level(sigma: f64) -> String {
-    if sigma == 0.0 {
-        return "0".into();
-    }
-    if !(1e-3..1e5).contains(&sigma) {
-        return format!("{sigma:.4e}");
-    }
-    let decimals = 4.0 - sigma.log10().floor();
-    format!("{sigma:.*}", decimals.max(0.0) as usize)
+/// A warning if the header's noise level is not the measured one, which may be `used`.
+fn doubtful(given: Option<f64>, survey: &Survey, used: bool) -> Option<Warning> {
+    let (given, noise) = (given?, &survey.noise);
+    let apart = noise.sigma() / given - 1.0;
+    let differs = apart.abs() > (CLEAR * noise.error()).max(LEAST_DOUBT);
+    // A header of zero or of no number.
+    (differs || apart.is_nan()).then_some(Warning::NoiseLevel {
+        given,
+        measured: noise.sigma(),
+        used,
+    })
 }
 
 /// Number of galaxies that `measure_folder` will measure, for progress bars: an estimate from the
@@ -604,6 +667,15 @@ pub fn galaxies_to_do(
     Ok((todo.len() * mosaic.galaxies) as u64)
 }
 
+/// The catalogues of `images`, as they are called.
+pub(super) fn catalogues(
+    run: &Run,
+    out: &Path,
+    images: &[ImageId],
+) -> impl Iterator<Item = PathBuf> {
+    images.iter().map(|id| run.catalogue(out, id.set, id.image))
+}
+
 /// Those of `images` that have no catalogue yet, and those that have one.
 pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> (Vec<ImageId>, Vec<ImageId>) {
     images
@@ -615,10 +687,11 @@ fn read_images(
     data: &DataFolder,
     todo: &[ImageId],
     measurer: &Measurer,
-    mut first: Option<Arc<Survey>>,
+    (first, mut warnings): (Option<Arc<Survey>>, Vec<Warning>),
     mut opened: impl FnMut(ImageId) -> Result<(), FileError>,
     feeder: &mut Feeder<'_, StampRow>,
 ) -> Result<(), PipelineError> {
+    let mut first = Some(first);
     for &id in todo {
         opened(id)?;
         let mut source = ImageSource::open(data, id, measurer.submission())?;
@@ -631,12 +704,21 @@ fn read_images(
             );
             return Err(FileError::new(path, message).into());
         }
-        if let Some(plan) = measurer.noise_plan() {
-            match first.take() {
-                Some(survey) => source.survey = Some(survey),
-                None => {
-                    source.look(data, plan)?;
-                }
+        source.warnings.append(&mut warnings);
+        match (measurer.noise_plan(), first.take()) {
+            (None, _) => {}
+            (Some(_), Some(found)) => {
+                // Without noise the header's does not take its place.
+                source.header_noise = source.header_noise.filter(|_| found.is_some());
+                source.survey = found;
+            }
+            (Some(plan), None) => {
+                let given = source.header_noise;
+                let found = source.look(data, plan)?;
+                source.warnings.extend(match found {
+                    Some(survey) => doubtful(given, &survey, true),
+                    None => Some(Warning::NoNoise),
+                });
             }
         }
         while let Some(row) = source.next_row()? {
@@ -743,24 +825,4 @@ pub(super) fn metadata(
         .map(|(key, value)| (key.to_owned(), value)),
     );
     Ok(all)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::level;
-
-    #[test]
-    fn levels_have_five_digits_in_any_unit() {
-        let shown = [0.0, 0.00121, 0.12345678, 1.0, 12345.67, 123456.7, 3.2e-7].map(level);
-        let expected = [
-            "0",
-            "0.0012100",
-            "0.12346",
-            "1.0000",
-            "12346",
-            "1.2346e5",
-            "3.2000e-7",
-        ];
-        assert_eq!(shown, expected);
-    }
 }

@@ -6,14 +6,18 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis};
 use shearq_measure::{
-    Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Worker, calibrate, star_psf, strip,
+    Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Warning, Worker, calibrate, star_psf, strip,
 };
 use shearq_quantities::Shear;
 use shearq_submissions::{PsfForm, Submission};
 
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
-use super::measure::{MeasuredRow, RowPsf, StampRow, Summary, measure_row, to_do, write_catalogue};
+use super::measure::{
+    MeasuredRow, RowPsf, StampRow, Summary, catalogues, measure_row, to_do, warnings,
+    write_catalogue,
+};
+use super::warned::Warned;
 use super::{PipelineError, simulate};
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;
@@ -85,7 +89,7 @@ pub fn run_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    let _claim = claim(&out.join(RUN_FILE), run)?;
+    let claim = claim(&out.join(RUN_FILE), run)?;
     let measurers = measurers(std::slice::from_ref(&run.submission))?;
     let truth = DataFolder::new(out);
     let (todo, done) = to_do(run, out, images);
@@ -93,6 +97,7 @@ pub fn run_folder(
         already: done.len(),
         ..Summary::default()
     };
+    let mut warned = Warned::default();
     progress.skip((summary.already * settings.grid * settings.grid) as u64);
     for of_set in todo.chunk_by(|a, b| a.set == b.set) {
         let set = of_set[0].set;
@@ -100,12 +105,27 @@ pub fn run_folder(
         let simulator = simulate::simulator(set, settings)?;
         simulate::write_truth(&truth, &simulator)?;
         progress.note(&format!("set {set:02}"));
+        // The bar is busy meanwhile.
+        let mut found = Vec::new();
         run_set(&simulator, &todo, &measurers, threads, progress, |image| {
+            let id = ImageId {
+                set,
+                image: image.image,
+            };
+            found.extend(warnings(&image.rows[0]).into_iter().map(|one| (id, one)));
+            // Writing would make the folder again, without the earlier catalogues.
+            claim.check()?;
             write_catalogue(run, out, &image.rows[0], BTreeMap::new())?;
             summary.count(&image.rows[0]);
             Ok(())
-        })?;
+        })
+        .map_err(|error| claim.explain(error))?;
+        for (id, warning) in found {
+            warned.add(id, vec![warning], progress)?;
+        }
     }
+    claim.check_results(catalogues(run, out, images))?;
+    warned.finish(progress);
     Ok(summary)
 }
 
@@ -293,11 +313,18 @@ pub fn measure_strip(
         header_noise: Some(NOISE_SIGMA),
         survey: None,
         psf: RowPsf::Functional(Vec::new()),
+        warnings: Vec::new(),
     };
     let mut measured = Vec::with_capacity(workers.len());
     for (k, worker) in workers.iter_mut().enumerate() {
         row.survey = surveys.get(k).cloned().flatten();
         row.psf = row_psf(set, fields, iy, worker.submission());
+        row.warnings = match iy {
+            0 => Warning::of_settings(worker.submission())
+                .into_iter()
+                .collect(),
+            _ => Vec::new(),
+        };
         measured.push(measure_row(worker, &row)?);
     }
     Ok(measured)

@@ -9,11 +9,12 @@ use shearq_quantities::Shear;
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
-use crate::data::layout::DataFolder;
+use crate::data::layout::{DataFolder, SIGN_KEY};
 use crate::data::psf_table;
-use crate::data::run::claim;
+use crate::data::run::{Run, Source, claim};
 use shearq_files::atomic;
 use shearq_files::fits::{ImageWriter, Value};
+use shearq_files::open::is_there;
 use shearq_simulate::kinds::{SETS, SetKind};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
@@ -30,6 +31,19 @@ pub struct SimulationRecord {
     pub version: String,
     /// What the data are made from.
     pub settings: SimulationSettings,
+}
+
+/// The kind of a set by its number if the data were simulated; other data may have the same numbers.
+pub fn kind_of(data: &DataFolder, set: u32) -> Option<SetKind> {
+    let in_memory = || {
+        let run = Run::read(data.root()).ok().flatten();
+        run.is_some_and(|run| matches!(run.source, Source::Simulated(_)))
+    };
+    if is_there(&data.root().join(SIMULATION_FILE)) || in_memory() {
+        SetKind::of(set)
+    } else {
+        None
+    }
 }
 
 /// One row of stamps to draw.
@@ -74,7 +88,7 @@ pub fn simulate_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
-    let _claim = claim(&data.root().join(SIMULATION_FILE), record)?;
+    let claim = claim(&data.root().join(SIMULATION_FILE), record)?;
     let todo: Vec<ImageId> = images
         .iter()
         .filter(|id| !data.galaxies(id.set, id.image).is_file())
@@ -101,7 +115,11 @@ pub fn simulate_folder(
             progress.advance(row.observed.len() as u64);
             let mut image = match open.take() {
                 Some(image) => image,
-                None => OpenImage::create(record, data, &row.job)?,
+                None => {
+                    // Writing would make the folder again, without the earlier images.
+                    claim.check()?;
+                    OpenImage::create(record, data, &row.job)?
+                }
             };
             let last = row.job.iy + 1 == row.job.set.grid().n;
             image.add(row)?;
@@ -113,7 +131,9 @@ pub fn simulate_folder(
             }
             Ok(())
         },
-    )?;
+    )
+    .map_err(|error| claim.explain(error))?;
+    claim.check_results(images.iter().map(|id| data.galaxies(id.set, id.image)))?;
     Ok((made, already))
 }
 
@@ -192,7 +212,8 @@ pub fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
 /// Writes the true shear of a set.
 pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {
     let grid = set.grid();
-    let mut text = String::from("x,y,g1,g2\n");
+    // The comment follows the header, so that readers which skip one line or a `#` read the columns.
+    let mut text = format!("x,y,g1,g2\n# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)\n");
     for iy in 0..grid.n {
         for ix in 0..grid.n {
             let (x, y) = grid.centre(ix, iy);

@@ -5,6 +5,8 @@ use std::borrow::Cow;
 
 use shearq_submissions::is_control;
 
+use shearq_files::text::formula_mark;
+
 /// Text for a terminal: control characters but line breaks and tabs are written out as `\u001b`, which in
 /// JSON and TOML means the same character.
 pub fn visible(text: &str) -> Cow<'_, str> {
@@ -39,14 +41,9 @@ pub(super) fn markdown(text: &str) -> String {
     safe
 }
 
-/// A cell of CSV. Spreadsheets take what begins with `=`, `+`, `-` or `@` for a formula: it gets an
-/// apostrophe in front.
+/// A cell of CSV, without formulas.
 pub(super) fn csv(text: &str) -> String {
-    let mark = if text.starts_with(['=', '+', '-', '@', '\t', '\r']) {
-        "'"
-    } else {
-        ""
-    };
+    let mark = formula_mark(text);
     if text.contains([',', '"', '\n', '\r']) {
         format!("\"{mark}{}\"", text.replace('"', "\"\""))
     } else {

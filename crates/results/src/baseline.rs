@@ -13,7 +13,7 @@ mod measured;
 mod moved;
 
 pub use measured::{Wanted, figures_of, measure};
-pub use moved::{Checked, Shift, check};
+pub use moved::{Checked, Settings, Shift, check};
 
 /// A baseline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -40,6 +40,9 @@ pub struct BaselineSubmission {
     /// Its name.
     #[serde(deserialize_with = "checked_name")]
     pub name: String,
+    /// Its configuration file, from the folder of the baseline. None if it is a named one, or not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub file: Option<PathBuf>,
     /// All settings. Kept as text would be, so that settings of later versions can be told apart
     /// from them.
     pub settings: toml::Table,
@@ -48,13 +51,18 @@ pub struct BaselineSubmission {
 }
 
 impl BaselineSubmission {
-    /// A measured submission.
+    /// A measured submission, of the configuration `file` if it is known.
     ///
     /// # Errors
     /// Where its settings cannot be stored.
-    pub fn new(submission: &Submission, sets: Vec<BaselineSet>) -> Result<Self, toml::ser::Error> {
+    pub fn new(
+        submission: &Submission,
+        file: Option<PathBuf>,
+        sets: Vec<BaselineSet>,
+    ) -> Result<Self, toml::ser::Error> {
         Ok(BaselineSubmission {
             name: submission.name.clone(),
+            file,
             settings: toml::Table::try_from(submission)?,
             sets,
         })
@@ -169,12 +177,25 @@ impl Baseline {
         Err(Baseline::exists(path))
     }
 
-    /// Writes the baseline in place of what is there.
+    /// Writes the baseline in place of `earlier`, which was read from the same file before the work.
     ///
     /// # Errors
-    /// Where it cannot be written.
-    pub fn replace(&self, path: &Path) -> Result<(), FileError> {
+    /// Where the file has changed since, or cannot be written.
+    pub fn replace(&self, path: &Path, earlier: &Baseline) -> Result<(), FileError> {
         atomic::sweep_beside(path);
+        // Until the file is replaced, other processes wait here. Without locks in the file system they do not.
+        let folder = path
+            .parent()
+            .and_then(|folder| std::fs::File::open(folder).ok());
+        let _ = folder.as_ref().map(std::fs::File::lock);
+        // As texts, in which unknown errors are equal.
+        if Baseline::read(path)?.text(path)? != earlier.text(path)? {
+            let name = path.file_stem().unwrap_or_default().to_string_lossy();
+            let message = format!(
+                "the baseline was changed while this command measured; nothing was written. Try: shearq baseline check {name}"
+            );
+            return Err(FileError::new(path, message));
+        }
         atomic::write(path, self.text(path)?.as_bytes())
     }
 
@@ -200,3 +221,28 @@ fn sets_of(submissions: &[BaselineSubmission]) -> impl Iterator<Item = &Baseline
 
 /// Ending of file names.
 const ENDING: &str = "toml";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shearq_simulate::set::SimulationSettings;
+
+    #[test]
+    fn of_two_that_replace_one_baseline_the_second_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = Baseline::path(folder.path(), "mine");
+        let of = |seed| {
+            let source = Source::Simulated(SimulationSettings::new(seed, 8));
+            Baseline::new(source, Vec::new(), Vec::new())
+        };
+        of(1).create(&path).unwrap();
+        let earlier = Baseline::read(&path).unwrap();
+        of(2).replace(&path, &earlier).unwrap();
+        let message = of(3).replace(&path, &earlier).unwrap_err().to_string();
+        assert!(
+            message.ends_with("mine.toml: the baseline was changed while this command measured; nothing was written. Try: shearq baseline check mine"),
+            "{message}"
+        );
+        assert_eq!(Baseline::read(&path).unwrap(), of(2));
+    }
+}

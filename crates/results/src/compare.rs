@@ -8,8 +8,10 @@ use shearq_scoring::resample::{PairedDifference, PairedSet, mean_over_sets, pair
 use shearq_scoring::{Choice, Definition, Figures, Grid, Options};
 use shearq_submissions::{Published, Registry};
 
+use super::conditions::Conditions;
 use super::foreign::Foreign;
-use super::row::SetRecord;
+use super::groups::Order;
+use super::row::{RunRecord, SetRecord, choice_word, definition_word};
 use super::score::{Catalogues, ScoredSet, own_catalogue, score_variants, unscored};
 use shearq_files::FileError;
 use shearq_pipeline::data::layout::{DataFolder, MAX_SET};
@@ -27,15 +29,58 @@ pub struct Variant {
     pub sets: Vec<ScoredSet>,
     /// What of these sets was not scored.
     pub unscored: Vec<String>,
+    /// What is kept of it, as in a results store.
+    pub run: RunRecord,
 }
 
 impl Variant {
     /// What is kept of its sets.
     pub fn records(&self) -> Vec<SetRecord> {
-        // All are scored against one truth, so their data need no fingerprint to be told apart.
-        let record = |scored: &ScoredSet| Some(SetRecord::new(scored.set?, scored, String::new()));
-        self.sets.iter().filter_map(record).collect()
+        self.run.sets.clone()
     }
+}
+
+/// What is kept of sets that are all scored against one truth, whose data need no fingerprint.
+fn records(sets: &[ScoredSet]) -> Vec<SetRecord> {
+    let record = |scored: &ScoredSet| Some(SetRecord::new(scored.set?, scored, String::new()));
+    sets.iter().filter_map(record).collect()
+}
+
+/// The variants for which conditions hold, with the sets for which they hold, in the order asked for.
+///
+/// # Errors
+/// If a condition is not about a column, or none is left.
+pub fn chosen(
+    variants: Vec<Variant>,
+    conditions: Option<&Conditions>,
+    order: Option<&Order>,
+) -> Result<Vec<Variant>, PipelineError> {
+    let mut kept = Vec::new();
+    for mut variant in variants {
+        if let Some(conditions) = conditions {
+            let left = conditions.choose(vec![variant.run])?;
+            let Some(run) = left.into_iter().next() else {
+                continue;
+            };
+            let holds = |set: &ScoredSet| run.sets.iter().any(|own| Some(own.set) == set.set);
+            variant.sets.retain(holds);
+            variant.run = run;
+        }
+        kept.push(variant);
+    }
+    if kept.is_empty() {
+        let message = "--where: there is no set for which the conditions hold";
+        return Err(PipelineError::Request(message.into()));
+    }
+    let sets: Vec<Vec<SetRecord>> = kept.iter().map(Variant::records).collect();
+    if common_sets(&sets).is_empty() {
+        let message = "--where: the conditions leave no set that all have in common";
+        return Err(PipelineError::Request(message.into()));
+    }
+    if let Some(order) = order {
+        kept.sort_by(|a, b| order.compare(&a.run, &b.run));
+    }
+    Ok(kept)
 }
 
 /// Variants by name with what is kept of their sets, as pictures of several of them take it.
@@ -50,6 +95,7 @@ struct Entrant<'a> {
     published: Option<Published>,
     files: Files,
     foreign: Option<&'a Foreign>,
+    settings: String,
 }
 
 /// How variants are scored.
@@ -90,13 +136,18 @@ pub fn score_all(
             published: None,
             files: foreign.catalogues(&[])?,
             foreign: Some(foreign),
+            settings: foreign.pattern().display().to_string(),
         });
+    }
+    if entrants.iter().all(|e| e.files.serve_all_sets()) {
+        let message = "no pattern of the catalogues has a number of the set (expected {set} in `catalogues`); nothing says which sets to compare";
+        return Err(PipelineError::Request(message.into()));
     }
     if let Some(entrant) = entrants.iter().find(|e| e.files.sets().is_empty()) {
         let message = format!("{}: there is no catalogue to score", entrant.name);
         return Err(PipelineError::Request(message));
     }
-    let common = |set: u32| entrants.iter().all(|e| e.files.sets().contains(&set));
+    let common = |set: u32| entrants.iter().all(|e| e.files.has(set));
     if !(1..=MAX_SET).any(common) {
         let message = "the variants have no set in common; there is nothing to compare".into();
         return Err(PipelineError::Request(message));
@@ -137,11 +188,26 @@ pub fn score_all(
         .zip(scored)
         .map(|(entrant, sets)| {
             let numbers: Vec<u32> = sets.iter().filter_map(|set| set.set).collect();
+            let choice = match entrant.foreign {
+                Some(_) => way.foreign,
+                None => way.own,
+            };
+            let run = RunRecord {
+                submission: entrant.name.clone(),
+                version: shearq_pipeline::VERSION.into(),
+                settings: entrant.settings.clone(),
+                source: data.root().display().to_string(),
+                definition: definition_word(way.definition).into(),
+                choice: choice_word(choice),
+                noise: "measured".into(),
+                sets: records(&sets),
+            };
             Ok(Variant {
                 name: entrant.name.clone(),
                 published: entrant.published,
                 unscored: unscored(&data, &sets, &numbers)?,
                 sets,
+                run,
             })
         })
         .collect()
@@ -191,6 +257,10 @@ fn own_entrants(
             name: run.submission.name.clone(),
             files: run.catalogues(folder, &[])?,
             foreign: None,
+            settings: toml::to_string(&run.submission).map_err(FileError::doing(
+                folder,
+                "cannot write the settings as TOML",
+            ))?,
         });
     }
     Ok(entrants)

@@ -77,6 +77,14 @@ fn one() -> i8 {
     1
 }
 
+/// The folder that a file is in; of a bare file name, the current one.
+pub fn folder_of(path: &Path) -> &Path {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    }
+}
+
 impl Foreign {
     /// Reads a description.
     ///
@@ -98,7 +106,7 @@ impl Foreign {
         }
         check_pattern("catalogues", &foreign.catalogues, &[IMAGE_PLACEHOLDERS])
             .map_err(|message| FileError::new(path, message))?;
-        foreign.folder = path.parent().unwrap_or(Path::new("")).to_owned();
+        foreign.folder = folder_of(path).to_owned();
         Ok(foreign)
     }
 
@@ -184,26 +192,25 @@ impl Foreign {
 pub struct Screen {
     /// A value of either component.
     pub missing: Option<f64>,
-    /// The largest |e| that is one.
+    /// The largest |e| that is one, after conversion.
     pub max_modulus: Option<f64>,
+    /// Whether the ellipticities are distortions, which are converted to shear-type ellipticities.
+    #[serde(default)]
+    pub distortion: bool,
 }
 
 impl Screen {
-    /// The row, without an ellipticity where its value stands for none.
+    /// The row as a shear-type ellipticity, without one if its value stands for none.
     pub fn apply(&self, row: Row) -> Row {
         let missing = self.missing.is_some_and(|m| row.e1 == m || row.e2 == m);
-        if missing
-            || self
-                .max_modulus
-                .is_some_and(|max| row.e1.hypot(row.e2) > max)
-        {
-            return Row {
-                e1: f64::NAN,
-                e2: f64::NAN,
-                ..row
-            };
-        }
-        row
+        let shape = match (missing, self.distortion) {
+            (true, _) => None,
+            (false, true) => Distortion::new(row.e1, row.e2).to_shear(),
+            (false, false) => Some(Shear::new(row.e1, row.e2)),
+        };
+        let shape = shape.filter(|e| self.max_modulus.is_none_or(|most| e.modulus() <= most));
+        let Shear { e1, e2 } = shape.unwrap_or(Shear::new(f64::NAN, f64::NAN));
+        Row { e1, e2, ..row }
     }
 }
 

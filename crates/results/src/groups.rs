@@ -76,6 +76,14 @@ impl FromStr for Order {
     }
 }
 
+impl Order {
+    /// Two runs in this order.
+    pub(super) fn compare(&self, a: &RunRecord, b: &RunRecord) -> Ordering {
+        let (a, b) = (Group::whole(a), Group::whole(b));
+        in_order(&a.key(&self.field), &b.key(&self.field), self.descending)
+    }
+}
+
 /// A run, or a group of its sets.
 pub struct Group<'a> {
     /// The run.
@@ -89,7 +97,17 @@ pub struct Group<'a> {
 }
 
 impl<'a> Group<'a> {
-    /// The groups of runs, in the order of `order`; where none is asked for, groups stand together.
+    /// A whole run.
+    fn whole(run: &'a RunRecord) -> Self {
+        Group {
+            run,
+            id: run.id(),
+            value: None,
+            sets: run.sets.iter().collect(),
+        }
+    }
+
+    /// The groups of runs: rows of equal value stand together, and are in the order of `order`.
     ///
     /// # Errors
     /// Where polars cannot make a table of the runs.
@@ -123,7 +141,10 @@ impl<'a> Group<'a> {
         }
         let (field, descending) =
             order.map_or(("group", false), |o| (o.field.as_str(), o.descending));
+        // The sort is stable: rows of a group are sorted first, and stay in that order.
         groups.sort_by(|a, b| in_order(&a.key(field), &b.key(field), descending));
+        let of_groups = field == "group" && descending;
+        groups.sort_by(|a, b| in_order(&a.key("group"), &b.key("group"), of_groups));
         Ok(groups)
     }
 

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use shearq_measure::{Flag, Warning};
 use shearq_quantities::statistics::RunningMean;
 
 use shearq_files::FileError;
@@ -19,12 +20,32 @@ pub struct SetMean {
     pub galaxies: usize,
     /// Galaxies without one.
     pub flagged: usize,
+    /// Galaxies with each of [`Flag::ALL`].
+    pub flags: [usize; Flag::ALL.len()],
     /// Mean of e1 and e2.
     pub mean: [f64; 2],
     /// Standard error of the means, of galaxies that know nothing of one another.
     pub error: [f64; 2],
     /// Standard deviation of one galaxy.
     pub scatter: [f64; 2],
+}
+
+impl SetMean {
+    /// A warning if more than half of the galaxies are flagged.
+    pub fn mostly_flagged(&self) -> Option<Warning> {
+        let with = |flag: Flag| {
+            let mut counts = self.flags.iter().zip(Flag::ALL);
+            counts
+                .find(|(_, other)| *other == flag)
+                .map_or(0, |(count, _)| *count)
+        };
+        Warning::of_counts(with, self.flagged, self.flagged + self.galaxies)
+    }
+
+    /// Whether all galaxies have one ellipticity, so that their scatter is no error.
+    pub fn is_constant(&self) -> bool {
+        self.galaxies > 1 && self.scatter == [0.0; 2]
+    }
 }
 
 /// The means over the catalogues of each set of the results folder `out` (of `sets`, if there are some).
@@ -53,12 +74,18 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<SetMean>, 
 
 fn mean_of(set: u32, catalogues: &[(u32, PathBuf)]) -> Result<SetMean, FileError> {
     let (mut moments, mut flagged) = ([RunningMean::default(); 2], 0);
+    let mut flags = [0; Flag::ALL.len()];
     for (_, path) in catalogues {
-        let read = table::read(path, Some(&["e1", "e2"]), table::MAX_ROWS)?;
+        let read = table::read(path, Some(&["e1", "e2", "flag"]), table::MAX_ROWS)?;
         let (e1, e2) = (
             table::numbers(&read, "e1", path)?,
             table::numbers(&read, "e2", path)?,
         );
+        for &bits in table::numbers(&read, "flag", path)?.iter() {
+            for (count, flag) in flags.iter_mut().zip(Flag::ALL) {
+                *count += usize::from(bits as u32 & flag as u32 != 0);
+            }
+        }
         for (&first, &second) in e1.iter().zip(e2.iter()) {
             if first.is_finite() && second.is_finite() {
                 moments[0].add(first);
@@ -75,6 +102,7 @@ fn mean_of(set: u32, catalogues: &[(u32, PathBuf)]) -> Result<SetMean, FileError
         images: catalogues.iter().map(|(image, _)| *image).collect(),
         galaxies,
         flagged,
+        flags,
         mean: moments.map(|m| m.mean()),
         error: scatter.map(|deviation| deviation / (galaxies as f64).sqrt()),
         scatter,

@@ -10,6 +10,7 @@ use shearq_submissions::check_name;
 
 use super::score::ScoredSet;
 use shearq_files::FileError;
+use shearq_files::table::MAX_ROWS;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::fingerprint::{self, Fingerprint};
 use shearq_pipeline::data::layout::DataFolder;
@@ -21,6 +22,9 @@ use shearq_simulate::kinds::SetKind;
 pub struct SetRecord {
     /// Set number.
     pub set: u32,
+    /// Whether it is a simulated set, whose number gives its kind. Records without it are.
+    #[serde(default = "yes")]
+    pub simulated: bool,
     /// Fingerprint of the set's data ([`fingerprint::of_set`]).
     pub data: String,
     /// Numbers of the images scored.
@@ -48,18 +52,32 @@ pub struct SetRecord {
     pub convention_leaderboard: u8,
 }
 
+fn yes() -> bool {
+    true
+}
+
 impl SetRecord {
+    /// The kind of a simulated set.
+    pub fn kind(&self) -> Option<SetKind> {
+        SetKind::of(self.set).filter(|_| self.simulated)
+    }
+
     /// What is kept of the scored set `set`, of data with the fingerprint `data`.
     pub fn new(set: u32, scored: &ScoredSet, data: String) -> Self {
         let ScoredSet {
             set: _,
+            kind,
             images,
             score,
             rows,
             basis,
+            sign: _,
+            findings: _,
+            odd_images: _,
         } = scored;
         SetRecord {
             set,
+            simulated: kind.is_some(),
             data,
             images: images.clone(),
             galaxies: (rows.used + rows.not_finite) as u64,
@@ -95,6 +113,23 @@ pub struct RunRecord {
     pub noise: String,
     /// The sets, in order.
     pub sets: Vec<SetRecord>,
+}
+
+/// A bandpower definition in records.
+pub(super) fn definition_word(definition: Definition) -> &'static str {
+    match definition {
+        Definition::Leaderboard => "leaderboard",
+        Definition::Corrected => "corrected",
+    }
+}
+
+/// A choice of a convention in records.
+pub(super) fn choice_word(choice: Choice) -> String {
+    match choice {
+        Choice::Matched => "matched".into(),
+        Choice::Best => "best".into(),
+        Choice::Insist(convention) => convention.number().to_string(),
+    }
 }
 
 /// What was measured, and by what.
@@ -160,15 +195,8 @@ impl RunRecord {
                     .map_err(FileError::doing(data.root(), "cannot store the settings"))?,
                 Source::Folder { .. } => fingerprint::of_source(source, data)?,
             },
-            definition: match options.definition {
-                Definition::Leaderboard => "leaderboard".into(),
-                Definition::Corrected => "corrected".into(),
-            },
-            choice: match options.choice {
-                Choice::Matched => "matched".into(),
-                Choice::Best => "best".into(),
-                Choice::Insist(convention) => convention.number().to_string(),
-            },
+            definition: definition_word(options.definition).into(),
+            choice: choice_word(options.choice),
             noise: match options.noise {
                 Noise::Measured => "measured".into(),
                 Noise::Given(variance) => variance.to_string(),
@@ -254,7 +282,7 @@ pub fn table_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
     let kind = |name: &str, value: &dyn Fn(&SetKind) -> &'static str| {
         let values = rows
             .iter()
-            .map(|row| SetKind::of(row.2.set).as_ref().map_or("", value));
+            .map(|row| row.2.kind().as_ref().map_or("", value));
         Column::new(name.into(), values.collect::<Vec<&str>>())
     };
     let text = |name: &str, value: &dyn Fn(&SetRecord) -> String| {
@@ -387,12 +415,29 @@ impl Rows<'_> {
             }
             Ok(Figures::from_values(values))
         };
+        let images: Vec<u32> = self.list("image_numbers", row)?;
+        // Numbers that no catalogues have are not added up.
+        let at_most = |name: &str, most: u64| match self.count::<u64>(name, row)? {
+            found if found <= most => Ok(found),
+            found => {
+                let message = format!(
+                    "row {}: column `{name}` is {found}; expected at most {most}",
+                    row + 1
+                );
+                Err(FileError::new(self.path, message))
+            }
+        };
+        at_most("images", images.len() as u64)?;
+        let galaxies = at_most("galaxies", images.len() as u64 * MAX_ROWS as u64)?;
         Ok(SetRecord {
             set: self.count("set", row)?,
+            simulated: self
+                .text("set_kind", row)
+                .is_ok_and(|kind| !kind.is_empty()),
             data: self.text("data", row)?.to_owned(),
-            images: self.list("image_numbers", row)?,
-            galaxies: self.count("galaxies", row)?,
-            flagged: self.count("flagged", row)?,
+            images,
+            galaxies,
+            flagged: at_most("flagged", galaxies)?,
             figures: figures(&str::to_owned)?,
             errors: figures(&error_of)?,
             q_replicates: self.list("q_replicates", row)?,

@@ -5,16 +5,18 @@ use std::path::{Path, PathBuf};
 
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
-    Choice, Convention, ConventionMatch, FieldSum, Figures, Grid, Options, RowCounts, SetImages,
-    SetScore, SetScorer,
+    Choice, Convention, ConventionMatch, Fault, FieldSum, Figures, Grid, ImageFaults, Options,
+    RowCounts, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
 };
 
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
 use shearq_pipeline::data::layout::{DataFolder, MAX_SET, read_rows};
 use shearq_pipeline::data::run::Run;
-use shearq_pipeline::truth::{Reading, read_truth, reading_of};
+use shearq_pipeline::simulate::kind_of;
+use shearq_pipeline::truth::{ReadTruth, Reading, SignBasis, read_truth, reading_of};
 use shearq_pipeline::{PipelineError, engine, inputs};
+use shearq_simulate::kinds::SetKind;
 
 /// Columns of our catalogues that are scored.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
@@ -26,6 +28,8 @@ pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
 pub struct ScoredSet {
     /// Its number; a set given as plain files has none.
     pub set: Option<u32>,
+    /// Its kind, if the data were simulated.
+    pub kind: Option<SetKind>,
     /// Numbers of the images scored.
     pub images: Vec<u32>,
     /// The score.
@@ -34,6 +38,66 @@ pub struct ScoredSet {
     pub rows: RowCounts,
     /// How the convention was chosen.
     pub basis: Basis,
+    /// How the sign of the true g2 was determined.
+    pub sign: SignBasis,
+    /// Probable faults of the ellipticities or the truth.
+    pub findings: Vec<Fault>,
+    /// Probable faults of single images.
+    pub odd_images: OddImages,
+}
+
+/// Catalogues of a set with faults that their sum does not show.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct OddImages {
+    /// Catalogues with the ellipticities of another one, and that one.
+    pub copies: Vec<(PathBuf, PathBuf)>,
+    /// Catalogues whose galaxies all have one ellipticity, and that ellipticity.
+    pub constant: Vec<(PathBuf, [f64; 2])>,
+}
+
+impl OddImages {
+    /// Names the images of `faults`, which were added in the order of `paths`.
+    pub fn new(faults: &ImageFaults, paths: &[PathBuf]) -> Self {
+        OddImages {
+            copies: faults
+                .copies
+                .iter()
+                .map(|(copy, first)| (paths[*copy].clone(), paths[*first].clone()))
+                .collect(),
+            constant: faults
+                .constant
+                .iter()
+                .map(|(place, e)| (paths[*place].clone(), *e))
+                .collect(),
+        }
+    }
+}
+
+impl OddImages {
+    /// With other names of the files, for those of an unpacked archive.
+    pub fn renamed(&mut self, name: impl Fn(&Path) -> PathBuf) {
+        for (copy, first) in &mut self.copies {
+            (*copy, *first) = (name(copy), name(first));
+        }
+        for (path, _) in &mut self.constant {
+            *path = name(path);
+        }
+    }
+}
+
+/// Probable faults of a scored set.
+fn findings(
+    scorer: &SetScorer,
+    images: &SetImages,
+    score: &SetScore,
+    choice: Choice,
+) -> Vec<Fault> {
+    // The convention with the highest Q may be a wrong one.
+    let convention = match choice {
+        Choice::Best => score.matching.convention(),
+        Choice::Matched | Choice::Insist(_) => score.chosen,
+    };
+    scorer.diagnose(images, score, convention)
 }
 
 /// What the convention of a submission's figures rests on. It is the same for all its sets.
@@ -84,13 +148,33 @@ pub fn score_files(
     options: Options,
     threads: usize,
 ) -> Result<ScoredSet, PipelineError> {
-    let (grid, shear) = read_truth(truth, reading)?;
+    let ReadTruth {
+        grid,
+        mut shear,
+        mut basis,
+    } = read_truth(truth, reading)?;
     let scoring = |source| PipelineError::Scoring { set: None, source };
+    let Added {
+        images,
+        rows,
+        odd_images,
+    } = add_up(&grid, catalogues, read, threads)?;
+    if basis == SignBasis::Unknown
+        && let Some(sign) = sign_by_correlation(&shear.flipped(), images.total())
+    {
+        basis = SignBasis::Correlation(sign);
+        if sign == TruthSign::Standard {
+            shear = shear.flipped();
+        }
+    }
     let scorer = SetScorer::new(grid, shear, options).map_err(scoring)?;
-    let (images, rows) = add_up(&grid, catalogues, read, threads)?;
     let score = scorer.score(&images).map_err(scoring)?;
     Ok(ScoredSet {
         set: None,
+        kind: None,
+        findings: findings(&scorer, &images, &score, options.choice),
+        odd_images,
+        sign: basis,
         images: (1..=catalogues.len() as u32).collect(),
         basis: match options.choice {
             Choice::Matched => Basis::Matched(score.matching),
@@ -102,13 +186,21 @@ pub fn score_files(
     })
 }
 
+/// Catalogues of a set, added up.
+struct Added {
+    images: SetImages,
+    rows: RowCounts,
+    odd_images: OddImages,
+}
+
 /// Reads catalogues in parallel and adds them up in order.
 fn add_up(
     grid: &Grid,
     catalogues: &[PathBuf],
     read: ReadImage<'_>,
     threads: usize,
-) -> Result<(SetImages, RowCounts), PipelineError> {
+) -> Result<Added, PipelineError> {
+    let mut faults = ImageFaults::default();
     let mut images = SetImages::new(grid);
     let mut counts = RowCounts::default();
     engine::ordered(
@@ -124,24 +216,40 @@ fn add_up(
         || (),
         |(), path: PathBuf| Ok(read(grid, &path)?),
         |(sum, more)| {
+            faults.add(&sum);
             images.add(&sum);
             counts += more;
             Ok(())
         },
     )?;
     if counts.used == 0
-        && counts.outside > 0
         && let Some(first) = catalogues.first()
     {
-        let message = format!(
-            "no row of the {} catalogue(s) falls on the {1} × {1} grid of {2} px stamps",
-            catalogues.len(),
-            grid.n,
-            grid.stamp.0
-        );
-        return Err(FileError::new(first, message).into());
+        return Err(FileError::new(first, nothing_used(&counts, catalogues.len(), grid)).into());
     }
-    Ok((images, counts))
+    Ok(Added {
+        images,
+        rows: counts,
+        odd_images: OddImages::new(&faults, catalogues),
+    })
+}
+
+/// Why no row of `files` catalogues can be scored.
+fn nothing_used(counts: &RowCounts, files: usize, grid: &Grid) -> String {
+    let (n, stamp) = (grid.n, grid.stamp.0);
+    if counts.outside > counts.not_finite {
+        return format!(
+            "no row of the {files} catalogue(s) falls on the {n} × {n} grid of {stamp} px stamps; expected x and y in pixels from 0.5 to {}. Are they sky coordinates in degrees?",
+            n as f64 * stamp + 0.5
+        );
+    }
+    if counts.not_finite > 0 {
+        return format!(
+            "none of the {} galaxies in {files} catalogue(s) has an ellipticity: all values are NaN, flagged or marked as missing. Check the column names, the flags, and the PSF of the measurement",
+            counts.not_finite
+        );
+    }
+    format!("there is no galaxy in {files} catalogue(s); expected a row per galaxy")
 }
 
 /// Catalogues of one variant of a measurement.
@@ -191,14 +299,18 @@ pub fn score_variants(
                 set: Some(*set),
                 source,
             };
-            let (scorer, images, rows) =
-                prepare(data, *set, &files[k], variant.read, options, threads)?;
+            let (scorer, added) = prepare(data, *set, &files[k], variant.read, options, threads)?;
+            let score = scorer.score(&added.images).map_err(scoring)?;
             own.push(ScoredSet {
                 set: Some(*set),
+                kind: kind_of(data, *set),
                 images: files[k].iter().map(|file| file.0).collect(),
-                score: scorer.score(&images).map_err(scoring)?,
-                rows,
+                findings: findings(&scorer, &added.images, &score, options.choice),
+                odd_images: added.odd_images,
+                score,
+                rows: added.rows,
                 basis,
+                sign: SignBasis::Specified,
             });
         }
         scored.push(own);
@@ -216,8 +328,9 @@ fn sets_to_score(
         if !wanted.is_empty() && !wanted.contains(&set) {
             continue;
         }
-        let files: Vec<_> = variants.iter().map(|v| (v.of_set)(set)).collect();
-        if files.iter().all(|files| !files.is_empty()) {
+        let files = variants.iter().map(|v| (v.of_set)(set));
+        let files: Vec<_> = files.take_while(|files| !files.is_empty()).collect();
+        if files.len() == variants.len() {
             sets.push((set, files));
         } else if wanted.contains(&set) {
             let message = format!("there is no catalogue of set {set} to score");
@@ -241,7 +354,7 @@ fn match_over_sets(
 ) -> Result<ConventionMatch, PipelineError> {
     let mut all = ConventionMatch::default();
     for (set, files) in sets {
-        let (scorer, images, _) = prepare(
+        let (scorer, added) = prepare(
             data,
             *set,
             &files[k],
@@ -249,7 +362,7 @@ fn match_over_sets(
             Options::default(),
             threads,
         )?;
-        all.merge(&scorer.match_convention(&images));
+        all.merge(&scorer.match_convention(&added.images));
     }
     Ok(all)
 }
@@ -262,15 +375,14 @@ fn prepare(
     read: ReadImage<'_>,
     options: Options,
     threads: usize,
-) -> Result<(SetScorer, SetImages, RowCounts), PipelineError> {
-    let (grid, shear) = read_truth(&data.truth(set), &reading_of(data, set)?)?;
+) -> Result<(SetScorer, Added), PipelineError> {
+    let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
     let scorer = SetScorer::new(grid, shear, options).map_err(|source| PipelineError::Scoring {
         set: Some(set),
         source,
     })?;
     let files: Vec<PathBuf> = files.iter().map(|file| file.1.clone()).collect();
-    let (images, rows) = add_up(&grid, &files, read, threads)?;
-    Ok((scorer, images, rows))
+    Ok((scorer, add_up(&grid, &files, read, threads)?))
 }
 
 /// Scores sets of a data folder from catalogues found by `catalogues`: all sets that have some, or
@@ -343,7 +455,9 @@ pub fn without_catalogue(
     sets: &[u32],
 ) -> Result<Vec<String>, FileError> {
     let images = data.images(sets)?;
-    let (mut absent, mut lines) = (Vec::new(), Vec::new());
+    let mut absent = Vec::new();
+    let unread = images.unread().into_iter();
+    let mut lines: Vec<String> = unread.map(|line| format!("Warning: {line}.")).collect();
     for set in images.sets() {
         let there = images.of_set(set);
         let Some(used) = used.get(&set) else {
@@ -354,7 +468,7 @@ pub fn without_catalogue(
         match lacking.count() {
             0 => {}
             count => lines.push(format!(
-                "Warning: {count} of the {} images of set {set} have no catalogue; figures depend on the number of images.",
+                "warning: {count} of the {} images of set {set} have no catalogue; figures depend on the number of images.",
                 there.len()
             )),
         }
@@ -362,7 +476,7 @@ pub fn without_catalogue(
     if !absent.is_empty() {
         let absent = absent.join(", ");
         lines.push(format!(
-            "Warning: there are data of sets without a catalogue: {absent}."
+            "warning: there are data of sets without a catalogue: {absent}."
         ));
     }
     Ok(lines)

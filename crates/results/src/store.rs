@@ -17,15 +17,31 @@ use shearq_pipeline::data::fingerprint;
 /// Key and value in the footer that tell the files of a store.
 const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");
 
+/// Most sets of one run: ten times the highest number that file names have room for.
+const MAX_SETS: usize = 100_000;
+/// A store's folder. If it was made for this and is still empty in the end, it is removed.
+#[must_use]
+pub struct Prepared(Option<PathBuf>);
+
+impl Drop for Prepared {
+    fn drop(&mut self) {
+        if let Some(made) = &self.0 {
+            // Fails for a folder that has files, as it should.
+            let _ = std::fs::remove_dir(made);
+        }
+    }
+}
+
 /// Makes the folder of a store, so that a long run does not find out at its end that it cannot.
 ///
 /// # Errors
-/// Where it cannot be made.
-pub fn prepare(store: &Path) -> Result<(), FileError> {
+/// If it cannot be made.
+pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
+    let absent = !store.exists();
     std::fs::create_dir_all(store)
         .map_err(FileError::doing(store, "cannot make the results store"))?;
     atomic::sweep(store);
-    Ok(())
+    Ok(Prepared(absent.then(|| store.to_owned())))
 }
 
 /// Records a run; the file it is now in.
@@ -57,7 +73,7 @@ fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
 /// Reads the run of one file.
 fn read_run(path: &Path) -> Result<RunRecord, FileError> {
     let failed = |error: TableError| bare(path, &error);
-    let table = read_parquet(path, None).map_err(failed)?;
+    let table = read_parquet(path, None, MAX_SETS).map_err(failed)?;
     let metadata = parquet_metadata(path).map_err(failed)?;
     let found = metadata.get(SCHEMA.0).map(String::as_str);
     if found != Some(SCHEMA.1) {
@@ -129,7 +145,7 @@ fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<Stri
             Some(own) => {
                 if own.images.len() == set.images.len() {
                     notes.push(format!(
-                        "Warning: {} holds set {} of a run that another file holds too, with other results on as many images; that other one counts.",
+                        "warning: {} holds set {} of a run that another file holds too, with other results on as many images; that other one counts.",
                         path.display(),
                         set.set
                     ));

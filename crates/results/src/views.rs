@@ -2,8 +2,10 @@
 
 pub mod baseline;
 pub mod comparison;
+pub mod diagnosis;
 pub mod mean;
 pub mod pages;
 pub mod scores;
 pub mod spectrum;
 pub mod steps;
+pub mod verdict;

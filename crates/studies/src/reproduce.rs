@@ -18,8 +18,10 @@ use shearq_pipeline::engine::Progress;
 use shearq_pipeline::measure::MeasuredRow;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
+use shearq_pipeline::truth::SignBasis;
 use shearq_results::row::SetRecord;
-use shearq_results::score::{Basis, OWN, ScoredSet};
+use shearq_results::score::{Basis, OWN, OddImages, ScoredSet};
+use shearq_simulate::kinds::SetKind;
 use shearq_simulate::set::SimulationSettings;
 
 /// What a run is made from.
@@ -166,10 +168,14 @@ pub fn run_sets(
         let scored = |(sum, rows): &(SetImages, RowCounts)| {
             Ok(ScoredSet {
                 set: Some(set),
+                kind: SetKind::of(set),
                 images: images.clone(),
                 score: scorer.score(sum)?,
                 rows: *rows,
                 basis: Basis::Told,
+                sign: SignBasis::Specified,
+                findings: Vec::new(),
+                odd_images: OddImages::default(),
             })
         };
         let scored: Vec<ScoredSet> = sums

@@ -603,7 +603,7 @@ fn best_score(
     let reading = Reading {
         field: Degrees(10.0),
         stamp: Pixels(48.0),
-        sign: TruthSign::Standard,
+        sign: Some(TruthSign::Standard),
     };
     let mut best = f64::INFINITY;
     for _ in 0..3 {

@@ -10,7 +10,7 @@ per pixel in the image's unit; results do not depend on the number of threads, a
 """
 
 from . import adapters
-from ._measure import Catalogue, Flag, FunctionalPsf, MeanShear, measure
+from ._measure import Catalogue, DataWarning, Flag, FunctionalPsf, MeanShear, measure
 from ._score import FIGURES, Score, compare, power_spectrum, score
 from ._shearq import __version__
 from ._simulate import SimulatedImage, Simulation, simulate
@@ -19,6 +19,7 @@ from ._submissions import Submission, submission, submissions
 __all__ = [
     "FIGURES",
     "Catalogue",
+    "DataWarning",
     "Flag",
     "FunctionalPsf",
     "MeanShear",

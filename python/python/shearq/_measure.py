@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,10 @@ Flag.__doc__ = "Why a galaxy could not be measured: the bits of a catalogue's ``
 
 # Columns as AnaCal calls them.
 _ANACAL = {"e1": "e1", "e2": "e2", "R11": "de1_dg1", "R22": "de2_dg2"}
+
+
+class DataWarning(UserWarning):
+    """Stamps or PSFs that are measured, although they bias shears or are likely a mistake."""
 
 
 class FunctionalPsf:
@@ -295,6 +300,11 @@ def measure(
     KeyError
         Where there is no such submission.
 
+    Warns
+    -----
+    DataWarning
+        If stamps bias shears or are likely a mistake, for example if they contain sky.
+
     Notes
     -----
     e1 and e2 are divided by the mean response of the good galaxies of this call: some thousands tell it to a per
@@ -337,7 +347,7 @@ def measure(
             raise ValueError(
                 f"noise: found an array of shape {shown(sigmas.shape)}; expected one number, or ({count},), one for each stamp"
             )
-    found, response = _shearq.measure(
+    found, response, doubts = _shearq.measure(
         stamps,
         star,
         stars,
@@ -348,6 +358,8 @@ def measure(
         thread_count(threads),
         callback(progress),
     )
+    for doubt in doubts:
+        warnings.warn(doubt, DataWarning, stacklevel=2)
     catalogue = np.empty(count, dtype=[(name, column.dtype) for name, column in found.items()]).view(Catalogue)
     for name, column in found.items():
         catalogue[name] = column

@@ -72,7 +72,7 @@ class Score:
         matched, meaning = found["matched"]
         if found["matched_clearly"] and matched != self.convention:
             self.notes.append(
-                f"Warning: the ellipticities match the truth in convention {matched} ({meaning}), and are scored in"
+                f"warning: the ellipticities match the truth in convention {matched} ({meaning}), and are scored in"
                 f" {self.convention}: mind the signs of e1 and e2 and the order of the axes."
             )
 
@@ -133,7 +133,8 @@ def score(
         Variance of the ellipticities' noise per component, galaxy and image, for q_dn. Measured from the scatter
         between images by default.
     truth_sign : {'standard', 'challenge'}
-        'challenge' where truth_g2 is minus the standard one, as in the challenge's files.
+        'challenge' if truth_g2 is minus the standard one, as in the challenge's files. The `truth.csv` that
+        `simulate` writes has the standard sign.
 
     Returns
     -------
@@ -142,12 +143,14 @@ def score(
     Raises
     ------
     ValueError, TypeError
-        Where shapes do not fit, the truth is not finite, or ellipticities are other quantities.
+        If shapes do not fit, the truth is not finite or |g| ≥ 1, no galaxy has an ellipticity, or ellipticities are
+        other quantities.
 
     Warns
     -----
     UserWarning
-        Of missing and repeated galaxies, |e| > 1, and ellipticities that match the truth with other signs.
+        Of missing and repeated galaxies, |e| > 1, copies of an image, constant ellipticities, a large |m|, and
+        ellipticities that match the truth with other signs, swapped, shifted by a cell, or as distortions.
     """
     g1, g2 = flat("truth_g1", truth_g1), flat("truth_g2", truth_g2)
     if g1.shape != g2.shape:
@@ -178,7 +181,9 @@ def score(
         )
     )
     for note in found.notes:
-        warnings.warn(note, stacklevel=2)
+        # A constant shear is no fault; the note is kept.
+        if found.mean is None or not note.startswith("note: the true shear"):
+            warnings.warn(note, stacklevel=2)
     return found
 
 

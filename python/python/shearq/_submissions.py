@@ -61,8 +61,16 @@ class Submission:
         figures = self._resolved.published
         return None if figures is None else dict(zip(("q", "m_half", "sqrt_a"), figures))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (self._resolved.parts,)
+
     def __repr__(self) -> str:
         return f"<shearq.Submission {self.name!r}: {self.description}>"
+
+
+def _restored(parts: tuple[str, str | None, tuple[float, float, float] | None]) -> Submission:
+    """The submission that pickle kept."""
+    return Submission(_shearq.Submission.restored(parts))
 
 
 def submission(of: SubmissionLike) -> Submission:

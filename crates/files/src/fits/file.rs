@@ -1,6 +1,6 @@
 //! An open FITS file: cfitsio's own functions, after what they would believe was checked.
 
-use std::ffi::{CString, c_char, c_int};
+use std::ffi::{CStr, CString, c_char, c_int};
 use std::path::Path;
 use std::ptr;
 
@@ -142,6 +142,32 @@ impl File {
         Ok(true)
     }
 
+    /// Goes to the header of an extension, from 1, that was reached before.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn go_to(&mut self, extension: usize) -> Result<(), FileError> {
+        self.place = c_int::try_from(extension + 1).unwrap_or(c_int::MAX);
+        self.tiling = None;
+        self.call(
+            || format!("cannot read header {} of the file", self.place),
+            // SAFETY: the file is open, and the type of what is there is not requested.
+            |raw, status| unsafe {
+                sys::ffmahd(raw, self.place, ptr::null_mut(), status);
+            },
+        )
+    }
+
+    /// Number of the extension that it is at, 0 of the primary header.
+    pub fn number_of_extension(&self) -> usize {
+        usize::try_from(self.place - 1).unwrap_or(0)
+    }
+
+    /// The file's path.
+    pub fn path(&self) -> &Path {
+        self.source.path()
+    }
+
     /// Takes out how the image here is compressed, if it is.
     pub fn take_tiling(&mut self) -> Result<Option<Tiling>, FileError> {
         let mut compressed = 0;
@@ -281,27 +307,28 @@ impl File {
         Ok(present.then_some(value))
     }
 
-    /// Text of a header key, empty where there is none.
+    /// Text of a header key, of all its CONTINUE cards; empty if there is none.
     pub fn text(&self, key: &str) -> String {
         let Ok(name) = CString::new(key) else {
             return String::new();
         };
-        // A value has at most 68 characters, FLEN_VALUE with its quotes and zero byte is 71.
-        let mut value = [0 as c_char; 81];
-        // SAFETY: the file is open, the name ends in a zero byte, and the value has room.
+        let mut value = ptr::null_mut();
+        let mut text = String::new();
+        // SAFETY: the file is open, and the name ends in a zero byte. The value is a string that cfitsio allocates and
+        // that is read and given back before another call.
         let found = self.call(String::new, |raw, status| unsafe {
-            sys::ffgkys(
-                raw,
-                name.as_ptr(),
-                value.as_mut_ptr(),
-                ptr::null_mut(),
-                status,
-            );
+            sys::ffgkls(raw, name.as_ptr(), &mut value, ptr::null_mut(), status);
+            if *status == 0 && !value.is_null() {
+                text = CStr::from_ptr(value).to_string_lossy().trim().to_owned();
+            }
+            if !value.is_null() {
+                let mut freed = 0;
+                sys::fffree(value.cast(), &mut freed);
+            }
         });
-        if found.is_ok() {
-            plain(&value)
-        } else {
-            String::new()
+        match found {
+            Ok(()) => text,
+            Err(_) => String::new(),
         }
     }
 

@@ -9,7 +9,7 @@ use fitsio::sys;
 
 use super::file::File;
 use super::tiles::Tiles;
-use crate::error::FileError;
+use crate::error::{FileError, names_of};
 use crate::frames::polars::{Column, DataFrame};
 
 /// Largest image side accepted, against absurd sizes in damaged headers.
@@ -288,17 +288,155 @@ struct Description {
     repeat: i64,
 }
 
-/// Columns of the first table of a file: those of `wanted`, or all that are numbers.
-///
-/// # Errors
-/// Where the file cannot be read, holds no table, or lacks a column.
-pub fn read_table(path: &Path, wanted: Option<&[&str]>) -> Result<DataFrame, FileError> {
-    let mut file = File::open(path, "table")?;
-    while file.is_image()? {
-        if !file.next()? {
-            return Err(file.fault("there is no table in this file".into()));
+/// A table of a file.
+pub struct TableHead {
+    /// Number of its extension, from 1.
+    pub number: usize,
+    /// Its name, EXTNAME; empty if it has none.
+    pub name: String,
+    /// Names of its columns.
+    pub columns: Vec<String>,
+}
+
+impl TableHead {
+    /// The table that `file` is at.
+    fn here(file: &File) -> Result<Self, FileError> {
+        let name = |number: c_int| file.text(&format!("TTYPE{number}"));
+        Ok(TableHead {
+            number: file.number_of_extension(),
+            name: file.text("EXTNAME"),
+            columns: (1..=column_count(file)?).map(name).collect(),
+        })
+    }
+
+    /// Its number and name, as messages list it.
+    pub fn shown(&self) -> String {
+        match self.name.as_str() {
+            "" => self.number.to_string(),
+            name => format!("{} `{name}`", self.number),
         }
     }
+
+    /// Whether it has this name or number.
+    pub fn is_called(&self, name: &str) -> bool {
+        match name.parse::<usize>() {
+            Ok(number) => self.number == number,
+            Err(_) => self.name.eq_ignore_ascii_case(name),
+        }
+    }
+
+    /// Whether it is the one that FITS_LDAC keeps the header of an image in.
+    fn is_image_head(&self) -> bool {
+        self.name.eq_ignore_ascii_case("LDAC_IMHEAD")
+    }
+}
+
+/// Tables as messages list them.
+fn list_of(tables: &[TableHead]) -> String {
+    let shown: Vec<String> = tables.iter().map(TableHead::shown).collect();
+    names_of(&shown)
+}
+
+/// The tables of a file, in order; if `table` is a name or a number, those that have it.
+///
+/// # Errors
+/// If the file cannot be read or has no such table.
+pub fn tables(path: &Path, table: Option<&str>) -> Result<Vec<TableHead>, FileError> {
+    let mut file = File::open(path, "table")?;
+    let all = all_tables(&mut file)?;
+    let Some(table) = table else {
+        return Ok(all);
+    };
+    let list = list_of(&all);
+    let called: Vec<_> = all
+        .into_iter()
+        .filter(|head| head.is_called(table))
+        .collect();
+    match called.is_empty() {
+        true => Err(no_table(&file, table, &list)),
+        false => Ok(called),
+    }
+}
+
+fn no_table(file: &File, table: &str, found: &str) -> FileError {
+    file.fault(format!(
+        "there is no table `{table}` in this file; tables found: {found}"
+    ))
+}
+
+fn all_tables(file: &mut File) -> Result<Vec<TableHead>, FileError> {
+    let mut found = Vec::new();
+    while file.next()? {
+        if !file.is_image()? {
+            found.push(TableHead::here(file)?);
+        }
+    }
+    if found.is_empty() {
+        return Err(file.fault("there is no table in this file".into()));
+    }
+    Ok(found)
+}
+
+/// Goes to the table of a file that is meant: the one that `table` names or numbers; otherwise the one that has all of
+/// the columns `wanted`; otherwise the first.
+fn go_to_table(
+    file: &mut File,
+    wanted: Option<&[&str]>,
+    table: Option<&str>,
+) -> Result<(), FileError> {
+    let tables = all_tables(file)?;
+    let has = |head: &&TableHead| {
+        let all = |wanted: &[&str]| wanted.iter().all(|w| head.columns.iter().any(|c| c == w));
+        wanted.is_none_or(all)
+    };
+    let chosen: Vec<&TableHead> = match (table, wanted) {
+        (Some(table), _) => tables.iter().filter(|head| head.is_called(table)).collect(),
+        (None, Some(_)) => tables.iter().filter(has).collect(),
+        (None, None) => {
+            let first = tables.iter().find(|head| !head.is_image_head());
+            first.into_iter().collect()
+        }
+    };
+    let number = match (chosen.as_slice(), table) {
+        ([one], _) => one.number,
+        // Which columns there are is reported by the caller.
+        ([], None) => {
+            let first = tables.iter().find(|head| !head.is_image_head());
+            first.unwrap_or(&tables[0]).number
+        }
+        ([], Some(table)) => {
+            return Err(no_table(file, table, &list_of(&tables)));
+        }
+        ([first, .., last], _) => {
+            let what = match table {
+                Some(table) => format!("tables are called `{table}`"),
+                None => "tables have these columns".into(),
+            };
+            return Err(file.fault(format!(
+                "{} {what} (extensions {} to {}); expected one. Try: {}[{}]",
+                chosen.len(),
+                first.number,
+                last.number,
+                file.path().display(),
+                first.number
+            )));
+        }
+    };
+    file.go_to(number)
+}
+
+/// Columns of a table of a file: those of `wanted`, or all that are numbers. The table is the one that `table` names
+/// (EXTNAME) or numbers (the first extension is 1); otherwise the one that has the columns wanted; otherwise the first.
+///
+/// # Errors
+/// If the file cannot be read, has no such table or several, or lacks a column.
+pub fn read_table(
+    path: &Path,
+    wanted: Option<&[&str]>,
+    table: Option<&str>,
+) -> Result<DataFrame, FileError> {
+    let mut file = File::open(path, "table")?;
+    go_to_table(&mut file, wanted, table)?;
     let rows = table_rows(&mut file)?;
     let descriptions = describe_columns(&file)?;
     if let Some(missing) = wanted
@@ -379,7 +517,7 @@ fn table_rows(file: &mut File) -> Result<usize, FileError> {
     Ok(rows)
 }
 
-fn describe_columns(file: &File) -> Result<Vec<Description>, FileError> {
+fn column_count(file: &File) -> Result<c_int, FileError> {
     let mut count = 0;
     // SAFETY: the file is open, and the pointers are to live variables.
     file.call(
@@ -388,10 +526,15 @@ fn describe_columns(file: &File) -> Result<Vec<Description>, FileError> {
             sys::ffgncl(raw, &mut count, status);
         },
     )?;
-    (1..=count)
+    Ok(count)
+}
+
+fn describe_columns(file: &File) -> Result<Vec<Description>, FileError> {
+    (1..=column_count(file)?)
         .map(|number| {
             let name = file.text(&format!("TTYPE{number}"));
             let (kind, repeat) = file.column_type(number)?;
+            check_scale(file, number, &name)?;
             Ok(Description {
                 number,
                 name,
@@ -400,6 +543,21 @@ fn describe_columns(file: &File) -> Result<Vec<Description>, FileError> {
             })
         })
         .collect()
+}
+
+/// Refuses a column that is scaled by zero or by what is no number.
+fn check_scale(file: &File, number: c_int, name: &str) -> Result<(), FileError> {
+    for (key, zero) in [("TSCAL", false), ("TZERO", true)] {
+        let key = format!("{key}{number}");
+        if let Some(value) = file.number(&key)?
+            && (!value.is_finite() || value == 0.0 && !zero)
+        {
+            return Err(file.fault(format!(
+                "column `{name}`: the header key {key} is {value}; expected a finite number other than 0"
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// A column as real numbers; missing ones are NaN, true is 1 and false 0.

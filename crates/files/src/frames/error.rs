@@ -23,6 +23,16 @@ pub enum TableError {
         /// What was found to be wrong.
         detail: String,
     },
+    /// The file has more rows than the caller can use.
+    #[error("{}: found {found} rows, expected at most {most}", path.display())]
+    TooManyRows {
+        /// The file.
+        path: PathBuf,
+        /// Its number of rows.
+        found: usize,
+        /// The largest number of rows that is read.
+        most: usize,
+    },
     /// A wanted column is not in the file.
     #[error(
         "{}: no column `{wanted}`; the file has {}",

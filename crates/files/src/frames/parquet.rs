@@ -30,8 +30,10 @@ use super::{Metadata, TableError};
 /// The key under which Parquet files keep the Arrow schema.
 const SCHEMA_KEY: &str = "ARROW:schema";
 
-/// Most values read from a file of fewer bytes than that; a larger one may have one for each byte.
+/// Most values read of all columns of a file of fewer bytes than that; a larger one may have one for each byte.
 const FREE_VALUES: u64 = 1 << 22;
+/// Most bytes of a page for each of its values if they are numbers: twice the widest, for dictionaries and gaps.
+const VALUE_BYTES: u64 = 16;
 /// Most bytes that the pages of a column chunk, and all texts of a file, may unpack to beyond
 /// [`INFLATION`] times the file's own.
 const FREE_BYTES: u64 = 1 << 26;
@@ -90,10 +92,12 @@ pub fn write_parquet<W: Write>(
 /// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read;
 /// [`TableError::MissingColumn`], [`TableError::DuplicateColumn`], [`TableError::UnsupportedType`] and
 /// [`TableError::MissingValues`] for a wanted column that is absent, named twice, or neither of
-/// numbers nor of text.
+/// numbers nor of text. A file of more than `most_rows` rows is refused before memory is taken for them:
+/// repeated values take next to nothing in a file.
 pub fn read_parquet(
     path: impl AsRef<Path>,
     wanted: Option<&[&str]>,
+    most_rows: usize,
 ) -> Result<DataFrame, TableError> {
     let path = path.as_ref();
     let mut source = Source::open(path)?;
@@ -101,7 +105,10 @@ pub fn read_parquet(
         None => source.fields.clone(),
         Some(names) => source.pick(names)?,
     };
-    source.check_size(fields.len())?;
+    source.check_rows(most_rows)?;
+    if wanted.is_none() {
+        source.check_values(fields.len())?;
+    }
     let columns = fields.iter().map(|field| source.read_column(field));
     frame(columns.collect::<Result<_, TableError>>()?)
 }
@@ -173,27 +180,42 @@ impl<'a> Source<'a> {
         })
     }
 
-    /// Checks that the rows of `columns` columns can be those of a file of this size, before memory is
-    /// taken for them: repeated values take next to nothing in a file.
-    fn check_size(&self, columns: usize) -> Result<(), TableError> {
-        let damaged = |detail| TableError::Damaged {
+    fn damaged(&self, detail: String) -> TableError {
+        TableError::Damaged {
             path: self.path.into(),
             detail,
-        };
+        }
+    }
+
+    /// Checks the number of rows before memory is taken for them.
+    fn check_rows(&self, most: usize) -> Result<(), TableError> {
         let groups = self.footer.row_groups.iter();
         let rows = groups.fold(0, |rows: usize, group| {
             rows.saturating_add(group.num_rows())
         });
         if rows != self.footer.num_rows {
-            return Err(damaged(format!(
+            return Err(self.damaged(format!(
                 "found row groups of {rows} rows, expected {} as in the footer",
                 self.footer.num_rows
             )));
         }
+        if rows > most {
+            return Err(TableError::TooManyRows {
+                path: self.path.into(),
+                found: rows,
+                most,
+            });
+        }
+        Ok(())
+    }
+
+    /// Checks that all `columns` columns, however many there are, can be those of a file of this size.
+    fn check_values(&self, columns: usize) -> Result<(), TableError> {
+        let rows = self.footer.num_rows;
         let values = (rows as u64).saturating_mul(columns as u64);
         let most = FREE_VALUES.max(self.length);
         if values > most {
-            return Err(damaged(format!(
+            return Err(self.damaged(format!(
                 "found {rows} rows of {columns} columns, expected at most {most} values in a file of this size"
             )));
         }
@@ -273,7 +295,8 @@ impl<'a> Source<'a> {
             let bytes = self
                 .read_bytes(start, chunk.compressed_size())
                 .map_err(damaged)?;
-            let most = unpacked_bytes(self.length);
+            let most =
+                unpacked_bytes(self.length).max(number_bytes(&field.dtype, group.num_rows()));
             let series = guarded(path, &place, || decode(chunk, bytes, &field, most))?;
             if series.len() != group.num_rows() {
                 return Err(damaged(format!(
@@ -395,6 +418,15 @@ const DELTA_BYTE_ARRAY: i32 = 7;
 /// Most bytes that a part of a file of `length` bytes may unpack to.
 fn unpacked_bytes(length: u64) -> u64 {
     length.saturating_mul(INFLATION).max(FREE_BYTES)
+}
+
+/// Most bytes that the pages of `rows` values of this type may unpack to, whatever the size of the file. Of text, whose
+/// values have any length, none.
+fn number_bytes(decoded: &ArrowDataType, rows: usize) -> u64 {
+    match decoded {
+        ArrowDataType::Utf8View => 0,
+        _ => (rows as u64).saturating_mul(VALUE_BYTES),
+    }
 }
 
 /// Bytes of the texts of a column.

@@ -15,7 +15,7 @@ const LEAST_SIDE: usize = 12;
 
 /// Noise-equivalent area in px² of a PSF of sum one: 1/Σp², without what a star's noise adds to the sum, which is told
 /// from its frame.
-fn area(psf: ArrayView2<'_, f64>) -> f64 {
+pub(super) fn area(psf: ArrayView2<'_, f64>) -> f64 {
     let square = |value: &f64| value * value;
     let mut sum = psf.iter().map(square).sum::<f64>();
     let n = psf.nrows();

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use crate::data::layout::{DataFolder, MAX_SET};
+use crate::data::layout::DataFolder;
 use crate::data::run::Source;
 use shearq_files::FileError;
 use shearq_files::open;
@@ -137,12 +137,9 @@ pub fn of_source(source: &Source, data: &DataFolder) -> Result<String, FileError
             print.add(text);
         }
         Source::Folder { .. } => {
-            for set in 1..=MAX_SET {
-                let path = data.truth(set);
-                if open::is_there(&path) {
-                    print.add(set.to_le_bytes());
-                    print.add(read(&path)?);
-                }
+            for set in data.sets_with_truth()? {
+                print.add(set.to_le_bytes());
+                print.add(read(&data.truth(set))?);
             }
         }
     }

@@ -12,9 +12,9 @@ use shearq_files::open::{self, is_there};
 use shearq_files::table;
 
 /// Highest set number.
-pub const MAX_SET: u32 = 99;
+pub const MAX_SET: u32 = 9_999;
 /// Highest image number.
-pub const MAX_IMAGE: u32 = 999;
+pub const MAX_IMAGE: u32 = 999_999;
 
 /// Largest side of a postage stamp, in pixels.
 pub const MAX_STAMP: usize = 1024;
@@ -26,7 +26,7 @@ pub const LAYOUT_FILE: &str = "layout.toml";
 const STAMPS: &str = "set{set:02}/stamps-{image:03}.csv";
 
 /// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for the plain
-/// numbers, `{set:02}` and `{image:03}` for zero-padded ones. Wherever it is read from, it is checked.
+/// numbers, `{set:02}` and `{image:03}` for those with zeros in front up to two and three digits. Wherever it is read from, it is checked.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(remote = "Self", deny_unknown_fields, default)]
 pub struct Layout {
@@ -220,20 +220,77 @@ impl DataFolder {
         listing::find(&self.root, pattern, endings(pattern), sets)
     }
 
+    /// The folder in which this one would be that of a set, with images where the layout has them.
+    pub fn folder_above(&self) -> Option<PathBuf> {
+        let (first, rest) = self.layout.galaxies.split_once('/')?;
+        let root = self.root.canonicalize().ok()?;
+        let above = self
+            .root
+            .parent()
+            .filter(|path| !path.as_os_str().is_empty());
+        let here = listing::find(root.parent()?, first, &[""], &[]).ok()?;
+        let is_set = here
+            .sets()
+            .into_iter()
+            .any(|set| root.ends_with(fill(first, set, 0)));
+        let images = listing::find(&root, rest, endings(rest), &[]).ok()?;
+        (is_set && !images.is_empty()).then(|| above.map_or_else(|| "..".into(), Path::to_owned))
+    }
+
+    /// Sets that have a file of true shear. If one file serves all sets, these are the sets that have images.
+    ///
+    /// # Errors
+    /// If a folder cannot be listed.
+    pub fn sets_with_truth(&self) -> Result<Vec<u32>, FileError> {
+        let [plain, padded] = IMAGE_PLACEHOLDERS;
+        let pattern = &self.layout.truth.replace(padded, "000").replace(plain, "0");
+        let truths = listing::find(&self.root, pattern, &[""], &[])?;
+        if truths.serve_all_sets() {
+            return Ok(self.images(&[])?.sets());
+        }
+        Ok(truths.sets())
+    }
+
     /// True shear of a set on `grid`.
     ///
     /// # Errors
     /// Where the file cannot be read or does not cover the grid.
     pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
         let path = self.truth(set);
-        if !path.exists() {
-            let message = "there is no true shear to score against; `shearq mean` gives the mean shear of a field";
-            return Err(FileError::new(&path, message));
-        }
-        let rows = read_truth_rows(&path)?;
-        TrueShear::from_rows(grid, self.layout.truth_sign, rows)
+        truth_is_there(&path)?;
+        let rows = read_truth_rows(&path, table::most_rows(grid.cells()))?;
+        TrueShear::from_rows(grid, self.truth_sign(set)?, rows)
             .map_err(|error| FileError::new(&path, error))
     }
+
+    /// Sign of g2 in the truth of a set: the one that the file states, or else the layout's.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or states the standard sign and the layout the challenge's.
+    pub fn truth_sign(&self, set: u32) -> Result<TruthSign, FileError> {
+        let (path, layout) = (self.truth(set), self.layout.truth_sign);
+        match stated_sign(&path)? {
+            Some(TruthSign::Standard) if layout == TruthSign::Challenge => {
+                let message = format!(
+                    "the file states `{SIGN_KEY}: standard`, but `truth_sign` in {LAYOUT_FILE} is `challenge`; remove the wrong one"
+                );
+                Err(FileError::new(&path, message))
+            }
+            stated => Ok(stated.unwrap_or(layout)),
+        }
+    }
+}
+
+/// Checks that there is a truth file.
+///
+/// # Errors
+/// If there is none; the message names the command for data without a true shear.
+pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
+    if is_there(path) {
+        return Ok(());
+    }
+    let message = "there is no true shear to score against. Try: shearq mean --measured OUT, for the mean shear of images of your own";
+    Err(FileError::new(path, message))
 }
 
 /// Endings of the names of images by `pattern` beyond its own: those of gzip and fpack.
@@ -244,12 +301,35 @@ fn endings(pattern: &str) -> &'static [&'static str] {
     }
 }
 
-/// Rows (x, y, g1, g2) of a truth file: CSV with that header, or ASCII columns in that order.
+/// Key under which a truth file states the sign of its g2: `standard` or `challenge`.
+pub const SIGN_KEY: &str = "g2sign";
+
+/// The sign of g2 that a truth file states, if it does.
+///
+/// # Errors
+/// If the file cannot be read, or states another word.
+pub fn stated_sign(path: &Path) -> Result<Option<TruthSign>, FileError> {
+    match table::stated(path, SIGN_KEY)?.as_deref() {
+        None => Ok(None),
+        Some("standard") => Ok(Some(TruthSign::Standard)),
+        Some("challenge") => Ok(Some(TruthSign::Challenge)),
+        Some(other) => {
+            let message = format!("{SIGN_KEY} is `{other}`; expected `standard` or `challenge`");
+            Err(FileError::new(path, message))
+        }
+    }
+}
+
+/// Rows (x, y, g1, g2) of a truth file, at most `most`: CSV with that header, or ASCII columns in that order.
 ///
 /// # Errors
 /// Where the file cannot be read.
-pub fn read_truth_rows(path: &Path) -> Result<Vec<Row>, FileError> {
-    rows_of(path, &table::read_truth(path)?, &["x", "y", "g1", "g2"])
+pub fn read_truth_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
+    rows_of(
+        path,
+        &table::read_truth(path, most)?,
+        &["x", "y", "g1", "g2"],
+    )
 }
 
 /// Rows of a catalogue, at most `most`, from four named columns.

@@ -6,7 +6,7 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Component, Path, PathBuf};
 
-use crate::data::layout::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, SET_PLACEHOLDERS};
+use crate::data::layout::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, SET_PLACEHOLDERS, fill};
 use shearq_files::FileError;
 use shearq_files::open::is_there;
 
@@ -15,6 +15,28 @@ use shearq_files::open::is_there;
 pub struct Files {
     /// No number of a set where the pattern has none, so that a file serves every set.
     by_set: BTreeMap<Option<u32>, BTreeMap<u32, Found>>,
+    /// What looks like such files and is not read, by kind.
+    unread: BTreeMap<Reason, Unread>,
+}
+
+/// Why something that looks like a file of data is not read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Reason {
+    /// The name of a file does not follow the pattern.
+    File,
+    /// The name of a folder does not.
+    Folder,
+    /// Another file has the same numbers.
+    Second,
+}
+
+/// Things that are not read for one reason.
+#[derive(Debug)]
+struct Unread {
+    first: PathBuf,
+    /// Name that the first one should have, or the file that is read instead.
+    expected: String,
+    count: usize,
 }
 
 #[derive(Debug)]
@@ -40,6 +62,47 @@ impl Files {
             return (1..=MAX_SET).collect();
         }
         self.by_set.keys().copied().flatten().collect()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.by_set.is_empty()
+    }
+
+    /// Whether a set has a file.
+    pub fn has(&self, set: u32) -> bool {
+        self.serve_all_sets() || self.by_set.contains_key(&Some(set))
+    }
+
+    /// What looks like files of data and is not read: a sentence for each reason, with the first of them and their number.
+    pub fn unread(&self) -> Vec<String> {
+        let line = |(reason, unread): (&Reason, &Unread)| {
+            let Unread {
+                first,
+                expected,
+                count,
+            } = unread;
+            let name = first.file_name().unwrap_or_default().to_string_lossy();
+            let thing = match reason {
+                Reason::File | Reason::Second => "file",
+                Reason::Folder => "folder",
+            };
+            let others = match count - 1 {
+                0 => String::new(),
+                1 => format!(", like 1 other {thing}"),
+                more => format!(", like {more} other {thing}s"),
+            };
+            let place = first.display();
+            match reason {
+                Reason::File | Reason::Folder => format!(
+                    "{place}: this {thing} is not read{others}, because of its name (found {name}, expected {expected}). Try: rename it"
+                ),
+                Reason::Second => format!(
+                    "{place}: this {thing} is not read{others}, because {expected} is read instead. Try: remove one of them"
+                ),
+            }
+        };
+        self.unread.iter().map(line).collect()
     }
 
     /// Those of `sets`, or the sets that have a file where there are none of them.
@@ -75,7 +138,8 @@ struct Search<'a> {
 /// Finds the files below `root` that `pattern` names, of `sets` (of all if empty), with any of
 /// `endings` after the name; the first of them where there are several.
 ///
-/// Whatever is called so is taken for a file, so that none is left out that cannot be read.
+/// Whatever is called so is taken for a file, so that none is left out that cannot be read. Files of a pattern without
+/// the number of an image have number 0.
 ///
 /// # Errors
 /// Where a folder cannot be listed.
@@ -123,12 +187,15 @@ impl Search<'_> {
             }
             return Ok(());
         }
+        let shape_of_pattern = part.to_str().map(|part| shape(&fill(part, 1, 1)));
         for name in names(folder)? {
+            let mut follows = false;
             for (rank, ending) in endings.iter().enumerate() {
                 let Some(stem) = name.strip_suffix(ending) else {
                     continue;
                 };
                 for numbers in matches(&pattern, stem, numbers) {
+                    follows = true;
                     let other = |set| !self.sets.is_empty() && !self.sets.contains(&set);
                     if numbers.set.is_some_and(other) {
                         continue;
@@ -141,22 +208,151 @@ impl Search<'_> {
                     }
                 }
             }
+            if !follows && Some(shape(&name)) == shape_of_pattern {
+                self.pass_over(folder.join(&name), &name, &pattern, !rest.is_empty());
+            }
         }
         Ok(())
     }
 
     fn add(&mut self, path: PathBuf, numbers: Numbers, rank: usize) {
-        let Some(image) = numbers.image else {
-            return;
-        };
+        let image = numbers.image.unwrap_or(0);
         let of_set = self.files.by_set.entry(numbers.set).or_default();
-        if of_set.get(&image).is_none_or(|other| rank < other.rank) {
-            of_set.insert(image, Found { path, rank });
+        let found = Found { path, rank };
+        let (path, better) = match of_set.remove(&image) {
+            None => {
+                of_set.insert(image, found);
+                return;
+            }
+            Some(other) if found.rank < other.rank => (other.path, found),
+            Some(other) => (found.path, other),
+        };
+        let name = better.path.file_name().unwrap_or_default();
+        let name = name.to_string_lossy().into_owned();
+        of_set.insert(image, better);
+        self.files.pass_over(Reason::Second, path, || name);
+    }
+
+    /// Notes what has nearly the name that a pattern describes.
+    fn pass_over(&mut self, path: PathBuf, name: &str, pattern: &[Piece<'_>], folder: bool) {
+        if path.is_dir() != folder {
+            return;
         }
+        let runs = digits(name);
+        let of_set = |piece: &&Piece<'_>| matches!(piece, Piece::Number { of_set: true, .. });
+        let known = |run: &&str| run.parse().is_ok_and(|set| self.sets.contains(&set));
+        // One of a set that is not wanted.
+        if !self.sets.is_empty() && pattern.iter().any(|p| of_set(&p)) && !runs.iter().any(known) {
+            return;
+        }
+        let reason = match folder {
+            true => Reason::Folder,
+            false => Reason::File,
+        };
+        self.files
+            .pass_over(reason, path, || expected(pattern, &runs));
     }
 }
 
-/// Names in a folder that are UTF-8, none if it does not exist.
+impl Files {
+    fn pass_over(&mut self, reason: Reason, path: PathBuf, expected: impl FnOnce() -> String) {
+        let unread = self.unread.entry(reason).or_insert_with(|| Unread {
+            first: path,
+            expected: expected(),
+            count: 0,
+        });
+        unread.count += 1;
+    }
+}
+
+/// The name that a pattern has with the numbers in `runs` of digits; the pattern's form if they do not fit it.
+fn expected(pattern: &[Piece<'_>], runs: &[&str]) -> String {
+    let places = |piece: &&Piece<'_>| match piece {
+        Piece::Text(text) => digits(text).len(),
+        Piece::Number { .. } => 1,
+    };
+    let fits = pattern.iter().map(|piece| places(&piece)).sum::<usize>() == runs.len();
+    let (mut name, mut next) = (String::new(), 0);
+    for piece in pattern {
+        match *piece {
+            Piece::Text(text) => {
+                name.push_str(text);
+                next += digits(text).len();
+            }
+            Piece::Number { of_set, padded } => {
+                let (most, width) = match of_set {
+                    true => (MAX_SET, 2),
+                    false => (MAX_IMAGE, 3),
+                };
+                let run = runs.get(next).filter(|_| fits);
+                let number = run.and_then(|run| run.parse::<u32>().ok());
+                let number = number.filter(|number| (1..=most).contains(number));
+                match (number, padded) {
+                    (Some(number), true) => name.push_str(&format!("{number:0width$}")),
+                    (Some(number), false) => name.push_str(&number.to_string()),
+                    (None, _) => name.push_str(&format!("{{1 to {most}}}")),
+                }
+                next += 1;
+            }
+        }
+    }
+    name
+}
+
+/// Runs of digits in a name.
+fn digits(name: &str) -> Vec<&str> {
+    let runs = name.split(|c: char| !c.is_ascii_digit());
+    runs.filter(|run| !run.is_empty()).collect()
+}
+
+/// What is left of a name without what people write differently: case, separators, numbers, and the endings of FITS and
+/// compressed files.
+fn shape(name: &str) -> String {
+    let mut name = name.to_ascii_lowercase();
+    for ending in [".gz", ".fz", ".bz2", ".xz", ".z", ".zip"] {
+        if let Some(plain) = name.strip_suffix(ending) {
+            name.truncate(plain.len());
+        }
+    }
+    for ending in [".fit", ".fts"] {
+        if let Some(stem) = name.strip_suffix(ending) {
+            name = format!("{stem}.fits");
+        }
+    }
+    let mut shape = String::new();
+    for c in name.chars() {
+        match c {
+            '-' | '_' | ' ' => {}
+            c if c.is_ascii_digit() => {
+                if !shape.ends_with('#') {
+                    shape.push('#');
+                }
+            }
+            c => shape.push(c),
+        }
+    }
+    shape
+}
+
+/// Most names of a folder that a message lists.
+const SHOWN: usize = 4;
+
+/// The first names in a folder as a message lists them.
+///
+/// # Errors
+/// If it cannot be listed.
+pub fn sample(folder: &Path) -> Result<String, FileError> {
+    let names = names(folder)?;
+    let list = names.iter().take(SHOWN).map(String::as_str);
+    let list = list.collect::<Vec<_>>().join(", ");
+    Ok(match names.len().checked_sub(SHOWN) {
+        None if names.is_empty() => "an empty folder".into(),
+        None | Some(0) => list,
+        Some(more) => format!("{list} and {more} more"),
+    })
+}
+
+/// Names in a folder that are UTF-8, in order, none if it does not exist.
 fn names(folder: &Path) -> Result<Vec<String>, FileError> {
     let place = match folder.as_os_str().is_empty() {
         true => Path::new("."),
@@ -176,9 +372,11 @@ fn names(folder: &Path) -> Result<Vec<String>, FileError> {
         entries => entries,
     };
     let name = |entry: std::io::Result<fs::DirEntry>| Ok(entry?.file_name().into_string().ok());
-    entries
+    let mut names: Vec<String> = entries
         .and_then(|entries| entries.map(name).filter_map(Result::transpose).collect())
-        .map_err(FileError::doing(place, "cannot read the folder"))
+        .map_err(FileError::doing(place, "cannot read the folder"))?;
+    names.sort_unstable();
+    Ok(names)
 }
 
 /// A part of the pattern of a name.
@@ -236,9 +434,14 @@ fn matches(pattern: &[Piece<'_>], name: &str, known: Numbers) -> Vec<Numbers> {
     };
     let width = most.to_string().len();
     let digits = name.bytes().take_while(u8::is_ascii_digit).take(width);
+    // As numbers are written: no more zeros in front than make up two digits of a set and three of an image.
+    let zeros = match (padded, of_set) {
+        (false, _) => 1,
+        (true, true) => 2,
+        (true, false) => 3,
+    };
     (1..=digits.count())
-        .filter(|length| !padded || *length == width)
-        .filter(|length| padded || !name.starts_with('0') || *length == 0)
+        .filter(|length| *length == zeros || *length > zeros && !name.starts_with('0'))
         .filter_map(|length| Some((name[..length].parse().ok()?, &name[length..])))
         .filter(|(number, _)| (1..=most).contains(number))
         .filter(|(number, _)| before.is_none_or(|before| before == *number))
@@ -277,6 +480,11 @@ mod tests {
             [(None, Some(12))]
         );
         assert_eq!(numbers("{set}_{image}.NN.dat", "7_12.NN.dat"), both(7, 12));
+        assert_eq!(numbers("set{set:02}", "set100"), [(Some(100), None)]);
+        assert_eq!(
+            numbers("g-{image:03}.fits", "g-123456.fits"),
+            [(None, Some(123_456))]
+        );
         assert_eq!(
             numbers("{set}{image}", "112"),
             [both(1, 12), both(11, 2)].concat()
@@ -287,8 +495,9 @@ mod tests {
             ("set{set:02}", "set007"),
             ("set{set}", "set07"),
             ("set{set}", "set0"),
-            ("set{set}", "set100"),
-            ("g-{image}.fits", "g-1000.fits"),
+            ("set{set}", "set10000"),
+            ("g-{image}.fits", "g-1000000.fits"),
+            ("g-{image:03}.fits", "g-0001.fits"),
             ("g-{image}.fits", "g-+1.fits"),
             ("g-{image}.fits", "g-1.fits.gz"),
             ("{set}-{image}-{set}", "3-4-5"),
@@ -326,7 +535,7 @@ mod tests {
         );
         let deep = find("a/../a/set0{image}/i-001", &[]).unwrap();
         assert_eq!(named(&deep, 5), ["9 a/../a/set09/i-001"]);
-        assert_eq!(deep.sets().len(), 99);
+        assert!(deep.serve_all_sets() && deep.has(7));
         assert!(find("b/{set}/{image}", &[]).unwrap().sets().is_empty());
         fs::create_dir(root.path().join("a/set09/i-002")).unwrap();
         let all = find("a/set{set:02}/i-{image:03}", &[]).unwrap();

@@ -29,6 +29,27 @@ pub(super) fn from(folder: &Path, path: &Path) -> Result<PathBuf> {
     })
 }
 
+/// `path` without the `folder/..` in it, if that is the same folder: a short name for messages.
+pub fn shortened(path: PathBuf) -> PathBuf {
+    let mut short = PathBuf::new();
+    for part in path.components() {
+        match (part, short.components().next_back()) {
+            (Component::ParentDir, Some(Component::Normal(_))) => {
+                short.pop();
+            }
+            (part, _) => short.push(part),
+        }
+    }
+    if short.as_os_str().is_empty() {
+        short.push(".");
+    }
+    // Behind a link, `..` leads elsewhere.
+    match (resolve(&short), resolve(&path)) {
+        (Ok(one), Ok(other)) if one == other => short,
+        _ => path,
+    }
+}
+
 /// An absolute path without links, as far as it exists, and without `.` and `..`.
 fn resolve(path: &Path) -> Result<PathBuf> {
     let path = std::path::absolute(path)?;
@@ -52,6 +73,23 @@ fn resolve(path: &Path) -> Result<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_path_is_shortened_unless_a_link_leads_elsewhere() {
+        let root = tempfile::tempdir().unwrap();
+        let at = |name: &str| root.path().join(name);
+        std::fs::create_dir_all(at("out/deep")).unwrap();
+        std::fs::create_dir_all(at("data")).unwrap();
+        assert_eq!(shortened(at("out/deep/../../data")), at("data"));
+        assert_eq!(shortened("src/..".into()), Path::new("."));
+        assert_eq!(shortened("../..".into()), Path::new("../.."));
+        #[cfg(unix)]
+        {
+            std::os::unix::fs::symlink(at("out/deep"), at("link")).unwrap();
+            std::fs::create_dir_all(at("out/data")).unwrap();
+            assert_eq!(shortened(at("link/../data")), at("link/../data"));
+        }
+    }
 
     #[test]
     fn a_path_is_the_same_however_it_was_given() {

@@ -73,14 +73,19 @@ impl Source {
     /// Where it is not there any more.
     pub fn data(&self, measured: &Path) -> Result<DataFolder, FileError> {
         match self {
-            Source::Folder { path, .. } => DataFolder::open(measured.join(path)),
+            Source::Folder { path, .. } => {
+                DataFolder::open(relative::shortened(measured.join(path)))
+            }
             Source::Simulated(_) => DataFolder::open(measured),
         }
     }
 }
 
-/// The way from the folder of a record to a data folder.
-fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
+/// The way from the folder of a record to a data folder or a file.
+///
+/// # Errors
+/// Where the current folder is not known.
+pub fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
     relative::from(from, to).map_err(FileError::doing(to, "cannot tell where the folder is"))
 }
 
@@ -130,12 +135,20 @@ impl Run {
     /// # Errors
     /// Where there is none, or it cannot be read.
     pub fn require(folder: &Path) -> Result<Self, FileError> {
-        Run::read(folder)?.ok_or_else(|| {
-            let message = format!(
-                "there is no {RUN_FILE}; expected a folder that `shearq measure` or `shearq run` wrote"
-            );
-            FileError::new(folder, message)
-        })
+        const EXPECTED: &str = "a folder of catalogues that `shearq measure` or `shearq run` wrote";
+        check_folder(folder, EXPECTED)?;
+        if let Some(run) = Run::read(folder)? {
+            return Ok(run);
+        }
+        let images = DataFolder::open(folder).and_then(|data| data.images(&[]));
+        let message = match images {
+            Ok(images) if !images.sets().is_empty() => format!(
+                "this is a data folder: it contains galaxy images and no {RUN_FILE}; expected {EXPECTED}. Try: shearq measure --data {} --out OUT --submission 48/linear/star",
+                folder.display()
+            ),
+            _ => format!("there is no {RUN_FILE}; expected {EXPECTED}"),
+        };
+        Err(FileError::new(folder, message))
     }
 
     /// The catalogue of an image.
@@ -155,6 +168,52 @@ impl Run {
         let ending = self.format.extension();
         format!("set{{set:02}}/catalogue-{{image:03}}.{ending}")
     }
+}
+
+/// Checks that `folder` is a folder; it should be what `expected` says.
+///
+/// # Errors
+/// Where there is nothing of this name, or a file.
+pub fn check_folder(folder: &Path, expected: &str) -> Result<(), FileError> {
+    let found = if folder.is_dir() {
+        return Ok(());
+    } else if folder.exists() {
+        "this is a file"
+    } else {
+        "there is no such folder"
+    };
+    Err(FileError::new(
+        folder,
+        format!("{found}; expected {expected}"),
+    ))
+}
+
+/// Opens the data folder that a command is to read images from.
+///
+/// # Errors
+/// As [`DataFolder::open`], and where the folder contains catalogues instead of images.
+pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
+    let data = DataFolder::open(folder)?;
+    let Some(run) = Run::read(folder).ok().flatten() else {
+        return Ok(data);
+    };
+    // Catalogues may lie beside the images.
+    if !data.images(&[])?.sets().is_empty() {
+        return Ok(data);
+    }
+    let advice = match &run.source {
+        Source::Folder { path, .. } => {
+            let data = relative::shortened(folder.join(path));
+            format!(". Try: --data {}", data.display())
+        }
+        Source::Simulated(_) => {
+            "; they were simulated in memory, and `shearq simulate` writes images".into()
+        }
+    };
+    let message = format!(
+        "this folder contains catalogues ({RUN_FILE}) and no galaxy images; expected the data folder that they were measured from{advice}"
+    );
+    Err(FileError::new(folder, message))
 }
 
 /// Reads any record; `None` where there is none.
@@ -243,7 +302,62 @@ pub fn nan_for_null<'de, D: Deserializer<'de>, N: Numbers>(deserializer: D) -> R
 #[must_use]
 pub struct Claim {
     /// The record, with a shared lock on it.
-    _record: File,
+    record: File,
+    path: PathBuf,
+}
+
+impl Claim {
+    /// Checks that the folder is still the claimed one: nobody has removed or replaced its record since.
+    ///
+    /// # Errors
+    /// Where it is not.
+    pub fn check(&self) -> Result<(), FileError> {
+        if self.is_there() {
+            return Ok(());
+        }
+        let folder = self.path.parent().unwrap_or(&self.path);
+        let message = "the folder was removed or replaced while results were written to it; they are incomplete";
+        Err(FileError::new(folder, message))
+    }
+
+    /// The error of work in the folder: that the folder is gone, if it is, else `error`.
+    pub fn explain<E: From<FileError>>(&self, error: E) -> E {
+        self.check().map_or_else(E::from, |()| error)
+    }
+
+    /// Whether the record is the file that was claimed.
+    #[cfg(unix)]
+    fn is_there(&self) -> bool {
+        use std::os::unix::fs::MetadataExt;
+        let (Ok(held), Ok(found)) = (self.record.metadata(), std::fs::metadata(&self.path)) else {
+            return false;
+        };
+        (held.dev(), held.ino()) == (found.dev(), found.ino())
+    }
+
+    /// Elsewhere an open file cannot be removed.
+    #[cfg(not(unix))]
+    fn is_there(&self) -> bool {
+        self.path.exists()
+    }
+
+    /// Checks the same at the end of the work, and that all `results` are there.
+    ///
+    /// # Errors
+    /// Where one of them is not.
+    pub fn check_results(
+        &self,
+        results: impl IntoIterator<Item = PathBuf>,
+    ) -> Result<(), FileError> {
+        self.check()?;
+        match results.into_iter().find(|path| !path.is_file()) {
+            None => Ok(()),
+            Some(path) => {
+                let message = "the file was removed while results were written to its folder. Try: the same command again";
+                Err(FileError::new(path, message))
+            }
+        }
+    }
 }
 
 /// Makes the folder of `path` that of `record`: writes it where there is none, and refuses a folder
@@ -267,7 +381,7 @@ pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result
             folder,
             format!(
                 "this folder holds results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
-                differences.join("\n  ")
+                most_important(differences).join("\n  ")
             ),
         ));
     }
@@ -280,7 +394,56 @@ pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result
     // wait for: there leftovers stay, and do no harm.
     let _ = file.unlock();
     let _ = file.lock_shared();
-    Ok(Claim { _record: file })
+    Ok(Claim {
+        record: file,
+        path: path.to_owned(),
+    })
+}
+
+/// Most differences that a message lists.
+const SHOWN: usize = 6;
+/// Most characters of one of them.
+const LONGEST: usize = 160;
+
+/// The differences that explain most, in this order, and the number of the others.
+fn most_important(mut differences: Vec<String>) -> Vec<String> {
+    const FIRST: [&str; 8] = [
+        "version",
+        "submission.name",
+        "submissions",
+        "submission.method",
+        "source",
+        "settings",
+        "simulation",
+        "images",
+    ];
+    differences.sort_by_key(|line| {
+        let key = line.split(": ").next().unwrap_or(line);
+        // Words do not change results.
+        if key.ends_with("description") {
+            return FIRST.len() + 1;
+        }
+        let of = |first: &&str| {
+            key.strip_prefix(*first)
+                .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+        };
+        FIRST
+            .iter()
+            .position(|first| of(first))
+            .unwrap_or(FIRST.len())
+    });
+    let more = differences.len().saturating_sub(SHOWN);
+    differences.truncate(SHOWN);
+    for line in &mut differences {
+        if let Some((end, _)) = line.char_indices().nth(LONGEST) {
+            line.truncate(end);
+            line.push('…');
+        }
+    }
+    if more > 0 {
+        differences.push(format!("and {more} more"));
+    }
+    differences
 }
 
 /// Opens a record so that it can be locked: over NFS an exclusive lock needs the right to write.
@@ -371,6 +534,47 @@ mod tests {
         assert!(!left.exists());
         let message = claim(&path, &2).unwrap_err().to_string();
         assert!(message.contains(": 1 ≠ 2"), "{message}");
+    }
+
+    #[test]
+    fn the_differences_that_explain_most_come_first_and_others_are_counted() {
+        let mut lines: Vec<String> = (0..34)
+            .map(|k| format!("submission.a.k{k}: 1 ≠ 2"))
+            .collect();
+        lines.insert(0, "submission.description: \"a\" ≠ \"b\"".into());
+        lines.push("submission.name: \"a\" ≠ \"b\"".into());
+        lines.push("version: \"1\" ≠ \"2\"".into());
+        let shown = most_important(lines);
+        assert_eq!(shown.len(), SHOWN + 1);
+        assert!(shown[0].starts_with("version") && shown[1].starts_with("submission.name"));
+        assert_eq!(shown[2], "submission.a.k0: 1 ≠ 2");
+        assert_eq!(shown[SHOWN], "and 31 more");
+        assert_eq!(
+            most_important(vec!["images: 1 ≠ 2".into()]),
+            ["images: 1 ≠ 2"]
+        );
+    }
+
+    #[test]
+    fn a_folder_that_was_removed_or_replaced_is_not_the_claimed_one() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("out");
+        let path = folder.join("record.json");
+        let claimed = claim(&path, &1).unwrap();
+        let result = folder.join("result");
+        std::fs::write(&result, "").unwrap();
+        claimed.check_results([result.clone()]).unwrap();
+        std::fs::remove_file(&result).unwrap();
+        let message = claimed.check_results([result]).unwrap_err().to_string();
+        assert!(message.contains("was removed"), "{message}");
+        std::fs::remove_dir_all(&folder).unwrap();
+        assert!(claimed.check().is_err());
+        let _other = claim(&path, &1).unwrap();
+        let message = claimed.check().unwrap_err().to_string();
+        assert!(
+            message.contains("out: the folder was removed or replaced"),
+            "{message}"
+        );
     }
 
     #[test]

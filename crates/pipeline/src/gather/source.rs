@@ -277,14 +277,19 @@ impl<'a> Exposure<'a> {
         self.images.now.as_mut().ok_or_else(none)
     }
 
+    /// Columns and rows.
+    pub(super) fn sides(&mut self) -> Result<[usize; 2], FileError> {
+        let reader = self.reader()?;
+        Ok([reader.width(), reader.height()])
+    }
+
     /// Refuses one whose sides are not those of `other`.
     pub(super) fn like(&mut self, other: &mut Self) -> Result<(), FileError> {
-        let sides = |reader: &ImageReader| (reader.width(), reader.height());
-        let (own, expected) = (sides(self.reader()?), sides(other.reader()?));
+        let (own, expected) = (self.sides()?, other.sides()?);
         if own != expected {
             let message = format!(
                 "the mask is {} × {} pixels; the exposure has {} × {}",
-                own.0, own.1, expected.0, expected.1
+                own[0], own[1], expected[0], expected[1]
             );
             return Err(self.origin.fault(&message));
         }
@@ -298,8 +303,17 @@ impl<'a> Exposure<'a> {
         (x, y): (f64, f64),
         side: usize,
     ) -> Result<Vec<f32>, FileError> {
-        // Its first pixel, from 0.
-        let first = |at: f64| (at - (side as f64 + 1.0) / 2.0).round() as i64;
-        self.reader()?.read_square(first(x), first(y), side)
+        self.reader()?
+            .read_square(first_pixel(x, side), first_pixel(y, side), side)
     }
+}
+
+/// First pixel, from 0, of the `side` pixels whose middle is nearest to a position in FITS pixels.
+fn first_pixel(at: f64, side: usize) -> i64 {
+    (at - (side as f64 + 1.0) / 2.0).round() as i64
+}
+
+/// Where a position is on the square that is cut around it, from its middle.
+pub(super) fn off_middle((x, y): (f64, f64), side: usize) -> [f64; 2] {
+    [x, y].map(|at| at - (side as f64 + 1.0) / 2.0 - first_pixel(at, side) as f64)
 }

@@ -46,29 +46,38 @@ pub fn measure(
 ) -> Result<Vec<BaselineSet>, PipelineError> {
     let folder = Scratch::new()?;
     let out = folder.path();
+    let data = match source {
+        // By a name that is not from the temporary folder.
+        Source::Folder { .. } => Some(source.data(beside)?),
+        Source::Simulated(_) => None,
+    };
     let source = source.moved(beside, out)?;
     let run = Run::new(source, submission.clone(), FileFormat::default());
-    match &run.source {
-        Source::Simulated(settings) => {
+    match (&run.source, &data) {
+        (Source::Simulated(settings), _) => {
             let images: Vec<ImageId> = wanted
                 .iter()
                 .flat_map(|w| images::of_simulation(&[w.set], w.images))
                 .collect();
             run_folder(&run, *settings, &images, out, threads, progress)?;
         }
-        Source::Folder { .. } => {
+        (Source::Folder { .. }, None) => {}
+        (Source::Folder { .. }, Some(data)) => {
             let sets: Vec<u32> = wanted.iter().map(|w| w.set).collect();
-            let data = run.source.data(out)?;
             let asked = |id: &ImageId| {
                 let mut of_set = wanted.iter().filter(|w| w.set == id.set);
                 of_set.any(|w| id.image <= w.images)
             };
-            let mut images = images::of_folder(&data, &sets)?;
+            let mut images = images::of_folder(data, &sets)?;
             images.retain(asked);
-            measure_folder(&run, &data, out, &images, threads, progress)?;
+            measure_folder(&run, data, out, &images, threads, progress)?;
         }
     }
-    figures_of(&run, &run.source.data(out)?, out, threads)
+    let data = match data {
+        Some(data) => data,
+        None => run.source.data(out)?,
+    };
+    figures_of(&run, &data, out, threads)
 }
 
 /// Figures of every set in a folder of catalogues.

@@ -1,9 +1,12 @@
 //! What moved since a baseline.
 
+use std::path::Path;
+
 use shearq_submissions::{Registry, Submission};
 
 use super::measured::{SCATTER, Wanted};
 use super::{Baseline, BaselineSet, BaselineSubmission};
+use shearq_pipeline::data::relative::shortened;
 use shearq_pipeline::data::run::differences;
 
 /// Figures that must not move.
@@ -115,6 +118,8 @@ pub struct Checked {
     pub settings: Vec<String>,
     /// What should be known and is no failure.
     pub notes: Vec<String>,
+    /// Whether the settings are those stored, although their configuration may have changed.
+    pub stored: bool,
 }
 
 impl Checked {
@@ -152,14 +157,35 @@ fn base_of(settings: &toml::Table) -> &'static str {
     }
 }
 
-/// The settings by which a submission of a baseline is measured again: the present ones of a named
-/// submission; those stored of another, in which what the baseline does not know is the base's.
+/// Which settings a baseline is measured with again. Named submissions have the present ones always.
+#[derive(Debug, Clone, Copy)]
+pub enum Settings<'a> {
+    /// Those of the configuration files, which are found from this folder.
+    Files(&'a Path),
+    /// Those stored in the baseline.
+    Stored,
+}
+
+/// The settings by which a submission of a baseline is measured again, and whether they are those stored because its
+/// file is not known. In stored settings, keys that the baseline does not have are the base's.
 fn settings_now(
     before: &BaselineSubmission,
     registry: &Registry,
-) -> Result<Submission, anyhow::Error> {
-    if registry.names().contains(&before.name) {
-        return Ok(registry.get(&before.name)?.submission);
+    settings: Settings<'_>,
+) -> Result<(Submission, bool), anyhow::Error> {
+    if let (Settings::Files(folder), Some(file)) = (settings, &before.file) {
+        let path = shortened(folder.join(file));
+        // A plain name could be one of the registry.
+        let path = Path::new(".").join(path);
+        anyhow::ensure!(
+            path.is_file(),
+            "{}: the configuration file is not there any more. Try: shearq baseline check --stored",
+            path.display()
+        );
+        return Ok((registry.get(&path.to_string_lossy())?.submission, false));
+    }
+    if before.file.is_none() && registry.names().contains(&before.name) {
+        return Ok((registry.get(&before.name)?.submission, false));
     }
     let base = registry.get(base_of(&before.settings))?.submission;
     let mut all = toml::Table::try_from(&base)?;
@@ -173,7 +199,7 @@ fn settings_now(
             }
         }
     }
-    Ok(all.try_into()?)
+    Ok((all.try_into()?, matches!(settings, Settings::Files(_))))
 }
 
 /// Holds the submissions of the baseline `name` against what they are as `measure` measures them now; what
@@ -185,12 +211,13 @@ pub fn check(
     name: &str,
     baseline: &Baseline,
     sigmas: f64,
+    settings: Settings<'_>,
     mut measure: impl FnMut(&Submission, &[Wanted]) -> anyhow::Result<Vec<BaselineSet>>,
 ) -> anyhow::Result<(Vec<Checked>, Vec<BaselineSubmission>)> {
     let registry = Registry::embedded()?;
     let (mut checks, mut submissions) = (Vec::new(), Vec::new());
     for before in &baseline.submissions {
-        let submission = settings_now(before, &registry)
+        let (submission, stored) = settings_now(before, &registry, settings)
             .map_err(|error| error.context(format!("settings of {}", before.name)))?;
         let (settings, new) = settings_moved(before, &submission)?;
         let mut check = Checked {
@@ -202,6 +229,7 @@ pub fn check(
                 .iter()
                 .map(|line| format!("a setting is new: {line}"))
                 .collect(),
+            stored,
         };
         let wanted: Vec<Wanted> = before
             .sets
@@ -226,7 +254,11 @@ pub fn check(
             }
             check.shifts.extend(shifts(old, now, sigmas));
         }
-        submissions.push(BaselineSubmission::new(&submission, sets)?);
+        submissions.push(BaselineSubmission::new(
+            &submission,
+            before.file.clone(),
+            sets,
+        )?);
         checks.push(check);
     }
     Ok((checks, submissions))

@@ -13,11 +13,10 @@ use tar::{Archive, Builder, Header};
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
 use shearq_files::FileError;
 use shearq_files::atomic::{PartFile, PartFolder, sweep_beside};
-use shearq_files::open::open;
-use shearq_pipeline::data::layout;
+use shearq_files::open::{is_there, open};
 
-/// Largest manifest accepted, in bytes: some four times that of 999 images of 99 sets.
-const MAX_MANIFEST: u64 = 1 << 22;
+/// Largest manifest accepted, in bytes: some two hundred for each file.
+const MAX_MANIFEST: u64 = 1 << 26;
 
 /// Most bytes that one byte of an archive may unpack to, beyond the first [`FREE`]: numbers in ASCII come
 /// to three, blank catalogues to a hundred or so.
@@ -26,8 +25,8 @@ const MAX_RATIO: u64 = 300;
 const FREE: u64 = 1 << 24;
 /// Bytes that a file counts for in addition to its own, as it takes them on disk.
 const FILE: u64 = 1 << 12;
-/// Most files: a catalogue for every image of every set, and a manifest.
-const MAX_FILES: u64 = layout::MAX_SET as u64 * layout::MAX_IMAGE as u64 + 1;
+/// Most files, the manifest included: 8,000 images of each of 24 sets and some more.
+pub const MAX_FILES: u64 = 200_000;
 
 /// Whether a path's ending is that of an archive.
 pub fn is_archive(path: &Path) -> bool {
@@ -42,11 +41,14 @@ pub struct ArchiveWriter {
 }
 
 impl ArchiveWriter {
-    /// Starts an archive.
+    /// Starts an archive, which must be new.
     ///
     /// # Errors
-    /// Where the file cannot be made.
+    /// Where the file exists or cannot be made.
     pub fn create(path: &Path) -> Result<Self, FileError> {
+        if is_there(path) {
+            return Err(exists(path));
+        }
         sweep_beside(path);
         let (part, file) = PartFile::create(path)?;
         // Neither the time nor the system of its making.
@@ -87,8 +89,19 @@ impl ArchiveWriter {
             .and_then(GzEncoder::finish)
             .and_then(|mut file| file.flush())
             .map_err(cannot_write(part.target()))?;
-        part.finish()
+        let path = part.target().to_owned();
+        match part.finish_if_absent()? {
+            true => Ok(()),
+            false => Err(exists(&path)),
+        }
     }
+}
+
+fn exists(path: &Path) -> FileError {
+    FileError::new(
+        path,
+        "the archive exists already; expected a new file. Remove it or choose another name",
+    )
 }
 
 /// gzip's number for it.
@@ -139,6 +152,8 @@ impl Unpacked {
 /// As [`read`] and [`Unpacked::verify`], and where `out` exists or cannot be written.
 pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
     let part = PartFolder::new(out)?;
+    // All of it, before any file is written.
+    read(path, None)?.verify(path, required)?;
     let unpacked = read(path, Some(part.path()))?;
     unpacked.verify(path, required)?;
     part.finish()?;

@@ -223,7 +223,11 @@ mod tests {
 
     #[test]
     fn names_are_recognised_and_made() {
-        for name in ["g10_v1_objs_7_12.NN23.dat", "NN_23_set24.dat"] {
+        for name in [
+            "g10_v1_objs_7_12.NN23.dat",
+            "g10_v1_objs_100_1000.NN23.dat",
+            "NN_23_set24.dat",
+        ] {
             let kind = Kind::of(Path::new(name)).unwrap();
             assert_eq!(kind.file_name(), name);
         }
@@ -231,8 +235,8 @@ mod tests {
             "g10_v1_objs_7.NN.dat",
             "NN_set1.txt",
             "NN_set01.dat",
-            "NN_set100.dat",
-            "g10_v1_objs_1_1000.NN.dat",
+            "NN_set10000.dat",
+            "g10_v1_objs_1_1000000.NN.dat",
             "set.dat",
             "x",
         ] {

@@ -9,7 +9,7 @@ use shearq_scoring::{
     SpectrumCovariance,
 };
 
-use super::archive::{ArchiveWriter, is_archive};
+use super::archive::{ArchiveWriter, MAX_FILES, is_archive};
 use super::challenge::{Kind, Spectrum, catalogue_text, spectrum_text};
 use super::manifest::{Contents, FileSum, MANIFEST_FILE, Manifest};
 use crate::foreign::Foreign;
@@ -145,6 +145,13 @@ impl Packing<'_> {
         let mut matching = ConventionMatch::default();
         let mut add = |kind: Kind, text: String| -> Result<(), FileError> {
             let (name, mut bytes) = (kind.file_name(), text.as_bytes());
+            if files.len() as u64 + 1 >= MAX_FILES {
+                let message = format!(
+                    "there are more than {} files to pack, the most that `check` and `unpack` read",
+                    MAX_FILES - 1
+                );
+                return Err(FileError::new(out, message));
+            }
             destination.add(&name, bytes)?;
             let sum = FileSum::copying(&mut bytes, &mut std::io::sink())
                 .map_err(FileError::doing(out, "cannot add up"))?;

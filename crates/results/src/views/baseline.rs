@@ -121,6 +121,7 @@ mod tests {
             submission: submission.into(),
             shifts,
             settings: Vec::new(),
+            stored: false,
             notes: Vec::new(),
         };
         let text = junit(&[check("a<b", vec![shift]), check("c", Vec::new())]);

@@ -6,13 +6,15 @@ use std::collections::BTreeSet;
 use ndarray::Array2;
 use shearq_files::frames::polars::AnyValue;
 use shearq_scoring::resample::PairedDifference;
-use shearq_scoring::{Definition, Figures};
+use shearq_scoring::{Definition, Fault, Figures};
 use shearq_submissions::Published;
 
-use crate::compare::{Paired, Variant, common_sets, difference, mean_figure};
+use crate::compare::{Paired, Variant, by_name, common_sets, difference, mean_figure};
 use crate::groups::{Group, Grouping};
 use crate::row::{RunRecord, SetRecord};
+use crate::views::diagnosis::of_sets;
 use crate::views::scores::{best_is_another, definition_note, notes};
+use crate::views::verdict::verdict;
 use shearq_render::figure::{ColourMap, HeatMap};
 use shearq_render::table::{Cell, Heading, Table};
 
@@ -171,6 +173,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             lines.push(format!("{}: {line}", variant.name));
         }
     }
+    lines.extend(verdict(&by_name(variants)));
     Table {
         title: "Comparison of submissions".into(),
         headings,
@@ -249,11 +252,16 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
         title: "Recorded runs".into(),
         headings,
         rows,
-        notes: run_notes(runs, grouping, &unpaired),
+        notes: run_notes(runs, groups, grouping, &unpaired),
     }
 }
 
-fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[&str]) -> Vec<String> {
+fn run_notes(
+    runs: &[RunRecord],
+    groups: &[Group<'_>],
+    grouping: Option<Grouping>,
+    unpaired: &[&str],
+) -> Vec<String> {
     let ways: BTreeSet<String> = runs
         .iter()
         .map(|run| {
@@ -273,10 +281,46 @@ fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[&str]) 
         notes.push("ΔQ, ΔQ cal.: from the first row of the same group.".into());
     }
     if several {
-        notes.push("Warning: these runs were scored in different ways; choose one with --where definition=... or choice=...".into());
+        notes.push("warning: these runs were scored in different ways; choose one with --where definition=... or choice=...".into());
     }
     notes.extend(unpaired_note(unpaired));
+    for run in runs {
+        notes.extend(bias_note(run));
+    }
+    if grouping.is_none() {
+        let runs: Vec<(String, Vec<SetRecord>)> = groups
+            .iter()
+            .map(|group| {
+                (
+                    group.name(),
+                    group.sets.iter().map(|&set| set.clone()).collect(),
+                )
+            })
+            .collect();
+        let sets: Vec<Vec<SetRecord>> = runs.iter().map(|(_, sets)| sets.clone()).collect();
+        let common = common_sets(&sets);
+        let of_common = |(name, mut sets): (String, Vec<SetRecord>)| {
+            sets.retain(|set| common.contains(&set.set));
+            (name, sets)
+        };
+        let runs: Vec<_> = runs.into_iter().map(of_common).collect();
+        notes.extend(verdict(&runs));
+    }
     notes
+}
+
+/// A warning about the sets of a recorded run whose multiplicative bias is large.
+fn bias_note(run: &RunRecord) -> Option<String> {
+    let findings: Vec<(Option<u32>, Vec<Fault>)> = run
+        .sets
+        .iter()
+        .map(|set| {
+            let finding = Fault::of_bias(set.figures.m_cross, set.errors.m_cross);
+            (Some(set.set), finding.into_iter().collect())
+        })
+        .collect();
+    let lines = of_sets(findings.iter().map(|(set, found)| (*set, found.as_slice())));
+    (!lines.is_empty()).then(|| format!("{}: {}", run.submission, lines.join(" ")))
 }
 
 /// Sets as `1-3,7`.

@@ -102,7 +102,7 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
             &score.spectra().ee,
             &score.ee_error,
         ];
-        spectrum::panel(set.set, powers, score.noise.as_ref())
+        spectrum::panel(set.set, set.kind, powers, score.noise.as_ref())
     };
     PanelGrid {
         title: format!("Shear power of {name}"),

@@ -5,12 +5,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Value, json};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
-    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Figures, SetScore,
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, Figures, SetScore,
     SpectrumScore,
 };
 
+use crate::row::SetRecord;
 use crate::score::{Basis, ScoredSet, means};
+use crate::views::diagnosis;
 use crate::views::spectrum;
+use crate::views::verdict::verdict;
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_simulate::kinds::SetKind;
 
@@ -22,13 +25,17 @@ fn figure_cells(figures: &Figures, errors: &Figures) -> Vec<Cell> {
         .collect()
 }
 
-/// Where kinds come from: catalogues of other sets may have the same numbers.
-const KINDS: &str = "Kinds are those of GREAT10's sets of these numbers.";
+/// What the kind of a set is called in tables.
+fn kind_label(kind: Option<SetKind>) -> String {
+    kind.map_or_else(String::new, |kind| kind.image.label().to_owned())
+}
 
-/// What a set is called in tables.
-fn kind_label(set: Option<u32>) -> String {
-    set.and_then(SetKind::of)
-        .map_or_else(String::new, |kind| kind.image.label().to_owned())
+/// Where kinds come from, if there are any.
+fn kinds_note(mut kinds: impl Iterator<Item = Option<SetKind>>) -> &'static str {
+    match kinds.any(|kind| kind.is_some()) {
+        true => " Kinds are those of GREAT10's sets of these numbers.",
+        false => "",
+    }
 }
 
 /// One line that says what the figures are.
@@ -56,14 +63,14 @@ pub fn convention_note(scored: &[ScoredSet]) -> String {
             "Convention: set by set the one with the highest Q, as the leaderboard took it.".into()
         }
         Basis::Matched(_) if constant => {
-            format!("Convention {name}: a shear that is the same everywhere does not tell it.")
+            format!("Convention {name}: a constant shear does not determine it.")
         }
         Basis::Matched(matching) if matching.is_clear() => format!(
             "Convention {name}, matched to the truth of all sets together (correlation {:.2}).",
             matching.correlation(chosen)
         ),
         Basis::Matched(matching) => format!(
-            "Warning: the data do not tell the convention (best {}, correlation {:.2}; {:.2} more than any other would be clear); figures are in convention {name}, and differences from other submissions mean nothing. --convention sets one.",
+            "warning: cannot determine the sign and axis convention: convention {} correlates best ({:.2}), but not by the required {:.2}. Scored in convention {name}; differences from other configurations are not significant. Try: --convention N.",
             matching.best().number(),
             matching.correlation(matching.best()),
             matching.least_clear()
@@ -75,18 +82,26 @@ pub fn convention_note(scored: &[ScoredSet]) -> String {
 /// from another one, truth that looks misread, and what is odd about the catalogues.
 pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
     let mut lines = vec![convention_note(scored)];
+    let mut signs: Vec<String> = scored
+        .iter()
+        .filter_map(|s| diagnosis::sign(s.sign))
+        .collect();
+    signs.dedup();
+    lines.extend(signs);
     for ScoredSet {
-        set, score, rows, ..
+        set,
+        score,
+        rows,
+        odd_images,
+        ..
     } in scored
     {
+        let odd = diagnosis::odd_images(odd_images).into_iter();
+        lines.extend(odd.map(|odd| format!("{}{odd}.", diagnosis::prefix(*set))));
         let name = set.map_or_else(|| "this set".to_owned(), |set| format!("set {set}"));
-        if rows.used == 0 {
+        if let Some(mean) = &score.constant {
             lines.push(format!(
-                "Warning: no galaxy of {name} has an ellipticity; its figures are those of an empty submission."
-            ));
-        } else if let Some(mean) = &score.constant {
-            lines.push(format!(
-                "Note: the true shear of {name} is ({}, {}) everywhere, without power to compare: mean e = ({:.5} ± {:.5}, {:.5} ± {:.5}).",
+                "note: the true shear of {name} is ({}, {}) everywhere, without power to compare: mean e = ({:.5} ± {:.5}, {:.5} ± {:.5}).",
                 mean.truth[0], mean.truth[1], mean.e[0], mean.error[0], mean.e[1], mean.error[1]
             ));
         } else if score.wrong_convention_wins() {
@@ -99,17 +114,20 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
                 )
             });
             lines.push(format!(
-                "Warning: in {name} the leaderboard takes {best}, where these figures are of {chosen}."
+                "warning: in {name} the leaderboard takes {best}, where these figures are of {chosen}."
             ));
         }
         if score.constant.is_none() && score.true_b_share() > 0.2 {
             lines.push(format!(
-                "Warning: {:.0} % of the true power of {name} is in B modes; its g2 may have the other sign (--truth-sign).",
+                "warning: {:.0} % of the true power of {name} is in B modes; its g2 may have the other sign (--truth-sign).",
                 100.0 * score.true_b_share()
             ));
         }
         lines.extend(rows.oddities(&name));
     }
+    lines.extend(diagnosis::of_sets(
+        scored.iter().map(|set| (set.set, believable(set))),
+    ));
     let blank = |set: &&ScoredSet| {
         set.score.constant.is_none() && set.rows.used > 0 && set.score.figures.q_calibrated.is_nan()
     };
@@ -120,11 +138,29 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         .collect();
     if !blank.is_empty() {
         lines.push(format!(
-            "Note: no Q cal. and noise for set {}, whose response is less than three of its errors from zero: more galaxies tell.",
+            "note: no Q cal. and noise for set {}, whose response is less than three of its errors from zero: more galaxies tell.",
             blank.join(", ")
         ));
     }
     lines
+}
+
+/// Findings of a set, except those that odd images explain: copies seem to have no noise, and constant
+/// ellipticities no response.
+fn believable(set: &ScoredSet) -> &[Fault] {
+    let odd = &set.odd_images;
+    match set.findings.as_slice() {
+        [Fault::Uncorrelated { .. }] if !odd.copies.is_empty() => &[],
+        [Fault::Biased { .. }] if !odd.constant.is_empty() => &[],
+        all => all,
+    }
+}
+
+/// The sentence that ends the notes on the scores of the configuration called `name`, if its metrics are known.
+pub fn verdict_line(name: &str, scored: &[ScoredSet]) -> Option<String> {
+    let record = |set: &ScoredSet| SetRecord::new(set.set.unwrap_or(0), set, String::new());
+    let with_power = scored.iter().filter(|set| set.score.constant.is_none());
+    verdict(&[(name.to_owned(), with_power.map(record).collect())])
 }
 
 /// What a set is called in a table's first column.
@@ -132,7 +168,7 @@ fn set_cell(set: Option<u32>) -> Cell {
     Cell::text(set.map_or_else(|| "–".into(), |set| format!("{set:02}")))
 }
 
-/// Figures per set, with a row of means where there are several sets.
+/// Metrics per set, with a row of means if there are several sets.
 pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Table {
     if scored.iter().all(|set| set.score.constant.is_some()) {
         return constant_shear(scored, title);
@@ -155,10 +191,13 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
         ..Heading::new("q_leaderboard", "Q leaderboard")
     });
     let mut rows = Vec::new();
-    for ScoredSet { set, score, .. } in scored {
+    for ScoredSet {
+        set, kind, score, ..
+    } in scored
+    {
         let mut row = vec![
             set_cell(*set),
-            Cell::text(kind_label(*set)),
+            Cell::text(kind_label(*kind)),
             Cell::number(score.images as f64, 0),
         ];
         row.extend(figure_cells(&score.figures, &score.errors));
@@ -182,7 +221,11 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     let counts: BTreeSet<usize> = scored.iter().map(|set| set.score.images).collect();
     let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
     let mut lines = vec![
-        format!("Images a set: {}. {KINDS}", counts.join(", ")),
+        format!(
+            "Images a set: {}.{}",
+            counts.join(", "),
+            kinds_note(scored.iter().map(|set| set.kind))
+        ),
         definition_note(definition),
     ];
     lines.extend(notes(scored));
@@ -243,9 +286,10 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
     }
 }
 
-/// Figures of power-spectrum submissions, one row per set and one of means.
+/// Figures of power-spectrum submissions, one row per set and one of means. `kind_of` tells the kind of a set.
 pub fn spectra(
     scored: &[(Option<u32>, SpectrumScore)],
+    kind_of: impl Fn(u32) -> Option<SetKind>,
     title: &str,
     definition: Definition,
 ) -> Table {
@@ -273,7 +317,8 @@ pub fn spectra(
     let mut rows: Vec<Vec<Cell>> = scored
         .iter()
         .map(|(set, score)| {
-            let mut row = vec![set_cell(*set), Cell::text(kind_label(*set))];
+            let kind = set.and_then(&kind_of);
+            let mut row = vec![set_cell(*set), Cell::text(kind_label(kind))];
             row.extend(cells(figures(score)));
             row
         })
@@ -300,7 +345,8 @@ pub fn spectra(
         headings,
         rows,
         notes: vec![format!(
-            "Figures: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian. {KINDS}"
+            "Figures: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian.{}",
+            kinds_note(scored.iter().map(|(set, _)| set.and_then(&kind_of)))
         )],
     }
 }

@@ -19,6 +19,7 @@ pub fn bins(l: &[f64; BINS]) -> impl Iterator<Item = usize> {
 /// The scored bandpowers of the true and of the measured shear, and the latter without those of its noise, where known.
 pub fn panel(
     set: Option<u32>,
+    kind: Option<SetKind>,
     [l, truth, measured, errors]: Powers<'_>,
     noise: Option<&[f64; BINS]>,
 ) -> LinePlot {
@@ -29,8 +30,8 @@ pub fn panel(
         .collect();
     let scored = |values: &[f64; BINS]| seen.iter().map(|&bin| values[bin]).collect::<Vec<_>>();
     let title = set.map(|number| {
-        let kind = SetKind::of(number).map_or("", |kind| kind.image.label());
-        format!("Set {number} {kind}")
+        let kind = kind.map_or("", |kind| kind.image.label());
+        format!("Set {number} {kind}").trim_end().to_owned()
     });
     let mut series = vec![
         Series::new("true", scored(l), scored(truth), Style::Line, 2),

@@ -229,7 +229,7 @@ pub fn power_spectra(results: &[SetResult], place: usize, name: &str) -> PanelGr
         .map(|set| {
             let own = &set.results[place];
             let powers = [&set.l, &set.true_ee, &own.ee, &own.ee_error];
-            spectrum::panel(Some(set.set), powers, None)
+            spectrum::panel(Some(set.set), SetKind::of(set.set), powers, None)
         })
         .collect();
     PanelGrid {

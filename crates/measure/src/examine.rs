@@ -1,0 +1,542 @@
+//! Whether the stamps of an image are what the measurement requires: sky subtracted, one galaxy in the middle of
+//! each, noise of one level.
+//!
+//! All numbers are medians over stamps, so that neighbours on a few of them do not matter. The sky is measured in
+//! the corners, where a galaxy has least light.
+
+use ndarray::{ArrayView2, Axis};
+use shearq_submissions::PsfCut;
+
+use crate::batch::Psfs;
+use crate::error::MeasureError;
+use crate::extent::{Core, core_sums};
+use crate::galaxy::highest;
+use crate::pixel::Pixel;
+use crate::psf::examine::{self, PsfLook};
+use crate::psf::{Star, star};
+use crate::surroundings::centre;
+use crate::warning::Warning;
+
+/// Pixels a side of a block, and the largest share of the stamp's side.
+const BLOCK: usize = 8;
+const BLOCK_SHARE: usize = 4;
+/// Radius in pixels within which a galaxy's light is summed.
+const INNER: f64 = 8.0;
+/// Distances in pixels of pairs that show noise with a longer correlation than the survey covers.
+const LONG: [usize; 2] = [4, 5];
+/// Stamps of an image that are examined: 1.2 million pixels in frames of 48 px, which know the variance to 0.15 %.
+const ENOUGH: usize = 1000;
+
+/// Fewest galaxies whose core is compared with the core of the PSF, and how many times the median of all a galaxy's light
+/// may count.
+const FEWEST: usize = 30;
+const MOST: f64 = 4.0;
+/// PSFs of single galaxies of an image that are examined.
+pub const EXAMINED_PSFS: usize = 100;
+
+/// Significance that every warning requires, in standard errors.
+const CLEAR: f64 = 5.0;
+/// Light of the sky within 8 px, in units of the galaxy's, that changes m by less than 5·10⁻³: measured for the
+/// simulated galaxies, of which a share of 0.48 makes m = −0.006,
+/// −0.013 if they are large and −0.011 at S/N 10.
+const SKY_SHARE: f64 = 0.15;
+/// A galaxy's wings fall from the sides of a stamp to its corners; a sky is equal in both.
+const FALLING: f64 = 0.6;
+/// Change of that share over 8 px that changes c by less than 5·10⁻³: at 0.076 the simulated
+/// galaxies have c = 0.0035, and at S/N 10 m = −0.009.
+const GRADIENT_SHARE: f64 = 0.04;
+/// Offset of the galaxies in pixels: stamps that are cut half a pixel off along x and y are silent, those a whole
+/// pixel off are not.
+const OFFSET: f64 = 0.85;
+/// Scatter of the galaxies' places in pixels.
+const SCATTER: f64 = 2.0;
+/// Scatter of the noise between stamps.
+const DEPTHS: f64 = 0.1;
+/// Correlation at the distances `LONG`.
+const LONG_CORRELATION: f64 = 0.03;
+/// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
+/// away from the smallest and largest numbers there are.
+pub(crate) const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
+/// Standard deviation of Gaussian numbers in units of the median of their moduli, and standard error of their
+/// median in units of the one of their mean.
+const FROM_MODULI: f64 = 1.482_602_2;
+const OF_MEDIAN: f64 = 1.253_314;
+
+/// Which of `rows` rows of `columns` stamps are examined: enough for a thousand stamps, or all. They are spread
+/// evenly but not regularly, so that they do not miss what differs from row to row.
+pub fn examined_rows(columns: usize, rows: usize) -> Vec<usize> {
+    // The golden ratio's multiples fill an interval without a period.
+    const STEP: f64 = 0.618_033_988_749_895;
+    let count = enough(columns, rows);
+    let place = |k: usize| (k as f64 + (STEP * k as f64).fract()) * rows as f64 / count as f64;
+    (0..count)
+        .map(|k| (place(k) as usize).min(rows - 1))
+        .collect()
+}
+
+/// How many of `rows` rows of `columns` stamps are enough.
+pub(crate) fn enough(columns: usize, rows: usize) -> usize {
+    ENOUGH.div_ceil(columns.max(1)).min(rows)
+}
+
+/// What one stamp shows.
+#[derive(Debug, Clone, Copy)]
+struct Look {
+    /// Level of its corners, and of the middles of its sides.
+    corner: f64,
+    side: f64,
+    /// Change of the corners' level per pixel along x and y.
+    slope: [f64; 2],
+    /// Noise of two of the corners, and of the other two.
+    noise: [f64; 2],
+    /// Sums over pairs at the distances `LONG`: of products, of the pixels, and their number.
+    pairs: [f64; 3],
+    /// Centroid from the expected place.
+    place: [f64; 2],
+    /// Light within `INNER`, without sky.
+    flux: f64,
+    peak: f64,
+    /// Sums under the narrow weight of [`Core`].
+    core: [f64; 2],
+    /// Equal for equal stamps.
+    trace: u64,
+}
+
+/// Sums over stamps of an image. They depend on nothing but the stamps and their order.
+#[derive(Debug, Clone)]
+pub struct Examination {
+    full: usize,
+    block: usize,
+    pixels: Vec<f32>,
+    looks: Vec<Look>,
+    blank: usize,
+    psfs: Vec<PsfLook>,
+    /// Whether each PSF is that of one galaxy.
+    each: bool,
+}
+
+/// A block's mean, variance about its plane, and sums over pairs.
+#[derive(Debug, Clone, Copy, Default)]
+struct Block {
+    mean: f64,
+    variance: f64,
+    pairs: [f64; 3],
+}
+
+impl Examination {
+    /// Of stamps of `full` pixels a side, `count` of which will be added.
+    pub fn new(full: usize, count: usize) -> Self {
+        Examination {
+            full,
+            block: BLOCK.min(full / BLOCK_SHARE),
+            pixels: vec![0.0; full * full],
+            looks: Vec::with_capacity(count),
+            blank: 0,
+            psfs: Vec::new(),
+            each: false,
+        }
+    }
+
+    /// Examines the PSF of all galaxies, of sum one, which was `moved` by so many pixels to be in the middle.
+    pub fn add_psf(&mut self, psf: ArrayView2<'_, f64>, moved: Option<[f64; 2]>) {
+        self.psfs.extend(PsfLook::of(psf, moved));
+    }
+
+    /// Examines the PSF of all galaxies, or up to `most` of those for one galaxy each, as a configuration cuts them for
+    /// stamps of `full` pixels a side. PSFs that cannot be used are left out.
+    pub fn add_psfs<P: Pixel>(&mut self, psfs: Psfs<'_, P>, cut: PsfCut, most: usize) {
+        let count = match psfs {
+            Psfs::Star(given) => return self.add_star(given, cut),
+            Psfs::Prepared(psf) => return self.add_psf(psf, None),
+            Psfs::Stars(stars) => stars.len_of(Axis(0)),
+            Psfs::Functional(formulas) => formulas.len(),
+        };
+        self.each = true;
+        let some = most.min(count);
+        for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
+            match psfs {
+                Psfs::Stars(stars) => self.add_star(stars.index_axis(Axis(0), at), cut),
+                Psfs::Functional(formulas) => {
+                    if let Ok(psf) = formulas[at].checked_stamp(cut.size, self.full) {
+                        self.add_psf(psf.view(), None);
+                    }
+                }
+                Psfs::Star(_) | Psfs::Prepared(_) => {}
+            }
+        }
+    }
+
+    fn add_star<P: Pixel>(&mut self, stamp: ArrayView2<'_, P>, cut: PsfCut) {
+        if let Ok(Star { psf, moved }) = star(stamp, cut) {
+            self.add_psf(psf.view(), moved);
+        }
+    }
+
+    /// Examines a stamp with its galaxy in the middle.
+    ///
+    /// # Errors
+    /// If the stamp has other sizes than planned.
+    pub fn add<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) -> Result<(), MeasureError> {
+        self.add_at(stamp, [0.0; 2])
+    }
+
+    /// Examines a stamp with its galaxy expected at `place`, (x, y) in pixels from the middle.
+    ///
+    /// # Errors
+    /// If the stamp has other sizes than planned.
+    pub fn add_at<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+        place: [f64; 2],
+    ) -> Result<(), MeasureError> {
+        let n = self.full;
+        if stamp.dim() != (n, n) {
+            let expected = format!("{n} × {n}");
+            return Err(MeasureError::square("a stamp", stamp.dim(), expected));
+        }
+        for (to, value) in self.pixels.iter_mut().zip(stamp) {
+            *to = value.to_f32();
+        }
+        if self.pixels.iter().all(|v| *v == self.pixels[0]) {
+            self.blank += 1;
+            return Ok(());
+        }
+        let (edge, middle) = (n - self.block, (n - self.block) / 2);
+        let at = |y, x| block(&self.pixels, n, self.block, (y, x));
+        let corners = [at(0, 0), at(0, edge), at(edge, 0), at(edge, edge)];
+        let sides = [
+            at(0, middle),
+            at(edge, middle),
+            at(middle, 0),
+            at(middle, edge),
+        ];
+        let [a, b, c, d] = corners.map(|corner| corner.mean);
+        let apart = 2.0 * edge as f64;
+        let noise = |one: Block, other: Block| (0.5 * (one.variance + other.variance)).sqrt();
+        let mut pairs = [0.0; 3];
+        for corner in corners {
+            for (sum, more) in pairs.iter_mut().zip(corner.pairs) {
+                *sum += more;
+            }
+        }
+        let corner = middle_of(&mut corners.map(|corner| corner.mean));
+        let look = Look {
+            corner,
+            side: middle_of(&mut sides.map(|side| side.mean)),
+            slope: [(b + d - a - c) / apart, (c + d - a - b) / apart],
+            noise: [noise(corners[0], corners[3]), noise(corners[1], corners[2])],
+            pairs,
+            peak: f64::from(highest(&self.pixels)),
+            trace: trace(&self.pixels),
+            place: [0.0; 2],
+            flux: 0.0,
+            core: [0.0; 2],
+        };
+        for value in &mut self.pixels {
+            // Missing pixels are as bright as the sky.
+            *value = if value.is_finite() {
+                (f64::from(*value) - corner) as f32
+            } else {
+                0.0
+            };
+        }
+        let found = centre(&self.pixels, n);
+        self.looks.push(Look {
+            place: [0, 1].map(|k| f64::from(found[k]) - place[k]),
+            flux: inner(&self.pixels, n),
+            core: core_sums(
+                |x, y| f64::from(self.pixels[y * n + x]),
+                [n; 2],
+                found.map(f64::from),
+            ),
+            ..look
+        });
+        Ok(())
+    }
+
+    /// Adds what another examination has found, as if its stamps had been added here.
+    pub fn join(&mut self, other: &Self) {
+        self.looks.extend_from_slice(&other.looks);
+        self.blank += other.blank;
+        self.psfs.extend_from_slice(&other.psfs);
+        self.each |= other.each;
+    }
+
+    /// What is wrong with the stamps.
+    pub fn warnings(&self) -> Vec<Warning> {
+        let mut found = Vec::new();
+        let examined = self.looks.len() + self.blank;
+        if self.looks.is_empty() {
+            if self.blank > 0 {
+                found.push(Warning::Blank { of: self.blank });
+            }
+            found.extend(self.psfs(None));
+            return found;
+        }
+        let (peak, _) = self.median(|look| look.peak, 0.0);
+        // On a stamp without a positive pixel it is zero.
+        if peak > 0.0 && !PEAKS.contains(&(peak as f32)) {
+            found.push(Warning::Brightness { peak });
+        }
+        let (noise, _) = self.median(|look| look.noise[0].hypot(look.noise[1]) / 2f64.sqrt(), 0.0);
+        let (flux, flux_error) = self.median(|look| look.flux, noise * INNER);
+        // Without light there is nothing that a sky or an offset could be compared with.
+        let lit = flux.abs() > CLEAR * flux_error;
+        if lit && flux < 0.0 {
+            let count = self.looks.iter().filter(|look| look.flux < 0.0).count();
+            found.push(Warning::Negative {
+                count,
+                of: examined,
+            });
+        }
+        let sky = self.sky(noise, flux);
+        let gradient = self.gradient(noise, flux);
+        if sky.is_none() && gradient.is_none() {
+            found.extend(self.long_correlation(noise));
+        }
+        found.extend(sky);
+        found.extend(gradient);
+        if lit && flux > 0.0 {
+            found.extend(self.places());
+        }
+        found.extend(self.depths());
+        found.extend(self.copies(examined));
+        let galaxies = self.core().filter(|_| lit && flux > 0.0);
+        found.extend(self.psfs(galaxies));
+        found
+    }
+
+    fn psfs(&self, galaxies: Option<Core>) -> Vec<Warning> {
+        examine::warnings(&self.psfs, !self.each, galaxies)
+    }
+
+    /// How broad the core of the galaxies is, with the PSF.
+    fn core(&self) -> Option<Core> {
+        let mut lights: Vec<f64> = self.looks.iter().map(|look| look.core[0].abs()).collect();
+        let most = MOST * median(&mut lights).filter(|_| lights.len() >= FEWEST)?;
+        let sums = || {
+            self.looks.iter().map(|look| {
+                // Bright stars and bad pixels count no more than a few galaxies.
+                let share = (most / look.core[0].abs()).min(1.0);
+                look.core.map(|sum| share * sum)
+            })
+        };
+        let light: f64 = sums().map(|core| core[0]).sum();
+        let q = 0.5 * sums().map(|core| core[1]).sum::<f64>() / light;
+        let rest = sums().map(|core| (0.5 * core[1] - q * core[0]).powi(2));
+        Core::of(q, rest.sum::<f64>().sqrt() / light.abs())
+    }
+
+    fn sky(&self, noise: f64, flux: f64) -> Option<Warning> {
+        let pixels = (self.block * self.block) as f64;
+        // The median of four corners is about the mean of two.
+        let (level, error) = self.median(|look| look.corner, noise / (2.0 * pixels).sqrt());
+        let (side, _) = self.median(|look| look.side, 0.0);
+        let share = level * disc() / flux.abs();
+        let wings = level > 0.0 && level < FALLING * side;
+        let clear = level.abs() > CLEAR * error && share.abs() > SKY_SHARE && !wings;
+        clear.then_some(Warning::Sky {
+            level,
+            error,
+            noise,
+            share,
+        })
+    }
+
+    fn gradient(&self, noise: f64, flux: f64) -> Option<Warning> {
+        let edge = (self.full - self.block) as f64;
+        let floor = noise / (self.block as f64 * edge);
+        let found = [0, 1].map(|k| self.median(|look| look.slope[k], floor));
+        let error = found[0].1.max(found[1].1);
+        let slope = found.map(|(slope, _)| slope);
+        let steep = slope[0].hypot(slope[1]);
+        let share = steep * INNER * disc() / flux.abs();
+        (steep > CLEAR * error && share > GRADIENT_SHARE).then_some(Warning::Gradient {
+            slope,
+            error,
+            noise,
+        })
+    }
+
+    fn places(&self) -> Option<Warning> {
+        let found = [0, 1].map(|k| self.median(|look| look.place[k], 0.0));
+        let offset = found.map(|(offset, _)| offset);
+        let error = found[0].1.max(found[1].1);
+        let away = offset[0].hypot(offset[1]);
+        if away > OFFSET && away > CLEAR * error {
+            return Some(Warning::OffCentre { offset, error });
+        }
+        let scatter = found.map(|(_, error)| error * (self.looks.len() as f64).sqrt() / OF_MEDIAN);
+        (scatter[0].max(scatter[1]) > SCATTER).then_some(Warning::Wandering { scatter })
+    }
+
+    /// The noise of two corners varies from stamp to stamp like the noise of the other two if the stamps' noise
+    /// differs, and independently of it if all have one level.
+    fn depths(&self) -> Option<Warning> {
+        let usable = |look: &&Look| look.noise.iter().all(|noise| *noise > 0.0);
+        let logs: Vec<[f64; 2]> = self
+            .looks
+            .iter()
+            .filter(usable)
+            .map(|look| look.noise.map(f64::ln))
+            .collect();
+        let count = logs.len() as f64;
+        let middle = [0, 1].map(|k| median(&mut logs.iter().map(|log| log[k]).collect::<Vec<_>>()));
+        let [a, b] = [middle[0]?, middle[1]?];
+        // Neighbours on a corner count no more than a factor of e.
+        let about = |log: &[f64; 2]| [(log[0] - a).clamp(-1.0, 1.0), (log[1] - b).clamp(-1.0, 1.0)];
+        let products: Vec<f64> = logs.iter().map(|log| about(log).iter().product()).collect();
+        let mean = products.iter().sum::<f64>() / count;
+        let square = products
+            .iter()
+            .map(|product| (product - mean).powi(2))
+            .sum::<f64>();
+        let error = (square / (count - 1.0) / count).sqrt();
+        let scatter = mean.max(0.0).sqrt();
+        (mean > CLEAR * error && scatter > DEPTHS).then_some(Warning::Depths { scatter })
+    }
+
+    fn long_correlation(&self, noise: f64) -> Option<Warning> {
+        let (level, _) = self.median(|look| look.corner, 0.0);
+        let of = |look: &Look| {
+            let [products, sums, count] = look.pairs;
+            (products - level * sums + count * level * level) / (count * noise * noise)
+        };
+        let mut all: Vec<f64> = self
+            .looks
+            .iter()
+            .map(of)
+            .filter(|r| r.is_finite())
+            .collect();
+        let count = all.len() as f64;
+        let (middle, scatter) = scatter(&mut all)?;
+        let most = 3.0 * scatter;
+        let clipped = all.iter().map(|r| (r - middle).clamp(-most, most));
+        let correlation = middle + clipped.sum::<f64>() / count;
+        let error = scatter / count.sqrt();
+        (correlation > CLEAR * error && correlation > LONG_CORRELATION && count > 1.0)
+            .then_some(Warning::LongCorrelation { correlation })
+    }
+
+    fn copies(&self, of: usize) -> Option<Warning> {
+        let mut traces: Vec<u64> = self.looks.iter().map(|look| look.trace).collect();
+        traces.sort_unstable();
+        let count = traces.windows(2).filter(|pair| pair[0] == pair[1]).count();
+        (count > 0).then_some(Warning::Copies { count, of })
+    }
+
+    /// Median of a number over stamps with its standard error, which is at least that of stamps with an error of
+    /// `floor` each.
+    fn median(&self, of: impl Fn(&Look) -> f64, floor: f64) -> (f64, f64) {
+        let mut all: Vec<f64> = self
+            .looks
+            .iter()
+            .map(of)
+            .filter(|value| !value.is_nan())
+            .collect();
+        let count = all.len() as f64;
+        let (middle, scatter) = scatter(&mut all).unwrap_or((f64::NAN, f64::NAN));
+        (middle, OF_MEDIAN * scatter.max(floor) / count.sqrt())
+    }
+}
+
+/// Mean, variance and pairs of a square block from (y, x) on; not numbers if a pixel is missing.
+fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Block {
+    let row = |y: usize| &pixels[(y0 + y) * n + x0..][..side];
+    let (count, middle) = ((side * side) as f64, (side as f64 - 1.0) / 2.0);
+    let [mut sum, mut square, mut along, mut across, mut spread] = [0.0; 5];
+    for y in 0..side {
+        let dy = y as f64 - middle;
+        spread += dy * dy * side as f64;
+        for (x, value) in row(y).iter().enumerate() {
+            let value = f64::from(*value);
+            sum += value;
+            square += value * value;
+            along += value * (x as f64 - middle);
+            across += value * dy;
+        }
+    }
+    let mut pairs = [0.0; 3];
+    let mut pair = |a: f32, b: f32| {
+        let (a, b) = (f64::from(a), f64::from(b));
+        pairs[0] += a * b;
+        pairs[1] += a + b;
+        pairs[2] += 1.0;
+    };
+    for apart in LONG.into_iter().filter(|apart| *apart < side) {
+        for y in 0..side {
+            let here = row(y);
+            here.iter()
+                .zip(&here[apart..])
+                .for_each(|(a, b)| pair(*a, *b));
+            if y + apart < side {
+                here.iter()
+                    .zip(row(y + apart))
+                    .for_each(|(a, b)| pair(*a, *b));
+            }
+        }
+    }
+    let plane = sum * sum / count + (along * along + across * across) / spread;
+    Block {
+        mean: sum / count,
+        variance: ((square - plane) / (count - 3.0)).max(0.0),
+        pairs,
+    }
+}
+
+/// Pixels within `INNER` of the middle.
+fn disc() -> f64 {
+    std::f64::consts::PI * INNER * INNER
+}
+
+/// Light within `INNER` of the middle.
+fn inner(pixels: &[f32], n: usize) -> f64 {
+    let middle = (n as f64 - 1.0) / 2.0;
+    let mut sum = 0.0;
+    for (y, row) in pixels.chunks_exact(n).enumerate() {
+        let dy = y as f64 - middle;
+        let half = (INNER * INNER - dy * dy).max(-1.0).sqrt();
+        if half.is_nan() {
+            continue;
+        }
+        let first = (middle - half).ceil().max(0.0) as usize;
+        let last = ((middle + half).floor() as usize).min(n - 1);
+        sum += row[first..=last].iter().map(|v| f64::from(*v)).sum::<f64>();
+    }
+    sum
+}
+
+/// A number from the bits of the stamp's pixels: Fowler, Noll and Vo's hash.
+fn trace(pixels: &[f32]) -> u64 {
+    // Noise makes a fifth of the pixels different for every stamp.
+    let some = pixels.iter().step_by(5);
+    some.fold(0xcbf2_9ce4_8422_2325, |hash, value| {
+        (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0100_0000_01b3)
+    })
+}
+
+/// Mean of the two in the middle of up to four numbers, without those that are none.
+fn middle_of(values: &mut [f64; 4]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    // Numbers that are none come last, or first if negative.
+    let first = values.iter().take_while(|value| value.is_nan()).count();
+    let rest = &values[first..];
+    let count = rest.iter().take_while(|value| !value.is_nan()).count();
+    match count {
+        0 => f64::NAN,
+        _ => 0.5 * (rest[(count - 1) / 2] + rest[count / 2]),
+    }
+}
+
+/// The lower median; reorders the values.
+fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len().checked_sub(1)? / 2;
+    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// Median and scatter of the values.
+fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
+    let middle = median(values)?;
+    let mut moduli: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
+    Some((middle, FROM_MODULI * median(&mut moduli)?))
+}

@@ -1,0 +1,147 @@
+//! Probable faults of ellipticities and of the true shear, in words.
+
+use std::path::PathBuf;
+
+use shearq_scoring::{Fault, ImageFaults, TruthSign};
+
+use crate::score::OddImages;
+use shearq_pipeline::truth::SignBasis;
+
+/// A finding: what was found, what was expected, and what to do.
+pub fn words(finding: &Fault) -> String {
+    match *finding {
+        Fault::StrongTruth { rms } => format!(
+            "the true shear is too strong for weak lensing (rms {rms:.3}, expected below 0.3). Is it in percent, or another quantity?"
+        ),
+        Fault::Convention {
+            scored,
+            correlation,
+            better,
+            with,
+        } => format!(
+            "wrong convention suspected: convention {} ({}) correlates with the true shear by {with:.2}, convention {} only by {correlation:.2}. Check the signs of e1 and e2 and the order of x and y",
+            better.number(),
+            better.describe(),
+            scored.number()
+        ),
+        Fault::Swapped { correlation, with } => format!(
+            "e1 and e2 seem to be swapped: swapped they correlate with the true shear by {with:.2}, as given only by {correlation:.2}. Check the order of the columns"
+        ),
+        Fault::Shifted {
+            x,
+            y,
+            correlation,
+            with,
+        } => format!(
+            "the ellipticities seem to be shifted by ({x:+}, {y:+}) cells: shifted back they correlate with the true shear by {with:.2}, as given only by {correlation:.2}. Check the order of the rows and the positions"
+        ),
+        Fault::Uncorrelated {
+            correlation,
+            allowed,
+        } => format!(
+            "the ellipticities correlate with the true shear by only {correlation:.2}, but their noise allows {allowed:.2}. Check the order of the rows, the positions, the columns, and that truth and catalogues belong together"
+        ),
+        Fault::Distortion { m, error } => format!(
+            "the ellipticities respond to shear by a factor of {:.2} ± {error:.2}, expected 1: they seem to be distortions χ, not shear-type ε",
+            1.0 + m
+        ),
+        Fault::Biased { m, error } => format!(
+            "m = {m:.3} ± {error:.3}, expected |m| below 0.1: a high Q does not make such ellipticities fit for use. Calibrate them"
+        ),
+    }
+}
+
+/// Faults of the images of arrays, counted from 1, a sentence each.
+pub fn odd_arrays(faults: &ImageFaults) -> Vec<String> {
+    let name = |place: usize| PathBuf::from(format!("image {}", place + 1));
+    let images: Vec<PathBuf> = (0..faults.images()).map(name).collect();
+    odd_images(&OddImages::new(faults, &images))
+}
+
+/// Faults of single images, a sentence each.
+pub fn odd_images(odd: &OddImages) -> Vec<String> {
+    let mut lines = Vec::new();
+    let more = |count: usize| match count {
+        1 => String::new(),
+        2 => ", and 1 more likewise".to_owned(),
+        _ => format!(", and {} more likewise", count - 1),
+    };
+    if let Some((copy, first)) = odd.copies.first() {
+        lines.push(format!(
+            "{} has the ellipticities of {}{}; expected an independent measurement per image. Noise, Q_dn and errors are wrong",
+            copy.display(),
+            first.display(),
+            more(odd.copies.len())
+        ));
+    }
+    if let Some((path, [e1, e2])) = odd.constant.first() {
+        lines.push(format!(
+            "all galaxies of {} have the ellipticity ({e1}, {e2}){}; expected measured values. Check the column names",
+            path.display(),
+            more(odd.constant.len())
+        ));
+    }
+    lines
+}
+
+/// What a reader should know about the sign of the true g2, if anything.
+pub fn sign(basis: SignBasis) -> Option<String> {
+    match basis {
+        SignBasis::Unknown => Some(
+            "warning: cannot determine the sign of g2 in the truth; assumed the challenge's (g2 > 0 along x = -y). Try: --truth-sign standard, or a line `# g2sign: standard` in the file".into(),
+        ),
+        SignBasis::Modes(TruthSign::Standard) => Some(
+            "note: the truth does not state the sign of g2; used the standard sign, in which the shear is an E-mode field.".into(),
+        ),
+        SignBasis::Correlation(sign) => Some(format!(
+            "note: the truth does not state the sign of g2; used the {} sign, with which e2 correlates.",
+            match sign {
+                TruthSign::Standard => "standard",
+                TruthSign::Challenge => "challenge's",
+            }
+        )),
+        SignBasis::Specified | SignBasis::Modes(TruthSign::Challenge) => None,
+    }
+}
+
+/// Findings of several sets, a line per kind: the first set with its finding in words, and the numbers of the other sets.
+pub fn of_sets<'a>(sets: impl Iterator<Item = (Option<u32>, &'a [Fault])>) -> Vec<String> {
+    let mut kinds: Vec<(Fault, Vec<Option<u32>>)> = Vec::new();
+    for (set, findings) in sets {
+        for finding in findings {
+            let kind = std::mem::discriminant(finding);
+            match kinds
+                .iter_mut()
+                .find(|(first, _)| std::mem::discriminant(first) == kind)
+            {
+                Some((_, sets)) => sets.push(set),
+                None => kinds.push((*finding, vec![set])),
+            }
+        }
+    }
+    kinds
+        .iter()
+        .map(|(finding, sets)| {
+            let others: Vec<String> = sets[1..].iter().flatten().map(u32::to_string).collect();
+            let others = match others.is_empty() {
+                true => String::new(),
+                false => format!(" (likewise in set {})", others.join(", ")),
+            };
+            let advice = match finding {
+                Fault::Distortion { .. } => {
+                    " Try: --ellipticity distortion, or `ellipticity = \"distortion\"` with --foreign."
+                }
+                _ => "",
+            };
+            format!("{}{}{others}.{advice}", prefix(sets[0]), words(finding))
+        })
+        .collect()
+}
+
+/// `warning: set 02: `, or `warning: ` if the set has no number.
+pub fn prefix(set: Option<u32>) -> String {
+    set.map_or_else(
+        || "warning: ".into(),
+        |set| format!("warning: set {set:02}: "),
+    )
+}

@@ -1,0 +1,182 @@
+//! Which configuration to use, in one sentence.
+
+use std::borrow::Borrow;
+
+use crate::compare::{Paired, difference, mean_figure};
+use crate::row::SetRecord;
+use shearq_render::table::Cell;
+
+/// Significance from which one configuration is said to be better than another.
+const CLEAR: f64 = 3.0;
+/// Most sets whose noise is listed set by set.
+const LISTED: usize = 3;
+
+/// Which configuration to use, with the metrics that decide; of a single one, its metrics. `None` of a single
+/// one whose response is not known.
+pub fn verdict<R: Borrow<SetRecord>>(submissions: &[(String, Vec<R>)]) -> Option<String> {
+    let mean = |sets: &[R], name: &str| mean_figure(sets, name).0;
+    let calibrated = |sets: &[R]| mean(sets, "q_calibrated");
+    let known = submissions
+        .iter()
+        .filter(|(_, sets)| !sets.is_empty() && calibrated(sets).is_finite());
+    let best = known.max_by(|a, b| calibrated(&a.1).total_cmp(&calibrated(&b.1)));
+    let Some((place, (name, sets))) = best.and_then(|best| {
+        submissions
+            .iter()
+            .enumerate()
+            .find(|(_, s)| std::ptr::eq(*s, best))
+    }) else {
+        return (submissions.len() > 1)
+            .then(|| "Not enough data to rank the configurations.".into());
+    };
+    let shown = |sets: &[R], name: &str, decimals: usize| {
+        let (value, error) = mean_figure(sets, name);
+        Cell::with_error(value, Some(error), decimals).in_words()
+    };
+    let rivals = || {
+        let others = submissions.iter().enumerate();
+        others
+            .filter(move |(k, _)| *k != place)
+            .map(|(_, rival)| rival)
+    };
+    let behind = |others: &[R]| difference(Paired::Calibrated, others, sets);
+    let others: Vec<String> = rivals()
+        .map(|(other, others)| {
+            let behind = behind(others).map_or(String::new(), |d| {
+                let lower = Cell::with_error(d.difference, Some(d.error), 1);
+                format!(", lower by {}", lower.in_words())
+            });
+            format!(
+                "; {other} has m = {} and Q calibrated = {}{behind}",
+                shown(others, "m_cross", 2),
+                shown(others, "q_calibrated", 1)
+            )
+        })
+        .collect();
+    // A configuration without a calibrated Q is not distinguished either.
+    let equal: Vec<&str> = rivals()
+        .filter(|(_, others)| !behind(others).is_some_and(|d| d.sigma() >= CLEAR))
+        .map(|(other, _)| other.as_str())
+        .collect();
+    let lead = match (submissions.len(), equal.is_empty()) {
+        (1, _) => name.clone(),
+        (_, true) => format!("Use {name}"),
+        (_, false) => format!(
+            "{name} has the highest Q calibrated, but these images do not distinguish it from {}",
+            equal.join(" and ")
+        ),
+    };
+    // With few images, Q itself can rank otherwise.
+    let raised = rivals()
+        .filter(|(_, others)| mean(others, "q") > mean(sets, "q") && mean(others, "m_cross") < 0.0)
+        .map(|(other, _)| other.as_str())
+        .collect::<Vec<_>>();
+    let warning = match raised.is_empty() {
+        true => String::new(),
+        false => format!(
+            " Q itself is higher for {}, which lose shear and noise alike (m below zero): real analyses cannot use that.",
+            raised.join(" and ")
+        ),
+    };
+    let noise = match sets.as_slice() {
+        [_] => shown(sets, "galaxy_noise", 3),
+        few if few.len() <= LISTED => {
+            let noise = few.iter().map(|set| {
+                let set = set.borrow();
+                let noise = Some(set.errors.galaxy_noise);
+                let noise = Cell::with_error(set.figures.galaxy_noise, noise, 3).in_words();
+                format!("{noise} in set {}", set.set)
+            });
+            noise.collect::<Vec<_>>().join(" and ")
+        }
+        many => format!(
+            "{} (mean of {} sets)",
+            shown(many, "galaxy_noise", 3),
+            many.len()
+        ),
+    };
+    Some(format!(
+        "{lead}: m = {}, noise per galaxy after calibration {noise}, and Q calibrated = {}{}.{warning}",
+        shown(sets, "m_cross", 2),
+        shown(sets, "q_calibrated", 1),
+        others.concat()
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shearq_scoring::Figures;
+
+    /// A submission with one set of eight images, whose calibrated Q scatters as `replicates`.
+    fn submission(
+        name: &str,
+        q: f64,
+        calibrated: f64,
+        replicates: [f64; 8],
+    ) -> (String, Vec<SetRecord>) {
+        let with = |q, q_calibrated, m_cross| Figures {
+            q,
+            q_calibrated,
+            m_cross,
+            ..Figures::unknown()
+        };
+        let record = SetRecord {
+            set: 2,
+            simulated: true,
+            data: String::new(),
+            images: (1..=8).collect(),
+            galaxies: 8,
+            flagged: 0,
+            figures: with(q, calibrated, -0.3),
+            errors: with(0.1, 2.0, 0.01),
+            q_replicates: vec![q; 8],
+            q_calibrated_replicates: replicates.map(|off| calibrated + off).to_vec(),
+            q_leaderboard: q,
+            convention: 5,
+            convention_known: true,
+            convention_leaderboard: 5,
+        };
+        (name.into(), vec![record])
+    }
+
+    #[test]
+    fn a_submission_is_named_where_its_images_tell_it_from_the_others() {
+        let common = [0.5, -0.5, 0.5, -0.5, 0.5, -0.5, 0.5, -0.5];
+        let own = [0.7, -0.7, 0.3, -0.3, 0.7, -0.7, 0.3, -0.3];
+        let better = submission("b", 10.0, 25.0, own);
+        // The noise that both have in common takes their errors of 2 down to √(7/8 · Σ 0.2²) = 0.53.
+        let told = verdict(&[submission("a", 12.0, 20.0, common), better.clone()]).unwrap();
+        assert!(told.starts_with("Use b: m = -0.300 ± 0.010"), "{told}");
+        assert!(
+            told.contains("Q calibrated = 20.0 ± 2.0, lower by 5.00 ± 0.53"),
+            "{told}"
+        );
+        assert!(
+            told.contains("Q itself is higher for a, which lose shear"),
+            "{told}"
+        );
+        let untold = verdict(&[submission("a", 9.0, 24.0, common), better.clone()]).unwrap();
+        let start =
+            "b has the highest Q calibrated, but these images do not distinguish it from a: m";
+        assert!(
+            untold.starts_with(start) && !untold.contains("itself"),
+            "{untold}"
+        );
+        let unknown = verdict(&[submission("a", 9.0, f64::NAN, common), better]).unwrap();
+        assert!(
+            unknown.contains("do not distinguish it from a"),
+            "{unknown}"
+        );
+        assert!(
+            unknown.contains("a has m = -0.300 ± 0.010 and Q calibrated = unknown"),
+            "{unknown}"
+        );
+        let blank = || submission("a", 9.0, f64::NAN, common);
+        let none = verdict(&[blank(), blank()]).unwrap();
+        assert_eq!(none, "Not enough data to rank the configurations.");
+        assert_eq!(verdict(&[blank()]), None);
+        let alone = verdict(&[submission("a", 9.0, 24.0, common)]).unwrap();
+        assert!(alone.starts_with("a: m = -0.300 ± 0.010, noise"), "{alone}");
+    }
+}

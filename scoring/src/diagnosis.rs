@@ -1,0 +1,371 @@
+//! Which fault explains a submission that disagrees with the true shear: order of rows, components, type of
+//! ellipticity, copies. Arithmetic on grids; the caller words the findings.
+
+use std::collections::HashMap;
+use std::f64::consts::PI;
+use std::hash::{DefaultHasher, Hash, Hasher};
+
+use ndarray::Array2;
+use shearq_fourier::Complex64;
+
+use crate::bandpower::{Bins, SCORED};
+use crate::catalogue::{FieldSum, TrueShear, TruthSign};
+use crate::convention::Convention;
+use crate::grid::Grid;
+use crate::modes::{Decomposer, Modes};
+use crate::score::{SetScore, SetScorer};
+
+/// Significance in standard deviations from which a finding is reported.
+const CLEAR: f64 = 5.0;
+/// Least gain in correlation with the truth for which another order is reported.
+const LEAST_GAIN: f64 = 0.02;
+/// Least shortfall of the correlation below the value that the noise allows. Errors common to all images of a
+/// set also lower the correlation, as a poor PSF correction does.
+const SHORTFALL: f64 = 0.3;
+/// |m| from which ellipticities are called biased, and its significance.
+const LARGE_BIAS: (f64, f64) = (0.1, 3.0);
+/// m from which a distortion is suspected: a distortion responds nearly twice as much as a shear.
+const OF_DISTORTION: f64 = 0.5;
+/// A shear field whose rms exceeds this is not weak lensing.
+const STRONG_SHEAR: f64 = 0.3;
+/// Difference of the shares of B modes that determines the sign of g₂. A pure E-mode field has a share of 0 in
+/// the right sign and of about one half in the other.
+const SHARES_APART: f64 = 0.2;
+/// Standard deviations at which a correlation of e₂ with g₂ determines the sign of g₂.
+const SIGN_CLEAR: f64 = 4.0;
+
+/// A probable fault of a set's ellipticities, or of its true shear.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Fault {
+    /// The true shear is too strong for weak lensing.
+    StrongTruth {
+        /// Root mean square of |g|.
+        rms: f64,
+    },
+    /// Another convention of signs and axes correlates clearly better with the truth.
+    Convention {
+        /// The convention scored.
+        scored: Convention,
+        /// Its correlation with the truth.
+        correlation: f64,
+        /// The better one.
+        better: Convention,
+        /// Its correlation with the truth.
+        with: f64,
+    },
+    /// e₁ and e₂ in the other order correlate clearly better.
+    Swapped {
+        /// Correlation with the truth as scored.
+        correlation: f64,
+        /// Correlation after the exchange.
+        with: f64,
+    },
+    /// The galaxies lie in neighbouring cells of those that they belong to.
+    Shifted {
+        /// Cells along x that they are too far right.
+        x: i32,
+        /// Cells along y that they are too far up.
+        y: i32,
+        /// Correlation with the truth as scored.
+        correlation: f64,
+        /// Correlation after shifting back.
+        with: f64,
+    },
+    /// The correlation is far below the value that the noise allows.
+    Uncorrelated {
+        /// Correlation with the truth as scored.
+        correlation: f64,
+        /// Correlation that the noise between images allows.
+        allowed: f64,
+    },
+    /// The response to shear is too large for a shear-type ellipticity.
+    Distortion {
+        /// Multiplicative bias.
+        m: f64,
+        /// Its error.
+        error: f64,
+    },
+    /// A large multiplicative bias.
+    Biased {
+        /// Multiplicative bias.
+        m: f64,
+        /// Its error.
+        error: f64,
+    },
+}
+
+/// Faults of single images, found while they are added one after the other.
+#[derive(Debug, Clone, Default)]
+pub struct ImageFaults {
+    seen: HashMap<u64, usize>,
+    images: usize,
+    /// Places of images with the ellipticities of an earlier one, and the place of that one, from 0.
+    pub copies: Vec<(usize, usize)>,
+    /// Places of images whose galaxies all have one ellipticity, and that ellipticity.
+    pub constant: Vec<(usize, [f64; 2])>,
+}
+
+impl ImageFaults {
+    /// Number of images looked at.
+    pub fn images(&self) -> usize {
+        self.images
+    }
+
+    /// Looks at the next image. Images without any galaxy are not compared.
+    pub fn add(&mut self, image: &FieldSum) {
+        let place = self.images;
+        self.images += 1;
+        let filled = image.count.iter().filter(|count| **count > 0.0).count();
+        if filled == 0 {
+            return;
+        }
+        if let Some(e) = constant(image).filter(|_| filled > 1) {
+            self.constant.push((place, e));
+            return;
+        }
+        let mut hasher = DefaultHasher::new();
+        for values in [&image.e1, &image.e2, &image.count] {
+            // Adding zero makes one zero of both.
+            values
+                .iter()
+                .for_each(|v| (v + 0.0).to_bits().hash(&mut hasher));
+        }
+        let first = *self.seen.entry(hasher.finish()).or_insert(place);
+        if first != place {
+            self.copies.push((place, first));
+        }
+    }
+}
+
+/// The ellipticity of all galaxies of an image, if it is the same.
+fn constant(image: &FieldSum) -> Option<[f64; 2]> {
+    let mut values = image.e1.iter().zip(&image.e2).zip(&image.count);
+    let mut values = values.by_ref().filter(|(_, count)| **count > 0.0);
+    let ((&e1, &e2), _) = values.next()?;
+    let same = values.all(|((a, b), _)| *a == e1 && *b == e2);
+    same.then_some([e1, e2])
+}
+
+impl SetScorer {
+    /// Probable faults of the images scored as `score`, most important first. `convention` is the one to
+    /// compare others with. At most one finding concerns the order of the ellipticities, and m is examined only if
+    /// there is none.
+    pub fn diagnose(
+        &self,
+        images: &crate::SetImages,
+        score: &SetScore,
+        convention: Convention,
+    ) -> Vec<Fault> {
+        let mut findings = Vec::new();
+        let rms = self.truth().rms();
+        if rms > STRONG_SHEAR {
+            findings.push(Fault::StrongTruth { rms });
+        }
+        if score.constant.is_some() {
+            return findings;
+        }
+        match self.misplaced(images.total(), score, convention) {
+            Some(finding) => findings.push(finding),
+            None if convention == score.chosen => {
+                findings.extend(Fault::of_bias(score.figures.m_cross, score.errors.m_cross))
+            }
+            None => {}
+        }
+        findings
+    }
+
+    /// What is wrong with the order of a set's rows or components, if anything.
+    fn misplaced(&self, sum: &FieldSum, score: &SetScore, convention: Convention) -> Option<Fault> {
+        let correlation = score.conventions[convention.index()].correlation;
+        if !correlation.is_finite() {
+            return None;
+        }
+        let modes: usize = SCORED.map(|b| score.bins.modes[b]).sum();
+        let better = |with: f64| gain(correlation, with, modes) > CLEAR * CLEAR;
+        let mut best: Option<(f64, Fault)> = None;
+        let mut offer = |with: f64, finding: Fault| {
+            if better(with) && best.as_ref().is_none_or(|(other, _)| with > *other) {
+                best = Some((with, finding));
+            }
+        };
+        let matching = &score.matching;
+        if matching.is_clear() && matching.best() != convention {
+            let (other, with) = (matching.best(), matching.correlation(matching.best()));
+            let finding = Fault::Convention {
+                scored: convention,
+                correlation,
+                better: other,
+                with,
+            };
+            offer(with, finding);
+        }
+        let swapped = FieldSum {
+            e1: sum.e2.clone(),
+            e2: sum.e1.clone(),
+            ..sum.clone()
+        };
+        let with = Convention::ALL
+            .map(|k| self.correlation_of(&swapped, k))
+            .into_iter()
+            .fold(f64::NEG_INFINITY, f64::max);
+        offer(with, Fault::Swapped { correlation, with });
+        for ((x, y), with) in self.shifted(sum, convention) {
+            let finding = Fault::Shifted {
+                x,
+                y,
+                correlation,
+                with,
+            };
+            offer(with, finding);
+        }
+        best.map(|(_, finding)| finding).or_else(|| {
+            let allowed = allowed(score, convention)?;
+            // Of correlations that chance alone makes, less than this is believed.
+            let chance = 2.0 * score.matching.least_clear();
+            let shortfall = allowed - correlation.max(0.0);
+            (shortfall > SHORTFALL.max(chance)).then_some(Fault::Uncorrelated {
+                correlation,
+                allowed,
+            })
+        })
+    }
+
+    /// Correlations with the truth after moving the field back by one cell in each direction.
+    fn shifted(&self, sum: &FieldSum, convention: Convention) -> Vec<((i32, i32), f64)> {
+        let (modes, truth) = self.both_modes(sum, convention);
+        let bins = self.bins();
+        let product = |a, b| bins.scored_product(a, b);
+        let scale = (product(&truth.e, &truth.e) * product(&modes.e, &modes.e)).sqrt();
+        let n = modes.e.nrows() as f64;
+        let phase = |k: usize, cells: i32| 2.0 * PI * k as f64 * f64::from(cells) / n;
+        let neighbours = (-1..=1).flat_map(|x| (-1..=1).map(move |y| (x, y)));
+        neighbours
+            .filter(|shift| *shift != (0, 0))
+            .map(|(x, y)| {
+                let mut cross = 0.0;
+                bins.each_scored(|at, _, _| {
+                    let back = Complex64::from_polar(1.0, phase(at.0, x) + phase(at.1, y));
+                    cross += (truth.e[at].conj() * modes.e[at] * back).re;
+                });
+                ((x, y), cross / scale)
+            })
+            .collect()
+    }
+}
+
+/// Twice the gain in the logarithm of the likelihood of `modes` modes with Gaussian noise of unknown variance,
+/// from the correlations with the truth before and after.
+fn gain(before: f64, after: f64, modes: usize) -> f64 {
+    let left = |r: f64| (1.0 - r.clamp(0.0, 1.0).powi(2)).max(f64::EPSILON);
+    match after > before + LEAST_GAIN {
+        true => modes as f64 * (left(before) / left(after)).ln(),
+        false => 0.0,
+    }
+}
+
+/// The correlation with the truth that the measured noise allows, where it is known.
+fn allowed(score: &SetScore, convention: Convention) -> Option<f64> {
+    let noise = score.noise.as_ref()?;
+    if convention.class() != score.chosen.class() {
+        return None;
+    }
+    let total = &score.conventions[convention.index()].ee;
+    let sum = |powers: &[f64; crate::BINS]| -> f64 {
+        let of_a_mode = score.bins.white_noise(1.0);
+        let of_bin = |b: usize| match score.bins.modes[b] {
+            0 => 0.0,
+            modes => powers[b] * modes as f64 / of_a_mode[b],
+        };
+        SCORED.map(of_bin).sum()
+    };
+    let signal = 1.0 - sum(noise) / sum(total);
+    (signal > 0.0).then(|| signal.min(1.0).sqrt())
+}
+
+impl Fault {
+    /// The finding about a multiplicative bias: as large as for a distortion, or large in either direction.
+    pub fn of_bias(m: f64, error: f64) -> Option<Self> {
+        let (large, sigmas) = LARGE_BIAS;
+        if m - OF_DISTORTION > sigmas * error {
+            return Some(Fault::Distortion { m, error });
+        }
+        (m.abs() - large > sigmas * error).then_some(Fault::Biased { m, error })
+    }
+}
+
+/// The sign of g₂ in a truth, read as `standard`, whose power is E mode in one sign only.
+pub fn sign_by_modes(grid: &Grid, standard: &TrueShear) -> Option<TruthSign> {
+    let decomposer = Decomposer::new(*grid);
+    let bins = Bins::new(grid, crate::Definition::Leaderboard);
+    let share = |truth: &TrueShear| {
+        let Modes { e, b } = decomposer.decompose(Convention::STANDARD.apply(&truth.g1, &truth.g2));
+        let (e, b) = (bins.scored_product(&e, &e), bins.scored_product(&b, &b));
+        b / (e + b)
+    };
+    let difference = share(&standard.flipped()) - share(standard);
+    sign_where(difference, SHARES_APART)
+}
+
+/// The sign of g₂ in a truth, read as `standard`, with which e₂ of the images correlates clearly.
+pub fn sign_by_correlation(standard: &TrueShear, sum: &FieldSum) -> Option<TruthSign> {
+    let product = |a: &Array2<f64>, b: &Array2<f64>| (a * b).sum();
+    let (g, e) = (&standard.g2, &sum.e2);
+    let correlation = product(g, e) / (product(g, g) * product(e, e)).sqrt();
+    sign_where(correlation, SIGN_CLEAR / (g.len() as f64).sqrt())
+}
+
+/// The standard sign where `value` is at least `clear`, the challenge's where it is at most its negative.
+fn sign_where(value: f64, clear: f64) -> Option<TruthSign> {
+    if value >= clear {
+        Some(TruthSign::Standard)
+    } else if value <= -clear {
+        Some(TruthSign::Challenge)
+    } else {
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(value: impl Fn(usize) -> (f64, f64)) -> FieldSum {
+        let grid = Grid::great10(8).unwrap();
+        let mut sum = FieldSum::new(&grid);
+        sum.images = 1;
+        for k in 0..64 {
+            let at = (k % 8, k / 8);
+            (sum.e1[at], sum.e2[at]) = value(k);
+            sum.count[at] = 1.0;
+        }
+        sum
+    }
+
+    #[test]
+    fn copies_and_constant_images_are_found() {
+        let mut faults = ImageFaults::default();
+        let varied = |k: usize| (k as f64, -(k as f64));
+        let blank = FieldSum::new(&Grid::great10(8).unwrap());
+        for sum in [
+            image(varied),
+            blank.clone(),
+            image(|_| (0.0, 0.0)),
+            image(|k| (-(k as f64), k as f64)),
+            image(varied),
+            blank,
+            image(|_| (0.1, 0.2)),
+        ] {
+            faults.add(&sum);
+        }
+        assert_eq!(faults.copies, [(4, 0)]);
+        assert_eq!(faults.constant, [(2, [0.0, 0.0]), (6, [0.1, 0.2])]);
+    }
+
+    #[test]
+    fn a_better_order_must_be_clear() {
+        assert_eq!(gain(0.98, 0.985, 700), 0.0);
+        assert!(gain(0.0, 0.1, 700) < CLEAR * CLEAR);
+        assert!(gain(0.49, 0.98, 700) > CLEAR * CLEAR);
+        assert!(gain(-0.5, 0.5, 700) > CLEAR * CLEAR);
+    }
+}

@@ -1,0 +1,192 @@
+//! Every pair of options of every command is used, or refused.
+
+use clap::{Arg, Command, CommandFactory};
+
+use crate::Cli;
+
+/// The ways in which a command is used, each with the options that have an effect in it. Two options without a
+/// way in common must be refused.
+const WAYS: [(&str, &[&str]); 26] = [
+    ("quickstart", &["out threads"]),
+    (
+        "simulate",
+        &["sets images grid seed amplitude tilt out shard threads"],
+    ),
+    (
+        "gather",
+        &[
+            "stamps extension mask mask-extension psf psf-extension noise set image out",
+            "exposure positions table first-pixel columns size extension mask mask-extension psf psf-extension noise set image out",
+        ],
+    ),
+    (
+        "measure",
+        &["submission data out sets catalogue-format shard threads"],
+    ),
+    (
+        "run",
+        &[
+            "submission data sets out catalogue-format store report shard threads",
+            "submission simulate sets images grid seed amplitude tilt out catalogue-format store report shard threads",
+        ],
+    ),
+    ("merge", &["OUT sets images shards discard-damaged threads"]),
+    ("mean", &["measured sets format threads"]),
+    (
+        "score",
+        &[
+            "data measured sets noise-var store format wide figures report definition convention threads",
+            "data foreign sets noise-var store format wide figures report definition convention threads",
+            "data packed sets noise-var format wide figures definition convention threads",
+            "data spectra sets format wide figures definition threads",
+            "truth CATALOGUE truth-sign stamp field columns ellipticity missing max-modulus noise-var format wide figures report definition convention threads",
+            "truth spectra truth-sign stamp field format wide figures definition threads",
+        ],
+    ),
+    (
+        "compare",
+        &[
+            "OUT data foreign where sort group-by heat-map format wide figures report definition convention threads",
+            "store where sort group-by heat-map format wide figures report",
+        ],
+    ),
+    ("check", &["PATH data grid stamp images json"]),
+    (
+        "pack",
+        &["measured out method kind", "foreign data out method kind"],
+    ),
+    ("unpack", &["ARCHIVE out verify"]),
+    ("show", &["submission data galaxy out"]),
+    (
+        "calibrate",
+        &["submission galaxies seed out format threads"],
+    ),
+    (
+        "reproduce",
+        &["out images grid sets submission galaxies seed threads"],
+    ),
+    (
+        "study",
+        &["submission sets images pairs grid seed amplitude tilt out format threads"],
+    ),
+    ("bench", &["submission catalogues out format threads"]),
+    ("submissions list", &["format"]),
+    ("submissions show", &["NAME|FILE"]),
+    ("submissions init", &["FILE method"]),
+    ("completions", &["SHELL"]),
+    ("manual", &["DIR"]),
+    // Only the names of these options are compared; their ways depend on more than two options.
+    (
+        NAMES_ONLY[0],
+        &[
+            "NAME measured data simulate submission sets images grid seed amplitude tilt folder threads",
+        ],
+    ),
+    (
+        NAMES_ONLY[1],
+        &["NAME data stored sigma update reason junit folder format threads"],
+    ),
+    ("help", &[]),
+    ("baseline help", &[]),
+];
+
+/// Commands whose pairs are not compared.
+const NAMES_ONLY: [&str; 2] = ["baseline record", "baseline check"];
+
+/// Pairs that the command itself refuses, with an error, when it runs.
+const REFUSED_WHEN_RUN: [(&str, &str, &str); 6] = [
+    ("run", "data", "grid"),
+    ("run", "data", "seed"),
+    ("run", "data", "amplitude"),
+    ("run", "data", "tilt"),
+    ("run", "shard", "store"),
+    ("run", "shard", "report"),
+];
+
+/// What an option is called on the command line.
+fn name(argument: &Arg) -> String {
+    let value = || {
+        let names = argument.get_value_names().unwrap_or_default();
+        names.first().map(ToString::to_string)
+    };
+    let name = argument.get_long().map(str::to_owned).or_else(value);
+    name.unwrap_or_else(|| argument.get_id().to_string().to_uppercase())
+}
+
+/// Whether clap refuses two options together.
+fn refused(command: &Command, a: &Arg, b: &Arg) -> bool {
+    let names = |a: &Arg, b: &Arg| {
+        let others = command.get_arg_conflicts_with(a);
+        others.iter().any(|other| other.get_id() == b.get_id())
+    };
+    let exclusive = command.get_groups().any(|group| {
+        let mut members = group.get_args();
+        let both =
+            group.get_args().any(|id| id == a.get_id()) && members.any(|id| id == b.get_id());
+        // Flattened structures are groups of any number.
+        both && !group.clone().is_multiple()
+    });
+    names(a, b) || names(b, a) || exclusive
+}
+
+/// Compares a command, or its subcommands, with the table.
+fn compare(path: &str, command: &Command, wrong: &mut Vec<String>) {
+    if command.has_subcommands() {
+        for inner in command.get_subcommands() {
+            let path = format!("{path} {}", inner.get_name());
+            compare(path.trim(), inner, wrong);
+        }
+        return;
+    }
+    let Some((_, ways)) = WAYS.iter().find(|(name, _)| *name == path) else {
+        wrong.push(format!("{path}: not in the table of ways"));
+        return;
+    };
+    let ways: Vec<Vec<&str>> = ways.iter().map(|way| way.split(' ').collect()).collect();
+    let options: Vec<&Arg> = command
+        .get_arguments()
+        .filter(|a| !["help", "version"].contains(&a.get_id().as_str()))
+        .collect();
+    for way in ways.iter().flatten() {
+        if !options.iter().any(|option| name(option) == *way) {
+            wrong.push(format!("{path}: there is no option {way}"));
+        }
+    }
+    for (k, a) in options.iter().enumerate() {
+        let first = name(a);
+        let has = |way: &&Vec<&str>, name: &str| way.contains(&name);
+        if !ways.iter().any(|way| has(&way, &first)) {
+            wrong.push(format!("{path}: {first} is in no way of using it"));
+        }
+        if NAMES_ONLY.contains(&path) {
+            continue;
+        }
+        for b in &options[k + 1..] {
+            let second = name(b);
+            let used = ways
+                .iter()
+                .any(|way| has(&way, &first) && has(&way, &second));
+            let when_run = |(of, x, y): &(&str, &str, &str)| {
+                *of == path && [(*x, *y), (*y, *x)].contains(&(first.as_str(), second.as_str()))
+            };
+            let when_run = REFUSED_WHEN_RUN.iter().any(when_run);
+            match (used && !when_run, refused(command, a, b)) {
+                (true, true) => wrong.push(format!("{path}: {first} with {second} is refused")),
+                (false, false) if !when_run => {
+                    wrong.push(format!("{path}: {first} with {second} is ignored"));
+                }
+                _ => {}
+            }
+        }
+    }
+}
+
+#[test]
+fn every_pair_of_options_is_used_or_refused() {
+    let mut cli = Cli::command();
+    cli.build();
+    let mut wrong = Vec::new();
+    compare("", &cli, &mut wrong);
+    wrong.retain(|line| !line.contains("help"));
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
