@@ -454,3 +454,76 @@ fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
     let mut moduli: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
     Some((middle, FROM_MODULI * median(&mut moduli)?))
 }
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array2;
+
+    use super::*;
+
+    const N: usize = 48;
+
+    /// A Gaussian of 3 px on a stamp with a plane under it.
+    fn stamp(level: f32, slope: [f32; 2], centre: [f32; 2]) -> Array2<f32> {
+        Array2::from_shape_fn((N, N), |(y, x)| {
+            let (x, y) = (x as f32 - 23.5, y as f32 - 23.5);
+            let (dx, dy) = (x - centre[0], y - centre[1]);
+            10.0 * (-(dx * dx + dy * dy) / 18.0).exp() + level + slope[0] * x + slope[1] * y
+        })
+    }
+
+    #[test]
+    fn a_stamp_shows_its_level_slope_and_centre() {
+        let mut examination = Examination::new(N, 1);
+        let stamp = stamp(0.5, [0.01, -0.02], [0.75, -0.5]);
+        examination.add_at(stamp.view(), [0.75, 0.0]).unwrap();
+        let look = examination.looks[0];
+        // In single precision.
+        assert!((look.corner - 0.5).abs() < 1e-5, "{look:?}");
+        assert!((look.slope[0] - 0.01).abs() < 1e-6, "{look:?}");
+        assert!((look.slope[1] + 0.02).abs() < 1e-6, "{look:?}");
+        assert!(look.noise[0] < 1e-4 && look.noise[1] < 1e-4, "{look:?}");
+        // Centroids fall short of the centre, and planes pull them.
+        assert!(look.place[0].abs() < 0.15, "{look:?}");
+        assert!((look.place[1] + 0.5).abs() < 0.15, "{look:?}");
+    }
+
+    #[test]
+    fn a_corner_with_missing_pixels_is_left_out() {
+        let mut examination = Examination::new(N, 1);
+        let mut stamp = stamp(0.5, [0.0; 2], [0.0; 2]);
+        stamp[(1, 1)] = f32::NAN;
+        stamp[(46, 2)] = 1e4;
+        examination.add(stamp.view()).unwrap();
+        assert!((examination.looks[0].corner - 0.5).abs() < 1e-5);
+        assert!(middle_of(&mut [f64::NAN; 4]).is_nan());
+        assert_eq!(middle_of(&mut [3.0, -f64::NAN, f64::NAN, 1.0]), 2.0);
+        assert_eq!(middle_of(&mut [4.0, 1.0, 9.0, 2.0]), 3.0);
+    }
+
+    #[test]
+    fn examinations_joined_are_one() {
+        let [mut one, mut first, mut second] = [(); 3].map(|()| Examination::new(N, 8));
+        for k in 0..8 {
+            let stamp = stamp(0.5 + 0.1 * k as f32, [0.02, 0.0], [0.1 * k as f32, 0.0]);
+            one.add(stamp.view()).unwrap();
+            let part = if k < 3 { &mut first } else { &mut second };
+            part.add(stamp.view()).unwrap();
+        }
+        first.join(&second);
+        assert_eq!(first.warnings(), one.warnings());
+        assert!(!one.warnings().is_empty());
+    }
+
+    #[test]
+    fn rows_are_spread_without_a_period_and_cover_small_images() {
+        assert_eq!(examined_rows(16, 16), (0..16).collect::<Vec<_>>());
+        assert_eq!(examined_rows(7, 1), [0]);
+        assert!(examined_rows(7, 0).is_empty());
+        let rows = examined_rows(100, 100);
+        assert_eq!(rows.len(), 10);
+        assert!(rows.windows(2).all(|pair| pair[0] < pair[1]));
+        let even = rows.iter().filter(|row| *row % 2 == 0).count();
+        assert!((3..=7).contains(&even), "{rows:?}");
+    }
+}
