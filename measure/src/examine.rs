@@ -24,9 +24,8 @@ const ENOUGH: usize = 1000;
 
 /// Significance that every warning requires, in standard errors.
 const CLEAR: f64 = 5.0;
-/// Light of the sky within 8 px, in units of the galaxy's, that changes m by less than 5·10⁻³: measured for the
-/// simulated galaxies, of which a share of 0.48 makes m = −0.006,
-/// −0.013 if they are large and −0.011 at S/N 10.
+/// Light of the sky within 8 px, in units of the galaxy's, that changes m by less than 5·10⁻³. A share of 0.48
+/// changes m of the simulated galaxies by −0.006, by −0.013 if they are large, and by −0.011 at S/N 10.
 const SKY_SHARE: f64 = 0.15;
 /// A galaxy's wings fall from the sides of a stamp to its corners; a sky is equal in both.
 const FALLING: f64 = 0.6;
@@ -107,7 +106,7 @@ struct Block {
 }
 
 impl Examination {
-    /// Of stamps of `full` pixels a side, `count` of which will be added.
+    /// For `count` stamps of `full` pixels a side.
     pub fn new(full: usize, count: usize) -> Self {
         Examination {
             full,
@@ -217,7 +216,7 @@ impl Examination {
         }
         let (noise, _) = self.median(|look| look.noise[0].hypot(look.noise[1]) / 2f64.sqrt(), 0.0);
         let (flux, flux_error) = self.median(|look| look.flux, noise * INNER);
-        // Without light there is nothing that a sky or an offset could be compared with.
+        // An offset needs light to be measured.
         let lit = flux.abs() > CLEAR * flux_error;
         if lit && flux < 0.0 {
             let count = self.looks.iter().filter(|look| look.flux < 0.0).count();
@@ -284,8 +283,8 @@ impl Examination {
         (scatter[0].max(scatter[1]) > SCATTER).then_some(Warning::Wandering { scatter })
     }
 
-    /// The noise of two corners varies from stamp to stamp like the noise of the other two if the stamps' noise
-    /// differs, and independently of it if all have one level.
+    /// Compares the noise of two corners with the noise of the other two. Both vary together from stamp to stamp if
+    /// the stamps' noise differs, and independently if all stamps have one level.
     fn depths(&self) -> Option<Warning> {
         let usable = |look: &&Look| look.noise.iter().all(|noise| *noise > 0.0);
         let logs: Vec<[f64; 2]> = self
@@ -297,7 +296,7 @@ impl Examination {
         let count = logs.len() as f64;
         let middle = [0, 1].map(|k| median(&mut logs.iter().map(|log| log[k]).collect::<Vec<_>>()));
         let [a, b] = [middle[0]?, middle[1]?];
-        // Neighbours on a corner count no more than a factor of e.
+        // A neighbour on a corner counts at most a factor of e.
         let about = |log: &[f64; 2]| [(log[0] - a).clamp(-1.0, 1.0), (log[1] - b).clamp(-1.0, 1.0)];
         let products: Vec<f64> = logs.iter().map(|log| about(log).iter().product()).collect();
         let mean = products.iter().sum::<f64>() / count;
@@ -339,8 +338,7 @@ impl Examination {
         (count > 0).then_some(Warning::Copies { count, of })
     }
 
-    /// Median of a number over stamps with its standard error, which is at least that of stamps with an error of
-    /// `floor` each.
+    /// Median of a number over stamps with its standard error. Each stamp has an error of at least `floor`.
     fn median(&self, of: impl Fn(&Look) -> f64, floor: f64) -> (f64, f64) {
         let mut all: Vec<f64> = self
             .looks
