@@ -409,7 +409,7 @@ fn folders_are_chosen_sorted_and_grouped_like_a_store() {
     // A data folder in place of results.
     let message = fail(&["compare", text(&data), text(&raw)]);
     assert!(
-        message.contains("this is a data folder with images"),
+        message.contains("this is a data folder: it contains galaxy images and no run.json"),
         "{message}"
     );
     // Without a truth the images determine the grid.

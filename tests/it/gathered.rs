@@ -408,10 +408,10 @@ fn noise_that_is_told_to_be_white_and_is_not_and_padding_are_told() {
         .collect();
     for (submission, told) in [(LINEAR, false), (text(&white), true), (text(&border), true)] {
         let (_, said) = measure("plain", &galaxies, submission);
-        assert!(!said.contains("is taken as white"), "{said}");
+        assert!(!said.contains("is treated as white"), "{said}");
         let (well, said) = measure("summed", &summed, submission);
         assert_eq!(
-            (well, said.contains("is taken as white")),
+            (well, said.contains("is treated as white")),
             (true, told),
             "{said}"
         );

@@ -467,6 +467,7 @@ fn catalogues_with_a_head_of_sextractor_or_in_a_named_table_are_scored() {
     let rows: Vec<Vec<f64>> = fs::read_to_string(&truth)
         .unwrap()
         .lines()
+        .filter(|line| !line.starts_with('#'))
         .skip(1)
         .map(|line| {
             line.split(',')

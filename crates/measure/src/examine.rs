@@ -36,9 +36,8 @@ pub const EXAMINED_PSFS: usize = 100;
 
 /// Significance that every warning requires, in standard errors.
 const CLEAR: f64 = 5.0;
-/// Light of the sky within 8 px, in units of the galaxy's, that changes m by less than 5·10⁻³: measured for the
-/// simulated galaxies, of which a share of 0.48 makes m = −0.006,
-/// −0.013 if they are large and −0.011 at S/N 10.
+/// Light of the sky within 8 px, in units of the galaxy's, that changes m by less than 5·10⁻³. A share of 0.48
+/// changes m of the simulated galaxies by −0.006, by −0.013 if they are large, and by −0.011 at S/N 10.
 const SKY_SHARE: f64 = 0.15;
 /// A galaxy's wings fall from the sides of a stamp to its corners; a sky is equal in both.
 const FALLING: f64 = 0.6;
@@ -124,7 +123,7 @@ struct Block {
 }
 
 impl Examination {
-    /// Of stamps of `full` pixels a side, `count` of which will be added.
+    /// For `count` stamps of `full` pixels a side.
     pub fn new(full: usize, count: usize) -> Self {
         Examination {
             full,
@@ -280,7 +279,7 @@ impl Examination {
         }
         let (noise, _) = self.median(|look| look.noise[0].hypot(look.noise[1]) / 2f64.sqrt(), 0.0);
         let (flux, flux_error) = self.median(|look| look.flux, noise * INNER);
-        // Without light there is nothing that a sky or an offset could be compared with.
+        // An offset needs light to be measured.
         let lit = flux.abs() > CLEAR * flux_error;
         if lit && flux < 0.0 {
             let count = self.looks.iter().filter(|look| look.flux < 0.0).count();
@@ -370,8 +369,8 @@ impl Examination {
         (scatter[0].max(scatter[1]) > SCATTER).then_some(Warning::Wandering { scatter })
     }
 
-    /// The noise of two corners varies from stamp to stamp like the noise of the other two if the stamps' noise
-    /// differs, and independently of it if all have one level.
+    /// Compares the noise of two corners with the noise of the other two. Both vary together from stamp to stamp if
+    /// the stamps' noise differs, and independently if all stamps have one level.
     fn depths(&self) -> Option<Warning> {
         let usable = |look: &&Look| look.noise.iter().all(|noise| *noise > 0.0);
         let logs: Vec<[f64; 2]> = self
@@ -383,7 +382,7 @@ impl Examination {
         let count = logs.len() as f64;
         let middle = [0, 1].map(|k| median(&mut logs.iter().map(|log| log[k]).collect::<Vec<_>>()));
         let [a, b] = [middle[0]?, middle[1]?];
-        // Neighbours on a corner count no more than a factor of e.
+        // A neighbour on a corner counts at most a factor of e.
         let about = |log: &[f64; 2]| [(log[0] - a).clamp(-1.0, 1.0), (log[1] - b).clamp(-1.0, 1.0)];
         let products: Vec<f64> = logs.iter().map(|log| about(log).iter().product()).collect();
         let mean = products.iter().sum::<f64>() / count;
@@ -425,8 +424,7 @@ impl Examination {
         (count > 0).then_some(Warning::Copies { count, of })
     }
 
-    /// Median of a number over stamps with its standard error, which is at least that of stamps with an error of
-    /// `floor` each.
+    /// Median of a number over stamps with its standard error. Each stamp has an error of at least `floor`.
     fn median(&self, of: impl Fn(&Look) -> f64, floor: f64) -> (f64, f64) {
         let mut all: Vec<f64> = self
             .looks
@@ -539,4 +537,77 @@ fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
     let middle = median(values)?;
     let mut moduli: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
     Some((middle, FROM_MODULI * median(&mut moduli)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array2;
+
+    use super::*;
+
+    const N: usize = 48;
+
+    /// A Gaussian of 3 px on a stamp with a plane under it.
+    fn stamp(level: f32, slope: [f32; 2], centre: [f32; 2]) -> Array2<f32> {
+        Array2::from_shape_fn((N, N), |(y, x)| {
+            let (x, y) = (x as f32 - 23.5, y as f32 - 23.5);
+            let (dx, dy) = (x - centre[0], y - centre[1]);
+            10.0 * (-(dx * dx + dy * dy) / 18.0).exp() + level + slope[0] * x + slope[1] * y
+        })
+    }
+
+    #[test]
+    fn a_stamp_shows_its_level_slope_and_centre() {
+        let mut examination = Examination::new(N, 1);
+        let stamp = stamp(0.5, [0.01, -0.02], [0.75, -0.5]);
+        examination.add_at(stamp.view(), [0.75, 0.0]).unwrap();
+        let look = examination.looks[0];
+        // In single precision.
+        assert!((look.corner - 0.5).abs() < 1e-5, "{look:?}");
+        assert!((look.slope[0] - 0.01).abs() < 1e-6, "{look:?}");
+        assert!((look.slope[1] + 0.02).abs() < 1e-6, "{look:?}");
+        assert!(look.noise[0] < 1e-4 && look.noise[1] < 1e-4, "{look:?}");
+        // Centroids fall short of the centre, and planes pull them.
+        assert!(look.place[0].abs() < 0.15, "{look:?}");
+        assert!((look.place[1] + 0.5).abs() < 0.15, "{look:?}");
+    }
+
+    #[test]
+    fn a_corner_with_missing_pixels_is_left_out() {
+        let mut examination = Examination::new(N, 1);
+        let mut stamp = stamp(0.5, [0.0; 2], [0.0; 2]);
+        stamp[(1, 1)] = f32::NAN;
+        stamp[(46, 2)] = 1e4;
+        examination.add(stamp.view()).unwrap();
+        assert!((examination.looks[0].corner - 0.5).abs() < 1e-5);
+        assert!(middle_of(&mut [f64::NAN; 4]).is_nan());
+        assert_eq!(middle_of(&mut [3.0, -f64::NAN, f64::NAN, 1.0]), 2.0);
+        assert_eq!(middle_of(&mut [4.0, 1.0, 9.0, 2.0]), 3.0);
+    }
+
+    #[test]
+    fn examinations_joined_are_one() {
+        let [mut one, mut first, mut second] = [(); 3].map(|()| Examination::new(N, 8));
+        for k in 0..8 {
+            let stamp = stamp(0.5 + 0.1 * k as f32, [0.02, 0.0], [0.1 * k as f32, 0.0]);
+            one.add(stamp.view()).unwrap();
+            let part = if k < 3 { &mut first } else { &mut second };
+            part.add(stamp.view()).unwrap();
+        }
+        first.join(&second);
+        assert_eq!(first.warnings(), one.warnings());
+        assert!(!one.warnings().is_empty());
+    }
+
+    #[test]
+    fn rows_are_spread_without_a_period_and_cover_small_images() {
+        assert_eq!(examined_rows(16, 16), (0..16).collect::<Vec<_>>());
+        assert_eq!(examined_rows(7, 1), [0]);
+        assert!(examined_rows(7, 0).is_empty());
+        let rows = examined_rows(100, 100);
+        assert_eq!(rows.len(), 10);
+        assert!(rows.windows(2).all(|pair| pair[0] < pair[1]));
+        let even = rows.iter().filter(|row| *row % 2 == 0).count();
+        assert!((3..=7).contains(&even), "{rows:?}");
+    }
 }

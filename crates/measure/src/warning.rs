@@ -209,7 +209,7 @@ impl Warning {
 
     /// The same if `count` galaxies of so many are flagged, each number of them `with` a flag.
     pub fn of_counts(with: impl Fn(Flag) -> usize, count: usize, of: usize) -> Option<Warning> {
-        // Galaxies without a usable mean response have this flag beside the one that explains it.
+        // Galaxies without a usable mean response have this flag together with the one that explains it.
         let explains = |flag: &Flag| *flag != Flag::NoResponse && 2 * with(*flag) > of;
         let flag = Flag::ALL.into_iter().find(explains);
         // Of equal numbers the first reason.

@@ -1,0 +1,42 @@
+"""Wrong data are measured with a warning, good data without one."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import shearq
+
+
+def measured(image, stamps, **more):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        shearq.measure(stamps, image.psf, **more)
+    return caught
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (lambda stamps, x: stamps + 3, "the stamps contain sky (found "),
+        (lambda stamps, x: stamps + np.float32(0.05) * x, "the sky has a gradient"),
+        (lambda stamps, x: np.roll(stamps, 3, axis=2), "off the centre of their stamps"),
+        (lambda stamps, x: -stamps, "darker than their surroundings"),
+        (lambda stamps, x: np.repeat(stamps[:1], len(stamps), axis=0), "copies of each other"),
+        (lambda stamps, x: 0 * stamps, "the stamps are blank"),
+    ],
+    ids=["sky", "gradient", "off centre", "negative", "copies", "blank"],
+)
+def test_wrong_stamps_are_warned_of(image, spoil, expected):
+    x = np.arange(48, dtype=np.float32) - 23.5
+    caught = measured(image, spoil(image.stamps, x).astype(np.float32), noise=1.0)
+    found = [str(warning.message) for warning in caught]
+    assert any(expected in text for text in found), found
+    assert all(warning.category is shearq.DataWarning for warning in caught)
+    # The warning points at the caller.
+    assert all(warning.filename == __file__ for warning in caught)
+
+
+@pytest.mark.parametrize("submission", ["48/linear/star", "23/raw/star"])
+def test_good_stamps_have_no_warning(image, submission):
+    assert not measured(image, image.stamps, submission=submission)
