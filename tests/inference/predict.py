@@ -12,7 +12,7 @@ IMAGES = 200  # of a set
 BINS = 20
 SCORED = slice(1, 9)  # bins 2 to 9
 
-# ℓ²C_ℓ/2π of the fiducial shear (src/simulate/field.rs).
+# ℓ²C_ℓ/2π of the fiducial shear (crates/simulate/src/field.rs).
 FIDUCIAL = [
     (36, 3.56e-6), (60, 5.80e-6), (100, 8.65e-6), (180, 1.22e-5), (300, 1.63e-5), (500, 2.27e-5),
     (800, 3.19e-5), (1200, 4.27e-5), (1800, 5.53e-5), (2600, 6.62e-5), (3600, 7.35e-5), (5000, 7.71e-5),

@@ -2,8 +2,8 @@
 # Makes what is published of a release, in the folder named: an archive with the binary, a Debian package where
 # dpkg-deb is there, and their checksums. Reproducible: the same commit and compiler give the same bytes.
 set -euo pipefail
-cd "$(dirname "$0")/.."
-out=${1:?usage: release/archive.sh FOLDER}
+cd "$(dirname "$0")/../.."
+out=${1:?usage: .ci/release/archive.sh FOLDER}
 mkdir -p "$out"
 out=$(cd "$out" && pwd)
 version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
@@ -23,7 +23,7 @@ install -m 755 "$binary" "$tree/shearq"
 strip "$tree/shearq"
 cp README.md CHANGELOG.md CITATION.cff LICENSE-MIT LICENSE-APACHE "$tree"
 cp -r docs "$tree/docs"
-python3 release/licences.py > "$tree/LICENCES-OF-DEPENDENCIES.txt"
+python3 .ci/release/licences.py > "$tree/LICENCES-OF-DEPENDENCIES.txt"
 for shell in bash zsh fish; do
     "$binary" completions "$shell" > "$tree/completions/shearq.$shell"
 done

@@ -1,0 +1,110 @@
+//! The crates of the workspace use those below them, and none above.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+/// The crates from the lowest level up, with their folders. A crate uses crates of lower levels only.
+const LEVELS: [&[(&str, &str)]; 8] = [
+    &[
+        ("shearq-fourier", "crates/fourier"),
+        ("shearq-quantities", "crates/quantities"),
+        ("shearq-submissions", "submissions"),
+    ],
+    &[
+        ("shearq-scoring", "scoring"),
+        ("shearq-measure", "crates/measure"),
+        ("shearq-files", "crates/files"),
+    ],
+    &[
+        ("shearq-simulate", "crates/simulate"),
+        ("shearq-render", "crates/render"),
+    ],
+    &[("shearq-pipeline", "crates/pipeline")],
+    &[("shearq-results", "crates/results")],
+    &[("shearq-studies", "crates/studies")],
+    &[("shearq", ".")],
+    &[("shearq-python", "python"), ("shearq-benches", "benches")],
+];
+
+/// Crates that do without files, frames and threads.
+const PURE: [&str; 6] = [
+    "shearq-fourier",
+    "shearq-quantities",
+    "shearq-submissions",
+    "shearq-scoring",
+    "shearq-measure",
+    "shearq-simulate",
+];
+
+fn manifest(folder: &str) -> toml::Table {
+    let path = Path::new(folder).join("Cargo.toml");
+    fs::read_to_string(path).unwrap().parse().unwrap()
+}
+
+/// What a crate needs to be built: its dependencies without those of its tests.
+fn dependencies(manifest: &toml::Table) -> Vec<String> {
+    let found = manifest["dependencies"].as_table().unwrap();
+    found.keys().cloned().collect()
+}
+
+#[test]
+fn crates_use_those_below_them() {
+    let levels: BTreeMap<&str, usize> = LEVELS
+        .iter()
+        .enumerate()
+        .flat_map(|(level, crates)| crates.iter().map(move |(name, _)| (*name, level)))
+        .collect();
+    for (level, crates) in LEVELS.iter().enumerate() {
+        for (name, folder) in *crates {
+            let manifest = manifest(folder);
+            assert_eq!(manifest["package"]["name"].as_str(), Some(*name));
+            for used in dependencies(&manifest) {
+                if used.starts_with("shearq") {
+                    let Some(below) = levels.get(used.as_str()) else {
+                        panic!("{name} uses {used}, which has no level");
+                    };
+                    assert!(*below < level, "{name} uses {used}, which is not below it");
+                }
+            }
+        }
+    }
+    let folders = LEVELS.iter().flat_map(|crates| crates.iter());
+    let mut listed: Vec<&str> = folders.map(|(_, folder)| *folder).collect();
+    let inner = fs::read_dir("crates").unwrap().map(|entry| entry.unwrap());
+    let mut present: Vec<String> = inner
+        .map(|entry| format!("crates/{}", entry.file_name().to_string_lossy()))
+        .chain(["benches", "python", "scoring", "submissions", "."].map(str::to_owned))
+        .collect();
+    listed.sort_unstable();
+    present.sort_unstable();
+    assert_eq!(listed, present, "each crate has a level");
+}
+
+#[test]
+fn measuring_simulating_and_scoring_need_neither_files_nor_threads() {
+    for (name, folder) in LEVELS.iter().flat_map(|crates| crates.iter()) {
+        if !PURE.contains(name) {
+            continue;
+        }
+        let used = dependencies(&manifest(folder));
+        for other in ["shearq-files", "fitsio", "polars", "rayon"] {
+            assert!(!used.iter().any(|one| one == other), "{name} uses {other}");
+        }
+    }
+}
+
+#[test]
+fn the_architecture_page_lists_every_crate_with_its_level() {
+    let page = fs::read_to_string("docs/architecture.md").unwrap();
+    for (level, crates) in LEVELS.iter().enumerate() {
+        for (_, folder) in *crates {
+            if *folder == "benches" {
+                continue;
+            }
+            let folder = if *folder == "." { "src" } else { *folder };
+            let row = format!("| {} | `{folder}` |", level + 1);
+            assert!(page.contains(&row), "{row}");
+        }
+    }
+}
