@@ -46,7 +46,12 @@ pub(crate) struct Arguments {
     positions: Option<PathBuf>,
     /// Table of the positions in a FITS file: its name (EXTNAME), or its number from 1 [default: the one that has the
     /// columns].
-    #[arg(long, value_name = "NAME|NUMBER", requires = "positions")]
+    #[arg(
+        long,
+        value_name = "NAME|NUMBER",
+        requires = "positions",
+        conflicts_with = "stamps"
+    )]
     table: Option<String>,
     /// Number of the first pixel's centre in the positions: 1 for FITS and SExtractor, 0 for NumPy and sep.
     #[arg(long, value_name = "0|1", default_value_t = 1, value_parser = clap::value_parser!(u8).range(0..=1), requires = "exposure", conflicts_with = "stamps")]
