@@ -5,8 +5,8 @@
 //! [`parquet_columns`] and [`parquet_metadata`] read the footer alone.
 //!
 //! ```
-//! use crate::frames::polars::Column;
-//! use crate::frames::{Metadata, frame, parquet_metadata, read_parquet, reals, write_parquet};
+//! use shearq_files::frames::polars::Column;
+//! use shearq_files::frames::{Metadata, frame, parquet_metadata, read_parquet, reals, write_parquet};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let galaxies = frame(vec![

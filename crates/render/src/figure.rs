@@ -6,7 +6,7 @@
 //! because of what they are, only lists that should be equally long and are not.
 //!
 //! ```
-//! # use shearq::report::figure::{Figure, PictureFormat, LinePlot, Series, Style};
+//! # use shearq_render::figure::{Figure, PictureFormat, LinePlot, Series, Style};
 //! let plot = LinePlot {
 //!     title: "Shear power".into(),
 //!     x_label: "ℓ".into(),
@@ -17,7 +17,7 @@
 //!     ..LinePlot::default()
 //! };
 //! assert!(plot.render(PictureFormat::Svg)?.starts_with(b"<svg"));
-//! # Ok::<(), shearq::report::figure::FigureError>(())
+//! # Ok::<(), shearq_render::figure::FigureError>(())
 //! ```
 
 mod bar;

@@ -5,7 +5,7 @@
 //! reads the same, only that its tables cannot be sorted. The same report gives the same bytes.
 //!
 //! ```
-//! # use shearq::report::html::{Block, Report, Section};
+//! # use shearq_render::html::{Block, Report, Section};
 //! let report = Report {
 //!     title: "Scores".into(),
 //!     sections: vec![Section::new("q", "Q", vec![Block::Text("**Q** as in `score`.".into())])],
