@@ -54,6 +54,9 @@ impl<'a> Noise<'a> {
     }
 }
 
+/// The catalogue, the mean response, and the warnings.
+type Measured<'py> = (Bound<'py, PyDict>, Option<[f64; 2]>, Vec<String>);
+
 /// Some stamps with all that is needed to measure them.
 struct Job<'a> {
     stamps: Piece<'a>,
@@ -78,7 +81,7 @@ pub(crate) fn measure<'py>(
     submission: &Bound<'py, Submission>,
     threads_asked: Option<u16>,
     progress: Option<Py<PyAny>>,
-) -> PyResult<(Bound<'py, PyDict>, Option<[f64; 2]>, Vec<String>)> {
+) -> PyResult<Measured<'py>> {
     let submission = &submission.get().entry.submission;
     let stamps = Borrowed::new(stamps)?;
     let (count, rows, columns) = stamps.dim();

@@ -5,6 +5,7 @@
 //! `background`, `sampling`, `centre`, `size` or `narrow`, SETS a set or several with commas, GRID the galaxies a side and
 //! STARS the realizations of a star's noise. Prints one row per case: means over galaxies under shears of both signs,
 //! with both signs of their intrinsic ellipticities, so that shape noise cancels.
+#![expect(clippy::print_stdout, reason = "an example shows what it finds")]
 
 use std::error::Error;
 

@@ -50,7 +50,11 @@ fn shift(n: usize, by: f64) -> Array2<f64> {
     Array2::from_shape_fn((n, n), |(to, from)| {
         let t = to as f64 - from as f64 - by;
         let (angle, count) = (PI * t / n as f64, n as f64);
-        let below = if n % 2 == 0 { angle.tan() } else { angle.sin() };
+        let below = if n.is_multiple_of(2) {
+            angle.tan()
+        } else {
+            angle.sin()
+        };
         if below.abs() < 1e-12 {
             1.0
         } else {

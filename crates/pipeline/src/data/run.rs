@@ -427,10 +427,7 @@ fn most_important(mut differences: Vec<String>) -> Vec<String> {
             key.strip_prefix(*first)
                 .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
         };
-        FIRST
-            .iter()
-            .position(|first| of(first))
-            .unwrap_or(FIRST.len())
+        FIRST.iter().position(of).unwrap_or(FIRST.len())
     });
     let more = differences.len().saturating_sub(SHOWN);
     differences.truncate(SHOWN);
