@@ -294,6 +294,9 @@ pub fn simulated_steps(
 
 /// Measures a strip of simulated stamps by each worker, with the noise that was measured for it: without one
 /// the noise that was drawn.
+///
+/// # Errors
+/// If the stamps have other sizes than planned.
 pub fn measure_strip(
     set: &SetSimulator,
     fields: &ImageFields,
