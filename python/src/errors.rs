@@ -2,7 +2,7 @@
 
 use pyo3::PyErr;
 use pyo3::exceptions::{PyKeyError, PyMemoryError, PyRuntimeError, PyValueError};
-use shearq_measure::MeasureError;
+use shearq_measure::{MeasureError, Warning};
 use shearq_pipeline::PipelineError;
 use shearq_scoring::ScoringError;
 use shearq_submissions::SubmissionError;
@@ -12,6 +12,7 @@ pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
     let argument = match error {
         MeasureError::Submission(error) => return of_submission(error),
         MeasureError::Noise(_) => "noise",
+        MeasureError::Data(Warning::Brightness { .. }) => "stamps",
         MeasureError::Shape { what, .. } | MeasureError::NotFinite { what, .. }
             if !what.contains("PSF") =>
         {

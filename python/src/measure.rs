@@ -203,6 +203,9 @@ pub(crate) fn measure<'py>(
     let mut examination = examine(&stamps, count, rows)?;
     add_psfs(&mut examination, &psfs, count, moved, cut)?;
     let mut warnings = examination.warnings();
+    if let Noise::One(Some(given)) = noise {
+        warnings.extend(examination.given_noise(given));
+    }
     warnings.extend(Warning::of_settings(submission));
     warnings.extend(Warning::of_flags(&galaxies));
     if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {

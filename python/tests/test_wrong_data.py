@@ -40,3 +40,16 @@ def test_wrong_stamps_are_warned_of(image, spoil, expected):
 @pytest.mark.parametrize("submission", ["48/linear/star", "23/raw/star"])
 def test_good_stamps_have_no_warning(image, submission):
     assert not measured(image, image.stamps, submission=submission)
+
+
+def test_a_wrong_noise_is_warned_of_and_a_right_one_is_not(image):
+    caught = measured(image, image.stamps, noise=2.0)
+    assert [str(warning.message).split(" (")[0] for warning in caught] == [
+        "the given noise disagrees with the noise of the stamps"
+    ]
+    assert not measured(image, image.stamps, noise=1.0)
+
+
+def test_units_out_of_range_are_an_error_of_the_stamps(image):
+    with pytest.raises(ValueError, match="stamps: pixel values are out of range"):
+        shearq.measure(image.stamps * np.float32(1e20), image.psf)

@@ -183,6 +183,23 @@ fn a_batch_of_wrong_stamps_has_a_warning_of_what_is_wrong() {
 }
 
 #[test]
+fn a_batch_with_another_noise_than_that_of_the_stamps_has_a_warning() {
+    let (stamps, psf) = simulated(2);
+    let measurer = Measurer::named(LINEAR, STAMP).unwrap();
+    let psf = ArrayView2::from_shape((STAMP, STAMP), &psf).unwrap();
+    for (given, silent) in [(1.0, true), (0.9, false), (2.0, false)] {
+        let batch = measurer.batch(stamps.view(), Psfs::Star(psf), Some(given));
+        let found = batch.unwrap().warnings;
+        assert_eq!(found.is_empty(), silent, "{given}: {found:?}");
+        let expected = "the given noise disagrees with the noise of the stamps (found ";
+        assert!(
+            silent || found[0].to_string().contains(expected),
+            "{found:?}"
+        );
+    }
+}
+
+#[test]
 fn simulated_stamps_have_no_warning() {
     for set in [2, 5, 8, 11, 14, 17] {
         let (stamps, psf) = simulated(set);

@@ -113,6 +113,7 @@ impl Measurer {
         let mut examination = examine(stamps)?;
         examination.add_psfs(psfs, self.submission().psf_cut(), EXAMINED_PSFS);
         let mut warnings = examination.warnings();
+        warnings.extend(noise.and_then(|noise| examination.given_noise(noise)));
         warnings.extend(Warning::of_settings(self.submission()));
         warnings.extend(Warning::of_flags(&galaxies));
         if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {

@@ -49,6 +49,8 @@ const GRADIENT_SHARE: f64 = 0.04;
 const OFFSET: f64 = 0.85;
 /// Scatter of the galaxies' places in pixels.
 const SCATTER: f64 = 2.0;
+/// Least difference of the given noise that is reported, in units of the noise: it changes m by 0.005 at S/N 20.
+const LEAST_NOISE: f64 = 0.02;
 /// Scatter of the noise between stamps.
 const DEPTHS: f64 = 0.1;
 /// Correlation at the distances `LONG`.
@@ -277,7 +279,7 @@ impl Examination {
         if peak > 0.0 && !PEAKS.contains(&(peak as f32)) {
             found.push(Warning::Brightness { peak });
         }
-        let (noise, _) = self.median(|look| look.noise[0].hypot(look.noise[1]) / 2f64.sqrt(), 0.0);
+        let (noise, _) = self.noise();
         let (flux, flux_error) = self.median(|look| look.flux, noise * INNER);
         // An offset needs light to be measured.
         let lit = flux.abs() > CLEAR * flux_error;
@@ -303,6 +305,23 @@ impl Examination {
         let galaxies = self.core().filter(|_| lit && flux > 0.0);
         found.extend(self.psfs(galaxies));
         found
+    }
+
+    /// A warning if `given` is not the noise of the stamps.
+    pub fn given_noise(&self, given: f64) -> Option<Warning> {
+        let (measured, error) = self.noise();
+        let apart = (given - measured).abs();
+        let differs = apart > (CLEAR * error).max(LEAST_NOISE * measured) && measured > 0.0;
+        differs.then_some(Warning::GivenNoise { given, measured })
+    }
+
+    /// Median noise in the corners of the stamps, with its standard error.
+    fn noise(&self) -> (f64, f64) {
+        let of = |look: &Look| look.noise[0].hypot(look.noise[1]) / 2f64.sqrt();
+        let (noise, error) = self.median(of, 0.0);
+        // Of one stamp or two there is no scatter. The variance of n pixels has the relative error √(2/n).
+        let pixels = (4 * self.block * self.block * self.looks.len()) as f64;
+        (noise, error.max(OF_MEDIAN * noise / (2.0 * pixels).sqrt()))
     }
 
     fn psfs(&self, galaxies: Option<Core>) -> Vec<Warning> {

@@ -89,6 +89,13 @@ pub enum Warning {
         /// Whether the measured noise is used.
         used: bool,
     },
+    /// The noise of the stamps disagrees with the one in the call.
+    GivenNoise {
+        /// The noise in the call.
+        given: f64,
+        /// The noise measured in the corners of the stamps.
+        measured: f64,
+    },
     /// Noise is correlated, and the configuration treats it as white.
     CorrelatedNoise {
         /// Correlation of neighbours along x and y.
@@ -232,6 +239,7 @@ impl Warning {
             Warning::Blank { .. } => "blank",
             Warning::Brightness { .. } => "brightness",
             Warning::NoiseLevel { .. } => "noise-level",
+            Warning::GivenNoise { .. } => "given-noise",
             Warning::CorrelatedNoise { .. } => "correlated-noise",
             Warning::NoNoise => "no-noise",
             Warning::PsfOffCentre { .. } => "psf-off-centre",
@@ -357,6 +365,12 @@ impl fmt::Display for Warning {
                 } else {
                     "NOISESIG is used"
                 }
+            ),
+            Warning::GivenNoise { given, measured } => write!(
+                f,
+                "the given noise disagrees with the noise of the stamps (found {}, expected {}), which biases shears. Try: leave out the noise, so that it is measured",
+                level(*given),
+                level(*measured)
             ),
             Warning::CorrelatedNoise { correlation } => write!(
                 f,
