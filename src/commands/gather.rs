@@ -70,7 +70,8 @@ pub(crate) struct Arguments {
     /// Pixels a side of a stamp that is cut out.
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure", conflicts_with = "stamps")]
     size: u16,
-    /// FITS files of PSF stamps, or one table of functional PSFs (.csv).
+    /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one for all galaxies, or one for each. Stars of
+    /// another number, of at most half of the galaxies, are averaged to one PSF.
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
     psf: Vec<PathBuf>,
     /// Only images of this name of the files of PSFs.

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
+use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 
 use crate::support::{Small, fail, fits_image, floats, pixels_of, shearq, succeed, text};
 
@@ -192,6 +193,55 @@ fn the_mean_of_a_field_is_that_of_its_catalogue() {
     assert!(near(value("scatter2"), (square / (n - 1.0)).sqrt()));
     assert_eq!(value("galaxies"), n);
     assert_eq!(value("flagged"), all.len() as f64 - n);
+}
+
+#[test]
+fn several_stars_of_one_psf_are_averaged() {
+    const STARS: usize = 9;
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let profile = PsfProfile::Moffat { beta: 3.0 };
+    let psf = FunctionalPsf::new(profile, 3.4, Shear::new(0.05, -0.02)).unwrap();
+    let truth = psf.stamp(48);
+    let power = truth.iter().map(|v| v * v).sum::<f64>().sqrt();
+    // A fixed sequence of numbers of mean zero and variance one: the stars have S/N 100.
+    let mut state = 7u32;
+    let mut noise = || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        12f64.sqrt() * (f64::from(state >> 8) / f64::from(1 << 24) - 0.5) * power / 100.0
+    };
+    let stars: Vec<Vec<f32>> = (0..STARS)
+        .map(|_| truth.iter().map(|v| (v + noise()) as f32).collect())
+        .collect();
+    let stamps: Vec<Vec<f32>> = (0..20)
+        .map(|_| {
+            truth
+                .iter()
+                .map(|v| (50.0 * v + 20.0 * noise()) as f32)
+                .collect()
+        })
+        .collect();
+    fs::write(at("stamps.fits"), cube(&stamps, 48)).unwrap();
+    fs::write(at("stars.fits"), cube(&stars, 48)).unwrap();
+    let (from, psf, out) = (at("stamps.fits"), at("stars.fits"), at("data"));
+    let gather = ["gather", "--stamps", text(&from), "--psf", text(&psf)];
+    let done = shearq(&[&gather[..], &["--out", text(&out)]].concat());
+    let said = String::from_utf8(done.stderr).unwrap();
+    assert!(done.status.success(), "{said}");
+    let expected = "stars.fits: 9 stars were averaged to one PSF for all galaxies";
+    assert!(said.contains(expected), "{said}");
+    let (average, side) = pixels_of(&out.join("set01/psf-001.fits"));
+    assert_eq!(side, 48);
+    let off = |star: &[f32]| {
+        let sum: f64 = star.iter().map(|v| f64::from(*v)).sum();
+        let each = star.iter().zip(&truth);
+        each.map(|(v, t)| (f64::from(*v) / sum - t).powi(2))
+            .sum::<f64>()
+            .sqrt()
+    };
+    // Nine stars have a third of the noise of one; shifts by their measured places add to it.
+    let ratio = off(&average) / off(&stars[0]);
+    assert!(ratio < 0.5, "{ratio}");
 }
 
 #[test]

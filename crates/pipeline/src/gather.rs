@@ -7,9 +7,9 @@ mod source;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use ndarray::ArrayView2;
+use ndarray::{ArrayView2, ArrayView3};
 use serde::{Serialize, Serializer};
-use shearq_measure::{Examination, Star, Warning, examined_rows, star};
+use shearq_measure::{Examination, Star, Warning, average_stars, examined_rows, star};
 use shearq_submissions::PsfCut;
 
 use self::positions::Positions;
@@ -37,6 +37,8 @@ const LARGE: usize = 192;
 const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
 /// Pixels a side of a PSF that are examined: as many as configurations use.
 const EXAMINED_SIDE: usize = 48;
+/// Most pixels of stars that are averaged, all of which are in memory.
+const MOST_AVERAGED: usize = 1 << 24;
 /// Pixels by which an offset may differ from a whole pixel.
 const HALF: f64 = 0.5;
 
@@ -420,18 +422,26 @@ fn gather_psfs(
         return Ok(PsfFile::Table(path, psf_table::text(&rows)));
     }
     let (count, side) = survey(files)?;
-    // No list of files is empty.
-    check(&files.paths[0], count)?;
+    // Stars of a field, not one that is missing of as many as there are galaxies.
+    let average = count > 1 && 2 * count <= mosaic.galaxies;
+    if !average {
+        // No list of files is empty.
+        check(&files.paths[0], count)?;
+    }
     // One, or as many as galaxies, which lie as these do.
     let stars = Mosaic::of(count, side);
-    let mut image = Rows::create(&data.psf_star(id.set, id.image), stars, &[])?;
-    let mut planes = Planes::of(files);
     let size = side - side.saturating_sub(EXAMINED_SIDE).next_multiple_of(2);
     let cut = PsfCut {
         size,
         // So that a star off the centre can be cut around itself.
         least: size - (size / 3).next_multiple_of(2),
     };
+    let path = data.psf_star(id.set, id.image);
+    if average {
+        return averaged(&path, files, (count, side), cut, doubts);
+    }
+    let mut image = Rows::create(&path, stars, &[])?;
+    let mut planes = Planes::of(files);
     let mut examination = Examination::new(side, 0);
     let mut dark = 0;
     while let Some((origin, pixels)) = planes.next()? {
@@ -462,6 +472,49 @@ fn gather_psfs(
             "warning: the pixels of {dark} of {count} PSFs add up to nothing, less or no number: galaxies with them will be flagged"
         ));
     }
+    Ok(PsfFile::Stars(Box::new(image)))
+}
+
+/// The average of `count` stars of `side` pixels a side, as the PSF of all galaxies.
+fn averaged(
+    path: &Path,
+    files: Files<'_>,
+    (count, side): (usize, usize),
+    cut: PsfCut,
+    doubts: &mut Vec<String>,
+) -> Result<PsfFile, FileError> {
+    let first = &files.paths[0];
+    let pixels = count * side * side;
+    if pixels > MOST_AVERAGED {
+        let message = format!(
+            "there are {count} stars of {side} × {side} pixels to average ({pixels} pixels, expected at most {MOST_AVERAGED}). Try: fewer stars"
+        );
+        return Err(FileError::new(first, message));
+    }
+    let mut all = Vec::with_capacity(pixels);
+    let mut planes = Planes::of(files);
+    while let Some((_, pixels)) = planes.next()? {
+        all.extend(pixels.iter().map(|&value| f64::from(value)));
+    }
+    let stars = ArrayView3::from_shape((count, side, side), &all)
+        .map_err(|error| FileError::new(first, error))?;
+    let psf = average_stars(stars, cut)
+        .map_err(|(k, error)| FileError::new(first, format!("star {k}: {error}")))?;
+    let shown = first.display();
+    doubts.push(format!(
+        "note: {shown}: {count} stars were averaged to one PSF for all galaxies"
+    ));
+    let mut examination = Examination::new(side, 0);
+    examination.add_psf(psf.view(), None);
+    let found = examination.warnings();
+    doubts.extend(
+        found
+            .iter()
+            .map(|warning| format!("warning: {shown}: {warning}")),
+    );
+    let mut image = Rows::create(path, Mosaic::of(1, psf.nrows()), &[])?;
+    let pixels: Vec<f32> = psf.iter().map(|&value| value as f32).collect();
+    image.add(&pixels)?;
     Ok(PsfFile::Stars(Box::new(image)))
 }
 
