@@ -506,7 +506,7 @@ mod tests {
 
     /// GalSim's rendering of GREAT10-like sets, where it is present.
     fn galsim_sets() -> Option<PathBuf> {
-        let folder = PathBuf::from("../../shared/galsim-sets");
+        let folder = PathBuf::from("../../../shared/galsim-sets");
         if folder.is_dir() {
             return Some(folder);
         }
