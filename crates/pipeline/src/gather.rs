@@ -461,12 +461,7 @@ fn gather_psfs(
         }
         image.add(&pixels)?;
     }
-    let found = examination.warnings();
-    doubts.extend(
-        found
-            .iter()
-            .map(|warning| format!("warning: {}: {warning}", files.paths[0].display())),
-    );
+    doubts.extend(named(&examination, &files.paths[0]));
     if dark > 0 {
         doubts.push(format!(
             "warning: the pixels of {dark} of {count} PSFs add up to nothing, less or no number: galaxies with them will be flagged"
@@ -506,16 +501,18 @@ fn averaged(
     ));
     let mut examination = Examination::new(side, 0);
     examination.add_psf(psf.view(), None);
-    let found = examination.warnings();
-    doubts.extend(
-        found
-            .iter()
-            .map(|warning| format!("warning: {shown}: {warning}")),
-    );
+    doubts.extend(named(&examination, first));
     let mut image = Rows::create(path, Mosaic::of(1, psf.nrows()), &[])?;
     let pixels: Vec<f32> = psf.iter().map(|&value| value as f32).collect();
     image.add(&pixels)?;
     Ok(PsfFile::Stars(Box::new(image)))
+}
+
+/// The warnings of an examination, with the file that they are about.
+fn named(examination: &Examination, path: &Path) -> Vec<String> {
+    let found = examination.warnings();
+    let line = |warning: &Warning| format!("warning: {}: {warning}", path.display());
+    found.iter().map(line).collect()
 }
 
 /// PSFs that are about to be written.
