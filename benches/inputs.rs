@@ -1,14 +1,14 @@
 //! Inputs that the benchmarks share.
 
-use shearq_submissions::{Registry, Submission};
+use shearq_submissions::{Configuration, Registry};
 
 /// An embedded submission.
 ///
 /// # Panics
 /// Where there is none of that name.
-pub fn submission(name: &str) -> Submission {
+pub fn configuration(name: &str) -> Configuration {
     let entry = Registry::embedded().and_then(|registry| registry.get(name));
-    entry.expect("an embedded submission").submission
+    entry.expect("an embedded submission").configuration
 }
 
 /// A galaxy-like n×n stamp with noise of σ = 1 from a fixed generator.

@@ -4,7 +4,7 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use ndarray::ArrayView2;
-use shearq_benches::{stamp, submission};
+use shearq_benches::{configuration, stamp};
 use shearq_measure::Measurer;
 use shearq_measure::parts::{
     AdaptiveMoments, Autocorrelation, Network, Rule, Spectral, Step, WaveletWiener,
@@ -55,8 +55,8 @@ fn autocorrelation(c: &mut Criterion) {
 }
 
 fn denoise(c: &mut Criterion) {
-    let submission = submission("23/den/star");
-    let settings = submission.wavelet().expect("a denoised submission");
+    let configuration = configuration("23/den/star");
+    let settings = configuration.wavelet().expect("a denoised submission");
     let mut group = c.benchmark_group("denoise");
     for n in [24, 48] {
         let filter = WaveletWiener::new(n, settings);
@@ -74,8 +74,8 @@ fn denoise(c: &mut Criterion) {
 }
 
 fn linear(c: &mut Criterion) {
-    let submission = submission("48/linear/star");
-    let method = submission.linear().expect("a linear submission");
+    let configuration = configuration("48/linear/star");
+    let method = configuration.linear().expect("a linear submission");
     let settings = &method.deconvolution;
     let mut group = c.benchmark_group("linear");
     for n in [32, 40, 48] {
@@ -120,11 +120,11 @@ fn galaxy(c: &mut Criterion) {
         "29/den/func",
         "48/linear/star",
     ] {
-        let submission = submission(name);
-        let measurer = Measurer::new(&submission, 48).expect("a valid submission");
+        let configuration = configuration(name);
+        let measurer = Measurer::new(&configuration, 48).expect("a valid submission");
         let mut worker = measurer.worker();
         worker
-            .set_psf(moffat(submission.psf.size).view())
+            .set_psf(moffat(configuration.psf.size).view())
             .expect("a valid PSF");
         let data = stamp(48);
         let data = ArrayView2::from_shape((48, 48), &data).expect("a full stamp");

@@ -86,10 +86,10 @@ pub(super) struct Printing {
     /// wider than the terminal.
     #[arg(long)]
     wide: bool,
-    /// Print these figures alone, beside the names of the rows and in this order: columns by their names in CSV, as
+    /// Print these metrics alone, beside the names of the rows and in this order: columns by their names in CSV, as
     /// `q,q_calibrated,m_cross`; a table that fits into a column of a paper.
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
-    figures: Vec<String>,
+    metrics: Vec<String>,
 }
 
 impl Printing {
@@ -97,20 +97,20 @@ impl Printing {
         self.form.format
     }
 
-    /// Whether only some figures are printed.
+    /// Whether only some metrics are printed.
     pub(super) fn chooses(&self) -> bool {
-        !self.figures.is_empty()
+        !self.metrics.is_empty()
     }
 
-    /// The figures that are asked for of a table.
+    /// The metrics that are asked for of a table.
     fn chosen(&self, table: &Table) -> anyhow::Result<Table> {
-        table.chosen(&self.figures).map_err(|unknown| {
+        table.chosen(&self.metrics).map_err(|unknown| {
             let known = table.figures().join(", ");
-            anyhow::anyhow!("--figures: no figure is called {unknown:?}; expected some of {known}")
+            anyhow::anyhow!("--metrics: no metric is called {unknown:?}; expected some of {known}")
         })
     }
 
-    /// Refuses figures that such a table does not have, before anything is written.
+    /// Refuses metrics that such a table does not have, before anything is written.
     pub(super) fn check(&self, table: &Table) -> anyhow::Result<()> {
         self.chosen(table).map(|_| ())
     }
@@ -118,7 +118,7 @@ impl Printing {
     /// Prints a table.
     ///
     /// # Errors
-    /// Where a figure that is asked for is no column of it.
+    /// Where a metric that is asked for is no column of it.
     pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
         if self.chooses() {
             let chosen = self.chosen(table)?;
@@ -148,7 +148,7 @@ impl Printing {
 /// A page to be written.
 #[derive(Debug, Clone, Args)]
 pub(super) struct ReportFile {
-    /// Write the results as one HTML page with figures, which needs nothing else.
+    /// Write the results as one HTML page with metrics, which needs nothing else.
     #[arg(long = "report", value_name = "FILE")]
     path: Option<PathBuf>,
 }
@@ -303,7 +303,7 @@ pub(super) struct ScoreSettings {
     /// How bandpowers and Q are defined.
     #[arg(long, value_enum, default_value_t)]
     definition: DefinitionArgument,
-    /// Convention of the figures: 1 to 8 (5 is the standard one), `matched` to the truth of all sets
+    /// Convention of the metrics: 1 to 8 (5 is the standard one), `matched` to the truth of all sets
     /// together, or `best` as the leaderboard took it, set by set [default: 5 for what shearq measured,
     /// matched for other catalogues].
     #[arg(long, value_name = "WHICH", value_parser = parse_choice)]

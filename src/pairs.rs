@@ -35,19 +35,19 @@ const WAYS: [(&str, &[&str]); 26] = [
     (
         "score",
         &[
-            "data measured sets noise-var store format wide figures report definition convention threads",
-            "data foreign sets noise-var store format wide figures report definition convention threads",
-            "data packed sets noise-var format wide figures definition convention threads",
-            "data spectra sets format wide figures definition threads",
-            "truth CATALOGUE truth-sign stamp field columns ellipticity missing max-modulus noise-var format wide figures report definition convention threads",
-            "truth spectra truth-sign stamp field format wide figures definition threads",
+            "data measured sets noise-var store format wide metrics report definition convention threads",
+            "data foreign sets noise-var store format wide metrics report definition convention threads",
+            "data packed sets noise-var format wide metrics definition convention threads",
+            "data spectra sets format wide metrics definition threads",
+            "truth CATALOGUE truth-sign stamp field columns ellipticity missing max-modulus noise-var format wide metrics report definition convention threads",
+            "truth spectra truth-sign stamp field format wide metrics definition threads",
         ],
     ),
     (
         "compare",
         &[
-            "OUT data foreign where sort group-by heat-map format wide figures report definition convention threads",
-            "store where sort group-by heat-map format wide figures report",
+            "OUT data foreign where sort group-by heat-map format wide metrics report definition convention threads",
+            "store where sort group-by heat-map format wide metrics report",
         ],
     ),
     ("check", &["PATH data grid stamp images json"]),

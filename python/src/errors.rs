@@ -5,12 +5,12 @@ use pyo3::exceptions::{PyKeyError, PyMemoryError, PyRuntimeError, PyValueError};
 use shearq_measure::{MeasureError, Warning};
 use shearq_pipeline::PipelineError;
 use shearq_scoring::ScoringError;
-use shearq_submissions::SubmissionError;
+use shearq_submissions::ConfigurationError;
 
 /// What is wrong with stamps, PSFs, the noise or the submission.
 pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
     let argument = match error {
-        MeasureError::Submission(error) => return of_submission(error),
+        MeasureError::Configuration(error) => return of_submission(error),
         MeasureError::Noise(_) => "noise",
         MeasureError::Data(Warning::Brightness { .. }) => "stamps",
         MeasureError::Shape { what, .. } | MeasureError::NotFinite { what, .. }
@@ -24,10 +24,10 @@ pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
 }
 
 /// What is wrong with a submission: its name, or its settings.
-pub(crate) fn of_submission(error: SubmissionError) -> PyErr {
+pub(crate) fn of_submission(error: ConfigurationError) -> PyErr {
     let message = format!("submission: {error}");
     match error {
-        SubmissionError::Unknown { .. } => PyKeyError::new_err(message),
+        ConfigurationError::Unknown { .. } => PyKeyError::new_err(message),
         _ => PyValueError::new_err(message),
     }
 }

@@ -22,11 +22,11 @@ mod _shearq {
     #[pymodule_export]
     use super::measure::{flags, measure};
     #[pymodule_export]
-    use super::score::{difference, figures, score, spectrum};
+    use super::score::{difference, metrics, score, spectrum};
     #[pymodule_export]
     use super::simulate::simulate;
     #[pymodule_export]
-    use super::submissions::{Submission, names};
+    use super::submissions::{Configuration, names};
 
     /// Version of shearq.
     #[pymodule_export]

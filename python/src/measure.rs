@@ -17,7 +17,7 @@ use shearq_submissions::PsfCut;
 
 use crate::errors::{no_memory, of_measuring};
 use crate::stamps::{Borrowed, Piece, Stamps};
-use crate::submissions::Submission;
+use crate::submissions::Configuration;
 use crate::work::{Failure, Watch, threads};
 
 /// Stamps that a worker takes at a time: enough that handing them out costs nothing, few enough that copies
@@ -78,11 +78,11 @@ pub(crate) fn measure<'py>(
     formulas: Option<PyReadonlyArray2<'py, f64>>,
     noise: Option<f64>,
     noises: Option<PyReadonlyArray1<'py, f64>>,
-    submission: &Bound<'py, Submission>,
+    submission: &Bound<'py, Configuration>,
     threads_asked: Option<u16>,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Measured<'py>> {
-    let submission = &submission.get().entry.submission;
+    let submission = &submission.get().entry.configuration;
     let stamps = Borrowed::new(stamps)?;
     let (count, rows, columns) = stamps.dim();
     let stamps = stamps.shared();

@@ -1,4 +1,4 @@
-//! Ellipticities on a grid into spectra and figures of merit.
+//! Ellipticities on a grid into spectra and metrics of merit.
 
 use ndarray::{Array2, ArrayView1};
 use numpy::{IntoPyArray, PyReadonlyArray1, ToPyArray};
@@ -10,16 +10,16 @@ use shearq_results::views::diagnosis;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
 use shearq_scoring::{
-    BINS, Bins, Choice, Convention, Definition, Fault, FieldSum, Figures, Grid, ImageFaults, Noise,
+    BINS, Bins, Choice, Convention, Definition, Fault, FieldSum, Grid, ImageFaults, Metrics, Noise,
     Options, Row, RowCounts, SCORED, SetImages, SetScorer, TrueShear, TruthSign, sign_by_modes,
 };
 
 use crate::errors::of_scoring;
 
-/// Names, headings and meanings of the figures.
+/// Names, headings and meanings of the metrics.
 #[pyfunction]
-pub(crate) fn figures() -> Vec<(&'static str, &'static str, &'static str)> {
-    Figures::ALL.map(|f| (f.name, f.label, f.meaning)).into()
+pub(crate) fn metrics() -> Vec<(&'static str, &'static str, &'static str)> {
+    Metrics::ALL.map(|f| (f.name, f.label, f.meaning)).into()
 }
 
 /// A grid of `n` cells a side.
@@ -119,7 +119,7 @@ impl<'a> Rows<'a> {
 }
 
 /// Scores images of `n` × `n` galaxies against their true shear, both in the order of the grid, x running
-/// fastest, or the images at positions. Returns all figures, spectra and counts by name.
+/// fastest, or the images at positions. Returns all metrics, spectra and counts by name.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
 pub(crate) fn score<'py>(
@@ -195,17 +195,17 @@ pub(crate) fn score<'py>(
 
     let spectra = scored.spectra();
     let found = PyDict::new(py);
-    let names = Figures::ALL.map(|figure| figure.name);
-    let by_name = |figures: &Figures| {
+    let names = Metrics::ALL.map(|metric| metric.name);
+    let by_name = |metrics: &Metrics| {
         let values = PyDict::new(py);
-        for (name, value) in names.iter().zip(figures.values()) {
+        for (name, value) in names.iter().zip(metrics.values()) {
             values.set_item(name, value)?;
         }
         PyResult::Ok(values)
     };
-    found.set_item("figures", by_name(&scored.figures)?)?;
+    found.set_item("metrics", by_name(&scored.metrics)?)?;
     found.set_item("errors", by_name(&scored.errors)?)?;
-    let replicates: Vec<f64> = scored.replicates.iter().flat_map(Figures::values).collect();
+    let replicates: Vec<f64> = scored.replicates.iter().flat_map(Metrics::values).collect();
     let replicates = Array2::from_shape_vec((scored.replicates.len(), names.len()), replicates)
         .map_err(|error| PyValueError::new_err(error.to_string()))?;
     found.set_item("replicates", replicates.into_pyarray(py))?;
@@ -292,7 +292,7 @@ pub(crate) fn spectrum<'py>(
     Ok(found)
 }
 
-/// The difference of two figures of the same images, with its error; `None` where it has none.
+/// The difference of two metrics of the same images, with its error; `None` where it has none.
 #[pyfunction]
 pub(crate) fn difference(
     images: usize,

@@ -16,17 +16,17 @@ type Parts = (String, Option<String>, Option<(f64, f64, f64)>);
 
 /// Settings of a submission, resolved.
 #[pyclass(frozen)]
-pub(crate) struct Submission {
+pub(crate) struct Configuration {
     pub(crate) entry: Entry,
 }
 
 #[pymethods]
-impl Submission {
+impl Configuration {
     /// The submission of a name or a file.
     #[staticmethod]
     fn named(name: &str) -> PyResult<Self> {
         let entry = Registry::embedded().and_then(|registry| registry.get(name));
-        Ok(Submission {
+        Ok(Configuration {
             entry: entry.map_err(of_submission)?,
         })
     }
@@ -36,7 +36,7 @@ impl Submission {
     fn text(text: &str) -> PyResult<Self> {
         let entry =
             Registry::embedded().and_then(|registry| registry.get_text(Path::new(OWN), text));
-        Ok(Submission {
+        Ok(Configuration {
             entry: entry.map_err(of_submission)?,
         })
     }
@@ -57,12 +57,12 @@ impl Submission {
     #[staticmethod]
     fn restored(parts: Parts) -> PyResult<Self> {
         let (settings, extends, published) = parts;
-        let submission: shearq_submissions::Submission = serde_json::from_str(&settings)
+        let submission: shearq_submissions::Configuration = serde_json::from_str(&settings)
             .map_err(|error| PyValueError::new_err(format!("submission: {error}")))?;
         let published = published.map(|(q, m_half, sqrt_a)| Published { q, m_half, sqrt_a });
-        Ok(Submission {
+        Ok(Configuration {
             entry: Entry {
-                submission,
+                configuration: submission,
                 published,
                 extends,
             },
@@ -81,12 +81,12 @@ impl Submission {
 
     #[getter]
     fn name(&self) -> &str {
-        &self.entry.submission.name
+        &self.entry.configuration.name
     }
 
     #[getter]
     fn description(&self) -> &str {
-        &self.entry.submission.description
+        &self.entry.configuration.description
     }
 
     #[getter]
@@ -105,40 +105,40 @@ impl Submission {
     /// All settings as JSON.
     #[getter]
     fn settings(&self) -> PyResult<String> {
-        serde_json::to_string(&self.entry.submission)
+        serde_json::to_string(&self.entry.configuration)
             .map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
     /// All settings as TOML.
     #[getter]
     fn toml(&self) -> PyResult<String> {
-        toml::to_string(&self.entry.submission)
+        toml::to_string(&self.entry.configuration)
             .map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
     /// Pixels a side of the piece of a stamp, and of a PSF stamp, that are used.
     #[getter]
     fn sizes(&self) -> (usize, usize) {
-        let submission = &self.entry.submission;
+        let submission = &self.entry.configuration;
         (submission.stamp.size, submission.psf.size)
     }
 
     /// Whether it takes PSFs by their formula.
     #[getter]
     fn functional(&self) -> bool {
-        self.entry.submission.psf.form == PsfForm::Functional
+        self.entry.configuration.psf.form == PsfForm::Functional
     }
 
     /// Whether the noise level has to be given.
     #[getter]
     fn needs_noise(&self) -> bool {
-        self.entry.submission.noise == NoiseSource::Header
+        self.entry.configuration.noise == NoiseSource::Header
     }
 
     /// `shear` or `distortion`.
     #[getter]
     fn ellipticity(&self) -> &'static str {
-        match self.entry.submission.ellipticity() {
+        match self.entry.configuration.ellipticity() {
             EllipticityType::Shear => "shear",
             EllipticityType::Distortion => "distortion",
         }

@@ -115,7 +115,7 @@ def test_scores_are_those_of_the_command_line(command, data, simulations, tmp_pa
         catalogues = [shearq.measure(i.stamps, i.psf, noise=i.noise) for i in simulation]
         e1, e2 = (np.stack([c[name] for c in catalogues]) for name in ("e1", "e2"))
         scored = shearq.score(e1, e2, simulation.g1, simulation.g2)
-        for name, value in scored.figures.items():
+        for name, value in scored.metrics.items():
             found = rows[set][name]
             # JSON has no NaN.
             found = np.nan if found is None else found

@@ -174,7 +174,7 @@ def test_submissions_of_ones_own_are_mappings_texts_and_files(image, tmp_path):
     assert shearq.submission(resolved.toml).settings == resolved.settings == shearq.submission(resolved.settings).settings
 
 
-def test_submissions_have_settings_and_published_figures():
+def test_submissions_have_settings_and_published_metrics():
     all_of_them = shearq.submissions()
     assert list(all_of_them)[0] == "subm/19/den/star" and "48/linear/func" in all_of_them
     assert all_of_them["23/den/star"].published == {"q": 87.06, "m_half": 0.0357, "sqrt_a": 0.0895}

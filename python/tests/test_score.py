@@ -12,7 +12,7 @@ from conftest import same_bits
 
 import shearq
 
-# Cases with known figures that the tests of the Rust crate are held against, too.
+# Cases with known metrics that the tests of the Rust crate are held against, too.
 CASES = pathlib.Path(__file__).parents[2] / "scoring/tests/data"
 
 
@@ -61,7 +61,7 @@ def test_a_known_bias_is_found_in_any_arrangement(wave):
     # What noise of 1e-5 does to the mean of 256 galaxies under shear of 0.02.
     assert scored["m_cross"] == pytest.approx(0.01, abs=1e-4)
     assert scored.images == 3 and scored.convention == 5 and scored.notes == []
-    assert scored.errors["m_cross"] < 1e-3 and scored.replicates.shape == (3, len(shearq.FIGURES))
+    assert scored.errors["m_cross"] < 1e-3 and scored.replicates.shape == (3, len(shearq.METRICS))
     x, y = np.meshgrid(48 * np.arange(16) + 24.5, 48 * np.arange(16) + 24.5)
     order = np.random.default_rng(2).permutation(3 * 256)
     mixed = [np.broadcast_to(a, e1.shape).reshape(-1)[order] for a in (e1, e2, x, y)]
@@ -72,8 +72,8 @@ def test_a_known_bias_is_found_in_any_arrangement(wave):
         shearq.score(*mixed[:2], g1, g2, images=labels, positions=mixed[2:], stamp=48),
         shearq.score(e1.astype(">f8"), np.asfortranarray(e2), g1, -g2, truth_sign="challenge"),
     ):
-        assert same_bits(list(other.figures.values()), list(scored.figures.values()))
-    with pytest.raises(KeyError, match="no figure 'Q'; known figures: q, "):
+        assert same_bits(list(other.metrics.values()), list(scored.metrics.values()))
+    with pytest.raises(KeyError, match="no metric 'Q'; known metrics: q, "):
         scored["Q"]
 
 

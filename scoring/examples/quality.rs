@@ -22,8 +22,8 @@ fn main() -> Result<(), shearq_scoring::ScoringError> {
     let score = SetScorer::new(grid, truth, options)?.score(&images)?;
     println!(
         "Q = {:.1} ± {:.1}, m = {:.4}",
-        score.figures.q, score.errors.q, score.figures.m_cross
+        score.metrics.q, score.errors.q, score.metrics.m_cross
     );
-    assert!((score.figures.m_cross - 0.01).abs() < 1e-9);
+    assert!((score.metrics.m_cross - 0.01).abs() < 1e-9);
     Ok(())
 }

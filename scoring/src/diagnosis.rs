@@ -167,7 +167,7 @@ impl SetScorer {
         match self.misplaced(images.total(), score, convention) {
             Some(finding) => findings.push(finding),
             None if convention == score.chosen => {
-                findings.extend(Fault::of_bias(score.figures.m_cross, score.errors.m_cross));
+                findings.extend(Fault::of_bias(score.metrics.m_cross, score.errors.m_cross));
             }
             None => {}
         }

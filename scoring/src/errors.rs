@@ -1,4 +1,4 @@
-//! Standard errors of a set's figures, from what the truth does not explain of its averaged field.
+//! Standard errors of a set's metrics, from what the truth does not explain of its averaged field.
 //!
 //! A jackknife over images cannot see what all images have in common: intrinsic shapes that are the same in
 //! all of them, and it knows little with few images. The averaged field itself shows both. With the E modes

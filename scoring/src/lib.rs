@@ -1,4 +1,4 @@
-//! Shear power spectra from gridded ellipticity catalogues, and the figures of merit of the GREAT10
+//! Shear power spectra from gridded ellipticity catalogues, and the metrics of merit of the GREAT10
 //! challenge: Q, Q_dn, M and A. Pure arithmetic on grids: no files, no threads.
 //!
 //! # Conventions
@@ -11,7 +11,7 @@
 //!   steradian, ℓ in rad⁻¹.
 //! * Noise variances are per component, galaxy and image.
 //!
-//! # Figures of merit
+//! # Metrics of merit
 //!
 //! ```
 #![doc = include_str!("../examples/quality.rs")]
@@ -35,9 +35,9 @@ mod cross;
 mod diagnosis;
 mod error;
 mod errors;
-mod figures;
 mod grid;
 mod matching;
+mod metrics;
 pub mod modes;
 pub mod quality;
 pub mod resample;
@@ -49,9 +49,9 @@ pub use convention::{Convention, ConventionClass};
 pub use cross::{CrossSpectrum, cross_spectrum};
 pub use diagnosis::{Fault, ImageFaults, sign_by_correlation, sign_by_modes};
 pub use error::ScoringError;
-pub use figures::{Figure, Figures};
 pub use grid::{Grid, cell_at, centre_of};
 pub use matching::ConventionMatch;
+pub use metrics::{Metric, Metrics};
 pub use quality::{Bias, BiasFits, Quality};
 pub use score::{
     Choice, ConventionScore, MAX_GROUPS, MeanShear, Noise, Options, SetImages, SetScore, SetScorer,

@@ -1,4 +1,4 @@
-//! The figures of merit: Q, Q_dn, M and A.
+//! The metrics of merit: Q, Q_dn, M and A.
 
 use serde::Serialize;
 
@@ -65,7 +65,7 @@ pub fn quality_error(
     reason = "the field's own symbols, also in the JSON output"
 )]
 pub struct Bias {
-    /// Multiplicative bias M ≈ m² + 2m; the published figure is M/2.
+    /// Multiplicative bias M ≈ m² + 2m; the published metric is M/2.
     pub M: f64,
     /// Additive bias A = σ²(c), in the unit of the spectra fitted.
     pub A: f64,
@@ -107,7 +107,7 @@ pub(crate) fn bias_weights(
     })
 }
 
-/// The same fit in the units that have been in use. The published figures are `cl`; in ℓ²C_ℓ units
+/// The same fit in the units that have been in use. The published metrics are `cl`; in ℓ²C_ℓ units
 /// M swallows the noise, whose bandpower rises like the modes' weight.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct BiasFits {

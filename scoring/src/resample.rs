@@ -10,8 +10,8 @@ pub fn group_sizes(images: usize) -> Vec<usize> {
         .collect()
 }
 
-/// Standard error of a figure by the delete-a-group jackknife for groups of unequal size (Busing,
-/// Meijer & van der Leeden 1999, Stat. Comput. 9, 3): `full` is the figure from all `images`,
+/// Standard error of a metric by the delete-a-group jackknife for groups of unequal size (Busing,
+/// Meijer & van der Leeden 1999, Stat. Comput. 9, 3): `full` is the metric from all `images`,
 /// `replicates` those with each group left out. For equal groups it is Tukey's
 /// √((G−1)/G · Σ(θ_g − θ̄)²). Not a number with fewer than two groups.
 pub fn jackknife_error(full: f64, replicates: impl IntoIterator<Item = f64>, images: usize) -> f64 {
@@ -42,7 +42,7 @@ pub fn jackknife_error(full: f64, replicates: impl IntoIterator<Item = f64>, ima
     variance.sqrt()
 }
 
-/// Mean over sets of a figure and its standard error. Sets have noise of their own, so their
+/// Mean over sets of a metric and its standard error. Sets have noise of their own, so their
 /// variances add: error = √(Σ σ²)/N, not a number where one of them is unknown.
 pub fn mean_over_sets(values_and_errors: &[(f64, f64)]) -> (f64, f64) {
     let count = values_and_errors.len() as f64;
@@ -51,7 +51,7 @@ pub fn mean_over_sets(values_and_errors: &[(f64, f64)]) -> (f64, f64) {
     (mean, variance.sqrt() / count)
 }
 
-/// Difference of two figures measured on the same images, in units of its own error.
+/// Difference of two metrics measured on the same images, in units of its own error.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairedDifference {
     /// Mean over sets of (second − first).
@@ -102,16 +102,16 @@ pub fn paired_difference(sets: &[PairedSet<'_>]) -> Option<PairedDifference> {
     })
 }
 
-/// One figure of one set under two variants.
+/// One metric of one set under two variants.
 #[derive(Debug, Clone, Copy)]
 pub struct PairedSet<'a> {
     /// Images of the set.
     pub images: usize,
-    /// The first variant's figure.
+    /// The first variant's metric.
     pub first: f64,
     /// Its delete-one replicates.
     pub first_replicates: &'a [f64],
-    /// The second variant's figure.
+    /// The second variant's metric.
     pub second: f64,
     /// Its delete-one replicates, groups in the same order.
     pub second_replicates: &'a [f64],

@@ -9,9 +9,9 @@ use crate::catalogue::{FieldSum, TrueShear};
 use crate::convention::{Convention, ConventionClass};
 use crate::error::ScoringError;
 use crate::errors::{self, Scatter};
-use crate::figures::Figures;
 use crate::grid::Grid;
 use crate::matching::ConventionMatch;
+use crate::metrics::Metrics;
 use crate::modes::{Decomposer, Modes};
 use crate::quality::{BiasFits, Quality, bias_fits, calibrated_quality, quality, quality_error};
 use crate::resample::jackknife_error;
@@ -21,7 +21,7 @@ pub const MAX_GROUPS: usize = 20;
 /// Errors of its own by which the response must be above zero for anything to be divided by it.
 const CLEAR_RESPONSE: f64 = 3.0;
 
-/// Which convention the figures of a table are taken from.
+/// Which convention the metrics of a table are taken from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Choice {
     /// The one whose E modes clearly correlate best with the truth, otherwise the standard one.
@@ -50,7 +50,7 @@ pub struct Options {
     pub definition: Definition,
     /// Noise to remove for Q_dn.
     pub noise: Noise,
-    /// Convention of the headline figures.
+    /// Convention of the headline metrics.
     pub choice: Choice,
 }
 
@@ -139,7 +139,7 @@ fn check_shape(
     }
 }
 
-/// One convention's spectra and figures.
+/// One convention's spectra and metrics.
 #[derive(Debug, Clone, Serialize)]
 pub struct ConventionScore {
     /// Which convention.
@@ -170,7 +170,7 @@ pub struct ConventionScore {
 }
 
 /// What is known of a set whose true shear is the same everywhere, in the chosen convention: it has no
-/// power to compare, and its means are its figures.
+/// power to compare, and its means are its metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MeanShear {
     /// Mean ellipticity of the galaxies.
@@ -207,15 +207,15 @@ pub struct SetScore {
     pub best: Convention,
     /// How well each convention correlates with the truth.
     pub matching: ConventionMatch,
-    /// The convention of the headline figures.
+    /// The convention of the headline metrics.
     pub chosen: Convention,
-    /// Headline figures.
-    pub figures: Figures,
+    /// Headline metrics.
+    pub metrics: Metrics,
     /// Their standard errors; not a number where unknown.
-    pub errors: Figures,
-    /// The figures with each group of images left out in turn; empty with fewer than two images.
-    pub replicates: Vec<Figures>,
-    /// Means, where the true shear is the same everywhere. All figures but c1 and c2 are then unknown.
+    pub errors: Metrics,
+    /// The metrics with each group of images left out in turn; empty with fewer than two images.
+    pub replicates: Vec<Metrics>,
+    /// Means, where the true shear is the same everywhere. All metrics but c1 and c2 are then unknown.
     pub constant: Option<MeanShear>,
 }
 
@@ -243,7 +243,7 @@ impl SetScore {
 /// Covariance of the eight bandpowers of a power-spectrum submission.
 pub type SpectrumCovariance = [[f64; SCORED.end - SCORED.start]; SCORED.end - SCORED.start];
 
-/// Figures of a power-spectrum submission; errors are not numbers where the covariance is unknown.
+/// Metrics of a power-spectrum submission; errors are not numbers where the covariance is unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SpectrumScore {
     /// Q and σ_sys.
@@ -332,8 +332,8 @@ impl SetScorer {
             Choice::Best => best,
             Choice::Insist(k) => k,
         };
-        let mut figures = self.figures(total, &conventions[chosen.index()]);
-        let replicates: Vec<Figures> = match images.groups.len() {
+        let mut metrics = self.metrics(total, &conventions[chosen.index()]);
+        let replicates: Vec<Metrics> = match images.groups.len() {
             0 | 1 => Vec::new(),
             _ => (0..images.groups.len())
                 .map(|k| {
@@ -346,15 +346,15 @@ impl SetScorer {
                 .collect(),
         };
         let chosen_one = &conventions[chosen.index()];
-        let (mut errors, ee_error) = self.errors(images, chosen_one, &figures, &replicates);
+        let (mut errors, ee_error) = self.errors(images, chosen_one, &metrics, &replicates);
         // By a response that may as well be zero nothing can be divided.
-        if 1.0 + figures.m_cross < CLEAR_RESPONSE * errors.m_cross {
-            for of in [&mut figures, &mut errors] {
+        if 1.0 + metrics.m_cross < CLEAR_RESPONSE * errors.m_cross {
+            for of in [&mut metrics, &mut errors] {
                 (of.q_calibrated, of.galaxy_noise) = (f64::NAN, f64::NAN);
             }
         }
         let constant = self.truth.constant().map(|truth| MeanShear {
-            e: [truth[0] + figures.c1, truth[1] + figures.c2],
+            e: [truth[0] + metrics.c1, truth[1] + metrics.c2],
             error: [errors.c1, errors.c2],
             truth,
         });
@@ -377,7 +377,7 @@ impl SetScorer {
             best,
             matching,
             chosen,
-            figures,
+            metrics,
             errors,
             replicates,
             constant,
@@ -612,7 +612,7 @@ impl SetScorer {
         }
     }
 
-    /// Headline figures with one group of images left out; `others` are the rest. Where too few are
+    /// Headline metrics with one group of images left out; `others` are the rest. Where too few are
     /// left to measure the noise, that of all images is scaled.
     fn replicate(
         &self,
@@ -621,7 +621,7 @@ impl SetScorer {
         chosen: Convention,
         others: &[MeanPower],
         noise: Option<&NoisePower>,
-    ) -> Figures {
+    ) -> Metrics {
         let rest = total.without(group);
         let own = self.noise_power(&rest, others).or_else(|| {
             let more = self.noise_gain(&rest) / self.noise_gain(total);
@@ -633,15 +633,15 @@ impl SetScorer {
             &self.true_modes(&rest, chosen),
             own.as_ref(),
         );
-        self.figures(&rest, &score)
+        self.metrics(&rest, &score)
     }
 
-    fn figures(&self, sum: &FieldSum, score: &ConventionScore) -> Figures {
+    fn metrics(&self, sum: &FieldSum, score: &ConventionScore) -> Metrics {
         let [first, second] = self.biases(sum, score.convention);
         let mean_c_l = |power: &[f64; BINS]| {
             SCORED.map(|b| power[b] * self.bins.to_c_l(b)).sum::<f64>() / SCORED.len() as f64 * 1e9
         };
-        let own = Figures {
+        let own = Metrics {
             q: score.quality.q,
             q_dn: score.quality_dn.map_or(f64::NAN, |quality| quality.q),
             q_calibrated: score.quality_calibrated.q,
@@ -659,10 +659,10 @@ impl SetScorer {
         };
         match self.truth.constant() {
             None => own,
-            Some(_) => Figures {
+            Some(_) => Metrics {
                 c1: own.c1,
                 c2: own.c2,
-                ..Figures::unknown()
+                ..Metrics::unknown()
             },
         }
     }
@@ -690,15 +690,15 @@ impl SetScorer {
         ]
     }
 
-    /// Standard errors of the figures ([`crate::errors`]). c has the jackknife's over images where that is
+    /// Standard errors of the metrics ([`crate::errors`]). c has the jackknife's over images where that is
     /// larger: what moves all galaxies of an image alike shows nowhere else.
     fn errors(
         &self,
         images: &SetImages,
         score: &ConventionScore,
-        figures: &Figures,
-        replicates: &[Figures],
-    ) -> (Figures, [f64; BINS]) {
+        metrics: &Metrics,
+        replicates: &[Metrics],
+    ) -> (Metrics, [f64; BINS]) {
         let (sum, bins, k) = (&images.total, &self.bins, score.convention);
         let biases = self.biases(sum, k);
         let [v1, v2] = {
@@ -719,16 +719,16 @@ impl SetScorer {
             let c = sums([&biases[0].of_c, &biases[1].of_c]);
             [(m[0], c[0]), (m[1], c[1])]
         };
-        let jackknife = |of: fn(&Figures) -> f64| {
-            jackknife_error(of(figures), replicates.iter().map(of), images.total.images)
+        let jackknife = |of: fn(&Metrics) -> f64| {
+            jackknife_error(of(metrics), replicates.iter().map(of), images.total.images)
         };
         let c1 = v1.1.max(jackknife(|f| f.c1));
         let c2 = v2.1.max(jackknife(|f| f.c2));
         if self.truth.constant().is_some() {
-            let means = Figures {
+            let means = Metrics {
                 c1,
                 c2,
-                ..Figures::unknown()
+                ..Metrics::unknown()
             };
             return (means, [f64::NAN; BINS]);
         }
@@ -748,7 +748,7 @@ impl SetScorer {
                 };
                 let apart = std::array::from_fn(|b| score.noise_free[b] - true_ee[b]);
                 let variance = scatter.of_power(bins, &signal, own);
-                errors::of_quality(bins, figures.q_dn, &apart, &variance)
+                errors::of_quality(bins, metrics.q_dn, &apart, &variance)
             }
         };
         let independent =
@@ -762,19 +762,19 @@ impl SetScorer {
             response,
             &score.ee,
             &true_ee,
-            figures.q_calibrated,
+            metrics.q_calibrated,
         );
         let galaxy_noise = {
             let own = match (self.options.noise, images.groups.len() as f64) {
                 (Noise::Given(_), _) => 0.0,
                 (Noise::Measured, groups) => bins.variance_of_white_power() / (groups - 1.0) / 4.0,
             };
-            figures.galaxy_noise * (own + (m_cross / response).powi(2)).sqrt()
+            metrics.galaxy_noise * (own + (m_cross / response).powi(2)).sqrt()
         };
         let fit = &score.fit.cl;
         let [bb, eb] = scatter.of_null_tests(bins, &signal);
-        let figures = Figures {
-            q: errors::of_quality(bins, figures.q, &apart, &power),
+        let metrics = Metrics {
+            q: errors::of_quality(bins, metrics.q, &apart, &power),
             q_dn,
             q_calibrated,
             m_half: m / 2.0,
@@ -793,7 +793,7 @@ impl SetScorer {
         for b in SCORED {
             ee_error[b] = power[b].sqrt();
         }
-        (figures, ee_error)
+        (metrics, ee_error)
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::{ArgGroup, Args, Subcommand};
-use shearq_submissions::{Registry, Submission};
+use shearq_submissions::{Configuration, Registry};
 
 use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once, positive};
 use crate::progress::Bar;
@@ -14,12 +14,12 @@ use shearq_pipeline::data::layout::MAX_IMAGE;
 use shearq_pipeline::data::run::{Run, Source, open_data, way};
 use shearq_render::table::TableFormat;
 use shearq_results::baseline::{
-    self, Baseline, BaselineSet, BaselineSubmission, Change, Checked, Settings, Wanted, figures_of,
-    measure,
+    self, Baseline, BaselineConfiguration, BaselineSet, Change, Checked, Settings, Wanted, measure,
+    metrics_of,
 };
 use shearq_results::views::baseline::{junit, shift_table};
 
-/// Keep figures as baselines, and see later whether they moved.
+/// Keep metrics as baselines, and see later whether they moved.
 ///
 /// A baseline is a TOML file that holds the scores with errors per set, the scatter of the
 /// ellipticities, and everything that made them: settings, data, seed, version.
@@ -41,7 +41,7 @@ enum Command {
     Check(CheckArguments),
 }
 
-/// Store figures as a new baseline.
+/// Store metrics as a new baseline.
 ///
 /// Of folders that `measure` or `run` wrote (--measured), of a data folder (--data), or of sets simulated
 /// for it (--simulate).
@@ -82,7 +82,7 @@ struct RecordArguments {
 ///
 /// Named submissions and configuration files are measured with their present settings, and settings that
 /// changed are listed. A file is known if `record` measured it (--submission FILE); catalogues (--measured)
-/// have the settings stored. On the same data a figure must be the same but for rounding; on other data (--data) within noise. Q, M/2, √A
+/// have the settings stored. On the same data a metric must be the same but for rounding; on other data (--data) within noise. Q, M/2, √A
 /// and the scatter of e1 and e2 are looked at; CSV and JSON have every one, the other formats those
 /// that moved.
 ///
@@ -98,7 +98,7 @@ struct CheckArguments {
     /// Measure with the settings stored in the baseline, not with those of your configuration files.
     #[arg(long)]
     stored: bool,
-    /// Standard errors by which a figure may be off on other data than the baseline's.
+    /// Standard errors by which a metric may be off on other data than the baseline's.
     #[arg(long, value_name = "K", default_value_t = 3.0, value_parser = positive)]
     sigma: f64,
     /// Replace what moved. The baseline keeps the reason and what moved.
@@ -195,20 +195,23 @@ fn of_source(
     arguments: &RecordArguments,
     source: Source,
     wanted: Vec<Wanted>,
-) -> anyhow::Result<(Source, Vec<BaselineSubmission>)> {
+) -> anyhow::Result<(Source, Vec<BaselineConfiguration>)> {
     let (folder, threads) = (&arguments.place.folder, arguments.threads.number());
     let submissions = chosen(&arguments.submission, folder)?
         .into_iter()
         .map(|(submission, file)| {
             let sets = measured(&source, folder, &submission, &wanted, threads)?;
-            Ok(BaselineSubmission::new(&submission, file, sets)?)
+            Ok(BaselineConfiguration::new(&submission, file, sets)?)
         })
         .collect::<anyhow::Result<_>>()?;
     Ok((source, submissions))
 }
 
 /// The submissions called `names`, or all named ones, with their files from the folder `beside`.
-fn chosen(names: &[String], beside: &Path) -> anyhow::Result<Vec<(Submission, Option<PathBuf>)>> {
+fn chosen(
+    names: &[String],
+    beside: &Path,
+) -> anyhow::Result<Vec<(Configuration, Option<PathBuf>)>> {
     given_once(names)?;
     let registry = Registry::embedded()?;
     let names = if names.is_empty() {
@@ -223,18 +226,18 @@ fn chosen(names: &[String], beside: &Path) -> anyhow::Result<Vec<(Submission, Op
             let file = (!registry.names().contains(name) && path.is_file())
                 .then(|| way(beside, path))
                 .transpose()?;
-            Ok((registry.get(name)?.submission, file))
+            Ok((registry.get(name)?.configuration, file))
         })
         .collect()
 }
 
-/// Takes the figures of folders of catalogues, and the source that all of them have, for a record in the
+/// Takes the metrics of folders of catalogues, and the source that all of them have, for a record in the
 /// folder `beside`.
 fn of_folders(
     folders: &[PathBuf],
     beside: &Path,
     threads: usize,
-) -> anyhow::Result<(Source, Vec<BaselineSubmission>)> {
+) -> anyhow::Result<(Source, Vec<BaselineConfiguration>)> {
     let mut first: Option<Source> = None;
     let mut submissions = Vec::new();
     for folder in folders {
@@ -246,8 +249,8 @@ fn of_folders(
             "{}: it was measured from {own}, the first from {source}; a baseline has one source",
             folder.display(),
         );
-        let sets = figures_of(&run, &run.source.data(folder)?, folder, threads)?;
-        submissions.push(BaselineSubmission::new(&run.submission, None, sets)?);
+        let sets = metrics_of(&run, &run.source.data(folder)?, folder, threads)?;
+        submissions.push(BaselineConfiguration::new(&run.configuration, None, sets)?);
     }
     Ok((first.context("--measured names no folder")?, submissions))
 }
@@ -256,7 +259,7 @@ fn of_folders(
 fn measured(
     source: &Source,
     beside: &Path,
-    submission: &Submission,
+    submission: &Configuration,
     wanted: &[Wanted],
     threads: usize,
 ) -> anyhow::Result<Vec<BaselineSet>> {
@@ -317,7 +320,7 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
         None => baseline.source.clone(),
     };
     let threads = arguments.threads.number();
-    let measure = |submission: &Submission, wanted: &[Wanted]| {
+    let measure = |submission: &Configuration, wanted: &[Wanted]| {
         measured(&source, beside, submission, wanted, threads)
     };
     let settings = match arguments.stored {
@@ -331,7 +334,7 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
         tell(format_args!(
             "{}: {}: measured with the stored settings; the baseline does not name a configuration file",
             path.display(),
-            check.submission
+            check.configuration
         ));
     }
     let moved: Vec<String> = checks.iter().flat_map(Checked::moved).collect();

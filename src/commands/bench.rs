@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use shearq_submissions::{Registry, Submission};
+use shearq_submissions::{Configuration, Registry};
 
 use crate::arguments::{Form, Threads, given_once};
 use crate::print;
@@ -41,8 +41,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let submissions = arguments
         .submission
         .iter()
-        .map(|name| Ok(registry.get(name)?.submission))
-        .collect::<anyhow::Result<Vec<Submission>>>()?;
+        .map(|name| Ok(registry.get(name)?.configuration))
+        .collect::<anyhow::Result<Vec<Configuration>>>()?;
     let threads = arguments.threads.number();
     let settings = SimulationSettings::new(1, 50);
     let mut page = arguments.out.as_deref().map(|out| {

@@ -39,7 +39,9 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let submission = Registry::embedded()?.get(&arguments.submission)?.submission;
+    let submission = Registry::embedded()?
+        .get(&arguments.submission)?
+        .configuration;
     anyhow::ensure!(
         submission.network().is_some(),
         "{} has method = \"linear\"; λ is calibrated for the network's adaptive and constant update",

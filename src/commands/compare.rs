@@ -21,7 +21,7 @@ use shearq_results::views::pages;
 use shearq_results::views::scores::notes;
 use shearq_results::views::verdict::verdict;
 
-/// Put measured submissions side by side, beside the published figures, or past runs of a store.
+/// Put measured submissions side by side, beside the published metrics, or past runs of a store.
 ///
 /// Each OUT is a folder that `measure` or `run` wrote. Differences in Q are taken from the first and
 /// paired over the same images, so that noise common to both cancels.
@@ -103,7 +103,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Where the figures come from: inputs, and settings of what shearq measured.
+/// Where the metrics come from: inputs, and settings of what shearq measured.
 fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
     let mut made_by = Vec::new();
     for folder in &arguments.measured {

@@ -64,7 +64,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
     }
     let name = measured.display().to_string();
-    let mut table = mean_table(&means, &run.submission, &name);
+    let mut table = mean_table(&means, &run.configuration, &name);
     if let Some(data) = &data {
         let used = means.iter().map(|mean| (mean.set, mean.images.as_slice()));
         table

@@ -56,7 +56,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         sharding,
         threads,
     } = arguments;
-    let submission = Registry::embedded()?.get(submission)?.submission;
+    let submission = Registry::embedded()?.get(submission)?.configuration;
     let data = open_data(data)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
     let images = sharding.part(&images::of_folder(&data, sets)?);
@@ -126,7 +126,7 @@ pub(super) fn report(run: &Run, summary: &Summary, elapsed: Duration, threads: u
     };
     tell(format_args!(
         "{}: {}{speed}; {} there already, in {}",
-        run.submission.name,
+        run.configuration.name,
         count(summary.images, "image"),
         summary.already,
         out.display()

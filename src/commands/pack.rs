@@ -76,7 +76,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let foreign = foreign.as_deref().map(Foreign::read).transpose()?;
     let data = data.as_deref().map(open_data).transpose()?;
     let (origin, name) = match (measured, &run, &foreign) {
-        (Some(folder), Some(run), _) => (Origin::Measured { folder, run }, &run.submission.name),
+        (Some(folder), Some(run), _) => (Origin::Measured { folder, run }, &run.configuration.name),
         (_, _, Some(foreign)) => {
             let data = data.as_ref();
             (Origin::Foreign { foreign, data }, &foreign.name)

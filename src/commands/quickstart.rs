@@ -75,7 +75,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     )];
     for name in SUBMISSIONS {
         let folder = out.join(name.replace('/', "-"));
-        let submission = registry.get(name)?.submission;
+        let submission = registry.get(name)?.configuration;
         let run = Run::new(
             Source::folder(&data, &folder)?,
             submission,
@@ -89,7 +89,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         print_table(&table.narrow())?;
         print("\n")?;
         sections.push(pages::scores(name, &scored, table)?);
-        made_by.push((name.to_owned(), toml::to_string(&run.submission)?));
+        made_by.push((name.to_owned(), toml::to_string(&run.configuration)?));
         folders.push(folder);
     }
     let way = ScoreSettings::default().way();

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::bail;
 use clap::Args;
-use shearq_submissions::{Published, Registry, Submission};
+use shearq_submissions::{Configuration, Published, Registry};
 
 use crate::arguments::{SetList, Threads, given_once};
 use crate::progress::{Bar, goes_on};
@@ -82,7 +82,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let results = run_sets(&study, sets, threads, &mut bar)?;
     drop(bar);
     let mut bar = Bar::new("calibrating", *galaxies);
-    let base = registry.get("paper")?.submission;
+    let base = registry.get("paper")?.configuration;
     let curves = calibrate(&base, *galaxies, *seed, threads, &mut bar)?;
     drop(bar);
 
@@ -154,7 +154,7 @@ const SECT_FIVE: &str = "Submissions of Table 1 on sets of Table 2. The images a
 fn of_table_one(
     registry: &Registry,
     wanted: &[String],
-) -> anyhow::Result<Vec<(Submission, Published)>> {
+) -> anyhow::Result<Vec<(Configuration, Published)>> {
     let all = registry.published()?;
     let known = names(&all);
     if let Some(name) = wanted.iter().find(|name| !known.contains(name)) {
@@ -190,7 +190,7 @@ fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn names(submissions: &[(Submission, Published)]) -> Vec<String> {
+fn names(submissions: &[(Configuration, Published)]) -> Vec<String> {
     submissions.iter().map(|(s, _)| s.name.clone()).collect()
 }
 

@@ -102,7 +102,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         None => Source::Simulated(simulation.settings()?),
     };
-    let submission = Registry::embedded()?.get(submission)?.submission;
+    let submission = Registry::embedded()?.get(submission)?.configuration;
     let run = Run::new(source, submission, catalogue_format.unwrap_or_default());
     match (&run.source, &data) {
         (Source::Simulated(settings), _) => {
@@ -136,10 +136,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         return Ok(());
     }
     let scored = score(&run, out, wanted, store.as_deref(), threads)?;
-    let title = format!("Scores of {}", run.submission.name);
+    let title = format!("Scores of {}", run.configuration.name);
     let sections = || {
         Ok(vec![pages::scores(
-            &run.submission.name,
+            &run.configuration.name,
             &scored.0,
             scored.1,
         )?])
@@ -166,9 +166,9 @@ pub(super) fn score(
         let made = Measured::run(run, &truth, out)?;
         score::record(store, made, &scored, options)?;
     }
-    let title = format!("Scores of {}", run.submission.name);
+    let title = format!("Scores of {}", run.configuration.name);
     let mut table = per_set(&scored, &title, options.definition);
-    let verdict = verdict_line(&run.submission.name, &scored);
+    let verdict = verdict_line(&run.configuration.name, &scored);
     table.notes.extend(verdict);
     for (name, table) in [("scores", &table), ("bandpowers", &bandpowers(&scored))] {
         let text = table.render(TableFormat::Csv);

@@ -179,7 +179,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             }
             let unscored = unscored(&data, &scored, sets)?;
             let made_by = made_by(&run, measured)?;
-            (run.submission.name, made_by, scored, unscored)
+            (run.configuration.name, made_by, scored, unscored)
         }
         (None, Some(path), Some(data)) => {
             let foreign = Foreign::read(path)?;
@@ -242,8 +242,8 @@ pub(super) fn made_by(run: &Run, out: &Path) -> anyhow::Result<Vec<(String, Stri
         ("Catalogues".into(), out.display().to_string()),
         ("Source".into(), serde_json::to_string(&run.source)?),
         (
-            run.submission.name.clone(),
-            toml::to_string(&run.submission)?,
+            run.configuration.name.clone(),
+            toml::to_string(&run.configuration)?,
         ),
     ])
 }
@@ -468,7 +468,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     if arguments.printing.format() == TableFormat::Json {
         anyhow::ensure!(
             !arguments.printing.chooses(),
-            "--figures: JSON of one set from plain files has everything; use --format csv for some figures"
+            "--metrics: JSON of one set from plain files has everything; use --format csv for some metrics"
         );
         let name = |path: &Path| path.display().to_string();
         let input = SetInput {

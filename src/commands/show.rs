@@ -73,7 +73,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         out,
     } = arguments;
     PictureFormat::of(out)?;
-    let submission = Registry::embedded()?.get(submission)?.submission;
+    let submission = Registry::embedded()?.get(submission)?.configuration;
     let data = open_data(data)?;
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in galaxy {

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use shearq_submissions::{Registry, Submission};
+use shearq_submissions::{Configuration, Registry};
 
 use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once};
 use crate::print;
@@ -67,8 +67,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let registry = Registry::embedded()?;
     let submissions = submission
         .iter()
-        .map(|name| Ok(registry.get(name)?.submission))
-        .collect::<anyhow::Result<Vec<Submission>>>()?;
+        .map(|name| Ok(registry.get(name)?.configuration))
+        .collect::<anyhow::Result<Vec<Configuration>>>()?;
     let plan = Plan {
         version: shearq_pipeline::VERSION.into(),
         simulation: simulation.settings()?,

@@ -58,7 +58,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Command::List { form } => form.print(&list()?),
         Command::Show { name } => {
             let entry = Registry::embedded()?.get(name)?;
-            let mut text = toml::to_string(&entry.submission)?;
+            let mut text = toml::to_string(&entry.configuration)?;
             if let Some(published) = entry.published {
                 text.push_str(&format!("\n[published]\n{}", toml::to_string(&published)?));
             }
@@ -85,7 +85,7 @@ fn list() -> anyhow::Result<Table> {
     let mut rows = Vec::new();
     for name in registry.names() {
         let entry = registry.get(name)?;
-        let s = &entry.submission;
+        let s = &entry.configuration;
         let published = |value: fn(&shearq_submissions::Published) -> f64| {
             entry.published.as_ref().map_or(f64::NAN, value)
         };

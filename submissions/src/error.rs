@@ -8,7 +8,7 @@ use crate::name::EXPECTED;
 
 /// What can be wrong with a submission's name or file.
 #[derive(Debug, Error)]
-pub enum SubmissionError {
+pub enum ConfigurationError {
     /// Neither a known name nor a file.
     #[error("{}there is no submission or file named `{name}`; known submissions: {known}", from.as_ref().map_or_else(String::new, |from| format!("{}: `extends`: ", from.display())))]
     Unknown {

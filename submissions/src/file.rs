@@ -5,10 +5,10 @@ use std::path::Path;
 
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::error::SubmissionError;
+use crate::error::ConfigurationError;
 use crate::settings::{
-    MethodName, PartialDeconvolution, PartialDenoise, PartialNoise, PartialPsf, PartialShape,
-    PartialStamp, PartialSubmission, Submission,
+    Configuration, MethodName, PartialConfiguration, PartialDeconvolution, PartialDenoise,
+    PartialNoise, PartialPsf, PartialShape, PartialStamp,
 };
 
 /// Figures published for a submission.
@@ -47,14 +47,14 @@ pub(crate) struct File {
 }
 
 impl File {
-    pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, SubmissionError> {
-        toml::from_str(text).map_err(|error| SubmissionError::Parse {
+    pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, ConfigurationError> {
+        toml::from_str(text).map_err(|error| ConfigurationError::Parse {
             path: path.to_owned(),
             message: error.to_string().trim_end().to_owned(),
         })
     }
 
-    pub(crate) fn settings(self) -> PartialSubmission {
+    pub(crate) fn settings(self) -> PartialConfiguration {
         let File {
             name: _,
             description: _,
@@ -68,7 +68,7 @@ impl File {
             shape,
             published: _,
         } = self;
-        PartialSubmission {
+        PartialConfiguration {
             method,
             stamp,
             psf,
@@ -80,20 +80,20 @@ impl File {
     }
 }
 
-impl<'de> Deserialize<'de> for Submission {
+impl<'de> Deserialize<'de> for Configuration {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         use serde::de::Error;
         let mut file = File::deserialize(deserializer)?;
         let (name, description) = (file.name.take(), file.description.take());
-        let submission = file
+        let configuration = file
             .settings()
             .complete(
                 name.ok_or_else(|| Error::missing_field("name"))?,
                 description.ok_or_else(|| Error::missing_field("description"))?,
             )
             .map_err(Error::missing_field)?;
-        submission.validate().map_err(Error::custom)?;
-        Ok(submission)
+        configuration.validate().map_err(Error::custom)?;
+        Ok(configuration)
     }
 }
 
@@ -105,10 +105,10 @@ pub(crate) struct DeadKey {
 }
 
 /// Keys of `text`, a valid file, that `submission` has no use for, in order.
-pub(crate) fn dead_keys(text: &str, submission: &Submission) -> Vec<DeadKey> {
+pub(crate) fn dead_keys(text: &str, configuration: &Configuration) -> Vec<DeadKey> {
     let (Ok(file), Ok(used)) = (
         toml::de::DeTable::parse(text),
-        toml::Table::try_from(submission),
+        toml::Table::try_from(configuration),
     ) else {
         return Vec::new();
     };
@@ -147,16 +147,16 @@ pub(crate) fn dead_keys(text: &str, submission: &Submission) -> Vec<DeadKey> {
 const MOST: u64 = 1 << 20;
 
 /// The text of a file.
-pub(crate) fn read(path: &Path) -> Result<String, SubmissionError> {
+pub(crate) fn read(path: &Path) -> Result<String, ConfigurationError> {
     let mut text = String::new();
     std::fs::File::open(path)
         .and_then(|file| file.take(MOST + 1).read_to_string(&mut text))
-        .map_err(|source| SubmissionError::Read {
+        .map_err(|source| ConfigurationError::Read {
             path: path.to_owned(),
             source,
         })?;
     if text.len() as u64 > MOST {
-        return Err(SubmissionError::Parse {
+        return Err(ConfigurationError::Parse {
             path: path.to_owned(),
             message: format!("it has more than {MOST} bytes, the most that settings may have"),
         });

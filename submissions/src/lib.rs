@@ -1,7 +1,7 @@
 //! Named submission configurations: how to get from a stamp to an ellipticity, in TOML files with
 //! inheritance.
 //!
-//! A [`Submission`] holds every setting of its method, resolved. The seven variants of the paper's Table 1
+//! A [`Configuration`] holds every setting of its method, resolved. The seven variants of the paper's Table 1
 //! and the linear ones are embedded ([`Registry`]); a user's own file works wherever a name does, and
 //! `extends` either a name or another file. Unknown keys, keys that the method does not use, values out of
 //! range, unknown names and cycles are refused with the file and place.
@@ -15,14 +15,14 @@ mod settings;
 mod template;
 mod validate;
 
-pub use error::SubmissionError;
+pub use error::ConfigurationError;
 pub use file::Published;
 pub use name::{MAX_NAME, check_name, checked_name, is_control};
 pub use registry::{Entry, Registry};
 pub use settings::{
-    AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Denoise,
-    EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method, NetworkDeconvolution,
-    NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf, Stamp, Start, StepScale,
-    Submission, Update, Wavelet, WeightedShape,
+    AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Configuration,
+    Denoise, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method,
+    NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf,
+    Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
 };
 pub use template::Template;

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Deserializer};
 
-use crate::error::SubmissionError;
+use crate::error::ConfigurationError;
 
 /// Longest name, in bytes: file names are made with it.
 pub const MAX_NAME: usize = 100;
@@ -12,11 +12,11 @@ pub const MAX_NAME: usize = 100;
 ///
 /// # Errors
 /// [`SubmissionError::Name`].
-pub fn check_name(name: &str) -> Result<(), SubmissionError> {
+pub fn check_name(name: &str) -> Result<(), ConfigurationError> {
     if (1..=MAX_NAME).contains(&name.len()) && !name.contains(is_control) {
         return Ok(());
     }
-    Err(SubmissionError::Name { found: shown(name) })
+    Err(ConfigurationError::Name { found: shown(name) })
 }
 
 /// The beginning of a name, with its control characters written out.

@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use crate::error::SubmissionError;
+use crate::error::ConfigurationError;
 use crate::file::{File, Published, dead_keys, read};
-use crate::settings::{PartialSubmission, Submission};
+use crate::settings::{Configuration, PartialConfiguration};
 
 /// The commented configuration that the submissions with the network rest on.
 pub(crate) const NETWORK: &str = include_str!("../named/paper.toml");
@@ -76,7 +76,7 @@ const MAX_DEPTH: usize = 16;
 #[derive(Debug, Clone, PartialEq)]
 pub struct Entry {
     /// All settings.
-    pub submission: Submission,
+    pub configuration: Configuration,
     /// Published figures, where there are any.
     pub published: Option<Published>,
     /// What it directly inherits from.
@@ -95,7 +95,7 @@ impl Registry {
     ///
     /// # Errors
     /// Where one of them is not valid, which a test rules out.
-    pub fn embedded() -> Result<Self, SubmissionError> {
+    pub fn embedded() -> Result<Self, ConfigurationError> {
         let mut registry = Registry {
             names: Vec::new(),
             files: BTreeMap::new(),
@@ -121,11 +121,15 @@ impl Registry {
     ///
     /// # Errors
     /// As [`Registry::get`].
-    pub fn published(&self) -> Result<Vec<(Submission, Published)>, SubmissionError> {
+    pub fn published(&self) -> Result<Vec<(Configuration, Published)>, ConfigurationError> {
         let mut found = Vec::new();
         for name in &self.names {
             let entry = self.get(name)?;
-            found.extend(entry.published.map(|figures| (entry.submission, figures)));
+            found.extend(
+                entry
+                    .published
+                    .map(|figures| (entry.configuration, figures)),
+            );
         }
         Ok(found)
     }
@@ -136,7 +140,7 @@ impl Registry {
     ///
     /// # Errors
     /// Where there is no such name or file, or it or what it extends is not valid.
-    pub fn get(&self, name_or_path: &str) -> Result<Entry, SubmissionError> {
+    pub fn get(&self, name_or_path: &str) -> Result<Entry, ConfigurationError> {
         self.entry(self.find(name_or_path, None)?, name_or_path)
     }
 
@@ -145,7 +149,7 @@ impl Registry {
     ///
     /// # Errors
     /// Where the text, or what it extends, is not valid.
-    pub fn get_text(&self, path: &Path, text: &str) -> Result<Entry, SubmissionError> {
+    pub fn get_text(&self, path: &Path, text: &str) -> Result<Entry, ConfigurationError> {
         let link = Link {
             file: File::parse(path, text)?,
             path: path.to_owned(),
@@ -155,26 +159,26 @@ impl Registry {
     }
 
     /// What a file, called `asked`, resolves to.
-    fn entry(&self, link: Link, asked: &str) -> Result<Entry, SubmissionError> {
+    fn entry(&self, link: Link, asked: &str) -> Result<Entry, ConfigurationError> {
         let (published, extends) = (link.file.published, link.file.extends.clone());
         let (path, name) = (link.path.clone(), own_name(&link.file, &link.path));
         let description = link.file.description.clone().unwrap_or_default();
         let settings = self.resolve(link, &mut vec![asked.to_owned()])?;
-        let submission =
+        let configuration =
             settings
                 .complete(name, description)
-                .map_err(|key| SubmissionError::Missing {
+                .map_err(|key| ConfigurationError::Missing {
                     path: path.clone(),
                     key,
                 })?;
-        submission
+        configuration
             .validate()
-            .map_err(|error| SubmissionError::Range {
+            .map_err(|error| ConfigurationError::Range {
                 path,
                 message: error.to_string(),
             })?;
         Ok(Entry {
-            submission,
+            configuration,
             published,
             extends,
         })
@@ -185,26 +189,26 @@ impl Registry {
         &self,
         link: Link,
         chain: &mut Vec<String>,
-    ) -> Result<PartialSubmission, SubmissionError> {
+    ) -> Result<PartialConfiguration, ConfigurationError> {
         let Link { path, file, text } = link;
         let base = match file.extends.clone() {
-            None => PartialSubmission::default(),
+            None => PartialConfiguration::default(),
             Some(parent) => {
                 let again = chain.contains(&parent);
                 chain.push(parent.clone());
                 if again || chain.len() > MAX_DEPTH {
                     let chain = chain.join(" → ");
-                    return Err(SubmissionError::Cycle { path, chain });
+                    return Err(ConfigurationError::Cycle { path, chain });
                 }
                 self.resolve(self.find(&parent, Some(&path))?, chain)?
             }
         };
         let settings = file.settings().over(base);
         if let Some(text) = text
-            && let Ok(submission) = settings.complete(String::new(), String::new())
-            && let Some(dead) = dead_keys(&text, &submission).into_iter().next()
+            && let Ok(configuration) = settings.complete(String::new(), String::new())
+            && let Some(dead) = dead_keys(&text, &configuration).into_iter().next()
         {
-            return Err(SubmissionError::Dead {
+            return Err(ConfigurationError::Dead {
                 path,
                 line: dead.line,
                 key: dead.key,
@@ -215,7 +219,7 @@ impl Registry {
     }
 
     /// The file of a name or path; paths are relative to the file `from` that names them.
-    fn find(&self, name: &str, from: Option<&Path>) -> Result<Link, SubmissionError> {
+    fn find(&self, name: &str, from: Option<&Path>) -> Result<Link, ConfigurationError> {
         if let Some((path, file)) = self.files.get(name) {
             return Ok(Link {
                 path: path.clone(),
@@ -228,7 +232,7 @@ impl Registry {
             None => PathBuf::from(name),
         };
         if !path.is_file() {
-            return Err(SubmissionError::Unknown {
+            return Err(ConfigurationError::Unknown {
                 from: from.map(Path::to_owned),
                 name: name.to_owned(),
                 known: self.names.join(", "),
@@ -290,7 +294,7 @@ mod tests {
         {
             assert_eq!(name, listed);
             let entry = registry.get(name).unwrap();
-            let s = &entry.submission;
+            let s = &entry.configuration;
             assert_eq!(s.stamp.size, size, "{name}");
             assert_eq!(s.psf.size, 15, "{name}");
             assert_eq!(s.wavelet().is_some(), den, "{name}");
@@ -314,11 +318,11 @@ mod tests {
             "extends = \"base.toml\"\n[deconvolution]\nlambda = 0.5\n",
         );
         let entry = Registry::embedded().unwrap().get(&own).unwrap();
-        assert_eq!(entry.submission.name, "own");
-        assert_eq!(entry.submission.stamp.size, 31);
-        let network = entry.submission.network().unwrap();
+        assert_eq!(entry.configuration.name, "own");
+        assert_eq!(entry.configuration.stamp.size, 31);
+        let network = entry.configuration.network().unwrap();
         assert_eq!(network.deconvolution.lambda, 0.5);
-        assert!(entry.submission.wavelet().is_some());
+        assert!(entry.configuration.wavelet().is_some());
         assert_eq!(entry.published, None);
     }
 
@@ -402,15 +406,18 @@ mod tests {
     fn only_what_the_method_uses_is_stored_and_it_is_read_back() {
         let registry = Registry::embedded().unwrap();
         for name in registry.names() {
-            let submission = registry.get(name).unwrap().submission;
-            let table = toml::Table::try_from(&submission).unwrap();
-            let linear = submission.linear().is_some();
+            let configuration = registry.get(name).unwrap().configuration;
+            let table = toml::Table::try_from(&configuration).unwrap();
+            let linear = configuration.linear().is_some();
             assert_eq!(table.contains_key("denoise"), !linear, "{name}");
             let keys = ["target_sigma", "unit_divisor"];
             let held = keys.map(|key| table["deconvolution"].get(key).is_some());
             assert_eq!(held, [linear, !linear], "{name}");
-            let text = toml::to_string(&submission).unwrap();
-            assert_eq!(toml::from_str::<Submission>(&text).unwrap(), submission);
+            let text = toml::to_string(&configuration).unwrap();
+            assert_eq!(
+                toml::from_str::<Configuration>(&text).unwrap(),
+                configuration
+            );
         }
     }
 
@@ -423,7 +430,7 @@ mod tests {
             "own.toml",
             "extends = \"48/linear/star\"\n[noise]\nsource = \"border\"\n",
         );
-        let noise = registry.get(&own).unwrap().submission.noise;
+        let noise = registry.get(&own).unwrap().configuration.noise;
         assert_eq!(noise, NoiseSource::Border { border: 4 });
         let text = "extends = \"23/den/star\"\nmethod = \"linear\"\n";
         let own = write(folder.path(), "own.toml", text);

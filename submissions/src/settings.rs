@@ -448,7 +448,7 @@ pub enum EllipticityType {
 /// Every setting of a submission, resolved: those that its method uses and no others. Wherever they are read
 /// from, they are checked against their ranges.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Submission {
+pub struct Configuration {
     /// Name, as tables print it.
     pub name: String,
     /// What it is, in a sentence.
@@ -518,7 +518,7 @@ impl From<usize> for PsfCut {
     }
 }
 
-impl Submission {
+impl Configuration {
     /// How much of a PSF is taken.
     pub fn psf_cut(&self) -> PsfCut {
         let size = self.psf.size;
@@ -575,7 +575,7 @@ impl Submission {
 
 /// The sections of one file, none of which must be complete.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct PartialSubmission {
+pub(crate) struct PartialConfiguration {
     pub(crate) method: Option<MethodName>,
     pub(crate) stamp: PartialStamp,
     pub(crate) psf: PartialPsf,
@@ -585,9 +585,9 @@ pub(crate) struct PartialSubmission {
     pub(crate) shape: PartialShape,
 }
 
-impl PartialSubmission {
+impl PartialConfiguration {
     pub(crate) fn over(self, base: Self) -> Self {
-        PartialSubmission {
+        PartialConfiguration {
             method: self.method.or(base.method),
             stamp: self.stamp.over(base.stamp),
             psf: self.psf.over(base.psf),
@@ -603,8 +603,8 @@ impl PartialSubmission {
         &self,
         name: String,
         description: String,
-    ) -> Result<Submission, &'static str> {
-        Ok(Submission {
+    ) -> Result<Configuration, &'static str> {
+        Ok(Configuration {
             name,
             description,
             stamp: Stamp::of(&self.stamp)?,

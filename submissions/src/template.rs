@@ -1,6 +1,6 @@
 //! Commented files for users to start from.
 
-use crate::error::SubmissionError;
+use crate::error::ConfigurationError;
 use crate::file::dead_keys;
 use crate::registry::{LINEAR, NETWORK, Registry};
 
@@ -19,13 +19,13 @@ impl Template {
     ///
     /// # Errors
     /// Where the embedded submissions are not valid, which a test rules out.
-    pub fn text(self) -> Result<String, SubmissionError> {
+    pub fn text(self) -> Result<String, ConfigurationError> {
         let (base, text) = match self {
             Template::Network => ("paper", NETWORK),
             Template::Linear => ("48/linear/star", LINEAR),
         };
-        let submission = Registry::embedded()?.get(base)?.submission;
-        let dead: Vec<usize> = dead_keys(text, &submission)
+        let configuration = Registry::embedded()?.get(base)?.configuration;
+        let dead: Vec<usize> = dead_keys(text, &configuration)
             .iter()
             .map(|dead| dead.line)
             .collect();
@@ -60,8 +60,8 @@ mod tests {
             let text = template.text().unwrap();
             let path = folder.path().join("own.toml");
             std::fs::write(&path, &text).unwrap();
-            let own = registry.get(path.to_str().unwrap()).unwrap().submission;
-            let base = registry.get(base).unwrap().submission;
+            let own = registry.get(path.to_str().unwrap()).unwrap().configuration;
+            let base = registry.get(base).unwrap().configuration;
             assert_eq!((&own.stamp, &own.psf), (&base.stamp, &base.psf));
             assert_eq!((&own.noise, &own.method), (&base.noise, &base.method));
             let all = toml::Table::try_from(&own).unwrap();

@@ -6,8 +6,8 @@ use thiserror::Error;
 use crate::limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, MIN_TARGET, WINDOWS};
 use crate::name;
 use crate::settings::{
-    Clipping, Denoise, LinearDeconvolution, LinearMethod, Method, NetworkDeconvolution,
-    NetworkMethod, NoiseSource, Submission, Update,
+    Clipping, Configuration, Denoise, LinearDeconvolution, LinearMethod, Method,
+    NetworkDeconvolution, NetworkMethod, NoiseSource, Update,
 };
 
 /// A value that is out of range.
@@ -55,10 +55,10 @@ fn real(
     })
 }
 
-impl Submission {
+impl Configuration {
     /// Checks every value against its range.
     pub(crate) fn validate(&self) -> Result<(), OutOfRange> {
-        let Submission {
+        let Configuration {
             name,
             description: _,
             stamp,

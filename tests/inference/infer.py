@@ -217,7 +217,7 @@ def table(results, found, heading):
     ]
     show = lambda figures, key, digits: f"{figures[key]:.{digits}f}" if key in figures else "–"
     for name, result in sorted(results.items(), key=lambda item: item[1]["marginal"]):
-        f, p, n = result["figures"], result["plain"], result["nuisances"]
+        f, p, n = result["metrics"], result["plain"], result["nuisances"]
         three = lambda what, digits, of=f: ", ".join(show(of, f"{what} {row}", digits) for row in ROWS)
         leakage = lambda row: f"{result['cells'][row]['fiducial']['leakage']:.2f}" if row in result["cells"] else "–"
         lines.append(

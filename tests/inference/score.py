@@ -170,7 +170,7 @@ def judge(statements, rows, curves):
         "marginal": marginal,
         "best": best[0],
         "nuisances": dict(zip(NUISANCES, best[1])),
-        "figures": {key: float(value) for key, value in best[2].items()},
+        "metrics": {key: float(value) for key, value in best[2].items()},
         "plain": {key: float(value) for key, value in plain.items()},
         "statements": {s["id"]: (float(best[2][s["what"]]), d) for s, d in zip(best[3], best[4])},
     }

@@ -71,7 +71,7 @@ fn a_changed_digit_and_a_changed_setting_are_seen_and_an_update_keeps_the_reason
     let baseline = fs::read_to_string(&path).unwrap();
     let mut edited: toml::Table = baseline.parse().unwrap();
     let first = &mut edited["submissions"][0];
-    let q = &mut first["sets"][0]["figures"]["q"][0];
+    let q = &mut first["sets"][0]["metrics"]["q"][0];
     *q = toml::Value::Float(q.as_float().unwrap() * 1.01);
     first["settings"]["deconvolution"]["lambda"] = toml::Value::Float(123.0);
     // As if this setting had come later: others than named submissions take the base's value.
@@ -85,7 +85,7 @@ fn a_changed_digit_and_a_changed_setting_are_seen_and_an_update_keeps_the_reason
         .filter(|row| row["moved"] == "yes")
         .collect();
     assert_eq!(moved.len(), 1);
-    assert_eq!(moved[0]["figure"], "q");
+    assert_eq!(moved[0]["metric"], "q");
     let xml = fs::read_to_string(&junit).unwrap();
     assert!(xml.contains("tests=\"2\" failures=\"1\""), "{xml}");
     assert!(xml.contains("deconvolution.lambda: 123.0 ≠"), "{xml}");

@@ -201,7 +201,7 @@ fn submissions_can_be_listed_shown_and_started() {
         .get("paper")
         .unwrap();
     let started = settings(&succeed(&["submissions", "show", text(&own)]));
-    let base = settings(&toml::to_string(&base.submission).unwrap());
+    let base = settings(&toml::to_string(&base.configuration).unwrap());
     assert_eq!(started, base);
     assert!(fail(&["submissions", "init", text(&own)]).contains("exists"));
     let linear = root.path().join("linear.toml");

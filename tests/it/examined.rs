@@ -93,7 +93,7 @@ fn values_that_stand_for_none_are_asked_about() {
         assert_eq!(named["rows"]["not_finite"], 20);
         assert!(has(&named, "20 of 256 galaxies"));
         let cut = json(&files, &["--max-modulus", "1"]);
-        assert_eq!(cut["figures"], named["figures"]);
+        assert_eq!(cut["metrics"], named["metrics"]);
     }
 }
 
@@ -155,8 +155,8 @@ fn a_constant_shear_gives_means_and_no_power() {
         "{printed}"
     );
     let found = json(&files, &[]);
-    assert!(found["figures"]["q"].is_null() && found["figures"]["m_half"].is_null());
-    let c = found["figures"]["c1"].as_f64().unwrap();
+    assert!(found["metrics"]["q"].is_null() && found["metrics"]["m_half"].is_null());
+    let c = found["metrics"]["c1"].as_f64().unwrap();
     assert!((c - (mean - 0.03)).abs() < 1e-12, "{c}");
     // Of 256 numbers evenly spread over 0.1: 0.1/√12/16. It is told by the lowest modes, some 100.
     let error = found["mean_shear"]["error"][0].as_f64().unwrap();

@@ -14,7 +14,7 @@ use shearq_pipeline::images::ImageId;
 use shearq_pipeline::measure::ImageSource;
 use shearq_results::foreign::Foreign;
 use shearq_results::submit::challenge::{Kind, read_spectrum};
-use shearq_submissions::{Registry, Submission};
+use shearq_submissions::{Configuration, Registry};
 
 use crate::bad_images::gzip;
 use crate::support::{PACKED, Small, fits_image, pixels_of};
@@ -275,7 +275,7 @@ fn fuzz_images(count: u64) {
         .unwrap()
         .get("23/raw/star")
         .unwrap()
-        .submission;
+        .configuration;
     let folder = DataFolder::open(&data).unwrap();
     let image = folder.galaxies(2, 1);
     let plain = [whole, real];
@@ -310,7 +310,7 @@ fn fuzz_images(count: u64) {
     });
 }
 
-fn read_image(folder: &DataFolder, submission: &Submission) -> bool {
+fn read_image(folder: &DataFolder, submission: &Configuration) -> bool {
     let id = ImageId { set: 2, image: 1 };
     let Ok(mut source) = ImageSource::open(folder, id, submission) else {
         return false;
@@ -386,7 +386,7 @@ fn fuzz_others(count: u64) {
     other("folder/run.json", &[run], &|path| {
         matches!(Run::read(path.parent().unwrap()), Ok(Some(_)))
     });
-    let submission = registry.get("23/raw/func").unwrap().submission;
+    let submission = registry.get("23/raw/func").unwrap().configuration;
     let folder = DataFolder::open(small.at("data")).unwrap();
     let psf = bytes("data/set02/psf-001.csv");
     other("data/set02/psf-001.csv", &[psf], &|_| {

@@ -47,7 +47,7 @@ fn measured_ellipticities_follow_the_truth() {
         let run = Run {
             version: "test".into(),
             source: Source::folder(&data, out.path()).unwrap(),
-            submission: registry.get(name).unwrap().submission,
+            configuration: registry.get(name).unwrap().configuration,
             format: FileFormat::Fits,
         };
         let results = out.path().join(name.replace('/', "-"));
@@ -83,7 +83,7 @@ fn measured_ellipticities_follow_the_truth() {
                     "{name}, set {set}, e{}",
                     k + 1
                 );
-                if run.submission.calibration() == Calibration::Response {
+                if run.configuration.calibration() == Calibration::Response {
                     // 512 galaxies of σ_ε = 0.14 that scatter by 0.11: slopes are good to 0.035.
                     assert!(
                         (own.slope - 1.0).abs() < 4.0 * 0.035,

@@ -11,7 +11,7 @@ use shearq_pipeline::data::run::{read_record, write_record};
 use shearq_render::table::{Cell, Heading, Table, TableFormat};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::SimulationSettings;
-use shearq_submissions::{Denoise, Method, Registry, Submission};
+use shearq_submissions::{Configuration, Denoise, Method, Registry};
 
 use crate::support::{contents, succeed, text};
 
@@ -102,7 +102,7 @@ fn settings_of_all_digits_are_read_as_they_were_written() {
         .unwrap()
         .get("paper")
         .unwrap()
-        .submission;
+        .configuration;
     for _ in 0..500 {
         let mut submission = base.clone();
         let Method::Network(network) = &mut submission.method else {
@@ -122,10 +122,13 @@ fn settings_of_all_digits_are_read_as_they_were_written() {
         };
         let path = folder.path().join("settings.json");
         write_record(&path, &(&submission, simulation)).unwrap();
-        let read: (Submission, SimulationSettings) = read_record(&path).unwrap().unwrap();
+        let read: (Configuration, SimulationSettings) = read_record(&path).unwrap().unwrap();
         assert_eq!(read, (submission.clone(), simulation));
         let written = toml::to_string(&submission).unwrap();
-        assert_eq!(toml::from_str::<Submission>(&written).unwrap(), submission);
+        assert_eq!(
+            toml::from_str::<Configuration>(&written).unwrap(),
+            submission
+        );
     }
 }
 

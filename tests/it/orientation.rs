@@ -27,7 +27,7 @@ fn a_round_galaxy_comes_out_round_only_with_its_own_psf() {
         .unwrap()
         .get("29/den/func")
         .unwrap()
-        .submission;
+        .configuration;
     submission.psf.size = 25;
     let Method::Network(network) = &mut submission.method else {
         panic!("29/den/func has the network");

@@ -154,7 +154,7 @@ fn a_store_with_a_name_that_acts_is_refused() {
     let (out, place) = (root.path().join("out"), root.path().join("store"));
     run_simulated("2", "23/raw/star", &out, &["--store", text(&place)]);
     let (mut runs, _) = store::read(&place).unwrap();
-    runs[0].submission = "\u{1b}[2J".into();
+    runs[0].configuration = "\u{1b}[2J".into();
     store::write(&place, &runs[0]).unwrap();
     let message = fail(&["compare", "--store", text(&place)]);
     assert!(
@@ -205,7 +205,10 @@ fn names_with_marks_of_every_format_go_through_the_chain() {
     .unwrap();
     let (out, place, map) = (at("out"), at("store"), at("map.svg"));
     run_simulated("2,5", text(&own), &out, &["--store", text(&place)]);
-    assert_eq!(Run::require(Path::new(&out)).unwrap().submission.name, name);
+    assert_eq!(
+        Run::require(Path::new(&out)).unwrap().configuration.name,
+        name
+    );
     let compare = |format: &str| {
         let folders = [
             "compare",

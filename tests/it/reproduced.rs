@@ -9,23 +9,23 @@ use shearq_pipeline::Quiet;
 use shearq_pipeline::run::measurers;
 use shearq_pipeline::simulate::simulator;
 use shearq_results::score::OWN;
-use shearq_scoring::{Figures, Options, SetImages, SetScorer};
+use shearq_scoring::{Metrics, Options, SetImages, SetScorer};
 use shearq_simulate::kinds::shares;
 use shearq_simulate::set::SimulationSettings;
 use shearq_studies::bias::biases;
 use shearq_studies::calibration::{LOG_LAMBDA, PAPER_LAMBDA, calibrate};
 use shearq_studies::exhibits::{Finding, findings, lambda_findings};
 use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
-use shearq_submissions::{PsfForm, Registry, Submission};
+use shearq_submissions::{Configuration, PsfForm, Registry};
 
 /// A set of each kind.
 const KINDS: [u32; 10] = [2, 5, 8, 11, 14, 16, 18, 20, 22, 24];
 
-fn submissions(names: &[&str]) -> Vec<Submission> {
+fn submissions(names: &[&str]) -> Vec<Configuration> {
     let registry = Registry::embedded().unwrap();
     names
         .iter()
-        .map(|name| registry.get(name).unwrap().submission)
+        .map(|name| registry.get(name).unwrap().configuration)
         .collect()
 }
 
@@ -55,7 +55,7 @@ struct Follows {
 }
 
 /// Figures of 200 images of 100 × 100 galaxies that answer the set's own shear so, and scatter so.
-fn at_full_size(set: u32, follows: &Follows) -> Figures {
+fn at_full_size(set: u32, follows: &Follows) -> Metrics {
     let simulator = simulator(set, SimulationSettings::new(15, 100)).unwrap();
     let grid = simulator.grid();
     // Eight sums of 25 images each: their noise is white, and the mean is what counts.
@@ -81,7 +81,7 @@ fn at_full_size(set: u32, follows: &Follows) -> Figures {
         ..Options::default()
     };
     let scorer = SetScorer::new(grid, simulator.truth(), options).unwrap();
-    scorer.score(&images).unwrap().figures
+    scorer.score(&images).unwrap().metrics
 }
 
 /// Mean over the 24 sets of Q and M/2 at full size of each submission, from `grid`² galaxies of each kind for the
@@ -153,7 +153,7 @@ fn table_one_comes_out_at_full_size() {
 }
 
 /// `submissions` on `sets`, eight images of 256 galaxies each, so that differences of Q have errors.
-fn on_sets(submissions: Vec<Submission>, sets: &[u32]) -> (Vec<SetResult>, Vec<String>) {
+fn on_sets(submissions: Vec<Configuration>, sets: &[u32]) -> (Vec<SetResult>, Vec<String>) {
     let names = submissions.iter().map(|s| s.name.clone()).collect();
     let plan = Plan {
         version: "test".into(),
@@ -187,7 +187,7 @@ fn submissions_compare_as_the_paper_found() {
     // the star's stamp tells them apart.
     let (star, functional) = (place(&names, "23/den/star"), place(&names, "23/den/func"));
     for set in &results {
-        let q = |k: usize| set.results[k].score.figures.q;
+        let q = |k: usize| set.results[k].score.metrics.q;
         assert!((q(star) / q(functional) - 1.0).abs() < 1e-3, "{}", set.set);
     }
 }

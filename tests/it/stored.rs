@@ -197,13 +197,13 @@ fn figures_are_chosen_beside_what_names_a_row_and_unknown_ones_refused_before_an
     let recorded = Recorded::new();
     let store = recorded.at("store");
     let grouped = ["compare", "--store", text(&store), "--group-by", "set"];
-    let table = succeed(&[&grouped[..], &["--figures", "q,q", "--format", "csv"]].concat());
+    let table = succeed(&[&grouped[..], &["--metrics", "q,q", "--format", "csv"]].concat());
     let mut lines = table.lines();
     assert_eq!(lines.next(), Some("submission,run,set,sets,q,q_error"));
     assert_eq!(lines.count(), 4);
     let (raw, new) = (recorded.at("raw"), recorded.at("new"));
     let score = ["score", "--measured", text(&raw), "--store", text(&new)];
-    let message = fail(&[&score[..], &["--figures", "q,nope"]].concat());
+    let message = fail(&[&score[..], &["--metrics", "q,nope"]].concat());
     assert!(
         message.contains("no figure is called \"nope\""),
         "{message}"

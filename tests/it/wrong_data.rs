@@ -159,7 +159,7 @@ fn warnings(stamps: &Stamps, psf: &[f32], name: &str) -> Vec<String> {
     let measurer = Measurer::named(name, STAMP).unwrap();
     let psf = ArrayView2::from_shape((STAMP, STAMP), psf).unwrap();
     let given =
-        (measurer.submission().noise == shearq_submissions::NoiseSource::Header).then_some(1.0);
+        (measurer.configuration().noise == shearq_submissions::NoiseSource::Header).then_some(1.0);
     let batch = measurer.batch(stamps.view(), Psfs::Star(psf), given);
     let batch = match batch {
         Ok(batch) => batch,

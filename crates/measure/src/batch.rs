@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 use shearq_quantities::FunctionalPsf;
-use shearq_submissions::{Method, NoiseSource, Submission};
+use shearq_submissions::{Configuration, Method, NoiseSource};
 
 use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
@@ -61,12 +61,12 @@ impl Measurer {
         psf: ArrayView2<'_, P>,
         noise: Option<f64>,
     ) -> Result<Measurement, MeasureError> {
-        check(self.submission(), stamp.dim(), Some(psf.dim()), noise)?;
+        check(self.configuration(), stamp.dim(), Some(psf.dim()), noise)?;
         if noise.is_none() && self.noise_plan().is_some() {
             return Err(MeasureError::Noise("not given".into()));
         }
         let mut worker = self.worker();
-        worker.set_psf(star_psf(psf, self.submission().psf_cut())?.view())?;
+        worker.set_psf(star_psf(psf, self.configuration().psf_cut())?.view())?;
         let found = worker.measure(stamp, noise)?;
         if found.flags.contains(Flag::NotFinite) {
             let finite = |pixel: T| pixel.to_f32().is_finite();
@@ -103,18 +103,18 @@ impl Measurer {
             Psfs::Stars(stars) => Some((stars.dim().1, stars.dim().2)),
             Psfs::Functional(_) | Psfs::Prepared(_) => None,
         };
-        check(self.submission(), (rows, columns), star, noise)?;
+        check(self.configuration(), (rows, columns), star, noise)?;
         let mut worker = self.worker();
         if noise.is_none() {
             worker.set_survey(self.survey(stamps)?.as_ref());
         }
         let mut galaxies = [worker.measure_each(stamps, psfs, noise)?];
-        let response = calibrate(self.submission(), &mut galaxies);
+        let response = calibrate(self.configuration(), &mut galaxies);
         let mut examination = examine(stamps)?;
-        examination.add_psfs(psfs, self.submission().psf_cut(), EXAMINED_PSFS);
+        examination.add_psfs(psfs, self.configuration().psf_cut(), EXAMINED_PSFS);
         let mut warnings = examination.warnings();
         warnings.extend(noise.and_then(|noise| examination.given_noise(noise)));
-        warnings.extend(Warning::of_settings(self.submission()));
+        warnings.extend(Warning::of_settings(self.configuration()));
         warnings.extend(Warning::of_flags(&galaxies));
         if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {
             return Err(MeasureError::Data(warnings.swap_remove(fatal)));
@@ -165,7 +165,7 @@ impl Worker {
         psfs: Psfs<'_, P>,
         header_noise: Option<f64>,
     ) -> Result<Vec<Measurement>, MeasureError> {
-        let (cut, count) = (self.submission().psf_cut(), stamps.len_of(Axis(0)));
+        let (cut, count) = (self.configuration().psf_cut(), stamps.len_of(Axis(0)));
         let side = stamps.len_of(Axis(1));
         let given = match psfs {
             Psfs::Star(_) | Psfs::Prepared(_) => count,
@@ -243,12 +243,12 @@ pub fn strip<T>(
 
 /// Checks what a measurement of single stamps, or of star stamps, asks for beyond that they are large enough.
 fn check(
-    submission: &Submission,
+    configuration: &Configuration,
     stamp: (usize, usize),
     star: Option<(usize, usize)>,
     noise: Option<f64>,
 ) -> Result<(), MeasureError> {
-    let given = match (noise, submission.noise) {
+    let given = match (noise, configuration.noise) {
         (Some(sigma), _) => (!(sigma >= 0.0 && sigma.is_finite())).then(|| sigma.to_string()),
         (None, NoiseSource::Header) => Some("not given".to_owned()),
         (None, NoiseSource::Border { .. } | NoiseSource::Image { .. }) => None,
@@ -257,10 +257,10 @@ fn check(
         return Err(MeasureError::Noise(found));
     }
     // The linear method's window is fixed at the middle of the stamp, where the PSF has to leave the galaxy.
-    if matches!(submission.method, Method::Linear(_)) {
+    if matches!(configuration.method, Method::Linear(_)) {
         let sides = [
-            ("stamps", Some(stamp), submission.stamp.size),
-            ("a PSF stamp", star, submission.psf.size),
+            ("stamps", Some(stamp), configuration.stamp.size),
+            ("a PSF stamp", star, configuration.psf.size),
         ];
         for (what, found, size) in sides {
             if let Some((rows, columns)) = found
@@ -269,7 +269,7 @@ fn check(
                 let parity = if size % 2 == 0 { "an even" } else { "an odd" };
                 let expected = format!(
                     "{parity} number a side, as the {size} that submission {} cuts around the centre",
-                    submission.name
+                    configuration.name
                 );
                 return Err(MeasureError::square(what, (rows, columns), expected));
             }
@@ -396,8 +396,8 @@ mod tests {
         let star = moffat(0.0).stamp(32);
         let mut holed = whole.clone();
         holed.slice_mut(s![.., 19..22, 26..29]).fill(f32::NAN);
-        let measured = |submission: &str, stamps: &Array3<f32>| {
-            let measurer = Measurer::named(submission, 48).unwrap();
+        let measured = |configuration: &str, stamps: &Array3<f32>| {
+            let measurer = Measurer::named(configuration, 48).unwrap();
             let psf = Psfs::Star(star.view());
             measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
         };

@@ -1,7 +1,7 @@
 //! Calibration of ellipticities by their own mean response to shear.
 
 use shearq_quantities::statistics::RunningMean;
-use shearq_submissions::{Calibration, Submission};
+use shearq_submissions::{Calibration, Configuration};
 
 use crate::flag::Flag;
 use crate::measurement::Measurement;
@@ -17,11 +17,11 @@ const CLEAR: f64 = 3.0;
 /// mean over 10,000 has an error of 0.2 to 0.5 %, independent from image to image, so that the error
 /// of a set's mean ellipticity is far below a thousandth. Where a mean is not positive by three of its errors, as where
 /// there are no galaxies on the stamps, all are flagged. (One galaxy's has no error, and need be positive alone.)
-pub fn calibrate<P>(submission: &Submission, parts: &mut [P]) -> Option<[f64; 2]>
+pub fn calibrate<P>(configuration: &Configuration, parts: &mut [P]) -> Option<[f64; 2]>
 where
     P: AsRef<[Measurement]> + AsMut<[Measurement]>,
 {
-    if submission.calibration() == Calibration::None {
+    if configuration.calibration() == Calibration::None {
         return None;
     }
     let good = || {
@@ -79,7 +79,7 @@ mod tests {
     #[test]
     fn ellipticities_are_divided_by_the_mean_of_good_galaxies() {
         let registry = Registry::embedded().unwrap();
-        let of = |name| registry.get(name).unwrap().submission;
+        let of = |name| registry.get(name).unwrap().configuration;
         let (plain, calibrated) = (of("paper"), of("48/linear/star"));
         let mut rows = vec![row(&[0.4, 0.8, f64::NAN]), row(&[0.3])];
         assert_eq!(calibrate(&plain, &mut rows), None);

@@ -1,7 +1,7 @@
 //! What can be wrong with a request.
 
 use shearq_quantities::ProfileError;
-use shearq_submissions::SubmissionError;
+use shearq_submissions::ConfigurationError;
 use thiserror::Error;
 
 use crate::warning::Warning;
@@ -60,7 +60,7 @@ pub enum MeasureError {
     Data(Warning),
     /// A submission that does not exist or is not valid.
     #[error(transparent)]
-    Submission(#[from] SubmissionError),
+    Configuration(#[from] ConfigurationError),
 }
 
 impl MeasureError {

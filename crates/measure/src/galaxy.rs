@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ndarray::ArrayView2;
 use shearq_quantities::{Distortion, Shear};
-use shearq_submissions::{EllipticityType, Method, NoiseSource, Registry, Submission};
+use shearq_submissions::{Configuration, EllipticityType, Method, NoiseSource, Registry};
 
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::MeasureError;
@@ -24,7 +24,7 @@ pub struct Measurer {
 }
 
 struct Plan {
-    submission: Submission,
+    configuration: Configuration,
     full: usize,
     n: usize,
     denoise: Option<WaveletWiener>,
@@ -54,27 +54,27 @@ impl Measurer {
     ///
     /// # Errors
     /// Where the stamps are smaller than the submission needs, or a size is out of range.
-    pub fn new(submission: &Submission, full: usize) -> Result<Self, MeasureError> {
-        let n = submission.stamp.size;
+    pub fn new(configuration: &Configuration, full: usize) -> Result<Self, MeasureError> {
+        let n = configuration.stamp.size;
         if full < n {
             let expected = format!(
                 "at least {n} × {n}, as submission {} needs",
-                submission.name
+                configuration.name
             );
             return Err(MeasureError::square("stamps", (full, full), expected));
         }
         let plan = Plan {
             full,
             n,
-            denoise: submission
+            denoise: configuration
                 .wavelet()
                 .map(|settings| WaveletWiener::new(full, settings)),
-            method: MethodPlan::new(submission, n)?,
-            noise: match submission.noise {
+            method: MethodPlan::new(configuration, n)?,
+            noise: match configuration.noise {
                 NoiseSource::Image { correlation } => Some(NoisePlan::new(full, correlation)?),
                 NoiseSource::Header | NoiseSource::Border { .. } => None,
             },
-            submission: submission.clone(),
+            configuration: configuration.clone(),
         };
         Ok(Measurer {
             plan: Arc::new(plan),
@@ -85,13 +85,16 @@ impl Measurer {
     ///
     /// # Errors
     /// Where there is no such submission, it is not valid, or as [`Measurer::new`].
-    pub fn named(submission: &str, full: usize) -> Result<Self, MeasureError> {
-        Measurer::new(&Registry::embedded()?.get(submission)?.submission, full)
+    pub fn named(configuration: &str, full: usize) -> Result<Self, MeasureError> {
+        Measurer::new(
+            &Registry::embedded()?.get(configuration)?.configuration,
+            full,
+        )
     }
 
     /// The submission.
-    pub fn submission(&self) -> &Submission {
-        &self.plan.submission
+    pub fn configuration(&self) -> &Configuration {
+        &self.plan.configuration
     }
 
     /// How the noise of an image is measured on its stamps, where the submission asks for that.
@@ -129,8 +132,8 @@ impl Measurer {
 
 impl Worker {
     /// The submission.
-    pub fn submission(&self) -> &Submission {
-        &self.plan.submission
+    pub fn configuration(&self) -> &Configuration {
+        &self.plan.configuration
     }
 
     /// Takes what [`NoiseSurvey`](crate::NoiseSurvey) found on the image of the galaxies that follow: level and
@@ -152,7 +155,7 @@ impl Worker {
     }
 
     /// Takes the PSF of the galaxies that follow, centred, of sum one, and as large as [`star_psf`](crate::star_psf) cuts it
-    /// with [`Submission::psf_cut`](shearq_submissions::Submission::psf_cut). One that is refused flags them.
+    /// with [`Configuration::psf_cut`](shearq_submissions::Submission::psf_cut). One that is refused flags them.
     ///
     /// # Errors
     /// Where its sizes are others, or a pixel is not finite.
@@ -192,7 +195,7 @@ impl Worker {
         }
         // Without an end before the last one, which would keep it from looking at several at a time.
         let whole = self.full.iter().fold(true, |all, v| all & v.is_finite());
-        if !whole && !matches!(plan.submission.method, Method::Linear(_)) {
+        if !whole && !matches!(plan.configuration.method, Method::Linear(_)) {
             return Ok(Measurement::flagged(Flag::NotFinite));
         }
         if !self.usable_psf {
@@ -201,7 +204,7 @@ impl Worker {
         if self.full.iter().all(|v| *v == self.full[0]) {
             return Ok(Measurement::flagged(Flag::NoScale));
         }
-        let noise = match plan.submission.noise {
+        let noise = match plan.configuration.noise {
             NoiseSource::Header | NoiseSource::Image { .. } => match &self.survey {
                 Some(survey) => survey.noise.sigma(),
                 None => header_noise.unwrap_or(f64::NAN),
@@ -241,7 +244,7 @@ impl Worker {
             size: found.size,
             ..Measurement::flagged(Flag::NoShear)
         };
-        Ok(match report(plan.submission.ellipticity(), &found) {
+        Ok(match report(plan.configuration.ellipticity(), &found) {
             Err(flag) => Measurement {
                 flags: flag.into(),
                 ..nothing

@@ -9,7 +9,7 @@ mod window;
 
 use std::sync::Arc;
 
-use shearq_submissions::{Method, Submission};
+use shearq_submissions::{Configuration, Method};
 
 use self::family::LinearFamily;
 pub(crate) use self::found::{CutWorker, Found, Images, ResponseMatrix};
@@ -25,13 +25,15 @@ pub(crate) enum MethodPlan {
 }
 
 impl MethodPlan {
-    pub(crate) fn new(submission: &Submission, n: usize) -> Result<Self, MeasureError> {
-        Ok(match &submission.method {
-            Method::Network(network) => {
-                MethodPlan::Network(Arc::new(NetworkPlan::new(network, n, submission.psf.size)?))
-            }
+    pub(crate) fn new(configuration: &Configuration, n: usize) -> Result<Self, MeasureError> {
+        Ok(match &configuration.method {
+            Method::Network(network) => MethodPlan::Network(Arc::new(NetworkPlan::new(
+                network,
+                n,
+                configuration.psf.size,
+            )?)),
             Method::Linear(linear) => {
-                let family = LinearFamily::new(linear, n, submission.psf_cut())?;
+                let family = LinearFamily::new(linear, n, configuration.psf_cut())?;
                 MethodPlan::Linear(Arc::new(family))
             }
         })

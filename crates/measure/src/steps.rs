@@ -38,7 +38,7 @@ impl Worker {
         psf: ArrayView2<'_, f64>,
         measurement: &Measurement,
     ) -> Result<Steps, MeasureError> {
-        let n = self.submission().stamp.size;
+        let n = self.configuration().stamp.size;
         let (Some(y0), Some(x0)) = (cut_start(stamp.nrows(), n), cut_start(stamp.ncols(), n))
         else {
             let expected = format!("at least {n} × {n}");

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use shearq_submissions::Submission;
+use shearq_submissions::Configuration;
 
 use crate::flag::Flag;
 use crate::measurement::Measurement;
@@ -191,9 +191,9 @@ const LEAST_PSF_SIZE: usize = 32;
 
 impl Warning {
     /// A warning if the configuration uses too little of the PSF.
-    pub fn of_settings(submission: &Submission) -> Option<Warning> {
-        let size = submission.psf.size;
-        let cut = submission.linear().is_some() && size < LEAST_PSF_SIZE;
+    pub fn of_settings(configuration: &Configuration) -> Option<Warning> {
+        let size = configuration.psf.size;
+        let cut = configuration.linear().is_some() && size < LEAST_PSF_SIZE;
         cut.then_some(Warning::PsfSize { size })
     }
 

@@ -50,7 +50,7 @@ impl<'a> Inputs<'a> {
 
     /// The files of an image, by their keys.
     fn files(&self, id: ImageId) -> BTreeMap<&'static str, PathBuf> {
-        let psf = match self.run.submission.psf.form {
+        let psf = match self.run.configuration.psf.form {
             PsfForm::Star => self.data.psf_star(id.set, id.image),
             PsfForm::Functional => self.data.psf_functional(id.set, id.image),
         };

@@ -12,7 +12,7 @@ use shearq_measure::{
     NoisePlan, Psfs, Star, Survey, Warning, Worker, calibrate, examined_rows, star, star_psf,
     strip,
 };
-use shearq_submissions::{EllipticityType, NoiseSource, PsfCut, PsfForm, Submission};
+use shearq_submissions::{Configuration, EllipticityType, NoiseSource, PsfCut, PsfForm};
 
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
@@ -132,31 +132,31 @@ impl ImageSource {
     pub fn open(
         data: &DataFolder,
         id: ImageId,
-        submission: &Submission,
+        configuration: &Configuration,
     ) -> Result<Self, PipelineError> {
         let (image, mosaic) = open_galaxies(data, id)?;
         let stamp = mosaic.stamp;
-        if stamp < submission.stamp.size {
+        if stamp < configuration.stamp.size {
             let path = data.galaxies(id.set, id.image);
-            return Err(FileError::new(path, too_small(stamp, submission)).into());
+            return Err(FileError::new(path, too_small(stamp, configuration)).into());
         }
         let header_noise = image.number("NOISESIG")?;
-        if submission.noise == NoiseSource::Header
+        if configuration.noise == NoiseSource::Header
             && !header_noise.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite())
         {
             let found = header_noise.map_or("absent".into(), |sigma| sigma.to_string());
-            let other = match submission.linear() {
+            let other = match configuration.linear() {
                 Some(_) => "image",
                 None => "border",
             };
             let message = format!(
                 "the header key NOISESIG is {found}; expected a positive number, as submission {} takes the noise from it (noise.source = \"{other}\" would measure it)",
-                submission.name
+                configuration.name
             );
             return Err(FileError::new(data.galaxies(id.set, id.image), message).into());
         }
-        let (psf, moved) = open_psf(data, id, submission, &mosaic)?;
-        let mut warnings: Vec<Warning> = Warning::of_settings(submission).into_iter().collect();
+        let (psf, moved) = open_psf(data, id, configuration, &mosaic)?;
+        let mut warnings: Vec<Warning> = Warning::of_settings(configuration).into_iter().collect();
         warnings.extend(moved.map(Warning::of_moved));
         Ok(ImageSource {
             psf,
@@ -255,18 +255,18 @@ impl ImageSource {
 }
 
 /// Why stamps of `stamp` pixels a side cannot be measured, with the lines of a configuration that measures them.
-fn too_small(stamp: usize, submission: &Submission) -> String {
-    let Submission { name, .. } = submission;
-    let needed = submission.stamp.size;
+fn too_small(stamp: usize, configuration: &Configuration) -> String {
+    let Configuration { name, .. } = configuration;
+    let needed = configuration.stamp.size;
     let mut lines = format!("  extends = \"{name}\"\n  stamp.size = {stamp}");
-    if let Some(linear) = submission.linear() {
+    if let Some(linear) = configuration.linear() {
         // The linear method asks for a window of at most a quarter of the stamp, and for a PSF that is even or odd as it.
         let window = stamp as f64 / 4.0;
         if linear.deconvolution.window_sigma > window {
             lines += &format!("\n  deconvolution.window_sigma = {window}");
         }
-        if submission.psf.size % 2 != stamp % 2 {
-            lines += &format!("\n  psf.size = {}", submission.psf.size - 1);
+        if configuration.psf.size % 2 != stamp % 2 {
+            lines += &format!("\n  psf.size = {}", configuration.psf.size - 1);
         }
     }
     format!(
@@ -302,12 +302,12 @@ pub(super) fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), File
 fn open_psf(
     data: &DataFolder,
     id: ImageId,
-    submission: &Submission,
+    configuration: &Configuration,
     mosaic: &Mosaic,
 ) -> Result<(PsfSource, Option<[f64; 2]>), PipelineError> {
-    let cut = submission.psf_cut();
+    let cut = configuration.psf_cut();
     let PsfCut { size, least } = cut;
-    match submission.psf.form {
+    match configuration.psf.form {
         PsfForm::Functional => {
             let path = data.psf_functional(id.set, id.image);
             let rows = psf_table::read(&path, mosaic)?;
@@ -417,7 +417,7 @@ pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, P
         mosaic: row.mosaic,
         galaxies: galaxies?,
         warnings: row.warnings.clone(),
-        examination: examine(row, stamps, worker.submission().psf_cut())?,
+        examination: examine(row, stamps, worker.configuration().psf_cut())?,
     })
 }
 
@@ -540,10 +540,10 @@ pub fn measure_folder(
         return Ok(summary);
     };
     // All images of a folder have stamps of one size; each is checked when it is opened.
-    let stamp = ImageSource::open(data, first, &run.submission)?
+    let stamp = ImageSource::open(data, first, &run.configuration)?
         .mosaic
         .stamp;
-    let measurer = Measurer::new(&run.submission, stamp)?;
+    let measurer = Measurer::new(&run.configuration, stamp)?;
     let first = first_noise(data, first, &measurer)?;
     let mut warned = Warned::default();
     let mut rows = Vec::new();
@@ -566,7 +566,7 @@ pub fn measure_folder(
             let (id, mosaic) = (row.id, row.mosaic);
             rows.push(row);
             if rows.len() == mosaic.rows() {
-                calibrate(&run.submission, &mut rows);
+                calibrate(&run.configuration, &mut rows);
                 warned.add(id, warnings(&rows), progress)?;
                 let prints = receive.recv().unwrap_or_default();
                 // Writing would make the folder again, without the earlier catalogues.
@@ -592,9 +592,9 @@ fn first_noise(
     first: ImageId,
     measurer: &Measurer,
 ) -> Result<(Option<Arc<Survey>>, Vec<Warning>), PipelineError> {
-    let submission = measurer.submission();
+    let configuration = measurer.configuration();
     let nothing = (None, Vec::new());
-    if submission.linear().is_none() {
+    if configuration.linear().is_none() {
         return Ok(nothing);
     }
     let own;
@@ -609,7 +609,7 @@ fn first_noise(
             Err(_) => return Ok(nothing),
         },
     };
-    let mut source = ImageSource::open(data, first, submission)?;
+    let mut source = ImageSource::open(data, first, configuration)?;
     let asked = measurer.noise_plan().is_some();
     let given = source.header_noise;
     let survey = match source.look(data, plan) {
@@ -618,7 +618,8 @@ fn first_noise(
         Ok(None) if asked => return Ok((None, vec![Warning::NoNoise])),
         Ok(None) | Err(_) => return Ok(nothing),
     };
-    let white = !matches!(submission.noise, NoiseSource::Image { correlation } if correlation > 0);
+    let white =
+        !matches!(configuration.noise, NoiseSource::Image { correlation } if correlation > 0);
     // A survey that takes noise as white does not look for more.
     let coloured = if white && asked {
         source.look(data, &NoisePlan::new(measurer.full(), CORRELATION)?)?
@@ -663,7 +664,7 @@ pub fn galaxies_to_do(
     let Some(&first) = todo.first() else {
         return Ok(0);
     };
-    let mosaic = ImageSource::open(data, first, &run.submission)?.mosaic;
+    let mosaic = ImageSource::open(data, first, &run.configuration)?.mosaic;
     Ok((todo.len() * mosaic.galaxies) as u64)
 }
 
@@ -694,7 +695,7 @@ fn read_images(
     let mut first = Some(first);
     for &id in todo {
         opened(id)?;
-        let mut source = ImageSource::open(data, id, measurer.submission())?;
+        let mut source = ImageSource::open(data, id, measurer.configuration())?;
         let stamp = measurer.full();
         let found = source.mosaic.stamp;
         if found != stamp {
@@ -805,18 +806,18 @@ pub(super) fn metadata(
     id: ImageId,
     prints: BTreeMap<String, String>,
 ) -> Result<BTreeMap<String, String>, PipelineError> {
-    let ellipticity = match run.submission.ellipticity() {
+    let ellipticity = match run.configuration.ellipticity() {
         EllipticityType::Distortion => "distortion",
         EllipticityType::Shear => "shear",
     };
-    let settings = toml::to_string(&run.submission).map_err(|error| {
+    let settings = toml::to_string(&run.configuration).map_err(|error| {
         PipelineError::Request(format!("the settings cannot be stored: {error}"))
     })?;
     let mut all = prints;
     all.extend(
         [
             ("creator", format!("shearq {}", run.version)),
-            ("submiss", run.submission.name.clone()),
+            ("submiss", run.configuration.name.clone()),
             ("elltype", ellipticity.to_owned()),
             ("set", id.set.to_string()),
             ("image", id.image.to_string()),

@@ -9,7 +9,7 @@ use shearq_measure::{
     Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Warning, Worker, calibrate, star_psf, strip,
 };
 use shearq_quantities::Shear;
-use shearq_submissions::{PsfForm, Submission};
+use shearq_submissions::{Configuration, PsfForm};
 
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
@@ -67,10 +67,10 @@ struct Scratch {
 ///
 /// # Errors
 /// Where a submission's sizes cannot be worked with.
-pub fn measurers(submissions: &[Submission]) -> Result<Vec<Measurer>, PipelineError> {
+pub fn measurers(submissions: &[Configuration]) -> Result<Vec<Measurer>, PipelineError> {
     submissions
         .iter()
-        .map(|submission| Ok(Measurer::new(submission, STAMP)?))
+        .map(|configuration| Ok(Measurer::new(configuration, STAMP)?))
         .collect()
 }
 
@@ -90,7 +90,7 @@ pub fn run_folder(
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
     let claim = claim(&out.join(RUN_FILE), run)?;
-    let measurers = measurers(std::slice::from_ref(&run.submission))?;
+    let measurers = measurers(std::slice::from_ref(&run.configuration))?;
     let truth = DataFolder::new(out);
     let (todo, done) = to_do(run, out, images);
     let mut summary = Summary {
@@ -165,7 +165,7 @@ pub fn run_set(
             }
             if iy + 1 == n {
                 for (rows, measurer) in rows.iter_mut().zip(measurers) {
-                    calibrate(measurer.submission(), rows);
+                    calibrate(measurer.configuration(), rows);
                 }
                 done(&SimulatedImage {
                     image,
@@ -280,7 +280,7 @@ pub fn simulated_steps(
     set.draw(&fields, ix, iy, &mut RenderScratch::new(), &mut pixels);
     let stamps = strip(&pixels, 1, STAMP)?;
     let stamp = stamps.index_axis(Axis(0), 0);
-    let cut = measurer.submission().psf_cut();
+    let cut = measurer.configuration().psf_cut();
     let psf = fields.psf.at(ix, iy).stamp_beside(cut.size, STAMP);
     let mut worker = measurer.worker();
     worker.set_psf(psf.view())?;
@@ -321,9 +321,9 @@ pub fn measure_strip(
     let mut measured = Vec::with_capacity(workers.len());
     for (k, worker) in workers.iter_mut().enumerate() {
         row.survey = surveys.get(k).cloned().flatten();
-        row.psf = row_psf(set, fields, iy, worker.submission());
+        row.psf = row_psf(set, fields, iy, worker.configuration());
         row.warnings = match iy {
-            0 => Warning::of_settings(worker.submission())
+            0 => Warning::of_settings(worker.configuration())
                 .into_iter()
                 .collect(),
             _ => Vec::new(),
@@ -334,10 +334,15 @@ pub fn measure_strip(
 }
 
 /// The PSFs of a row in the form that a submission uses.
-fn row_psf(set: &SetSimulator, fields: &ImageFields, iy: usize, submission: &Submission) -> RowPsf {
+fn row_psf(
+    set: &SetSimulator,
+    fields: &ImageFields,
+    iy: usize,
+    configuration: &Configuration,
+) -> RowPsf {
     let n = set.grid().n;
-    let (size, cut) = (submission.psf.size, submission.psf_cut());
-    match (&fields.psf, submission.psf.form) {
+    let (size, cut) = (configuration.psf.size, configuration.psf_cut());
+    match (&fields.psf, configuration.psf.form) {
         (PsfField::One(psf), PsfForm::Functional) => {
             RowPsf::Shared(Arc::new(psf.stamp_beside(cut.size, STAMP)))
         }

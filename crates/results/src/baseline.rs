@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shearq_submissions::{Submission, checked_name};
+use shearq_submissions::{Configuration, checked_name};
 
 use shearq_files::{FileError, atomic};
 use shearq_pipeline::data::run::Source;
@@ -12,7 +12,7 @@ use shearq_pipeline::data::run::Source;
 mod measured;
 mod moved;
 
-pub use measured::{Wanted, figures_of, measure};
+pub use measured::{Wanted, measure, metrics_of};
 pub use moved::{Checked, Settings, Shift, check};
 
 /// A baseline.
@@ -30,13 +30,13 @@ pub struct Baseline {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub history: Vec<Change>,
     /// What was measured.
-    pub submissions: Vec<BaselineSubmission>,
+    pub submissions: Vec<BaselineConfiguration>,
 }
 
 /// One submission of a baseline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct BaselineSubmission {
+pub struct BaselineConfiguration {
     /// Its name.
     #[serde(deserialize_with = "checked_name")]
     pub name: String,
@@ -50,20 +50,20 @@ pub struct BaselineSubmission {
     pub sets: Vec<BaselineSet>,
 }
 
-impl BaselineSubmission {
+impl BaselineConfiguration {
     /// A measured submission, of the configuration `file` if it is known.
     ///
     /// # Errors
     /// Where its settings cannot be stored.
     pub fn new(
-        submission: &Submission,
+        configuration: &Configuration,
         file: Option<PathBuf>,
         sets: Vec<BaselineSet>,
     ) -> Result<Self, toml::ser::Error> {
-        Ok(BaselineSubmission {
-            name: submission.name.clone(),
+        Ok(BaselineConfiguration {
+            name: configuration.name.clone(),
             file,
-            settings: toml::Table::try_from(submission)?,
+            settings: toml::Table::try_from(configuration)?,
             sets,
         })
     }
@@ -83,9 +83,9 @@ pub struct BaselineSet {
     pub galaxies: u64,
     /// Of these, without an ellipticity.
     pub flagged: u64,
-    /// Value and standard error of each figure, and of the scatter (rms) of either component of the
+    /// Value and standard error of each metric, and of the scatter (rms) of either component of the
     /// ellipticity. An unknown error is NaN.
-    pub figures: BTreeMap<String, [f64; 2]>,
+    pub metrics: BTreeMap<String, [f64; 2]>,
 }
 
 /// A change of a baseline.
@@ -102,7 +102,11 @@ pub struct Change {
 
 impl Baseline {
     /// Of what this version measured.
-    pub fn new(source: Source, history: Vec<Change>, submissions: Vec<BaselineSubmission>) -> Self {
+    pub fn new(
+        source: Source,
+        history: Vec<Change>,
+        submissions: Vec<BaselineConfiguration>,
+    ) -> Self {
         Baseline {
             version: shearq_pipeline::VERSION.into(),
             sets_held: Some(sets_of(&submissions).count()),
@@ -145,12 +149,12 @@ impl Baseline {
         let baseline: Baseline = toml::from_str(&text)
             .map_err(|error| FileError::new(path, error.to_string().trim_end()))?;
         let wild = |set: &&BaselineSet| {
-            let mut figures = set.figures.values();
-            figures.any(|[value, error]| value.is_infinite() || error.is_infinite() || *error < 0.0)
+            let mut metrics = set.metrics.values();
+            metrics.any(|[value, error]| value.is_infinite() || error.is_infinite() || *error < 0.0)
         };
         if let Some(set) = sets_of(&baseline.submissions).find(wild) {
             let message = format!(
-                "set {} has an infinite figure, or an error that is infinite or negative",
+                "set {} has an infinite metric, or an error that is infinite or negative",
                 set.set
             );
             return Err(FileError::new(path, message));
@@ -215,8 +219,10 @@ impl Baseline {
     }
 }
 
-fn sets_of(submissions: &[BaselineSubmission]) -> impl Iterator<Item = &BaselineSet> {
-    submissions.iter().flat_map(|submission| &submission.sets)
+fn sets_of(submissions: &[BaselineConfiguration]) -> impl Iterator<Item = &BaselineSet> {
+    submissions
+        .iter()
+        .flat_map(|configuration| &configuration.sets)
 }
 
 /// Ending of file names.

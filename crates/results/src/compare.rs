@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::resample::{PairedDifference, PairedSet, mean_over_sets, paired_difference};
-use shearq_scoring::{Choice, Definition, Figures, Grid, Options};
+use shearq_scoring::{Choice, Definition, Grid, Metrics, Options};
 use shearq_submissions::{Published, Registry};
 
 use super::conditions::Conditions;
@@ -23,7 +23,7 @@ use shearq_pipeline::{PipelineError, inputs};
 pub struct Variant {
     /// Name of the submission.
     pub name: String,
-    /// Published figures.
+    /// Published metrics.
     pub published: Option<Published>,
     /// Its sets, those that all variants have, in order.
     pub sets: Vec<ScoredSet>,
@@ -193,7 +193,7 @@ pub fn score_all(
                 None => way.own,
             };
             let run = RunRecord {
-                submission: entrant.name.clone(),
+                configuration: entrant.name.clone(),
                 version: shearq_pipeline::VERSION.into(),
                 settings: entrant.settings.clone(),
                 source: data.root().display().to_string(),
@@ -248,16 +248,16 @@ fn own_entrants(
             inputs::verify(data, folder, &run, &[], threads)?;
         }
         entrants.push(Entrant {
-            // Published figures belong to the embedded settings, not to a file of the same name.
+            // Published metrics belong to the embedded settings, not to a file of the same name.
             published: registry
-                .get(&run.submission.name)
+                .get(&run.configuration.name)
                 .ok()
-                .filter(|entry| entry.submission == run.submission)
+                .filter(|entry| entry.configuration == run.configuration)
                 .and_then(|entry| entry.published),
-            name: run.submission.name.clone(),
+            name: run.configuration.name.clone(),
             files: run.catalogues(folder, &[])?,
             foreign: None,
-            settings: toml::to_string(&run.submission).map_err(FileError::doing(
+            settings: toml::to_string(&run.configuration).map_err(FileError::doing(
                 folder,
                 "cannot write the settings as TOML",
             ))?,
@@ -274,19 +274,19 @@ pub fn common_sets(all: &[Vec<SetRecord>]) -> BTreeSet<u32> {
         .unwrap_or_default()
 }
 
-/// Mean over sets of the figure called `name`, and its error.
-pub fn mean_figure<R: Borrow<SetRecord>>(sets: &[R], name: &str) -> (f64, f64) {
+/// Mean over sets of the metric called `name`, and its error.
+pub fn mean_metric<R: Borrow<SetRecord>>(sets: &[R], name: &str) -> (f64, f64) {
     let value =
-        |figures: &Figures| Figures::place(name).map_or(f64::NAN, |place| figures.values()[place]);
+        |metrics: &Metrics| Metrics::place(name).map_or(f64::NAN, |place| metrics.values()[place]);
     let pairs: Vec<(f64, f64)> = sets
         .iter()
         .map(Borrow::borrow)
-        .map(|set| (value(&set.figures), value(&set.errors)))
+        .map(|set| (value(&set.metrics), value(&set.errors)))
         .collect();
     mean_over_sets(&pairs)
 }
 
-/// A figure that is kept for every group of images left out, so that differences in it can be paired.
+/// A metric that is kept for every group of images left out, so that differences in it can be paired.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Paired {
     /// Q.
@@ -299,16 +299,16 @@ impl Paired {
     /// Its value of a set, and those with each group left out.
     fn of(self, set: &SetRecord) -> (f64, &[f64]) {
         match self {
-            Paired::Q => (set.figures.q, &set.q_replicates),
-            Paired::Calibrated => (set.figures.q_calibrated, &set.q_calibrated_replicates),
+            Paired::Q => (set.metrics.q, &set.q_replicates),
+            Paired::Calibrated => (set.metrics.q_calibrated, &set.q_calibrated_replicates),
         }
     }
 }
 
-/// Paired difference in a figure of `second` from `first`; `None` where they are not of the same sets, data
+/// Paired difference in a metric of `second` from `first`; `None` where they are not of the same sets, data
 /// and images, or where noise may have chosen the convention of either.
 pub fn difference<R: Borrow<SetRecord>>(
-    figure: Paired,
+    metric: Paired,
     first: &[R],
     second: &[R],
 ) -> Option<PairedDifference> {
@@ -326,7 +326,7 @@ pub fn difference<R: Borrow<SetRecord>>(
     let pairs: Vec<PairedSet<'_>> = pairs()
         .map(|(a, b)| {
             let ((first, first_replicates), (second, second_replicates)) =
-                (figure.of(a), figure.of(b));
+                (metric.of(a), metric.of(b));
             PairedSet {
                 images: a.images.len(),
                 first,

@@ -5,9 +5,9 @@ use std::str::FromStr;
 
 use shearq_files::frames::TableError;
 use shearq_files::frames::polars::AnyValue;
-use shearq_scoring::Figures;
+use shearq_scoring::Metrics;
 
-use super::compare::mean_figure;
+use super::compare::mean_metric;
 use super::row::{RunRecord, SetRecord, table_of};
 
 /// Digits of a run's id in tables, as many as tell runs of a store apart.
@@ -48,7 +48,7 @@ pub struct Order {
     descending: bool,
 }
 
-/// Fields beside the figures that runs can be sorted by.
+/// Fields beside the metrics that runs can be sorted by.
 const SORTED: [&str; 5] = ["submission", "run", "version", "group", "images"];
 
 impl FromStr for Order {
@@ -62,11 +62,11 @@ impl FromStr for Order {
                 return Err(format!("`{other}` is no order; expected `asc` or `desc`"));
             }
         };
-        if !SORTED.contains(&field) && Figures::place(field).is_none() {
+        if !SORTED.contains(&field) && Metrics::place(field).is_none() {
             return Err(format!(
                 "a table cannot be sorted by `{field}`; expected one of {}, {}",
                 SORTED.join(", "),
-                Figures::ALL.map(|figure| figure.name).join(", ")
+                Metrics::ALL.map(|metric| metric.name).join(", ")
             ));
         }
         Ok(Order {
@@ -151,12 +151,12 @@ impl<'a> Group<'a> {
     /// The value sorted by.
     fn key(&self, field: &str) -> AnyValue<'_> {
         match field {
-            "submission" => AnyValue::String(&self.run.submission),
+            "submission" => AnyValue::String(&self.run.configuration),
             "run" => AnyValue::String(&self.id),
             "version" => AnyValue::String(&self.run.version),
             "group" => self.value.clone().unwrap_or(AnyValue::Null),
             "images" => AnyValue::UInt64(self.images() as u64),
-            figure => AnyValue::Float64(mean_figure(&self.sets, figure).0),
+            metric => AnyValue::Float64(mean_metric(&self.sets, metric).0),
         }
     }
 
@@ -167,7 +167,7 @@ impl<'a> Group<'a> {
 
     /// Submission and run.
     pub fn name(&self) -> String {
-        format!("{} {}", self.run.submission, self.id)
+        format!("{} {}", self.run.configuration, self.id)
     }
 }
 

@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use shearq_files::frames::TableError;
 use shearq_files::frames::polars::{Column, DataFrame};
-use shearq_scoring::{Choice, Definition, Figure, Figures, Noise, Options};
+use shearq_scoring::{Choice, Definition, Metric, Metrics, Noise, Options};
 use shearq_submissions::check_name;
 
 use super::score::ScoredSet;
@@ -33,10 +33,10 @@ pub struct SetRecord {
     pub galaxies: u64,
     /// Of these, without an ellipticity.
     pub flagged: u64,
-    /// Figures of the chosen convention.
-    pub figures: Figures,
+    /// Metrics of the chosen convention.
+    pub metrics: Metrics,
     /// Their standard errors; not a number where unknown.
-    pub errors: Figures,
+    pub errors: Metrics,
     /// Q with each group of images left out in turn, for paired differences.
     pub q_replicates: Vec<f64>,
     /// Calibrated Q likewise; empty in records of versions that did not keep it.
@@ -82,7 +82,7 @@ impl SetRecord {
             images: images.clone(),
             galaxies: (rows.used + rows.not_finite) as u64,
             flagged: rows.not_finite as u64,
-            figures: score.figures,
+            metrics: score.metrics,
             errors: score.errors,
             q_replicates: score.replicates.iter().map(|r| r.q).collect(),
             q_calibrated_replicates: score.replicates.iter().map(|r| r.q_calibrated).collect(),
@@ -98,7 +98,7 @@ impl SetRecord {
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunRecord {
     /// Name of the submission, or of another program's catalogues.
-    pub submission: String,
+    pub configuration: String,
     /// Version of shearq.
     pub version: String,
     /// All settings, as TOML.
@@ -150,10 +150,10 @@ impl<'a> Measured<'a> {
     /// # Errors
     /// Where the settings cannot be written as TOML.
     pub fn run(run: &'a Run, data: &'a DataFolder, folder: &Path) -> Result<Self, FileError> {
-        let settings = toml::to_string(&run.submission)
+        let settings = toml::to_string(&run.configuration)
             .map_err(FileError::doing(folder, "cannot store the settings"))?;
         Ok(Measured {
-            name: &run.submission.name,
+            name: &run.configuration.name,
             settings,
             source: &run.source,
             data,
@@ -187,7 +187,7 @@ impl RunRecord {
             })
             .collect::<Result<_, FileError>>()?;
         Ok(RunRecord {
-            submission: name.to_owned(),
+            configuration: name.to_owned(),
             version: shearq_pipeline::VERSION.into(),
             settings,
             source: match source {
@@ -209,7 +209,7 @@ impl RunRecord {
     /// which sets and images. Parts of one run, from several processes, have it in common.
     pub fn id(&self) -> String {
         let RunRecord {
-            submission,
+            configuration,
             version,
             settings,
             source,
@@ -220,7 +220,13 @@ impl RunRecord {
         } = self;
         let mut print = Fingerprint::default();
         for part in [
-            submission, version, settings, source, definition, choice, noise,
+            configuration,
+            version,
+            settings,
+            source,
+            definition,
+            choice,
+            noise,
         ] {
             print.add(part);
         }
@@ -234,10 +240,10 @@ impl RunRecord {
     pub fn from_table(table: &DataFrame, path: &Path) -> Result<Self, FileError> {
         let rows = Rows { path, table };
         let text = |name| rows.text(name, 0).map(str::to_owned);
-        let submission = text("submission")?;
-        check_name(&submission).map_err(|error| FileError::new(path, error.to_string()))?;
+        let configuration = text("submission")?;
+        check_name(&configuration).map_err(|error| FileError::new(path, error.to_string()))?;
         let run = RunRecord {
-            submission,
+            configuration,
             version: text("version")?,
             settings: text("settings")?,
             source: text("source")?,
@@ -300,7 +306,7 @@ pub fn table_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
     let run_ids: Vec<&str> = rows.iter().map(|row| row.1).collect();
     let mut columns = vec![
         Column::new("run".into(), run_ids),
-        of_run("submission", &|run| &run.submission),
+        of_run("submission", &|run| &run.configuration),
         of_run("version", &|run| &run.version),
         of_run("settings", &|run| &run.settings),
         of_run("source", &|run| &run.source),
@@ -320,8 +326,8 @@ pub fn table_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
         count("galaxies", &|set| set.galaxies),
         count("flagged", &|set| set.flagged),
     ];
-    for (k, Figure { name, .. }) in Figures::ALL.iter().enumerate() {
-        columns.push(real(name, &|set| set.figures.values()[k]));
+    for (k, Metric { name, .. }) in Metrics::ALL.iter().enumerate() {
+        columns.push(real(name, &|set| set.metrics.values()[k]));
         columns.push(real(&error_of(name), &|set| set.errors.values()[k]));
     }
     columns.extend([
@@ -339,9 +345,9 @@ pub fn table_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
     shearq_files::frames::frame(columns)
 }
 
-/// Name of the column with a figure's standard errors.
-fn error_of(figure: &str) -> String {
-    format!("{figure}_error")
+/// Name of the column with a metric's standard errors.
+fn error_of(metric: &str) -> String {
+    format!("{metric}_error")
 }
 
 /// Numbers as a JSON list, with all their digits; what is not finite is null.
@@ -405,15 +411,15 @@ impl Rows<'_> {
     }
 
     fn set(&self, row: usize) -> Result<SetRecord, FileError> {
-        let figures = |column: &dyn Fn(&str) -> String| -> Result<Figures, FileError> {
-            let mut values = [f64::NAN; Figures::ALL.len()];
-            for (value, Figure { name, .. }) in values.iter_mut().zip(Figures::ALL) {
+        let metrics = |column: &dyn Fn(&str) -> String| -> Result<Metrics, FileError> {
+            let mut values = [f64::NAN; Metrics::ALL.len()];
+            for (value, Metric { name, .. }) in values.iter_mut().zip(Metrics::ALL) {
                 let name = column(name);
-                if name == column(Figures::ALWAYS) || self.table.column(&name).is_ok() {
+                if name == column(Metrics::ALWAYS) || self.table.column(&name).is_ok() {
                     *value = self.real(&name, row)?;
                 }
             }
-            Ok(Figures::from_values(values))
+            Ok(Metrics::from_values(values))
         };
         let images: Vec<u32> = self.list("image_numbers", row)?;
         // Numbers that no catalogues have are not added up.
@@ -438,8 +444,8 @@ impl Rows<'_> {
             images,
             galaxies,
             flagged: at_most("flagged", galaxies)?,
-            figures: figures(&str::to_owned)?,
-            errors: figures(&error_of)?,
+            metrics: metrics(&str::to_owned)?,
+            errors: metrics(&error_of)?,
             q_replicates: self.list("q_replicates", row)?,
             // Earlier versions did not keep them.
             q_calibrated_replicates: match self.table.column("q_calibrated_replicates") {

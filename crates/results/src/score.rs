@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
-    Choice, Convention, ConventionMatch, Fault, FieldSum, Figures, Grid, ImageFaults, Options,
+    Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, Metrics, Options,
     RowCounts, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
 };
 
@@ -100,7 +100,7 @@ fn findings(
     scorer.diagnose(images, score, convention)
 }
 
-/// What the convention of a submission's figures rests on. It is the same for all its sets.
+/// What the convention of a submission's metrics rests on. It is the same for all its sets.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Basis {
     /// It was told, or is that of our own measurements.
@@ -468,7 +468,7 @@ pub fn without_catalogue(
         match lacking.count() {
             0 => {}
             count => lines.push(format!(
-                "warning: {count} of the {} images of set {set} have no catalogue; figures depend on the number of images.",
+                "warning: {count} of the {} images of set {set} have no catalogue; metrics depend on the number of images.",
                 there.len()
             )),
         }
@@ -482,17 +482,17 @@ pub fn without_catalogue(
     Ok(lines)
 }
 
-/// Means over sets of the headline figures and their errors.
-pub fn means(scored: &[ScoredSet]) -> (Figures, Figures) {
-    let columns: [(f64, f64); Figures::ALL.len()] = std::array::from_fn(|k| {
+/// Means over sets of the headline metrics and their errors.
+pub fn means(scored: &[ScoredSet]) -> (Metrics, Metrics) {
+    let columns: [(f64, f64); Metrics::ALL.len()] = std::array::from_fn(|k| {
         let pairs: Vec<(f64, f64)> = scored
             .iter()
-            .map(|s| (s.score.figures.values()[k], s.score.errors.values()[k]))
+            .map(|s| (s.score.metrics.values()[k], s.score.errors.values()[k]))
             .collect();
         mean_over_sets(&pairs)
     });
     (
-        Figures::from_values(columns.map(|c| c.0)),
-        Figures::from_values(columns.map(|c| c.1)),
+        Metrics::from_values(columns.map(|c| c.0)),
+        Metrics::from_values(columns.map(|c| c.1)),
     )
 }

@@ -62,7 +62,7 @@ pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
 /// Name of the file that holds `bytes`.
 fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
     let words: Vec<&str> = run
-        .submission
+        .configuration
         .split(|c: char| !c.is_ascii_alphanumeric())
         .filter(|word| !word.is_empty())
         .collect();
@@ -127,7 +127,7 @@ pub fn read(store: &Path) -> Result<(Vec<RunRecord>, Vec<String>), FileError> {
     let mut notes = Vec::new();
     for path in paths {
         let run = read_run(&path)?;
-        match runs.entry((run.submission.clone(), run.id())) {
+        match runs.entry((run.configuration.clone(), run.id())) {
             Entry::Vacant(place) => {
                 place.insert(run);
             }

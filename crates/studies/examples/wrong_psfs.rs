@@ -66,7 +66,7 @@ fn measured(
     galaxies: &Galaxies,
     star: &Array2<f64>,
 ) -> Result<[f64; 5], Box<dyn Error>> {
-    let psf = star_psf(star.view(), measurer.submission().psf_cut())?;
+    let psf = star_psf(star.view(), measurer.configuration().psf_cut())?;
     let side = |stamps: ArrayView3<'_, f32>| -> Result<_, Box<dyn Error>> {
         let mut worker = measurer.worker();
         worker.set_survey(measurer.survey(stamps)?.as_ref());
@@ -76,7 +76,7 @@ fn measured(
         side(galaxies.sides[0].view())?,
         side(galaxies.sides[1].view())?,
     ];
-    shearq_measure::calibrate(measurer.submission(), &mut sides);
+    shearq_measure::calibrate(measurer.configuration(), &mut sides);
     // Galaxies count with all of their versions or not at all.
     let (mut sums, mut count, mut lost) = ([[0.0; 2]; 2], 0.0, 0.0);
     for (plus, minus) in sides[0].chunks(4).zip(sides[1].chunks(4)) {
@@ -109,7 +109,7 @@ fn warned(measurer: &Measurer, galaxies: &Galaxies, star: &Array2<f64>) -> Vec<W
         }
     }
     let psf = Psfs::Star(star.view());
-    examination.add_psfs(psf, measurer.submission().psf_cut(), 1);
+    examination.add_psfs(psf, measurer.configuration().psf_cut(), 1);
     examination.warnings()
 }
 
@@ -228,9 +228,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             }
             "size" => {
                 for size in [12, 16, 20, 24, 28, 32, 40] {
-                    let mut submission = measurer.submission().clone();
-                    submission.psf.size = size;
-                    let found = Measurer::new(&submission, STAMP)
+                    let mut configuration = measurer.configuration().clone();
+                    configuration.psf.size = size;
+                    let found = Measurer::new(&configuration, STAMP)
                         .map_err(Box::<dyn Error>::from)
                         .and_then(|cut| measured(&cut, &galaxies, &middle));
                     match found {

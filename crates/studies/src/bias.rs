@@ -128,7 +128,7 @@ pub fn biases(
     Ok(sums
         .iter()
         .zip(measurers)
-        .map(|(sums, measurer)| sums.bias(measurer.submission().calibration()))
+        .map(|(sums, measurer)| sums.bias(measurer.configuration().calibration()))
         .collect())
 }
 
@@ -296,7 +296,7 @@ mod tests {
     fn calibrated_ellipticities_recover_shear_and_leave_the_psf_behind() {
         let registry = Registry::embedded().unwrap();
         let names = ["48/linear/star", "as-printed/23/raw/star"];
-        let submissions = names.map(|name| registry.get(name).unwrap().submission);
+        let submissions = names.map(|name| registry.get(name).unwrap().configuration);
         let measurers = measurers(&submissions).unwrap();
         let simulator = simulator(2, SimulationSettings::new(19, 32)).unwrap();
         let found = biases(&simulator, &[1], &measurers, 2, &mut Quiet).unwrap();

@@ -20,7 +20,7 @@ use shearq_measure::parts::{
 };
 use shearq_quantities::{Distortion, Shear};
 use shearq_quantities::{FunctionalPsf, PsfProfile};
-use shearq_submissions::{NetworkDeconvolution, Submission, Update};
+use shearq_submissions::{Configuration, NetworkDeconvolution, Update};
 
 use super::speed::network_of;
 use shearq_pipeline::PipelineError;
@@ -200,13 +200,13 @@ const CHUNK: u64 = 8;
 /// # Errors
 /// Where the submission's sizes cannot be worked with.
 pub fn calibrate(
-    submission: &Submission,
+    configuration: &Configuration,
     galaxies: u64,
     seed: u64,
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Curves, PipelineError> {
-    let planned = LambdaStudy::new(submission)?;
+    let planned = LambdaStudy::new(configuration)?;
     let mut curves = Curves::new();
     engine::ordered(
         threads,
@@ -265,9 +265,9 @@ struct Synthetic {
 }
 
 impl LambdaStudy {
-    fn new(submission: &Submission) -> Result<Self, PipelineError> {
-        let (n, p) = (submission.stamp.size, submission.psf.size);
-        let method = network_of(submission)?;
+    fn new(configuration: &Configuration) -> Result<Self, PipelineError> {
+        let (n, p) = (configuration.stamp.size, configuration.psf.size);
+        let method = network_of(configuration)?;
         let settings = method.deconvolution.clone();
         let plan = |log: f64| Network::plan(n, p, settings.printed_lambda(10f64.powf(log)));
         let networks = LOG_LAMBDA

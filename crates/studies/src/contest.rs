@@ -2,11 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 use shearq_scoring::resample::mean_over_sets;
-use shearq_submissions::Submission;
+use shearq_submissions::Configuration;
 
 use super::bias::{ShearBias, biases};
 use super::bound::{cramer_rao, sample_limit};
-use super::reproduce::{Plan, SetResult, Study, SubmissionResult};
+use super::reproduce::{ConfigurationResult, Plan, SetResult, Study};
 use super::speed;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::run::{read_record, write_record};
@@ -81,19 +81,19 @@ pub fn contest_table(
     let costs = plan
         .submissions
         .iter()
-        .map(|submission| speed::whole(submission, plan.simulation))
+        .map(|configuration| speed::whole(configuration, plan.simulation))
         .collect::<Result<Vec<f64>, _>>()?;
     let mut rows = Vec::new();
     for (result, bias) in results.iter().zip(biases) {
-        for (k, submission) in plan.submissions.iter().enumerate() {
-            rows.push(row(result, bias, k, submission, costs[k]));
+        for (k, configuration) in plan.submissions.iter().enumerate() {
+            rows.push(row(result, bias, k, configuration, costs[k]));
         }
     }
     if results.len() > 1 {
         let limits: Vec<f64> = biases.iter().filter_map(|b| b.limit).collect();
         let limit = limits.iter().sum::<f64>() / limits.len() as f64;
-        for (k, submission) in plan.submissions.iter().enumerate() {
-            let mean = |value: &dyn Fn(&SubmissionResult) -> (f64, f64), decimals: usize| {
+        for (k, configuration) in plan.submissions.iter().enumerate() {
+            let mean = |value: &dyn Fn(&ConfigurationResult) -> (f64, f64), decimals: usize| {
                 let all: Vec<_> = results.iter().map(|r| value(&r.results[k])).collect();
                 let (mean, error) = mean_over_sets(&all);
                 Cell::with_error(mean, Some(error), decimals)
@@ -101,10 +101,10 @@ pub fn contest_table(
             let mut row = vec![
                 Cell::text("mean"),
                 Cell::Empty,
-                Cell::text(&submission.name),
+                Cell::text(&configuration.name),
             ];
             row.extend((0..8).map(|_| Cell::Empty));
-            row.push(mean(&|r| (r.score.figures.q, r.score.errors.q), 1));
+            row.push(mean(&|r| (r.score.metrics.q, r.score.errors.q), 1));
             row.push(mean(&spectrum, 0));
             row.push(Cell::number(limit, 0));
             row.push(Cell::number(costs[k], 0));
@@ -175,7 +175,7 @@ fn row(
     result: &SetResult,
     bias: &SetBiases,
     k: usize,
-    submission: &Submission,
+    configuration: &Configuration,
     cost: f64,
 ) -> Vec<Cell> {
     let (own, biases) = (&result.results[k], &bias.biases[k]);
@@ -189,7 +189,7 @@ fn row(
     vec![
         Cell::text(format!("{:02}", result.set)),
         Cell::text(SetKind::of(result.set).map_or("", |kind| kind.image.label())),
-        Cell::text(&submission.name),
+        Cell::text(&configuration.name),
         Cell::with_error(scatter, Some(scatter_error), 5),
         Cell::with_error(scatter / bound, Some(scatter / bound * relative), 3),
         scaled(biases.m[0], biases.m_error[0], 1e3),
@@ -198,7 +198,7 @@ fn row(
         scaled(biases.c[1], biases.c_error[1], 1e4),
         Cell::with_error(biases.leakage, Some(biases.leakage_error), 3),
         Cell::number((own.response.flagged + biases.dropped) as f64, 0),
-        Cell::with_error(own.score.figures.q, Some(own.score.errors.q), 1),
+        Cell::with_error(own.score.metrics.q, Some(own.score.errors.q), 1),
         Cell::with_error(q_spectrum, Some(q_spectrum_error), 0),
         Cell::number(bias.limit.unwrap_or(f64::NAN), 0),
         Cell::number(cost, 0),
@@ -206,7 +206,7 @@ fn row(
 }
 
 /// Q of a submission's cross-spectrum and its error.
-fn spectrum(result: &SubmissionResult) -> (f64, f64) {
+fn spectrum(result: &ConfigurationResult) -> (f64, f64) {
     (
         result.q_spectrum.unwrap_or(f64::NAN),
         result.q_spectrum_error.unwrap_or(f64::NAN),

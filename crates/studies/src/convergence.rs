@@ -3,7 +3,7 @@
 use std::hint::black_box;
 
 use shearq_measure::parts::{Network, Rule, Step};
-use shearq_submissions::Submission;
+use shearq_submissions::Configuration;
 
 use super::speed::{Inputs, network_of, time};
 use shearq_pipeline::PipelineError;
@@ -20,7 +20,7 @@ const UPDATES: [&str; 2] = ["adaptive", "accelerated"];
 
 /// Energy left above the minimum and cost, update by update and over [`ITERATIONS`].
 pub struct Convergence {
-    submission: String,
+    configuration: String,
     /// Mean over galaxies of (E − E_min)/(E₀ − E_min).
     excess: [Vec<f64>; 2],
     /// Microseconds a galaxy.
@@ -32,12 +32,12 @@ pub struct Convergence {
 /// # Errors
 /// Where the submission's sizes cannot be worked with.
 pub fn convergence(
-    submission: &Submission,
+    configuration: &Configuration,
     settings: SimulationSettings,
 ) -> Result<Convergence, PipelineError> {
     let inputs = Inputs::new(settings)?;
-    let (n, p) = (submission.stamp.size, submission.psf.size);
-    let deconvolution = &network_of(submission)?.deconvolution;
+    let (n, p) = (configuration.stamp.size, configuration.psf.size);
+    let deconvolution = &network_of(configuration)?.deconvolution;
     let lambda = deconvolution.printed_lambda(deconvolution.lambda);
     let mut network = Network::<f32>::plan(n, p, lambda)?;
     network.set_scaled_psf(inputs.psf(p).view(), deconvolution.psf_scale)?;
@@ -66,7 +66,7 @@ pub fn convergence(
         })
         .collect::<Result<_, PipelineError>>()?;
     let mut found = Convergence {
-        submission: submission.name.clone(),
+        configuration: configuration.name.clone(),
         excess: Default::default(),
         cost: Default::default(),
     };
@@ -109,7 +109,7 @@ impl Convergence {
             row
         });
         Table {
-            title: format!("Energy of {} above its minimum", self.submission),
+            title: format!("Energy of {} above its minimum", self.configuration),
             headings: vec![
                 Heading::new("iterations", "Iterations"),
                 Heading::new("adaptive_excess", "adaptive ×10³"),
@@ -144,7 +144,7 @@ impl Convergence {
             ..LinePlot::default()
         };
         PanelGrid {
-            title: format!("Energy of {}", self.submission),
+            title: format!("Energy of {}", self.configuration),
             columns: 2,
             plots: vec![
                 panel("iterations", &|_| iterations.clone()),

@@ -8,7 +8,7 @@ use shearq_scoring::{
     BINS, Convention, FieldSum, Grid, Noise, Options, Row, RowCounts, SetImages, SetScore,
     SetScorer, cross_spectrum,
 };
-use shearq_submissions::{Submission, checked_name};
+use shearq_submissions::{Configuration, checked_name};
 
 use super::response::{Regression, Response};
 use shearq_files::FileError;
@@ -34,7 +34,7 @@ pub struct Plan {
     /// Images per set.
     pub images: u32,
     /// Submissions, resolved.
-    pub submissions: Vec<Submission>,
+    pub submissions: Vec<Configuration>,
 }
 
 /// A folder of results that belongs to a plan for as long as this lives.
@@ -63,10 +63,11 @@ impl<'a> Study<'a> {
 
 /// One submission on one set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct SubmissionResult {
+pub struct ConfigurationResult {
     /// Submission's name.
     #[serde(deserialize_with = "checked_name")]
-    pub submission: String,
+    #[serde(rename = "submission")]
+    pub configuration: String,
     /// Its score in the standard convention, leaderboard definition.
     #[serde(flatten)]
     pub score: SetRecord,
@@ -97,7 +98,7 @@ pub struct SetResult {
     /// Bandpowers of the true shear.
     pub true_ee: [f64; BINS],
     /// One per submission, in the plan's order.
-    pub results: Vec<SubmissionResult>,
+    pub results: Vec<ConfigurationResult>,
 }
 
 /// Where a set's result is kept.
@@ -193,11 +194,11 @@ pub fn run_sets(
                 .submissions
                 .iter()
                 .zip(&place)
-                .map(|(submission, &at)| {
+                .map(|(configuration, &at)| {
                     let score = &scored[at].score;
                     let spectrum = spectrum_quality(score, &sums[at].0);
-                    SubmissionResult {
-                        submission: submission.name.clone(),
+                    ConfigurationResult {
+                        configuration: configuration.name.clone(),
                         // Of what is simulated the settings are the fingerprint: those of the plan.
                         score: SetRecord::new(set, &scored[at], String::new()),
                         convention_matched: score.matching.best().number(),
@@ -228,19 +229,19 @@ fn spectrum_quality(score: &SetScore, images: &SetImages) -> Option<(f64, Option
 }
 
 /// Submissions without repetition, and the place of each one given among them.
-fn distinct(submissions: &[Submission]) -> (Vec<Submission>, Vec<usize>) {
-    let mut kept: Vec<Submission> = Vec::new();
+fn distinct(submissions: &[Configuration]) -> (Vec<Configuration>, Vec<usize>) {
+    let mut kept: Vec<Configuration> = Vec::new();
     let mut place = Vec::new();
-    for submission in submissions {
-        let same = |other: &Submission| {
-            Submission {
+    for configuration in submissions {
+        let same = |other: &Configuration| {
+            Configuration {
                 name: other.name.clone(),
                 description: other.description.clone(),
-                ..submission.clone()
+                ..configuration.clone()
             } == *other
         };
         place.push(kept.iter().position(same).unwrap_or_else(|| {
-            kept.push(submission.clone());
+            kept.push(configuration.clone());
             kept.len() - 1
         }));
     }

@@ -13,7 +13,7 @@ use shearq_measure::{Measurer, StampNoise};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::{
-    Clipping, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut, Start, Submission,
+    Clipping, Configuration, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut, Start,
     Update,
 };
 
@@ -68,11 +68,11 @@ fn view(stamp: &[f32]) -> ArrayView2<'_, f32> {
 ///
 /// # Errors
 /// Where it has the linear method.
-pub(super) fn network_of(submission: &Submission) -> Result<&NetworkMethod, PipelineError> {
-    submission.network().ok_or_else(|| {
+pub(super) fn network_of(configuration: &Configuration) -> Result<&NetworkMethod, PipelineError> {
+    configuration.network().ok_or_else(|| {
         PipelineError::Request(format!(
             "submission {} has method = \"linear\"; expected \"network\"",
-            submission.name
+            configuration.name
         ))
     })
 }
@@ -105,9 +105,9 @@ impl Inputs {
     }
 
     /// Microseconds of a whole measurement, the PSF being taken already.
-    fn whole(&self, submission: &Submission) -> Result<f64, PipelineError> {
-        let psf = self.psf(submission.psf_cut());
-        let mut worker = Measurer::new(submission, STAMP)?.worker();
+    fn whole(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
+        let psf = self.psf(configuration.psf_cut());
+        let mut worker = Measurer::new(configuration, STAMP)?.worker();
         worker.set_psf(psf.view())?;
         Ok(time(|k| {
             let _ = black_box(worker.measure(view(&self.stamps[k]), Some(NOISE_SIGMA)));
@@ -115,9 +115,9 @@ impl Inputs {
     }
 
     /// Microseconds of taking a PSF.
-    fn taking_a_psf(&self, submission: &Submission) -> Result<f64, PipelineError> {
-        let psf = self.psf(submission.psf_cut());
-        let mut worker = Measurer::new(submission, STAMP)?.worker();
+    fn taking_a_psf(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
+        let psf = self.psf(configuration.psf_cut());
+        let mut worker = Measurer::new(configuration, STAMP)?.worker();
         Ok(time(|_| {
             let _ = worker.set_psf(black_box(psf.view()));
         }))
@@ -133,8 +133,11 @@ impl Inputs {
 ///
 /// # Errors
 /// Where the submission's sizes cannot be worked with.
-pub fn whole(submission: &Submission, settings: SimulationSettings) -> Result<f64, PipelineError> {
-    Inputs::new(settings)?.whole(submission)
+pub fn whole(
+    configuration: &Configuration,
+    settings: SimulationSettings,
+) -> Result<f64, PipelineError> {
+    Inputs::new(settings)?.whole(configuration)
 }
 
 /// Cost of each stage of a measurement by `submission`, and of simulating the galaxy.
@@ -142,11 +145,11 @@ pub fn whole(submission: &Submission, settings: SimulationSettings) -> Result<f6
 /// # Errors
 /// Where the submission's sizes cannot be worked with.
 pub fn stages(
-    submission: &Submission,
+    configuration: &Configuration,
     settings: SimulationSettings,
 ) -> Result<Table, PipelineError> {
     let inputs = Inputs::new(settings)?;
-    let (n, p) = (submission.stamp.size, submission.psf.size);
+    let (n, p) = (configuration.stamp.size, configuration.psf.size);
     let psf = inputs.psf(p);
     let fields = inputs.set.image_fields(1);
     let grid = inputs.set.grid().n;
@@ -154,7 +157,7 @@ pub fn stages(
     let mut stamp = vec![0.0; STAMP * STAMP];
     let mut rows: Vec<(&str, f64)> = Vec::new();
     let before = rows.len();
-    if let NoiseSource::Border { border: width } = submission.noise {
+    if let NoiseSource::Border { border: width } = configuration.noise {
         let mut border = Vec::new();
         rows.push((
             "noise level",
@@ -164,7 +167,7 @@ pub fn stages(
             }),
         ));
     }
-    if let Some(settings) = submission.wavelet() {
+    if let Some(settings) = configuration.wavelet() {
         let filter = WaveletWiener::new(STAMP, settings);
         let mut filter_scratch = filter.scratch();
         rows.push((
@@ -179,14 +182,14 @@ pub fn stages(
     let mut notes = vec![format!(
         "One thread; fastest of several passes over {SAMPLE} galaxies."
     )];
-    let linear = submission.linear().is_some();
-    match &submission.method {
+    let linear = configuration.linear().is_some();
+    match &configuration.method {
         Method::Linear(method) => linear_stages(method, n, psf.view(), &cut, &mut rows)?,
         Method::Network(method) => {
             notes.extend(network_stages(method, n, psf.view(), &cut, &mut rows)?);
         }
     }
-    let whole = inputs.whole(submission)?;
+    let whole = inputs.whole(configuration)?;
     let stages: f64 = rows[before..].iter().map(|(_, time)| time).sum();
     let rest = if linear {
         "sheared noise (one galaxy in four) and the rest"
@@ -195,7 +198,7 @@ pub fn stages(
     };
     rows.push((rest, whole - stages));
     rows.push(("whole measurement", whole));
-    let taken = inputs.taking_a_psf(submission)?;
+    let taken = inputs.taking_a_psf(configuration)?;
     rows.push(("take a PSF, where each galaxy has its own", taken));
     rows.push((
         "simulate",
@@ -208,7 +211,7 @@ pub fn stages(
         }),
     ));
     Ok(Table {
-        title: format!("Stages of {}", submission.name),
+        title: format!("Stages of {}", configuration.name),
         headings: vec![
             Heading::new("stage", "Stage"),
             Heading::new("microseconds", "µs a galaxy"),
@@ -420,14 +423,14 @@ fn centre(stamp: &[f32], n: usize) -> Vec<f32> {
 /// # Errors
 /// Where the submission's sizes cannot be worked with.
 pub fn size_costs(
-    submission: &Submission,
+    configuration: &Configuration,
     settings: SimulationSettings,
 ) -> Result<Vec<f64>, PipelineError> {
     let inputs = Inputs::new(settings)?;
     SIZES
         .iter()
         .map(|&n| {
-            let mut sized = submission.clone();
+            let mut sized = configuration.clone();
             sized.stamp.size = n;
             inputs.whole(&sized)
         })
@@ -483,12 +486,12 @@ pub fn sizes_figure(costs: &[(&str, Vec<f64>)]) -> LinePlot {
 /// # Errors
 /// Where the submission's sizes cannot be worked with or threads cannot be started.
 pub fn scaling(
-    submission: &Submission,
+    configuration: &Configuration,
     settings: SimulationSettings,
     threads: usize,
 ) -> Result<Table, PipelineError> {
     let inputs = Inputs::new(settings)?;
-    let measurers = measurers(std::slice::from_ref(submission))?;
+    let measurers = measurers(std::slice::from_ref(configuration))?;
     let galaxies = inputs.set.grid().cells() as f64;
     let rate = |threads: usize| -> Result<f64, PipelineError> {
         let mut best = 0.0f64;
@@ -516,7 +519,7 @@ pub fn scaling(
         ]);
     }
     Ok(Table {
-        title: format!("Simulating and measuring {} in memory", submission.name),
+        title: format!("Simulating and measuring {} in memory", configuration.name),
         headings: vec![
             Heading::new("threads", "Threads"),
             Heading::new("per_second", "galaxies a second"),

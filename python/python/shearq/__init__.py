@@ -1,4 +1,4 @@
-"""shearq: galaxy shapes for weak lensing from postage stamps and PSFs, and the figures of merit of shear challenges.
+"""shearq: galaxy shapes for weak lensing from postage stamps and PSFs, and the metrics of shear challenges.
 
 >>> import shearq
 >>> cat = shearq.measure(stamps, psf, noise=sigma)     # (n, ny, nx), (py, px) and a number
@@ -11,13 +11,13 @@ per pixel in the image's unit; results do not depend on the number of threads, a
 
 from . import adapters
 from ._measure import Catalogue, DataWarning, Flag, FunctionalPsf, MeanShear, measure
-from ._score import FIGURES, Score, compare, power_spectrum, score
+from ._score import METRICS, Score, compare, power_spectrum, score
 from ._shearq import __version__
 from ._simulate import SimulatedImage, Simulation, simulate
 from ._submissions import Submission, submission, submissions
 
 __all__ = [
-    "FIGURES",
+    "METRICS",
     "Catalogue",
     "DataWarning",
     "Flag",

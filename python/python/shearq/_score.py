@@ -1,4 +1,4 @@
-"""Ellipticities on a grid into spectra and figures of merit."""
+"""Ellipticities on a grid into spectra and metrics."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from . import _shearq
 from ._arrays import degrees, double, flat, real, shown, whole
 from ._submissions import submissions
 
-# Pixels a side of a cell where no positions tell otherwise; it then changes no figure.
+# Pixels a side of a cell where no positions tell otherwise; it then changes no metric.
 _CELL = 48.0
 
-FIGURES: dict[str, str] = {name: meaning for name, _, meaning in _shearq.figures()}
+METRICS: dict[str, str] = {name: meaning for name, _, meaning in _shearq.metrics()}
 
 
 class Score:
     """Figures of merit of ellipticities against their true shear.
 
-    ``score["q"]`` is a figure, ``score.errors["q"]`` its standard error, NaN where unknown. ``docs/scoring.md``
+    ``score["q"]`` is a metric, ``score.errors["q"]`` its standard error, NaN where unknown. ``docs/scoring.md``
     derives them all.
 
     Attributes
     ----------
-    figures, errors : dict of str to float
+    metrics, errors : dict of str to float
         ``q``: quality factor; ``q_dn``: without the noise's power;
         ``q_calibrated``: after dividing by the measured response squared; ``m_half``: M/2;
         ``sqrt_a``: √A in 10⁻⁴ (C_ℓ in steradian); ``galaxy_noise``: noise of a calibrated ellipticity; ``m_cross``: multiplicative bias by cross-correlation; ``m1``, ``m2``, ``c1``, ``c2``: biases of
@@ -43,7 +43,7 @@ class Score:
     noise_variance : float or None
         Variance of the ellipticities' noise per component, galaxy and image.
     convention : int
-        The one of the challenge's eight that the figures are in; 5 is e1 along +x, e2 along x = y.
+        The one of the challenge's eight that the metrics are in; 5 is e1 along +x, e2 along x = y.
     q_leaderboard : float
         The highest Q of all eight, as the challenge's leaderboard took it.
     correlation : float
@@ -51,13 +51,13 @@ class Score:
     mean : dict or None
         Where the true shear is the same everywhere: mean ``e``, its ``error`` and the ``truth``, two components each.
     replicates : array of shape (groups, 11)
-        Figures with each group of images left out, in the order of ``figures``; empty with one image.
+        Metrics with each group of images left out, in the order of ``metrics``; empty with one image.
     notes : list of str
         What was odd about the rows.
     """
 
     def __init__(self, found: dict[str, Any]) -> None:
-        self.figures: dict[str, float] = found["figures"]
+        self.metrics: dict[str, float] = found["metrics"]
         self.errors: dict[str, float] = found["errors"]
         self.spectrum = _table(found["spectrum"])
         self.images: int = found["images"]
@@ -78,14 +78,14 @@ class Score:
 
     def __getitem__(self, name: str) -> float:
         try:
-            return self.figures[name]
+            return self.metrics[name]
         except KeyError:
-            raise KeyError(f"there is no figure {name!r}; known figures: {', '.join(self.figures)}") from None
+            raise KeyError(f"there is no metric {name!r}; known metrics: {', '.join(self.metrics)}") from None
 
     def to_dict(self) -> dict[str, float]:
         """Figures, and their errors with ``_error`` after their names."""
         errors = {f"{name}_error": error for name, error in self.errors.items()}
-        return {**self.figures, **errors}
+        return {**self.metrics, **errors}
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{name} = {self[name]:.4g} ± {self.errors[name]:.2g}" for name in ("q", "m_cross"))
@@ -242,9 +242,9 @@ def compare(
     Returns
     -------
     pandas.DataFrame, polars.DataFrame or list of dict
-        A row each: ``submission``, figures with their errors, ``q_difference`` to the first with its error, paired
+        A row each: ``submission``, metrics with their errors, ``q_difference`` to the first with its error, paired
         over the same images, and its significance ``sigma`` (both from eight images on), the same of calibrated Q
-        (``q_calibrated_difference``, ``q_calibrated_sigma``), ``q_leaderboard``, and the figures published for a
+        (``q_calibrated_difference``, ``q_calibrated_sigma``), ``q_leaderboard``, and the metrics published for a
         submission of that name.
     """
     make = _frame(frame)
@@ -266,12 +266,12 @@ def compare(
     first = next(iter(scores.values()), None)
     for name, scored in scores.items():
         paired: dict[str, float] = {}
-        for figure, sigma in (("q", "sigma"), ("q_calibrated", "q_calibrated_sigma")):
-            difference, error = _difference(figure, first, scored)
-            paired[f"{figure}_difference"] = difference
-            paired[f"{figure}_difference_error"] = error
+        for metric, sigma in (("q", "sigma"), ("q_calibrated", "q_calibrated_sigma")):
+            difference, error = _difference(metric, first, scored)
+            paired[f"{metric}_difference"] = difference
+            paired[f"{metric}_difference_error"] = error
             paired[sigma] = difference / error if error else math.nan
-        figures = {f"{key}_published": value for key, value in (published.get(name) or {}).items()}
+        metrics = {f"{key}_published": value for key, value in (published.get(name) or {}).items()}
         missing = {f"{key}_published": math.nan for key in ("q", "m_half", "sqrt_a")}
         rows.append(
             {
@@ -280,22 +280,22 @@ def compare(
                 **paired,
                 "q_leaderboard": scored.q_leaderboard,
                 **missing,
-                **figures,
+                **metrics,
             }
         )
     return make(rows)
 
 
-def _difference(figure: str, first: Score | None, scored: Score) -> tuple[float, float]:
-    """The paired difference in a figure from the first, and its error; NaN of the first itself."""
+def _difference(metric: str, first: Score | None, scored: Score) -> tuple[float, float]:
+    """The paired difference in a metric from the first, and its error; NaN of the first itself."""
     if first is None or scored is first:
         return math.nan, math.nan
-    column = list(scored.figures).index(figure)
+    column = list(scored.metrics).index(metric)
     paired = _shearq.difference(
         scored.images,
-        first[figure],
+        first[metric],
         list(first.replicates[:, column]),
-        scored[figure],
+        scored[metric],
         list(scored.replicates[:, column]),
     )
     return (math.nan, math.nan) if paired is None else paired

@@ -26,7 +26,7 @@ class Submission:
     toml : str
         The same as a settings file has them, for the command line.
     published : dict or None
-        Published figures: ``q``, ``m_half`` (M/2) and ``sqrt_a`` (√A in 10⁻⁴).
+        Published metrics: ``q``, ``m_half`` (M/2) and ``sqrt_a`` (√A in 10⁻⁴).
     stamp_size, psf_size : int
         Pixels a side of the piece of a stamp, and of a PSF stamp, that are used; of smaller PSF stamps all, where those do.
     psf_form : {'star', 'functional'}
@@ -58,8 +58,8 @@ class Submission:
 
     @property
     def published(self) -> dict[str, float] | None:
-        figures = self._resolved.published
-        return None if figures is None else dict(zip(("q", "m_half", "sqrt_a"), figures))
+        metrics = self._resolved.published
+        return None if metrics is None else dict(zip(("q", "m_half", "sqrt_a"), metrics))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (self._resolved.parts,)

@@ -535,7 +535,7 @@ fn biases_of_the_galaxies_are_least_squares_with_their_weights() {
     };
     let scorer = SetScorer::new(grid, truth(&shear), options).unwrap();
     let score = scorer.score(&images).unwrap();
-    let f = score.figures;
+    let f = score.metrics;
     for (pairs, m, c) in [(&pairs[0], f.m1, f.c1), (&pairs[1], f.m2, f.c2)] {
         let count = pairs.len() as f64;
         let mean = |of: &dyn Fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>() / count;
@@ -717,7 +717,7 @@ fn errors_are_those_of_their_formulae() {
                 .unwrap()
                 .score(&images)
                 .unwrap();
-            let (f, errors) = (score.figures, score.errors);
+            let (f, errors) = (score.metrics, score.errors);
             // The averaged field and the truth, through the same gaps in the corrected definition.
             let weight = match definition {
                 Definition::Leaderboard => Array2::from_elem((n, n), 1.0),
@@ -897,7 +897,7 @@ fn errors_are_those_of_their_formulae() {
         .unwrap()
         .score(&images)
         .unwrap();
-    let (f, errors) = (score.figures, score.errors);
+    let (f, errors) = (score.metrics, score.errors);
     let residual = |e: &Array2<f64>, g: &Array2<f64>, m: f64, c: f64| {
         e - &(g.mapv(|g| (1.0 + m) * g + c) * &total.count)
     };

@@ -1,9 +1,9 @@
-//! A catalogue's figures are the same in whichever convention it comes.
+//! A catalogue's metrics are the same in whichever convention it comes.
 
 use ndarray::Array2;
 use shearq_fourier::Complex64;
 use shearq_scoring::{
-    Choice, Convention, Definition, FieldSum, Figures, Grid, Noise, Options, Row, SetImages,
+    Choice, Convention, Definition, FieldSum, Grid, Metrics, Noise, Options, Row, SetImages,
     SetScore, SetScorer,
 };
 
@@ -70,16 +70,16 @@ fn all_figures_and_errors_are_the_same_in_all_conventions_told_or_matched() {
                     score(grid, k, options)
                 };
                 let standard = of(Convention::STANDARD, Choice::Insist(Convention::STANDARD));
-                let expected = [standard.figures, standard.errors, standard.replicates[3]];
+                let expected = [standard.metrics, standard.errors, standard.replicates[3]];
                 assert!(expected[0].values().iter().all(|v| v.is_finite()));
                 for k in Convention::ALL {
                     for choice in [Choice::Insist(k), Choice::Matched] {
                         let found = of(k, choice);
                         assert_eq!(found.chosen, k, "{choice:?}");
-                        let found = [found.figures, found.errors, found.replicates[3]];
+                        let found = [found.metrics, found.errors, found.replicates[3]];
                         for (found, expected) in found.iter().zip(&expected) {
                             let pairs = found.values().into_iter().zip(expected.values());
-                            for ((found, expected), figure) in pairs.zip(Figures::ALL) {
+                            for ((found, expected), metric) in pairs.zip(Metrics::ALL) {
                                 // Waves are 10⁻¹⁰ off the modes' centres (3·10⁻¹² of the first), which turns
                                 // with the axes; differences of powers keep 10⁻⁷ of it at worst.
                                 let scale = expected.abs().max(1e-4);
@@ -87,7 +87,7 @@ fn all_figures_and_errors_are_the_same_in_all_conventions_told_or_matched() {
                                     (found - expected).abs() <= 1e-7 * scale
                                         || found.is_nan() && expected.is_nan(),
                                     "{} of {k:?} {choice:?}, n {n}, {definition:?}, {noise:?}: {found} {expected}",
-                                    figure.name
+                                    metric.name
                                 );
                             }
                         }

@@ -1,10 +1,10 @@
-//! The errors of a set's figures against the scatter of repeated trials.
+//! The errors of a set's metrics against the scatter of repeated trials.
 
 use ndarray::Array2;
 use shearq_fourier::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Choice, Convention, Definition, FieldSum, Figures, Grid, Options, SCORED, SetImages, SetScorer,
+    Choice, Convention, Definition, FieldSum, Grid, Metrics, Options, SCORED, SetImages, SetScorer,
     resample::{PairedSet, paired_difference},
 };
 
@@ -37,7 +37,7 @@ struct Kind {
     m: f64,
 }
 
-/// Scatter over trials of each figure that has an error and of each scored bandpower, over the mean of its error, and the
+/// Scatter over trials of each metric that has an error and of each scored bandpower, over the mean of its error, and the
 /// share of trials that have one.
 fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(String, f64, f64)> {
     const TRIALS: usize = 200;
@@ -67,14 +67,14 @@ fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(String, f6
         }
         let score = scorer.score(&images).unwrap();
         let with_power =
-            |figures: Figures, power: &[f64]| [&figures.values(), &power[SCORED]].concat();
+            |metrics: Metrics, power: &[f64]| [&metrics.values(), &power[SCORED]].concat();
         found.push((
-            with_power(score.figures, &score.spectra().ee),
+            with_power(score.metrics, &score.spectra().ee),
             with_power(score.errors, &score.ee_error),
         ));
     }
-    let figures = Figures::ALL.iter().map(|figure| figure.name.to_owned());
-    let names = figures.chain(SCORED.map(|bin| format!("EE of bin {bin}")));
+    let metrics = Metrics::ALL.iter().map(|metric| metric.name.to_owned());
+    let names = metrics.chain(SCORED.map(|bin| format!("EE of bin {bin}")));
     names
         .enumerate()
         .map(|(k, name)| {
@@ -149,9 +149,9 @@ fn errors_of_one_image_are_known_but_for_its_noise() {
     }
 }
 
-/// Scatter over trials of the difference in a figure of two methods on the same images, over the mean of its
+/// Scatter over trials of the difference in a metric of two methods on the same images, over the mean of its
 /// error. Both see the same shapes; half of the variance of their noise is common.
-fn paired_coverage(figure: fn(&Figures) -> f64, images: usize, m: [f64; 2]) -> f64 {
+fn paired_coverage(metric: fn(&Metrics) -> f64, images: usize, m: [f64; 2]) -> f64 {
     const TRIALS: usize = 200;
     const NOISE: f64 = 0.03;
     let grid = Grid::great10(20).unwrap();
@@ -184,8 +184,8 @@ fn paired_coverage(figure: fn(&Figures) -> f64, images: usize, m: [f64; 2]) -> f
             }
             let [first, second] = measured.map(|images| {
                 let score = scorer.score(&images).unwrap();
-                let replicates: Vec<f64> = score.replicates.iter().map(figure).collect();
-                (figure(&score.figures), replicates)
+                let replicates: Vec<f64> = score.replicates.iter().map(metric).collect();
+                (metric(&score.metrics), replicates)
             });
             let set = PairedSet {
                 images,
@@ -209,12 +209,12 @@ fn paired_coverage(figure: fn(&Figures) -> f64, images: usize, m: [f64; 2]) -> f
 
 #[test]
 fn errors_of_paired_differences_are_the_scatter_of_repeated_trials() {
-    for (name, figure) in [
-        ("q", (|f| f.q) as fn(&Figures) -> f64),
+    for (name, metric) in [
+        ("q", (|f| f.q) as fn(&Metrics) -> f64),
         ("q_calibrated", |f| f.q_calibrated),
     ] {
         for (images, m) in [(16, [0.0, 0.0]), (20, [-0.3, 0.0]), (20, [0.0, 0.05])] {
-            let ratio = paired_coverage(figure, images, m);
+            let ratio = paired_coverage(metric, images, m);
             // Where products of two images' noise decide, the jackknife's variance is twice theirs; a scatter from
             // 200 trials is good to 5 %, and Q is not linear in the noise.
             assert!(

@@ -81,7 +81,7 @@ fn perfect_ellipticities_score_without_bound_and_null_tests_vanish() {
                 ..Options::default()
             };
             let score = score(grid, &shear, &images, options);
-            let f = score.figures;
+            let f = score.metrics;
             assert!(f.q > 1e9, "n {n}: {}", f.q);
             for small in [
                 f.m_half, f.m_cross, f.m1, f.m2, f.c1, f.c2, f.b_power, f.eb_power,
@@ -130,7 +130,7 @@ fn biases_put_in_are_found() {
             definition,
             ..Options::default()
         };
-        let f = score(grid, &shear, &images, options).figures;
+        let f = score(grid, &shear, &images, options).metrics;
         // Exact: there is no noise. M = 1.05² − 1.
         assert!((f.m_half - 0.05125).abs() < 1e-9, "{f:?}");
         assert!(f.sqrt_a.abs() < 1e-5, "{f:?}");
@@ -152,8 +152,8 @@ fn noise_is_measured_as_it_is_and_the_jackknife_errors_are_those_of_repeated_tri
             ..Options::default()
         };
         let score = score(grid, &shear, &images, options);
-        q_dn.push(score.figures.q_dn / score.figures.q);
-        m.push(score.figures.m_cross);
+        q_dn.push(score.metrics.q_dn / score.metrics.q);
+        m.push(score.metrics.m_cross);
         errors.push(score.errors.m_cross);
         variances.push(score.noise_variance.unwrap());
     }
@@ -287,7 +287,7 @@ fn missing_galaxies_bias_the_leaderboard_but_not_the_corrected_definition() {
             choice: Choice::Insist(Convention::STANDARD),
             ..Options::default()
         };
-        score(grid, &shear, &images, options).figures.m_cross
+        score(grid, &shear, &images, options).metrics.m_cross
     };
     // Counting a fifth as zero dilutes the field by a fifth.
     assert!((m(Definition::Leaderboard) + 0.2).abs() < 0.02);
@@ -314,9 +314,9 @@ fn every_convention_is_recognised_by_its_correlation() {
         assert!(score.conventions[k.index()].correlation > 0.8, "{k:?}");
         assert_eq!(score.matching.best().class(), k.class(), "{k:?}");
         assert!(
-            score.figures.m_cross.abs() < 0.05,
+            score.metrics.m_cross.abs() < 0.05,
             "{k:?}: {:?}",
-            score.figures
+            score.metrics
         );
     }
 }

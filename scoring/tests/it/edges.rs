@@ -210,7 +210,7 @@ fn arrays_are_scored_like_rows_and_must_have_the_grids_shape() {
     let same = SetImages::of_arrays(&grid, views()).unwrap();
     let of = |images: &SetImages| score(grid, truth(&shear), images, Options::default());
     // By bits: what is not known is not a number.
-    let bits = |images: &SetImages| of(images).figures.values().map(f64::to_bits);
+    let bits = |images: &SetImages| of(images).metrics.values().map(f64::to_bits);
     assert_eq!(bits(&same), bits(&set));
     assert_eq!(same.total().count, set.total().count);
 
@@ -253,7 +253,7 @@ fn the_noise_of_one_image_is_not_known() {
     let set = images(&grid, &shear, &[0.1], |_, _| true);
     let score = score(grid, truth(&shear), &set, Options::default());
     assert!(score.noise.is_none() && score.noise_variance.is_none());
-    assert!(score.figures.q_dn.is_nan() && score.replicates.is_empty());
+    assert!(score.metrics.q_dn.is_nan() && score.replicates.is_empty());
 }
 
 #[test]
@@ -290,7 +290,7 @@ fn without_any_galaxy_the_leaderboard_counts_zeros_and_nothing_is_not_a_number_b
     let leaderboard = of(Definition::Leaderboard);
     let nothing = [0.0; BINS];
     let expected = quality(&leaderboard.bins, &nothing, &leaderboard.true_ee).q;
-    close(leaderboard.figures.q, expected, "Q of nothing");
+    close(leaderboard.metrics.q, expected, "Q of nothing");
     // All conventions of nothing are the same; the first of equals wins.
     assert_eq!(leaderboard.best.number(), 1);
     // Seen through no galaxies, the truth has no power either.
@@ -316,8 +316,8 @@ fn where_the_shear_is_constant_the_mean_is_the_truth_and_c() {
     for (found, expected) in [
         (mean.e[0], 0.035),
         (mean.e[1], -0.024),
-        (score.figures.c1, 0.005),
-        (score.figures.c2, -0.004),
+        (score.metrics.c1, 0.005),
+        (score.metrics.c2, -0.004),
     ] {
         assert!(
             (found - expected).abs() < 1e-15,

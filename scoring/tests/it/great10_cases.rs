@@ -1,4 +1,4 @@
-//! The leaderboard definition against figures of the challenge's own scoring program.
+//! The leaderboard definition against metrics of the challenge's own scoring program.
 //!
 //! The cases and what they were made from lie in `tests/data`.
 

@@ -169,7 +169,7 @@ impl CutWorker for FamilyWorker {
 mod tests {
     use ndarray::Array2;
     use shearq_quantities::Shear;
-    use shearq_submissions::{Method, Registry, Submission};
+    use shearq_submissions::{Configuration, Method, Registry};
 
     use std::sync::Arc;
 
@@ -178,16 +178,16 @@ mod tests {
     use crate::noise::{StampNoise, Survey};
     use shearq_quantities::{FunctionalPsf, PsfProfile};
 
-    fn submission(reference_area: f64) -> Submission {
-        let mut submission = Registry::embedded()
+    fn configuration(reference_area: f64) -> Configuration {
+        let mut configuration = Registry::embedded()
             .unwrap()
             .get("48/linear/star")
             .unwrap()
-            .submission;
-        if let Method::Linear(linear) = &mut submission.method {
+            .configuration;
+        if let Method::Linear(linear) = &mut configuration.method {
             linear.deconvolution.reference_area = reference_area;
         }
-        submission
+        configuration
     }
 
     fn moffat(fwhm: f64) -> FunctionalPsf {
@@ -196,10 +196,10 @@ mod tests {
     }
 
     /// Of a galaxy as broad as the PSF, elongated along x.
-    fn measured(submission: &Submission, fwhms: &[f64], noise: f64) -> Vec<Measurement> {
-        let mut worker = Measurer::new(submission, 48).unwrap().worker();
+    fn measured(configuration: &Configuration, fwhms: &[f64], noise: f64) -> Vec<Measurement> {
+        let mut worker = Measurer::new(configuration, 48).unwrap().worker();
         let each = fwhms.iter().map(|&fwhm| {
-            let psf = moffat(fwhm).stamp_beside(submission.psf_cut().size, 48);
+            let psf = moffat(fwhm).stamp_beside(configuration.psf_cut().size, 48);
             worker.set_psf(psf.view()).unwrap();
             let stamp = Array2::from_shape_fn((48, 48), |(y, x)| {
                 let (y, x) = (y as f64 - 23.5, x as f64 - 23.5);
@@ -212,7 +212,7 @@ mod tests {
 
     #[test]
     fn usual_psfs_are_measured_as_without_a_family_broad_ones_more_smoothly_and_narrow_ones_less() {
-        let (with, without) = (submission(50.0), submission(0.0));
+        let (with, without) = (configuration(50.0), configuration(0.0));
         let fwhms = [3.4, 6.0, 3.06, 2.0];
         let found = measured(&with, &fwhms, 0.5);
         let plain = measured(&without, &fwhms, 0.5);
@@ -231,9 +231,9 @@ mod tests {
 
     #[test]
     fn windows_follow_the_galaxies_of_the_image() {
-        let submission = submission(50.0);
-        let mut worker = Measurer::new(&submission, 48).unwrap().worker();
-        let psf = moffat(3.4).stamp_beside(submission.psf_cut().size, 48);
+        let configuration = configuration(50.0);
+        let mut worker = Measurer::new(&configuration, 48).unwrap().worker();
+        let psf = moffat(3.4).stamp_beside(configuration.psf_cut().size, 48);
         let stamp = moffat(6.0).stamp(48).mapv(|v| 1000.0 * v as f32);
         let mut radius = |extent: Option<f64>| {
             let survey = Survey {
@@ -256,8 +256,8 @@ mod tests {
 
     #[test]
     fn a_psf_is_taken_in_any_size_from_the_least_on_and_zeros_around_it_do_nothing() {
-        let submission = submission(50.0);
-        let mut worker = Measurer::new(&submission, 48).unwrap().worker();
+        let configuration = configuration(50.0);
+        let mut worker = Measurer::new(&configuration, 48).unwrap().worker();
         let stamp = moffat(8.0).stamp(48).mapv(|v| 1000.0 * v as f32);
         let star = moffat(6.0).stamp(36);
         let mut wide = Array2::zeros((48, 48));

@@ -69,7 +69,7 @@ mod tests {
 
     use ndarray::Array2;
     use shearq_quantities::Shear;
-    use shearq_submissions::{Method, Registry, Submission};
+    use shearq_submissions::{Configuration, Method, Registry};
 
     use super::super::window;
     use crate::extent::Moments;
@@ -78,14 +78,14 @@ mod tests {
     use shearq_quantities::{FunctionalPsf, PsfProfile};
 
     /// `48/linear/star` with a PSF as large as the stamp.
-    fn submission(half_snr: f64) -> Submission {
+    fn configuration(half_snr: f64) -> Configuration {
         let registry = Registry::embedded().unwrap();
-        let mut submission = registry.get("48/linear/star").unwrap().submission;
-        submission.psf.size = 48;
-        if let Method::Linear(linear) = &mut submission.method {
+        let mut configuration = registry.get("48/linear/star").unwrap().configuration;
+        configuration.psf.size = 48;
+        if let Method::Linear(linear) = &mut configuration.method {
             linear.shape.half_snr = half_snr;
         }
-        submission
+        configuration
     }
 
     /// A nearly round Gaussian of a mean square of `extent` px² per axis behind a round Gaussian PSF of `variance` px².
@@ -107,7 +107,7 @@ mod tests {
     fn a_galaxy_of_half_snr_counts_half_behind_any_psf_and_window() {
         let half_snr = 15.0;
         let mut workers =
-            [half_snr, 0.0].map(|snr| Measurer::new(&submission(snr), 48).unwrap().worker());
+            [half_snr, 0.0].map(|snr| Measurer::new(&configuration(snr), 48).unwrap().worker());
         let mut moments = Moments::default();
         for (fwhm, place) in [
             (2.4, window::OWN),

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize};
-use shearq_submissions::Submission;
+use shearq_submissions::Configuration;
 
 use crate::data::layout::{DataFolder, Layout, fill};
 use crate::data::listing::{self, Files};
@@ -106,7 +106,8 @@ pub struct Run {
     /// Where the galaxies come from.
     pub source: Source,
     /// All settings of the submission.
-    pub submission: Submission,
+    #[serde(rename = "submission")]
+    pub configuration: Configuration,
     /// FileFormat of the catalogues.
     pub format: FileFormat,
 }
@@ -121,11 +122,11 @@ impl Run {
     }
 
     /// What this version makes of `source`.
-    pub fn new(source: Source, submission: Submission, format: FileFormat) -> Self {
+    pub fn new(source: Source, configuration: Configuration, format: FileFormat) -> Self {
         Run {
             version: crate::VERSION.into(),
             source,
-            submission,
+            configuration,
             format,
         }
     }

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use shearq_scoring::{Figures, Options};
-use shearq_submissions::Submission;
+use shearq_scoring::{Metrics, Options};
+use shearq_submissions::Configuration;
 
 use super::BaselineSet;
 use crate::row::SetRecord;
@@ -31,7 +31,7 @@ pub struct Wanted {
     pub images: u32,
 }
 
-/// Measures a submission into a folder that is removed again, and takes its figures. `source` is as in a
+/// Measures a submission into a folder that is removed again, and takes its metrics. `source` is as in a
 /// record in the folder `beside`.
 ///
 /// # Errors
@@ -39,7 +39,7 @@ pub struct Wanted {
 pub fn measure(
     source: &Source,
     beside: &Path,
-    submission: &Submission,
+    configuration: &Configuration,
     wanted: &[Wanted],
     threads: usize,
     progress: &mut dyn Progress,
@@ -52,7 +52,7 @@ pub fn measure(
         Source::Simulated(_) => None,
     };
     let source = source.moved(beside, out)?;
-    let run = Run::new(source, submission.clone(), FileFormat::default());
+    let run = Run::new(source, configuration.clone(), FileFormat::default());
     match (&run.source, &data) {
         (Source::Simulated(settings), _) => {
             let images: Vec<ImageId> = wanted
@@ -77,14 +77,14 @@ pub fn measure(
         Some(data) => data,
         None => run.source.data(out)?,
     };
-    figures_of(&run, &data, out, threads)
+    metrics_of(&run, &data, out, threads)
 }
 
-/// Figures of every set in a folder of catalogues.
+/// Metrics of every set in a folder of catalogues.
 ///
 /// # Errors
 /// Where a file cannot be read, or there is nothing to score.
-pub fn figures_of(
+pub fn metrics_of(
     run: &Run,
     data: &DataFolder,
     out: &Path,
@@ -106,14 +106,14 @@ pub fn figures_of(
                 images,
                 galaxies,
                 flagged,
-                figures,
+                metrics,
                 errors,
                 ..
             } = SetRecord::new(set, scored, print);
-            let mut all: BTreeMap<String, [f64; 2]> = Figures::ALL
+            let mut all: BTreeMap<String, [f64; 2]> = Metrics::ALL
                 .iter()
-                .zip(figures.values().into_iter().zip(errors.values()))
-                .map(|(figure, (value, error))| (figure.name.to_owned(), [value, error]))
+                .zip(metrics.values().into_iter().zip(errors.values()))
+                .map(|(metric, (value, error))| (metric.name.to_owned(), [value, error]))
                 .collect();
             for (name, value) in SCATTER.iter().zip(scatter(run, out, set, threads)?) {
                 all.insert((*name).to_owned(), value);
@@ -124,7 +124,7 @@ pub fn figures_of(
                 images,
                 galaxies,
                 flagged,
-                figures: all,
+                metrics: all,
             })
         })
         .collect()

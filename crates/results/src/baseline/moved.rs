@@ -2,56 +2,56 @@
 
 use std::path::Path;
 
-use shearq_submissions::{Registry, Submission};
+use shearq_submissions::{Configuration, Registry};
 
 use super::measured::{SCATTER, Wanted};
-use super::{Baseline, BaselineSet, BaselineSubmission};
+use super::{Baseline, BaselineConfiguration, BaselineSet};
 use shearq_pipeline::data::relative::shortened;
 use shearq_pipeline::data::run::differences;
 
-/// Figures that must not move.
+/// Metrics that must not move.
 const CHECKED: [&str; 5] = ["q", "m_half", "sqrt_a", SCATTER[0], SCATTER[1]];
 
-/// How far a figure may be off on the same data, relative to itself: a changed digit of Q as tables
+/// How far a metric may be off on the same data, relative to itself: a changed digit of Q as tables
 /// print it is seen.
 ///
 /// The network works in f32, and instruction sets round its sums differently. On the project's own
-/// baseline, figures with fused multiply-add (AVX2, AVX-512) and without differ by less than 2e-6 of
+/// baseline, metrics with fused multiply-add (AVX2, AVX-512) and without differ by less than 2e-6 of
 /// themselves and 1e-5 of their standard errors, a fiftieth of what is allowed.
 pub const TOLERANCE: f64 = 1e-4;
 
-/// The same in units of the figure's standard error, for figures that are nearly zero.
+/// The same in units of the metric's standard error, for metrics that are nearly zero.
 pub const TOLERANCE_SIGMA: f64 = 1e-3;
 
-/// A figure of a baseline, and what it is now.
+/// A metric of a baseline, and what it is now.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shift {
     /// Set number.
     pub set: u32,
-    /// Name of the figure.
-    pub figure: &'static str,
+    /// Name of the metric.
+    pub metric: &'static str,
     /// Value and standard error in the baseline.
     pub before: [f64; 2],
     /// Value and standard error now.
     pub now: [f64; 2],
-    /// The difference in units of its error: that of the baseline's figure on the same data, on
+    /// The difference in units of its error: that of the baseline's metric on the same data, on
     /// others that of both.
     pub sigma: f64,
     /// Whether it moved by more than may be.
     pub moved: bool,
 }
 
-/// What became of the checked figures of a set.
+/// What became of the checked metrics of a set.
 ///
-/// On the same data a figure may be off by rounding alone: by [`TOLERANCE`] of itself or
+/// On the same data a metric may be off by rounding alone: by [`TOLERANCE`] of itself or
 /// [`TOLERANCE_SIGMA`] of its error, whichever is more. On other data it may be off by `sigmas` standard errors of the
 /// difference.
 pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift> {
     let same_data = before.data == now.data && before.images == now.images;
     CHECKED
         .iter()
-        .map(|&figure| {
-            let get = |set: &BaselineSet| set.figures.get(figure).copied();
+        .map(|&metric| {
+            let get = |set: &BaselineSet| set.metrics.get(metric).copied();
             let (old, new) = (
                 get(before).unwrap_or([f64::NAN; 2]),
                 get(now).unwrap_or([f64::NAN; 2]),
@@ -68,13 +68,13 @@ pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift
             } else {
                 sigmas * error
             };
-            // On other data nothing can be told where an error is withheld; a figure that is lost is a change.
+            // On other data nothing can be told where an error is withheld; a metric that is lost is a change.
             let untold = !same_data && error.is_nan() && difference.is_finite();
             let within = untold || difference.abs() <= allowed;
             let neither = old[0].is_nan() && new[0].is_nan();
             Shift {
                 set: before.set,
-                figure,
+                metric,
                 before: old,
                 now: new,
                 sigma: difference / error,
@@ -90,8 +90,8 @@ pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift
 /// # Errors
 /// Where settings cannot be compared.
 fn settings_moved(
-    before: &BaselineSubmission,
-    now: &Submission,
+    before: &BaselineConfiguration,
+    now: &Configuration,
 ) -> anyhow::Result<(Vec<String>, Vec<String>)> {
     let mut current = toml::Table::try_from(now)?;
     let mut earlier = before.settings.clone();
@@ -111,8 +111,8 @@ pub struct Checked {
     /// Name of the baseline.
     pub baseline: String,
     /// Name of the submission.
-    pub submission: String,
-    /// Every figure looked at.
+    pub configuration: String,
+    /// Every metric looked at.
     pub shifts: Vec<Shift>,
     /// Settings that are others now.
     pub settings: Vec<String>,
@@ -133,19 +133,19 @@ impl Checked {
         let settings = self
             .settings
             .iter()
-            .map(|line| format!("{}: setting {line}", self.submission));
-        let figures = self.shifts.iter().filter(|shift| shift.moved).map(|shift| {
+            .map(|line| format!("{}: setting {line}", self.configuration));
+        let metrics = self.shifts.iter().filter(|shift| shift.moved).map(|shift| {
             format!(
                 "{} set {}: {} from {} to {}, {:+.2} σ",
-                self.submission,
+                self.configuration,
                 shift.set,
-                shift.figure,
+                shift.metric,
                 shift.before[0],
                 shift.now[0],
                 shift.sigma
             )
         });
-        settings.chain(figures).collect()
+        settings.chain(metrics).collect()
     }
 }
 
@@ -169,10 +169,10 @@ pub enum Settings<'a> {
 /// The settings by which a submission of a baseline is measured again, and whether they are those stored because its
 /// file is not known. In stored settings, keys that the baseline does not have are the base's.
 fn settings_now(
-    before: &BaselineSubmission,
+    before: &BaselineConfiguration,
     registry: &Registry,
     settings: Settings<'_>,
-) -> Result<(Submission, bool), anyhow::Error> {
+) -> Result<(Configuration, bool), anyhow::Error> {
     if let (Settings::Files(folder), Some(file)) = (settings, &before.file) {
         let path = shortened(folder.join(file));
         // A plain name could be one of the registry.
@@ -182,12 +182,12 @@ fn settings_now(
             "{}: the configuration file is not there any more. Try: shearq baseline check --stored",
             path.display()
         );
-        return Ok((registry.get(&path.to_string_lossy())?.submission, false));
+        return Ok((registry.get(&path.to_string_lossy())?.configuration, false));
     }
     if before.file.is_none() && registry.names().contains(&before.name) {
-        return Ok((registry.get(&before.name)?.submission, false));
+        return Ok((registry.get(&before.name)?.configuration, false));
     }
-    let base = registry.get(base_of(&before.settings))?.submission;
+    let base = registry.get(base_of(&before.settings))?.configuration;
     let mut all = toml::Table::try_from(&base)?;
     for (key, value) in &before.settings {
         match (all.get_mut(key), value) {
@@ -212,17 +212,17 @@ pub fn check(
     baseline: &Baseline,
     sigmas: f64,
     settings: Settings<'_>,
-    mut measure: impl FnMut(&Submission, &[Wanted]) -> anyhow::Result<Vec<BaselineSet>>,
-) -> anyhow::Result<(Vec<Checked>, Vec<BaselineSubmission>)> {
+    mut measure: impl FnMut(&Configuration, &[Wanted]) -> anyhow::Result<Vec<BaselineSet>>,
+) -> anyhow::Result<(Vec<Checked>, Vec<BaselineConfiguration>)> {
     let registry = Registry::embedded()?;
     let (mut checks, mut submissions) = (Vec::new(), Vec::new());
     for before in &baseline.submissions {
-        let (submission, stored) = settings_now(before, &registry, settings)
+        let (configuration, stored) = settings_now(before, &registry, settings)
             .map_err(|error| error.context(format!("settings of {}", before.name)))?;
-        let (settings, new) = settings_moved(before, &submission)?;
+        let (settings, new) = settings_moved(before, &configuration)?;
         let mut check = Checked {
             baseline: name.to_owned(),
-            submission: before.name.clone(),
+            configuration: before.name.clone(),
             shifts: Vec::new(),
             settings,
             notes: new
@@ -239,14 +239,14 @@ pub fn check(
                 images: set.images.len() as u32,
             })
             .collect();
-        let sets = measure(&submission, &wanted)?;
+        let sets = measure(&configuration, &wanted)?;
         for old in &before.sets {
             let Some(now) = sets.iter().find(|now| now.set == old.set) else {
                 anyhow::bail!("set {} was not measured again", old.set);
             };
             if now.data != old.data || now.images != old.images {
                 check.notes.push(format!(
-                    "the data of set {} are not the baseline's ({} images then, {} now); its figures may differ by {sigmas} σ",
+                    "the data of set {} are not the baseline's ({} images then, {} now); its metrics may differ by {sigmas} σ",
                     old.set,
                     old.images.len(),
                     now.images.len(),
@@ -254,8 +254,8 @@ pub fn check(
             }
             check.shifts.extend(shifts(old, now, sigmas));
         }
-        submissions.push(BaselineSubmission::new(
-            &submission,
+        submissions.push(BaselineConfiguration::new(
+            &configuration,
             before.file.clone(),
             sets,
         )?);
@@ -269,14 +269,14 @@ mod tests {
     use super::*;
 
     fn set(data: &str, q: f64) -> BaselineSet {
-        let figures = CHECKED.map(|name| (name.to_owned(), [q, 2.0]));
+        let metrics = CHECKED.map(|name| (name.to_owned(), [q, 2.0]));
         BaselineSet {
             set: 1,
             data: data.into(),
             images: vec![1, 2],
             galaxies: 10,
             flagged: 0,
-            figures: figures.into(),
+            metrics: metrics.into(),
         }
     }
 
@@ -286,11 +286,11 @@ mod tests {
         let moved = |now: &BaselineSet| shifts(&before, now, 3.0)[0].moved;
         assert!(!moved(&set("a", 80.0 * (1.0 + 0.9 * TOLERANCE))));
         assert!(moved(&set("a", 80.0 * (1.0 - 1.1 * TOLERANCE))));
-        // 3 σ of the difference of two figures with errors of 2 is 8.5.
+        // 3 σ of the difference of two metrics with errors of 2 is 8.5.
         assert!(!moved(&set("b", 88.0)) && moved(&set("b", 89.0)));
         assert!(moved(&set("a", f64::NAN)) && moved(&set("b", f64::NAN)));
         let mut unsure = set("b", 1e9);
-        for value in unsure.figures.values_mut() {
+        for value in unsure.metrics.values_mut() {
             value[1] = f64::NAN;
         }
         assert!(!moved(&unsure));

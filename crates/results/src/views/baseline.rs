@@ -6,13 +6,13 @@ use crate::baseline::Checked;
 use shearq_render::escape::markup as escape;
 use shearq_render::table::{Cell, Heading, Table};
 
-/// Every figure of every check, or only those that moved.
+/// Every metric of every check, or only those that moved.
 pub fn shift_table(checks: &[Checked], all: bool) -> Table {
     let headings = [
         ("baseline", "Baseline"),
         ("submission", "Submission"),
         ("set", "Set"),
-        ("figure", "Figure"),
+        ("metric", "Metric"),
         ("before", "Before"),
         ("now", "Now"),
         ("difference", "Difference"),
@@ -27,9 +27,9 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
             };
             rows.push(vec![
                 Cell::text(&check.baseline),
-                Cell::text(&check.submission),
+                Cell::text(&check.configuration),
                 Cell::number(f64::from(shift.set), 0),
-                Cell::text(shift.figure),
+                Cell::text(shift.metric),
                 cell(shift.before),
                 cell(shift.now),
                 Cell::number(shift.now[0] - shift.before[0], 6),
@@ -45,11 +45,11 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
         .filter(|shift| shift.moved)
         .count();
     let mut notes = vec![format!(
-        "{moved} of {looked} figures of {} submission(s) moved by more than rounding or noise explains. In σ: difference over the figure's standard error.",
+        "{moved} of {looked} metrics of {} submission(s) moved by more than rounding or noise explains. In σ: difference over the metric's standard error.",
         checks.len()
     )];
     for check in checks {
-        let name = format!("{}, {}", check.baseline, check.submission);
+        let name = format!("{}, {}", check.baseline, check.configuration);
         for line in &check.settings {
             notes.push(format!("{name}: the setting moved: {line}"));
         }
@@ -78,10 +78,10 @@ pub fn junit(checks: &[Checked]) -> String {
             suite.len()
         );
         for check in suite {
-            let submission = escape(&check.submission);
+            let configuration = escape(&check.configuration);
             let _ = write!(
                 text,
-                "    <testcase classname=\"baseline.{name}\" name=\"{submission}\""
+                "    <testcase classname=\"baseline.{name}\" name=\"{configuration}\""
             );
             if check.failed() {
                 let lines = check.moved();
@@ -110,15 +110,15 @@ mod tests {
     fn junit_counts_failures_and_escapes_names() {
         let shift = Shift {
             set: 2,
-            figure: "q",
+            metric: "q",
             before: [80.0, 2.0],
             now: [81.0, 2.0],
             sigma: 0.5,
             moved: true,
         };
-        let check = |submission: &str, shifts: Vec<Shift>| Checked {
+        let check = |configuration: &str, shifts: Vec<Shift>| Checked {
             baseline: "small".into(),
-            submission: submission.into(),
+            configuration: configuration.into(),
             shifts,
             settings: Vec::new(),
             stored: false,

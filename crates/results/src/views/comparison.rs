@@ -1,4 +1,4 @@
-//! Submissions and recorded runs side by side: the means of their figures, differences in Q and calibrated Q, and Q per set.
+//! Submissions and recorded runs side by side: the means of their metrics, differences in Q and calibrated Q, and Q per set.
 
 use std::borrow::Borrow;
 use std::collections::BTreeSet;
@@ -6,10 +6,10 @@ use std::collections::BTreeSet;
 use ndarray::Array2;
 use shearq_files::frames::polars::AnyValue;
 use shearq_scoring::resample::PairedDifference;
-use shearq_scoring::{Definition, Fault, Figures};
+use shearq_scoring::{Definition, Fault, Metrics};
 use shearq_submissions::Published;
 
-use crate::compare::{Paired, Variant, by_name, common_sets, difference, mean_figure};
+use crate::compare::{Paired, Variant, by_name, common_sets, difference, mean_metric};
 use crate::groups::{Group, Grouping};
 use crate::row::{RunRecord, SetRecord};
 use crate::views::diagnosis::of_sets;
@@ -18,16 +18,16 @@ use crate::views::verdict::verdict;
 use shearq_render::figure::{ColourMap, HeatMap};
 use shearq_render::table::{Cell, Heading, Table};
 
-/// The cell of a mean over sets of the figure called `name`.
+/// The cell of a mean over sets of the metric called `name`.
 fn mean_cell(sets: &[&SetRecord], name: &str) -> Cell {
-    let (value, error) = mean_figure(sets, name);
-    let decimals = Figures::place(name).map_or(0, |place| Figures::ALL[place].decimals);
+    let (value, error) = mean_metric(sets, name);
+    let decimals = Metrics::place(name).map_or(0, |place| Metrics::ALL[place].decimals);
     Cell::with_error(value, Some(error), decimals)
 }
 
-/// The heading of the figure called `name`.
-fn figure_heading(name: &'static str) -> Heading {
-    let label = Figures::place(name).map_or(name, |place| Figures::ALL[place].label);
+/// The heading of the metric called `name`.
+fn metric_heading(name: &'static str) -> Heading {
+    let label = Metrics::place(name).map_or(name, |place| Metrics::ALL[place].label);
     Heading::new(name, label)
 }
 
@@ -35,7 +35,7 @@ fn figure_heading(name: &'static str) -> Heading {
 fn leaderboard_heading<'a>(sets: impl Iterator<Item = &'a SetRecord>) -> Heading {
     let apart = sets
         .into_iter()
-        .any(|set| best_is_another(set.q_leaderboard, set.figures.q));
+        .any(|set| best_is_another(set.q_leaderboard, set.metrics.q));
     Heading {
         detail: !apart,
         ..Heading::new("q_leaderboard", "Q leaderboard")
@@ -53,16 +53,16 @@ type Differences = Option<[Option<PairedDifference>; 2]>;
 
 /// Those of `sets` from `first`.
 fn differences<R: Borrow<SetRecord>>(first: &[R], sets: &[R]) -> [Option<PairedDifference>; 2] {
-    [Paired::Q, Paired::Calibrated].map(|figure| difference(figure, first, sets))
+    [Paired::Q, Paired::Calibrated].map(|metric| difference(metric, first, sets))
 }
 
 /// Headings of Q and calibrated Q, each with its difference and that one's significance.
 fn q_headings() -> [Heading; 6] {
     [
-        figure_heading("q"),
+        metric_heading("q"),
         Heading::new("q_difference", "ΔQ to first"),
         Heading::new("sigma", "in σ"),
-        figure_heading("q_calibrated"),
+        metric_heading("q_calibrated"),
         Heading::new("q_calibrated_difference", "ΔQ cal."),
         Heading::new("q_calibrated_sigma", "in σ"),
     ]
@@ -100,31 +100,31 @@ fn unpaired_note(names: &[&str]) -> Option<String> {
 }
 
 /// Variants side by side over the sets that all of them have, with the significance of each one's
-/// difference in Q from the first, paired over the same images, and the published figures.
+/// difference in Q from the first, paired over the same images, and the published metrics.
 pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     let records: Vec<Vec<SetRecord>> = variants.iter().map(Variant::records).collect();
     let common = common_sets(&records);
     let mut headings = vec![Heading::new("submission", "Submission")];
     headings.extend(q_headings());
     headings.extend([
-        figure_heading("galaxy_noise"),
-        figure_heading("m_cross"),
+        metric_heading("galaxy_noise"),
+        metric_heading("m_cross"),
         leaderboard_heading(records.iter().flatten()),
-        figure_heading("q_dn"),
-        figure_heading("m_half"),
-        figure_heading("sqrt_a"),
+        metric_heading("q_dn"),
+        metric_heading("m_half"),
+        metric_heading("sqrt_a"),
         Heading::new("q_published", "Q publ."),
         Heading::new("m_half_published", "M/2 publ."),
         Heading::new("sqrt_a_published", "√A publ."),
     ]);
     let shown: Vec<&str> = headings.iter().map(|heading| heading.key).collect();
     let others = || {
-        Figures::ALL
+        Metrics::ALL
             .iter()
-            .filter(|figure| !shown.contains(&figure.name))
+            .filter(|metric| !shown.contains(&metric.name))
     };
     let mut headings = headings.clone();
-    headings.extend(others().map(|figure| figure_heading(figure.name).detail()));
+    headings.extend(others().map(|metric| metric_heading(metric.name).detail()));
     let mut rows = Vec::new();
     let mut unpaired = Vec::new();
     let mut first: Option<Vec<&SetRecord>> = None;
@@ -153,7 +153,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             published(|p| p.m_half, 4),
             published(|p| p.sqrt_a, 4),
         ]);
-        row.extend(others().map(|figure| mean_cell(&sets, figure.name)));
+        row.extend(others().map(|metric| mean_cell(&sets, metric.name)));
         rows.push(row);
         first.get_or_insert(sets);
     }
@@ -206,12 +206,12 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
     ]);
     headings.extend(q_headings());
     headings.extend([
-        figure_heading("galaxy_noise"),
-        figure_heading("m_cross"),
+        metric_heading("galaxy_noise"),
+        metric_heading("m_cross"),
         leaderboard_heading(groups.iter().flat_map(|group| group.sets.iter().copied())),
-        figure_heading("q_dn"),
-        figure_heading("m_half"),
-        figure_heading("sqrt_a"),
+        metric_heading("q_dn"),
+        metric_heading("m_half"),
+        metric_heading("sqrt_a"),
     ]);
     let mut rows = Vec::new();
     let mut unpaired = Vec::new();
@@ -225,7 +225,7 @@ pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<G
             unpaired.push(group.id.as_str());
         }
         let mut row = vec![
-            Cell::text(&group.run.submission),
+            Cell::text(&group.run.configuration),
             Cell::text(&group.id),
             Cell::text(&group.run.version),
         ];
@@ -274,7 +274,7 @@ fn run_notes(
     let several = ways.len() > 1;
     let ways: Vec<String> = ways.into_iter().collect();
     let mut notes = vec![format!(
-        "Means over the sets of each row. Figures: {}. √A in 10⁻⁴ for C_ℓ in steradian.",
+        "Means over the sets of each row. Metrics: {}. √A in 10⁻⁴ for C_ℓ in steradian.",
         ways.join("; ")
     )];
     if grouping.is_some() {
@@ -315,12 +315,12 @@ fn bias_note(run: &RunRecord) -> Option<String> {
         .sets
         .iter()
         .map(|set| {
-            let finding = Fault::of_bias(set.figures.m_cross, set.errors.m_cross);
+            let finding = Fault::of_bias(set.metrics.m_cross, set.errors.m_cross);
             (Some(set.set), finding.into_iter().collect())
         })
         .collect();
     let lines = of_sets(findings.iter().map(|(set, found)| (*set, found.as_slice())));
-    (!lines.is_empty()).then(|| format!("{}: {}", run.submission, lines.join(" ")))
+    (!lines.is_empty()).then(|| format!("{}: {}", run.configuration, lines.join(" ")))
 }
 
 /// Sets as `1-3,7`.
@@ -350,9 +350,9 @@ pub fn q_heat_map<R: Borrow<SetRecord>>(variants: &[(String, Vec<R>)]) -> HeatMa
                 .iter()
                 .map(Borrow::borrow)
                 .find(|own| own.set == *set)
-                .map_or(f64::NAN, |own| own.figures.q);
+                .map_or(f64::NAN, |own| own.metrics.q);
         }
-        row[sets.len()] = mean_figure(own, "q").0;
+        row[sets.len()] = mean_metric(own, "q").0;
     }
     let most = values.iter().copied().fold(f64::NAN, f64::max);
     HeatMap {

@@ -1,12 +1,12 @@
 //! Mean shears as a table.
 
-use shearq_submissions::{Calibration, EllipticityType, Submission};
+use shearq_submissions::{Calibration, Configuration, EllipticityType};
 
 use crate::mean::SetMean;
 use shearq_render::table::{Cell, Heading, Table};
 
 /// Means of sets measured by `submission`, of catalogues that are called `name`.
-pub fn mean_table(means: &[SetMean], submission: &Submission, name: &str) -> Table {
+pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) -> Table {
     let headings = [
         ("set", "Set"),
         ("galaxies", "Galaxies"),
@@ -29,13 +29,13 @@ pub fn mean_table(means: &[SetMean], submission: &Submission, name: &str) -> Tab
     });
     let mut notes = vec![format!(
         "Mean ellipticities of {name} by {}, g2 along the diagonal of the pixels.",
-        submission.name
+        configuration.name
     )];
-    if submission.calibration() == Calibration::None {
+    if configuration.calibration() == Calibration::None {
         notes.push(
             "This submission does not divide by the response to shear: these are no shears.".into(),
         );
-    } else if submission.ellipticity() == EllipticityType::Distortion {
+    } else if configuration.ellipticity() == EllipticityType::Distortion {
         notes.push("Of distortions, divided by their response to shear.".into());
     }
     Table {

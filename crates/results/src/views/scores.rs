@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Value, json};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
-    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, Figures, SetScore,
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, Metrics, SetScore,
     SpectrumScore,
 };
 
@@ -17,11 +17,11 @@ use crate::views::verdict::verdict;
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_simulate::kinds::SetKind;
 
-fn figure_cells(figures: &Figures, errors: &Figures) -> Vec<Cell> {
-    let pairs = figures.values().into_iter().zip(errors.values());
-    let cells = pairs.zip(Figures::ALL);
+fn metric_cells(metrics: &Metrics, errors: &Metrics) -> Vec<Cell> {
+    let pairs = metrics.values().into_iter().zip(errors.values());
+    let cells = pairs.zip(Metrics::ALL);
     cells
-        .map(|((value, error), figure)| Cell::with_error(value, Some(error), figure.decimals))
+        .map(|((value, error), metric)| Cell::with_error(value, Some(error), metric.decimals))
         .collect()
 }
 
@@ -38,18 +38,18 @@ fn kinds_note(mut kinds: impl Iterator<Item = Option<SetKind>>) -> &'static str 
     }
 }
 
-/// One line that says what the figures are.
+/// One line that says what the metrics are.
 pub(super) fn definition_note(definition: Definition) -> String {
     let definition = match definition {
         Definition::Leaderboard => "leaderboard definition (the challenge's own arithmetic)",
         Definition::Corrected => "corrected definition (azimuthal averages, fixed bins)",
     };
     format!(
-        "Figures: {definition}. Errors: from what the truth leaves unexplained, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian; over its error it is twice as far from zero as A, and it has one where A is two of its own from zero."
+        "Metrics: {definition}. Errors: from what the truth leaves unexplained, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian; over its error it is twice as far from zero as A, and it has one where A is two of its own from zero."
     )
 }
 
-/// Which convention the figures of a submission's sets are in, and why.
+/// Which convention the metrics of a submission's sets are in, and why.
 pub fn convention_note(scored: &[ScoredSet]) -> String {
     let Some(first) = scored.first() else {
         return String::new();
@@ -114,7 +114,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
                 )
             });
             lines.push(format!(
-                "warning: in {name} the leaderboard takes {best}, where these figures are of {chosen}."
+                "warning: in {name} the leaderboard takes {best}, where these metrics are of {chosen}."
             ));
         }
         if score.constant.is_none() && score.true_b_share() > 0.2 {
@@ -129,7 +129,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         scored.iter().map(|set| (set.set, believable(set))),
     ));
     let blank = |set: &&ScoredSet| {
-        set.score.constant.is_none() && set.rows.used > 0 && set.score.figures.q_calibrated.is_nan()
+        set.score.constant.is_none() && set.rows.used > 0 && set.score.metrics.q_calibrated.is_nan()
     };
     let blank: Vec<String> = scored
         .iter()
@@ -178,14 +178,14 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
         Heading::new("kind", "Kind"),
         Heading::new("images", "Images").detail(),
     ];
-    headings.extend(Figures::ALL.iter().map(|figure| Heading {
-        detail: figure.detail,
-        ..Heading::new(figure.name, figure.label)
+    headings.extend(Metrics::ALL.iter().map(|metric| Heading {
+        detail: metric.detail,
+        ..Heading::new(metric.name, metric.label)
     }));
     headings.push(Heading::new("convention", "Conv.").detail());
     let apart = scored
         .iter()
-        .any(|set| best_is_another(q_leaderboard(&set.score), set.score.figures.q));
+        .any(|set| best_is_another(q_leaderboard(&set.score), set.score.metrics.q));
     headings.push(Heading {
         detail: !apart,
         ..Heading::new("q_leaderboard", "Q leaderboard")
@@ -200,7 +200,7 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
             Cell::text(kind_label(*kind)),
             Cell::number(score.images as f64, 0),
         ];
-        row.extend(figure_cells(&score.figures, &score.errors));
+        row.extend(metric_cells(&score.metrics, &score.errors));
         row.push(Cell::text(score.chosen.number().to_string()));
         row.push(Cell::number(q_leaderboard(score), 2));
         rows.push(row);
@@ -212,7 +212,7 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
             Cell::Empty,
             Cell::number(scored.iter().map(|s| s.score.images as f64).sum(), 0),
         ];
-        row.extend(figure_cells(&mean, &errors));
+        row.extend(metric_cells(&mean, &errors));
         row.push(Cell::Empty);
         let best: f64 = scored.iter().map(|s| q_leaderboard(&s.score)).sum();
         row.push(Cell::number(best / scored.len() as f64, 2));
@@ -237,7 +237,7 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     }
 }
 
-/// Whether the leaderboard's Q is of another class of conventions than the figures: within a class it is the
+/// Whether the leaderboard's Q is of another class of conventions than the metrics: within a class it is the
 /// same but for rounding, by 1e-7 at most.
 pub(super) fn best_is_another(q_leaderboard: f64, q: f64) -> bool {
     (q_leaderboard / q - 1.0).abs() > 1e-6
@@ -274,8 +274,8 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
             shear(mean.e[1], mean.error[1]),
             Cell::number(mean.truth[0], 5),
             Cell::number(mean.truth[1], 5),
-            shear(score.figures.c1, mean.error[0]),
-            shear(score.figures.c2, mean.error[1]),
+            shear(score.metrics.c1, mean.error[0]),
+            shear(score.metrics.c2, mean.error[1]),
         ])
     });
     Table {
@@ -286,7 +286,7 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
     }
 }
 
-/// Figures of power-spectrum submissions, one row per set and one of means. `kind_of` tells the kind of a set.
+/// Metrics of power-spectrum submissions, one row per set and one of means. `kind_of` tells the kind of a set.
 pub fn spectra(
     scored: &[(Option<u32>, SpectrumScore)],
     kind_of: impl Fn(u32) -> Option<SetKind>,
@@ -301,7 +301,7 @@ pub fn spectra(
         Heading::new("m_half", "M/2"),
         Heading::new("sqrt_a", "√A×10⁴"),
     ];
-    let figures = |score: &SpectrumScore| {
+    let metrics = |score: &SpectrumScore| {
         [
             (score.quality.q, score.quality_error),
             (score.quality.sigma_sys * 1e4, f64::NAN),
@@ -309,9 +309,9 @@ pub fn spectra(
             (score.sqrt_a, score.sqrt_a_error),
         ]
     };
-    let cells = |figures: [(f64, f64); 4]| {
+    let cells = |metrics: [(f64, f64); 4]| {
         let decimals = [2, 4, 4, 4];
-        let pairs = figures.into_iter().zip(decimals);
+        let pairs = metrics.into_iter().zip(decimals);
         pairs.map(|((value, error), decimals)| Cell::with_error(value, Some(error), decimals))
     };
     let mut rows: Vec<Vec<Cell>> = scored
@@ -319,13 +319,13 @@ pub fn spectra(
         .map(|(set, score)| {
             let kind = set.and_then(&kind_of);
             let mut row = vec![set_cell(*set), Cell::text(kind_label(kind))];
-            row.extend(cells(figures(score)));
+            row.extend(cells(metrics(score)));
             row
         })
         .collect();
     if scored.len() > 1 {
         let mean = |k: usize| {
-            let all: Vec<(f64, f64)> = scored.iter().map(|s| figures(&s.1)[k]).collect();
+            let all: Vec<(f64, f64)> = scored.iter().map(|s| metrics(&s.1)[k]).collect();
             mean_over_sets(&all)
         };
         let mut row = vec![Cell::text("mean"), Cell::Empty];
@@ -345,7 +345,7 @@ pub fn spectra(
         headings,
         rows,
         notes: vec![format!(
-            "Figures: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian.{}",
+            "Metrics: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian.{}",
             kinds_note(scored.iter().map(|(set, _)| set.and_then(&kind_of)))
         )],
     }
@@ -512,8 +512,8 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
     let own = json!({
         "chosen": score.chosen.number(),
         "convention_known": scored.basis.is_known(),
-        "figures": score.figures,
-        "figure_errors": score.errors,
+        "metrics": score.metrics,
+        "metric_errors": score.errors,
         "error_method": "from the modes that the truth leaves unexplained, at fixed truth; c1 and c2 at least the jackknife over images",
         "mean_shear": score.constant,
         "rows": scored.rows,

@@ -2,7 +2,7 @@
 
 use std::borrow::Borrow;
 
-use crate::compare::{Paired, difference, mean_figure};
+use crate::compare::{Paired, difference, mean_metric};
 use crate::row::SetRecord;
 use shearq_render::table::Cell;
 
@@ -14,7 +14,7 @@ const LISTED: usize = 3;
 /// Which configuration to use, with the metrics that decide; of a single one, its metrics. `None` of a single
 /// one whose response is not known.
 pub fn verdict<R: Borrow<SetRecord>>(submissions: &[(String, Vec<R>)]) -> Option<String> {
-    let mean = |sets: &[R], name: &str| mean_figure(sets, name).0;
+    let mean = |sets: &[R], name: &str| mean_metric(sets, name).0;
     let calibrated = |sets: &[R]| mean(sets, "q_calibrated");
     let known = submissions
         .iter()
@@ -30,7 +30,7 @@ pub fn verdict<R: Borrow<SetRecord>>(submissions: &[(String, Vec<R>)]) -> Option
             .then(|| "Not enough data to rank the configurations.".into());
     };
     let shown = |sets: &[R], name: &str, decimals: usize| {
-        let (value, error) = mean_figure(sets, name);
+        let (value, error) = mean_metric(sets, name);
         Cell::with_error(value, Some(error), decimals).in_words()
     };
     let rivals = || {
@@ -84,7 +84,7 @@ pub fn verdict<R: Borrow<SetRecord>>(submissions: &[(String, Vec<R>)]) -> Option
             let noise = few.iter().map(|set| {
                 let set = set.borrow();
                 let noise = Some(set.errors.galaxy_noise);
-                let noise = Cell::with_error(set.figures.galaxy_noise, noise, 3).in_words();
+                let noise = Cell::with_error(set.metrics.galaxy_noise, noise, 3).in_words();
                 format!("{noise} in set {}", set.set)
             });
             noise.collect::<Vec<_>>().join(" and ")
@@ -106,20 +106,20 @@ pub fn verdict<R: Borrow<SetRecord>>(submissions: &[(String, Vec<R>)]) -> Option
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shearq_scoring::Figures;
+    use shearq_scoring::Metrics;
 
     /// A submission with one set of eight images, whose calibrated Q scatters as `replicates`.
-    fn submission(
+    fn configuration(
         name: &str,
         q: f64,
         calibrated: f64,
         replicates: [f64; 8],
     ) -> (String, Vec<SetRecord>) {
-        let with = |q, q_calibrated, m_cross| Figures {
+        let with = |q, q_calibrated, m_cross| Metrics {
             q,
             q_calibrated,
             m_cross,
-            ..Figures::unknown()
+            ..Metrics::unknown()
         };
         let record = SetRecord {
             set: 2,
@@ -128,7 +128,7 @@ mod tests {
             images: (1..=8).collect(),
             galaxies: 8,
             flagged: 0,
-            figures: with(q, calibrated, -0.3),
+            metrics: with(q, calibrated, -0.3),
             errors: with(0.1, 2.0, 0.01),
             q_replicates: vec![q; 8],
             q_calibrated_replicates: replicates.map(|off| calibrated + off).to_vec(),
@@ -144,9 +144,9 @@ mod tests {
     fn a_submission_is_named_where_its_images_tell_it_from_the_others() {
         let common = [0.5, -0.5, 0.5, -0.5, 0.5, -0.5, 0.5, -0.5];
         let own = [0.7, -0.7, 0.3, -0.3, 0.7, -0.7, 0.3, -0.3];
-        let better = submission("b", 10.0, 25.0, own);
+        let better = configuration("b", 10.0, 25.0, own);
         // The noise that both have in common takes their errors of 2 down to √(7/8 · Σ 0.2²) = 0.53.
-        let told = verdict(&[submission("a", 12.0, 20.0, common), better.clone()]).unwrap();
+        let told = verdict(&[configuration("a", 12.0, 20.0, common), better.clone()]).unwrap();
         assert!(told.starts_with("Use b: m = -0.300 ± 0.010"), "{told}");
         assert!(
             told.contains("Q calibrated = 20.0 ± 2.0, lower by 5.00 ± 0.53"),
@@ -156,14 +156,14 @@ mod tests {
             told.contains("Q itself is higher for a, which lose shear"),
             "{told}"
         );
-        let untold = verdict(&[submission("a", 9.0, 24.0, common), better.clone()]).unwrap();
+        let untold = verdict(&[configuration("a", 9.0, 24.0, common), better.clone()]).unwrap();
         let start =
             "b has the highest Q calibrated, but these images do not distinguish it from a: m";
         assert!(
             untold.starts_with(start) && !untold.contains("itself"),
             "{untold}"
         );
-        let unknown = verdict(&[submission("a", 9.0, f64::NAN, common), better]).unwrap();
+        let unknown = verdict(&[configuration("a", 9.0, f64::NAN, common), better]).unwrap();
         assert!(
             unknown.contains("do not distinguish it from a"),
             "{unknown}"
@@ -172,11 +172,11 @@ mod tests {
             unknown.contains("a has m = -0.300 ± 0.010 and Q calibrated = unknown"),
             "{unknown}"
         );
-        let blank = || submission("a", 9.0, f64::NAN, common);
+        let blank = || configuration("a", 9.0, f64::NAN, common);
         let none = verdict(&[blank(), blank()]).unwrap();
         assert_eq!(none, "Not enough data to rank the configurations.");
         assert_eq!(verdict(&[blank()]), None);
-        let alone = verdict(&[submission("a", 9.0, 24.0, common)]).unwrap();
+        let alone = verdict(&[configuration("a", 9.0, 24.0, common)]).unwrap();
         assert!(alone.starts_with("a: m = -0.300 ± 0.010, noise"), "{alone}");
     }
 }

@@ -1,6 +1,6 @@
 //! The paper's qualitative statements, held against results.
 
-use shearq_scoring::Figures;
+use shearq_scoring::Metrics;
 use shearq_scoring::resample::mean_over_sets;
 
 use super::sets::{mean_of_24, weighted};
@@ -24,7 +24,7 @@ pub struct Finding {
 /// Mean difference in Q of `second` from `first` over the challenge's 24 sets: (ΔQ, error, Q of the first).
 fn q_difference(results: &[SetResult], first: usize, second: usize) -> Option<(f64, f64, f64)> {
     let of_set = |set: &SetResult| {
-        let [a, b] = [first, second].map(|submission| &set.results[submission].score);
+        let [a, b] = [first, second].map(|configuration| &set.results[configuration].score);
         difference(Paired::Q, &[a], &[b]).map(|paired| (paired.difference, paired.error))
     };
     let differences = results.iter().map(of_set).collect::<Option<Vec<_>>>()?;
@@ -100,7 +100,7 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
             .iter()
             .filter(|set| SetKind::of(set.set).is_some_and(|kind| kind.image == wanted))
             .map(|set| &set.results[den].score)
-            .map(|score| (score.figures.q, score.errors.q))
+            .map(|score| (score.metrics.q, score.errors.q))
             .collect();
         (!values.is_empty()).then(|| mean_over_sets(&values))
     };
@@ -151,7 +151,7 @@ pub fn findings(results: &[SetResult], names: &[String]) -> Vec<Finding> {
         true,
     );
     if let Some(raw) = place("23/raw/star") {
-        let mut bias = |paper, figure: fn(&Figures) -> f64, name: &str, lower: bool| {
+        let mut bias = |paper, figure: fn(&Metrics) -> f64, name: &str, lower: bool| {
             let mean = |place: usize| mean_of_24(results, place, figure);
             let ((raw, raw_error), (den, den_error)) = (mean(raw), mean(den));
             let error = raw_error.hypot(den_error);

@@ -1,6 +1,6 @@
 //! Sect. 4: Figs 4 to 7.
 
-use shearq_submissions::Submission;
+use shearq_submissions::Configuration;
 
 use crate::calibration::{CTR_SNR_DB, Curves, LOG_LAMBDA, LambdaSums, PAPER_LAMBDA, SNR_DB};
 use shearq_render::figure::{LinePlot, PanelGrid, Series, Style};
@@ -194,7 +194,7 @@ pub fn curves_table(curves: &Curves) -> Table {
 }
 
 /// A short table for terminals: per rule and S/N, the best λ and the figures at 10⁻⁴.
-pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
+pub fn calibration_table(curves: &Curves, configuration: &Configuration) -> Table {
     let mut rows = Vec::new();
     let mut at_edge = false;
     for (rule, name) in RULES.iter().enumerate() {
@@ -247,7 +247,7 @@ pub fn calibration_table(curves: &Curves, submission: &Submission) -> Table {
     Table {
         title: format!(
             "Calibration of λ for {} on {} synthetic galaxies",
-            submission.name, curves.galaxies
+            configuration.name, curves.galaxies
         ),
         headings: vec![
             Heading::new("update", "Update"),

@@ -1,7 +1,7 @@
 //! Sect. 5: Table 1, Figs 8 to 11, and what denoising does to ellipticities.
 
-use shearq_scoring::Figures;
-use shearq_submissions::{PsfForm, Published, Submission};
+use shearq_scoring::Metrics;
+use shearq_submissions::{Configuration, PsfForm, Published};
 
 use crate::reproduce::SetResult;
 use crate::response::Response;
@@ -14,12 +14,12 @@ use shearq_simulate::kinds::{ImageType, SetKind, shares};
 pub(super) fn over_sets(
     results: &[SetResult],
     place: usize,
-    figure: fn(&Figures) -> f64,
+    figure: fn(&Metrics) -> f64,
 ) -> Vec<(f64, f64)> {
     results
         .iter()
         .map(|set| &set.results[place].score)
-        .map(|score| (figure(&score.figures), figure(&score.errors)))
+        .map(|score| (figure(&score.metrics), figure(&score.errors)))
         .collect()
 }
 
@@ -45,24 +45,24 @@ pub(super) fn weighted(results: &[SetResult], values: &[(f64, f64)]) -> (f64, f6
 pub(super) fn mean_of_24(
     results: &[SetResult],
     place: usize,
-    figure: fn(&Figures) -> f64,
+    figure: fn(&Metrics) -> f64,
 ) -> (f64, f64) {
     weighted(results, &over_sets(results, place, figure))
 }
 
 /// Table 1: our figures beside the published ones.
-pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)]) -> Table {
+pub fn table_one(results: &[SetResult], submissions: &[(Configuration, Published)]) -> Table {
     let as_published = results.iter().all(|set| set.images == PUBLISHED_IMAGES);
     let mut rows = Vec::new();
-    for (place, (submission, published)) in submissions.iter().enumerate() {
-        let mean = |figure: fn(&Figures) -> f64, decimals: usize| {
+    for (place, (configuration, published)) in submissions.iter().enumerate() {
+        let mean = |figure: fn(&Metrics) -> f64, decimals: usize| {
             let (value, error) = mean_of_24(results, place, figure);
             Cell::with_error(value, Some(error), decimals)
         };
         let given = |value: fn(&Published) -> f64, decimals: usize| {
             Cell::number(value(published), decimals)
         };
-        let apart = |figure: fn(&Figures) -> f64, value: fn(&Published) -> f64| {
+        let apart = |figure: fn(&Metrics) -> f64, value: fn(&Published) -> f64| {
             if !as_published {
                 return Cell::Empty;
             }
@@ -71,10 +71,10 @@ pub fn table_one(results: &[SetResult], submissions: &[(Submission, Published)])
         };
         let yes = |yes: bool| Cell::text(if yes { "Y" } else { "N" });
         rows.push(vec![
-            Cell::text(&submission.name),
-            Cell::text(format!("{0}×{0}", submission.stamp.size)),
-            yes(submission.wavelet().is_some()),
-            Cell::text(match submission.psf.form {
+            Cell::text(&configuration.name),
+            Cell::text(format!("{0}×{0}", configuration.stamp.size)),
+            yes(configuration.wavelet().is_some()),
+            Cell::text(match configuration.psf.form {
                 PsfForm::Star => "Star",
                 PsfForm::Functional => "Func",
             }),
@@ -157,9 +157,9 @@ pub fn per_set_table(results: &[SetResult]) -> Table {
     let mut rows = Vec::new();
     for set in results {
         for result in &set.results {
-            let cell = |figure: fn(&Figures) -> f64, decimals: usize| {
+            let cell = |figure: fn(&Metrics) -> f64, decimals: usize| {
                 Cell::with_error(
-                    figure(&result.score.figures),
+                    figure(&result.score.metrics),
                     Some(figure(&result.score.errors)),
                     decimals,
                 )
@@ -167,7 +167,7 @@ pub fn per_set_table(results: &[SetResult]) -> Table {
             rows.push(vec![
                 Cell::number(f64::from(set.set), 0),
                 Cell::text(SetKind::of(set.set).map_or("", |kind| kind.image.label())),
-                Cell::text(&result.submission),
+                Cell::text(&result.configuration),
                 cell(|f| f.q, 2),
                 Cell::number(result.score.q_leaderboard, 2),
                 cell(|f| f.q_dn, 1),
@@ -275,7 +275,7 @@ pub fn power_spectra_table(results: &[SetResult], place: usize) -> Table {
 pub fn bias_per_set(
     results: &[SetResult],
     places: &[(usize, &str)],
-    figure: fn(&Figures) -> f64,
+    figure: fn(&Metrics) -> f64,
     title: &str,
     y_label: &str,
 ) -> BarPlot {

@@ -9,7 +9,7 @@ use super::*;
 
 fn settings(iterations: usize, target: f64, window: f64, lambda: f64) -> LinearDeconvolution {
     let registry = Registry::embedded().unwrap();
-    let named = registry.get("48/linear/star").unwrap().submission;
+    let named = registry.get("48/linear/star").unwrap().configuration;
     LinearDeconvolution {
         max_iterations: iterations,
         target_sigma: target,

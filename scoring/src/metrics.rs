@@ -1,12 +1,12 @@
-//! The figures of a scored set, declared once: everything that names, prints or stores them reads this.
+//! The metrics of a scored set, declared once: everything that names, prints or stores them reads this.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Deserializer, Serialize};
 
-/// What one figure is and how it is printed.
+/// What one metric is and how it is printed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Figure {
+pub struct Metric {
     /// Name in files: columns, keys, conditions.
     pub name: &'static str,
     /// Heading of tables, with the unit where there is one.
@@ -19,17 +19,17 @@ pub struct Figure {
     pub meaning: &'static str,
 }
 
-macro_rules! figures {
+macro_rules! metrics {
     ($($name:ident: $label:literal, $decimals:literal, $detail:literal, $meaning:literal;)+) => {
-        /// Figures of one set, of a replicate of it, or the errors of them. Not a number where unknown.
+        /// Metrics of one set, of a replicate of it, or the errors of them. Not a number where unknown.
         #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-        pub struct Figures {
+        pub struct Metrics {
             $(#[doc = $meaning] pub $name: f64,)+
         }
 
-        impl Figures {
-            /// What each is, in the order of [`Figures::values`].
-            pub const ALL: [Figure; [$($label),+].len()] = [$(Figure {
+        impl Metrics {
+            /// What each is, in the order of [`Metrics::values`].
+            pub const ALL: [Metric; [$($label),+].len()] = [$(Metric {
                 name: stringify!($name),
                 label: $label,
                 decimals: $decimals,
@@ -42,16 +42,16 @@ macro_rules! figures {
                 [$(self.$name),+]
             }
 
-            /// The inverse of [`Figures::values`].
+            /// The inverse of [`Metrics::values`].
             pub fn from_values(values: [f64; Self::ALL.len()]) -> Self {
                 let [$($name),+] = values;
-                Figures { $($name),+ }
+                Metrics { $($name),+ }
             }
         }
     };
 }
 
-figures! {
+metrics! {
     q: "Q", 2, false, "Quality factor, 5·10⁻³/σ_sys.";
     q_dn: "Q_dn", 2, false, "Quality factor after removing the noise's power.";
     q_calibrated: "Q cal.", 2, false, "Quality factor after dividing the spectrum by (1 + m)², m by cross-correlation: what noise and scale-dependent bias leave.";
@@ -68,13 +68,13 @@ figures! {
     sigma_sys_1e4: "σ_sys×10⁴", 4, true, "What Q is made of: the mean distance of the bandpowers from the truth, in 10⁻⁴.";
 }
 
-impl Figures {
-    /// The figure that all records have. Others are unknown to those that were written before they were thought of.
+impl Metrics {
+    /// The metric that all records have. Others are unknown to those that were written before they were thought of.
     pub const ALWAYS: &str = "q";
 
-    /// The place in [`Figures::values`] of the figure called `name`.
+    /// The place in [`Metrics::values`] of the metric called `name`.
     pub fn place(name: &str) -> Option<usize> {
-        Self::ALL.iter().position(|figure| figure.name == name)
+        Self::ALL.iter().position(|metric| metric.name == name)
     }
 
     /// None known.
@@ -83,15 +83,15 @@ impl Figures {
     }
 }
 
-/// JSON has no NaN: what was written as null is read as that, and so is a figure that is not there.
-impl<'de> Deserialize<'de> for Figures {
+/// JSON has no NaN: what was written as null is read as that, and so is a metric that is not there.
+impl<'de> Deserialize<'de> for Metrics {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let found = BTreeMap::<String, Option<f64>>::deserialize(deserializer)?;
         if !found.contains_key(Self::ALWAYS) {
             return Err(serde::de::Error::missing_field(Self::ALWAYS));
         }
         Ok(Self::from_values(Self::ALL.map(
-            |Figure { name, .. }| found.get(name).copied().flatten().unwrap_or(f64::NAN),
+            |Metric { name, .. }| found.get(name).copied().flatten().unwrap_or(f64::NAN),
         )))
     }
 }
@@ -102,28 +102,28 @@ mod tests {
 
     #[test]
     fn values_names_and_fields_go_together() {
-        let values: [f64; Figures::ALL.len()] = std::array::from_fn(|k| k as f64);
-        let figures = Figures::from_values(values);
-        assert_eq!(figures.values(), values);
+        let values: [f64; Metrics::ALL.len()] = std::array::from_fn(|k| k as f64);
+        let metrics = Metrics::from_values(values);
+        assert_eq!(metrics.values(), values);
         for (name, field) in [
-            ("q", figures.q),
-            ("m_cross", figures.m_cross),
-            ("c2", figures.c2),
+            ("q", metrics.q),
+            ("m_cross", metrics.m_cross),
+            ("c2", metrics.c2),
         ] {
-            assert_eq!(Figures::place(name), Some(field as usize));
+            assert_eq!(Metrics::place(name), Some(field as usize));
         }
-        assert_eq!(Figures::place("q_best"), None);
-        let text = serde_json::to_string(&figures).unwrap();
-        assert_eq!(serde_json::from_str::<Figures>(&text).unwrap(), figures);
-        let unknown = serde_json::to_string(&Figures::unknown()).unwrap();
+        assert_eq!(Metrics::place("q_best"), None);
+        let text = serde_json::to_string(&metrics).unwrap();
+        assert_eq!(serde_json::from_str::<Metrics>(&text).unwrap(), metrics);
+        let unknown = serde_json::to_string(&Metrics::unknown()).unwrap();
         assert!(
-            serde_json::from_str::<Figures>(&unknown)
+            serde_json::from_str::<Metrics>(&unknown)
                 .unwrap()
                 .q
                 .is_nan()
         );
-        let early: Figures = serde_json::from_str("{\"q\":1.0}").unwrap();
+        let early: Metrics = serde_json::from_str("{\"q\":1.0}").unwrap();
         assert!(early.q == 1.0 && early.values()[1..].iter().all(|value| value.is_nan()));
-        assert!(serde_json::from_str::<Figures>("{\"q_dn\":1.0}").is_err());
+        assert!(serde_json::from_str::<Metrics>("{\"q_dn\":1.0}").is_err());
     }
 }
