@@ -6,7 +6,7 @@ use std::str::FromStr;
 use anyhow::Context;
 use clap::Args;
 use ndarray::Axis;
-use shearq_measure::{Measurement, Measurer, Stop, strip};
+use shearq_measure::{ImageNoise, Measurement, Measurer, Stop, strip};
 use shearq_submissions::Registry;
 
 use crate::{print, tell};
@@ -105,11 +105,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let psf = psf_of(&row, ix, submission.psf_cut())
             .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
         let mut worker = measurer.worker();
-        worker.set_survey(row.survey.as_ref());
-        worker.set_psf(psf.view())?;
+        let mut worker = worker.image(ImageNoise::of(row.survey.as_ref(), row.header_noise));
+        let mut worker = worker.psf(psf.view())?;
         let stamps = strip(&row.pixels, columns, side)?;
         let stamp = stamps.index_axis(Axis(0), ix);
-        let measured = worker.measure(stamp, row.header_noise)?;
+        let measured = worker.measure(stamp)?;
         anyhow::ensure!(
             measured.descent.is_some(),
             "galaxy {index} could not be measured: {}",
@@ -140,7 +140,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
 /// The galaxy's own response to shear after `lead`, where the method knows it.
 fn response(measured: &Measurement, lead: &str) -> String {
-    match measured.response {
+    match measured.response_diagonal() {
         [first, second] if first.is_finite() && second.is_finite() => {
             format!("{lead}{first:.3}, {second:.3}")
         }

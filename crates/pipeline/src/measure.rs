@@ -4,12 +4,12 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2, ArrayView3, Axis, Slice};
+use ndarray::{ArcArray2, Array2, ArrayView2, ArrayView3, Axis, Slice};
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
 use shearq_measure::{
-    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, MeasureError, Measurement, Measurer,
-    NoisePlan, Psfs, Star, Survey, Warning, Worker, calibrate, examined_rows, star, star_psf,
+    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, ImageNoise, MeasureError, Measurement,
+    Measurer, NoisePlan, Psfs, Star, Survey, Warning, Worker, calibrate, examined_rows, star,
     strip,
 };
 use shearq_submissions::{Configuration, EllipticityType, NoiseSource, PsfCut, PsfForm};
@@ -40,21 +40,6 @@ const LEAST_DOUBT: f64 = 0.01;
 /// The same in units of its standard error.
 const CLEAR: f64 = 5.0;
 
-/// PSFs of one row of stamps.
-pub enum RowPsf {
-    /// The same for all galaxies of the image, cut and normalised.
-    Shared(Arc<Array2<f64>>),
-    /// A strip of star stamps of `side` pixels, row-major, one per galaxy.
-    Stars {
-        /// Pixels of the strip.
-        pixels: Vec<f32>,
-        /// Side of one star stamp.
-        side: usize,
-    },
-    /// Parameters, one per galaxy.
-    Functional(Vec<FunctionalPsf>),
-}
-
 /// One row of stamps of an image.
 pub struct StampRow {
     /// The image.
@@ -69,8 +54,8 @@ pub struct StampRow {
     pub header_noise: Option<f64>,
     /// What the image's stamps tell of it, where the submission asks for noise to be measured on them.
     pub survey: Option<Arc<Survey>>,
-    /// PSFs.
-    pub psf: RowPsf,
+    /// The PSFs of its galaxies.
+    pub psfs: Psfs<'static>,
     /// What was found wrong with the image when it was opened, with its first row.
     pub warnings: Vec<Warning>,
 }
@@ -116,7 +101,7 @@ pub struct ImageSource {
 }
 
 enum PsfSource {
-    Shared(Arc<Array2<f64>>),
+    Shared(ArcArray2<f64>),
     Stars {
         image: Box<ImageReader>,
         side: usize,
@@ -239,14 +224,16 @@ impl ImageSource {
             pixels: self.image.read_rows(mosaic.stamp)?,
             header_noise: self.header_noise,
             survey: self.survey.clone(),
-            psf: match &mut self.psf {
-                PsfSource::Shared(psf) => RowPsf::Shared(Arc::clone(psf)),
-                PsfSource::Stars { image, side } => RowPsf::Stars {
-                    pixels: image.read_rows(*side)?,
-                    side: *side,
-                },
+            psfs: match &mut self.psf {
+                PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
+                PsfSource::Stars { image, side } => {
+                    let mut stars = Psfs::strip(image.read_rows(*side)?, mosaic.columns, *side)?;
+                    // Behind the last galaxy there is nothing to measure.
+                    stars.truncate(mosaic.of_row(iy));
+                    stars
+                }
                 PsfSource::Functional(field) => {
-                    RowPsf::Functional(field[first..first + mosaic.of_row(iy)].to_vec())
+                    Psfs::functional(field[first..first + mosaic.of_row(iy)].to_vec())
                 }
             },
             warnings: std::mem::take(&mut self.warnings),
@@ -328,7 +315,7 @@ fn open_psf(
                         );
                         return Err(FileError::new(&path, message).into());
                     }
-                    PsfSource::Shared(Arc::new(stamp))
+                    PsfSource::Shared(stamp.into_shared())
                 }
                 _ => PsfSource::Functional(rows),
             };
@@ -381,7 +368,7 @@ fn open_psf(
                 .map_err(|error| FileError::new(&path, error))?;
             let Star { psf, moved } =
                 star(stamp, cut).map_err(|error| FileError::new(&path, error))?;
-            Ok((PsfSource::Shared(Arc::new(psf)), moved))
+            Ok((PsfSource::Shared(psf.into_shared()), moved))
         }
     }
 }
@@ -392,30 +379,17 @@ fn open_psf(
 /// Where the row's stamps have other sizes than planned.
 pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, PipelineError> {
     let Mosaic { columns, stamp, .. } = row.mosaic;
-    let noise = row.header_noise;
-    worker.set_survey(row.survey.as_ref());
     // Behind the last galaxy there is nothing to measure.
     let here = Slice::from(..row.mosaic.of_row(row.iy));
     let stamps = strip(&row.pixels, columns, stamp)?;
     let stamps = stamps.slice_axis(Axis(0), here);
-    let galaxies = match &row.psf {
-        RowPsf::Shared(psf) => {
-            worker.measure_each(stamps, Psfs::<f32>::Prepared(psf.view()), noise)
-        }
-        RowPsf::Stars { pixels, side } => {
-            let stars = strip(pixels, columns, *side)?;
-            let stars = stars.slice_axis(Axis(0), here);
-            worker.measure_each(stamps, Psfs::Stars(stars), noise)
-        }
-        RowPsf::Functional(field) => {
-            worker.measure_each(stamps, Psfs::<f32>::Functional(field), noise)
-        }
-    };
+    let mut image = worker.image(ImageNoise::of(row.survey.as_ref(), row.header_noise));
+    let galaxies = image.measure_each(stamps, &row.psfs)?;
     Ok(MeasuredRow {
         id: row.id,
         iy: row.iy,
         mosaic: row.mosaic,
-        galaxies: galaxies?,
+        galaxies,
         warnings: row.warnings.clone(),
         examination: examine(row, stamps, worker.configuration().psf_cut())?,
     })
@@ -437,20 +411,9 @@ fn examine(
         examination.add(stamp)?;
     }
     let most = EXAMINED_PSFS.div_ceil(rows.len());
-    match &row.psf {
-        // Once for the image.
-        RowPsf::Shared(psf) if rows.first() == Some(&row.iy) => {
-            examination.add_psf(psf.view(), None);
-        }
-        RowPsf::Shared(_) => {}
-        RowPsf::Stars { pixels, side } => {
-            let stars = strip(pixels, columns, *side)?;
-            let here = Slice::from(..stamps.len_of(Axis(0)));
-            examination.add_psfs(Psfs::Stars(stars.slice_axis(Axis(0), here)), cut, most);
-        }
-        RowPsf::Functional(field) => {
-            examination.add_psfs(Psfs::<f32>::Functional(field), cut, most);
-        }
+    // A PSF of all galaxies once for the image.
+    if row.psfs.count().is_some() || rows.first() == Some(&row.iy) {
+        examination.add_psfs(&row.psfs, cut, most);
     }
     Ok(Some(examination))
 }
@@ -473,14 +436,7 @@ pub(crate) fn warnings(rows: &[MeasuredRow]) -> Vec<Warning> {
 /// # Errors
 /// Where it cannot be used.
 pub fn psf_of(row: &StampRow, ix: usize, cut: PsfCut) -> Result<Array2<f64>, PipelineError> {
-    Ok(match &row.psf {
-        RowPsf::Shared(psf) => psf.as_ref().clone(),
-        RowPsf::Stars { pixels, side } => {
-            let stars = strip(pixels, row.mosaic.columns, *side)?;
-            star_psf(stars.index_axis(Axis(0), ix), cut)?
-        }
-        RowPsf::Functional(field) => field[ix].stamp_beside(cut.size, row.mosaic.stamp),
-    })
+    Ok(row.psfs.at(ix, cut, row.mosaic.stamp)?.psf)
 }
 
 /// What a measurement did.
@@ -779,8 +735,8 @@ pub fn catalogue(rows: &[MeasuredRow]) -> Result<DataFrame, TableError> {
         real("flux", &|g| g.flux),
         real("radius", &|g| g.radius),
         real("size", &|g| g.size),
-        real("response1", &|g| g.response[0]),
-        real("response2", &|g| g.response[1]),
+        real("response1", &|g| g.response_diagonal()[0]),
+        real("response2", &|g| g.response_diagonal()[1]),
     ])
 }
 

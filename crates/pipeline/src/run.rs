@@ -6,7 +6,8 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis};
 use shearq_measure::{
-    Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Warning, Worker, calibrate, star_psf, strip,
+    ImageNoise, Measurer, NoisePlan, NoiseSurvey, Psfs, Steps, Survey, Warning, Worker, calibrate,
+    star_psf, strip,
 };
 use shearq_quantities::Shear;
 use shearq_submissions::{Configuration, PsfForm};
@@ -14,8 +15,7 @@ use shearq_submissions::{Configuration, PsfForm};
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
 use super::measure::{
-    MeasuredRow, RowPsf, StampRow, Summary, catalogues, measure_row, to_do, warnings,
-    write_catalogue,
+    MeasuredRow, StampRow, Summary, catalogues, measure_row, to_do, warnings, write_catalogue,
 };
 use super::warned::Warned;
 use super::{PipelineError, simulate};
@@ -238,7 +238,7 @@ fn surveys(
     for row in rows {
         let found = row?;
         for (survey, more) in surveys.iter_mut().flatten().zip(found.iter().flatten()) {
-            survey.join(more);
+            survey.join(more)?;
         }
     }
     let found = surveys
@@ -283,8 +283,9 @@ pub fn simulated_steps(
     let cut = measurer.configuration().psf_cut();
     let psf = fields.psf.at(ix, iy).stamp_beside(cut.size, STAMP);
     let mut worker = measurer.worker();
-    worker.set_psf(psf.view())?;
-    let measured = worker.measure(stamp, Some(NOISE_SIGMA))?;
+    let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
+    let mut worker = image.psf(psf.view())?;
+    let measured = worker.measure(stamp)?;
     if measured.descent.is_none() {
         return Ok(None);
     }
@@ -315,13 +316,13 @@ pub fn measure_strip(
         pixels,
         header_noise: Some(NOISE_SIGMA),
         survey: None,
-        psf: RowPsf::Functional(Vec::new()),
+        psfs: Psfs::functional(Vec::new()),
         warnings: Vec::new(),
     };
     let mut measured = Vec::with_capacity(workers.len());
     for (k, worker) in workers.iter_mut().enumerate() {
         row.survey = surveys.get(k).cloned().flatten();
-        row.psf = row_psf(set, fields, iy, worker.configuration());
+        row.psfs = row_psfs(set, fields, iy, worker.configuration())?;
         row.warnings = match iy {
             0 => Warning::of_settings(worker.configuration())
                 .into_iter()
@@ -334,17 +335,17 @@ pub fn measure_strip(
 }
 
 /// The PSFs of a row in the form that a submission uses.
-fn row_psf(
+fn row_psfs(
     set: &SetSimulator,
     fields: &ImageFields,
     iy: usize,
     configuration: &Configuration,
-) -> RowPsf {
+) -> Result<Psfs<'static>, PipelineError> {
     let n = set.grid().n;
     let (size, cut) = (configuration.psf.size, configuration.psf_cut());
-    match (&fields.psf, configuration.psf.form) {
+    Ok(match (&fields.psf, configuration.psf.form) {
         (PsfField::One(psf), PsfForm::Functional) => {
-            RowPsf::Shared(Arc::new(psf.stamp_beside(cut.size, STAMP)))
+            Psfs::Prepared(psf.stamp_beside(cut.size, STAMP).into_shared())
         }
         (PsfField::One(psf), PsfForm::Star) => {
             let star = simulate::star(psf, STAMP);
@@ -352,14 +353,14 @@ fn row_psf(
                 .ok()
                 .and_then(|star| star_psf(star, cut).ok());
             // A noise-free star of the simulator's can always be cut.
-            RowPsf::Shared(Arc::new(psf.unwrap_or_else(|| Array2::zeros((size, size)))))
+            let psf = psf.unwrap_or_else(|| Array2::zeros((size, size)));
+            Psfs::Prepared(psf.into_shared())
         }
         (PsfField::PerGalaxy(_), PsfForm::Functional) => {
-            RowPsf::Functional((0..n).map(|ix| *fields.psf.at(ix, iy)).collect())
+            Psfs::functional((0..n).map(|ix| *fields.psf.at(ix, iy)).collect::<Vec<_>>())
         }
-        (PsfField::PerGalaxy(_), PsfForm::Star) => RowPsf::Stars {
-            pixels: simulate::draw_stars(set, fields, iy),
-            side: STAMP,
-        },
-    }
+        (PsfField::PerGalaxy(_), PsfForm::Star) => {
+            Psfs::strip(simulate::draw_stars(set, fields, iy), n, STAMP)?
+        }
+    })
 }

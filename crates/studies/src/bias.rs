@@ -219,7 +219,9 @@ impl BiasSums {
                 .zip(e)
                 .map(|((_, signs, _), e)| signs[k] * e);
             let slope = with_shear.sum::<f64>() / (COUNT * SHEAR);
-            let responses = versions.iter().map(|version| version.response[k]);
+            let responses = versions
+                .iter()
+                .map(|version| version.response_diagonal()[k]);
             let response = responses.sum::<f64>() / COUNT;
             self.slope[k].add(slope);
             self.surplus[k].add(slope - response);
