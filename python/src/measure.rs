@@ -32,9 +32,9 @@ enum AllPsfs<'a> {
     Formulas(Vec<FunctionalPsf>),
 }
 
-impl<'a> AllPsfs<'a> {
+impl AllPsfs<'_> {
     /// Those from `start` to before `end`.
-    fn piece(&'a self, start: usize, end: usize) -> PyResult<Psfs<'a>> {
+    fn piece(&self, start: usize, end: usize) -> PyResult<Psfs<'_>> {
         Ok(match self {
             AllPsfs::Shared(psf) => Psfs::Prepared(psf.clone()),
             AllPsfs::Stars(stars) => match stars.piece(start, end)? {
