@@ -308,7 +308,60 @@ fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> (FieldSum, RowCounts) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use shearq_pipeline::engine::Quiet;
     use shearq_submissions::Registry;
+
+    fn plan(names: &[&str]) -> Plan {
+        let registry = Registry::embedded().unwrap();
+        let configuration = |name: &&str| registry.get(name).unwrap().configuration;
+        Plan {
+            version: "test".into(),
+            simulation: SimulationSettings::new(5, 12),
+            images: 2,
+            submissions: names.iter().map(configuration).collect(),
+        }
+    }
+
+    /// Removes the folder as soon as the set is measured.
+    struct Remover<'a>(&'a Path);
+
+    impl Progress for Remover<'_> {
+        fn advance(&mut self, _: u64) {}
+
+        fn note(&mut self, _: &str) {
+            std::fs::remove_dir_all(self.0).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_removed_folder_is_an_error_and_is_not_made_again() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("study");
+        let plan = plan(&["23/raw/star"]);
+        let study = Study::open(&plan, &folder).unwrap();
+        study.check().unwrap();
+        let error = run_sets(&study, &[2], 1, &mut Remover(&folder)).unwrap_err();
+        let message = error.to_string();
+        assert!(message.contains("removed or replaced"), "{message}");
+        assert!(study.check().is_err());
+        assert!(!folder.exists());
+    }
+
+    #[test]
+    fn results_are_kept_and_read_again() {
+        let root = tempfile::tempdir().unwrap();
+        let plan = plan(&["23/raw/star", "23/den/star"]);
+        let study = Study::open(&plan, root.path()).unwrap();
+        let first = run_sets(&study, &[2], 1, &mut Quiet).unwrap();
+        assert_eq!(first[0].results.len(), 2);
+        assert_eq!(first[0].results[1].configuration, "23/den/star");
+        let text = |results: &[SetResult]| serde_json::to_string(results).unwrap();
+        let again = run_sets(&study, &[2], 1, &mut Quiet).unwrap();
+        assert_eq!(text(&again), text(&first));
+        // A result that is missing at the end is an error.
+        std::fs::remove_file(result_path(root.path(), 2)).unwrap();
+        assert!(study.check_results([result_path(root.path(), 2)]).is_err());
+    }
 
     #[test]
     fn configurations_that_differ_only_in_name_are_measured_once() {

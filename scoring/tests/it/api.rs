@@ -3,8 +3,8 @@
 use ndarray::Array2;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Bins, Choice, Complex64, Convention, Definition, FieldSum, Grid, MeanShear, Metrics, Noise,
-    Options, ScoringError, SetImages, SetScore, SetScorer, TrueShear, TruthSign, Unknown,
+    Bins, Choice, Complex64, Convention, Definition, Fault, FieldSum, Grid, MeanShear, Metrics,
+    Noise, Options, ScoringError, SetImages, SetScore, SetScorer, TrueShear, TruthSign, Unknown,
     cross_spectrum, measured_bandpowers, sign_by_correlation, sign_by_modes,
 };
 
@@ -237,4 +237,31 @@ fn the_sign_of_a_truth_follows_from_modes_and_images() {
         sign_by_correlation(&standard.flipped(), set.total()),
         Ok(Some(TruthSign::Challenge))
     );
+}
+
+#[test]
+fn shifted_rows_are_found_with_their_direction() {
+    let grid = grid(24);
+    let shear = field(&grid, Content::E, 7);
+    for (x, y) in [(1, 0), (0, -1), (1, 1), (1, -1)] {
+        // The galaxy of cell (ix, iy) lies in cell (ix + x, iy + y).
+        let from = |k: usize, by: i32| (k as i32 - by).rem_euclid(24) as usize;
+        let moved = Array2::from_shape_fn((24, 24), |(ix, iy)| shear[(from(ix, x), from(iy, y))]);
+        let set = images(&moved, 2, 1.0, 0.001);
+        let options = Options {
+            choice: Choice::Insist(Convention::STANDARD),
+            ..Options::default()
+        };
+        let scorer = SetScorer::new(grid, truth(&shear), options).unwrap();
+        let score = scorer.score(&set).unwrap();
+        let faults = scorer.diagnose(&set, &score, Convention::STANDARD).unwrap();
+        let found: Vec<(i32, i32)> = faults
+            .iter()
+            .filter_map(|fault| match fault {
+                Fault::Shifted { x, y, .. } => Some((*x, *y)),
+                _ => None,
+            })
+            .collect();
+        assert_eq!(found, [(x, y)], "{faults:?}");
+    }
 }
