@@ -331,6 +331,8 @@ mod tests {
         fn note(&mut self, _: &str) {
             std::fs::remove_dir_all(self.0).unwrap();
         }
+
+        fn warn(&mut self, _: &str) {}
     }
 
     #[test]

@@ -330,3 +330,71 @@ pub fn findings_table(findings: &[Finding]) -> Table {
         notes: Vec::new(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::calibration::calibrate;
+    use crate::reproduce::{Plan, Study, run_sets};
+    use shearq_pipeline::engine::Quiet;
+    use shearq_simulate::set::SimulationSettings;
+    use shearq_submissions::Registry;
+
+    #[test]
+    fn only_significant_differences_are_decided() {
+        assert_eq!(is_higher(0.3, 0.1), Some(true));
+        assert_eq!(is_higher(-0.3, 0.1), Some(false));
+        assert_eq!(is_higher(0.15, 0.1), None);
+        assert_eq!(is_higher(0.15, f64::NAN), None);
+    }
+
+    #[test]
+    fn statements_need_their_configurations_and_kinds() {
+        let registry = Registry::embedded().unwrap();
+        let names = ["23/raw/star", "23/den/star"];
+        let plan = Plan {
+            version: "test".into(),
+            simulation: SimulationSettings::new(5, 12),
+            images: 2,
+            submissions: names
+                .map(|name| registry.get(name).unwrap().configuration)
+                .into(),
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let study = Study::open(&plan, folder.path()).unwrap();
+        let mut results = run_sets(&study, &[2, 5], 1, &mut Quiet).unwrap();
+        // Known metrics: denoising halves M/2, and set 5 (low S/N) has a lower Q.
+        for (set, q) in results.iter_mut().zip([10.0, 4.0]) {
+            for (result, m) in set.results.iter_mut().zip([-0.2, -0.1]) {
+                let record = &mut result.score;
+                (record.metrics.q, record.errors.q) = (q, 0.1);
+                (record.metrics.m_half, record.errors.m_half) = (m, 0.01);
+                (record.metrics.sqrt_a, record.errors.sqrt_a) = (1.0, 0.1);
+            }
+        }
+        let names = names.map(String::from);
+        let all = findings(&results, &names);
+        let agrees = |words: &str| {
+            let found = all.iter().find(|finding| finding.paper.contains(words));
+            found.unwrap().agrees
+        };
+        assert_eq!(agrees("poor at low S/N"), Some(true));
+        assert_eq!(agrees("decreases the multiplicative bias"), Some(true));
+        assert_eq!(agrees("increases the additive bias"), None);
+        assert!(all.iter().all(|finding| !finding.paper.contains("Larger")));
+        assert!(all.iter().all(|finding| !finding.paper.contains("offset")));
+        assert_eq!(findings_table(&all).rows.len(), all.len());
+        // Without the denoising configuration only pairs could be compared, and there is none.
+        assert_eq!(findings(&results, &names[..1]), []);
+    }
+
+    #[test]
+    fn every_statement_on_lambda_has_a_result() {
+        let paper = Registry::embedded().unwrap().get("paper").unwrap();
+        let curves = calibrate(&paper.configuration, 8, 1, 1, &mut Quiet).unwrap();
+        let found = lambda_findings(&curves);
+        assert!(!found.is_empty());
+        let decided = |finding: &Finding| finding.agrees.is_some() && !finding.here.contains("NaN");
+        assert!(found.iter().all(decided), "{found:?}");
+    }
+}
