@@ -207,7 +207,7 @@ fn options_and_baselines_hold_finite_positive_limits() {
     for (text_of, words) in [
         (
             format!("{}inf{}", &sound[..start], &sound[end..]),
-            "set 2 has an infinite figure",
+            "set 2 has an infinite metric",
         ),
         (
             format!("{}{negative}", &sound[..end]),
