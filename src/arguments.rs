@@ -105,7 +105,7 @@ impl Printing {
     /// The metrics that are asked for of a table.
     fn chosen(&self, table: &Table) -> anyhow::Result<Table> {
         table.chosen(&self.metrics).map_err(|unknown| {
-            let known = table.figures().join(", ");
+            let known = table.metrics().join(", ");
             anyhow::anyhow!("--metrics: no metric is called {unknown:?}; expected some of {known}")
         })
     }

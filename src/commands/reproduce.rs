@@ -108,6 +108,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             toml::to_string(&base)?,
         ),
     ];
+    study.check()?;
     let mut page = Page::new(
         out,
         "Hopfield Neural Network deconvolution, reproduced",
@@ -133,6 +134,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         page.table("findings", findings)?;
     }
     sect_five(&mut page, &results, &names)?;
+    study.check()?;
     page.save()?;
     print_table(&table_one)?;
     for table in findings.iter().chain([&of_lambda, &calibration]) {

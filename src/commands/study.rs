@@ -103,6 +103,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     for submission in &plan.submissions {
         made_by.push((submission.name.clone(), toml::to_string(submission)?));
     }
+    study.check()?;
     let mut page = Page::new(out, "Submissions compared", "Simulated data", made_by);
     let [shapes, quality] = contest_parts(&table);
     page.section("Ellipticities", "Scatter and biases on every kind of set.");
@@ -115,6 +116,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.section("Spectra", "Quality on every kind of set, and cost.");
     page.table("quality", &quality)?;
     page.data("study", &table)?;
+    study.check()?;
     page.save()?;
     if matches!(form.format, TableFormat::Csv | TableFormat::Json) {
         return form.print(&table);

@@ -39,7 +39,7 @@ fn fields_beyond_the_sky_and_shears_beyond_numbers_are_refused() {
     for field in ["1e308", "1e12", "361", "1e-300", "nan"] {
         let plain = ["score", "--truth", text(&truth), text(&catalogue)];
         let error = fail(&[&plain[..], &["--field", field]].concat());
-        has(&error, &["degrees a side; expected 0.001 to 360"]);
+        has(&error, &["degrees per side; expected 0.001 to 360"]);
     }
     for field in ["1e12", "1e-320"] {
         fs::write(
@@ -207,7 +207,7 @@ fn options_and_baselines_hold_finite_positive_limits() {
     for (text_of, words) in [
         (
             format!("{}inf{}", &sound[..start], &sound[end..]),
-            "set 2 has an infinite figure",
+            "set 2 has an infinite metric",
         ),
         (
             format!("{}{negative}", &sound[..end]),

@@ -7,6 +7,7 @@ use shearq_quantities::{Distortion, Shear};
 use shearq_scoring::{FieldSum, Grid, Row, RowCounts};
 use shearq_submissions::{EllipticityType, checked_name};
 
+use crate::views::rows::fault as odd_rows;
 use shearq_files::FileError;
 use shearq_files::table::{self, most_rows};
 use shearq_pipeline::data::layout::{IMAGE_PLACEHOLDERS, check_pattern, read_rows};
@@ -225,7 +226,7 @@ pub fn sum_foreign(
 ) -> Result<(FieldSum, RowCounts), FileError> {
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, rows);
-    match counts.fault(grid) {
+    match odd_rows(&counts, grid) {
         Some(fault) => Err(FileError::new(path, fault)),
         None => Ok((sum, counts)),
     }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
     Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, Metrics, Options,
-    RowCounts, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
+    RowCounts, ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
 };
 
 use shearq_files::FileError;
@@ -91,7 +91,7 @@ fn findings(
     images: &SetImages,
     score: &SetScore,
     choice: Choice,
-) -> Vec<Fault> {
+) -> Result<Vec<Fault>, ScoringError> {
     // The convention with the highest Q may be a wrong one.
     let convention = match choice {
         Choice::Best => score.matching.convention(),
@@ -160,7 +160,8 @@ pub fn score_files(
         odd_images,
     } = add_up(&grid, catalogues, read, threads)?;
     if basis == SignBasis::Unknown
-        && let Some(sign) = sign_by_correlation(&shear.flipped(), images.total())
+        && let Some(sign) =
+            sign_by_correlation(&shear.flipped(), images.total()).map_err(scoring)?
     {
         basis = SignBasis::Correlation(sign);
         if sign == TruthSign::Standard {
@@ -172,7 +173,7 @@ pub fn score_files(
     Ok(ScoredSet {
         set: None,
         kind: None,
-        findings: findings(&scorer, &images, &score, options.choice),
+        findings: findings(&scorer, &images, &score, options.choice).map_err(scoring)?,
         odd_images,
         sign: basis,
         images: (1..=catalogues.len() as u32).collect(),
@@ -217,7 +218,9 @@ fn add_up(
         |(), path: PathBuf| Ok(read(grid, &path)?),
         |(sum, more)| {
             faults.add(&sum);
-            images.add(&sum);
+            images
+                .add(&sum)
+                .map_err(|source| PipelineError::Scoring { set: None, source })?;
             counts += more;
             Ok(())
         },
@@ -305,7 +308,8 @@ pub fn score_variants(
                 set: Some(*set),
                 kind: kind_of(data, *set),
                 images: files[k].iter().map(|file| file.0).collect(),
-                findings: findings(&scorer, &added.images, &score, options.choice),
+                findings: findings(&scorer, &added.images, &score, options.choice)
+                    .map_err(scoring)?,
                 odd_images: added.odd_images,
                 score,
                 rows: added.rows,
@@ -362,7 +366,11 @@ fn match_over_sets(
             Options::default(),
             threads,
         )?;
-        all.merge(&scorer.match_convention(&added.images));
+        let found = scorer.match_convention(&added.images);
+        all.merge(&found.map_err(|source| PipelineError::Scoring {
+            set: Some(*set),
+            source,
+        })?);
     }
     Ok(all)
 }

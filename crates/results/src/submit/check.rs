@@ -13,8 +13,12 @@ use super::manifest::{Contents, FileSum, Manifest};
 use super::packed::Sent;
 use crate::score::COLUMNS;
 use crate::views::diagnosis::words;
+use crate::views::rows::fault as odd_rows;
 use shearq_files::table::most_rows;
 use shearq_pipeline::data::layout::read_rows;
+
+/// Each catalogue is read as one image on the expected grid.
+const ONE_IMAGE: &str = "one image on the expected grid";
 
 /// How bad a finding is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
@@ -129,7 +133,7 @@ fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
                     first: file.clone(),
                 });
                 entry.faults.add(&sum);
-                entry.images.add(&sum);
+                entry.images.add(&sum).expect(ONE_IMAGE);
                 entry.numbers.push(*image);
                 entry.paths.push(file.clone());
             }
@@ -138,7 +142,7 @@ fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
                 let mut images = SetImages::new(&expected.grid);
                 let mut faults = ImageFaults::default();
                 faults.add(&sum);
-                images.add(&sum);
+                images.add(&sum).expect(ONE_IMAGE);
                 for set in expected.truth.keys() {
                     check_against_truth(*set, &images, &faults, file, expected, &mut report);
                 }
@@ -272,7 +276,7 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
             offset = (offset.0 + dx, offset.1 + dy);
         }
     }
-    if let Some(fault) = counts.fault(grid) {
+    if let Some(fault) = odd_rows(&counts, grid) {
         report.error(path, "values", fault);
     }
     if counts.excess > 0 {
@@ -437,7 +441,9 @@ fn check_against_truth(
         Fault::Biased { .. } => !faults.constant.is_empty(),
         _ => false,
     };
-    let found = scorer.diagnose(images, &score, Convention::STANDARD);
+    let Ok(found) = scorer.diagnose(images, &score, Convention::STANDARD) else {
+        return;
+    };
     for finding in found.into_iter().filter(|fault| !explained(fault)) {
         let (check, severity) = match finding {
             Fault::StrongTruth { .. } => ("truth", Severity::Warning),

@@ -79,7 +79,9 @@ impl Origin<'_> {
                 let truth = data.read_truth(set, grid)?;
                 let scorer = SetScorer::new(*grid, truth, Options::default())
                     .map_err(|error| FileError::new(data.truth(set), error))?;
-                Ok(scorer.match_convention(images))
+                scorer
+                    .match_convention(images)
+                    .map_err(|error| FileError::new(data.truth(set), error))
             }
             _ => Ok(ConventionMatch::default()),
         }
@@ -234,7 +236,9 @@ impl Packing<'_> {
             let rows = self.origin.rows(path, most_rows(grid.cells()))?;
             progress.advance(rows.len() as u64);
             used += sum.add_image(&grid, rows).used;
-            images.add(&sum);
+            images
+                .add(&sum)
+                .map_err(|error| FileError::new(path, error))?;
         }
         if used == 0 {
             let message =

@@ -13,6 +13,7 @@ use crate::compare::{Paired, Variant, by_name, common_sets, difference, mean_met
 use crate::groups::{Group, Grouping};
 use crate::row::{RunRecord, SetRecord};
 use crate::views::diagnosis::of_sets;
+use crate::views::metrics::{metric_cell, metric_heading};
 use crate::views::scores::{best_is_another, definition_note, notes};
 use crate::views::verdict::verdict;
 use shearq_render::figure::{ColourMap, HeatMap};
@@ -21,14 +22,7 @@ use shearq_render::table::{Cell, Heading, Table};
 /// The cell of a mean over sets of the metric called `name`.
 fn mean_cell(sets: &[&SetRecord], name: &str) -> Cell {
     let (value, error) = mean_metric(sets, name);
-    let decimals = Metrics::place(name).map_or(0, |place| Metrics::ALL[place].decimals);
-    Cell::with_error(value, Some(error), decimals)
-}
-
-/// The heading of the metric called `name`.
-fn metric_heading(name: &'static str) -> Heading {
-    let label = Metrics::place(name).map_or(name, |place| Metrics::ALL[place].label);
-    Heading::new(name, label)
+    metric_cell(name, value, error)
 }
 
 /// Heading of the leaderboard's Q, a detail where it is Q itself.

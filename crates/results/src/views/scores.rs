@@ -5,25 +5,19 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Value, json};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
-    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, Metrics, SetScore,
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, SetScore,
     SpectrumScore,
 };
 
 use crate::row::SetRecord;
 use crate::score::{Basis, ScoredSet, means};
 use crate::views::diagnosis;
+use crate::views::metrics::{FORMATS, metric_cells, metric_heading};
+use crate::views::rows::oddities;
 use crate::views::spectrum;
 use crate::views::verdict::verdict;
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_simulate::kinds::SetKind;
-
-fn metric_cells(metrics: &Metrics, errors: &Metrics) -> Vec<Cell> {
-    let pairs = metrics.values().into_iter().zip(errors.values());
-    let cells = pairs.zip(Metrics::ALL);
-    cells
-        .map(|((value, error), metric)| Cell::with_error(value, Some(error), metric.decimals))
-        .collect()
-}
 
 /// What the kind of a set is called in tables.
 fn kind_label(kind: Option<SetKind>) -> String {
@@ -123,7 +117,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
                 100.0 * score.true_b_share()
             ));
         }
-        lines.extend(rows.oddities(&name));
+        lines.extend(oddities(rows, &name));
     }
     lines.extend(diagnosis::of_sets(
         scored.iter().map(|set| (set.set, believable(set))),
@@ -178,9 +172,9 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
         Heading::new("kind", "Kind"),
         Heading::new("images", "Images").detail(),
     ];
-    headings.extend(Metrics::ALL.iter().map(|metric| Heading {
+    headings.extend(FORMATS.iter().map(|metric| Heading {
         detail: metric.detail,
-        ..Heading::new(metric.name, metric.label)
+        ..metric_heading(metric.name)
     }));
     headings.push(Heading::new("convention", "Conv.").detail());
     let apart = scored
@@ -387,7 +381,7 @@ pub fn bandpowers(scored: &[ScoredSet]) -> Table {
 }
 
 fn bias_json(bias: &Bias) -> Value {
-    json!({ "M": bias.M, "A": bias.A, "sqrtA": bias.sqrtA, "m": bias.m })
+    json!({ "M": bias.M, "A": bias.A, "sqrtA": bias.sqrtA, "m": bias.m_half })
 }
 
 fn fits_json(fits: &BiasFits) -> Value {

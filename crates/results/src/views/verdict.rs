@@ -115,11 +115,10 @@ mod tests {
         calibrated: f64,
         replicates: [f64; 8],
     ) -> (String, Vec<SetRecord>) {
-        let with = |q, q_calibrated, m_cross| Metrics {
-            q,
-            q_calibrated,
-            m_cross,
-            ..Metrics::unknown()
+        let with = |q, q_calibrated, m_cross| {
+            let mut metrics = Metrics::unknown();
+            (metrics.q, metrics.q_calibrated, metrics.m_cross) = (q, q_calibrated, m_cross);
+            metrics
         };
         let record = SetRecord {
             set: 2,
