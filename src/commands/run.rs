@@ -12,7 +12,7 @@ use crate::progress::{Bar, goes_on};
 use crate::{measure, print_table, score, tell, tell_unread};
 use shearq_files::atomic;
 use shearq_files::table::FileFormat;
-use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::data::run::{Run, Source, open_data};
 use shearq_pipeline::images;
 use shearq_pipeline::run::run_folder;

@@ -9,8 +9,9 @@ use shearq_submissions::{EllipticityType, checked_name};
 
 use shearq_files::FileError;
 use shearq_files::table::{self, most_rows};
-use shearq_pipeline::data::layout::{IMAGE_PLACEHOLDERS, check_pattern, read_rows};
+use shearq_pipeline::data::layout::read_rows;
 use shearq_pipeline::data::listing::{self, Files};
+use shearq_pipeline::data::pattern::{IMAGE_PLACEHOLDERS, check_pattern};
 
 /// How to read another program's catalogues.
 ///

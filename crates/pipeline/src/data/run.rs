@@ -7,8 +7,9 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize};
 use shearq_submissions::Configuration;
 
-use crate::data::layout::{DataFolder, Layout, fill};
+use crate::data::layout::{DataFolder, Layout};
 use crate::data::listing::{self, Files};
+use crate::data::pattern::fill;
 use crate::data::relative;
 use shearq_files::FileError;
 use shearq_files::atomic;
