@@ -2,14 +2,15 @@
 
 use std::sync::Arc;
 
-use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
+use ndarray::{ArcArray2, Array3, ArrayView2, ArrayView3, Axis};
 use numpy::{IntoPyArray, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_measure::{
-    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, MeasureError, Measurement, Measurer,
-    NoisePlan, Pixel, PsfProfile, Psfs, Survey, Warning, Worker, calibrate, examined_rows,
+    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, ImageNoise, MeasureError, Measurement,
+    Measurer, NoisePlan, Pixel, PsfProfile, Psfs, Survey, Warning, Worker, calibrate,
+    examined_rows,
 };
 use shearq_pipeline::engine;
 use shearq_quantities::Shear;
@@ -26,16 +27,24 @@ const PIECE: usize = 64;
 
 /// PSFs of all stamps.
 enum AllPsfs<'a> {
-    Shared(ArrayView2<'a, f64>),
+    Shared(ArcArray2<f64>),
     Stars(Stamps<'a>),
     Formulas(Vec<FunctionalPsf>),
 }
 
-/// PSFs of a piece.
-enum SomePsfs<'a> {
-    Shared(ArrayView2<'a, f64>),
-    Stars(Piece<'a>),
-    Formulas(&'a [FunctionalPsf]),
+impl AllPsfs<'_> {
+    /// Those from `start` to before `end`.
+    fn piece(&self, start: usize, end: usize) -> PyResult<Psfs<'_>> {
+        Ok(match self {
+            AllPsfs::Shared(psf) => Psfs::Prepared(psf.clone()),
+            AllPsfs::Stars(stars) => match stars.piece(start, end)? {
+                Piece::Single(stars) => Psfs::stars(stars),
+                Piece::Double(stars) => Psfs::stars(stars),
+                Piece::Copied(stars) => Psfs::stars(stars),
+            },
+            AllPsfs::Formulas(formulas) => Psfs::functional(&formulas[start..end]),
+        })
+    }
 }
 
 /// Noise levels of all stamps, or of a piece.
@@ -60,7 +69,7 @@ type Measured<'py> = (Bound<'py, PyDict>, Option<[f64; 2]>, Vec<String>);
 /// Some stamps with all that is needed to measure them.
 struct Job<'a> {
     stamps: Piece<'a>,
-    psfs: SomePsfs<'a>,
+    psfs: Psfs<'a>,
     noise: Noise<'a>,
 }
 
@@ -107,7 +116,7 @@ pub(crate) fn measure<'py>(
         Noise::One(level) => level,
         Noise::Each(levels) => Some(worst(levels)),
     };
-    let look = |psfs: Psfs<'_, f64>| {
+    let look = |psfs: Psfs<'_>| {
         if rows != columns {
             return Err(MeasureError::Shape {
                 what: "stamps",
@@ -115,16 +124,15 @@ pub(crate) fn measure<'py>(
                 expected: "squares".into(),
             });
         }
-        measurer.batch(none.view(), psfs, level).map(|_| ())
+        measurer.batch(none.view(), &psfs, level).map(|_| ())
     };
-    let prepared;
     let mut moved = None;
     let psfs = match (star, &stars, formulas) {
         (Some(star), None, None) => {
-            look(Psfs::Star(star.as_array())).map_err(of_measuring)?;
+            look(Psfs::star(star.as_array())).map_err(of_measuring)?;
             let found = shearq_measure::star(star.as_array(), cut).map_err(of_measuring)?;
-            (prepared, moved) = (found.psf, found.moved);
-            AllPsfs::Shared(prepared.view())
+            moved = found.moved;
+            AllPsfs::Shared(found.psf.into_shared())
         }
         (None, Some(stars), None) => {
             let (given, rows, columns) = stars.dim();
@@ -135,18 +143,18 @@ pub(crate) fn measure<'py>(
                     submission.name
                 )));
             }
-            let none = Array3::zeros((0, rows, columns));
-            look(Psfs::Stars(none.view())).map_err(of_measuring)?;
+            let none = Array3::<f64>::zeros((0, rows, columns));
+            look(Psfs::stars(none)).map_err(of_measuring)?;
             AllPsfs::Stars(stars.shared())
         }
         (None, None, Some(formulas)) => {
-            look(Psfs::Functional(&[])).map_err(of_measuring)?;
+            look(Psfs::functional(Vec::new())).map_err(of_measuring)?;
             let formulas = self::formulas(formulas.as_array()).map_err(of_measuring)?;
             match formulas.as_slice() {
                 [one] => {
-                    prepared = one.stamp_beside(cut.size, rows);
-                    look(Psfs::Prepared(prepared.view())).map_err(of_measuring)?;
-                    AllPsfs::Shared(prepared.view())
+                    let psf = one.stamp_beside(cut.size, rows).into_shared();
+                    look(Psfs::Prepared(psf.clone())).map_err(of_measuring)?;
+                    AllPsfs::Shared(psf)
                 }
                 _ => {
                     one_each("psf", formulas.len(), count)?;
@@ -183,12 +191,8 @@ pub(crate) fn measure<'py>(
                 }
                 Ok(())
             },
-            || {
-                let mut worker = measurer.worker();
-                worker.set_survey(survey.as_ref());
-                worker
-            },
-            |worker, job: Job<'_>| Ok(measure_job(worker, &job)?),
+            || measurer.worker(),
+            |worker, job: Job<'_>| Ok(measure_job(worker, survey.as_ref(), &job)?),
             |measured: Vec<Measurement>| {
                 watch.advance(measured.len())?;
                 galaxies.extend(measured);
@@ -229,16 +233,12 @@ fn add_psfs(
     match psfs {
         AllPsfs::Shared(psf) => examination.add_psf(psf.view(), moved),
         AllPsfs::Formulas(formulas) => {
-            examination.add_psfs(Psfs::<f64>::Functional(formulas), cut, EXAMINED_PSFS);
+            examination.add_psfs(&Psfs::functional(formulas), cut, EXAMINED_PSFS);
         }
-        AllPsfs::Stars(stars) => {
+        AllPsfs::Stars(_) => {
             let some = EXAMINED_PSFS.min(count);
             for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
-                match stars.piece(at, at + 1)? {
-                    Piece::Single(one) => examination.add_psfs(Psfs::Stars(one.view()), cut, 1),
-                    Piece::Double(one) => examination.add_psfs(Psfs::Stars(one.view()), cut, 1),
-                    Piece::Copied(one) => examination.add_psfs(Psfs::Stars(one.view()), cut, 1),
-                }
+                examination.add_psfs(&psfs.piece(at, at + 1)?, cut, 1);
             }
         }
     }
@@ -317,75 +317,39 @@ fn job<'a>(
 ) -> PyResult<Job<'a>> {
     Ok(Job {
         stamps: stamps.piece(start, end)?,
-        psfs: match psfs {
-            AllPsfs::Shared(psf) => SomePsfs::Shared(psf.view()),
-            AllPsfs::Stars(stars) => SomePsfs::Stars(stars.piece(start, end)?),
-            AllPsfs::Formulas(formulas) => SomePsfs::Formulas(&formulas[start..end]),
-        },
+        psfs: psfs.piece(start, end)?,
         noise: noise.piece(start, end),
     })
 }
 
-fn measure_job(worker: &mut Worker, job: &Job<'_>) -> Result<Vec<Measurement>, MeasureError> {
+fn measure_job(
+    worker: &mut Worker,
+    survey: Option<&Arc<Survey>>,
+    job: &Job<'_>,
+) -> Result<Vec<Measurement>, MeasureError> {
     match &job.stamps {
-        Piece::Single(stamps) => with_psfs(worker, stamps.view(), job),
-        Piece::Double(stamps) => with_psfs(worker, stamps.view(), job),
-        Piece::Copied(stamps) => with_psfs(worker, stamps.view(), job),
+        Piece::Single(stamps) => each(worker, survey, stamps.view(), job),
+        Piece::Double(stamps) => each(worker, survey, stamps.view(), job),
+        Piece::Copied(stamps) => each(worker, survey, stamps.view(), job),
     }
 }
 
-fn with_psfs<T: Pixel>(
+fn each<T: Pixel>(
     worker: &mut Worker,
+    survey: Option<&Arc<Survey>>,
     stamps: ArrayView3<'_, T>,
     job: &Job<'_>,
 ) -> Result<Vec<Measurement>, MeasureError> {
-    let noise = job.noise;
-    match &job.psfs {
-        SomePsfs::Shared(psf) => each(worker, stamps, Psfs::<f64>::Prepared(psf.view()), noise),
-        SomePsfs::Stars(Piece::Single(stars)) => {
-            each(worker, stamps, Psfs::Stars(stars.view()), noise)
+    match job.noise {
+        Noise::One(level) => {
+            let mut image = worker.image(ImageNoise::of(survey, level));
+            image.measure_each(stamps, &job.psfs)
         }
-        SomePsfs::Stars(Piece::Double(stars)) => {
-            each(worker, stamps, Psfs::Stars(stars.view()), noise)
-        }
-        SomePsfs::Stars(Piece::Copied(stars)) => {
-            each(worker, stamps, Psfs::Stars(stars.view()), noise)
-        }
-        SomePsfs::Formulas(formulas) => {
-            each(worker, stamps, Psfs::<f64>::Functional(formulas), noise)
+        Noise::Each(levels) => {
+            let mut image = worker.image(ImageNoise::Unknown);
+            image.measure_each_with_noise(stamps, &job.psfs, levels)
         }
     }
-}
-
-fn each<T: Pixel, P: Pixel>(
-    worker: &mut Worker,
-    stamps: ArrayView3<'_, T>,
-    psfs: Psfs<'_, P>,
-    noise: Noise<'_>,
-) -> Result<Vec<Measurement>, MeasureError> {
-    let levels = match noise {
-        Noise::One(level) => return worker.measure_each(stamps, psfs, level),
-        Noise::Each(levels) => levels,
-    };
-    if let Psfs::Prepared(psf) = psfs {
-        // Once for all of them: a PSF costs more to prepare than a galaxy to measure.
-        worker.set_psf(psf)?;
-        let measured = stamps.outer_iter().zip(levels);
-        return measured
-            .map(|(stamp, &level)| worker.measure(stamp, Some(level)))
-            .collect();
-    }
-    let mut galaxies = Vec::with_capacity(levels.len());
-    for (k, &level) in levels.iter().enumerate() {
-        let own = match psfs {
-            Psfs::Stars(stars) => Psfs::Stars(stars.slice_move(s![k..k + 1, .., ..])),
-            Psfs::Functional(formulas) => Psfs::Functional(&formulas[k..k + 1]),
-            Psfs::Star(_) | Psfs::Prepared(_) => psfs,
-        };
-        let stamp = stamps.index_axis(Axis(0), k);
-        galaxies.extend(worker.measure_each(stamp.insert_axis(Axis(0)), own, Some(level))?);
-    }
-    Ok(galaxies)
 }
 
 /// The columns of a catalogue, by name.
@@ -401,8 +365,8 @@ fn catalogue<'py>(py: Python<'py>, galaxies: &[Measurement]) -> PyResult<Bound<'
     };
     real("e1", &|g| g.e1)?;
     real("e2", &|g| g.e2)?;
-    real("R11", &|g| g.response[0])?;
-    real("R22", &|g| g.response[1])?;
+    real("R11", &|g| g.response_diagonal()[0])?;
+    real("R22", &|g| g.response_diagonal()[1])?;
     whole("flags", &|g| g.flags.bits() as i32)?;
     real("noise", &|g| g.noise)?;
     real("flux", &|g| g.flux)?;

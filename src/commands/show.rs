@@ -13,7 +13,7 @@ use crate::{print, tell};
 use shearq_pipeline::data::mosaic::Mosaic;
 use shearq_pipeline::data::run::open_data;
 use shearq_pipeline::images::ImageId;
-use shearq_pipeline::measure::{ImageSource, psf_of};
+use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::views::steps::{steps_figure, steps_row};
 
@@ -78,15 +78,13 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
-        let measurer = Measurer::new(&submission, source.mosaic().stamp)?;
-        if let Some(plan) = measurer.noise_plan() {
-            source.look(&data, plan)?;
-        }
+        let measurer = Measurer::new(&submission, source.head().mosaic.stamp)?;
+        source.survey(&data, &measurer)?;
         let Mosaic {
             columns,
             galaxies,
             stamp: side,
-        } = source.mosaic();
+        } = source.head().mosaic;
         anyhow::ensure!(
             index <= galaxies,
             "set {} image {} has {galaxies} galaxies; galaxy {index} was asked for",
@@ -102,14 +100,16 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 break row;
             }
         };
-        let psf = psf_of(&row, ix, submission.psf_cut())
+        let psf = row.psfs.at(ix, submission.psf_cut(), side);
+        let psf = psf
+            .map(|star| star.psf)
             .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
         let mut worker = measurer.worker();
-        worker.set_survey(row.survey.as_ref());
-        worker.set_psf(psf.view())?;
+        let mut worker = worker.image(row.head.noise());
+        let mut worker = worker.psf(psf.view())?;
         let stamps = strip(&row.pixels, columns, side)?;
         let stamp = stamps.index_axis(Axis(0), ix);
-        let measured = worker.measure(stamp, row.header_noise)?;
+        let measured = worker.measure(stamp)?;
         anyhow::ensure!(
             measured.descent.is_some(),
             "galaxy {index} could not be measured: {}",
@@ -140,7 +140,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
 /// The galaxy's own response to shear after `lead`, where the method knows it.
 fn response(measured: &Measurement, lead: &str) -> String {
-    match measured.response {
+    match measured.response_diagonal() {
         [first, second] if first.is_finite() && second.is_finite() => {
             format!("{lead}{first:.3}, {second:.3}")
         }

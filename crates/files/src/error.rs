@@ -49,7 +49,8 @@ impl FileError {
 
     /// About `path`, whose columns are `found`, without one named `wanted`.
     pub fn no_column(path: &Path, wanted: &str, found: &[impl AsRef<str>]) -> Self {
-        let hint = renamed::column_hint(wanted, found).map_or_else(String::new, |hint| format!(". {hint}"));
+        let hint = renamed::column_hint(wanted, found)
+            .map_or_else(String::new, |hint| format!(". {hint}"));
         let found = names_of(found);
         let message = format!("there is no column `{wanted}`; columns found: {found}{hint}");
         FileError {

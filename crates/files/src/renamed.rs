@@ -1,7 +1,11 @@
 //! Names in files that were replaced by others: one table, from which errors name the new one.
 
 /// Columns of catalogues, old and new.
-const COLUMNS: [(&str, &str); 3] = [("flag", "flags"), ("response1", "R11"), ("response2", "R22")];
+const COLUMNS: [(&str, &str); 3] = [
+    ("flag", "flags"),
+    ("response1", "R11"),
+    ("response2", "R22"),
+];
 
 /// Keys of JSON and TOML files, old and new.
 const KEYS: [(&str, &str); 1] = [("figures", "metrics")];
@@ -23,9 +27,9 @@ pub fn key_hint(error: &str, text: &str) -> Option<String> {
     let named = |start: &str| error.split_once(start)?.1.split('`').next();
     let (missing, unknown) = (named("missing field `"), named("unknown field `"));
     let has = |key: &str| text.contains(&format!("\"{key}\""));
-    let &(old, new) = KEYS.iter().find(|(old, new)| {
-        unknown == Some(*old) || missing == Some(*new) && has(old)
-    })?;
+    let &(old, new) = KEYS
+        .iter()
+        .find(|(old, new)| unknown == Some(*old) || missing == Some(*new) && has(old))?;
     Some(format!(
         "The key `{old}` is now called `{new}`. Try: write the file again with this version"
     ))

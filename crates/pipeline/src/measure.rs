@@ -14,12 +14,11 @@ use std::path::Path;
 use shearq_files::FileError;
 use shearq_measure::{Measurer, calibrate};
 
-pub(crate) use self::catalogue::{Catalogues, metadata};
 pub use self::catalogue::{COLUMNS, Summary, Value};
-pub use self::psfs::{RowPsf, psf_of};
+pub(crate) use self::catalogue::{Catalogues, metadata};
 pub use self::row::{MeasuredRow, measure_row};
-pub(crate) use self::source::{check_strip, open_galaxies};
 pub use self::source::{ImageHead, ImageSource, StampRow};
+pub(crate) use self::source::{check_strip, open_galaxies};
 use crate::PipelineError;
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;

@@ -147,7 +147,7 @@ pub fn run_sets(
             &measurers,
             threads,
             progress,
-            |image| {
+            |image, _| {
                 let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
                 for (((sum, counts), regression), rows) in each {
                     let (field, used) = field_sum(&grid, rows);
@@ -253,7 +253,7 @@ fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> (FieldSum, RowCounts) {
     let mut sum = FieldSum::new(grid);
     let galaxies = rows.iter().flat_map(|row| {
         row.galaxies.iter().enumerate().map(|(ix, galaxy)| {
-            let (x, y) = row.mosaic.centre(ix, row.iy);
+            let (x, y) = row.head.mosaic.centre(ix, row.iy);
             Row {
                 x,
                 y,

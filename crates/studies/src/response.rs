@@ -139,17 +139,9 @@ mod tests {
 
     /// A galaxy without flags.
     fn measured(e1: f64, e2: f64) -> Measurement {
-        Measurement {
-            e1,
-            e2,
-            flags: Flags::NONE,
-            response: [f64::NAN; 2],
-            descent: None,
-            noise: 1.0,
-            flux: 1.0,
-            radius: 1.0,
-            size: 1.0,
-        }
+        let mut galaxy = Measurement::flagged(Flags::NONE);
+        (galaxy.e1, galaxy.e2) = (e1, e2);
+        galaxy
     }
 
     #[test]

@@ -9,7 +9,7 @@ use shearq_measure::parts::{
     AdaptiveMoments, ClippedAcf, Matrices, Network, Rule, Spectral, StampFft, Step, WaveletWiener,
     border_noise,
 };
-use shearq_measure::{Measurer, StampNoise};
+use shearq_measure::{ImageNoise, Measurer, StampNoise};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::{
@@ -108,9 +108,10 @@ impl Inputs {
     fn whole(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
         let psf = self.psf(configuration.psf_cut());
         let mut worker = Measurer::new(configuration, STAMP)?.worker();
-        worker.set_psf(psf.view())?;
+        let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
+        let mut worker = image.psf(psf.view())?;
         Ok(time(|k| {
-            let _ = black_box(worker.measure(view(&self.stamps[k]), Some(NOISE_SIGMA)));
+            let _ = black_box(worker.measure(view(&self.stamps[k])));
         }))
     }
 
@@ -118,8 +119,9 @@ impl Inputs {
     fn taking_a_psf(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
         let psf = self.psf(configuration.psf_cut());
         let mut worker = Measurer::new(configuration, STAMP)?.worker();
+        let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
         Ok(time(|_| {
-            let _ = worker.set_psf(black_box(psf.view()));
+            let _ = image.psf(black_box(psf.view()));
         }))
     }
 
@@ -497,9 +499,14 @@ pub fn scaling(
         let mut best = 0.0f64;
         for _ in 0..3 {
             let start = Instant::now();
-            run_set(&inputs.set, &[1], &measurers, threads, &mut Quiet, |_| {
-                Ok(())
-            })?;
+            run_set(
+                &inputs.set,
+                &[1],
+                &measurers,
+                threads,
+                &mut Quiet,
+                |_, _| Ok(()),
+            )?;
             best = best.max(galaxies / start.elapsed().as_secs_f64());
         }
         Ok(best)

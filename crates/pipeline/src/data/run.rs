@@ -12,8 +12,8 @@ use crate::data::listing::{self, Files};
 use crate::data::pattern::fill;
 use crate::data::relative;
 use shearq_files::FileError;
-use shearq_files::{atomic, renamed};
 use shearq_files::table::FileFormat;
+use shearq_files::{atomic, renamed};
 use shearq_simulate::set::SimulationSettings;
 
 /// Name of the record in a folder of results.

@@ -11,11 +11,11 @@ use shearq_measure::{Flag, Measurement, Warning};
 use shearq_submissions::EllipticityType;
 
 use super::row::{MeasuredRow, warnings};
+use crate::PipelineError;
 use crate::data::run::{Claim, RUN_FILE, Run, claim};
 use crate::engine::Progress;
 use crate::images::ImageId;
 use crate::warned::Warned;
-use crate::{PipelineError, VERSION};
 
 /// How a column follows from a measurement.
 #[derive(Debug, Clone, Copy)]
@@ -27,7 +27,7 @@ pub enum Value {
 }
 
 /// The columns of catalogues after the position, in order. The command line and Python use the same.
-pub const COLUMNS: [(&str, Value); 14] = [
+pub const COLUMNS: [(&str, Value); 16] = [
     ("e1", Value::Real(|g| g.e1)),
     ("e2", Value::Real(|g| g.e2)),
     ("flags", Value::Whole(|g| g.flags.bits() as i32)),
@@ -38,7 +38,7 @@ pub const COLUMNS: [(&str, Value); 14] = [
     // −1 if the network did not run.
     (
         "stop",
-        Value::Whole(|g| g.descent.map_or(-1, |d| i32::from(d.stop.code()))),
+        Value::Whole(|g| g.descent.map_or(-1, |d| d.stop.code() as i32)),
     ),
     (
         "updated",
@@ -56,9 +56,16 @@ pub const COLUMNS: [(&str, Value); 14] = [
     ("flux", Value::Real(|g| g.flux)),
     ("radius", Value::Real(|g| g.radius)),
     ("size", Value::Real(|g| g.size)),
-    ("R11", Value::Real(|g| g.response[0])),
-    ("R22", Value::Real(|g| g.response[1])),
+    ("R11", Value::Real(|g| response(g, 0, 0))),
+    ("R22", Value::Real(|g| response(g, 1, 1))),
+    ("R12", Value::Real(|g| response(g, 0, 1))),
+    ("R21", Value::Real(|g| response(g, 1, 0))),
 ];
+
+/// Response of component `i` to component `j` of shear; NaN if there is none.
+fn response(galaxy: &Measurement, i: usize, j: usize) -> f64 {
+    galaxy.response.map_or(f64::NAN, |response| response[i][j])
+}
 
 /// Key of the metadata with the warnings of an image.
 const WARNINGS: &str = "warnings";

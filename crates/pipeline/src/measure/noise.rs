@@ -95,7 +95,10 @@ pub(super) fn correlation(
     Ok(found
         .filter(|survey| survey.noise.is_correlated())
         .map(|survey| Warning::CorrelatedNoise {
-            correlation: [survey.noise.correlation(1, 0), survey.noise.correlation(0, 1)],
+            correlation: [
+                survey.noise.correlation(1, 0),
+                survey.noise.correlation(0, 1),
+            ],
         }))
 }
 

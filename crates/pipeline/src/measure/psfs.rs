@@ -1,58 +1,25 @@
 //! The PSFs of an image: one for all galaxies, or one per galaxy along the rows of stamps.
 
 use std::path::Path;
-use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2, Axis, Slice};
+use ndarray::{ArcArray2, ArrayView2};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
-use shearq_measure::{FunctionalPsf, Psfs, Star, star, star_psf, strip};
+use shearq_measure::{FunctionalPsf, Psfs, Star, star};
 use shearq_submissions::{Configuration, PsfCut, PsfForm};
 
-use super::source::{StampRow, check_strip};
+use super::source::check_strip;
 use crate::PipelineError;
 use crate::data::layout::{DataFolder, MAX_STAMP};
 use crate::data::mosaic::Mosaic;
 use crate::data::psf_table;
 use crate::grid::whole;
 use crate::images::ImageId;
-
-/// PSFs of one row of stamps.
-#[derive(Debug, Clone)]
-pub enum RowPsf {
-    /// One for all galaxies of the image, cut and normalised.
-    Shared(Arc<Array2<f64>>),
-    /// A strip of star stamps of `side` pixels, row-major, one per galaxy.
-    Stars {
-        /// Pixels of the strip.
-        pixels: Vec<f32>,
-        /// Side of one star stamp.
-        side: usize,
-    },
-    /// Parameters, one per galaxy.
-    Functional(Vec<FunctionalPsf>),
-}
-
-impl RowPsf {
-    /// The PSFs of the first `count` galaxies of a row of `columns`, as they are measured with.
-    ///
-    /// # Errors
-    /// If a strip has another number of pixels.
-    pub(super) fn view(&self, columns: usize, count: usize) -> Result<Psfs<'_, f32>, PipelineError> {
-        Ok(match self {
-            RowPsf::Shared(psf) => Psfs::Prepared(psf.view()),
-            RowPsf::Stars { pixels, side } => {
-                let stars = strip(pixels, columns, *side)?;
-                Psfs::Stars(stars.slice_axis_move(Axis(0), Slice::from(..count)))
-            }
-            RowPsf::Functional(field) => Psfs::Functional(field),
-        })
-    }
-}
+use crate::pixel_scale;
 
 /// The PSFs of an image, read along its rows.
 pub(super) enum PsfSource {
-    Shared(Arc<Array2<f64>>),
+    Shared(ArcArray2<f64>),
     Stars {
         image: Box<ImageReader>,
         side: usize,
@@ -65,23 +32,39 @@ impl PsfSource {
     ///
     /// # Errors
     /// If star stamps cannot be read.
-    pub(super) fn next_row(&mut self, mosaic: Mosaic, iy: usize) -> Result<RowPsf, FileError> {
+    pub(super) fn next_row(
+        &mut self,
+        mosaic: Mosaic,
+        iy: usize,
+    ) -> Result<Psfs<'static>, PipelineError> {
+        let count = mosaic.of_row(iy);
         Ok(match self {
-            PsfSource::Shared(psf) => RowPsf::Shared(Arc::clone(psf)),
-            PsfSource::Stars { image, side } => RowPsf::Stars {
-                pixels: image.read_rows(*side)?,
-                side: *side,
-            },
+            PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
+            PsfSource::Stars { image, side } => {
+                let pixels = image.read_rows(*side)?;
+                let mut stars = Psfs::strip(pixels, mosaic.columns, *side)?;
+                // The last row may be shorter.
+                stars.truncate(count);
+                stars
+            }
             PsfSource::Functional(field) => {
                 let first = iy * mosaic.columns;
-                RowPsf::Functional(field[first..first + mosaic.of_row(iy)].to_vec())
+                Psfs::functional(field[first..first + count].to_vec())
             }
         })
     }
 }
 
-/// Opens the PSFs of an image. Returns also the offset of the star for all galaxies if it was moved to the centre of its
-/// stamp.
+/// The PSFs of an image, and what is known about their file.
+pub(super) struct OpenPsfs {
+    pub(super) source: PsfSource,
+    /// Offset of the star for all galaxies in pixels, if it was moved to the centre of its stamp.
+    pub(super) moved: Option<[f64; 2]>,
+    /// Pixel scale in arcseconds, if the header states it.
+    pub(super) scale: Option<f64>,
+}
+
+/// Opens the PSFs of an image.
 ///
 /// # Errors
 /// If the PSFs cannot be read, or do not fit the configuration or the galaxies.
@@ -90,12 +73,16 @@ pub(super) fn open_psf(
     id: ImageId,
     configuration: &Configuration,
     mosaic: &Mosaic,
-) -> Result<(PsfSource, Option<[f64; 2]>), FileError> {
+) -> Result<OpenPsfs, FileError> {
     let cut = configuration.psf_cut();
     match configuration.psf.form {
         PsfForm::Functional => {
             let path = data.psf_functional(id.set, id.image);
-            Ok((open_functional(&path, cut, mosaic)?, None))
+            Ok(OpenPsfs {
+                source: open_functional(&path, cut, mosaic)?,
+                moved: None,
+                scale: None,
+            })
         }
         PsfForm::Star => open_stars(&data.psf_star(id.set, id.image), cut, mosaic),
     }
@@ -121,16 +108,13 @@ fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSourc
         );
         return Err(FileError::new(path, message));
     }
-    Ok(PsfSource::Shared(Arc::new(stamp)))
+    Ok(PsfSource::Shared(stamp.into_shared()))
 }
 
-fn open_stars(
-    path: &Path,
-    cut: PsfCut,
-    mosaic: &Mosaic,
-) -> Result<(PsfSource, Option<[f64; 2]>), FileError> {
+fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, FileError> {
     let least = cut.least;
     let mut image = ImageReader::open(path)?;
+    let scale = pixel_scale::of_header(&image);
     let (width, height) = (image.width(), image.height());
     let (columns, rows) = (mosaic.columns, mosaic.rows());
     let side = match whole(&image, path, "STAMP", MAX_STAMP)? {
@@ -161,7 +145,11 @@ fn open_stars(
     if mosaic.galaxies > 1 && (width, height) == (columns * side, rows * side) {
         check_strip(path, columns, side)?;
         let image = Box::new(image);
-        return Ok((PsfSource::Stars { image, side }, None));
+        return Ok(OpenPsfs {
+            source: PsfSource::Stars { image, side },
+            moved: None,
+            scale,
+        });
     }
     if !one || side > MAX_STAMP {
         let message = format!(
@@ -174,21 +162,9 @@ fn open_stars(
     let stamp = ArrayView2::from_shape((height, width), &pixels)
         .map_err(|error| FileError::new(path, error))?;
     let Star { psf, moved } = star(stamp, cut).map_err(|error| FileError::new(path, error))?;
-    Ok((PsfSource::Shared(Arc::new(psf)), moved))
-}
-
-/// The PSF by which galaxy `ix` of a row is deconvolved.
-///
-/// # Errors
-/// If it cannot be used.
-pub fn psf_of(row: &StampRow, ix: usize, cut: PsfCut) -> Result<Array2<f64>, PipelineError> {
-    let mosaic = row.head.mosaic;
-    Ok(match &row.psf {
-        RowPsf::Shared(psf) => psf.as_ref().clone(),
-        RowPsf::Stars { pixels, side } => {
-            let stars = strip(pixels, mosaic.columns, *side)?;
-            star_psf(stars.index_axis(Axis(0), ix), cut)?
-        }
-        RowPsf::Functional(field) => field[ix].stamp_beside(cut.size, mosaic.stamp),
+    Ok(OpenPsfs {
+        source: PsfSource::Shared(psf.into_shared()),
+        moved,
+        scale,
     })
 }

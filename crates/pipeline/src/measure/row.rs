@@ -7,7 +7,6 @@ use shearq_measure::{
     EXAMINED_PSFS, Examination, Measurement, Warning, Worker, examined_rows, strip,
 };
 
-use super::psfs::RowPsf;
 use super::source::{ImageHead, StampRow};
 use crate::PipelineError;
 
@@ -46,8 +45,7 @@ pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, P
     let stamps = strip(&row.pixels, columns, head.mosaic.stamp)?;
     // The last row may be shorter.
     let stamps = stamps.slice_axis(Axis(0), Slice::from(..count));
-    worker.set_survey(head.survey.as_ref());
-    let galaxies = worker.measure_each(stamps, row.psf.view(columns, count)?, head.noise)?;
+    let galaxies = worker.image(head.noise()).measure_each(stamps, &row.psfs)?;
     Ok(MeasuredRow {
         head: Arc::clone(head),
         iy: row.iy,
@@ -71,13 +69,11 @@ fn examine(
     for stamp in stamps.outer_iter() {
         examination.add(stamp)?;
     }
-    let shared = matches!(row.psf, RowPsf::Shared(_));
     // A PSF for all galaxies is examined once.
-    if !shared || rows.first() == Some(&row.iy) {
+    if row.psfs.count().is_some() || rows.first() == Some(&row.iy) {
         let cut = worker.configuration().psf_cut();
         let most = EXAMINED_PSFS.div_ceil(rows.len());
-        let psfs = row.psf.view(mosaic.columns, stamps.len_of(Axis(0)))?;
-        examination.add_psfs(psfs, cut, most);
+        examination.add_psfs(&row.psfs, cut, most);
     }
     Ok(Some(examination))
 }

@@ -7,16 +7,17 @@ use std::sync::Arc;
 
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
-use shearq_measure::{Measurer, Survey, Warning};
+use shearq_measure::{ImageNoise, Measurer, Psfs, Survey, Warning};
 use shearq_submissions::{Configuration, NoiseSource};
 
 use super::noise;
-use super::psfs::{PsfSource, RowPsf, open_psf};
+use super::psfs::{OpenPsfs, PsfSource, open_psf};
 use crate::PipelineError;
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;
 use crate::grid;
 use crate::images::ImageId;
+use crate::pixel_scale;
 
 /// Most pixels of a row of stamps, several of which are in memory at a time.
 const MAX_STRIP: usize = 1 << 24;
@@ -42,6 +43,13 @@ pub struct ImageHead {
     pub prints: BTreeMap<String, String>,
 }
 
+impl ImageHead {
+    /// What is known about the noise of the image.
+    pub fn noise(&self) -> ImageNoise<'_> {
+        ImageNoise::of(self.survey.as_ref(), self.noise)
+    }
+}
+
 /// One row of stamps of an image.
 #[derive(Debug, Clone)]
 pub struct StampRow {
@@ -52,14 +60,14 @@ pub struct StampRow {
     /// The rows of pixels that contain the stamps.
     pub pixels: Vec<f32>,
     /// PSFs of the galaxies of the row.
-    pub psf: RowPsf,
+    pub psfs: Psfs<'static>,
 }
 
 /// An open image with its PSFs, of which rows are read one after the other.
 pub struct ImageSource {
     head: Arc<ImageHead>,
     image: ImageReader,
-    psf: PsfSource,
+    psfs: PsfSource,
     next: usize,
 }
 
@@ -102,9 +110,15 @@ impl ImageSource {
             );
             return Err(FileError::new(path, message).into());
         }
-        let (psf, moved) = open_psf(data, id, configuration, &mosaic)?;
+        let OpenPsfs {
+            source: psfs,
+            moved,
+            scale,
+        } = open_psf(data, id, configuration, &mosaic)?;
         let mut warnings: Vec<Warning> = Warning::of_settings(configuration).into_iter().collect();
         warnings.extend(moved.map(Warning::of_moved));
+        let own_scale = pixel_scale::of_header(&image);
+        warnings.extend(pixel_scale::disagreement(scale, own_scale));
         let head = ImageHead {
             id,
             mosaic,
@@ -118,7 +132,7 @@ impl ImageSource {
         Ok(ImageSource {
             head: Arc::new(head),
             image,
-            psf,
+            psfs,
             next: 0,
         })
     }
@@ -192,7 +206,7 @@ impl ImageSource {
             head: Arc::clone(&self.head),
             iy,
             pixels: self.image.read_rows(mosaic.stamp)?,
-            psf: self.psf.next_row(mosaic, iy)?,
+            psfs: self.psfs.next_row(mosaic, iy)?,
         }))
     }
 }
