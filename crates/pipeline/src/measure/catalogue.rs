@@ -142,6 +142,20 @@ pub struct Summary {
 }
 
 impl Summary {
+    /// A warning with the most frequent reason if galaxies were measured and all are flagged.
+    pub fn all_flagged(&self) -> Option<Warning> {
+        let Summary {
+            galaxies, flagged, ..
+        } = *self;
+        let with = |flag: Flag| {
+            let mut counts = self.flags.iter().zip(Flag::ALL);
+            let found = counts.find(|(_, other)| *other == flag);
+            found.map_or(0, |(count, _)| *count as usize)
+        };
+        let all = Warning::of_counts(with, flagged as usize, galaxies as usize)?;
+        (galaxies > 0 && flagged == galaxies).then_some(all)
+    }
+
     /// Counts one image.
     fn count(&mut self, rows: &[MeasuredRow]) {
         self.images += 1;
