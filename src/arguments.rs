@@ -9,7 +9,7 @@ use shearq_scoring::{Choice, Convention, Definition};
 
 use crate::choices::named;
 use crate::{print, print_table, tell};
-use shearq_pipeline::data::layout::MAX_SET;
+use shearq_pipeline::data::pattern::MAX_SET;
 use shearq_pipeline::images::{ImageId, Shard};
 use shearq_render::figure::FigureError;
 use shearq_render::html::Section;

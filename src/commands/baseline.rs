@@ -10,7 +10,7 @@ use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once, 
 use crate::progress::Bar;
 use crate::{print, tell};
 use shearq_files::atomic;
-use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::data::run::{Run, Source, open_data, way};
 use shearq_render::table::TableFormat;
 use shearq_results::baseline::{

@@ -9,7 +9,8 @@ use shearq_scoring::Grid;
 
 use crate::{Findings, count, print};
 use shearq_files::table::MAX_ROWS;
-use shearq_pipeline::data::layout::{DataFolder, Layout, MAX_IMAGE, read_truth_rows};
+use shearq_pipeline::data::layout::{DataFolder, Layout, read_truth_rows};
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::grid;
 use shearq_pipeline::truth::grid_of_set;
 use shearq_results::submit::check::{Expected, Finding, Severity, check};

@@ -9,7 +9,7 @@ use shearq_submissions::{Configuration, Published, Registry};
 use crate::arguments::{SetList, Threads, given_once};
 use crate::progress::{Bar, goes_on};
 use crate::{print, print_table, tell};
-use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::run::{measurers, simulated_steps};
 use shearq_pipeline::simulate::simulator;
 use shearq_render::page::Page;

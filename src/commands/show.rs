@@ -6,14 +6,14 @@ use std::str::FromStr;
 use anyhow::Context;
 use clap::Args;
 use ndarray::Axis;
-use shearq_measure::{ImageNoise, Measurement, Measurer, Stop, strip};
+use shearq_measure::{Measurement, Measurer, Stop, strip};
 use shearq_submissions::Registry;
 
 use crate::{print, tell};
 use shearq_pipeline::data::mosaic::Mosaic;
 use shearq_pipeline::data::run::open_data;
 use shearq_pipeline::images::ImageId;
-use shearq_pipeline::measure::{ImageSource, psf_of};
+use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::views::steps::{steps_figure, steps_row};
 
@@ -78,15 +78,13 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
-        let measurer = Measurer::new(&submission, source.mosaic().stamp)?;
-        if let Some(plan) = measurer.noise_plan() {
-            source.look(&data, plan)?;
-        }
+        let measurer = Measurer::new(&submission, source.head().mosaic.stamp)?;
+        source.survey(&data, &measurer)?;
         let Mosaic {
             columns,
             galaxies,
             stamp: side,
-        } = source.mosaic();
+        } = source.head().mosaic;
         anyhow::ensure!(
             index <= galaxies,
             "set {} image {} has {galaxies} galaxies; galaxy {index} was asked for",
@@ -102,10 +100,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 break row;
             }
         };
-        let psf = psf_of(&row, ix, submission.psf_cut())
+        let psf = row.psfs.at(ix, submission.psf_cut(), side);
+        let psf = psf
+            .map(|star| star.psf)
             .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
         let mut worker = measurer.worker();
-        let mut worker = worker.image(ImageNoise::of(row.survey.as_ref(), row.header_noise));
+        let mut worker = worker.image(row.head.noise());
         let mut worker = worker.psf(psf.view())?;
         let stamps = strip(&row.pixels, columns, side)?;
         let stamp = stamps.index_axis(Axis(0), ix);

@@ -8,7 +8,7 @@ use shearq_submissions::{Configuration, Registry};
 use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once};
 use crate::print;
 use crate::progress::{Bar, goes_on};
-use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_render::page::Page;
 use shearq_render::table::TableFormat;
 use shearq_results::views::pages;

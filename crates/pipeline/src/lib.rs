@@ -12,6 +12,7 @@ pub mod grid;
 pub mod images;
 pub mod inputs;
 pub mod measure;
+mod pixel_scale;
 pub mod run;
 pub mod simulate;
 pub mod truth;

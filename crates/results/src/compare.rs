@@ -14,8 +14,9 @@ use super::groups::Order;
 use super::row::{RunRecord, SetRecord, choice_word, definition_word};
 use super::score::{Catalogues, ScoredSet, own_catalogue, score_variants, unscored};
 use shearq_files::FileError;
-use shearq_pipeline::data::layout::{DataFolder, MAX_SET};
+use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::listing::Files;
+use shearq_pipeline::data::pattern::MAX_SET;
 use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::{PipelineError, inputs};
 

@@ -10,8 +10,9 @@ use shearq_submissions::{EllipticityType, checked_name};
 use crate::views::rows::fault as odd_rows;
 use shearq_files::FileError;
 use shearq_files::table::{self, most_rows};
-use shearq_pipeline::data::layout::{IMAGE_PLACEHOLDERS, check_pattern, read_rows};
+use shearq_pipeline::data::layout::read_rows;
 use shearq_pipeline::data::listing::{self, Files};
+use shearq_pipeline::data::pattern::{IMAGE_PLACEHOLDERS, check_pattern};
 
 /// How to read another program's catalogues.
 ///

@@ -11,7 +11,8 @@ use shearq_scoring::{
 
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
-use shearq_pipeline::data::layout::{DataFolder, MAX_SET, read_rows};
+use shearq_pipeline::data::layout::{DataFolder, read_rows};
+use shearq_pipeline::data::pattern::MAX_SET;
 use shearq_pipeline::data::run::Run;
 use shearq_pipeline::simulate::kind_of;
 use shearq_pipeline::truth::{ReadTruth, Reading, SignBasis, read_truth, reading_of};

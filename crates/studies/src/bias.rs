@@ -95,20 +95,16 @@ pub fn biases(
             (RenderScratch::new(), workers)
         },
         |(render, workers), job| {
-            let RowJob {
-                fields,
-                iy,
-                surveys,
-            } = job;
+            let RowJob { fields, iy, .. } = &job;
             let mut versions = Vec::with_capacity(VERSIONS.len());
             for version in VERSIONS {
-                let strip = draw(set, &fields, iy, version, render);
-                versions.push(measure_strip(set, &fields, iy, strip, workers, &surveys)?);
+                let strip = draw(set, fields, *iy, version, render);
+                versions.push(measure_strip(set, &job, strip, workers)?);
             }
             let found = (0..measurers.len()).map(|k| {
                 let mut sums = BiasSums::default();
                 for ix in 0..n {
-                    let psf = fields.psf.at(ix, iy).shape;
+                    let psf = fields.psf.at(ix, *iy).shape;
                     let galaxy = std::array::from_fn(|v| &versions[v][k].galaxies[ix]);
                     sums.add(galaxy, psf);
                 }

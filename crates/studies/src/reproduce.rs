@@ -186,7 +186,7 @@ fn measure_set(
     let images: Vec<u32> = (1..=plan.images).collect();
     let mut sums = vec![(SetImages::new(&grid), RowCounts::default()); measurers.len()];
     let mut regressions = vec![Regression::default(); measurers.len()];
-    run_set(&simulator, &images, measurers, threads, progress, |image| {
+    run_set(&simulator, &images, measurers, threads, progress, |image, _| {
         let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
         for (((sum, counts), regression), rows) in each {
             let (field, used) = field_sum(&grid, rows);
@@ -292,7 +292,7 @@ fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> (FieldSum, RowCounts) {
     let mut sum = FieldSum::new(grid);
     let galaxies = rows.iter().flat_map(|row| {
         row.galaxies.iter().enumerate().map(|(ix, galaxy)| {
-            let (x, y) = row.mosaic.centre(ix, row.iy);
+            let (x, y) = row.head.mosaic.centre(ix, row.iy);
             Row {
                 x,
                 y,

@@ -499,9 +499,14 @@ pub fn scaling(
         let mut best = 0.0f64;
         for _ in 0..3 {
             let start = Instant::now();
-            run_set(&inputs.set, &[1], &measurers, threads, &mut Quiet, |_| {
-                Ok(())
-            })?;
+            run_set(
+                &inputs.set,
+                &[1],
+                &measurers,
+                threads,
+                &mut Quiet,
+                |_, _| Ok(()),
+            )?;
             best = best.max(galaxies / start.elapsed().as_secs_f64());
         }
         Ok(best)

@@ -200,6 +200,16 @@ impl ImageReader {
         self.file.number(key)
     }
 
+    /// A header value as text; empty if absent.
+    pub fn text(&self, key: &str) -> String {
+        self.file.text(key)
+    }
+
+    /// Goes back to the first row.
+    pub fn rewind(&mut self) {
+        self.next_row = 0;
+    }
+
     /// Leaves the next `rows` rows out.
     pub fn skip_rows(&mut self, rows: usize) {
         self.next_row = (self.next_row + rows).min(self.rows());

@@ -14,7 +14,7 @@ use shearq_scoring::{
 
 use shearq_files::FileError;
 use shearq_files::table;
-use shearq_pipeline::data::layout::{MAX_IMAGE, MAX_SET};
+use shearq_pipeline::data::pattern::{MAX_IMAGE, MAX_SET};
 
 /// One line of a power-spectrum file.
 #[derive(Debug, Clone, Copy, PartialEq)]
