@@ -402,10 +402,7 @@ fn folders_are_chosen_sorted_and_grouped_like_a_store() {
     let named = rows(&["--where", "submission=48/*"]);
     assert_eq!(named.len(), 1);
     let message = fail(&["compare", text(&raw), "--where", "set=3"]);
-    assert!(
-        message.contains("no set for which the conditions hold"),
-        "{message}"
-    );
+    assert!(message.contains("no set meets the conditions"), "{message}");
     // A data folder in place of results.
     let message = fail(&["compare", text(&data), text(&raw)]);
     assert!(

@@ -213,7 +213,10 @@ fn options_and_baselines_hold_finite_positive_limits() {
             format!("{}{negative}", &sound[..end]),
             "an error that is infinite or negative",
         ),
-        (shorter.to_owned(), "1 of 2 sets are there"),
+        (
+            shorter.to_owned(),
+            "found 1 sets, expected 2 as in `sets_held`",
+        ),
     ] {
         fs::write(&path, text_of).unwrap();
         let error = fail(&["baseline", "check", "--folder", text(&folder)]);

@@ -120,7 +120,7 @@ fn what_was_changed_since_it_was_recorded_is_refused() {
     let message = fail(&["compare", "--store", text(&store)]);
     assert!(message.contains(text(&one.0)), "{message}");
     assert!(
-        message.contains("changed since it was recorded"),
+        message.contains("changed after it was recorded"),
         "{message}"
     );
     // Under a name of one's own it is what it is.

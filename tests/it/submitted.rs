@@ -279,7 +279,7 @@ fn blank_catalogues_count_as_images_and_odd_tables_get_errors() {
     let message = String::from_utf8(nothing.stderr).unwrap();
     assert_eq!(nothing.status.code(), Some(1), "{message}");
     assert!(
-        message.contains("there is no galaxy in 1 catalogue(s)"),
+        message.contains("found no galaxy in 1 catalogue(s)"),
         "{message}"
     );
     // The same column twice, from every format.

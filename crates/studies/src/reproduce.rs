@@ -173,7 +173,7 @@ pub fn run_sets(
                 images: images.clone(),
                 score: scorer.score(sum)?,
                 rows: *rows,
-                basis: Basis::Told,
+                basis: Basis::Given,
                 sign: SignBasis::Specified,
                 findings: Vec::new(),
                 odd_images: OddImages::default(),

@@ -58,7 +58,7 @@ pub fn convention_note(scored: &[ScoredSet]) -> String {
     let name = format!("{} ({})", chosen.number(), chosen.describe());
     let constant = scored.iter().all(|set| set.score.constant.is_some());
     match first.basis {
-        Basis::Told => format!("Convention {name}."),
+        Basis::Given => format!("Convention {name}."),
         Basis::HighestQ => {
             "Convention: set by set the one with the highest Q, as the leaderboard took it.".into()
         }
