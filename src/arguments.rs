@@ -249,7 +249,7 @@ impl SimulationArguments {
         Ok(settings)
     }
 
-    /// Refuses them if nothing is simulated.
+    /// Refuses these options for data that are not simulated.
     pub(super) fn must_be_unused(&self) -> anyhow::Result<()> {
         anyhow::ensure!(
             self.settings()? == SimulationSettings::new(SEED, usize::from(GRID)),

@@ -18,8 +18,7 @@ use shearq_studies::reproduce::{Plan, Study, run_sets};
 /// Compare configurations with each other and with the Cramér–Rao bound.
 ///
 /// For each set and configuration, the command measures the scatter of calibrated ellipticities and its ratio to the
-/// bound, multiplicative and additive bias, PSF leakage, Q of catalogues and of cross-spectra, and the time per
-/// galaxy.
+/// bound. It also measures multiplicative and additive bias, PSF leakage, Q, and the time per galaxy.
 ///
 /// The data are simulated in memory. Finished sets are kept, so the same command resumes a stopped study. Use a seed
 /// with which no setting was tuned.

@@ -20,3 +20,8 @@ pub mod score;
 pub mod store;
 pub mod submit;
 pub mod views;
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
