@@ -228,15 +228,15 @@ fn catalogues_of_another_program_are_packed_as_they_are_scored() {
     refused(
         pattern,
         &["--kind", "spectra"],
-        "--data DIR gives it for spectra",
+        "cannot determine the grid of the spectra. Try: --data DIR",
     );
     refused(
         "absent-{set}-{image}.csv",
         &[],
         "found no catalogue to pack",
     );
-    refused("other-8-{image}.csv", &[], "has no {set}");
-    // A spectrum cannot tell the sign of e2, but the truth can.
+    refused("other-8-{image}.csv", &[], "contains no {set}");
+    // A spectrum does not determine the sign of e2, but the truth does.
     let wrong = text_of(pattern).replace("e2_sign = -1", "e2_sign = 1");
     fs::write(&description, wrong).unwrap();
     let pack = [
@@ -381,7 +381,7 @@ fn archives_that_are_not_what_was_packed_are_refused_and_leave_nothing() {
     header.set_size(0);
     builder.append_data(&mut header, &long, &b""[..]).unwrap();
     builder.into_inner().unwrap().finish().unwrap();
-    refused("`././@LongLink`; expected plain files");
+    refused("`././@LongLink`, expected plain files");
     // Without a manifest there is nothing to verify by.
     let bare: Vec<(&str, &[u8])> = files
         .into_iter()

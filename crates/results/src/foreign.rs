@@ -241,3 +241,51 @@ pub fn plain_columns<'a>(
         sum_foreign(grid, path, rows.into_iter().map(|row| screen.apply(row)))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The rows of a catalogue with the columns a, b, u, v and bad, described by more keys.
+    fn rows(keys: &str, lines: &str) -> Vec<Row> {
+        let folder = tempfile::tempdir().unwrap();
+        let (toml, csv) = (folder.path().join("f.toml"), folder.path().join("1-1.csv"));
+        let names = "x = \"a\"\ny = \"b\"\ne1 = \"u\"\ne2 = \"v\"\nflag = \"bad\"";
+        let start = "name = \"F\"\ncatalogues = \"{set}-{image}.csv\"";
+        std::fs::write(&toml, format!("{start}\n{names}\n{keys}\n")).unwrap();
+        std::fs::write(&csv, format!("a,b,u,v,bad\n{lines}")).unwrap();
+        let foreign = Foreign::read(&toml).unwrap();
+        assert_eq!(foreign.catalogues(&[]).unwrap().of_set(1).len(), 1);
+        foreign.rows(&csv, 100).unwrap()
+    }
+
+    #[test]
+    fn columns_signs_offsets_and_types_are_converted() {
+        let keys = "ellipticity = \"distortion\"\ne2_sign = -1\nposition_offset = 1";
+        let found = rows(keys, "0,5,0.6,0,0\n1,5,0,0.8,0\n");
+        // χ = 2ε/(1 + ε²): 0.6 is ε = 1/3, 0.8 is ε = 1/2. Rounding leaves 1e-15.
+        assert_eq!((found[0].x, found[0].y), (1.0, 6.0));
+        assert!((found[0].e1 - 1.0 / 3.0).abs() < 1e-15, "{}", found[0].e1);
+        assert!((found[1].e2 + 0.5).abs() < 1e-15, "{}", found[1].e2);
+    }
+
+    #[test]
+    fn flagged_missing_and_large_ellipticities_are_not_measured() {
+        let keys = "ellipticity = \"shear\"\nmissing = -99\nmax_modulus = 0.5";
+        let lines = "1,1,0.1,0.2,0\n1,1,0.1,0.2,4\n1,1,-99,0.2,0\n1,1,0.4,0.4,0\n";
+        let measured: Vec<bool> = rows(keys, lines).iter().map(|r| r.e1.is_finite()).collect();
+        assert_eq!(measured, [true, false, false, false]);
+        let screen = Screen {
+            missing: Some(-99.0),
+            max_modulus: Some(0.5),
+            distortion: true,
+        };
+        let apply = |e1| {
+            let (x, y, e2) = (1.0, 1.0, 0.0);
+            screen.apply(Row { x, y, e1, e2 }).e1
+        };
+        assert!((apply(0.6) - 1.0 / 3.0).abs() < 1e-15);
+        // A distortion of 0.9 is a shear of 0.63.
+        assert!(apply(-99.0).is_nan() && apply(0.9).is_nan());
+    }
+}

@@ -158,3 +158,95 @@ fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<Stri
     }
     run.sets.sort_by_key(|set| set.set);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::row::SetRecord;
+    use shearq_scoring::Metrics;
+
+    fn run(configuration: &str, sets: &[(u32, u32, f64)]) -> RunRecord {
+        let record = |&(set, images, q): &(u32, u32, f64)| SetRecord {
+            set,
+            simulated: true,
+            data: "d".into(),
+            images: (1..=images).collect(),
+            galaxies: 64,
+            flagged: 1,
+            metrics: Metrics {
+                q,
+                ..Metrics::unknown()
+            },
+            errors: Metrics::unknown(),
+            q_replicates: vec![q, f64::NAN],
+            q_calibrated_replicates: Vec::new(),
+            q_leaderboard: q,
+            convention: 5,
+            convention_known: true,
+            convention_leaderboard: 6,
+        };
+        RunRecord {
+            configuration: configuration.into(),
+            version: "1".into(),
+            settings: String::new(),
+            source: "s".into(),
+            definition: "leaderboard".into(),
+            choice: "5".into(),
+            noise: "measured".into(),
+            sets: sets.iter().map(record).collect(),
+        }
+    }
+
+    #[test]
+    fn runs_are_read_back_and_more_images_replace_fewer() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = folder.path().join("store");
+        let _prepared = prepare(&store).unwrap();
+        let first = run("b", &[(2, 1, 10.0), (7, 3, 20.0)]);
+        let path = write(&store, &first).unwrap();
+        assert_eq!(write(&store, &first).unwrap(), path);
+        write(&store, &run("b", &[(2, 4, 11.0)])).unwrap();
+        write(&store, &run("a", &[(1, 1, 5.5)])).unwrap();
+        let (runs, notes) = read(&store).unwrap();
+        assert!(notes.is_empty(), "{notes:?}");
+        let found = |run: &RunRecord| -> Vec<(u32, usize, f64)> {
+            let sets = run.sets.iter();
+            sets.map(|set| (set.set, set.images.len(), set.metrics.q))
+                .collect()
+        };
+        assert_eq!(runs.len(), 2);
+        assert_eq!(
+            (runs[0].configuration.as_str(), found(&runs[0])),
+            ("a", vec![(1, 1, 5.5)])
+        );
+        assert_eq!(found(&runs[1]), [(2, 4, 11.0), (7, 3, 20.0)]);
+        assert!(runs[0].sets[0].q_replicates[1].is_nan());
+        // Other results on as many images.
+        write(&store, &run("a", &[(1, 1, 6.5)])).unwrap();
+        let (_, notes) = read(&store).unwrap();
+        assert!(
+            notes.len() == 1 && notes[0].contains("repeats set 1"),
+            "{notes:?}"
+        );
+    }
+
+    #[test]
+    fn an_edited_file_and_an_empty_folder_are_noticed() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = folder.path().join("store");
+        let prepared = prepare(&store).unwrap();
+        let path = write(&store, &run("a", &[(1, 1, 5.5)])).unwrap();
+        let other = write(&store, &run("a", &[(1, 2, 6.5)])).unwrap();
+        std::fs::rename(other, path).unwrap();
+        let message = read(&store).unwrap_err().to_string();
+        assert!(
+            message.contains("changed after it was recorded"),
+            "{message}"
+        );
+        drop(prepared);
+        assert!(store.exists());
+        let empty = folder.path().join("empty");
+        drop(prepare(&empty).unwrap());
+        assert!(!empty.exists());
+    }
+}

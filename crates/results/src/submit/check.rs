@@ -535,3 +535,47 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shearq_quantities::units::{Degrees, Pixels};
+
+    /// Names of the checks that a catalogue of 8 × 8 galaxies fails.
+    fn failed(edit: impl Fn(&mut Vec<[f64; 4]>)) -> Vec<&'static str> {
+        let centre = |k: usize| 24.5 + 48.0 * k as f64;
+        let e = |k: usize| 0.01 * (k as f64 - 31.5) / 32.0;
+        let mut rows: Vec<[f64; 4]> = (0..64)
+            .map(|k| [centre(k % 8), centre(k / 8), e(k), -e(k)])
+            .collect();
+        edit(&mut rows);
+        let line = |[x, y, e1, e2]: &[f64; 4]| format!("{x} {y} {e1} {e2}\n");
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("g10_v1_objs_2_1.M.dat");
+        std::fs::write(&path, rows.iter().map(line).collect::<String>()).unwrap();
+        let expected = Expected {
+            grid: Grid::new(8, Pixels(48.0), Degrees(10.0)).unwrap(),
+            truth: BTreeMap::new(),
+            images: None,
+        };
+        let findings = check(&path, &expected);
+        findings.iter().map(|finding| finding.check).collect()
+    }
+
+    #[test]
+    fn each_fault_of_a_catalogue_fails_its_check() {
+        assert!(failed(|_| {}).is_empty());
+        assert_eq!(failed(|rows| _ = rows.pop()), ["missing"]);
+        assert_eq!(failed(|rows| rows[3][0] += 1.0), ["positions"]);
+        assert_eq!(failed(|rows| rows[3][2] = 1.5), ["range"]);
+        assert_eq!(failed(|rows| rows[3][2] = f64::NAN), ["not-finite"]);
+        assert_eq!(failed(|rows| rows[3][0] = 999.0), ["outside", "missing"]);
+        assert_eq!(failed(|rows| rows[3] = rows[4]), ["missing", "duplicates"]);
+        let zero = |rows: &mut Vec<[f64; 4]>| {
+            for row in rows {
+                (row[2], row[3]) = (0.0, 0.0);
+            }
+        };
+        assert_eq!(failed(zero), ["constant"]);
+    }
+}

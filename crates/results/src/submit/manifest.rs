@@ -137,3 +137,53 @@ impl Manifest {
         listed.chain(extra).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn missing_changed_and_additional_files_are_named() {
+        let sum =
+            |text: &str| FileSum::copying(&mut text.as_bytes(), &mut std::io::sink()).unwrap();
+        // The test vector "abc" of FIPS 180-4.
+        assert!(sum("abc").sha256.starts_with("ba7816bf8f01cfea"));
+        let files = |pairs: &[(&str, &str)]| -> BTreeMap<String, FileSum> {
+            let pairs = pairs.iter();
+            pairs
+                .map(|(name, text)| ((*name).to_owned(), sum(text)))
+                .collect()
+        };
+        let manifest = Manifest {
+            version: "1".into(),
+            method: "M".into(),
+            contents: Contents::Catalogues,
+            run: None,
+            foreign: None,
+            files: files(&[
+                ("gone", "x"),
+                ("longer", "x"),
+                ("other", "x"),
+                ("same", "x"),
+            ]),
+            covariances: BTreeMap::new(),
+        };
+        let found = files(&[
+            ("longer", "xx"),
+            ("more", "x"),
+            ("other", "y"),
+            ("same", "x"),
+        ]);
+        let faults = manifest.faults(&found);
+        let expected = [
+            ("gone", "missing"),
+            ("longer", "found 2 bytes, expected 1"),
+            ("other", "found SHA-256"),
+            ("more", "does not list"),
+        ];
+        assert_eq!(faults.len(), expected.len(), "{faults:?}");
+        for ((name, message), (of, part)) in faults.iter().zip(expected) {
+            assert!(name == of && message.contains(part), "{name}: {message}");
+        }
+    }
+}

@@ -144,26 +144,24 @@ impl Packing<'_> {
     /// # Errors
     /// If a catalogue cannot be read, or `out` cannot be written.
     pub fn write(&self, out: &Path, progress: &mut dyn Progress) -> Result<usize, FileError> {
+        let found = self.origin.catalogues()?;
+        let per_set = |set| match self.contents {
+            Contents::Catalogues => found.of_set(set).len(),
+            Contents::Spectra | Contents::CrossSpectra => 1,
+        };
+        check_number(found.sets().into_iter().map(per_set).sum(), out)?;
         let mut destination = Destination::create(out)?;
         let mut files = BTreeMap::new();
         let mut covariances = BTreeMap::new();
         let mut matching = ConventionMatch::default();
         let mut add = |kind: Kind, text: String| -> Result<(), FileError> {
             let (name, mut bytes) = (kind.file_name(), text.as_bytes());
-            if files.len() as u64 + 1 >= MAX_FILES {
-                let message = format!(
-                    "too many files to pack (found more than {}, the limit of `check` and `unpack`)",
-                    MAX_FILES - 1
-                );
-                return Err(FileError::new(out, message));
-            }
             destination.add(&name, bytes)?;
             let sum = FileSum::copying(&mut bytes, &mut std::io::sink())
                 .map_err(FileError::doing(out, "cannot add up"))?;
             files.insert(name, sum);
             Ok(())
         };
-        let found = self.origin.catalogues()?;
         for set in found.sets() {
             let catalogues = found.of_set(set);
             let method = self.method.clone();
@@ -250,6 +248,16 @@ impl Packing<'_> {
     }
 }
 
+/// Refuses more files than `check` and `unpack` read. The manifest is one more file.
+fn check_number(files: usize, out: &Path) -> Result<(), FileError> {
+    if (files as u64) < MAX_FILES {
+        return Ok(());
+    }
+    let most = MAX_FILES - 1;
+    let message = format!("too many files to pack (found {files}, expected at most {most})");
+    Err(FileError::new(out, message))
+}
+
 /// Where packed files are written.
 enum Destination {
     Folder(PartFolder),
@@ -281,5 +289,21 @@ impl Destination {
             Destination::Archive(archive) => archive.finish(),
             Destination::Folder(folder) => folder.finish(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn as_many_files_are_packed_as_are_read() {
+        let out = Path::new("sent.tar.gz");
+        assert!(check_number(199_999, out).is_ok());
+        let message = check_number(200_000, out).unwrap_err().to_string();
+        assert_eq!(
+            message,
+            "sent.tar.gz: too many files to pack (found 200000, expected at most 199999)"
+        );
     }
 }

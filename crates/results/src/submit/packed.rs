@@ -184,3 +184,44 @@ fn verified(sent: &Sent, files: &[PathBuf]) -> Result<Option<Manifest>, FileErro
     found.verify(&sent.given, true)?;
     Ok(found.manifest)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Reads a folder of empty files.
+    fn read(names: &[&str]) -> Result<Submission, FileError> {
+        let folder = tempfile::tempdir().unwrap();
+        for name in names {
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
+        Submission::read(&Sent::open(folder.path())?)
+    }
+
+    #[test]
+    fn files_are_sorted_by_kind_set_and_image() {
+        let names = ["g10_v1_objs_2_10.M.dat", "g10_v1_objs_2_9.M.dat", ".hidden"];
+        let submission = read(&names).unwrap();
+        let Packed::Catalogues(sets) = submission.packed else {
+            panic!("catalogues are no spectra");
+        };
+        let images: Vec<u32> = sets[&2].keys().copied().collect();
+        assert_eq!((submission.method.as_str(), images), ("M", vec![9, 10]));
+        let spectra = read(&["M_set1.dat", "M_set2.dat"]).unwrap();
+        assert!(matches!(spectra.packed, Packed::Spectra(files) if files.len() == 2));
+    }
+
+    #[test]
+    fn a_submission_has_one_method_and_one_kind() {
+        let one = "g10_v1_objs_2_1.M.dat";
+        for (names, expected) in [
+            (&[][..], "contains no files"),
+            (&[one, "g10_v1_objs_2_2.N.dat"], "several methods: M, N"),
+            (&[one, "M_set2.dat"], "catalogues and spectra"),
+            (&[one, "notes.txt"], "the name is neither"),
+        ] {
+            let message = read(names).unwrap_err().to_string();
+            assert!(message.contains(expected), "{names:?}: {message}");
+        }
+    }
+}

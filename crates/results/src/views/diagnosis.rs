@@ -145,3 +145,32 @@ pub fn prefix(set: Option<u32>) -> String {
         |set| format!("warning: set {set:02}: "),
     )
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fault_of_several_sets_is_one_line_with_advice() {
+        let distorted = |m| Fault::Distortion { m, error: 0.1 };
+        let (two, five) = ([distorted(1.02)], [distorted(0.9)]);
+        let sets = [(Some(2), &two[..]), (Some(5), &five[..])];
+        let lines = of_sets(sets.into_iter());
+        assert_eq!(lines.len(), 1);
+        assert!(lines[0].starts_with("warning: set 02: ") && lines[0].contains("2.02 ± 0.10"));
+        assert!(lines[0].contains("(likewise in set 5). Try: --ellipticity distortion"));
+        assert!(of_sets([(None, &two[..])].into_iter())[0].starts_with("warning: the "));
+    }
+
+    #[test]
+    fn copies_and_constant_images_are_counted() {
+        let path = |name: &str| PathBuf::from(name);
+        let odd = OddImages {
+            copies: vec![(path("b"), path("a")), (path("c"), path("a"))],
+            constant: vec![(path("d"), [0.0, 0.5])],
+        };
+        let lines = odd_images(&odd);
+        assert!(lines[0].starts_with("b has the ellipticities of a, and 1 more likewise;"));
+        assert!(lines[1].starts_with("all galaxies of d have the ellipticity (0, 0.5);"));
+    }
+}
