@@ -507,7 +507,7 @@ fn a_psf_stamp_that_loses_the_wings_is_doubted() {
         let content = format!("extends = \"48/linear/star\"\npsf.size = {size}\n");
         fs::write(&own, content).unwrap();
         let said = small.measure(&["--submission", text(&own)]);
-        let warning = format!("warning: psf.size is {size} (expected 32 or more)");
+        let warning = format!("image 001: psf.size is {size} (expected 32 or more)");
         assert_eq!(said.contains(&warning), doubted, "{said}");
         assert_eq!(said.contains("warning"), doubted, "{said}");
     }

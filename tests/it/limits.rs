@@ -207,11 +207,11 @@ fn options_and_baselines_hold_finite_positive_limits() {
     for (text_of, words) in [
         (
             format!("{}inf{}", &sound[..start], &sound[end..]),
-            "set 2 has an infinite figure",
+            "set 2: a metric is infinite",
         ),
         (
             format!("{}{negative}", &sound[..end]),
-            "an error that is infinite or negative",
+            "its error is infinite or negative",
         ),
         (
             shorter.to_owned(),

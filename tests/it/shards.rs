@@ -152,7 +152,7 @@ fn merge_lists_what_is_missing_damaged_or_of_other_settings() {
     }
     let message = fail(&["merge", text(&at("parquet"))]);
     assert!(
-        message.contains("give the --sets and --images"),
+        message.contains("Try: --sets LIST --images N"),
         "{message}"
     );
     let message = fail(&["merge", text(root.path())]);

@@ -329,7 +329,7 @@ fn differences_are_given_only_for_the_same_images() {
     assert!(
         table["notes"]
             .to_string()
-            .contains("it needs the same images as the first")
+            .contains("differences need equal images")
     );
 }
 
