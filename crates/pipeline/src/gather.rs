@@ -175,7 +175,7 @@ fn gather_alone(
         gathering,
     };
     let record = serde_json::to_string_pretty(&record)
-        .map_err(FileError::doing(&which, "cannot tell what made it"))?;
+        .map_err(FileError::doing(&which, "cannot write the record of the settings"))?;
     let mut doubts = Vec::new();
     let positions = match stamps {
         Stamps::Files(_) => Vec::new(),
@@ -242,7 +242,7 @@ fn gather_alone(
         };
         places.serialize(place).map_err(FileError::doing(
             &target,
-            "cannot tell which stamp is which",
+            "cannot write the list of stamps",
         ))?;
         image.add(pixels)
     };
