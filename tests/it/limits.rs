@@ -207,13 +207,16 @@ fn options_and_baselines_hold_finite_positive_limits() {
     for (text_of, words) in [
         (
             format!("{}inf{}", &sound[..start], &sound[end..]),
-            "set 2 has an infinite metric",
+            "set 2: a metric is infinite",
         ),
         (
             format!("{}{negative}", &sound[..end]),
-            "an error that is infinite or negative",
+            "its error is infinite or negative",
         ),
-        (shorter.to_owned(), "1 of 2 sets are there"),
+        (
+            shorter.to_owned(),
+            "found 1 sets, expected 2 as in `sets_held`",
+        ),
     ] {
         fs::write(&path, text_of).unwrap();
         let error = fail(&["baseline", "check", "--folder", text(&folder)]);

@@ -22,6 +22,7 @@ mod galsim_measured;
 mod gathered;
 mod identity;
 mod killed;
+mod language;
 mod limits;
 mod odd_files;
 mod orientation;

@@ -11,3 +11,8 @@ pub mod exhibits;
 pub mod reproduce;
 pub mod response;
 pub mod speed;
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -186,17 +186,24 @@ fn measure_set(
     let images: Vec<u32> = (1..=plan.images).collect();
     let mut sums = vec![(SetImages::new(&grid), RowCounts::default()); measurers.len()];
     let mut regressions = vec![Regression::default(); measurers.len()];
-    run_set(&simulator, &images, measurers, threads, progress, |image, _| {
-        let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
-        for (((sum, counts), regression), rows) in each {
-            let (field, used) = field_sum(&grid, rows);
-            sum.add(&field).map_err(scoring)?;
-            *counts += used;
-            let measured = rows.iter().flat_map(|row| &row.galaxies);
-            regression.add(image.observed.iter().copied().zip(measured));
-        }
-        Ok(())
-    })?;
+    run_set(
+        &simulator,
+        &images,
+        measurers,
+        threads,
+        progress,
+        |image, _| {
+            let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
+            for (((sum, counts), regression), rows) in each {
+                let (field, used) = field_sum(&grid, rows);
+                sum.add(&field).map_err(scoring)?;
+                *counts += used;
+                let measured = rows.iter().flat_map(|row| &row.galaxies);
+                regression.add(image.observed.iter().copied().zip(measured));
+            }
+            Ok(())
+        },
+    )?;
     progress.note(&format!("set {set:02}"));
     let options = Options {
         noise: Noise::Measured,
@@ -214,7 +221,7 @@ fn measure_set(
                 images: images.clone(),
                 score,
                 rows: *rows,
-                basis: Basis::Told,
+                basis: Basis::Given,
                 sign: SignBasis::Specified,
                 findings: Vec::new(),
                 odd_images: OddImages::default(),

@@ -87,7 +87,7 @@ impl Source {
 /// # Errors
 /// Where the current folder is not known.
 pub fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
-    relative::from(from, to).map_err(FileError::doing(to, "cannot tell where the folder is"))
+    relative::from(from, to).map_err(FileError::doing(to, "cannot determine where the folder is"))
 }
 
 impl std::fmt::Display for Source {
