@@ -68,7 +68,7 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<SetMean>, 
     if means.is_empty() {
         return Err(FileError::new(
             out,
-            "there is no catalogue; expected those of `measure`",
+            "there is no catalogue; expected a folder that `measure` wrote",
         ));
     }
     Ok(means)
