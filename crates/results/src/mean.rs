@@ -84,7 +84,7 @@ fn mean_of(
     let (mut flags, mut flagged) = ([0; Flag::ALL.len()], 0);
     for (_, path) in catalogues {
         let rows = Rows::read(path, calibrated)?;
-        for &bits in rows.flags.iter() {
+        for &bits in &*rows.flags {
             for (count, flag) in flags.iter_mut().zip(Flag::ALL) {
                 *count += usize::from(bits as u32 & flag as u32 != 0);
             }
