@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 import threading
+import warnings
 
 import numpy as np
 import pytest
@@ -112,6 +113,23 @@ def test_galaxies_that_cannot_be_measured_are_flagged(image):
     assert shearq.Flag(int(again(image, psf=stars)["flags"][7])) == shearq.Flag.BadPsf
 
 
+def test_a_call_without_a_good_galaxy_is_an_error_with_its_cause(image):
+    stamps = np.full_like(image.stamps[:5], np.nan)
+    with pytest.raises(ValueError, match="stamps: no galaxy could be measured: 5 of 5 .*missing.*Try: check masks"):
+        again(image, stamps)
+
+
+def test_noise_per_stamp_is_compared_with_the_stamps(image):
+    # Half of the stamps are ten times as bright, so no single level is right.
+    scale = np.where(np.arange(len(image.stamps)) % 2, 10.0, 1.0)
+    stamps = image.stamps * scale[:, np.newaxis, np.newaxis]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "the given noise", shearq.DataWarning)
+        shearq.measure(stamps, image.psf, noise=image.noise * scale)
+    with pytest.warns(shearq.DataWarning, match="the given noise disagrees"):
+        shearq.measure(stamps, image.psf, noise=2 * image.noise * scale)
+
+
 def test_the_catalogue_knows_what_made_it_and_keeps_it(measured):
     attrs = measured.attrs
     assert attrs["submission"] == "48/linear/star" and attrs["version"] == shearq.__version__
@@ -129,6 +147,7 @@ def test_the_mean_shear_is_the_mean_ellipticity_with_weights_over_their_own_resp
     assert shear.g1 == pytest.approx(measured["e1"].mean(), rel=1e-12)
     residual = measured["e2"] - shear.g2 * measured["R22"] / measured["R22"].mean()
     assert shear.g2_error == pytest.approx(residual.std(ddof=1) / len(measured) ** 0.5, rel=1e-2)
+    assert shear.covariance[1][1] == pytest.approx(shear.g2_error**2) and shear.flagged == 0
     assert shear.galaxies == len(measured) and tuple(shear) == (shear.g1, shear.g2)
     # Weights of zero and one are a choice of rows.
     chosen = measured["flux"] > np.median(measured["flux"])

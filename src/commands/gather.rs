@@ -172,10 +172,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Gathered {
         mosaic,
         incomplete,
-        doubts,
+        messages,
     } = gather(&data, id, &gathering)?;
-    for doubt in doubts {
-        tell(format_args!("{doubt}"));
+    for message in messages {
+        tell(format_args!("{message}"));
     }
     if incomplete > 0 {
         tell(format_args!(

@@ -7,6 +7,8 @@ use serde::{Serialize, Serializer};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 
+use crate::pixel_scale;
+
 /// Names by which instruments call what lies beside an image of the sky: without a choice, none of these is one.
 const COMPANIONS: [&str; 15] = [
     "PSF",
@@ -283,7 +285,12 @@ impl<'a> Exposure<'a> {
         Ok([reader.width(), reader.height()])
     }
 
-    /// Refuses one whose sides are not those of `other`.
+    /// Pixel scale in arcseconds, if the header states it.
+    pub(super) fn scale(&mut self) -> Result<Option<f64>, FileError> {
+        Ok(pixel_scale::of_header(self.reader()?))
+    }
+
+    /// Refuses an image of another size than `other`.
     pub(super) fn like(&mut self, other: &mut Self) -> Result<(), FileError> {
         let (own, expected) = (self.sides()?, other.sides()?);
         if own != expected {

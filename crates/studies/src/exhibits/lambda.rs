@@ -239,7 +239,7 @@ pub fn calibration_table(curves: &Curves, configuration: &Configuration) -> Tabl
     )];
     if at_edge {
         notes.push(format!(
-            "Warning: a best λ is at the edge of what was looked at, 10^{} to 10^{}; it may lie beyond.",
+            "warning: a best λ is at the edge of the range that was tested (10^{} to 10^{}), and may lie beyond.",
             LOG_LAMBDA[0],
             LOG_LAMBDA[LOG_LAMBDA.len() - 1]
         ));
