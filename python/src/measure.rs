@@ -106,8 +106,8 @@ type Measured<'py> = (
 ///
 /// PSFs are one star stamp for all, star stamps one per galaxy, or formulas (FWHM, e1, e2 and β, which is NaN for
 /// Kolmogorov), one for all or one per galaxy. The noise is one level for all or one per stamp. Without any, the
-/// configuration measures it on the stamps. Returns the columns of the catalogue, the mean response by which the
-/// ellipticities were divided, the warnings, and an error if all galaxies are flagged.
+/// configuration measures it on the stamps. Returns the columns of the catalogue, the mean response in
+/// the divisor, the warnings, and an error if all galaxies are flagged.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
 pub(crate) fn measure<'py>(
@@ -160,7 +160,7 @@ pub(crate) fn measure<'py>(
 }
 
 impl<'s> Request<'s> {
-    /// The plan by which noise is measured on the stamps, unless it is given.
+    /// The plan for measuring the noise on the stamps, unless it is given.
     fn noise_plan(&self) -> Option<&NoisePlan> {
         match self.noise {
             Noise::One(None) => self.measurer.noise_plan().filter(|_| self.dim.0 > 0),
@@ -277,7 +277,7 @@ impl<'s> Request<'s> {
                     Ok(())
                 },
             )
-            .and_then(|()| watch.tell())
+            .and_then(|()| watch.report())
         });
         failure.or(result)?;
         Ok(galaxies)

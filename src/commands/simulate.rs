@@ -12,13 +12,13 @@ use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::images;
 use shearq_pipeline::simulate::{SimulationRecord, simulate_folder};
 
-/// Write simulated GREAT10-like sets: images, PSFs, true shear, intrinsic shapes.
+/// Write simulated GREAT10-like sets: images, PSFs, true shear and intrinsic shapes.
 ///
-/// The sets are those of the paper's Table 2: galaxies of bulge and disc at S/N 20 with a Moffat PSF of 3.4 pixels
-/// (1 to 3), S/N 10 (4 to 6), 40 (7 to 9), of many S/N (10 to 12), small (13, 14), large (15, 16), of many sizes (17,
-/// 18), a Kolmogorov PSF (19, 20), many bulge fractions (21, 22) and bulges off the disc's centre (23, 24). S/N is
-/// √(Σ I²)/σ before lensing and behind a round PSF. Images already in the folder are kept if the same settings made them, so
-/// a stopped simulation goes on where it was.
+/// The sets follow Table 2 of the paper. Sets 1 to 3 have galaxies of bulge and disc at S/N 20 and a Moffat PSF of 3.4
+/// pixels. The others differ in S/N: 10 (4 to 6), 40 (7 to 9), many (10 to 12). They differ in size: small (13, 14),
+/// large (15, 16), many (17, 18). The last have a Kolmogorov PSF (19, 20), many bulge fractions (21, 22), or bulges off
+/// the centre of the disc (23, 24). S/N is √(Σ I²)/σ before lensing and for a round PSF. Images of the same settings that
+/// are in the folder already are kept. So the same command continues a simulation that was stopped.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Sets, as `1,2,7-9` or `all`.

@@ -33,7 +33,7 @@ use shearq_files::table;
 
 /// Most stamps of one image: one per galaxy of the largest grid.
 const MAX_STAMPS: usize = table::MAX_ROWS;
-/// Pixels a side from which on a single stamp looks like a mosaic or an exposure: four times the default stamp.
+/// Least pixels a side of a single stamp that looks like a mosaic or an exposure: four times the default stamp.
 const LARGE: usize = 192;
 /// Advice for a mosaic or an exposure.
 const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
@@ -83,7 +83,7 @@ pub struct Gathering<'a> {
     pub noise: Option<f64>,
 }
 
-/// Record of the sources, stored beside the image.
+/// Record of the sources, stored with the image.
 #[derive(Serialize)]
 struct Record<'a> {
     version: &'a str,

@@ -18,7 +18,7 @@ use crate::images::ImageId;
 
 /// Pixels a side of a PSF that are examined: as many as configurations use.
 const EXAMINED_SIDE: usize = 48;
-/// Most pixels of stars that are averaged, all of which are in memory.
+/// Most pixels of stars that are averaged. All of them are in memory.
 const MOST_AVERAGED: usize = 1 << 24;
 
 /// The PSFs of an image, not yet written.
