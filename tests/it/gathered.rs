@@ -324,10 +324,7 @@ fn what_cannot_be_gathered_is_named() {
     let rest = ["--size", "20", "--psf", text(&psf), "--out", text(&out)];
     let done = shearq(&[&["gather"][..], &from, &rest].concat());
     let said = String::from_utf8(done.stderr).unwrap();
-    assert!(
-        said.contains("1 stamp with missing pixels"),
-        "{said}"
-    );
+    assert!(said.contains("1 stamp with missing pixels"), "{said}");
     assert!(said.contains("the PSF contains a background"), "{said}");
 }
 

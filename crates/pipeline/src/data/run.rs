@@ -87,7 +87,10 @@ impl Source {
 /// # Errors
 /// If the current folder cannot be determined.
 pub fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
-    relative::from(from, to).map_err(FileError::doing(to, "cannot determine the path of the folder"))
+    relative::from(from, to).map_err(FileError::doing(
+        to,
+        "cannot determine the path of the folder",
+    ))
 }
 
 impl std::fmt::Display for Source {
@@ -234,7 +237,8 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
             Some(hint) => format!(". {hint}"),
             // Valid JSON with other keys or types.
             None if error.is_data() => {
-                "; it was written by another version. Try: make the results again in another folder".into()
+                "; it was written by another version. Try: make the results again in another folder"
+                    .into()
             }
             None => String::new(),
         };
