@@ -16,7 +16,7 @@ use shearq_pipeline::images::ImageId;
 /// an exposure around positions. Pixels are missing if they are beyond the exposure, not finite, or masked. A linear
 /// configuration fills a few of them from the opposite side of the galaxy; a network flags the galaxy. The PSF is one
 /// star stamp, one per galaxy in the same order, or a table of functional PSFs (x,y,profile,beta,fwhm,e1,e2; see
-/// docs/formats.md), whose positions are not used. A table with the image lists the origin of each stamp, in the order of
+/// docs/files-data.md), whose positions are not used. A table with the image lists the origin of each stamp, in the order of
 /// the catalogues. Stamps and PSFs are compared: width, noise and pixel scale.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {

@@ -151,10 +151,7 @@ fn merge_lists_what_is_missing_damaged_or_of_other_settings() {
         assert_eq!(contents(&out), whole);
     }
     let message = fail(&["merge", text(&at("parquet"))]);
-    assert!(
-        message.contains("give the --sets and --images"),
-        "{message}"
-    );
+    assert!(message.contains("Try: --sets LIST --images N"), "{message}");
     let message = fail(&["merge", text(root.path())]);
     assert!(
         message.contains("neither run.json nor simulation.json"),

@@ -195,7 +195,7 @@ fn check_catalogue(
         None => Ok(()),
         Some((key, _)) => {
             let message = format!(
-                "its `{key}` does not match set {} image {} of this run; it belongs to another run or to other data",
+                "its `{key}` does not match set {} image {} of this run; the file belongs to another image or to other data",
                 id.set, id.image
             );
             Err(FileError::new(path, message).into())

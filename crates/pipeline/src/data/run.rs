@@ -87,10 +87,7 @@ impl Source {
 /// # Errors
 /// If the current folder cannot be determined.
 pub fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
-    relative::from(from, to).map_err(FileError::doing(
-        to,
-        "cannot determine the path of the folder",
-    ))
+    relative::from(from, to).map_err(FileError::doing(to, "cannot determine where the folder is"))
 }
 
 impl std::fmt::Display for Source {
