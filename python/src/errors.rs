@@ -1,4 +1,4 @@
-//! Errors of the crates as exceptions that name the argument they are about.
+//! Errors of the crates as exceptions that name the argument.
 
 use pyo3::PyErr;
 use pyo3::exceptions::{PyKeyError, PyMemoryError, PyRuntimeError, PyValueError};
@@ -7,7 +7,7 @@ use shearq_pipeline::PipelineError;
 use shearq_scoring::ScoringError;
 use shearq_submissions::ConfigurationError;
 
-/// What is wrong with stamps, PSFs, the noise or the submission.
+/// Errors about stamps, PSFs, the noise or the configuration.
 pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
     let argument = match error {
         MeasureError::Configuration(error) => return of_submission(error),
@@ -23,7 +23,7 @@ pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
     PyValueError::new_err(format!("{argument}: {error}"))
 }
 
-/// What is wrong with a submission: its name, or its settings.
+/// Errors about the name or the settings of a configuration.
 pub(crate) fn of_submission(error: ConfigurationError) -> PyErr {
     let message = format!("submission: {error}");
     match error {
@@ -32,24 +32,22 @@ pub(crate) fn of_submission(error: ConfigurationError) -> PyErr {
     }
 }
 
-/// What is wrong with what is to be scored.
+/// Errors of scoring.
 pub(crate) fn of_scoring(error: ScoringError) -> PyErr {
     PyValueError::new_err(error.to_string())
 }
 
-/// What stopped the engine.
+/// Errors of the engine.
 pub(crate) fn of_pipeline(error: PipelineError) -> PyErr {
     match error {
         PipelineError::Measure(error) => of_measuring(error),
         PipelineError::Scoring { source, .. } => of_scoring(source),
         PipelineError::Request(message) => PyValueError::new_err(message),
-        other @ (PipelineError::File(_) | PipelineError::Threads(_)) => {
-            PyRuntimeError::new_err(other.to_string())
-        }
+        other => PyRuntimeError::new_err(other.to_string()),
     }
 }
 
-/// Room that there is not.
+/// A failed allocation.
 pub(crate) fn no_memory(what: &str) -> PyErr {
     PyMemoryError::new_err(format!("there is no memory for {what}"))
 }

@@ -106,8 +106,8 @@ type Measured<'py> = (
 ///
 /// PSFs are one star stamp for all, star stamps one per galaxy, or formulas (FWHM, e1, e2 and β, which is NaN for
 /// Kolmogorov), one for all or one per galaxy. The noise is one level for all or one per stamp. Without any, the
-/// configuration measures it on the stamps. Returns the columns of the catalogue, the mean response by which the
-/// ellipticities were divided, the warnings, and an error if all galaxies are flagged.
+/// configuration measures it on the stamps. Returns the columns of the catalogue, the mean response in
+/// the divisor, the warnings, and an error if all galaxies are flagged.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
 pub(crate) fn measure<'py>(
@@ -160,7 +160,7 @@ pub(crate) fn measure<'py>(
 }
 
 impl<'s> Request<'s> {
-    /// The plan by which noise is measured on the stamps, unless it is given.
+    /// The plan for measuring the noise on the stamps, unless it is given.
     fn noise_plan(&self) -> Option<&NoisePlan> {
         match self.noise {
             Noise::One(None) => self.measurer.noise_plan().filter(|_| self.dim.0 > 0),
@@ -277,7 +277,7 @@ impl<'s> Request<'s> {
                     Ok(())
                 },
             )
-            .and_then(|()| watch.tell())
+            .and_then(|()| watch.report())
         });
         failure.or(result)?;
         Ok(galaxies)
@@ -300,7 +300,7 @@ impl<'s> Request<'s> {
         let configuration = self.measurer.configuration();
         let examination = self.examine(psfs)?;
         let mut warnings = examination.warnings();
-        warnings.extend(self.given_noise(&examination));
+        warnings.extend(self.given_noise(&examination)?);
         warnings.extend(Warning::of_settings(configuration));
         warnings.extend(Warning::of_flags(galaxies));
         match warnings.iter().position(Warning::is_fatal) {
@@ -340,12 +340,35 @@ impl<'s> Request<'s> {
         Ok(examination)
     }
 
-    /// A warning if the given noise disagrees with the stamps.
-    fn given_noise(&self, examination: &Examination) -> Option<Warning> {
-        match self.noise {
-            Noise::One(level) => examination.given_noise(level?),
-            Noise::Each(_) => None,
+    /// A warning if the given noise disagrees with the stamps. Stamps with levels of their own are examined in units of
+    /// their levels, and the warning states the median level.
+    fn given_noise(&self, examination: &Examination) -> PyResult<Option<Warning>> {
+        let levels = match self.noise {
+            Noise::One(level) => {
+                return Ok(level.and_then(|level| examination.given_noise(level)));
+            }
+            Noise::Each(levels) => levels,
+        };
+        let (count, side, _) = self.dim;
+        let chosen = examined_rows(1, count);
+        let mut sorted: Vec<f64> = chosen.iter().map(|&at| levels[at]).collect();
+        sorted.retain(|level| *level > 0.0);
+        sorted.sort_by(f64::total_cmp);
+        let Some(&median) = sorted.get(sorted.len() / 2) else {
+            return Ok(None);
+        };
+        let mut scaled = Examination::new(side, chosen.len());
+        for at in chosen.into_iter().filter(|&at| levels[at] > 0.0) {
+            let scale = median / levels[at];
+            let stamp = match self.stamps.piece(at, at + 1)? {
+                Piece::Single(one) => one.mapv(|value| f64::from(value) * scale),
+                Piece::Double(one) => one.mapv(|value| value * scale),
+                Piece::Copied(one) => one * scale,
+            };
+            let added = scaled.add(stamp.index_axis(Axis(0), 0));
+            added.map_err(of_measuring)?;
         }
+        Ok(scaled.given_noise(median))
     }
 }
 

@@ -125,7 +125,7 @@ impl<'a> Rows<'a> {
 /// Scores images of `n` × `n` galaxies against their true shear, both in the order of the grid, x running
 /// fastest, or the images at positions. Returns all metrics, spectra and counts by name.
 #[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
+#[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
 pub(crate) fn score<'py>(
     py: Python<'py>,
     n: usize,
@@ -263,7 +263,7 @@ fn bins<'py>(py: Python<'py>, bins: &Bins) -> PyResult<Bound<'py, PyDict>> {
 /// E, B and EB bandpowers of the mean of images of `n` × `n` galaxies in the order of the grid, x running
 /// fastest. No truth is needed.
 #[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
+#[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
 pub(crate) fn spectrum<'py>(
     py: Python<'py>,
     n: usize,

@@ -19,7 +19,7 @@ use shearq_simulate::set::{
 use crate::errors::{no_memory, of_pipeline};
 use crate::work::{Failure, Watch, threads};
 
-/// Values of a formula: FWHM, e1, e2 and β.
+/// Numbers of a functional PSF: FWHM, e1, e2 and β.
 const FORMULA: usize = 4;
 
 /// One row of galaxies, drawn.
@@ -30,10 +30,10 @@ struct Drawn {
     observed: Vec<Shear>,
 }
 
-/// Simulates images of a set as the command line does, into arrays by name: those of all images one after the
-/// other, galaxies in the order of the grid, x running fastest.
+/// Simulates images of a set like the command line, into arrays by name. Images follow one another, and galaxies are in the
+/// order of the grid, x fastest.
 #[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
+#[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
 pub(crate) fn simulate<'py>(
     py: Python<'py>,
     set: u32,
@@ -101,7 +101,7 @@ pub(crate) fn simulate<'py>(
                 Ok(())
             },
         )
-        .and_then(|()| watch.tell())
+        .and_then(|()| watch.report())
     });
     failure.or(result)?;
     let truth = (0..cells).map(|k| simulator.shear_at(k % grid, k / grid));
@@ -122,7 +122,7 @@ pub(crate) fn simulate<'py>(
     Ok(found)
 }
 
-/// A row of stamps with their PSFs: of one PSF for all of an image, that of its first row alone.
+/// A row of stamps with their PSFs. A PSF for all galaxies comes with the first row only.
 fn draw(set: &SetSimulator, fields: &ImageFields, iy: usize, scratch: &mut RenderScratch) -> Drawn {
     let n = set.grid().n;
     let mut pixels = vec![0.0; n * STAMP * STAMP];

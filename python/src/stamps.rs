@@ -1,4 +1,4 @@
-//! Stamps as Python has them: viewed where they lie if Rust can, otherwise converted piece by piece.
+//! Stamps of Python: viewed without a copy if possible, otherwise converted in pieces.
 
 use ndarray::{Array3, ArrayView3, s};
 use numpy::{PyArray3, PyArrayMethods, PyReadonlyArray3, PyUntypedArray, PyUntypedArrayMethods};
@@ -6,11 +6,11 @@ use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::PySlice;
 
-/// An array `(n, ny, nx)`, borrowed for as long as it is worked on.
+/// A borrowed array `(n, ny, nx)`.
 pub(crate) enum Borrowed<'py> {
     Single(PyReadonlyArray3<'py, f32>),
     Double(PyReadonlyArray3<'py, f64>),
-    /// Of other numbers, in the other order of bytes, or not aligned, as in FITS files and records.
+    /// Other types, another byte order, or not aligned, as in FITS files and records.
     Other(Bound<'py, PyUntypedArray>),
 }
 
@@ -18,13 +18,13 @@ impl<'py> Borrowed<'py> {
     /// Borrows an array of three axes.
     ///
     /// # Errors
-    /// Where it is none.
+    /// If it has another number of axes.
     pub(crate) fn new(array: &Bound<'py, PyAny>) -> PyResult<Self> {
         let array = array.cast::<PyUntypedArray>()?;
         if array.ndim() != 3 {
             return Err(PyTypeError::new_err("expected an array of three axes"));
         }
-        // Views of memory that is not aligned would be undefined.
+        // Views of unaligned memory are undefined.
         if array.is_aligned() {
             if let Ok(single) = array.cast::<PyArray3<f32>>() {
                 return Ok(Borrowed::Single(single.try_readonly()?));
@@ -48,7 +48,7 @@ impl<'py> Borrowed<'py> {
         }
     }
 
-    /// What threads without the interpreter can share.
+    /// The form that threads without the interpreter share.
     pub(crate) fn shared(&self) -> Stamps<'_> {
         match self {
             Borrowed::Single(array) => Stamps::Single(array.as_array()),
@@ -73,9 +73,9 @@ pub(crate) enum Piece<'a> {
 }
 
 impl<'a> Stamps<'a> {
-    /// Those from `start` to before `end`. Attaches to the interpreter where they have to be converted.
+    /// The stamps from `start` to before `end`. Converting them requires the interpreter.
     pub(crate) fn piece(&self, start: usize, end: usize) -> PyResult<Piece<'a>> {
-        // Of copies of the views, which live longer than this borrow of them.
+        // Copies of the views live longer than this borrow.
         Ok(match self {
             Stamps::Single(all) => Piece::Single((*all).slice_move(s![start..end, .., ..])),
             Stamps::Double(all) => Piece::Double((*all).slice_move(s![start..end, .., ..])),

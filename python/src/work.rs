@@ -1,4 +1,4 @@
-//! Long work on behalf of Python: its progress, and what interrupts it.
+//! Progress and interruption of long work.
 
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -8,10 +8,10 @@ use shearq_pipeline::PipelineError;
 
 use crate::errors::of_pipeline;
 
-/// How often Python hears of the work. Attaching to the interpreter may have to wait for its other threads.
+/// Period of calls to Python. Attaching to the interpreter may wait for its other threads.
 const PERIOD: Duration = Duration::from_millis(50);
 
-/// Worker threads: as asked for, or one per core.
+/// Worker threads: the given number, or one per core.
 pub(crate) fn threads(asked: Option<u16>) -> usize {
     asked.map_or_else(
         || std::thread::available_parallelism().map_or(1, usize::from),
@@ -19,18 +19,18 @@ pub(crate) fn threads(asked: Option<u16>) -> usize {
     )
 }
 
-/// An exception that stops the work, from whichever thread.
+/// An exception of any thread that stops the work.
 #[derive(Default)]
 pub(crate) struct Failure(Mutex<Option<PyErr>>);
 
 impl Failure {
-    /// Keeps an exception, and gives the error that stops the engine.
+    /// Keeps an exception, and returns the error that stops the engine.
     pub(crate) fn keep(&self, error: PyErr) -> PipelineError {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(error);
         PipelineError::Request("the work was interrupted".into())
     }
 
-    /// The result of the work: its own, or the exception that stopped it.
+    /// The result of the work, or the exception that stopped it.
     pub(crate) fn or(self, result: Result<(), PipelineError>) -> PyResult<()> {
         match self.0.into_inner().unwrap_or_else(PoisonError::into_inner) {
             Some(error) => Err(error),
@@ -39,13 +39,13 @@ impl Failure {
     }
 }
 
-/// Tells a callback how many more galaxies are done, and looks for signals such as Ctrl-C. For the thread
+/// Calls back with the number of galaxies done since the last call, and checks signals such as Ctrl-C. For the thread
 /// that called from Python.
 pub(crate) struct Watch<'a> {
     callback: Option<Py<PyAny>>,
     failure: &'a Failure,
-    untold: u64,
-    told: Instant,
+    unreported: u64,
+    reported: Instant,
 }
 
 impl<'a> Watch<'a> {
@@ -53,24 +53,24 @@ impl<'a> Watch<'a> {
         Watch {
             callback,
             failure,
-            untold: 0,
-            told: Instant::now(),
+            unreported: 0,
+            reported: Instant::now(),
         }
     }
 
     /// `galaxies` more are done.
     pub(crate) fn advance(&mut self, galaxies: usize) -> Result<(), PipelineError> {
-        self.untold += galaxies as u64;
-        if self.told.elapsed() < PERIOD {
+        self.unreported += galaxies as u64;
+        if self.reported.elapsed() < PERIOD {
             return Ok(());
         }
-        self.tell()
+        self.report()
     }
 
-    /// Tells what has not been told.
-    pub(crate) fn tell(&mut self) -> Result<(), PipelineError> {
-        let (more, callback) = (std::mem::take(&mut self.untold), &self.callback);
-        let heard = Python::attach(|py| {
+    /// Calls back with the galaxies that were not reported.
+    pub(crate) fn report(&mut self) -> Result<(), PipelineError> {
+        let (more, callback) = (std::mem::take(&mut self.unreported), &self.callback);
+        let result = Python::attach(|py| {
             if let Some(callback) = callback
                 && more > 0
             {
@@ -78,7 +78,7 @@ impl<'a> Watch<'a> {
             }
             py.check_signals()
         });
-        self.told = Instant::now();
-        heard.map_err(|error| self.failure.keep(error))
+        self.reported = Instant::now();
+        result.map_err(|error| self.failure.keep(error))
     }
 }

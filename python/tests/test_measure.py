@@ -119,6 +119,17 @@ def test_a_call_without_a_good_galaxy_is_an_error_with_its_cause(image):
         again(image, stamps)
 
 
+def test_noise_per_stamp_is_compared_with_the_stamps(image):
+    # Half of the stamps are ten times as bright, so no single level is right.
+    scale = np.where(np.arange(len(image.stamps)) % 2, 10.0, 1.0)
+    stamps = image.stamps * scale[:, np.newaxis, np.newaxis]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "the given noise", shearq.DataWarning)
+        shearq.measure(stamps, image.psf, noise=image.noise * scale)
+    with pytest.warns(shearq.DataWarning, match="the given noise disagrees"):
+        shearq.measure(stamps, image.psf, noise=2 * image.noise * scale)
+
+
 def test_the_catalogue_knows_what_made_it_and_keeps_it(measured):
     attrs = measured.attrs
     assert attrs["submission"] == "48/linear/star" and attrs["version"] == shearq.__version__

@@ -19,7 +19,8 @@ use shearq_pipeline::images::ImageId;
 /// fills a few from the opposite side of the galaxy; a network flags the galaxy.
 ///
 /// The PSF is one star stamp for all galaxies, or one per galaxy in the same order. It may also be a table of functional
-/// PSFs (x,y,profile,beta,fwhm,e1,e2; docs/files-data.md), whose positions are not used. A table next to the image lists
+/// PSFs (x,y,profile,beta,fwhm,e1,e2; docs/files-data.md), whose positions are not used. Width, noise and pixel scale of
+/// stamps and PSFs are compared. A table next to the image lists
 /// the stamps in the order of the catalogues.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
@@ -29,18 +30,17 @@ pub(crate) struct Arguments {
     /// Image to cut stamps out of: the first of its file.
     #[arg(long, value_name = "FILE", requires = "positions")]
     exposure: Option<PathBuf>,
-    /// Only images of this name (EXTNAME) of the files of stamps or the exposure, as SCI.
+    /// Use only images of this name (EXTNAME), such as SCI.
     #[arg(long, value_name = "NAME")]
     extension: Option<String>,
-    /// Masks like the stamps, one each in the same order, or like the exposure: pixels are missing where they are not
-    /// zero.
+    /// Masks of the stamps in the same order, or of the exposure. A pixel is missing if its mask is not zero.
     #[arg(long, value_name = "FILE", num_args = 1..)]
     mask: Vec<PathBuf>,
-    /// Only images of this name of the files of masks [default: masks are in the files of the stamps or the exposure].
+    /// Use only masks of this name [default files: those of the stamps or the exposure].
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
-    /// Table of the galaxies' positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the
-    /// first is at 1). `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file.
+    /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1).
+    /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file.
     #[arg(
         long,
         value_name = "FILE",
@@ -48,8 +48,7 @@ pub(crate) struct Arguments {
         conflicts_with = "stamps"
     )]
     positions: Option<PathBuf>,
-    /// Table of the positions in a FITS file: its name (EXTNAME), or its number from 1 [default: the one that has the
-    /// columns].
+    /// Table of a FITS file: its name (EXTNAME), or its number from 1 [default: the table that has the columns].
     #[arg(
         long,
         value_name = "NAME|NUMBER",
@@ -57,11 +56,11 @@ pub(crate) struct Arguments {
         conflicts_with = "stamps"
     )]
     table: Option<String>,
-    /// Number of the first pixel's centre in the positions: 1 for FITS and SExtractor, 0 for NumPy and sep.
+    /// Coordinate of the centre of the first pixel: 1 for FITS and SExtractor, 0 for NumPy and sep.
     #[arg(long, value_name = "0|1", default_value_t = 1, value_parser = clap::value_parser!(u8).range(0..=1), requires = "exposure", conflicts_with = "stamps")]
     first_pixel: u8,
-    /// Columns of the positions: names, or numbers from 1 if the table has no names [default: x and y, or the names of
-    /// SExtractor such as X_IMAGE and Y_IMAGE, or the two columns of a table without names].
+    /// Columns of the positions: names, or numbers from 1 if the table has no names [default: x and y, names of SExtractor
+    /// such as X_IMAGE and Y_IMAGE, or the only two columns].
     #[arg(
         long,
         value_name = "X,Y",
@@ -71,26 +70,26 @@ pub(crate) struct Arguments {
         conflicts_with = "stamps"
     )]
     columns: Option<Vec<String>>,
-    /// Pixels a side of a stamp that is cut out.
+    /// Pixels a side of the stamps that are cut out.
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure", conflicts_with = "stamps")]
     size: u16,
-    /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one for all galaxies, or one for each. Stars of
-    /// another number, of at most half of the galaxies, are averaged to one PSF.
+    /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy.
+    /// Several stars, at most half as many as galaxies, are averaged to one PSF.
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
     psf: Vec<PathBuf>,
-    /// Only images of this name of the files of PSFs.
+    /// Use only PSFs of this name (EXTNAME).
     #[arg(long, value_name = "NAME")]
     psf_extension: Option<String>,
-    /// Standard deviation of the noise of a pixel, where a submission is to take it from the header.
+    /// Standard deviation of the noise per pixel, written to the header for configurations that do not measure it.
     #[arg(long, value_name = "SIGMA")]
     noise: Option<f64>,
-    /// Set that the image belongs to.
+    /// Set of the image.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_SET)))]
     set: u32,
     /// Number of the image in its set.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     image: u32,
-    /// Data folder; images of other numbers may be there.
+    /// Data folder. It may contain images of other numbers.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }
@@ -175,14 +174,14 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Gathered {
         mosaic,
         incomplete,
-        doubts,
+        messages,
     } = gather(&data, id, &gathering)?;
-    for doubt in doubts {
-        tell(format_args!("{doubt}"));
+    for message in messages {
+        tell(format_args!("{message}"));
     }
     if incomplete > 0 {
         tell(format_args!(
-            "{} with pixels that are missing or beyond the edge: flagged by networks, and by linear submissions where too much is missing",
+            "{} with missing pixels. Networks flag such galaxies; linear configurations flag them if too many pixels are missing",
             count(incomplete, "stamp")
         ));
     }

@@ -12,7 +12,7 @@ use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::images;
 use shearq_pipeline::simulate::{SimulationRecord, simulate_folder};
 
-/// Write simulated GREAT10-like sets: images, PSFs, true shear, intrinsic shapes.
+/// Write simulated GREAT10-like sets: images, PSFs, true shear and intrinsic shapes.
 ///
 /// The sets follow Table 2 of the paper. Sets 1 to 3 have galaxies of bulge and disc at S/N 20 and a Moffat PSF of
 /// 3.4 px. The others differ by S/N 10 (4 to 6), S/N 40 (7 to 9), many S/N (10 to 12); small (13, 14), large (15, 16)

@@ -156,7 +156,7 @@ fn stamps_of_all_kinds_of_files_are_measured_alike() {
     succeed(&[&measure[..], &["--data", text(&data)]].concat());
     assert_eq!(small.measured("01", "x"), [24.5, 72.5, 120.5, 24.5, 72.5]);
     let again = fail(&[&gather[..], &more].concat());
-    assert!(again.contains("this is there already"), "{again}");
+    assert!(again.contains("the file is there already"), "{again}");
     // They are no grid that has a spectrum.
     let sent = at("sent");
     let pack = ["pack", "--measured", text(&out), "--kind", "spectra"];
@@ -336,10 +336,7 @@ fn what_cannot_be_gathered_is_named() {
     let rest = ["--size", "20", "--psf", text(&psf), "--out", text(&out)];
     let done = shearq(&[&["gather"][..], &from, &rest].concat());
     let said = String::from_utf8(done.stderr).unwrap();
-    assert!(
-        said.contains("1 stamp with pixels that are missing"),
-        "{said}"
-    );
+    assert!(said.contains("1 stamp with missing pixels"), "{said}");
     assert!(said.contains("the PSF contains a background"), "{said}");
 }
 
@@ -395,7 +392,7 @@ fn a_gathered_image_goes_where_the_layout_says_and_is_of_one_run() {
     for psf in [&psf, &formula] {
         let message = fail(&[&gather[..], &["--psf", text(psf)]].concat());
         assert!(
-            message.contains("p-1-1.fits: this is there already"),
+            message.contains("p-1-1.fits: the file is there already"),
             "{message}"
         );
     }
@@ -422,7 +419,12 @@ fn sky_and_noise_that_is_another_are_told_where_they_are_seen() {
         assert!(done.status.success());
         String::from_utf8(done.stderr).unwrap()
     };
-    assert!(!said("dark").contains("warning"));
+    let dark = said("dark");
+    assert!(
+        dark.contains("the given noise disagrees with the noise of the stamps (found 5.0000"),
+        "{dark}"
+    );
+    assert!(!dark.contains("sky"), "{dark}");
     assert!(said("bright").contains("the stamps contain sky"));
     let (data, out) = (small.at("dark"), small.at("out"));
     let measure = ["measure", "--submission", LINEAR, "--data", text(&data)];
@@ -589,7 +591,7 @@ fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
     };
     refused(
         &from,
-        "parts.fits: image 2, plane 1: the image is called ERR; expected no such images, or the name of those that are meant (--extension)",
+        "parts.fits: image 2, plane 1: the image is called ERR; expected an image of the sky or a PSF. Try: choose images by name with --extension",
     );
     let wrong = [&from[..], &["--extension", "PRIMARY"]].concat();
     refused(
@@ -669,4 +671,48 @@ fn compressed_cubes_are_read_plane_by_plane() {
         message.contains("its tiles are of 3 planes each; expected one"),
         "{message}"
     );
+}
+
+#[test]
+fn a_psf_with_other_pixels_or_wider_than_the_galaxies_is_reported() {
+    let small = Small::new("2");
+    let set = small.at("data/set02");
+    let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
+    let (star, side) = pixels_of(&set.join("psf-001.fits"));
+    let scale = |arcsec: &str| format!("PIXSCALE= {arcsec:>20}");
+    let write = |name: &str, sides: &[usize], scale: &str, pixels: &[f32]| {
+        let path = small.at(name);
+        fs::write(&path, fits_image(-32, sides, &[scale], &floats(pixels))).unwrap();
+        path
+    };
+    let sides = [48, 48, galaxies.len()];
+    let stamps = write("stamps.fits", &sides, &scale("0.2"), &galaxies.concat());
+    let gather = |psf: &Path, out: &str| {
+        let out = small.at(out);
+        let gather = ["gather", "--stamps", text(&stamps), "--psf", text(psf)];
+        let done = shearq(&[&gather[..], &["--out", text(&out)]].concat());
+        (
+            done.status.success(),
+            String::from_utf8(done.stderr).unwrap(),
+        )
+    };
+    let good = write("good.fits", &[side; 2], &scale("0.2"), &star);
+    let (done, said) = gather(&good, "good");
+    assert!(done && !said.contains("warning"), "{said}");
+    let other = write("other.fits", &[side; 2], &scale("0.263"), &star);
+    let (done, said) = gather(&other, "other");
+    let expected = "warning: set 01 image 001: the PSF image and the galaxy image have different pixel scales (found 0.263, expected 0.2 arcsec";
+    assert!(done && said.contains(expected), "{said}");
+    // A Gaussian of FWHM 14 px.
+    let wide: Vec<f32> = (0..side * side)
+        .map(|k| [k % side, k / side].map(|at| at as f32 - (side as f32 - 1.0) / 2.0))
+        .map(|[x, y]| (-(x * x + y * y) / 72.0).exp())
+        .collect();
+    let wide = write("wide.fits", &[side; 2], &scale("0.2"), &wide);
+    let (done, said) = gather(&wide, "wide");
+    assert!(
+        !done && said.contains("wide.fits: the PSF is broader than the galaxies"),
+        "{said}"
+    );
+    assert!(!small.at("wide/set01").exists());
 }

@@ -90,7 +90,10 @@ fn a_folder_of_other_settings_lists_the_few_that_matter() {
     let other = ["--submission", "48/linear/star", "--out", text(&out)];
     let message = fail(&[&run[..], &other].concat());
     let lines: Vec<&str> = message.lines().collect();
-    has(lines[0], &["this folder holds results of other settings"]);
+    has(
+        lines[0],
+        &["this folder contains results of other settings"],
+    );
     has(
         lines[1],
         &["submission.name: \"23/den/star\" ≠ \"48/linear/star\""],

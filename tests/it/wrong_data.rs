@@ -7,6 +7,7 @@ use ndarray::{Array3, ArrayView2, s};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
+use shearq_files::table::{self, FileFormat};
 use shearq_measure::{Measurer, Psfs};
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::render::RenderScratch;
@@ -334,12 +335,29 @@ fn noise_is_compared_with_the_header_of_every_image() {
         fits_image(-32, &[side, side], &cards, &floats(&pixels)),
     )
     .unwrap();
-    let (data, out) = (at("data"), at("out"));
-    let measure = ["measure", "--data", text(&data), "--submission", LINEAR];
-    let done = shearq(&[&measure[..], &["--out", text(&out)]].concat());
-    let said = String::from_utf8(done.stderr).unwrap();
-    let expected = "warning: set 02 image 002: NOISESIG disagrees with the measured noise (found 2.0000, expected ";
-    assert!(said.contains(expected), "{said}");
+    let data = at("data");
+    let header = at("header.toml");
+    fs::write(
+        &header,
+        format!("extends = \"{LINEAR}\"\nnoise.source = \"header\"\n"),
+    )
+    .unwrap();
+    for (submission, used) in [(LINEAR, "the measured noise"), (text(&header), "NOISESIG")] {
+        let out = at(&used.replace(' ', "-"));
+        let measure = ["measure", "--data", text(&data), "--submission", submission];
+        let done = shearq(&[&measure[..], &["--out", text(&out)]].concat());
+        let said = String::from_utf8(done.stderr).unwrap();
+        let expected = "warning: set 02 image 002: NOISESIG disagrees with the measured noise (found 2.0000, expected ";
+        assert!(said.contains(expected), "{said}");
+        assert!(said.contains(&format!("): {used} is used")), "{said}");
+        let stored = |image: u32| {
+            let path = out.join(format!("set02/catalogue-00{image}.parquet"));
+            table::read_metadata(&path, FileFormat::Parquet, [&"warnings".to_owned()]).unwrap()
+        };
+        assert!(stored(1).is_empty());
+        let warnings = &stored(2)["warnings"];
+        assert!(warnings.starts_with("NOISESIG disagrees"), "{warnings}");
+    }
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::fs;
 
 use shearq_files::fits::ImageReader;
 
-use crate::support::{Small, fits_image, floats};
+use crate::support::{Small, fits_image, floats, pixels_of};
 
 const LINEAR: [&str; 2] = ["--submission", "48/linear/star"];
 
@@ -82,4 +82,27 @@ fn wrong_psfs_are_named_and_good_ones_are_not() {
         let message = small.fail_to_measure(&LINEAR);
         assert!(message.contains(expected), "{message}");
     }
+}
+
+#[test]
+fn another_pixel_scale_in_the_header_of_the_psf_is_reported() {
+    let small = Small::new("2");
+    let scaled = |name: &str, cards: &[&str]| {
+        let path = small.at(&format!("data/set02/{name}-001.fits"));
+        let (pixels, side) = pixels_of(&path);
+        let cards = [&["STAMP   =                   48"], cards].concat();
+        fs::write(&path, fits_image(-32, &[side; 2], &cards, &floats(&pixels))).unwrap();
+    };
+    let degrees = [
+        "CD1_1   =          -5.5556E-05",
+        "CD2_2   =           5.5556E-05",
+    ];
+    scaled("galaxies", &degrees);
+    scaled("psf", &["GS_SCALE=                  0.2"]);
+    let said = small.measure(&["--submission", "48/linear/star"]);
+    assert!(!said.contains("pixel scale"), "{said}");
+    scaled("psf", &["GS_SCALE=                 0.15"]);
+    let said = small.measure(&["--submission", "48/linear/star"]);
+    let expected = "warning: set 02 image 001: the PSF image and the galaxy image have different pixel scales (found 0.15, expected 0.200002 arcsec";
+    assert!(said.contains(expected), "{said}");
 }

@@ -1,4 +1,4 @@
-//! Whether a folder holds every result that it should, whole and of its settings.
+//! Checks that a folder has all its results, complete and of its settings.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -22,12 +22,13 @@ use shearq_files::table::{self, kept, most_rows, read_metadata};
 use shearq_simulate::set::STAMP;
 
 /// A folder of results to be checked.
+#[derive(Debug)]
 pub enum Results<'a> {
-    /// Catalogues in `out` of a run on `data`; the true shear lies in `data`.
+    /// Catalogues in `out` of a run on `data`, with the true shear in `data`.
     Catalogues {
         /// Record of the folder.
         run: &'a Run,
-        /// What was measured: for a simulated run, `out` itself.
+        /// The data that were measured; for a simulated run, `out`.
         data: &'a DataFolder,
         /// The folder.
         out: &'a Path,
@@ -41,16 +42,16 @@ pub enum Results<'a> {
     },
 }
 
-/// An image whose results are not there, or not as they should be.
+/// An image whose results are missing or wrong.
 #[derive(Debug)]
 pub struct Fault {
     /// The image.
     pub id: ImageId,
     /// Its place in the list of all images, from 0.
     pub position: usize,
-    /// File, what was found, what was expected.
+    /// The error.
     pub error: FileError,
-    /// The file without which the image is done again.
+    /// The file whose absence makes the image be measured again.
     pub result: PathBuf,
 }
 
@@ -61,10 +62,10 @@ impl Results<'_> {
         (images.len() * first.unwrap_or(0)) as u64
     }
 
-    /// Every fault of the results of `images`, which are all that there should be, in their order.
+    /// All faults of the results of `images`, in order.
     ///
     /// # Errors
-    /// Where threads cannot be started.
+    /// If threads cannot be started.
     pub fn faults(
         &self,
         images: &[ImageId],
@@ -137,8 +138,8 @@ impl Results<'_> {
         Ok(settings.grid.pow(2))
     }
 
-    /// Number of galaxies of an image whose results are in order; with those of the `first` image of
-    /// a set, what the set shares is looked at. Catalogues are those of `inputs`.
+    /// Number of galaxies of an image whose results are right. With the `first` image of a set, its true shear is checked
+    /// too.
     fn check(
         &self,
         id: ImageId,

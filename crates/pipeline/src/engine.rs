@@ -1,8 +1,7 @@
-//! Ordered, bounded, parallel mapping: one thread reads, a pool works, the caller's thread writes.
+//! Ordered, bounded, parallel mapping: one thread reads, a pool works, and the calling thread writes.
 //!
-//! Results reach the writer in the order in which they were read, whatever the number of threads.
-//! At most [`IN_FLIGHT`] items per worker exist at a time, so memory does not grow with the length
-//! of the work.
+//! Results reach the writer in the order of reading, for any number of threads. At most [`IN_FLIGHT`] items per worker
+//! exist at a time, so memory does not grow with the length of the work.
 
 use std::any::Any;
 use std::collections::BTreeMap;
@@ -17,21 +16,22 @@ use super::PipelineError;
 /// Items read, in work or waiting to be written, per worker.
 const IN_FLIGHT: usize = 4;
 
-/// Hears how far the work is. Called from the thread that writes.
+/// Receives the progress of the work, from the thread that writes.
 pub trait Progress {
     /// `galaxies` more are done.
     fn advance(&mut self, galaxies: u64);
-    /// `galaxies` more were found done.
+    /// `galaxies` more were done before.
     fn skip(&mut self, galaxies: u64) {
         self.advance(galaxies);
     }
-    /// A line worth showing.
+    /// A line about the current work.
     fn note(&mut self, line: &str);
-    /// A line that must not be missed.
+    /// A warning.
     fn warn(&mut self, line: &str);
 }
 
-/// Hears nothing.
+/// Discards all progress.
+#[derive(Debug, Clone, Copy, Default)]
 pub struct Quiet;
 
 impl Progress for Quiet {
@@ -40,17 +40,18 @@ impl Progress for Quiet {
     fn warn(&mut self, _line: &str) {}
 }
 
-/// Hands items to the workers; false once the work has been given up.
+/// Hands items to the workers.
+#[derive(Debug)]
 pub struct Feeder<'a, I> {
     items: SyncSender<(u64, I)>,
     permits: &'a Receiver<()>,
     next: u64,
-    /// As many threads as there are workers, which are busy with what was handed to them.
+    /// Threads for work before items are handed over.
     ahead: &'a rayon::ThreadPool,
 }
 
 impl<I> Feeder<'_, I> {
-    /// Waits for a place and hands over `item`. False means that nobody wants more.
+    /// Waits for a free place and hands over `item`; false if the work has ended.
     #[must_use]
     pub fn push(&mut self, item: I) -> bool {
         if self.permits.recv().is_err() {
@@ -60,7 +61,7 @@ impl<I> Feeder<'_, I> {
         self.items.send((self.next - 1, item)).is_ok()
     }
 
-    /// Maps what has to be known before items are handed over, on several threads, in order.
+    /// Maps values on several threads, in order, before items are handed over.
     pub fn each<T, R>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R>
     where
         T: Send,
@@ -70,17 +71,17 @@ impl<I> Feeder<'_, I> {
     }
 }
 
-/// What became of an item; a panic is handed on to the calling thread.
+/// Result of an item; a panic is passed to the calling thread.
 type Done<O> = Result<Result<O, PipelineError>, Box<dyn Any + Send>>;
 
-/// Runs `read` on a thread of its own, `work` on `threads` workers, each with a scratch of its own,
-/// and `write` on the calling thread, in the order of reading.
+/// Runs `read` on one thread, `work` on `threads` workers with one scratch each, and `write` on the calling thread in
+/// the order of reading.
 ///
 /// # Errors
-/// The first error of any part; what was written before stays written.
+/// The first error of any part. Earlier results stay written.
 ///
 /// # Panics
-/// Where a part does.
+/// If a part panics.
 pub fn ordered<I, O, S>(
     threads: usize,
     read: impl FnOnce(&mut Feeder<'_, I>) -> Result<(), PipelineError> + Send,
@@ -99,7 +100,7 @@ where
     let (result_sender, result_receiver) = sync_channel::<(u64, Done<O>)>(capacity);
     let (permit_sender, permit_receiver) = sync_channel::<()>(capacity);
     for _ in 0..capacity {
-        // The channel was just made with room for all of them.
+        // The new channel has room for all of them.
         let _ = permit_sender.try_send(());
     }
     let items = Mutex::new(item_receiver);
@@ -124,7 +125,7 @@ where
                     loop {
                         let next = items.lock().unwrap_or_else(PoisonError::into_inner).recv();
                         let Ok((number, item)) = next else { break };
-                        // A panic that ended this worker alone would leave the others waiting.
+                        // If a panic ended only this worker, the others would wait for ever.
                         let result = catch_unwind(AssertUnwindSafe(|| work(&mut own, item)));
                         if results.send((number, result)).is_err() {
                             break;
@@ -134,7 +135,7 @@ where
             }
             drop(result_sender);
             outcome = collect(&result_receiver, &permit_sender, &mut write);
-            // Whoever still waits finds nobody at the other end and stops.
+            // Threads that still wait find the channel closed and stop.
             drop(result_receiver);
             drop(permit_sender);
             if !matches!(outcome, Ok(Ok(()))) {
@@ -208,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_looked_at_ahead_comes_in_order() {
+    fn values_mapped_ahead_come_in_order() {
         let mut found = Vec::new();
         ordered(
             3,

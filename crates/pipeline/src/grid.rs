@@ -1,4 +1,4 @@
-//! Which grid galaxies lie on: decided here for measuring, scoring, packing and checking alike.
+//! The grid of galaxies of an image, for measuring, scoring, packing and checking.
 
 use std::path::Path;
 
@@ -10,19 +10,19 @@ use crate::data::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 
-/// Pixels a side of a stamp of an image: its header's STAMP, or else that of the data's layout.
+/// Pixels a side of a stamp of an image: STAMP in its header, or else `stamp` in the layout.
 ///
 /// # Errors
-/// Where STAMP is not a whole number of pixels.
+/// If STAMP is not a whole number of pixels.
 fn stamp_of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<usize, FileError> {
     Ok(whole(image, path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp))
 }
 
-/// The stamps of an image: n × n of them where its header has NGRID, NSTAMPS along rows as wide as the image is
-/// where it has that, and as many as there is room for otherwise.
+/// The stamps of an image: n × n if its header has NGRID = n, NSTAMPS along the rows if it has that, otherwise as many as
+/// fit.
 ///
 /// # Errors
-/// Where the image is not made of whole stamps, as many as its header says.
+/// If the image is not made of whole stamps, in the number that its header states.
 pub(super) fn of_image(
     data: &DataFolder,
     path: &Path,
@@ -37,7 +37,7 @@ pub(super) fn of_image(
     if columns == 0 || rows == 0 || (width, height) != (columns * stamp, rows * stamp) {
         let (columns, rows) = (columns.max(1), rows.max(1));
         let message = format!(
-            "the image is {width} × {height} pixels; expected {columns} × {rows} stamps of {stamp} pixels a side (the header key STAMP, or `stamp` in layout.toml, says how large they are)"
+            "the image is {width} × {height} pixels; expected {columns} × {rows} stamps of {stamp} pixels a side (from the header key STAMP, or `stamp` in layout.toml)"
         );
         return Err(FileError::new(path, message));
     }
@@ -58,10 +58,10 @@ pub(super) fn of_image(
     Ok(mosaic)
 }
 
-/// The grid that an image's stamps are on, for scoring.
+/// The grid of the stamps of an image, for scoring.
 ///
 /// # Errors
-/// Where they are not as many in a row as there are rows, or too few or many.
+/// If there are not as many stamps in a row as rows, or too few or many.
 fn square(data: &DataFolder, path: &Path, mosaic: &Mosaic) -> Result<Grid, FileError> {
     let (n, rows) = (mosaic.columns, mosaic.rows());
     if mosaic.galaxies != n * n {
@@ -75,11 +75,10 @@ fn square(data: &DataFolder, path: &Path, mosaic: &Mosaic) -> Result<Grid, FileE
     Grid::new(n, Pixels(mosaic.stamp as f64), field).map_err(|error| FileError::new(path, error))
 }
 
-/// Pixels a side of the stamps of a set: those of its first image, or of the data's layout where there
-/// is no image.
+/// Pixels a side of the stamps of a set: of its first image, or of the layout if there is no image.
 ///
 /// # Errors
-/// Where that image cannot be read.
+/// If that image cannot be read.
 pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
     match data.images(&[set])?.of_set(set).first() {
         Some((_, path)) => stamp_of_image(data, path, &ImageReader::open(path)?),
@@ -90,7 +89,7 @@ pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
 /// Grid of a set's first image, `None` where there is none.
 ///
 /// # Errors
-/// Where it cannot be read.
+/// If it cannot be read.
 pub(super) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>, FileError> {
     let images = data.images(&[set])?.of_set(set);
     let first = images.first().map(|(_, path)| {
@@ -100,10 +99,10 @@ pub(super) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>
     first.transpose()
 }
 
-/// Grid of a catalogue of ours, which has a row for every cell at its centre, measured or not.
+/// Grid of a catalogue of shearq, which has a row for every cell at its centre.
 ///
 /// # Errors
-/// Where `rows`, in order, are not those of a grid.
+/// If `rows`, in order, do not fill a grid.
 pub fn of_catalogue(path: &Path, rows: &[Row], field: Degrees) -> Result<Grid, FileError> {
     let n = side(path, rows.len())?;
     let whole = |cell: &Row| (cell.x == cell.y).then_some(2.0 * cell.x - 1.0);
@@ -125,10 +124,10 @@ pub fn of_catalogue(path: &Path, rows: &[Row], field: Degrees) -> Result<Grid, F
     }
 }
 
-/// Side of the grid that a file with one row per cell fills.
+/// Side of the grid of a file with one row per cell.
 ///
 /// # Errors
-/// Where the number of rows is no square.
+/// If the number of rows is no square.
 pub fn side(path: &Path, rows: usize) -> Result<usize, FileError> {
     Grid::side_of(rows).ok_or_else(|| {
         let message = format!("{rows} rows; expected the square of the grid's side");
@@ -139,7 +138,7 @@ pub fn side(path: &Path, rows: usize) -> Result<usize, FileError> {
 /// A header value that counts something, `None` where absent.
 ///
 /// # Errors
-/// Where it is no whole number from 1 to `most`.
+/// If it is no whole number from 1 to `most`.
 pub(super) fn whole(
     image: &ImageReader,
     path: &Path,

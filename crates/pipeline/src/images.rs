@@ -1,4 +1,4 @@
-//! Which images there are, and which of them one process works on.
+//! Images of a folder, and the share of one process.
 
 use std::str::FromStr;
 
@@ -20,7 +20,7 @@ pub struct ImageId {
 /// Images of `sets` of a data folder (of all its sets if empty), in order.
 ///
 /// # Errors
-/// Where a set has no image, or the folder none at all, or a folder cannot be listed.
+/// If a set has no image, or the folder none at all, or a folder cannot be listed.
 pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, PipelineError> {
     let files = data.images(sets)?;
     let mut found = Vec::new();
@@ -47,7 +47,7 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, Pipeli
     Ok(found)
 }
 
-/// What to try if a folder has no images: another name of what has nearly the right one, or the folder above that of a set.
+/// Advice for a folder without images: rename a file, or use the folder above.
 fn advice(data: &DataFolder, files: &Files) -> String {
     if let Some(line) = files.unread().first() {
         return format!(". {line}");
@@ -68,21 +68,21 @@ pub fn of_simulation(sets: &[u32], images: u32) -> Vec<ImageId> {
         .collect()
 }
 
-/// One of the parts that work on many images is split into. Images go round the parts in turn, so
-/// that each is in exactly one and their numbers differ by one at most.
+/// One of several shards of the work on many images. Images are dealt out in turn, so each is in exactly one shard and
+/// the numbers of images differ by at most one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
-    /// Number of this part, from 1.
+    /// Number of this shard, from 1.
     number: u32,
-    /// Number of parts.
+    /// Number of shards.
     of: u32,
 }
 
 impl Shard {
-    /// All the work in one part.
+    /// All the work in one shard.
     pub const WHOLE: Shard = Shard { number: 1, of: 1 };
 
-    /// The images of this part, out of all.
+    /// The images of this shard, out of all.
     pub fn part(&self, all: &[ImageId]) -> Vec<ImageId> {
         all.iter()
             .enumerate()
@@ -91,7 +91,7 @@ impl Shard {
             .collect()
     }
 
-    /// The one of `of` parts that the image at `position` of the list of all, from 0, belongs to.
+    /// The shard, of `of`, of the image at `position` in the list of all, from 0.
     pub fn holding(position: usize, of: u32) -> Shard {
         Shard {
             number: (position % of as usize) as u32 + 1,
@@ -99,12 +99,12 @@ impl Shard {
         }
     }
 
-    /// Number of parts.
+    /// Number of shards.
     pub fn of(&self) -> u32 {
         self.of
     }
 
-    /// Number of this part, from 1.
+    /// Number of this shard, from 1.
     pub fn number(&self) -> u32 {
         self.number
     }
@@ -118,7 +118,7 @@ impl FromStr for Shard {
             .and_then(|(number, of)| Some((number.parse().ok()?, of.parse().ok()?)))
             .filter(|&(number, of)| (1..=of).contains(&number))
             .map(|(number, of)| Shard { number, of })
-            .ok_or_else(|| "expected K/N, the K-th of N parts, with K from 1 to N".into())
+            .ok_or_else(|| "expected K/N, shard K of N, with K from 1 to N".into())
     }
 }
 
@@ -133,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_image_is_in_exactly_one_of_equal_parts() {
+    fn every_image_is_in_exactly_one_of_equal_shards() {
         let all = of_simulation(&[1, 7, 24], 5);
         for of in [1, 2, 4, 15, 40] {
             let parts: Vec<Vec<ImageId>> = (1..=of)
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_are_named_by_number_and_count() {
+    fn shards_are_named_by_number_and_count() {
         assert_eq!("1/1".parse(), Ok(Shard::WHOLE));
         assert_eq!("3/20".parse::<Shard>().unwrap().to_string(), "3/20");
         for wrong in ["0/3", "4/3", "3", "1/0", "-1/2", "1/2/3", "a/b", ""] {

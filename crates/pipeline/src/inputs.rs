@@ -1,5 +1,5 @@
-//! What a catalogue was measured from: fingerprints of the image, its PSF and the true shear, kept with the
-//! catalogue and compared wherever it is used again.
+//! Fingerprints of the image, the PSF and the true shear of a catalogue. They are stored with the catalogue, and compared
+//! when it is used.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -21,8 +21,8 @@ const GALAXIES: &str = "galaxies";
 const PSF: &str = "psf";
 const TRUTH: &str = "truth";
 
-/// The files that a run measures, as far as they are there. Of simulated ones, which nobody can replace,
-/// there are none.
+/// The files that a run measures, if they are there. A simulated run has none.
+#[derive(Debug)]
 pub struct Inputs<'a> {
     run: &'a Run,
     data: &'a DataFolder,
@@ -31,10 +31,10 @@ pub struct Inputs<'a> {
 }
 
 impl<'a> Inputs<'a> {
-    /// Those of `images` of a run on `data`.
+    /// The files of `images` of a run on `data`.
     ///
     /// # Errors
-    /// Where the true shear of a set is there and cannot be read.
+    /// If the true shear of a set is there and cannot be read.
     pub fn new(run: &'a Run, data: &'a DataFolder, images: &[ImageId]) -> Result<Self, FileError> {
         let mut truths = BTreeMap::new();
         if let Source::Folder { .. } = run.source {
@@ -64,7 +64,7 @@ impl<'a> Inputs<'a> {
     /// The fingerprints of an image's files, by their keys.
     ///
     /// # Errors
-    /// Where a file is there and cannot be read.
+    /// If a file is there and cannot be read.
     pub fn prints(&self, id: ImageId) -> Result<BTreeMap<String, String>, FileError> {
         let mut prints = BTreeMap::new();
         if let Source::Simulated(_) = self.run.source {
@@ -81,10 +81,10 @@ impl<'a> Inputs<'a> {
         Ok(prints)
     }
 
-    /// Checks that the catalogues in `out` of `images` were measured from the files that are there now.
+    /// Checks that the catalogues of `images` in `out` were measured from the present files.
     ///
     /// # Errors
-    /// Naming the first file that is another one, or that cannot be read.
+    /// If a file has changed or cannot be read; the error names the first.
     pub fn verify(
         &self,
         out: &Path,
@@ -119,7 +119,7 @@ impl<'a> Inputs<'a> {
                 && now != kept
             {
                 let message = format!(
-                    "this is not the file that {} was measured with: its fingerprint is {now}, that one's {kept}; measure again into another folder",
+                    "the file has changed since {} was measured (found the fingerprint {now}, expected {kept}). Try: measure again into another folder",
                     catalogue.display()
                 );
                 return Err(FileError::new(path, message));
@@ -129,11 +129,11 @@ impl<'a> Inputs<'a> {
     }
 }
 
-/// Checks that every catalogue of `sets` (of all, if empty) of a results folder was measured from the files
-/// that are in `data` now.
+/// Checks that every catalogue of `sets` (of all if empty) in a results folder was measured from the present files in
+/// `data`.
 ///
 /// # Errors
-/// Naming the first file that is another one.
+/// If a file has changed; the error names the first.
 pub fn verify(
     data: &DataFolder,
     out: &Path,

@@ -1,8 +1,7 @@
-//! The chain over many galaxies: read or simulate, measure, write.
+//! Simulating, gathering and measuring many images.
 //!
-//! [`engine`] is the only place that starts threads. Everything below it is serial and takes its
-//! scratch from the caller; everything in it is in order, so that results do not depend on the
-//! number of threads.
+//! Only [`engine`] starts threads. The code below it is serial and uses scratch of the caller. Results come back in
+//! order, so they do not depend on the number of threads.
 
 pub mod complete;
 pub mod data;
@@ -30,17 +29,18 @@ use shearq_files::FileError;
 
 /// What can stop the pipeline.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum PipelineError {
-    /// A file.
+    /// A file that cannot be used.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Sizes or PSFs that cannot be measured with.
+    /// Stamps, PSFs or settings that cannot be measured.
     #[error(transparent)]
     Measure(#[from] MeasureError),
-    /// Scores.
+    /// Data that cannot be scored.
     #[error("{}", set.map_or_else(|| "this set cannot be scored".into(), |set| format!("set {set}")))]
     Scoring {
-        /// The set's number, where it has one.
+        /// Number of the set, if it has one.
         set: Option<u32>,
         /// Why it cannot be scored.
         source: shearq_scoring::ScoringError,

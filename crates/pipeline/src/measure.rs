@@ -40,7 +40,7 @@ pub struct Session<'a> {
 
 impl<'a> Session<'a> {
     /// Plans the measurement of `images` of the run's data into catalogues in `out`. Catalogues of the same settings
-    /// that are there already are kept. Nothing is written.
+    /// that are there already are kept. Only [`Session::measure`] writes.
     ///
     /// # Errors
     /// If the first image or its PSF cannot be used.

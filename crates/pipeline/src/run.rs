@@ -80,7 +80,7 @@ pub fn measurers(configurations: &[Configuration]) -> Result<Vec<Measurer>, Pipe
 }
 
 /// Simulates `images`, which are in the order of their sets, and measures them by the run's configuration. Writes
-/// catalogues to `out`, with the true shear beside them. No image is stored. Catalogues of the same settings that are
+/// catalogues to `out`, with the true shear. No image is stored. Catalogues of the same settings that are
 /// there already are kept.
 ///
 /// # Errors
@@ -118,7 +118,7 @@ pub fn run_folder(
 
 /// Simulates images of a set and measures each galaxy by all `measurers`. `done` gets the images in order.
 ///
-/// The galaxies are equal to those that `simulate` writes with the same settings, and the measurements to those of
+/// The galaxies are equal to the galaxies of `simulate` with the same settings, and the measurements to the results of
 /// `measure`.
 ///
 /// # Errors
@@ -351,4 +351,53 @@ fn row_psfs(
             Psfs::strip(simulate::draw_stars(set, fields, iy), n, STAMP)?
         }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use shearq_files::table::FileFormat;
+    use shearq_submissions::Registry;
+
+    use super::*;
+    use crate::data::run::Source;
+
+    /// Galaxies that were done when each warning was shown.
+    #[derive(Default)]
+    struct Recorder {
+        done: u64,
+        warned: Vec<u64>,
+    }
+
+    impl Progress for Recorder {
+        fn advance(&mut self, galaxies: u64) {
+            self.done += galaxies;
+        }
+
+        fn note(&mut self, _line: &str) {}
+
+        fn warn(&mut self, _line: &str) {
+            self.warned.push(self.done);
+        }
+    }
+
+    #[test]
+    fn warnings_of_an_image_are_shown_before_the_next_image_is_done() {
+        let registry = Registry::embedded().unwrap();
+        let mut configuration = registry.get("48/linear/star").unwrap().configuration;
+        // Too little of the PSF: a warning for each image.
+        configuration.psf.size = 24;
+        let settings = SimulationSettings::new(1, 8);
+        let run = Run::new(
+            Source::Simulated(settings),
+            configuration,
+            FileFormat::Parquet,
+        );
+        let images = crate::images::of_simulation(&[2], 3);
+        let out = tempfile::tempdir().unwrap();
+        let mut progress = Recorder::default();
+        let summary = run_folder(&run, settings, &images, out.path(), 1, &mut progress).unwrap();
+        assert_eq!(summary.images, 3);
+        // The second line counts the other images.
+        assert_eq!(progress.warned, [64, 3 * 64]);
+    }
 }

@@ -24,16 +24,16 @@ use shearq_simulate::set::{
 /// Name of the record in a simulated data folder.
 pub const SIMULATION_FILE: &str = "simulation.json";
 
-/// Settings of a simulation, as stored with its data.
+/// Settings of a simulation, stored with its data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SimulationRecord {
     /// Version of shearq.
     pub version: String,
-    /// What the data are made from.
+    /// The settings.
     pub settings: SimulationSettings,
 }
 
-/// The kind of a set by its number if the data were simulated; other data may have the same numbers.
+/// The kind of a set, if the data were simulated. Other data may have the same set numbers.
 pub fn kind_of(data: &DataFolder, set: u32) -> Option<SetKind> {
     let in_memory = || {
         let run = Run::read(data.root()).ok().flatten();
@@ -57,15 +57,15 @@ struct RowJob {
 struct DrawnRow {
     job: RowJob,
     pixels: Vec<f32>,
-    /// Strip of star stamps, for one PSF per galaxy.
+    /// Strip of star stamps, if there is one PSF per galaxy.
     stars: Option<Vec<f32>>,
     observed: Vec<Shear>,
 }
 
-/// Draws what all images of a set share.
+/// Prepares what all images of a set share.
 ///
 /// # Errors
-/// Where there is no such set, or its shear would not be weak.
+/// If there is no such set, or its shear would not be weak.
 pub fn simulator(set: u32, settings: SimulationSettings) -> Result<SetSimulator, PipelineError> {
     let kind = SetKind::of(set).ok_or_else(|| {
         PipelineError::Request(format!("there is no set {set}; expected 1 to {SETS}"))
@@ -76,11 +76,11 @@ pub fn simulator(set: u32, settings: SimulationSettings) -> Result<SetSimulator,
     })
 }
 
-/// Simulates `images`, which are in the order of their sets, into `data`; returns how many were made
-/// and how many were there already.
+/// Simulates `images`, which are in the order of their sets, into `data`. Returns the number of new images and the number
+/// that were there already.
 ///
 /// # Errors
-/// Where a set does not exist, the folder holds data of other settings, or a file cannot be written.
+/// If a set does not exist, the folder holds data of other settings, or a file cannot be written.
 pub fn simulate_folder(
     record: &SimulationRecord,
     images: &[ImageId],
@@ -212,7 +212,7 @@ pub fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
 /// Writes the true shear of a set.
 pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {
     let grid = set.grid();
-    // The comment follows the header, so that readers which skip one line or a `#` read the columns.
+    // The comment follows the header, so that readers that skip one line or a `#` read the columns.
     let mut text = format!("x,y,g1,g2\n# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)\n");
     for iy in 0..grid.n {
         for ix in 0..grid.n {
@@ -224,7 +224,7 @@ pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), P
     Ok(atomic::write(data.truth(set.kind().set), text.as_bytes())?)
 }
 
-/// Files of one image on their way.
+/// Files of one image that is being written.
 struct OpenImage {
     galaxies: ImageWriter,
     stars: Option<ImageWriter>,
@@ -305,7 +305,7 @@ impl OpenImage {
         Ok(())
     }
 
-    /// The galaxies get their name last: an image with galaxies is complete.
+    /// The galaxies are renamed last: an image with galaxies is complete.
     fn finish(self, data: &DataFolder) -> Result<(), PipelineError> {
         let (set, image) = (self.job.set.kind().set, self.job.fields.image);
         if let Some(stars) = self.stars {

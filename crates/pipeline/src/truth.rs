@@ -35,6 +35,7 @@ pub enum SignBasis {
 }
 
 /// A true shear on its grid.
+#[derive(Debug, Clone)]
 pub struct ReadTruth {
     /// The grid.
     pub grid: Grid,

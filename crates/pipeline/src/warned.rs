@@ -46,7 +46,7 @@ impl Warned {
         Ok(())
     }
 
-    /// Shows how many more images have each kind of warning.
+    /// Shows how many more images have each kind of warning that was shown.
     pub(crate) fn finish(self, progress: &mut dyn Progress) {
         for (kind, more) in self.kinds.iter().filter(|(_, more)| **more > 0) {
             let images = if *more == 1 {

@@ -1,9 +1,8 @@
-//! Short names for contents: what tells whether two results were made from the same data.
+//! Fingerprints of contents, to determine whether two results were made from the same data.
 //!
-//! Small files count as a whole. Of a large image counts a sample, as reading it once more would take as
-//! long as reading it to measure: its length, its beginning and blocks spread evenly over the rest. Other
-//! pixels (another image, noise, scale or region above a 64th of the file) always show; a change between the
-//! blocks, as of a few stamps, does not.
+//! A small file is read completely. A large image is sampled: its length, its beginning, and blocks spread evenly over the
+//! rest. This detects another image, noise or scale, and any changed region above a 64th of the file. It does not detect
+//! a change between the blocks, such as of a few stamps.
 
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
@@ -15,17 +14,17 @@ use crate::data::run::Source;
 use shearq_files::FileError;
 use shearq_files::open;
 
-/// Bytes of the longest file that counts as a whole.
+/// Bytes of the longest file that is read completely.
 const WHOLE: u64 = 1 << 20;
-/// Bytes at the beginning of a longer one that count: its headers.
+/// Bytes at the beginning of a longer file: its headers.
 const HEAD: u64 = 16 * 1024;
-/// Blocks of the rest that count.
+/// Sampled blocks of the rest.
 const BLOCKS: u64 = 64;
-/// Bytes of such a block: what a system reads at once.
+/// Bytes of a block: what a system reads at once.
 const BLOCK: u64 = 4096;
 
-/// A SHA-256 on its way, of parts that cannot run into each other.
-#[derive(Default)]
+/// A SHA-256 of several parts with their lengths.
+#[derive(Debug, Default)]
 pub struct Fingerprint(Sha256);
 
 impl Fingerprint {
@@ -36,8 +35,7 @@ impl Fingerprint {
         self.0.update(part);
     }
 
-    /// Its first 64 bits in hexadecimal: of a million contents, two are alike by chance once in
-    /// forty million cases.
+    /// The first 64 bits in hexadecimal. For a million contents, the probability that any two collide is 3·10⁻⁸.
     pub fn finish(self) -> String {
         let digest = self.0.finalize();
         digest[..8]
@@ -57,15 +55,15 @@ pub fn of_bytes(bytes: &[u8]) -> String {
 /// Fingerprint of a file as a whole.
 ///
 /// # Errors
-/// Where it cannot be read.
+/// If it cannot be read.
 pub fn of_file(path: &Path) -> Result<String, FileError> {
     Ok(of_bytes(&read(path)?))
 }
 
-/// Fingerprint of an image, or of what belongs to one: a sample of a large file.
+/// Fingerprint of an image or its PSF: a sample if the file is large.
 ///
 /// # Errors
-/// Where it cannot be read.
+/// If it cannot be read.
 pub fn of_image(path: &Path) -> Result<String, FileError> {
     sample(path).map_err(FileError::doing(path, "cannot open the file"))
 }
@@ -97,11 +95,10 @@ fn sample(path: &Path) -> std::io::Result<String> {
     Ok(print.finish())
 }
 
-/// Fingerprint of one set: its true shear, the settings it is simulated from, and those of `images`
-/// that are there.
+/// Fingerprint of one set: its true shear, the settings of its simulation, and the existing files of `images`.
 ///
 /// # Errors
-/// Where a file cannot be read.
+/// If a file cannot be read.
 pub fn of_set(
     source: &Source,
     data: &DataFolder,
@@ -123,11 +120,10 @@ pub fn of_set(
     Ok(print.finish())
 }
 
-/// Fingerprint of all data of a source, whichever sets are scored: the settings of a simulation, or
-/// the true shear of every set of a folder.
+/// Fingerprint of all data of a source: the settings of a simulation, or the true shear of every set of a folder.
 ///
 /// # Errors
-/// Where a file cannot be read.
+/// If a file cannot be read.
 pub fn of_source(source: &Source, data: &DataFolder) -> Result<String, FileError> {
     let mut print = Fingerprint::default();
     match source {
@@ -155,7 +151,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn of_large_images_a_sample_tells_them_apart() {
+    fn a_sample_distinguishes_large_images() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("galaxies-001.fits");
         let print = |bytes: &[u8]| {

@@ -1,4 +1,4 @@
-//! Where the files of a challenge lie, and which conventions they follow.
+//! Names of the files of a challenge, and their conventions.
 
 use std::path::{Path, PathBuf};
 
@@ -18,11 +18,11 @@ pub const MAX_STAMP: usize = 1024;
 /// Name of the layout file inside a data folder.
 pub const LAYOUT_FILE: &str = "layout.toml";
 
-/// Name of the table that says which stamp of a gathered image is which.
+/// Name of the table of stamps of a gathered image.
 const STAMPS: &str = "set{set:02}/stamps-{image:03}.csv";
 
-/// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for the plain
-/// numbers, `{set:02}` and `{image:03}` for those with zeros in front up to two and three digits. Wherever it is read from, it is checked.
+/// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for plain numbers, `{set:02}` and
+/// `{image:03}` for numbers with leading zeros. A layout is checked when it is read.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(remote = "Self", deny_unknown_fields, default)]
 pub struct Layout {
@@ -40,7 +40,7 @@ pub struct Layout {
     pub truth_sign: TruthSign,
     /// Side of the field in degrees.
     pub field_degrees: f64,
-    /// Pixels a side of a stamp, where the image header has no STAMP.
+    /// Pixels a side of a stamp, if the image header has no STAMP.
     pub stamp: usize,
 }
 
@@ -124,7 +124,7 @@ impl DataFolder {
     /// Opens a folder, with the layout of its `layout.toml` or the default one.
     ///
     /// # Errors
-    /// Where the folder does not exist or its layout file is not valid.
+    /// If the folder does not exist or its layout file is not valid.
     pub fn open(root: impl AsRef<Path>) -> Result<Self, FileError> {
         let root = root.as_ref().to_owned();
         if !root.is_dir() {
@@ -162,7 +162,7 @@ impl DataFolder {
         &self.layout
     }
 
-    /// The galaxy image of a set, as it is called if it is not there.
+    /// The galaxy image of a set; the name without a compression ending if there is none.
     pub fn galaxies(&self, set: u32, image: u32) -> PathBuf {
         self.image(&self.layout.galaxies, set, image)
     }
@@ -192,7 +192,7 @@ impl DataFolder {
             .join(fill(&self.layout.psf_functional, set, image))
     }
 
-    /// Which stamp of an image gathered from others is which.
+    /// The table of stamps of a gathered image.
     pub fn stamps(&self, set: u32, image: u32) -> PathBuf {
         self.root.join(fill(STAMPS, set, image))
     }
@@ -210,13 +210,13 @@ impl DataFolder {
     /// The galaxy images of `sets` (of all if empty) that are there.
     ///
     /// # Errors
-    /// Where a folder cannot be listed.
+    /// If a folder cannot be listed.
     pub fn images(&self, sets: &[u32]) -> Result<Files, FileError> {
         let pattern = &self.layout.galaxies;
         listing::find(&self.root, pattern, endings(pattern), sets)
     }
 
-    /// The folder in which this one would be that of a set, with images where the layout has them.
+    /// The data folder, if this is the folder of one of its sets.
     pub fn folder_above(&self) -> Option<PathBuf> {
         let (first, rest) = self.layout.galaxies.split_once('/')?;
         let root = self.root.canonicalize().ok()?;
@@ -250,7 +250,7 @@ impl DataFolder {
     /// True shear of a set on `grid`.
     ///
     /// # Errors
-    /// Where the file cannot be read or does not cover the grid.
+    /// If the file cannot be read or does not cover the grid.
     pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
         let path = self.truth(set);
         truth_is_there(&path)?;
@@ -289,7 +289,7 @@ pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
     Err(FileError::new(path, message))
 }
 
-/// Endings of the names of images by `pattern` beyond its own: those of gzip and fpack.
+/// Further endings of the names of images: of gzip and fpack.
 fn endings(pattern: &str) -> &'static [&'static str] {
     match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
         true => &["", ".gz", ".fz"],
@@ -300,7 +300,7 @@ fn endings(pattern: &str) -> &'static [&'static str] {
 /// Key under which a truth file states the sign of its g2: `standard` or `challenge`.
 pub const SIGN_KEY: &str = "g2sign";
 
-/// The sign of g2 that a truth file states, if it does.
+/// The sign of g2, if a truth file states it.
 ///
 /// # Errors
 /// If the file cannot be read, or states another word.
@@ -319,7 +319,7 @@ pub fn stated_sign(path: &Path) -> Result<Option<TruthSign>, FileError> {
 /// Rows (x, y, g1, g2) of a truth file, at most `most`: CSV with that header, or ASCII columns in that order.
 ///
 /// # Errors
-/// Where the file cannot be read.
+/// If the file cannot be read.
 pub fn read_truth_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
     rows_of(
         path,
@@ -331,7 +331,7 @@ pub fn read_truth_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> 
 /// Rows of a catalogue, at most `most`, from four named columns.
 ///
 /// # Errors
-/// Where the file cannot be read or a column is absent.
+/// If the file cannot be read or a column is absent.
 pub fn read_rows(path: &Path, names: &[&str; 4], most: usize) -> Result<Vec<Row>, FileError> {
     let hint = "`score --columns` or a description (--foreign) names others";
     let table =

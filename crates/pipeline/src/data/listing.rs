@@ -1,4 +1,4 @@
-//! Which files of numbered sets and images there are: folders are listed, names are not guessed.
+//! Finds the files of numbered sets and images by listing folders.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -13,9 +13,9 @@ use shearq_files::open::is_there;
 /// Files found, by the numbers of set and image.
 #[derive(Debug, Default)]
 pub struct Files {
-    /// No number of a set where the pattern has none, so that a file serves every set.
+    /// `None` if the pattern has no set number, so that a file serves every set.
     by_set: BTreeMap<Option<u32>, BTreeMap<u32, Found>>,
-    /// What looks like such files and is not read, by kind.
+    /// Similar names that are not read, by reason.
     unread: BTreeMap<Reason, Unread>,
 }
 
@@ -42,12 +42,12 @@ struct Unread {
 #[derive(Debug)]
 struct Found {
     path: PathBuf,
-    /// Place of its ending among those looked for.
+    /// Rank of its ending.
     rank: usize,
 }
 
 impl Files {
-    /// Those of a set, by image number.
+    /// The files of a set, by image number.
     pub fn of_set(&self, set: u32) -> Vec<(u32, PathBuf)> {
         let files = self.by_set.get(&Some(set)).or(self.by_set.get(&None));
         let files = files.into_iter().flatten();
@@ -74,7 +74,7 @@ impl Files {
         self.serve_all_sets() || self.by_set.contains_key(&Some(set))
     }
 
-    /// What looks like files of data and is not read: a sentence for each reason, with the first of them and their number.
+    /// Similar names that are not read: a sentence for each reason, with the first name and their number.
     pub fn unread(&self) -> Vec<String> {
         let line = |(reason, unread): (&Reason, &Unread)| {
             let Unread {
@@ -105,7 +105,7 @@ impl Files {
         self.unread.iter().map(line).collect()
     }
 
-    /// Those of `sets`, or the sets that have a file where there are none of them.
+    /// `sets`, or if empty all sets that have a file.
     pub fn wanted(&self, sets: &[u32]) -> Vec<u32> {
         match sets {
             [] => self.sets(),
@@ -113,20 +113,20 @@ impl Files {
         }
     }
 
-    /// Whether the files belong to every set, as their pattern has no number of one.
+    /// Whether the files belong to every set, because their pattern has no set number.
     pub fn serve_all_sets(&self) -> bool {
         self.by_set.contains_key(&None)
     }
 }
 
-/// Numbers that a name holds.
+/// Numbers in a name.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Numbers {
     set: Option<u32>,
     image: Option<u32>,
 }
 
-/// What to look for.
+/// A search for files.
 struct Search<'a> {
     /// Endings that a file's name may have beyond the pattern's.
     endings: &'a [&'a str],
@@ -135,14 +135,14 @@ struct Search<'a> {
     files: Files,
 }
 
-/// Finds the files below `root` that `pattern` names, of `sets` (of all if empty), with any of
-/// `endings` after the name; the first of them where there are several.
+/// Finds the files below `root` that match `pattern`, of `sets` (of all if empty), with one of `endings` after the name.
+/// If there are several endings, the first counts.
 ///
-/// Whatever is called so is taken for a file, so that none is left out that cannot be read. Files of a pattern without
-/// the number of an image have number 0.
+/// Anything with such a name counts as a file, so that unreadable files are reported later. Files of a pattern without an
+/// image number have number 0.
 ///
 /// # Errors
-/// Where a folder cannot be listed.
+/// If a folder cannot be listed.
 pub fn find(
     root: &Path,
     pattern: &str,
@@ -233,7 +233,7 @@ impl Search<'_> {
         self.files.pass_over(Reason::Second, path, || name);
     }
 
-    /// Notes what has nearly the name that a pattern describes.
+    /// Notes a name that nearly matches a pattern.
     fn pass_over(&mut self, path: PathBuf, name: &str, pattern: &[Piece<'_>], folder: bool) {
         if path.is_dir() != folder {
             return;
@@ -241,7 +241,7 @@ impl Search<'_> {
         let runs = digits(name);
         let of_set = |piece: &&Piece<'_>| matches!(piece, Piece::Number { of_set: true, .. });
         let known = |run: &&str| run.parse().is_ok_and(|set| self.sets.contains(&set));
-        // One of a set that is not wanted.
+        // A name of another set.
         if !self.sets.is_empty() && pattern.iter().any(|p| of_set(&p)) && !runs.iter().any(known) {
             return;
         }
@@ -305,7 +305,7 @@ fn digits(name: &str) -> Vec<&str> {
     runs.filter(|run| !run.is_empty()).collect()
 }
 
-/// What is left of a name without what people write differently: case, separators, numbers, and the endings of FITS and
+/// A name without the parts that people write differently: case, separators, numbers, and the endings of FITS and
 /// compressed files.
 fn shape(name: &str) -> String {
     let mut name = name.to_ascii_lowercase();
@@ -360,10 +360,10 @@ fn names(folder: &Path) -> Result<Vec<String>, FileError> {
     };
     let entries = match fs::read_dir(place) {
         Err(error) if error.kind() == ErrorKind::NotFound => {
-            // A link that leads nowhere is there.
+            // A broken link exists.
             return match place.ancestors().find(|place| is_there(place)) {
                 Some(link) if !link.exists() => {
-                    let message = "this leads nowhere; expected a folder";
+                    let message = "this is a broken link; expected a folder";
                     Err(FileError::new(link, message))
                 }
                 _ => Ok(Vec::new()),
@@ -386,7 +386,7 @@ enum Piece<'a> {
     Number { of_set: bool, padded: bool },
 }
 
-/// Parts of a pattern of one name. What is not UTF-8 has no numbers.
+/// Parts of a pattern of one name. A name that is not UTF-8 has no numbers.
 fn pieces(pattern: &OsStr) -> Vec<Piece<'_>> {
     let Some(mut rest) = pattern.to_str() else {
         return Vec::new();
@@ -434,7 +434,7 @@ fn matches(pattern: &[Piece<'_>], name: &str, known: Numbers) -> Vec<Numbers> {
     };
     let width = most.to_string().len();
     let digits = name.bytes().take_while(u8::is_ascii_digit).take(width);
-    // As numbers are written: no more zeros in front than make up two digits of a set and three of an image.
+    // Leading zeros fill two digits of a set and three of an image, and no more.
     let zeros = match (padded, of_set) {
         (false, _) => 1,
         (true, true) => 2,
@@ -472,7 +472,7 @@ mod tests {
     }
 
     #[test]
-    fn names_follow_patterns_as_they_are_filled() {
+    fn names_match_filled_patterns() {
         let both = |set, image| vec![(Some(set), Some(image))];
         assert_eq!(numbers("set{set:02}", "set07"), [(Some(7), None)]);
         assert_eq!(
@@ -507,7 +507,7 @@ mod tests {
     }
 
     #[test]
-    fn files_are_found_wherever_the_numbers_stand() {
+    fn files_are_found_wherever_the_numbers_are() {
         let root = tempfile::tempdir().unwrap();
         for name in [
             "a/set07/i-012",

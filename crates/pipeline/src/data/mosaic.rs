@@ -3,12 +3,12 @@
 use shearq_quantities::units::Pixels;
 use shearq_scoring::{cell_at, centre_of};
 
-/// Stamps in rows of `columns`, the last of which may be shorter.
+/// Stamps in rows of `columns`. The last row may be shorter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mosaic {
-    /// Stamps of a full row; more than none.
+    /// Stamps of a full row, at least 1.
     pub columns: usize,
-    /// Stamps in all; more than none.
+    /// All stamps, at least 1.
     pub galaxies: usize,
     /// Pixels a side of a stamp.
     pub stamp: usize,
@@ -24,7 +24,7 @@ impl Mosaic {
         }
     }
 
-    /// As near to a square as `galaxies` stamps can lie.
+    /// The arrangement of `galaxies` stamps that is nearest to a square.
     pub fn of(galaxies: usize, stamp: usize) -> Self {
         let root = galaxies.isqrt();
         Mosaic {
@@ -52,12 +52,12 @@ impl Mosaic {
         (centre_of(ix, stamp), centre_of(iy, stamp))
     }
 
-    /// The same of stamp `place`, from 0 along the rows.
+    /// FITS pixel position of the centre of stamp `place`, from 0 along the rows.
     pub fn position(&self, place: usize) -> (f64, f64) {
         self.centre(place % self.columns, place / self.columns)
     }
 
-    /// Number, from 0 along the rows, of the stamp that holds the FITS pixel position (x, y).
+    /// Number, from 0 along the rows, of the stamp that contains the FITS pixel position (x, y).
     pub fn place(&self, x: f64, y: f64) -> Option<usize> {
         let stamp = Pixels(self.stamp as f64);
         let (ix, iy) = (cell_at(x, stamp)?, cell_at(y, stamp)?);
@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn stamps_fill_rows_of_which_the_last_is_shorter() {
+    fn stamps_fill_rows_and_the_last_may_be_shorter() {
         for (galaxies, columns, rows, last) in [
             (1, 1, 1, 1),
             (2, 2, 1, 2),

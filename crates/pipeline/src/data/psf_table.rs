@@ -19,7 +19,7 @@ const HEADER: &str = "x,y,profile,beta,fwhm,e1,e2";
 /// PSFs of an image: one, or one per galaxy along the rows of the mosaic.
 ///
 /// # Errors
-/// Where the file cannot be read, a row is not valid, or the rows are neither one nor one per
+/// If the file cannot be read, a row is not valid, or the rows are neither one nor one per
 /// galaxy.
 pub fn read(path: &Path, mosaic: &Mosaic) -> Result<Vec<FunctionalPsf>, FileError> {
     let rows = read_all(path)?;
@@ -54,7 +54,7 @@ pub fn read(path: &Path, mosaic: &Mosaic) -> Result<Vec<FunctionalPsf>, FileErro
 /// PSFs of a table, with their positions, in its order.
 ///
 /// # Errors
-/// Where the file cannot be read, or a row is not valid.
+/// If the file cannot be read, or a row is not valid.
 pub fn read_all(path: &Path) -> Result<Vec<Placed>, FileError> {
     const DOING: &str = "cannot read the PSF parameters";
     let text = open::read_to_string(path, open::DATA).map_err(FileError::doing(path, DOING))?;
@@ -118,7 +118,7 @@ pub fn read_all(path: &Path) -> Result<Vec<Placed>, FileError> {
 /// Writes PSFs with their positions.
 ///
 /// # Errors
-/// Where the file cannot be written.
+/// If the file cannot be written.
 pub fn write(path: &Path, rows: &[Placed]) -> Result<(), FileError> {
     atomic::write(path, text(rows).as_bytes())
 }
@@ -127,7 +127,7 @@ pub fn write(path: &Path, rows: &[Placed]) -> Result<(), FileError> {
 pub fn text(rows: &[Placed]) -> String {
     let mut text = format!("{HEADER}\n");
     for ((x, y), psf) in rows {
-        // A Kolmogorov PSF has no β; the column keeps the place with that of a Moffat.
+        // A Kolmogorov PSF has no β; the column has any valid number.
         let (profile, beta) = match psf.profile {
             PsfProfile::Moffat { beta } => ("moffat", beta),
             PsfProfile::Kolmogorov => ("kolmogorov", 3.0),

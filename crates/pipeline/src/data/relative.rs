@@ -1,13 +1,13 @@
-//! Paths as they are from a folder, however they were given.
+//! Relative paths between folders.
 
 use std::io::Result;
 use std::path::{Component, Path, PathBuf};
 
-/// `path` as it is from `folder`, where there is a way, and absolute where there is none. Either may be
-/// relative to the current folder, and need not exist.
+/// `path` relative to `folder` if possible, otherwise absolute. Both may be relative to the current folder, and need not
+/// exist.
 ///
 /// # Errors
-/// Where the current folder is not known.
+/// If the current folder cannot be determined.
 pub(super) fn from(folder: &Path, path: &Path) -> Result<PathBuf> {
     let (folder, path) = (resolve(folder)?, resolve(path)?);
     let shared = folder

@@ -1,4 +1,4 @@
-//! What made a folder of results: `run.json`, written before the first result.
+//! The record of a folder of results: `run.json`, written before the first result.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -19,13 +19,13 @@ use shearq_simulate::set::SimulationSettings;
 /// Name of the record in a folder of results.
 pub const RUN_FILE: &str = "run.json";
 
-/// Where the galaxies of a run come from.
+/// The source of the galaxies of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Source {
     /// Images of a data folder.
     Folder {
-        /// The folder, from the one that holds the record.
+        /// The folder, relative to the folder of the record.
         path: PathBuf,
         /// Its layout.
         layout: Layout,
@@ -38,7 +38,7 @@ impl Source {
     /// A data folder, for a record in the folder `beside`.
     ///
     /// # Errors
-    /// Where the way from one to the other is not known.
+    /// If the way from one to the other is not known.
     pub fn folder(data: &DataFolder, beside: &Path) -> Result<Self, FileError> {
         Ok(Source::Folder {
             path: way(beside, data.root())?,
@@ -49,7 +49,7 @@ impl Source {
     /// The same source, of a record in the folder `from`, for one in the folder `to`.
     ///
     /// # Errors
-    /// Where the way from one to the other is not known.
+    /// If the way from one to the other is not known.
     pub fn moved(&self, from: &Path, to: &Path) -> Result<Self, FileError> {
         Ok(match self {
             Source::Folder { path, layout } => Source::Folder {
@@ -60,7 +60,7 @@ impl Source {
         })
     }
 
-    /// Layout of the data, that of simulated ones included.
+    /// Layout of the data, also of simulated data.
     pub fn layout(&self) -> Layout {
         match self {
             Source::Folder { layout, .. } => layout.clone(),
@@ -68,10 +68,10 @@ impl Source {
         }
     }
 
-    /// The data folder with the true shear of a run whose record and catalogues lie in `measured`.
+    /// The data folder with the true shear, for a run in the folder `measured`.
     ///
     /// # Errors
-    /// Where it is not there any more.
+    /// If the data folder no longer exists.
     pub fn data(&self, measured: &Path) -> Result<DataFolder, FileError> {
         match self {
             Source::Folder { path, .. } => {
@@ -82,10 +82,10 @@ impl Source {
     }
 }
 
-/// The way from the folder of a record to a data folder or a file.
+/// The relative path from the folder of a record to a data folder or a file.
 ///
 /// # Errors
-/// Where the current folder is not known.
+/// If the current folder cannot be determined.
 pub fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
     relative::from(from, to).map_err(FileError::doing(to, "cannot determine where the folder is"))
 }
@@ -99,17 +99,17 @@ impl std::fmt::Display for Source {
     }
 }
 
-/// Settings of a measurement, as stored with its catalogues.
+/// Settings of a measurement, stored with its catalogues.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Run {
     /// Version of shearq.
     pub version: String,
-    /// Where the galaxies come from.
+    /// Source of the galaxies.
     pub source: Source,
-    /// All settings of the submission.
+    /// The configuration.
     #[serde(rename = "submission")]
     pub configuration: Configuration,
-    /// FileFormat of the catalogues.
+    /// File format of the catalogues.
     pub format: FileFormat,
 }
 
@@ -117,12 +117,12 @@ impl Run {
     /// Reads the record of a folder; `None` where there is none.
     ///
     /// # Errors
-    /// Where it exists and cannot be read.
+    /// If it exists and cannot be read.
     pub fn read(folder: &Path) -> Result<Option<Self>, FileError> {
         read_record(&folder.join(RUN_FILE))
     }
 
-    /// What this version makes of `source`.
+    /// A run of this version.
     pub fn new(source: Source, configuration: Configuration, format: FileFormat) -> Self {
         Run {
             version: crate::VERSION.into(),
@@ -135,7 +135,7 @@ impl Run {
     /// Reads the record of a folder that must be one of catalogues.
     ///
     /// # Errors
-    /// Where there is none, or it cannot be read.
+    /// If there is none, or it cannot be read.
     pub fn require(folder: &Path) -> Result<Self, FileError> {
         const EXPECTED: &str = "a folder of catalogues that `shearq measure` or `shearq run` wrote";
         check_folder(folder, EXPECTED)?;
@@ -161,7 +161,7 @@ impl Run {
     /// The catalogues of `sets` (of all if empty) that are there.
     ///
     /// # Errors
-    /// Where a folder cannot be listed.
+    /// If a folder cannot be listed.
     pub fn catalogues(&self, folder: &Path, sets: &[u32]) -> Result<Files, FileError> {
         listing::find(folder, &self.pattern(), &[""], sets)
     }
@@ -172,10 +172,10 @@ impl Run {
     }
 }
 
-/// Checks that `folder` is a folder; it should be what `expected` says.
+/// Checks that `folder` is a folder. `expected` describes it in the error.
 ///
 /// # Errors
-/// Where there is nothing of this name, or a file.
+/// If there is nothing of this name, or a file.
 pub fn check_folder(folder: &Path, expected: &str) -> Result<(), FileError> {
     let found = if folder.is_dir() {
         return Ok(());
@@ -193,13 +193,13 @@ pub fn check_folder(folder: &Path, expected: &str) -> Result<(), FileError> {
 /// Opens the data folder that a command is to read images from.
 ///
 /// # Errors
-/// As [`DataFolder::open`], and where the folder contains catalogues instead of images.
+/// As [`DataFolder::open`], and if the folder contains catalogues instead of images.
 pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
     let data = DataFolder::open(folder)?;
     let Some(run) = Run::read(folder).ok().flatten() else {
         return Ok(data);
     };
-    // Catalogues may lie beside the images.
+    // Catalogues may be beside the images.
     if !data.images(&[])?.sets().is_empty() {
         return Ok(data);
     }
@@ -221,7 +221,7 @@ pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
 /// Reads any record; `None` where there is none.
 ///
 /// # Errors
-/// Where it exists and cannot be read.
+/// If it exists and cannot be read.
 pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileError> {
     let text = match shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS) {
         Ok(text) => text,
@@ -245,7 +245,7 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
 /// Writes any record as indented JSON.
 ///
 /// # Errors
-/// Where it cannot be written.
+/// If it cannot be written.
 pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileError> {
     atomic::write(path, record_text(path, record)?.as_bytes())
 }
@@ -253,7 +253,7 @@ pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileErro
 /// Any record as indented JSON, for a file at `path`.
 ///
 /// # Errors
-/// Where it cannot be written as JSON.
+/// If it cannot be written as JSON.
 pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileError> {
     let mut text = serde_json::to_string_pretty(record)
         .map_err(FileError::doing(path, "cannot write the record"))?;
@@ -261,11 +261,11 @@ pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileE
     Ok(text)
 }
 
-/// Numbers of records that may be NaN, which JSON does not have.
+/// Numbers of records that may be NaN, which is null in JSON.
 pub trait Numbers: Sized {
-    /// As they are read: null for NaN.
+    /// The form in JSON.
     type Form: DeserializeOwned;
-    /// With NaN for null.
+    /// The numbers, with NaN for null.
     fn from_form(form: Self::Form) -> Self;
 }
 
@@ -296,13 +296,13 @@ where
 /// For `#[serde(deserialize_with)]`: reads null as NaN.
 ///
 /// # Errors
-/// Where there is anything but numbers and null.
+/// If there is anything but numbers and null.
 pub fn nan_for_null<'de, D: Deserializer<'de>, N: Numbers>(deserializer: D) -> Result<N, D::Error> {
     N::Form::deserialize(deserializer).map(N::from_form)
 }
 
-/// A folder of results that this process writes to, alone or with others of the same settings, until
-/// it drops this.
+/// A folder of results that this process writes to until it drops this. Other processes of the same settings may write to
+/// it too.
 #[derive(Debug)]
 #[must_use]
 pub struct Claim {
@@ -312,10 +312,10 @@ pub struct Claim {
 }
 
 impl Claim {
-    /// Checks that the folder is still the claimed one: nobody has removed or replaced its record since.
+    /// Checks that the record of the folder has not been removed or replaced.
     ///
     /// # Errors
-    /// Where it is not.
+    /// If it is not.
     pub fn check(&self) -> Result<(), FileError> {
         if self.is_there() {
             return Ok(());
@@ -325,7 +325,7 @@ impl Claim {
         Err(FileError::new(folder, message))
     }
 
-    /// The error of work in the folder: that the folder is gone, if it is, else `error`.
+    /// The error of work in the folder: that the folder was removed, if it was, else `error`.
     pub fn explain<E: From<FileError>>(&self, error: E) -> E {
         self.check().map_or_else(E::from, |()| error)
     }
@@ -346,10 +346,10 @@ impl Claim {
         self.path.exists()
     }
 
-    /// Checks the same at the end of the work, and that all `results` are there.
+    /// Checks the folder at the end of the work, and that all `results` are there.
     ///
     /// # Errors
-    /// Where one of them is not.
+    /// If one of them is not.
     pub fn check_results(
         &self,
         results: impl IntoIterator<Item = PathBuf>,
@@ -365,16 +365,15 @@ impl Claim {
     }
 }
 
-/// Makes the folder of `path` that of `record`: writes it where there is none, and refuses a folder
-/// with a different one, showing the differences. What killed processes left there is removed if no
-/// other process is at work.
+/// Claims the folder of `path` for `record`. Writes the record if there is none, and refuses a folder with a different
+/// record. Leftovers of killed processes are removed if no other process is at work.
 ///
 /// # Errors
-/// Where the folder belongs to other settings, or the record cannot be read or written.
+/// If the folder belongs to other settings, or the record cannot be read or written.
 pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result<Claim, FileError> {
     let mut earlier: Option<R> = read_record(path)?;
     if earlier.is_none() {
-        // Another process may be first; then its record is compared like any earlier one.
+        // If another process is first, its record is compared like any earlier record.
         let _ = atomic::write_if_absent(path, record_text(path, record)?.as_bytes())?;
         earlier = read_record(path)?;
     }
@@ -385,18 +384,17 @@ pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result
         return Err(FileError::new(
             folder,
             format!(
-                "this folder holds results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
+                "this folder contains results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
                 most_important(differences).join("\n  ")
             ),
         ));
     }
     let file = open_to_lock(path).map_err(FileError::doing(path, "cannot open the record"))?;
-    // Whoever has the file for itself is the only process at work here.
+    // A process with an exclusive lock is the only one at work here.
     if file.try_lock().is_ok() {
         atomic::remove_leftovers(folder)?;
     }
-    // Turns the lock into one that others may hold, too. File systems without locks have none to
-    // wait for: there leftovers stay, and do no harm.
+    // Shares the lock with other processes. On file systems without locks, leftovers stay and do no harm.
     let _ = file.unlock();
     let _ = file.lock_shared();
     Ok(Claim {
@@ -424,7 +422,7 @@ fn most_important(mut differences: Vec<String>) -> Vec<String> {
     ];
     differences.sort_by_key(|line| {
         let key = line.split(": ").next().unwrap_or(line);
-        // Words do not change results.
+        // Descriptions do not change results.
         if key.ends_with("description") {
             return FIRST.len() + 1;
         }
@@ -448,16 +446,16 @@ fn most_important(mut differences: Vec<String>) -> Vec<String> {
     differences
 }
 
-/// Opens a record so that it can be locked: over NFS an exclusive lock needs the right to write.
+/// Opens a record so that it can be locked. Over NFS an exclusive lock requires write permission.
 fn open_to_lock(path: &Path) -> std::io::Result<File> {
     let writable = File::options().read(true).write(true).open(path);
     writable.or_else(|_| File::open(path))
 }
 
-/// Lines in which two records differ, as `key: first ≠ second`; what one does not have is null.
+/// Differences of two records, as `key: first ≠ second`; a missing value is null.
 ///
 /// # Errors
-/// Where a record cannot be put in JSON.
+/// If a record cannot be written as JSON.
 pub fn differences(
     first: &impl Serialize,
     second: &impl Serialize,
@@ -518,7 +516,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn leftovers_are_removed_by_whoever_is_alone() {
+    fn leftovers_are_removed_if_no_other_process_is_at_work() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("record.json");
         let left = folder
@@ -539,7 +537,7 @@ mod tests {
     }
 
     #[test]
-    fn the_differences_that_explain_most_come_first_and_others_are_counted() {
+    fn important_differences_come_first_and_others_are_counted() {
         let mut lines: Vec<String> = (0..34)
             .map(|k| format!("submission.a.k{k}: 1 ≠ 2"))
             .collect();
@@ -558,7 +556,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_that_was_removed_or_replaced_is_not_the_claimed_one() {
+    fn a_removed_or_replaced_folder_is_detected() {
         let root = tempfile::tempdir().unwrap();
         let folder = root.path().join("out");
         let path = folder.join("record.json");
@@ -580,7 +578,7 @@ mod tests {
     }
 
     #[test]
-    fn lists_of_named_things_differ_by_their_names_or_else_by_what_differs() {
+    fn lists_of_named_things_differ_by_name_or_by_value() {
         let of = |values: &[(&str, u32)]| -> Vec<serde_json::Value> {
             let object = |&(name, size)| serde_json::json!({ "name": name, "size": size });
             values.iter().map(object).collect()

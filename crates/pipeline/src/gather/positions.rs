@@ -1,4 +1,4 @@
-//! Positions of galaxies on an exposure: which columns of a table they are, and whether they can be right.
+//! Positions of galaxies on an exposure: finding their columns in a table, and checking them.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -7,7 +7,7 @@ use shearq_files::FileError;
 use shearq_files::names_of;
 use shearq_files::table::{self, Columns, MAX_ROWS, Named, Place};
 
-/// Columns in which catalogues keep positions in pixels counted from 1, the best first, in any case.
+/// Names of columns of positions in pixels counted from 1, the best first, in any case.
 const KNOWN: [[&str; 2]; 6] = [
     ["x", "y"],
     ["xwin_image", "ywin_image"],
@@ -25,10 +25,10 @@ const SKY: [&str; 6] = [
     "alpha_sky",
     "right_ascension",
 ];
-/// Positions nearer to each other than this, in pixels, have the same galaxy: a stamp is cut out to half a pixel.
+/// Distance in pixels below which two positions have the same galaxy: stamps are cut to half a pixel.
 const SAME: f64 = 0.5;
 
-/// A table of positions, as the user names it.
+/// A table of positions.
 #[derive(Debug, Clone, Copy, serde::Serialize)]
 pub struct Table<'a> {
     /// The file, with `[TABLE]` behind its name if one of its tables is meant.
@@ -100,10 +100,10 @@ impl Positions {
         Ok(Positions { place, all, note })
     }
 
-    /// What is doubtful about the positions on an exposure of so many pixels.
+    /// Warnings about the positions on an exposure of this size.
     ///
     /// # Errors
-    /// If none is on the exposure, or they are those of the sky.
+    /// If no position is on the exposure, or they are degrees on the sky.
     pub(super) fn examine(
         &self,
         exposure: &Path,
@@ -120,7 +120,7 @@ impl Positions {
             .iter()
             .all(|(x, y)| (0.0..=360.0).contains(x) && y.abs() <= 90.0);
         let (x, y) = self.all[0];
-        // A field of the sky is a few pixels wide if its degrees are taken for pixels.
+        // Degrees that are treated as pixels lie within a few pixels.
         if beyond == count || degrees && count > 2 && 2 * repeated > count {
             let cause = match degrees {
                 true => {
@@ -161,7 +161,7 @@ impl Positions {
         Ok(doubts)
     }
 
-    /// The number of positions that lie where an earlier one does, and the first such pair.
+    /// The number of positions near an earlier one, and the first such pair.
     fn repeated(&self) -> (usize, Option<(usize, usize)>) {
         // Two positions in one cell are nearer than SAME. So a cell has at most one that is no repetition, and others
         // of it lie at most two cells away.
@@ -190,7 +190,7 @@ impl Positions {
     }
 }
 
-/// The columns that the user names, which must be there.
+/// The columns that the user names.
 fn given(place: &Place, columns: &Columns, names: [&str; 2]) -> Result<[String; 2], FileError> {
     let owned = names.map(str::to_owned);
     let numbers = names.iter().all(|name| name.parse::<usize>().is_ok());
@@ -212,7 +212,7 @@ fn given(place: &Place, columns: &Columns, names: [&str; 2]) -> Result<[String; 
     ))
 }
 
-/// The columns that have known names, or the two columns that there are. Sets the table that has them.
+/// The columns with known names, or the only two columns. Sets the table that has them.
 fn known(place: &mut Place, columns: &Columns) -> Result<[String; 2], FileError> {
     let found: Vec<(&Named, [String; 2])> = columns
         .named

@@ -7,7 +7,9 @@ use serde::{Serialize, Serializer};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 
-/// Names by which instruments call what lies beside an image of the sky: without a choice, none of these is one.
+use crate::pixel_scale;
+
+/// Names of images that accompany an image of the sky. They are refused unless they are chosen.
 const COMPANIONS: [&str; 15] = [
     "PSF",
     "ERR",
@@ -26,7 +28,7 @@ const COMPANIONS: [&str; 15] = [
     "BACKGROUND",
 ];
 
-/// Writes a path as it is shown: not all of them are Unicode.
+/// Writes a path as text; not all paths are Unicode.
 pub(super) fn shown<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&path.display())
 }
@@ -35,32 +37,32 @@ fn all_shown<S: Serializer>(paths: &[PathBuf], serializer: S) -> Result<S::Ok, S
     serializer.collect_seq(paths.iter().map(|path| path.display().to_string()))
 }
 
-/// FITS files, and which of their images are meant.
+/// FITS files and the name of the images in them.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Files<'a> {
     /// At least one.
     #[serde(serialize_with = "all_shown")]
     pub paths: &'a [PathBuf],
-    /// Name of the images (EXTNAME, in any case); without, all of them.
+    /// Name of the images (EXTNAME, in any case); all images if `None`.
     pub extension: Option<&'a str>,
-    /// What they are images of.
+    /// Their content.
     #[serde(skip)]
     pub content: Content,
 }
 
-/// What images are of.
+/// Content of images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Content {
     /// Galaxies.
     Sky,
     /// PSFs.
     Psf,
-    /// Nothing: they are not zero where a pixel is bad.
+    /// Masks: not zero for a bad pixel.
     Mask,
 }
 
 impl Content {
-    /// Whether an image of this name is of something else, for all that is known.
+    /// Whether an image of this name has another content.
     fn is_not(self, name: &str) -> bool {
         let companion = COMPANIONS
             .iter()
@@ -72,7 +74,7 @@ impl Content {
         }
     }
 
-    /// The option that names images of this.
+    /// The option that names such images.
     fn option(self) -> &'static str {
         match self {
             Content::Sky => "--extension",
@@ -82,7 +84,7 @@ impl Content {
     }
 }
 
-/// Where a stamp was found.
+/// The origin of a stamp.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Origin<'a> {
     pub(super) file: &'a Path,
@@ -90,7 +92,7 @@ pub(super) struct Origin<'a> {
     pub(super) image: usize,
     /// Plane of the image, from 1.
     pub(super) plane: usize,
-    /// Its galaxy's position.
+    /// Position of its galaxy.
     pub(super) position: Option<(f64, f64)>,
 }
 
@@ -109,7 +111,7 @@ pub(super) struct Images<'a> {
     now: Option<ImageReader>,
     /// Image of the file at hand, from 1.
     number: usize,
-    /// Names of its images that were passed over, and whether one was not.
+    /// Names of the images that were skipped, and whether one was not.
     others: Vec<String>,
     found: bool,
 }
@@ -126,11 +128,10 @@ impl<'a> Images<'a> {
         }
     }
 
-    /// The next image that is meant, of whose planes the first comes next; `None` after the last.
+    /// The next image; `None` after the last.
     ///
     /// # Errors
-    /// Where a file cannot be read, has no image of the name asked for, or without one has what is no image of the
-    /// sky.
+    /// If a file cannot be read, has no image of the chosen name, or without a choice has an image of other content.
     pub(super) fn next(&mut self) -> Result<Option<(Origin<'a>, &mut ImageReader)>, FileError> {
         loop {
             if let Some(image) = self.now.take() {
@@ -160,7 +161,7 @@ impl<'a> Images<'a> {
                 }
                 None if self.files.content.is_not(&name) => {
                     return Err(origin.fault(&format!(
-                        "the image is called {name}; expected no such images, or the name of those that are meant ({})",
+                        "the image is called {name}; expected an image of the sky or a PSF. Try: choose images by name with {}",
                         self.files.content.option()
                     )));
                 }
@@ -170,7 +171,7 @@ impl<'a> Images<'a> {
         }
     }
 
-    /// Looks whether the file that ends had an image that is meant.
+    /// Checks that the file that ends had a chosen image.
     fn all_there(&self) -> Result<(), FileError> {
         match (
             self.files.extension,
@@ -190,7 +191,7 @@ impl<'a> Images<'a> {
 /// The planes of the images of files, in order: stamps.
 pub(super) struct Planes<'a> {
     images: Images<'a>,
-    /// The image at hand, and its planes that are left.
+    /// The current image and its remaining planes.
     origin: Option<Origin<'a>>,
     left: usize,
 }
@@ -204,7 +205,7 @@ impl<'a> Planes<'a> {
         }
     }
 
-    /// Columns and rows of the one at hand.
+    /// Columns and rows of the current image.
     pub(super) fn sides(&self) -> [usize; 2] {
         let now = self.images.now.as_ref();
         now.map_or([0; 2], |image| [image.width(), image.height()])
@@ -213,7 +214,7 @@ impl<'a> Planes<'a> {
     /// The next one with its pixels, `None` after the last.
     ///
     /// # Errors
-    /// As [`Images::next`], and where its pixels cannot be read.
+    /// As [`Images::next`], and if its pixels cannot be read.
     pub(super) fn next(&mut self) -> Result<Option<(Origin<'a>, Vec<f32>)>, FileError> {
         let origin = match self.origin {
             Some(origin) if self.left > 0 => Origin {
@@ -246,12 +247,12 @@ pub(super) struct Exposure<'a> {
 
 impl<'a> Exposure<'a> {
     /// # Errors
-    /// As [`Images::next`], and where the image is a cube.
+    /// As [`Images::next`], and if the image is a cube.
     pub(super) fn open(files: Files<'a>) -> Result<Self, FileError> {
         if let Some(more) = files.paths.get(1) {
             return Err(FileError::new(
                 more,
-                "this is a second file; expected one, as the exposure is",
+                "this is a second file; expected one file with the exposure",
             ));
         }
         let mut images = Images::of(files);
@@ -283,7 +284,12 @@ impl<'a> Exposure<'a> {
         Ok([reader.width(), reader.height()])
     }
 
-    /// Refuses one whose sides are not those of `other`.
+    /// Pixel scale in arcseconds, if the header states it.
+    pub(super) fn scale(&mut self) -> Result<Option<f64>, FileError> {
+        Ok(pixel_scale::of_header(self.reader()?))
+    }
+
+    /// Refuses an image of another size than `other`.
     pub(super) fn like(&mut self, other: &mut Self) -> Result<(), FileError> {
         let (own, expected) = (self.sides()?, other.sides()?);
         if own != expected {
@@ -313,7 +319,7 @@ fn first_pixel(at: f64, side: usize) -> i64 {
     (at - (side as f64 + 1.0) / 2.0).round() as i64
 }
 
-/// Where a position is on the square that is cut around it, from its middle.
+/// A position on the square that is cut around it, from the centre.
 pub(super) fn off_middle((x, y): (f64, f64), side: usize) -> [f64; 2] {
     [x, y].map(|at| at - (side as f64 + 1.0) / 2.0 - first_pixel(at, side) as f64)
 }

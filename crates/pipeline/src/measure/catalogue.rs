@@ -169,7 +169,7 @@ impl Summary {
     }
 }
 
-/// Those of `images` that have no catalogue yet, and those that have one.
+/// The images without a catalogue, and the images with one.
 pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> (Vec<ImageId>, Vec<ImageId>) {
     images
         .iter()

@@ -19,7 +19,7 @@ use crate::grid;
 use crate::images::ImageId;
 use crate::pixel_scale;
 
-/// Most pixels of a row of stamps, several of which are in memory at a time.
+/// Most pixels of a row of stamps. Several rows are in memory at a time.
 const MAX_STRIP: usize = 1 << 24;
 
 /// What all rows of stamps of an image share.
@@ -63,7 +63,7 @@ pub struct StampRow {
     pub psfs: Psfs<'static>,
 }
 
-/// An open image with its PSFs, of which rows are read one after the other.
+/// An open image with its PSFs, read row by row.
 pub struct ImageSource {
     head: Arc<ImageHead>,
     image: ImageReader,
