@@ -6,7 +6,6 @@
     reason = "a test fails where it stands, and says why it is skipped"
 )]
 
-mod architecture;
 mod bad_catalogues;
 mod bad_images;
 mod bad_settings;
