@@ -123,13 +123,14 @@ fn galaxy(c: &mut Criterion) {
         let configuration = configuration(name);
         let measurer = Measurer::new(&configuration, 48).expect("a valid submission");
         let mut worker = measurer.worker();
-        worker
-            .set_psf(moffat(configuration.psf.size).view())
+        let mut image = worker.image(shearq_measure::ImageNoise::Level(1.0));
+        let mut worker = image
+            .psf(moffat(configuration.psf.size).view())
             .expect("a valid PSF");
         let data = stamp(48);
         let data = ArrayView2::from_shape((48, 48), &data).expect("a full stamp");
         group.bench_function(name, |b| {
-            b.iter(|| worker.measure(black_box(data), Some(1.0)));
+            b.iter(|| worker.measure(black_box(data)));
         });
     }
     group.finish();

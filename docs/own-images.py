@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """Images as one might have them, rendered by GalSim (pip install galsim astropy): a field of one shear as a cube of
-stamps, and a small challenge of one set in shearq's layout. docs/tutorial.md goes on from here."""
+stamps, and a small challenge of one set in shearq's layout. docs/own-images.md goes on from here."""
 
 from pathlib import Path
 

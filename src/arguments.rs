@@ -9,7 +9,7 @@ use shearq_scoring::{Choice, Convention, Definition};
 
 use crate::choices::named;
 use crate::{print, print_table, tell};
-use shearq_pipeline::data::layout::MAX_SET;
+use shearq_pipeline::data::pattern::MAX_SET;
 use shearq_pipeline::images::{ImageId, Shard};
 use shearq_render::figure::FigureError;
 use shearq_render::html::Section;
@@ -37,7 +37,7 @@ impl FromStr for SetList {
             match part.trim().parse() {
                 Ok(set) if (1..=MAX_SET).contains(&set) => Ok(set),
                 _ => Err(format!(
-                    "`{part}` is not a set; expected numbers from 1 to {MAX_SET} as in `1,2,7-9`, or `all`"
+                    "expected sets such as `1,2,7-9`, or `all` (found `{part}`, expected a number from 1 to {MAX_SET})"
                 )),
             }
         };
@@ -47,7 +47,9 @@ impl FromStr for SetList {
                 Some((first, last)) => {
                     let (first, last) = (number(first)?, number(last)?);
                     if first > last {
-                        return Err(format!("`{part}` runs backwards"));
+                        return Err(format!(
+                            "the range is empty (found {part}, expected {last}-{first})"
+                        ));
                     }
                     sets.extend(first..=last);
                 }
@@ -71,23 +73,24 @@ impl SetList {
     /// The sets, if all of them can be simulated.
     pub(super) fn simulated(&self) -> anyhow::Result<&[u32]> {
         if let Some(set) = self.0.iter().find(|&&set| set > SETS) {
-            anyhow::bail!("--sets: there is no set {set} to simulate; expected 1 to {SETS}");
+            anyhow::bail!(
+                "--sets: this set cannot be simulated (found {set}, expected 1 to {SETS})"
+            );
         }
         Ok(&self.0)
     }
 }
 
-/// How to print a table that has columns of detail.
+/// How to print a table with columns of detail.
 #[derive(Debug, Clone, Args)]
 pub(super) struct Printing {
     #[command(flatten)]
     form: Form,
-    /// Print the columns of detail (c, m per component, null tests) in the other formats too, and tables
-    /// wider than the terminal.
+    /// Print all columns (c, m per component, null tests), even if the table is wider than the terminal.
+    /// CSV and JSON have them always.
     #[arg(long)]
     wide: bool,
-    /// Print these metrics alone, beside the names of the rows and in this order: columns by their names in CSV, as
-    /// `q,q_calibrated,m_cross`; a table that fits into a column of a paper.
+    /// Print only these metrics, in this order: column names of the CSV format, such as `q,q_calibrated,m_cross`.
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     metrics: Vec<String>,
 }
@@ -102,15 +105,17 @@ impl Printing {
         !self.metrics.is_empty()
     }
 
-    /// The metrics that are asked for of a table.
+    /// The table with the chosen metrics only.
     fn chosen(&self, table: &Table) -> anyhow::Result<Table> {
         table.chosen(&self.metrics).map_err(|unknown| {
-            let known = table.figures().join(", ");
-            anyhow::anyhow!("--metrics: no metric is called {unknown:?}; expected some of {known}")
+            let known = table.metrics().join(", ");
+            anyhow::anyhow!(
+                "--metrics: unknown metric (found {unknown:?}, expected some of {known})"
+            )
         })
     }
 
-    /// Refuses metrics that such a table does not have, before anything is written.
+    /// Refuses metrics that the table does not have, before anything is written.
     pub(super) fn check(&self, table: &Table) -> anyhow::Result<()> {
         self.chosen(table).map(|_| ())
     }
@@ -118,7 +123,7 @@ impl Printing {
     /// Prints a table.
     ///
     /// # Errors
-    /// Where a metric that is asked for is no column of it.
+    /// If a chosen metric is not a column of the table.
     pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
         if self.chooses() {
             let chosen = self.chosen(table)?;
@@ -145,21 +150,21 @@ impl Printing {
     }
 }
 
-/// A page to be written.
+/// The page of `--report`.
 #[derive(Debug, Clone, Args)]
 pub(super) struct ReportFile {
-    /// Write the results as one HTML page with metrics, which needs nothing else.
+    /// Write tables and plots to this file as one self-contained HTML page.
     #[arg(long = "report", value_name = "FILE")]
     path: Option<PathBuf>,
 }
 
 impl ReportFile {
-    /// Whether a page was asked for.
+    /// Whether a page is wanted.
     pub(super) fn is_wanted(&self) -> bool {
         self.path.is_some()
     }
 
-    /// Writes the page, if one was asked for.
+    /// Writes the page if it is wanted.
     pub(super) fn save(
         &self,
         title: &str,
@@ -176,13 +181,13 @@ impl ReportFile {
 /// How to print a table.
 #[derive(Debug, Clone, Args)]
 pub(super) struct Form {
-    /// How to print; `csv` and `json` have every column in full precision.
+    /// Output format; `csv` and `json` have every column in full precision.
     #[arg(long, value_parser = named::<TableFormat>(), default_value = "table")]
     pub(super) format: TableFormat,
 }
 
 impl Form {
-    /// Prints a table. CSV has no room for its notes, which go to standard error.
+    /// Prints a table. The notes of a CSV table go to standard error.
     pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
         if self.format == TableFormat::Csv {
             for note in &table.notes {
@@ -196,18 +201,18 @@ impl Form {
     }
 }
 
-/// Galaxies a side of a simulated image, by default.
+/// Default number of galaxies per side of a simulated image.
 const GRID: u16 = 100;
-/// Seed of a simulation, by default.
+/// Default seed of a simulation.
 const SEED: u64 = 1;
 
-/// What simulated data are made from.
+/// Settings of simulated data.
 #[derive(Debug, Clone, Args)]
 pub(super) struct SimulationArguments {
-    /// Galaxies a side of a simulated image.
+    /// Galaxies per side of a simulated image.
     #[arg(long, value_name = "N", default_value_t = GRID, value_parser = clap::value_parser!(u16).range(8..=400))]
     grid: u16,
-    /// Seed of all random numbers of a simulation.
+    /// Seed of all random numbers.
     #[arg(long, value_name = "SEED", default_value_t = SEED)]
     seed: u64,
     /// Factor on the simulated shear power spectrum.
@@ -218,7 +223,7 @@ pub(super) struct SimulationArguments {
         allow_negative_numbers = true
     )]
     amplitude: f64,
-    /// Extra slope of the simulated shear power spectrum, about ℓ = 1000.
+    /// Extra slope of the simulated shear power spectrum, with its pivot at ℓ = 1000.
     #[arg(
         long,
         value_name = "T",
@@ -244,27 +249,27 @@ impl SimulationArguments {
         Ok(settings)
     }
 
-    /// Refuses them where nothing is simulated.
+    /// Refuses these options for data that are not simulated.
     pub(super) fn must_be_unused(&self) -> anyhow::Result<()> {
         anyhow::ensure!(
             self.settings()? == SimulationSettings::new(SEED, usize::from(GRID)),
-            "--grid, --seed, --amplitude and --tilt are for simulated data"
+            "--grid, --seed, --amplitude and --tilt apply to simulated data only. Try: without them"
         );
         Ok(())
     }
 }
 
-/// Which part of the work to do.
+/// The share of this process in the work.
 #[derive(Debug, Clone, Args)]
 pub(super) struct Sharding {
-    /// Do only the K-th of N parts of equal numbers of images, as one of N processes that may write to
-    /// the same folder at the same time; `merge` then checks that all is there (docs/clusters.md).
+    /// Process only shard K of N: an N-th of the images. N processes may write to one folder at the same time.
+    /// `merge` then checks that the folder is complete (docs/clusters.md).
     #[arg(long, value_name = "K/N")]
     pub(super) shard: Option<Shard>,
 }
 
 impl Sharding {
-    /// The images to work on, out of all.
+    /// The images of this shard.
     pub(super) fn part(&self, all: &[ImageId]) -> Vec<ImageId> {
         self.shard.unwrap_or(Shard::WHOLE).part(all)
     }
@@ -273,7 +278,7 @@ impl Sharding {
 /// Number of worker threads.
 #[derive(Debug, Clone, Args)]
 pub(super) struct Threads {
-    /// Worker threads [default: one per core]. Results do not depend on it.
+    /// Number of worker threads; results do not depend on it [default: one per core].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
 }
@@ -290,22 +295,22 @@ impl Threads {
 /// Bandpower definition on the command line.
 #[derive(Debug, Clone, Copy, Default, ValueEnum)]
 enum DefinitionArgument {
-    /// The challenge's own arithmetic.
+    /// The arithmetic of the challenge.
     #[default]
     Leaderboard,
-    /// True azimuthal averages over fixed bins.
+    /// Azimuthal averages over fixed bins.
     Corrected,
 }
 
 /// How to score.
 #[derive(Debug, Clone, Default, Args)]
 pub(super) struct ScoreSettings {
-    /// How bandpowers and Q are defined.
+    /// Definition of bandpowers and Q.
     #[arg(long, value_enum, default_value_t)]
     definition: DefinitionArgument,
-    /// Convention of the metrics: 1 to 8 (5 is the standard one), `matched` to the truth of all sets
-    /// together, or `best` as the leaderboard took it, set by set [default: 5 for what shearq measured,
-    /// matched for other catalogues].
+    /// Convention of signs and axes: 1 to 8 (5 is the standard one), `matched` or `best`. `matched` correlates best
+    /// with the truth of all sets; `best` has the highest Q of each set, as on the leaderboard [default: 5 for
+    /// catalogues by shearq, matched for others].
     #[arg(long, value_name = "WHICH", value_parser = parse_choice)]
     convention: Option<Choice>,
 }
@@ -318,7 +323,7 @@ impl ScoreSettings {
         }
     }
 
-    /// How variants are scored.
+    /// How `compare` scores.
     pub(super) fn way(&self) -> Way {
         Way {
             definition: self.definition(),
@@ -327,18 +332,18 @@ impl ScoreSettings {
         }
     }
 
-    /// The convention asked for, or that of other programs' catalogues.
+    /// The given convention, or the default for other programs' catalogues.
     pub(super) fn choice(&self) -> Choice {
         self.convention.unwrap_or(Choice::Matched)
     }
 
-    /// The convention asked for, or that of our own measurements.
+    /// The given convention, or the default for catalogues by shearq.
     pub(super) fn own_choice(&self) -> Choice {
         self.convention.unwrap_or(OWN)
     }
 }
 
-/// Refuses a submission that is named twice, which would be measured twice.
+/// Refuses a configuration that is given twice.
 pub(super) fn given_once(submissions: &[String]) -> anyhow::Result<()> {
     for (k, name) in submissions.iter().enumerate() {
         anyhow::ensure!(

@@ -1,4 +1,4 @@
-//! Choices on the command line of types of the layers below: how they are spelt, and what `--help` says.
+//! Names and `--help` lines of choices whose types belong to the layers below.
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
@@ -7,7 +7,7 @@ use shearq_render::table::TableFormat;
 use shearq_results::groups::Grouping;
 use shearq_results::submit::manifest::Contents;
 
-/// A type of which the command line offers the values by name.
+/// A type whose values are given by name on the command line.
 pub(crate) trait Named: Copy + Send + Sync + 'static {
     /// Each value with its name and its line of `--help`.
     const ALL: &[(Self, &str, &str)];
@@ -18,7 +18,7 @@ pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
     let names = T::ALL
         .iter()
         .map(|(_, name, help)| PossibleValue::new(*name).help(*help));
-    // Other names do not get here.
+    // Clap has refused other names.
     PossibleValuesParser::new(names).map(|given| {
         let found = T::ALL.iter().find(|(_, name, _)| *name == given);
         found.unwrap_or(&T::ALL[0]).0
@@ -41,20 +41,20 @@ choices! {
     TableFormat {
         Table: "table", "For reading on a terminal";
         Json: "json", "Machine-readable, full precision";
-        Csv: "csv", "Comma-separated, full precision, value and error in columns of their own; words that a spreadsheet would take for a formula have an apostrophe in front";
+        Csv: "csv", "Comma-separated, full precision, values and errors in separate columns. An apostrophe protects text that spreadsheets would execute as a formula";
         Markdown: "markdown", "Markdown";
         Latex: "latex", "A LaTeX tabular";
     }
     Grouping {
         Set: "set", "Each set alone";
-        SetKind: "set-kind", "The kinds of the paper's Table 2";
+        SetKind: "set-kind", "Kind of set, as in Table 2 of the paper";
         Psf: "psf", "Fixed or variable PSF";
         Snr: "snr", "Class of S/N";
         Size: "size", "Class of galaxy sizes";
     }
     Contents {
         Catalogues: "catalogues", "Ellipticity catalogues";
-        Spectra: "spectra", "Power spectra of the ellipticities averaged over the images, noise included";
-        CrossSpectra: "cross-spectra", "Shear power spectra from cross-spectra between groups of images, in which noise has no mean";
+        Spectra: "spectra", "Power spectra of the ellipticities averaged over the images, with their noise";
+        CrossSpectra: "cross-spectra", "Shear power spectra from cross-spectra between groups of images; their noise averages to zero";
     }
 }

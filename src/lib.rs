@@ -1,5 +1,5 @@
-//! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage. A reader of
-//! standard output that goes away (`| head`) is no failure: the command does its work and ends quietly.
+//! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage. A closed pipe
+//! (`| head`) is not an error: the command finishes its work.
 
 mod arguments;
 mod choices;
@@ -7,6 +7,7 @@ mod commands;
 #[cfg(test)]
 mod pairs;
 mod progress;
+mod renamed;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -23,13 +24,20 @@ use shearq_render::figure::HeatMap;
 use shearq_render::table::Table;
 use shearq_render::terminal::fitted;
 
-/// Score and submit weak-lensing shape measurements, and measure them by Hopfield-network
-/// deconvolution.
+/// Measure, calibrate and score weak-lensing galaxy shapes.
 ///
-/// Start with `shearq quickstart`. The chain in steps: `simulate` writes GREAT10-like sets (or `gather` takes
-/// stamps of your own), `measure` turns images into catalogues by a named submission, `score` turns catalogues
-/// into Q, M/2 and √A, `compare` puts variants side by side, `pack` and `check` prepare what is sent.
-/// `mean` ends a field of constant shear. `run` measures and scores in one go; `merge` completes what parts of it on a cluster left.
+/// Start with `shearq quickstart`, which needs no data. Then work in steps:
+///
+/// 1. `gather` makes a data folder from your stamps and PSFs. `simulate` makes a folder of simulated data.
+///
+/// 2. `measure` writes a catalogue of calibrated ellipticities per image.
+///
+/// 3. `mean` prints the shear of a set with one shear. `score` compares catalogues with a known shear field.
+///
+/// 4. `compare` shows several configurations side by side. `pack` and `check` prepare a submission to a challenge.
+///
+/// `run` measures and scores in one step. `merge` completes a run that was split over a cluster.
+/// A configuration is a named list of settings of the method: see `shearq submissions list`.
 #[derive(Debug, Parser)]
 #[command(name = "shearq", version, propagate_version = true)]
 struct Cli {
@@ -107,11 +115,11 @@ enum Command {
     Manual(help_files::Manual),
 }
 
-/// What the command found: done.
+/// Exit code of success.
 const DONE: u8 = 0;
-/// It failed, or found something.
+/// Exit code of an error, or of findings.
 const FAILED: u8 = 1;
-/// It was called wrongly.
+/// Exit code of wrong usage.
 const MISUSED: u8 = 2;
 
 /// Runs the command that this process was started with.
@@ -121,22 +129,28 @@ pub fn main() -> ExitCode {
     ExitCode::from(run_with(std::env::args_os()))
 }
 
-/// Makes writing beyond a limit of file sizes (`ulimit -f`) an error like any other. By default the signal ends the
-/// process without a message, and with files half written.
+/// Turns writing beyond a file size limit (`ulimit -f`) into an ordinary error. By default the signal ends the
+/// process without a message and leaves files half written.
 fn fail_at_size_limits() {
     #[cfg(unix)]
-    // SAFETY: ignoring a signal runs no code of ours, and no other thread has been started.
+    // SAFETY: ignoring a signal runs none of our code, and no other thread has been started.
     unsafe {
         libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
     }
 }
 
-/// Parses the arguments, of which the first is the program's name, runs the command and reports its error, if
-/// any, in one place. Returns the exit code.
+/// Parses the arguments (the first is the program's name), runs the command and prints its error, if any.
+/// Returns the exit code.
 pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let cli = match Cli::try_parse_from(arguments) {
         Ok(cli) => cli,
-        Err(message) => return usage(&message),
+        Err(message) => match renamed::advice(&message) {
+            Some(advice) => {
+                tell(format_args!("error: {advice}"));
+                return MISUSED;
+            }
+            None => return usage(&message),
+        },
     };
     let result = match cli.command {
         Command::Quickstart(arguments) => quickstart::run(&arguments),
@@ -171,7 +185,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     }
 }
 
-/// An error with its causes, of which those that it mentions itself are not repeated.
+/// An error with its causes. A cause that the error itself mentions is not repeated.
 fn causes(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
@@ -186,7 +200,7 @@ fn causes(error: &anyhow::Error) -> String {
     text
 }
 
-/// Prints help, the version or what is wrong with the arguments.
+/// Prints help, the version, or the error in the arguments.
 fn usage(message: &clap::Error) -> u8 {
     match written(|| message.print()) {
         Ok(()) => u8::try_from(message.exit_code()).unwrap_or(MISUSED),
@@ -197,75 +211,74 @@ fn usage(message: &clap::Error) -> u8 {
     }
 }
 
-/// Failure of a command whose printed results say already what was found.
+/// Failure of a command that has already printed its findings.
 #[derive(Debug, thiserror::Error)]
 #[error("there are findings")]
 struct Findings;
 
-/// Prints a heat map below a table that is read on a terminal; where output goes to a file or
-/// another program, nothing. `NO_COLOR` and a terminal without colours are respected.
+/// Prints a heat map on a terminal; prints nothing if the output goes to a file or another program.
+/// `NO_COLOR` and terminals without colours are respected.
 fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
     use std::io::IsTerminal;
     if !std::io::stdout().is_terminal() {
         return Ok(());
     }
-    // Two digits a cell leave room for 24 sets.
+    // Two digits per cell leave room for 24 sets.
     let decimals = usize::from(!map.values.iter().any(|value| *value >= 10.0));
     let map = HeatMap { decimals, ..map };
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
     let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
-    // Its colours are control characters; names were checked when they were read.
+    // The colours are control characters. Names were checked when they were read.
     write(&format!("\n{}", map.terminal(coloured)))
 }
 
-/// Says something on standard error; a reader that has gone away is no error.
+/// Prints a line on standard error. A closed pipe is not an error.
 fn tell(line: std::fmt::Arguments<'_>) {
     use std::io::Write;
     let _ = writeln!(std::io::stderr(), "{}", visible(&line.to_string()));
 }
 
-/// Reports what looks like files of data and is not read.
+/// Warns about files that look like data and are not read.
 fn tell_unread(files: &Files) {
     for line in files.unread() {
         tell(format_args!("warning: {line}"));
     }
 }
 
-/// A number of things.
+/// A number with its noun, in the plural unless it is 1.
 fn count(number: usize, thing: &str) -> String {
     let ending = if number == 1 { "" } else { "s" };
     format!("{number} {thing}{ending}")
 }
 
-/// Columns of the terminal that results are printed on; where they go elsewhere, those that `COLUMNS`
-/// names, or 80.
+/// Columns of the terminal; `COLUMNS` or 80 if the output goes elsewhere.
 fn width() -> usize {
-    let told = || std::env::var("COLUMNS").ok()?.parse().ok();
+    let stated = || std::env::var("COLUMNS").ok()?.parse().ok();
     let terminal = terminal_size::terminal_size_of(std::io::stdout());
     terminal
         .map(|(width, _)| usize::from(width.0))
-        .or_else(told)
+        .or_else(stated)
         .filter(|width| *width > 0)
         .unwrap_or(80)
 }
 
-/// Prints a table for reading, within the terminal's width.
+/// Prints a table within the terminal's width.
 fn print_table(table: &Table) -> anyhow::Result<()> {
     print(&fitted(table, Some(width())))
 }
 
-/// Prints results to standard output; a reader that has gone away is no error.
+/// Prints results to standard output, with control characters escaped. A closed pipe is not an error.
 fn print(text: &str) -> anyhow::Result<()> {
     write(&visible(text))
 }
 
-/// The same for text with control characters of ours.
+/// Prints text to standard output unchanged.
 fn write(text: &str) -> anyhow::Result<()> {
     use std::io::Write;
     written(|| std::io::stdout().write_all(text.as_bytes()))
 }
 
-/// Writes to standard output, of which nothing may be left in a buffer whose loss would not be noticed.
+/// Writes to standard output and flushes it, so that a failed write is reported.
 fn written(write: impl FnOnce() -> std::io::Result<()>) -> anyhow::Result<()> {
     use std::io::Write;
     match write().and_then(|()| std::io::stdout().flush()) {
@@ -282,7 +295,7 @@ mod tests {
 
     use super::*;
 
-    /// The words of a line of a shell, of which quotes and redirections are understood.
+    /// The words of a shell's line, without quotes and redirections.
     fn words(line: &str) -> Vec<String> {
         let line = line.split(" > ").next().unwrap_or(line);
         line.split_whitespace()
@@ -290,8 +303,7 @@ mod tests {
             .collect()
     }
 
-    /// The commands in the documents, a backslash at the end of a line putting two together; those without variables
-    /// of a shell.
+    /// The commands in the documents, except those with shell variables. A backslash joins two lines.
     fn documented() -> Vec<(String, String)> {
         let mut found = Vec::new();
         let mut pages = vec!["README.md".into(), "CONTRIBUTING.md".into()];
@@ -317,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cause_that_an_error_mentions_is_not_repeated() {
+    fn causes_are_printed_once() {
         let error = anyhow::anyhow!("no space")
             .context("cannot write: no space")
             .context("out.csv");
@@ -326,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn every_command_in_the_documents_is_understood() {
+    fn documented_commands_parse() {
         let commands = documented();
         assert!(commands.len() > 20);
         for (page, line) in commands {
@@ -337,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn every_command_has_an_example_that_it_understands() {
+    fn every_command_has_examples_that_parse() {
         for command in Cli::command().get_subcommands() {
             let help = command
                 .get_after_help()

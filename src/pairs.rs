@@ -1,11 +1,11 @@
-//! Every pair of options of every command is used, or refused.
+//! Every pair of options of a command is used or refused.
 
 use clap::{Arg, Command, CommandFactory};
 
 use crate::Cli;
 
-/// The ways in which a command is used, each with the options that have an effect in it. Two options without a
-/// way in common must be refused.
+/// The ways to use each command, and the options that each way uses. Two options without a common way must be
+/// refused.
 const WAYS: [(&str, &[&str]); 26] = [
     ("quickstart", &["out threads"]),
     (
@@ -75,7 +75,7 @@ const WAYS: [(&str, &[&str]); 26] = [
     ("submissions init", &["FILE method"]),
     ("completions", &["SHELL"]),
     ("manual", &["DIR"]),
-    // Only the names of these options are compared; their ways depend on more than two options.
+    // Only names are compared: the ways of these commands depend on more than two options.
     (
         NAMES_ONLY[0],
         &[
@@ -93,7 +93,7 @@ const WAYS: [(&str, &[&str]); 26] = [
 /// Commands whose pairs are not compared.
 const NAMES_ONLY: [&str; 2] = ["baseline record", "baseline check"];
 
-/// Pairs that the command itself refuses, with an error, when it runs.
+/// Pairs that the command refuses when it runs.
 const REFUSED_WHEN_RUN: [(&str, &str, &str); 6] = [
     ("run", "data", "grid"),
     ("run", "data", "seed"),
@@ -103,7 +103,7 @@ const REFUSED_WHEN_RUN: [(&str, &str, &str); 6] = [
     ("run", "shard", "report"),
 ];
 
-/// What an option is called on the command line.
+/// The name of an option on the command line.
 fn name(argument: &Arg) -> String {
     let value = || {
         let names = argument.get_value_names().unwrap_or_default();
@@ -123,7 +123,7 @@ fn refused(command: &Command, a: &Arg, b: &Arg) -> bool {
         let mut members = group.get_args();
         let both =
             group.get_args().any(|id| id == a.get_id()) && members.any(|id| id == b.get_id());
-        // Flattened structures are groups of any number.
+        // Flattened structures are groups that allow several members.
         both && !group.clone().is_multiple()
     });
     names(a, b) || names(b, a) || exclusive

@@ -1,5 +1,4 @@
-//! What is shown of long work: a progress bar on standard error, none when it is not a terminal, and a word
-//! where the work is stopped.
+//! Progress of long work: a bar on standard error if it is a terminal, and a line when Ctrl-C stops the work.
 
 use std::fmt::Write;
 use std::io::IsTerminal;
@@ -16,12 +15,12 @@ use shearq_pipeline::Progress;
 /// Galaxies done, rate and time left.
 pub(super) struct Bar {
     bar: ProgressBar,
-    /// Of the galaxies done, those that were found done and are no measure of speed.
+    /// Galaxies that were done before; they do not count for the rate.
     skipped: Arc<AtomicU64>,
 }
 
 impl Bar {
-    /// A bar over `galaxies`, with `what` in front.
+    /// A bar over `galaxies` with the label `what`.
     pub(super) fn new(what: &'static str, galaxies: u64) -> Self {
         let target = if std::io::stderr().is_terminal() {
             ProgressDrawTarget::stderr_with_hz(5)
@@ -30,14 +29,14 @@ impl Bar {
         };
         let bar = ProgressBar::with_draw_target(Some(galaxies), target);
         let skipped = Arc::new(AtomicU64::new(0));
-        // The bar takes what the words leave of the line.
+        // The bar fills the rest of the line.
         let template = "{prefix} {wide_bar} {percent}% of {human_len} galaxies{pace}{msg}";
         if let Ok(style) = ProgressStyle::with_template(template) {
             let skipped = Arc::clone(&skipped);
             let pace = move |state: &ProgressState, out: &mut dyn Write| {
                 let left = state.len().unwrap_or(0).saturating_sub(state.pos());
                 let done = state.pos().saturating_sub(skipped.load(Ordering::Relaxed));
-                // A formatter of a bar has nobody to tell.
+                // A failed write cannot be reported from here.
                 let _ = out.write_str(&pace(done, left, state.elapsed().as_secs_f64()));
             };
             bar.set_style(style.with_key("pace", pace));
@@ -47,7 +46,7 @@ impl Bar {
     }
 }
 
-/// Rate and time left, after `done` galaxies in so many seconds.
+/// Rate and remaining time after `done` galaxies in `seconds`.
 fn pace(done: u64, left: u64, seconds: f64) -> String {
     if done == 0 || seconds <= 0.0 {
         return String::new();
@@ -86,31 +85,31 @@ impl Drop for Bar {
     }
 }
 
-/// Whether the command of this process goes on where it was stopped.
+/// Whether the command of this process resumes.
 static GOES_ON: AtomicBool = AtomicBool::new(false);
 
-/// Says that the command of this process, given again, goes on where it was stopped.
+/// States that the command of this process resumes when it is given again.
 pub(super) fn goes_on() {
     GOES_ON.store(true, Ordering::Relaxed);
 }
 
-/// Exit code of what Ctrl-C stopped, as shells have it.
+/// Exit code after Ctrl-C, as in shells.
 const INTERRUPTED: i32 = 130;
 
-/// Ends the process at Ctrl-C with a word of what is to be done. Files are whole or not there at any moment.
+/// Ends the process at Ctrl-C and prints how to resume. At any moment, a file is complete or absent.
 pub(super) fn end_at_interrupt() {
     let handler = || {
         let goes_on = GOES_ON.load(Ordering::Relaxed);
         tell(format_args!(
             "\nstopped{}",
             match goes_on {
-                true => "; the same command goes on from what is done",
+                true => "; the same command resumes",
                 false => "",
             }
         ));
         std::process::exit(INTERRUPTED);
     };
-    // Without it, Ctrl-C ends the process without a word.
+    // Without the handler, Ctrl-C ends the process silently.
     let _ = ctrlc::set_handler(handler);
 }
 
@@ -119,7 +118,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_pace_is_that_of_work_done_now() {
+    fn the_rate_counts_new_galaxies_only() {
         assert_eq!(pace(0, 10, 1.0), "");
         assert_eq!(pace(5506, 11012, 1.0), ", 5,506/s, 2 seconds left");
     }

@@ -38,7 +38,7 @@ KINDS = {
 # Signs of the intrinsic ellipticity and of both components of shear.
 VERSIONS = [(1, (1, 1)), (1, (-1, -1)), (-1, (1, -1)), (-1, (-1, 1))]
 # Of the catalogue.
-COLUMNS = ["e1", "e2", "response1", "response2", "flag"]
+COLUMNS = ["e1", "e2", "R11", "R22", "flags"]
 # Light that may be folded back into the image: GalSim's default of 5e-3 is no better than the biases sought.
 ACCURACY = galsim.GSParams(folding_threshold=1e-3, maximum_fft_size=16384)
 
@@ -116,11 +116,11 @@ def main():
             noise = -noise if field % 2 else rng.standard_normal(size=stamps[0].shape, dtype=np.float32)
             fields.append(measure(command, stamps, psf, noise))
         column = lambda name: np.array([field[name] for field in fields])
-        line, flagged = f"{kind:14}", column("flag") != 0
+        line, flagged = f"{kind:14}", column("flags") != 0
         good = ~flagged.any(1)
         slopes, offsets = [], []
         for k in range(2):
-            response = np.where(flagged, np.nan, column(f"response{k + 1}"))
+            response = np.where(flagged, np.nan, column(f"R{k + 1}{k + 1}"))
             # Undo each image's own calibration and take the mean response of all.
             e = column(f"e{k + 1}") * np.nanmean(response, 2, keepdims=True)
             mean = np.nanmean(response)

@@ -1,8 +1,7 @@
-//! shearq for Python: the module `shearq._shearq`, thin doors to the crates that measure and score.
+//! shearq for Python: the module `shearq._shearq`, a thin layer above the crates that measure and score.
 //!
-//! What Python hands in is looked at by the package around it (`python/shearq`), which knows how arguments are
-//! called; here, arrays become views, requests become those of the crates, and errors become exceptions.
-//! Threads are started by `shearq_pipeline::engine` alone, with the interpreter released.
+//! The package in `python/shearq` checks types and shapes, and names the argument in its errors. Here, arrays become
+//! views and errors become exceptions. Only `shearq_pipeline::engine` starts threads, with the interpreter released.
 
 mod command;
 mod errors;
@@ -20,7 +19,7 @@ mod _shearq {
     #[pymodule_export]
     use super::command::run_command;
     #[pymodule_export]
-    use super::measure::{flags, measure};
+    use super::measure::{flags, mean_shear, measure};
     #[pymodule_export]
     use super::score::{difference, metrics, score, spectrum};
     #[pymodule_export]

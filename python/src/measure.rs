@@ -2,40 +2,53 @@
 
 use std::sync::Arc;
 
-use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
+use ndarray::{ArcArray2, Array3, ArrayView2, ArrayView3, Axis};
 use numpy::{IntoPyArray, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_measure::{
-    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, MeasureError, Measurement, Measurer,
-    NoisePlan, Pixel, PsfProfile, Psfs, Survey, Warning, Worker, calibrate, examined_rows,
+    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, ImageNoise, MeanShear, MeanShearError,
+    MeasureError, Measurement, Measurer, NoisePlan, Pixel, PsfProfile, Psfs, ShearSum, Survey,
+    Warning, Worker, calibrate, examined_rows,
 };
 use shearq_pipeline::engine;
+use shearq_pipeline::measure::{COLUMNS, Value};
 use shearq_quantities::Shear;
-use shearq_submissions::PsfCut;
 
 use crate::errors::{no_memory, of_measuring};
 use crate::stamps::{Borrowed, Piece, Stamps};
 use crate::submissions::Configuration;
 use crate::work::{Failure, Watch, threads};
 
-/// Stamps that a worker takes at a time: enough that handing them out costs nothing, few enough that copies
-/// of them, where they have to be made, are small.
+/// Stamps that a worker takes at a time: enough that handing them out costs nothing, and few enough that copies of them
+/// are small.
 const PIECE: usize = 64;
 
 /// PSFs of all stamps.
 enum AllPsfs<'a> {
-    Shared(ArrayView2<'a, f64>),
+    Shared {
+        psf: ArcArray2<f64>,
+        /// Offset of a star in pixels, if it was moved to the centre.
+        moved: Option<[f64; 2]>,
+    },
     Stars(Stamps<'a>),
     Formulas(Vec<FunctionalPsf>),
 }
 
-/// PSFs of a piece.
-enum SomePsfs<'a> {
-    Shared(ArrayView2<'a, f64>),
-    Stars(Piece<'a>),
-    Formulas(&'a [FunctionalPsf]),
+impl AllPsfs<'_> {
+    /// PSFs of the stamps from `start` to before `end`.
+    fn piece(&self, start: usize, end: usize) -> PyResult<Psfs<'_>> {
+        Ok(match self {
+            AllPsfs::Shared { psf, .. } => Psfs::Prepared(psf.clone()),
+            AllPsfs::Stars(stars) => match stars.piece(start, end)? {
+                Piece::Single(stars) => Psfs::stars(stars),
+                Piece::Double(stars) => Psfs::stars(stars),
+                Piece::Copied(stars) => Psfs::stars(stars),
+            },
+            AllPsfs::Formulas(formulas) => Psfs::functional(&formulas[start..end]),
+        })
+    }
 }
 
 /// Noise levels of all stamps, or of a piece.
@@ -52,24 +65,51 @@ impl<'a> Noise<'a> {
             Noise::Each(levels) => Noise::Each(&levels[start..end]),
         }
     }
+
+    /// A level that is wrong if any is.
+    fn worst(self) -> Option<f64> {
+        match self {
+            Noise::One(level) => level,
+            Noise::Each(levels) => {
+                let wrong = |sigma: &&f64| !(sigma.is_finite() && **sigma >= 0.0);
+                Some(levels.iter().find(wrong).copied().unwrap_or(1.0))
+            }
+        }
+    }
 }
 
-/// The catalogue, the mean response, and the warnings.
-type Measured<'py> = (Bound<'py, PyDict>, Option<[f64; 2]>, Vec<String>);
-
 /// Some stamps with all that is needed to measure them.
-struct Job<'a> {
-    stamps: Piece<'a>,
-    psfs: SomePsfs<'a>,
+struct Job<'s, 'p> {
+    stamps: Piece<'s>,
+    psfs: Psfs<'p>,
+    noise: Noise<'s>,
+}
+
+/// A request to measure stamps, without their PSFs.
+struct Request<'a> {
+    measurer: &'a Measurer,
+    stamps: Stamps<'a>,
+    /// Number of stamps, rows and columns.
+    dim: (usize, usize, usize),
     noise: Noise<'a>,
 }
 
-/// Measures stamps `(n, ny, nx)` with a star stamp for all, star stamps one each, or formulas (FWHM, e1, e2 and
-/// β, which is not a number for Kolmogorov), one or one each; and a noise level for all or one each, or none where the
-/// submission measures it on the stamps. Returns the catalogue's columns, the mean response that the ellipticities were
-/// divided by, and what is wrong with the data.
+/// The catalogue, the mean response, the warnings, and an error if all galaxies are flagged.
+type Measured<'py> = (
+    Bound<'py, PyDict>,
+    Option<[f64; 2]>,
+    Vec<String>,
+    Option<String>,
+);
+
+/// Measures stamps `(n, ny, nx)`.
+///
+/// PSFs are one star stamp for all, star stamps one per galaxy, or formulas (FWHM, e1, e2 and β, which is NaN for
+/// Kolmogorov), one for all or one per galaxy. The noise is one level for all or one per stamp. Without any, the
+/// configuration measures it on the stamps. Returns the columns of the catalogue, the mean response by which the
+/// ellipticities were divided, the warnings, and an error if all galaxies are flagged.
 #[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "Python gives them by name")]
+#[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
 pub(crate) fn measure<'py>(
     py: Python<'py>,
     stamps: &Bound<'py, PyAny>,
@@ -82,204 +122,261 @@ pub(crate) fn measure<'py>(
     threads_asked: Option<u16>,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Measured<'py>> {
-    let submission = &submission.get().entry.configuration;
+    let configuration = &submission.get().entry.configuration;
     let stamps = Borrowed::new(stamps)?;
-    let (count, rows, columns) = stamps.dim();
-    let stamps = stamps.shared();
-    let measurer = Measurer::new(submission, rows).map_err(of_measuring)?;
-    let cut = submission.psf_cut();
-    let least = cut.least;
+    let (count, rows, _) = stamps.dim();
+    let measurer = Measurer::new(configuration, rows).map_err(of_measuring)?;
     let stars = stars.map(Borrowed::new).transpose()?;
-    let noise = match &noises {
-        None => Noise::One(noise),
-        Some(levels) => Noise::Each(levels.as_slice()?),
+    let request = Request {
+        measurer: &measurer,
+        stamps: stamps.shared(),
+        dim: stamps.dim(),
+        noise: match &noises {
+            None => Noise::One(noise),
+            Some(levels) => Noise::Each(levels.as_slice()?),
+        },
     };
+    let psfs = match (star, &stars, formulas) {
+        (Some(star), None, None) => request.star(&star),
+        (None, Some(stars), None) => request.stars(stars),
+        (None, None, Some(formulas)) => request.formulas(&formulas),
+        _ => Err(PyValueError::new_err("psf: expected one kind of PSFs")),
+    }?;
+    if let Noise::Each(levels) = request.noise {
+        one_each("noise", levels.len(), count)?;
+    }
+    let galaxies = request.measure(py, &psfs, threads(threads_asked), progress)?;
+    let mut galaxies = [galaxies];
+    let response = calibrate(configuration, &mut galaxies);
+    let warnings = request.warnings(&psfs, &galaxies)?;
+    let [galaxies] = galaxies;
+    let flagged = galaxies.iter().filter(|g| !g.flags.is_empty()).count();
+    let all_flagged = (count > 0 && flagged == count)
+        .then(|| Warning::of_flags(&[galaxies.as_slice()]))
+        .flatten()
+        .map(|warning| format!("stamps: no galaxy could be measured: {warning}"));
+    let warnings = warnings.iter().map(Warning::to_string).collect();
+    Ok((catalogue(py, &galaxies)?, response, warnings, all_flagged))
+}
 
-    // A batch of no stamps finds all that is wrong with the request, before the work begins.
-    let none = Array3::<f64>::zeros((0, rows, columns));
-    let looked_at = match noise {
-        Noise::One(None) => measurer.noise_plan().filter(|_| count > 0),
-        Noise::One(Some(_)) | Noise::Each(_) => None,
-    };
-    let level = match noise {
-        // It will be measured.
-        Noise::One(None) if looked_at.is_some() => Some(1.0),
-        Noise::One(level) => level,
-        Noise::Each(levels) => Some(worst(levels)),
-    };
-    let look = |psfs: Psfs<'_, f64>| {
+impl<'s> Request<'s> {
+    /// The plan by which noise is measured on the stamps, unless it is given.
+    fn noise_plan(&self) -> Option<&NoisePlan> {
+        match self.noise {
+            Noise::One(None) => self.measurer.noise_plan().filter(|_| self.dim.0 > 0),
+            Noise::One(Some(_)) | Noise::Each(_) => None,
+        }
+    }
+
+    /// Checks stamps, PSFs and noise before the work begins: a batch of no stamps has the same errors.
+    fn check(&self, psfs: Psfs<'_>) -> PyResult<()> {
+        let (_, rows, columns) = self.dim;
         if rows != columns {
-            return Err(MeasureError::Shape {
+            return Err(of_measuring(MeasureError::Shape {
                 what: "stamps",
                 found: format!("{rows} × {columns} pixels"),
                 expected: "squares".into(),
-            });
+            }));
         }
-        measurer.batch(none.view(), psfs, level).map(|_| ())
-    };
-    let prepared;
-    let mut moved = None;
-    let psfs = match (star, &stars, formulas) {
-        (Some(star), None, None) => {
-            look(Psfs::Star(star.as_array())).map_err(of_measuring)?;
-            let found = shearq_measure::star(star.as_array(), cut).map_err(of_measuring)?;
-            (prepared, moved) = (found.psf, found.moved);
-            AllPsfs::Shared(prepared.view())
-        }
-        (None, Some(stars), None) => {
-            let (given, rows, columns) = stars.dim();
-            one_each("psf", given, count)?;
-            if rows < least || columns < least {
-                return Err(PyValueError::new_err(format!(
-                    "psf: PSF stamps of {rows} × {columns} pixels; expected at least {least} × {least}, as submission {} needs",
-                    submission.name
-                )));
-            }
-            let none = Array3::zeros((0, rows, columns));
-            look(Psfs::Stars(none.view())).map_err(of_measuring)?;
-            AllPsfs::Stars(stars.shared())
-        }
-        (None, None, Some(formulas)) => {
-            look(Psfs::Functional(&[])).map_err(of_measuring)?;
-            let formulas = self::formulas(formulas.as_array()).map_err(of_measuring)?;
-            match formulas.as_slice() {
-                [one] => {
-                    prepared = one.stamp_beside(cut.size, rows);
-                    look(Psfs::Prepared(prepared.view())).map_err(of_measuring)?;
-                    AllPsfs::Shared(prepared.view())
-                }
-                _ => {
-                    one_each("psf", formulas.len(), count)?;
-                    AllPsfs::Formulas(formulas)
-                }
-            }
-        }
-        _ => return Err(PyValueError::new_err("psf: expected one kind of PSFs")),
-    };
-    if let Noise::Each(levels) = noise {
-        one_each("noise", levels.len(), count)?;
+        let none = Array3::<f64>::zeros((0, rows, columns));
+        // A noise that will be measured has any level.
+        let measured = self.noise_plan().map(|_| 1.0);
+        let level = measured.or_else(|| self.noise.worst());
+        let found = self.measurer.batch(none.view(), &psfs, level);
+        found.map(|_| ()).map_err(of_measuring)
     }
 
-    let survey = match looked_at {
-        Some(plan) => look_at(plan, &stamps, count)?,
-        None => None,
-    };
-    let mut galaxies = Vec::new();
-    galaxies
-        .try_reserve_exact(count)
-        .map_err(|_| no_memory("the catalogue"))?;
-    let failure = Failure::default();
-    let mut watch = Watch::new(progress, &failure);
-    let result = py.detach(|| {
-        engine::ordered(
-            threads(threads_asked),
-            |feeder| {
-                for start in (0..count).step_by(PIECE) {
-                    let end = (start + PIECE).min(count);
-                    let job = job(&stamps, &psfs, noise, start, end);
-                    if !feeder.push(job.map_err(|error| failure.keep(error))?) {
-                        break;
+    fn star<'p>(&self, star: &PyReadonlyArray2<'_, f64>) -> PyResult<AllPsfs<'p>> {
+        self.check(Psfs::star(star.as_array()))?;
+        let cut = self.measurer.configuration().psf_cut();
+        let found = shearq_measure::star(star.as_array(), cut).map_err(of_measuring)?;
+        Ok(AllPsfs::Shared {
+            psf: found.psf.into_shared(),
+            moved: found.moved,
+        })
+    }
+
+    fn stars<'p>(&self, stars: &'p Borrowed<'_>) -> PyResult<AllPsfs<'p>> {
+        let (given, rows, columns) = stars.dim();
+        one_each("psf", given, self.dim.0)?;
+        let configuration = self.measurer.configuration();
+        let least = configuration.psf_cut().least;
+        if rows < least || columns < least {
+            return Err(PyValueError::new_err(format!(
+                "psf: PSF stamps of {rows} × {columns} pixels; expected at least {least} × {least}, as the configuration {} requires",
+                configuration.name
+            )));
+        }
+        self.check(Psfs::stars(Array3::<f64>::zeros((0, rows, columns))))?;
+        Ok(AllPsfs::Stars(stars.shared()))
+    }
+
+    fn formulas<'p>(&self, rows: &PyReadonlyArray2<'_, f64>) -> PyResult<AllPsfs<'p>> {
+        self.check(Psfs::functional(Vec::new()))?;
+        let formulas = formulas(rows.as_array()).map_err(of_measuring)?;
+        let [one] = formulas.as_slice() else {
+            one_each("psf", formulas.len(), self.dim.0)?;
+            return Ok(AllPsfs::Formulas(formulas));
+        };
+        let cut = self.measurer.configuration().psf_cut();
+        let psf = one.stamp_beside(cut.size, self.dim.1).into_shared();
+        self.check(Psfs::Prepared(psf.clone()))?;
+        Ok(AllPsfs::Shared { psf, moved: None })
+    }
+
+    /// Noise and galaxy sizes, measured on some of the stamps if the noise is not given.
+    fn survey(&self) -> PyResult<Option<Arc<Survey>>> {
+        let Some(plan) = self.noise_plan() else {
+            return Ok(None);
+        };
+        let mut survey = plan.survey();
+        for at in plan.rows(1, self.dim.0) {
+            match self.stamps.piece(at, at + 1)? {
+                Piece::Single(one) => survey.add(one.index_axis(Axis(0), 0)),
+                Piece::Double(one) => survey.add(one.index_axis(Axis(0), 0)),
+                Piece::Copied(one) => survey.add(one.index_axis(Axis(0), 0)),
+            }
+            .map_err(of_measuring)?;
+        }
+        survey.shared().map_err(of_measuring)
+    }
+
+    /// Measures all galaxies, without calibration.
+    fn measure(
+        &self,
+        py: Python<'_>,
+        psfs: &AllPsfs<'_>,
+        threads: usize,
+        progress: Option<Py<PyAny>>,
+    ) -> PyResult<Vec<Measurement>> {
+        let count = self.dim.0;
+        let survey = self.survey()?;
+        let mut galaxies = Vec::new();
+        galaxies
+            .try_reserve_exact(count)
+            .map_err(|_| no_memory("the catalogue"))?;
+        let failure = Failure::default();
+        let mut watch = Watch::new(progress, &failure);
+        let result = py.detach(|| {
+            engine::ordered(
+                threads,
+                |feeder| {
+                    for start in (0..count).step_by(PIECE) {
+                        let job = self.job(psfs, start, (start + PIECE).min(count));
+                        if !feeder.push(job.map_err(|error| failure.keep(error))?) {
+                            break;
+                        }
                     }
-                }
-                Ok(())
-            },
-            || {
-                let mut worker = measurer.worker();
-                worker.set_survey(survey.as_ref());
-                worker
-            },
-            |worker, job: Job<'_>| Ok(measure_job(worker, &job)?),
-            |measured: Vec<Measurement>| {
-                watch.advance(measured.len())?;
-                galaxies.extend(measured);
-                Ok(())
-            },
-        )
-        .and_then(|()| watch.tell())
-    });
-    failure.or(result)?;
-    let mut galaxies = [galaxies];
-    let response = calibrate(submission, &mut galaxies);
-    let mut examination = examine(&stamps, count, rows)?;
-    add_psfs(&mut examination, &psfs, count, moved, cut)?;
-    let mut warnings = examination.warnings();
-    if let Noise::One(Some(given)) = noise {
-        warnings.extend(examination.given_noise(given));
+                    Ok(())
+                },
+                || self.measurer.worker(),
+                |worker, job: Job<'_, '_>| Ok(measure_job(worker, survey.as_ref(), &job)?),
+                |measured: Vec<Measurement>| {
+                    watch.advance(measured.len())?;
+                    galaxies.extend(measured);
+                    Ok(())
+                },
+            )
+            .and_then(|()| watch.tell())
+        });
+        failure.or(result)?;
+        Ok(galaxies)
     }
-    warnings.extend(Warning::of_settings(submission));
-    warnings.extend(Warning::of_flags(&galaxies));
-    if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {
-        return Err(of_measuring(MeasureError::Data(
-            warnings.swap_remove(fatal),
-        )));
-    }
-    let warnings = warnings.iter().map(Warning::to_string).collect();
-    Ok((catalogue(py, &galaxies[0])?, response, warnings))
-}
 
-/// Examines the PSF of all `count` stamps, which was `moved` to the middle of its stamp, or as many of those for one each as are
-/// enough.
-fn add_psfs(
-    examination: &mut Examination,
-    psfs: &AllPsfs<'_>,
-    count: usize,
-    moved: Option<[f64; 2]>,
-    cut: PsfCut,
-) -> PyResult<()> {
-    match psfs {
-        AllPsfs::Shared(psf) => examination.add_psf(psf.view(), moved),
-        AllPsfs::Formulas(formulas) => {
-            examination.add_psfs(Psfs::<f64>::Functional(formulas), cut, EXAMINED_PSFS);
+    fn job<'p>(&self, psfs: &'p AllPsfs<'_>, start: usize, end: usize) -> PyResult<Job<'s, 'p>> {
+        Ok(Job {
+            stamps: self.stamps.piece(start, end)?,
+            psfs: psfs.piece(start, end)?,
+            noise: self.noise.piece(start, end),
+        })
+    }
+
+    /// The warnings about stamps and PSFs.
+    fn warnings(
+        &self,
+        psfs: &AllPsfs<'_>,
+        galaxies: &[Vec<Measurement>],
+    ) -> PyResult<Vec<Warning>> {
+        let configuration = self.measurer.configuration();
+        let examination = self.examine(psfs)?;
+        let mut warnings = examination.warnings();
+        warnings.extend(self.given_noise(&examination));
+        warnings.extend(Warning::of_settings(configuration));
+        warnings.extend(Warning::of_flags(galaxies));
+        match warnings.iter().position(Warning::is_fatal) {
+            Some(fatal) => Err(of_measuring(MeasureError::Data(
+                warnings.swap_remove(fatal),
+            ))),
+            None => Ok(warnings),
         }
-        AllPsfs::Stars(stars) => {
-            let some = EXAMINED_PSFS.min(count);
-            for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
-                match stars.piece(at, at + 1)? {
-                    Piece::Single(one) => examination.add_psfs(Psfs::Stars(one.view()), cut, 1),
-                    Piece::Double(one) => examination.add_psfs(Psfs::Stars(one.view()), cut, 1),
-                    Piece::Copied(one) => examination.add_psfs(Psfs::Stars(one.view()), cut, 1),
+    }
+
+    /// Examines some of the stamps and PSFs.
+    fn examine(&self, psfs: &AllPsfs<'_>) -> PyResult<Examination> {
+        let (count, side, _) = self.dim;
+        let chosen = examined_rows(1, count);
+        let mut examination = Examination::new(side, chosen.len());
+        for at in chosen {
+            match self.stamps.piece(at, at + 1)? {
+                Piece::Single(one) => examination.add(one.index_axis(Axis(0), 0)),
+                Piece::Double(one) => examination.add(one.index_axis(Axis(0), 0)),
+                Piece::Copied(one) => examination.add(one.index_axis(Axis(0), 0)),
+            }
+            .map_err(of_measuring)?;
+        }
+        let cut = self.measurer.configuration().psf_cut();
+        match psfs {
+            AllPsfs::Shared { psf, moved } => examination.add_psf(psf.view(), *moved),
+            AllPsfs::Formulas(formulas) => {
+                examination.add_psfs(&Psfs::functional(formulas), cut, EXAMINED_PSFS);
+            }
+            AllPsfs::Stars(_) => {
+                let some = EXAMINED_PSFS.min(count);
+                for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
+                    examination.add_psfs(&psfs.piece(at, at + 1)?, cut, 1);
                 }
             }
         }
+        Ok(examination)
     }
-    Ok(())
-}
 
-/// Examines as many of the stamps as are enough.
-fn examine(stamps: &Stamps<'_>, count: usize, side: usize) -> PyResult<Examination> {
-    let chosen = examined_rows(1, count);
-    let mut examination = Examination::new(side, chosen.len());
-    for at in chosen {
-        match stamps.piece(at, at + 1)? {
-            Piece::Single(one) => examination.add(one.index_axis(Axis(0), 0)),
-            Piece::Double(one) => examination.add(one.index_axis(Axis(0), 0)),
-            Piece::Copied(one) => examination.add(one.index_axis(Axis(0), 0)),
+    /// A warning if the given noise disagrees with the stamps.
+    fn given_noise(&self, examination: &Examination) -> Option<Warning> {
+        match self.noise {
+            Noise::One(level) => examination.given_noise(level?),
+            Noise::Each(_) => None,
         }
-        .map_err(of_measuring)?;
     }
-    Ok(examination)
 }
 
-/// What the stamps tell of their image, from as many as are enough.
-fn look_at(plan: &NoisePlan, stamps: &Stamps<'_>, count: usize) -> PyResult<Option<Arc<Survey>>> {
-    let mut survey = plan.survey();
-    for at in plan.rows(1, count) {
-        match stamps.piece(at, at + 1)? {
-            Piece::Single(one) => survey.add(one.index_axis(Axis(0), 0)),
-            Piece::Double(one) => survey.add(one.index_axis(Axis(0), 0)),
-            Piece::Copied(one) => survey.add(one.index_axis(Axis(0), 0)),
+fn measure_job(
+    worker: &mut Worker,
+    survey: Option<&Arc<Survey>>,
+    job: &Job<'_, '_>,
+) -> Result<Vec<Measurement>, MeasureError> {
+    match &job.stamps {
+        Piece::Single(stamps) => each(worker, survey, stamps.view(), job),
+        Piece::Double(stamps) => each(worker, survey, stamps.view(), job),
+        Piece::Copied(stamps) => each(worker, survey, stamps.view(), job),
+    }
+}
+
+fn each<T: Pixel>(
+    worker: &mut Worker,
+    survey: Option<&Arc<Survey>>,
+    stamps: ArrayView3<'_, T>,
+    job: &Job<'_, '_>,
+) -> Result<Vec<Measurement>, MeasureError> {
+    match job.noise {
+        Noise::One(level) => {
+            let mut image = worker.image(ImageNoise::of(survey, level));
+            image.measure_each(stamps, &job.psfs)
         }
-        .map_err(of_measuring)?;
+        Noise::Each(levels) => {
+            let mut image = worker.image(ImageNoise::Unknown);
+            image.measure_each_with_noise(stamps, &job.psfs, levels)
+        }
     }
-    survey.shared().map_err(of_measuring)
-}
-
-/// The first level that is none, so that it is told; any where all are.
-fn worst(levels: &[f64]) -> f64 {
-    let bad = levels
-        .iter()
-        .find(|sigma| !(sigma.is_finite() && **sigma >= 0.0));
-    bad.copied().unwrap_or(1.0)
 }
 
 /// Checks that there is one for each stamp.
@@ -308,117 +405,56 @@ fn formulas(rows: ArrayView2<'_, f64>) -> Result<Vec<FunctionalPsf>, MeasureErro
     rows.outer_iter().map(formula).collect()
 }
 
-fn job<'a>(
-    stamps: &Stamps<'a>,
-    psfs: &'a AllPsfs<'a>,
-    noise: Noise<'a>,
-    start: usize,
-    end: usize,
-) -> PyResult<Job<'a>> {
-    Ok(Job {
-        stamps: stamps.piece(start, end)?,
-        psfs: match psfs {
-            AllPsfs::Shared(psf) => SomePsfs::Shared(psf.view()),
-            AllPsfs::Stars(stars) => SomePsfs::Stars(stars.piece(start, end)?),
-            AllPsfs::Formulas(formulas) => SomePsfs::Formulas(&formulas[start..end]),
-        },
-        noise: noise.piece(start, end),
-    })
-}
-
-fn measure_job(worker: &mut Worker, job: &Job<'_>) -> Result<Vec<Measurement>, MeasureError> {
-    match &job.stamps {
-        Piece::Single(stamps) => with_psfs(worker, stamps.view(), job),
-        Piece::Double(stamps) => with_psfs(worker, stamps.view(), job),
-        Piece::Copied(stamps) => with_psfs(worker, stamps.view(), job),
-    }
-}
-
-fn with_psfs<T: Pixel>(
-    worker: &mut Worker,
-    stamps: ArrayView3<'_, T>,
-    job: &Job<'_>,
-) -> Result<Vec<Measurement>, MeasureError> {
-    let noise = job.noise;
-    match &job.psfs {
-        SomePsfs::Shared(psf) => each(worker, stamps, Psfs::<f64>::Prepared(psf.view()), noise),
-        SomePsfs::Stars(Piece::Single(stars)) => {
-            each(worker, stamps, Psfs::Stars(stars.view()), noise)
-        }
-        SomePsfs::Stars(Piece::Double(stars)) => {
-            each(worker, stamps, Psfs::Stars(stars.view()), noise)
-        }
-        SomePsfs::Stars(Piece::Copied(stars)) => {
-            each(worker, stamps, Psfs::Stars(stars.view()), noise)
-        }
-        SomePsfs::Formulas(formulas) => {
-            each(worker, stamps, Psfs::<f64>::Functional(formulas), noise)
-        }
-    }
-}
-
-fn each<T: Pixel, P: Pixel>(
-    worker: &mut Worker,
-    stamps: ArrayView3<'_, T>,
-    psfs: Psfs<'_, P>,
-    noise: Noise<'_>,
-) -> Result<Vec<Measurement>, MeasureError> {
-    let levels = match noise {
-        Noise::One(level) => return worker.measure_each(stamps, psfs, level),
-        Noise::Each(levels) => levels,
-    };
-    if let Psfs::Prepared(psf) = psfs {
-        // Once for all of them: a PSF costs more to prepare than a galaxy to measure.
-        worker.set_psf(psf)?;
-        let measured = stamps.outer_iter().zip(levels);
-        return measured
-            .map(|(stamp, &level)| worker.measure(stamp, Some(level)))
-            .collect();
-    }
-    let mut galaxies = Vec::with_capacity(levels.len());
-    for (k, &level) in levels.iter().enumerate() {
-        let own = match psfs {
-            Psfs::Stars(stars) => Psfs::Stars(stars.slice_move(s![k..k + 1, .., ..])),
-            Psfs::Functional(formulas) => Psfs::Functional(&formulas[k..k + 1]),
-            Psfs::Star(_) | Psfs::Prepared(_) => psfs,
-        };
-        let stamp = stamps.index_axis(Axis(0), k);
-        galaxies.extend(worker.measure_each(stamp.insert_axis(Axis(0)), own, Some(level))?);
-    }
-    Ok(galaxies)
-}
-
 /// The columns of a catalogue, by name.
 fn catalogue<'py>(py: Python<'py>, galaxies: &[Measurement]) -> PyResult<Bound<'py, PyDict>> {
     let columns = PyDict::new(py);
-    let real = |name: &str, value: &dyn Fn(&Measurement) -> f64| {
-        let values: Vec<f64> = galaxies.iter().map(value).collect();
-        columns.set_item(name, values.into_pyarray(py))
-    };
-    let whole = |name: &str, value: &dyn Fn(&Measurement) -> i32| {
-        let values: Vec<i32> = galaxies.iter().map(value).collect();
-        columns.set_item(name, values.into_pyarray(py))
-    };
-    real("e1", &|g| g.e1)?;
-    real("e2", &|g| g.e2)?;
-    real("R11", &|g| g.response[0])?;
-    real("R22", &|g| g.response[1])?;
-    whole("flags", &|g| g.flags.bits() as i32)?;
-    real("noise", &|g| g.noise)?;
-    real("flux", &|g| g.flux)?;
-    real("radius", &|g| g.radius)?;
-    real("size", &|g| g.size)?;
-    whole("iterations", &|g| {
-        g.descent.map_or(0, |d| d.iterations as i32)
-    })?;
-    // −1 where the network did not run, as in the catalogues of the command line.
-    whole("stop", &|g| g.descent.map_or(-1, |d| d.stop.code() as i32))?;
-    whole("updated", &|g| g.descent.map_or(0, |d| d.updated as i32))?;
-    real("first_energy", &|g| {
-        g.descent.map_or(f64::NAN, |d| d.first_energy)
-    })?;
-    real("energy", &|g| g.descent.map_or(f64::NAN, |d| d.energy))?;
+    for (name, value) in COLUMNS {
+        match value {
+            Value::Real(of) => {
+                let values: Vec<f64> = galaxies.iter().map(of).collect();
+                columns.set_item(name, values.into_pyarray(py))?;
+            }
+            Value::Whole(of) => {
+                let values: Vec<i32> = galaxies.iter().map(of).collect();
+                columns.set_item(name, values.into_pyarray(py))?;
+            }
+        }
+    }
     Ok(columns)
+}
+
+/// The mean shear: g1 and g2, their covariance, the mean responses, and the number of galaxies.
+type Mean = ([f64; 2], [[f64; 2]; 2], [f64; 2], usize);
+
+/// The mean shear of galaxies without flags from columns e1, e2, R11, R22 and weights of one length.
+#[pyfunction]
+pub(crate) fn mean_shear(
+    e1: PyReadonlyArray1<'_, f64>,
+    e2: PyReadonlyArray1<'_, f64>,
+    r11: PyReadonlyArray1<'_, f64>,
+    r22: PyReadonlyArray1<'_, f64>,
+    weights: PyReadonlyArray1<'_, f64>,
+) -> PyResult<Mean> {
+    let mut sum = ShearSum::default();
+    let e = e1.as_slice()?.iter().zip(e2.as_slice()?);
+    let responses = r11.as_slice()?.iter().zip(r22.as_slice()?);
+    for (((&e1, &e2), (&r11, &r22)), &weight) in e.zip(responses).zip(weights.as_slice()?) {
+        sum.add([e1, e2], [r11, r22], weight);
+    }
+    let MeanShear {
+        shear,
+        covariance,
+        response,
+        galaxies,
+        ..
+    } = sum.mean().map_err(|error| {
+        let argument = match error {
+            MeanShearError::Response { component, .. } => format!("R{component}{component}"),
+            _ => "weights".into(),
+        };
+        PyValueError::new_err(format!("{argument}: {error}"))
+    })?;
+    Ok((shear, covariance, response, galaxies))
 }
 
 /// Names, bits and meanings of the flags.

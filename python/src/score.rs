@@ -6,7 +6,8 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_results::views::diagnosis;
+use shearq_results::views::metrics::FORMATS;
+use shearq_results::views::{diagnosis, rows};
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
 use shearq_scoring::{
@@ -19,7 +20,10 @@ use crate::errors::of_scoring;
 /// Names, headings and meanings of the metrics.
 #[pyfunction]
 pub(crate) fn metrics() -> Vec<(&'static str, &'static str, &'static str)> {
-    Metrics::ALL.map(|f| (f.name, f.label, f.meaning)).into()
+    let metrics = Metrics::ALL.iter().zip(FORMATS);
+    metrics
+        .map(|(metric, format)| (metric.name, format.label, metric.meaning))
+        .collect()
 }
 
 /// A grid of `n` cells a side.
@@ -111,7 +115,7 @@ impl<'a> Rows<'a> {
                 }),
             );
             faults.add(&sum);
-            images.add(&sum);
+            images.add(&sum).map_err(of_scoring)?;
             start += length;
         }
         Ok((images, counts, faults))
@@ -143,7 +147,7 @@ pub(crate) fn score<'py>(
         choice: choice(convention)?,
     };
     let (g1, g2) = (truth.0.as_array(), truth.1.as_array());
-    let rows = Rows::new(&e, positions.as_ref(), lengths);
+    let catalogue = Rows::new(&e, positions.as_ref(), lengths);
     let (scored, mut warnings) = py.detach(|| {
         let truth = g1.iter().zip(&g2).take(grid.cells() + 1).enumerate();
         let truth = truth.map(|(k, (&e1, &e2))| {
@@ -155,18 +159,18 @@ pub(crate) fn score<'py>(
             false => TruthSign::Standard,
         };
         let truth = TrueShear::from_rows(&grid, sign, truth).map_err(of_scoring)?;
-        let (images, counts, faults) = rows.sum(&grid)?;
+        let (images, counts, faults) = catalogue.sum(&grid)?;
         if counts.used == 0 {
             return Err(PyValueError::new_err(format!(
                 "e1, e2: no galaxy has an ellipticity on the grid ({} are not finite, {} lie outside); expected numbers",
                 counts.not_finite, counts.outside
             )));
         }
-        if let Some(fault) = counts.fault(&grid) {
+        if let Some(fault) = rows::fault(&counts, &grid) {
             return Err(PyValueError::new_err(format!("e1, e2: {fault}")));
         }
-        let mut warnings = counts.oddities("e1, e2");
-        if sign_by_modes(&grid, &truth) == Some(TruthSign::Challenge) {
+        let mut warnings = rows::oddities(&counts, "e1, e2");
+        if sign_by_modes(&grid, &truth).map_err(of_scoring)? == Some(TruthSign::Challenge) {
             let other = if challenge_sign { "standard" } else { "challenge" };
             warnings.push(format!(
                 "warning: truth_g2 seems to have the other sign: with it the shear is an E-mode field. Try: truth_sign=\"{other}\""
@@ -176,7 +180,8 @@ pub(crate) fn score<'py>(
         warnings.extend(odd.map(|line| format!("warning: {line}.")));
         let scorer = SetScorer::new(grid, truth, options).map_err(of_scoring)?;
         let scored = scorer.score(&images).map_err(of_scoring)?;
-        for fault in scorer.diagnose(&images, &scored, scored.chosen) {
+        let faults_of_set = scorer.diagnose(&images, &scored, scored.chosen);
+        for fault in faults_of_set.map_err(of_scoring)? {
             let told = match fault {
                 // The Python package words it.
                 Fault::Convention { .. } => true,
@@ -277,8 +282,10 @@ pub(crate) fn spectrum<'py>(
         let total = images.total();
         let scale = 1.0 / total.images.max(1) as f64;
         let standard = Convention::STANDARD;
-        let field = standard.apply(&(&total.e1 * scale), &(&total.e2 * scale));
-        let modes = Decomposer::new(grid).decompose(field);
+        let field = standard
+            .apply(&(&total.e1 * scale), &(&total.e2 * scale))
+            .map_err(of_scoring)?;
+        let modes = Decomposer::new(grid).decompose(field).map_err(of_scoring)?;
         PyResult::Ok((Bins::new(&grid, definition), modes))
     })?;
     let found = bins(py, &all)?;
@@ -287,7 +294,8 @@ pub(crate) fn spectrum<'py>(
         ("bb", &modes.b, &modes.b),
         ("eb", &modes.e, &modes.b),
     ] {
-        found.set_item(name, all.power(a, b).to_pyarray(py))?;
+        let power = all.power(a, b).map_err(of_scoring)?;
+        found.set_item(name, power.to_pyarray(py))?;
     }
     Ok(found)
 }

@@ -135,7 +135,7 @@ WRONG = [
     (dict(e2=np.zeros((16, 15))), r"e2: found an array of shape \(16, 15\); expected \(16, 16\), as e1 has"),
     (dict(truth_g2=np.zeros(9)), "truth_g2: found 9 values; expected 256, as truth_g1 has"),
     (dict(truth_g1=np.zeros(10), truth_g2=np.zeros(10)), "truth_g1: found 10 values; expected those of a square"),
-    ({name: np.zeros((2, 2)) for name in ("e1", "e2", "truth_g1", "truth_g2")}, "the grid has 2 cells a side; expected 8 to"),
+    ({name: np.zeros((2, 2)) for name in ("e1", "e2", "truth_g1", "truth_g2")}, "the grid has 2 cells per side; expected 8 to"),
     (dict(truth_g1=FIELD + np.nan), r"the true shear of cell \(1, 1\) is not a finite number"),
     (dict(e1=np.zeros((3, 5)), e2=np.zeros((3, 5))), r"e1: found an array of shape \(3, 5\); expected \(16, 16\)"),
     (dict(images=3), "images: found 3; expected a divisor of the 256 values"),

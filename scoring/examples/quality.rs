@@ -1,12 +1,12 @@
 //! Q of arrays of ellipticities against the true shear.
-#![expect(clippy::print_stdout, reason = "an example shows what it finds")]
+#![expect(clippy::print_stdout, reason = "an example prints its results")]
 
 use ndarray::Array2;
 use shearq_scoring::{Choice, Convention, Grid, Options, SetImages, SetScorer, TrueShear};
 
 fn main() -> Result<(), shearq_scoring::ScoringError> {
     let grid = Grid::great10(24)?; // 24 × 24 galaxies on 10 degrees, index [ix, iy]
-    // Stand-ins for yours: a truth of one wave, and two images that follow it with m = 0.01.
+    // Replace these with your arrays: a true shear of one wave, and two images with m = 0.01.
     let g1 = Array2::from_shape_fn((24, 24), |(ix, _)| 0.02 * (ix as f64 * 0.785).cos());
     let (e1, zeros) = (1.01 * &g1, Array2::zeros((24, 24)));
 

@@ -1,5 +1,5 @@
 //! E- and B-mode bandpowers of a field of ellipticities.
-#![expect(clippy::print_stdout, reason = "an example shows what it finds")]
+#![expect(clippy::print_stdout, reason = "an example prints its results")]
 
 use ndarray::Array2;
 use shearq_scoring::modes::Decomposer;
@@ -10,11 +10,11 @@ fn main() -> Result<(), shearq_scoring::ScoringError> {
     let e1 = Array2::from_shape_fn((24, 24), |(ix, _)| 0.02 * (ix as f64 * 0.785).cos());
     let e2 = Array2::zeros((24, 24));
 
-    let modes = Decomposer::new(grid).decompose(Convention::STANDARD.apply(&e1, &e2));
+    let modes = Decomposer::new(grid).decompose(Convention::STANDARD.apply(&e1, &e2)?)?;
     let bins = Bins::new(&grid, Definition::Corrected);
     let (ee, bb) = (
-        bins.power(&modes.e, &modes.e),
-        bins.power(&modes.b, &modes.b),
+        bins.power(&modes.e, &modes.e)?,
+        bins.power(&modes.b, &modes.b)?,
     );
     for b in SCORED {
         println!(

@@ -1,10 +1,10 @@
 //! Linear ℓ bins and bandpowers, by two definitions.
 //!
-//! * [`Definition::Leaderboard`]: the arithmetic of the original scoring, bit of odd behaviour by bit.
-//!   The power of a bin is the sum of |E|²·|ℓ| over its modes divided by the bin's width, and the
-//!   bin's multipole is that of the mode visited last.
-//! * [`Definition::Corrected`]: true azimuthal averages over fixed bins, centres and widths from the
-//!   bins' edges alone.
+//! * [`Definition::Leaderboard`]: the arithmetic of the original scoring, with its peculiarities. The power
+//!   of a bin is the sum of |E|²·|ℓ| over its modes, divided by the bin width. The multipole of a bin is |ℓ| of
+//!   its last mode.
+//! * [`Definition::Corrected`]: azimuthal averages over fixed bins. Centres and widths depend on the edges of
+//!   the bins only.
 //!
 //! Both have 20 bins of width Δ = (ℓ_max − ℓ_min)/19; bins 2 to 9 (1-based) are scored.
 
@@ -14,21 +14,22 @@ use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 use shearq_fourier::Complex64;
 
-use crate::grid::Grid;
+use crate::error::ScoringError;
+use crate::grid::{Grid, check_shape};
 
 /// Number of bins between ℓ_min and ℓ_max.
 pub const BINS: usize = 20;
-/// The bins that count, 0-based: the challenge's bins 2 to 9.
+/// The scored bins, 0-based: the challenge's bins 2 to 9.
 pub const SCORED: Range<usize> = 1..9;
 
 /// How bandpowers and the quality factor are defined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Definition {
-    /// As the challenge's own program computes it.
+    /// As in the challenge's program.
     #[default]
     Leaderboard,
-    /// True azimuthal averages, fixed bins, cells weighted by the images that fill them.
+    /// Azimuthal averages over fixed bins; cells are weighted by the number of images with a galaxy there.
     Corrected,
 }
 
@@ -39,11 +40,11 @@ pub struct Bins {
     pub definition: Definition,
     /// Bin width Δ in multipole.
     pub width: f64,
-    /// Multipole of each bin: of the last mode visited (leaderboard), or the mean over the bin's
-    /// modes (corrected). Zero for a bin without modes.
+    /// Multipole of each bin: |ℓ| of its last mode (leaderboard), or the mean over its modes
+    /// (corrected). Zero for a bin without modes.
     pub l: [f64; BINS],
     /// Δ ln ℓ of each bin: between the `l` of this bin and the next (leaderboard), or between the
-    /// bin's edges (corrected). Zero where it cannot be had.
+    /// bin's edges (corrected). Zero if one of the two bins has no modes.
     pub dln_l: [f64; BINS],
     /// Modes in each bin; a mode and its opposite are both counted.
     pub modes: [usize; BINS],
@@ -55,7 +56,6 @@ pub struct Bins {
     modulus: Array2<f64>,
     /// From bandpower to C_ℓ in steradian.
     to_c_l: [f64; BINS],
-    /// What the modes are of.
     grid: Grid,
 }
 
@@ -77,7 +77,7 @@ impl Bins {
             grid: *grid,
         };
         let mut sum_l2 = [0.0; BINS];
-        // The order matters to the leaderboard definition: centred, first index outermost.
+        // The leaderboard definition depends on this order: centred, first index outermost.
         for i in 0..grid.n {
             for j in 0..grid.n {
                 let modulus = grid.wave(i).hypot(grid.wave(j));
@@ -93,8 +93,8 @@ impl Bins {
                     }
                     Definition::Corrected => {
                         let zero_mode = grid.frequency(i) == 0 && grid.frequency(j) == 0;
-                        // Nyquist rows of an even grid have no opposite: E and B cannot be told
-                        // apart there.
+                        // Nyquist rows of an even grid have no opposite frequency. E and B are
+                        // ambiguous there.
                         let nyquist = grid.n.is_multiple_of(2) && (i == 0 || j == 0);
                         if zero_mode || nyquist {
                             continue;
@@ -162,9 +162,23 @@ impl Bins {
     ///
     /// Leaderboard: P_b = Σ Re(a b*)|ℓ| / (n⁴Δ). Corrected: P_b = ⟨ℓ² Re(a b*)⟩ L²/(2πn⁴), the mean
     /// over the bin's modes.
-    pub fn power(&self, a: &Array2<Complex64>, b: &Array2<Complex64>) -> [f64; BINS] {
+    ///
+    /// # Errors
+    /// If the shape of `a` or `b` differs from the grid.
+    pub fn power(
+        &self,
+        a: &Array2<Complex64>,
+        b: &Array2<Complex64>,
+    ) -> Result<[f64; BINS], ScoringError> {
+        check_shape("the first set of modes", a, self.grid.n)?;
+        check_shape("the second set of modes", b, self.grid.n)?;
+        Ok(self.power_of(a, b))
+    }
+
+    /// [`Bins::power`] without the check.
+    pub(crate) fn power_of(&self, a: &Array2<Complex64>, b: &Array2<Complex64>) -> [f64; BINS] {
         let mut sums = [0.0; BINS];
-        // Sums run in the order in which the original visits the modes.
+        // The order of the original, so that sums round alike.
         for i in 0..self.grid.n {
             for j in 0..self.grid.n {
                 let at = (self.grid.fft_index(i), self.grid.fft_index(j));
@@ -190,7 +204,7 @@ impl Bins {
         })
     }
 
-    /// Bandpowers of white noise with variance `variance` per component and cell: the E (or B) part.
+    /// E-mode (or B-mode) bandpowers of white noise with `variance` per component and cell.
     pub fn white_noise(&self, variance: f64) -> [f64; BINS] {
         // |FFT|² of n² independent cells is n²·variance, so |FFT|²/n⁴ is variance/n².
         let per_mode = variance / self.grid.cells() as f64;
@@ -205,7 +219,7 @@ impl Bins {
         })
     }
 
-    /// Calls with every scored mode (in FFT order), its bin, and its weight w in P_b = Σ w·Re(a b*).
+    /// Calls `call` with every scored mode (index in FFT order), its bin and its weight w in P_b = Σ w·Re(a b*).
     pub(crate) fn each_scored(&self, mut call: impl FnMut((usize, usize), usize, f64)) {
         let n4 = (self.grid.n as f64).powi(4);
         for (at, &bin) in self.bin_of.indexed_iter() {
@@ -224,8 +238,8 @@ impl Bins {
         }
     }
 
-    /// Variance, relative to its square, of the scored power of one field of white noise, opposite modes being
-    /// conjugates: 2 Σw²/(Σw)².
+    /// Relative variance of the scored power of one field of white noise: 2 Σw²/(Σw)². Opposite modes are
+    /// conjugates, hence the 2.
     pub(crate) fn variance_of_white_power(&self) -> f64 {
         let (mut sum, mut squares) = (0.0, 0.0);
         self.each_scored(|_, _, w| {

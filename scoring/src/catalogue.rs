@@ -1,4 +1,4 @@
-//! Ellipticities of a set's images summed onto the grid.
+//! Ellipticities of the images of a set, summed on the grid.
 
 use ndarray::Array2;
 use serde::Serialize;
@@ -8,8 +8,7 @@ use crate::grid::Grid;
 
 /// One row of an ellipticity catalogue: FITS pixel position (1-based) and two components.
 ///
-/// The type of the ellipticity (shear-type or distortion) is the submission's choice: the original
-/// scoring takes the numbers as they are.
+/// The scoring does not convert between shear-type ellipticity and distortion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Row {
     /// Column position, FITS pixels.
@@ -22,37 +21,34 @@ pub struct Row {
     pub e2: f64,
 }
 
-/// An ellipticity larger than this is far from any ellipse's.
-const ABSURD: f64 = 5.0;
-/// Where one row in so many is, they are another quantity.
+/// If more than one row in so many is absurd, the column is probably another quantity.
 const TOO_MANY: usize = 20;
 
-/// How the rows of one catalogue, or of several, were used, and what is odd about them.
+/// How the rows of one or several catalogues were used, and how many are odd.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct RowCounts {
     /// Rows added to a cell.
     pub used: usize,
     /// Rows whose position is outside the grid.
     pub outside: usize,
-    /// Rows after the first n², which the original does not read.
+    /// Rows after the first n², which are not read.
     pub excess: usize,
-    /// Rows with an ellipticity that is not a finite number; counted as missing.
+    /// Rows whose ellipticity is not finite; these galaxies count as missing.
     pub not_finite: usize,
-    /// Rows added to a cell that had one of the same image.
+    /// Rows added to a cell that already has a row of this image.
     pub repeated: usize,
     /// Cells of the images without any row.
     pub missing: usize,
-    /// Rows used with |e| > 1, which no ellipse has.
+    /// Rows used with |e| > 1, which is impossible for an ellipse.
     pub above_one: usize,
-    /// Of these, rows with |e| > 5.
+    /// Rows with |e| > [`RowCounts::ABSURD`].
     pub absurd: usize,
-    /// The first of those: its place, counted from 1, and its ellipticity.
-    pub first_absurd: Option<(usize, f64, f64)>,
-    /// Of these, rows with a whole number beyond 5 in a component, as -99: a value that stands for "not
-    /// measured".
+    /// The first of the absurd rows.
+    pub first_absurd: Option<OddRow>,
+    /// Absurd rows with a whole number in an absurd component, such as -99 for "not measured".
     pub sentinels: usize,
-    /// The first of those.
-    pub first_sentinel: Option<(usize, f64, f64)>,
+    /// The first of the rows with such a number.
+    pub first_sentinel: Option<OddRow>,
 }
 
 impl std::ops::AddAssign for RowCounts {
@@ -71,80 +67,61 @@ impl std::ops::AddAssign for RowCounts {
     }
 }
 
-impl RowCounts {
-    /// Why these rows of another program should not be scored as they are, if so.
-    pub fn fault(&self, grid: &Grid) -> Option<String> {
-        if let Some((row, e1, e2)) = self.first_sentinel {
-            return Some(format!(
-                "{} rows have a whole number as ellipticity, the first of them row {row} with ({e1}, {e2}): if it stands for \"not measured\", name it as missing; otherwise set a largest |e|",
-                self.sentinels
-            ));
-        }
-        if let Some((row, e1, e2)) = self.first_absurd
-            && TOO_MANY * self.absurd > self.used
-        {
-            return Some(format!(
-                "{} of {} rows have |e| > {ABSURD}, the first of them row {row} with ({e1}, {e2}); expected ellipticities, below 1. If these are outliers, set a largest |e|",
-                self.absurd, self.used
-            ));
-        }
-        (2 * self.repeated > self.used).then(|| {
-            format!(
-                "{} of {} rows fall into cells that have a row already; expected positions in pixels, of {} px stamps on a {3} × {3} grid",
-                self.repeated, self.used, grid.stamp.0, grid.n
-            )
-        })
-    }
-
-    /// What is odd, a line each, of the catalogues of `whose`: what, how much, and what was done with it.
-    pub fn oddities(&self, whose: &str) -> Vec<String> {
-        let mut lines = Vec::new();
-        if self.outside + self.excess > 0 {
-            lines.push(format!(
-                "warning: {whose} has {} outside the grid and {} beyond the number of cells; they do not count.",
-                rows(self.outside),
-                self.excess
-            ));
-        }
-        if self.repeated > 0 {
-            lines.push(format!(
-                "warning: {} of {whose} of galaxies that have one already; they add up.",
-                rows(self.repeated)
-            ));
-        }
-        if self.missing > 0 {
-            lines.push(format!(
-                "warning: {} of {} galaxies of {whose} are not in the catalogues; each counts as zero.",
-                self.missing,
-                self.missing + self.used + self.not_finite - self.repeated
-            ));
-        }
-        if self.above_one > 0 {
-            lines.push(format!(
-                "warning: {} of {whose} with |e| > 1, {} with |e| > {ABSURD}; scored as they are.",
-                rows(self.above_one),
-                self.absurd
-            ));
-        }
-        if self.not_finite > 0 {
-            lines.push(format!(
-                "note: {} of {} galaxies of {whose} have no ellipticity and count as missing.",
-                self.not_finite,
-                self.not_finite + self.used
-            ));
-        }
-        lines
-    }
+/// Why the rows of a catalogue are probably not ellipticities on the grid.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum RowFault {
+    /// Whole numbers with modulus above [`RowCounts::ABSURD`]: they probably mean "not measured".
+    Sentinels {
+        /// Rows with such a number.
+        rows: usize,
+        /// The first of them.
+        first: OddRow,
+    },
+    /// More than one row in twenty has |e| > [`RowCounts::ABSURD`].
+    Absurd {
+        /// Rows with such an ellipticity.
+        rows: usize,
+        /// Rows used.
+        used: usize,
+        /// The first of them.
+        first: OddRow,
+    },
+    /// More than half of the rows fall into a cell that already has one.
+    Repeated {
+        /// Repeated rows.
+        rows: usize,
+        /// Rows used.
+        used: usize,
+    },
 }
 
-/// So many rows.
-fn rows(count: usize) -> String {
-    format!("{count} row{}", if count == 1 { "" } else { "s" })
+/// A row with an odd ellipticity: its number, counted from 1, e₁ and e₂.
+pub type OddRow = (usize, f64, f64);
+
+impl RowCounts {
+    /// |e| above which an ellipticity is absurd.
+    pub const ABSURD: f64 = 5.0;
+
+    /// The reason not to score these rows as they are, if there is one.
+    pub fn fault(&self) -> Option<RowFault> {
+        let (rows, used) = (self.sentinels, self.used);
+        if let Some(first) = self.first_sentinel {
+            return Some(RowFault::Sentinels { rows, first });
+        }
+        let rows = self.absurd;
+        if let Some(first) = self.first_absurd
+            && TOO_MANY * rows > used
+        {
+            return Some(RowFault::Absurd { rows, used, first });
+        }
+        let rows = self.repeated;
+        (2 * rows > used).then_some(RowFault::Repeated { rows, used })
+    }
 }
 
 /// Sums over images of ellipticities and of counts, on cells `[ix, iy]`.
 ///
-/// Memory is that of three grids however many images are added.
+/// The memory does not depend on the number of images: three grids.
 #[derive(Debug, Clone)]
 pub struct FieldSum {
     /// Σ e₁.
@@ -170,8 +147,10 @@ impl FieldSum {
     }
 
     /// Adds one image's catalogue as the original does: rows after the first n² are ignored, rows
-    /// outside the grid skipped, duplicates add up, missing cells stay as they are. Rows that are
-    /// not finite numbers count as missing.
+    /// outside the grid are skipped, and repeated rows add up. Rows that are not finite count as missing.
+    ///
+    /// # Panics
+    /// If `grid` is larger than the grid of this sum.
     pub fn add_image(&mut self, grid: &Grid, rows: impl IntoIterator<Item = Row>) -> RowCounts {
         let mut counts = RowCounts::default();
         let mut seen = Array2::from_elem((grid.n, grid.n), false);
@@ -197,11 +176,11 @@ impl FieldSum {
             counts.repeated += usize::from(repeated);
             let square = row.e1 * row.e1 + row.e2 * row.e2;
             counts.above_one += usize::from(square > 1.0);
-            if square > ABSURD * ABSURD {
+            if square > RowCounts::ABSURD * RowCounts::ABSURD {
                 counts.absurd += 1;
                 let found = (place + 1, row.e1, row.e2);
                 counts.first_absurd.get_or_insert(found);
-                let whole = |e: f64| e.abs() > ABSURD && e.fract() == 0.0;
+                let whole = |e: f64| e.abs() > RowCounts::ABSURD && e.fract() == 0.0;
                 if whole(row.e1) || whole(row.e2) {
                     counts.sentinels += 1;
                     counts.first_sentinel.get_or_insert(found);
@@ -212,8 +191,8 @@ impl FieldSum {
         counts
     }
 
-    /// Adds all of `other`.
-    pub fn merge(&mut self, other: &FieldSum) {
+    /// Adds all of `other`, a sum on the same grid.
+    pub(crate) fn merge(&mut self, other: &FieldSum) {
         self.e1 += &other.e1;
         self.e2 += &other.e2;
         self.count += &other.count;
@@ -221,7 +200,7 @@ impl FieldSum {
     }
 
     /// `self` without `part`, which must be one of the sums merged into it.
-    pub fn without(&self, part: &FieldSum) -> FieldSum {
+    pub(crate) fn without(&self, part: &FieldSum) -> FieldSum {
         FieldSum {
             e1: &self.e1 - &part.e1,
             e2: &self.e2 - &part.e2,
@@ -240,21 +219,21 @@ pub struct TrueShear {
     pub g2: Array2<f64>,
 }
 
-/// Which sign of g₂ a truth file holds.
+/// Sign of g₂ in a truth file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TruthSign {
-    /// The challenge's files: minus the standard g₂.
+    /// As in the files of the challenge: minus the standard g₂.
     Challenge,
     /// g₂ positive along x = y.
     Standard,
 }
 
-/// True shears closer together than this are the same.
+/// Largest difference of true shears that count as equal.
 const SAME_SHEAR: f64 = 1e-10;
 
 impl TrueShear {
-    /// The shear, where it is the same in all cells: then there is no power beyond the zero mode.
+    /// The shear, if it is the same in all cells. Then only the zero mode has power.
     pub fn constant(&self) -> Option<[f64; 2]> {
         let value = |g: &Array2<f64>| {
             let first = *g.first()?;
@@ -333,5 +312,35 @@ impl TrueShear {
             });
         }
         Ok(truth)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_of_images_add_and_come_apart_again() {
+        let grid = Grid::great10(8).unwrap();
+        let image = |k: usize| {
+            let mut sum = FieldSum::new(&grid);
+            // Multiples of 1/64, so that sums are exact.
+            let rows = (0..60).map(|cell| {
+                let (x, y) = grid.centre(cell % 8, cell / 8);
+                let e1 = ((cell * (k + 3)) % 17) as f64 / 64.0;
+                Row { x, y, e1, e2: -e1 }
+            });
+            sum.add_image(&grid, rows);
+            sum
+        };
+        let images = [image(0), image(1), image(2)];
+        let mut all = FieldSum::new(&grid);
+        images.iter().for_each(|image| all.merge(image));
+        assert_eq!((all.images, all.count.sum()), (3, 180.0));
+        let rest = all.without(&images[1]);
+        assert_eq!(rest.images, 2);
+        assert_eq!(rest.e1, &images[0].e1 + &images[2].e1);
+        assert_eq!(rest.e2, &images[0].e2 + &images[2].e2);
+        assert_eq!(rest.count, &images[0].count + &images[2].count);
     }
 }

@@ -1,22 +1,23 @@
-//! The eight sign and axis conventions that the original scoring tries on every submission.
+//! The eight sign and axis conventions that the original scoring tries on every catalogue.
 
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 use shearq_fourier::Complex64;
 
 use crate::error::ScoringError;
+use crate::grid::check_shape;
 
 /// One of the eight conventions, numbered 1 to 8 as in the original.
 ///
-/// A submission's cell value is s₁·e₁ + i·s₂·e₂ with (s₁, s₂) = (+,+), (+,−), (−,−), (−,+) for
+/// The value of a cell is s₁·e₁ + i·s₂·e₂ with (s₁, s₂) = (+,+), (+,−), (−,−), (−,+) for
 /// 1 to 4 and again for 5 to 8. Conventions 1 to 4 index the field `[iy, ix]`, 5 to 8 `[ix, iy]`.
 ///
-/// Convention 5 is the standard one of this project: e₁ along +x, e₂ along x = y.
+/// Convention 5 is the standard one: e₁ > 0 along +x, e₂ > 0 along x = y.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "u8", into = "u8")]
 pub struct Convention(u8);
 
-/// The two kinds of E-mode spectrum that the eight conventions can give.
+/// The two classes of conventions. All conventions of a class give the same E-mode spectrum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum ConventionClass {
     /// Conventions 1, 3, 6, 8.
@@ -29,7 +30,7 @@ impl ConventionClass {
     /// Both, in order.
     pub const BOTH: [ConventionClass; 2] = [ConventionClass::A, ConventionClass::B];
 
-    /// Place in [`ConventionClass::BOTH`].
+    /// Index in [`ConventionClass::BOTH`].
     pub fn index(self) -> usize {
         match self {
             ConventionClass::A => 0,
@@ -37,7 +38,7 @@ impl ConventionClass {
         }
     }
 
-    /// The member that does not swap x and y, and leaves e1 as it is.
+    /// The convention of this class that neither swaps x and y nor flips e1.
     pub fn representative(self) -> Convention {
         match self {
             ConventionClass::A => Convention(6),
@@ -66,7 +67,7 @@ impl Convention {
         self.0
     }
 
-    /// Place 0 to 7 in [`Convention::ALL`].
+    /// Index 0 to 7 in [`Convention::ALL`].
     pub fn index(self) -> usize {
         usize::from(self.0) - 1
     }
@@ -86,7 +87,7 @@ impl Convention {
         self.0 <= 4
     }
 
-    /// Which of the two spectra it gives.
+    /// The class of this convention.
     pub fn class(self) -> ConventionClass {
         match self.0 {
             1 | 3 | 6 | 8 => ConventionClass::A,
@@ -94,7 +95,7 @@ impl Convention {
         }
     }
 
-    /// What it means in words.
+    /// The convention in words.
     pub fn describe(self) -> &'static str {
         match self.0 {
             1 => "x and y swapped",
@@ -117,7 +118,21 @@ impl Convention {
     }
 
     /// The complex field of this convention from means of e₁ and e₂ on `[ix, iy]`.
-    pub fn apply(self, e1: &Array2<f64>, e2: &Array2<f64>) -> Array2<Complex64> {
+    ///
+    /// # Errors
+    /// If the two arrays differ in shape or are not square.
+    pub fn apply(
+        self,
+        e1: &Array2<f64>,
+        e2: &Array2<f64>,
+    ) -> Result<Array2<Complex64>, ScoringError> {
+        check_shape("e1", e1, e1.nrows())?;
+        check_shape("e2", e2, e1.nrows())?;
+        Ok(self.field(e1, e2))
+    }
+
+    /// [`Convention::apply`] without the check.
+    pub(crate) fn field(self, e1: &Array2<f64>, e2: &Array2<f64>) -> Array2<Complex64> {
         let (s1, s2) = self.signs();
         Array2::from_shape_fn(e1.dim(), |(i, j)| {
             let cell = if self.transposes() { (j, i) } else { (i, j) };

@@ -1,30 +1,30 @@
 //! The shear's E-mode spectrum from cross-spectra between groups of images.
 //!
-//! All images of a set have the same shear and noise of their own. The mean product of two groups'
-//! modes is the shear's power, without a mean of noise; the product of a group with itself is not used.
-//! Intrinsic ellipticities are B modes. Where they are the same in all images, what a measurement turns of
-//! them into E modes is common to all groups, and stays. With E_g the modes of the mean field of group g
-//! and w_g its weight,
+//! All images of a set have the same shear and independent noise. The mean product of the modes of two groups
+//! is the power of the shear. Noise adds nothing to this mean, because a group is never multiplied by itself.
+//! Intrinsic ellipticities are B modes. If all images have the same intrinsic ellipticities, the E modes that a
+//! measurement makes of them remain in the spectrum. With E_g the modes of the mean field of group g and w_g its
+//! weight,
 //!
 //! ```text
 //! P = Σ_{g<h} w_g w_h P_gh / Σ_{g<h} w_g w_h,    P_gh = bandpowers of Re(E_g E_h*).
 //! ```
 //!
-//! Groups have the inverse of their noise's variance as weight. Galaxies of one group have equal weights:
-//! intrinsic ellipticities are B modes alone, and uneven weights would turn half of them into E modes.
+//! The weight of a group is the inverse of its noise variance. Galaxies of one group have equal weights:
+//! uneven weights would turn half of the intrinsic B modes into E modes.
 //!
 //! # Covariance
 //!
-//! Pairs that have a group in common go together: the shear meets that group's noise in both. With
-//! r_gh = P_gh − P, c_gh the weight of a pair (of sum one) and G groups,
+//! Pairs with a common group are correlated: the shear is multiplied by the noise of this group in both. With
+//! r_gh = P_gh − P, c_gh the weight of a pair (their sum is one) and G groups,
 //!
 //! ```text
 //! cov = G(G − 1)/((G − 2)(G − 3)) · [Σ_g u_g u_gᵀ − Σ_{g<h} c_gh² r_gh r_ghᵀ],    u_g = Σ_h c_gh r_gh
 //! ```
 //!
-//! is the sum over all pairs of pairs with a common group, each once; for equal weights the factor makes
-//! its mean that of the covariance, whether shear and noise or noise and noise prevail. (A jackknife over
-//! groups would give twice the variance where noise prevails.)
+//! is the sum over all pairs of pairs with a common group, each once. For equal weights the factor makes the
+//! estimate unbiased, both if shear × noise dominates and if noise × noise does. (A jackknife over groups would
+//! give twice the variance if noise × noise dominates.)
 
 use ndarray::{Array2, Zip};
 use shearq_fourier::Complex64;
@@ -33,15 +33,16 @@ use crate::bandpower::{BINS, Bins, Definition, SCORED};
 use crate::catalogue::FieldSum;
 use crate::convention::Convention;
 use crate::error::ScoringError;
-use crate::grid::Grid;
+use crate::grid::{Grid, check_shape};
+use crate::images::SetImages;
 use crate::modes::Decomposer;
-use crate::score::SetImages;
 
-/// Fewest groups whose pairs tell a covariance: it is a difference, and of fewer often negative.
+/// Fewest groups for a covariance. It is a difference; with fewer groups it is often negative.
 const MIN_GROUPS: usize = 8;
 
-/// A spectrum from cross-spectra: what a power-spectrum submission holds, and how well it is known.
+/// A spectrum from cross-spectra, with its covariance.
 #[derive(Debug, Clone)]
+#[non_exhaustive]
 pub struct CrossSpectrum {
     /// The bins, in the leaderboard's definition.
     pub bins: Bins,
@@ -55,34 +56,35 @@ pub struct CrossSpectrum {
 
 /// The spectrum from all pairs of groups of images. No truth is needed.
 ///
-/// A cell's mean is that of the galaxies measured there; one that no image of a group has is zero.
+/// The value of a cell is the mean over the galaxies measured there, or zero if there is none.
 ///
 /// # Errors
-/// With fewer than two images.
+/// If there are fewer than two images, or if their grid is another one.
 pub fn cross_spectrum(
     grid: &Grid,
     images: &SetImages,
     convention: Convention,
 ) -> Result<CrossSpectrum, ScoringError> {
     if images.groups().len() < 2 {
-        return Err(ScoringError::OneImage);
+        return Err(ScoringError::TooFewImages(images.groups().len()));
     }
+    check_shape("the sum of the images", &images.total().e1, grid.n)?;
     let decomposer = Decomposer::new(*grid);
     let bins = Bins::new(grid, Definition::Leaderboard);
     let modes: Vec<Array2<Complex64>> = images
         .groups()
         .iter()
-        .map(|group| decomposer.decompose(mean_field(group, convention)).e)
+        .map(|group| decomposer.modes_of(mean_field(group, convention)).e)
         .collect();
     let mut pairs = Vec::new();
     for (h, second) in modes.iter().enumerate() {
         for (g, first) in modes[..h].iter().enumerate() {
-            let power = bins.power(first, second);
+            let power = bins.power_of(first, second);
             pairs.push(Pair { g, h, power });
         }
     }
     let counts: Vec<f64> = images.groups().iter().map(|g| g.images as f64).collect();
-    let own: Vec<[f64; BINS]> = modes.iter().map(|m| bins.power(m, m)).collect();
+    let own: Vec<[f64; BINS]> = modes.iter().map(|m| bins.power_of(m, m)).collect();
     let weights = weights(&own, &pairs, counts);
     let power = mean(&pairs, &weights);
     Ok(CrossSpectrum {
@@ -119,11 +121,11 @@ fn mean(pairs: &[Pair], weights: &[f64]) -> [f64; BINS] {
     })
 }
 
-/// Inverse variances of the groups' noise, of sum one.
+/// Inverse noise variances of the groups, normalised to a sum of one.
 ///
-/// The noise of a group is what its own power exceeds the mean of the pairs by, in the modes beyond the
-/// scored bins: a weight from the modes that it is applied to would go with their noise. Where that is
-/// not positive for all groups, numbers of images are the weights.
+/// The noise power of a group is its power minus the mean over pairs, in the modes beyond the scored bins. Weights
+/// from the scored modes would correlate with their noise. If a noise power is not positive, the weights are the
+/// numbers of images.
 fn weights(own: &[[f64; BINS]], pairs: &[Pair], images: Vec<f64>) -> Vec<f64> {
     let beyond = |power: &[f64; BINS]| (SCORED.end..BINS).map(|b| power[b]).sum::<f64>();
     let common = beyond(&mean(pairs, &images));
@@ -137,7 +139,7 @@ fn weights(own: &[[f64; BINS]], pairs: &[Pair], images: Vec<f64>) -> Vec<f64> {
     weights.into_iter().map(|w| w / sum).collect()
 }
 
-/// Covariance of the weighted mean over pairs, see the module's description.
+/// Covariance of the weighted mean over pairs; formula in the module description.
 fn covariance(pairs: &[Pair], weights: &[f64], power: &[f64; BINS]) -> Option<[[f64; BINS]; BINS]> {
     let groups = weights.len() as f64;
     if weights.len() < MIN_GROUPS {
@@ -178,5 +180,5 @@ fn mean_field(sum: &FieldSum, convention: Convention) -> Array2<Complex64> {
             *e = if count > 0.0 { *e / count } else { 0.0 };
         });
     }
-    convention.apply(&e1, &e2)
+    convention.field(&e1, &e2)
 }

@@ -1,5 +1,5 @@
-//! Which fault explains a submission that disagrees with the true shear: order of rows, components, type of
-//! ellipticity, copies. Arithmetic on grids; the caller words the findings.
+//! Probable faults of ellipticities that disagree with the true shear: order of rows, components, type of
+//! ellipticity, copies. The caller words the findings.
 
 use std::collections::HashMap;
 use std::f64::consts::PI;
@@ -11,7 +11,9 @@ use shearq_fourier::Complex64;
 use crate::bandpower::{Bins, SCORED};
 use crate::catalogue::{FieldSum, TrueShear, TruthSign};
 use crate::convention::Convention;
-use crate::grid::Grid;
+use crate::error::ScoringError;
+use crate::grid::{Grid, check_shape};
+use crate::images::SetImages;
 use crate::modes::{Decomposer, Modes};
 use crate::score::{SetScore, SetScorer};
 
@@ -106,12 +108,12 @@ pub struct ImageFaults {
 }
 
 impl ImageFaults {
-    /// Number of images looked at.
+    /// Number of images examined.
     pub fn images(&self) -> usize {
         self.images
     }
 
-    /// Looks at the next image. Images without any galaxy are not compared.
+    /// Examines the next image. Images without any galaxy are not compared.
     pub fn add(&mut self, image: &FieldSum) {
         let place = self.images;
         self.images += 1;
@@ -125,7 +127,7 @@ impl ImageFaults {
         }
         let mut hasher = DefaultHasher::new();
         for values in [&image.e1, &image.e2, &image.count] {
-            // Adding zero makes one zero of both.
+            // Adding zero removes the sign of a negative zero.
             values
                 .iter()
                 .for_each(|v| (v + 0.0).to_bits().hash(&mut hasher));
@@ -150,19 +152,23 @@ impl SetScorer {
     /// Probable faults of the images scored as `score`, most important first. `convention` is the one to
     /// compare others with. At most one finding concerns the order of the ellipticities, and m is examined only if
     /// there is none.
+    ///
+    /// # Errors
+    /// If the shape of the images differs from the grid.
     pub fn diagnose(
         &self,
-        images: &crate::SetImages,
+        images: &SetImages,
         score: &SetScore,
         convention: Convention,
-    ) -> Vec<Fault> {
+    ) -> Result<Vec<Fault>, ScoringError> {
+        self.check_images(images)?;
         let mut findings = Vec::new();
         let rms = self.truth().rms();
         if rms > STRONG_SHEAR {
             findings.push(Fault::StrongTruth { rms });
         }
         if score.constant.is_some() {
-            return findings;
+            return Ok(findings);
         }
         match self.misplaced(images.total(), score, convention) {
             Some(finding) => findings.push(finding),
@@ -171,10 +177,10 @@ impl SetScorer {
             }
             None => {}
         }
-        findings
+        Ok(findings)
     }
 
-    /// What is wrong with the order of a set's rows or components, if anything.
+    /// A fault of the order of rows or components, if there is one.
     fn misplaced(&self, sum: &FieldSum, score: &SetScore, convention: Convention) -> Option<Fault> {
         let correlation = score.conventions[convention.index()].correlation;
         if !correlation.is_finite() {
@@ -220,7 +226,7 @@ impl SetScorer {
         }
         best.map(|(_, finding)| finding).or_else(|| {
             let allowed = allowed(score, convention)?;
-            // Of correlations that chance alone makes, less than this is believed.
+            // A shortfall must exceed the scatter of chance correlations.
             let chance = 2.0 * score.matching.least_clear();
             let shortfall = allowed - correlation.max(0.0);
             (shortfall > SHORTFALL.max(chance)).then_some(Fault::Uncorrelated {
@@ -263,7 +269,7 @@ fn gain(before: f64, after: f64, modes: usize) -> f64 {
     }
 }
 
-/// The correlation with the truth that the measured noise allows, where it is known.
+/// The correlation with the truth that the measured noise allows, if it is known.
 fn allowed(score: &SetScore, convention: Convention) -> Option<f64> {
     let noise = score.noise.as_ref()?;
     if convention.class() != score.chosen.class() {
@@ -293,28 +299,43 @@ impl Fault {
     }
 }
 
-/// The sign of g₂ in a truth, read as `standard`, whose power is E mode in one sign only.
-pub fn sign_by_modes(grid: &Grid, standard: &TrueShear) -> Option<TruthSign> {
+/// The sign of g₂ in a truth that was read as `standard`: the sign in which its power is in E modes. `None` if both
+/// signs have similar shares of B modes.
+///
+/// # Errors
+/// If the shape of the truth differs from the grid.
+pub fn sign_by_modes(grid: &Grid, standard: &TrueShear) -> Result<Option<TruthSign>, ScoringError> {
+    check_shape("g1 of the truth", &standard.g1, grid.n)?;
+    check_shape("g2 of the truth", &standard.g2, grid.n)?;
     let decomposer = Decomposer::new(*grid);
     let bins = Bins::new(grid, crate::Definition::Leaderboard);
     let share = |truth: &TrueShear| {
-        let Modes { e, b } = decomposer.decompose(Convention::STANDARD.apply(&truth.g1, &truth.g2));
+        let Modes { e, b } = decomposer.modes_of(Convention::STANDARD.field(&truth.g1, &truth.g2));
         let (e, b) = (bins.scored_product(&e, &e), bins.scored_product(&b, &b));
         b / (e + b)
     };
     let difference = share(&standard.flipped()) - share(standard);
-    sign_where(difference, SHARES_APART)
+    Ok(sign_where(difference, SHARES_APART))
 }
 
-/// The sign of g₂ in a truth, read as `standard`, with which e₂ of the images correlates clearly.
-pub fn sign_by_correlation(standard: &TrueShear, sum: &FieldSum) -> Option<TruthSign> {
+/// The sign of g₂ in a truth that was read as `standard`: the sign with which e₂ of the images correlates. `None` if
+/// the correlation is not significant.
+///
+/// # Errors
+/// If the shapes of the truth and of the sum differ.
+pub fn sign_by_correlation(
+    standard: &TrueShear,
+    sum: &FieldSum,
+) -> Result<Option<TruthSign>, ScoringError> {
+    check_shape("e2 of the images", &sum.e2, standard.g2.nrows())?;
     let product = |a: &Array2<f64>, b: &Array2<f64>| (a * b).sum();
     let (g, e) = (&standard.g2, &sum.e2);
     let correlation = product(g, e) / (product(g, g) * product(e, e)).sqrt();
-    sign_where(correlation, SIGN_CLEAR / (g.len() as f64).sqrt())
+    let clear = SIGN_CLEAR / (g.len() as f64).sqrt();
+    Ok(sign_where(correlation, clear))
 }
 
-/// The standard sign where `value` is at least `clear`, the challenge's where it is at most its negative.
+/// The standard sign if `value ≥ clear`, the challenge's sign if `value ≤ −clear`.
 fn sign_where(value: f64, clear: f64) -> Option<TruthSign> {
     if value >= clear {
         Some(TruthSign::Standard)

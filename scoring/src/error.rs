@@ -1,14 +1,15 @@
-//! What can be wrong with input to the scoring.
+//! Errors of the scoring.
 
 use thiserror::Error;
 
-/// An input that cannot be scored. The caller adds the file it came from.
-#[derive(Debug, Error, PartialEq)]
+/// Input that cannot be scored. The caller adds the file.
+#[derive(Debug, Clone, Error, PartialEq)]
+#[non_exhaustive]
 pub enum ScoringError {
     /// A grid side out of range.
-    #[error("the grid has {found} cells a side; expected {min} to {max}")]
+    #[error("the grid has {found} cells per side; expected {min} to {max}")]
     GridSide {
-        /// Cells a side found.
+        /// Cells per side.
         found: usize,
         /// Smallest accepted.
         min: usize,
@@ -23,18 +24,18 @@ pub enum ScoringError {
         /// Its value.
         found: f64,
     },
-    /// An array that is not of the grid's shape.
+    /// The shape of an array differs from the grid.
     #[error("{what} has the shape {found:?}; expected ({side}, {side}), index [ix, iy]")]
     Shape {
         /// Which array.
         what: &'static str,
         /// Its shape.
         found: (usize, usize),
-        /// Cells a side of the grid.
+        /// Cells per side of the grid.
         side: usize,
     },
-    /// The side of a field that is out of range.
-    #[error("the field is {found} degrees a side; expected {least} to {most}")]
+    /// The side of the field is out of range.
+    #[error("the field has {found} degrees per side; expected {least} to {most}")]
     Field {
         /// The side in degrees.
         found: f64,
@@ -52,10 +53,10 @@ pub enum ScoringError {
         found: usize,
         /// Cells of the grid.
         expected: usize,
-        /// Cells a side.
+        /// Cells per side.
         side: usize,
     },
-    /// A truth value that is not a number.
+    /// A true shear is not a finite number.
     #[error("the true shear of cell ({ix}, {iy}) is not a finite number")]
     TruthNotFinite {
         /// Column, 1-based.
@@ -63,7 +64,7 @@ pub enum ScoringError {
         /// Row, 1-based.
         iy: usize,
     },
-    /// A truth value that no shear has.
+    /// A true shear is too large for a shear.
     #[error(
         "the true shear of cell ({ix}, {iy}) is |g| = {found:.4}; expected less than 1. Is it in percent, or an angle in degrees?"
     )]
@@ -78,25 +79,28 @@ pub enum ScoringError {
     /// No image was added.
     #[error("no image to score")]
     NoImages,
-    /// Cross-spectra of one image.
-    #[error("there is one image; cross-spectra need two or more")]
-    OneImage,
+    /// A sum that should contain one image contains none or several.
+    #[error("the sum contains {0} images; expected 1")]
+    NotOneImage(usize),
+    /// Too few images for cross-spectra.
+    #[error("cross-spectra need two or more images (found {0})")]
+    TooFewImages(usize),
     /// A negative or non-finite noise variance.
     #[error("the noise variance is {0}; expected a finite number, zero or more")]
     NoiseVariance(f64),
-    /// A convention number that does not exist.
+    /// The number of a convention does not exist.
     #[error("there is no convention {0}; expected 1 to 8")]
     Convention(u8),
     /// A simulated shear that is not weak.
-    #[error("the largest shear is {found:.2}; expected at most {most}: lower the amplitude")]
+    #[error("the largest shear is {found:.2}; expected at most {most}")]
     StrongShear {
         /// Its modulus.
         found: f64,
         /// Largest accepted.
         most: f64,
     },
-    /// A power-spectrum submission with the wrong bins.
-    #[error("a power-spectrum submission has {found} bins; expected the {expected} bins 2 to 9")]
+    /// A power spectrum has the wrong number of bins.
+    #[error("a power spectrum has {found} bins; expected the {expected} bins 2 to 9")]
     SpectrumBins {
         /// Bins found.
         found: usize,

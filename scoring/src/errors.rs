@@ -1,23 +1,23 @@
-//! Standard errors of a set's metrics, from what the truth does not explain of its averaged field.
+//! Standard errors of the metrics of a set, from the part of its averaged field that the truth does not explain.
 //!
-//! A jackknife over images cannot see what all images have in common: intrinsic shapes that are the same in
-//! all of them, and it knows little with few images. The averaged field itself shows both. With the E modes
-//! E, their truth T and m of the cross-correlation, ν = ⟨|E − (1 + m)T|²⟩ in rings of |ℓ| is the power of
-//! all that scatters them, noise or shapes, whatever it comes from; B modes have ⟨|B|²⟩ = ν_B. As Gaussian
-//! noise on a fixed truth, opposite modes being conjugates, with s = (1 + m)T and P_b = Σ w|E|²:
+//! A jackknife over images misses scatter that all images share, such as equal intrinsic shapes, and it is noisy
+//! with few images. The averaged field contains both. With the E modes E, their truth T and m of the
+//! cross-correlation, the scatter power is ν = ⟨|E − (1 + m)T|²⟩ in rings of |ℓ|, from noise and shapes alike.
+//! For B modes it is ν_B = ⟨|B|²⟩. The formulae assume Gaussian scatter on a fixed truth. Opposite modes are
+//! conjugates. With s = (1 + m)T and P_b = Σ w|E|²:
 //!
 //! ```text
-//! var P_b      = Σ 2w²(2|s|²ν + ν²)          bandpowers; ν²·G/(G − 1) once noise is removed that G groups tell
+//! var P_b      = Σ 2w²(2|s|²ν + ν²)          bandpowers; ν²·G/(G − 1) after subtracting noise measured from G groups
 //! var m_cross  = Σ |T|²ν / (Σ|T|²)²
 //! cov(P_b/r², P_c/r²) = δ_bc Σ 2w²(2|T|²ν/r² + ν²/r⁴) + g_b g_c var m − g_b k_c − g_c k_b
 //!                r = 1 + m as measured, g_b = 2P_b/r³, k_b = Σ_b 2w|T|²ν / (r Σ|T|²)
 //! var Σ_x u e₁ = n⁻⁴ Σ |U|²(cos²2φ ν + sin²2φ ν_B)   any sum over cells, U = FFT(u); sin and cos exchanged for e₂
 //! ```
 //!
-//! M, A and the null tests are linear in bandpowers, m₁ to c₂ sums over cells. σ_sys is a sum of moduli: each
-//! term has the scatter of a folded normal number. A mean, which is the zero mode, has the E modes' power
-//! at the lowest multipoles: intrinsic ellipticities, B modes, have no mean. Where the true shear has no modes,
-//! nothing tells the two kinds apart, and that of a mean is the mean of both.
+//! M, A and the null tests are linear in bandpowers; m₁ to c₂ are sums over cells. σ_sys is a sum of moduli: each
+//! term scatters like a folded normal number. A mean is the zero mode. Its scatter power is the power of E modes at
+//! the lowest multipoles, because intrinsic ellipticities are B modes and have no mean. If the true shear has no
+//! modes, E and B are ambiguous, and the mean of both powers is used.
 
 use ndarray::Array2;
 use shearq_fourier::Complex64;
@@ -27,12 +27,12 @@ use crate::grid::Grid;
 use crate::modes::{Decomposer, Modes};
 use crate::quality::bias_weights;
 
-/// Standard errors by which A must differ from zero for that of √A to be the first order's.
+/// Minimum significance (σ) of A for a first-order error of √A.
 const CLEAR_A: f64 = 2.0;
-/// Rings of lowest |ℓ| from which the power of the zero mode is taken.
+/// Number of rings of lowest |ℓ| that determine the power of the zero mode.
 const LOWEST: usize = 4;
 
-/// Power of scattered E and B modes in rings of |ℓ| as wide as the bins, Nyquist rows included.
+/// Scatter power of E and B modes in rings of |ℓ| as wide as the bins, Nyquist rows included.
 pub(crate) struct Scatter {
     ring_of: Array2<u8>,
     e: [f64; BINS],
@@ -42,7 +42,7 @@ pub(crate) struct Scatter {
 }
 
 impl Scatter {
-    /// Of modes of which the truth has been taken away.
+    /// The scatter power of modes after subtracting the explained part.
     pub(crate) fn new(grid: &Grid, width: f64, unexplained: &Modes) -> Self {
         let mut ring_of = Array2::from_elem((grid.n, grid.n), BINS as u8);
         let (mut e, mut b, mut count) = ([0.0; BINS], [0.0; BINS], [0.0; BINS]);
@@ -76,8 +76,7 @@ impl Scatter {
         }
     }
 
-    /// The same for a truth without modes, which tells neither kind from the other. Only means are asked for
-    /// then.
+    /// The same for a truth without modes, which leaves E and B ambiguous. Only means are known then.
     pub(crate) fn of_one_kind(self) -> Self {
         Scatter {
             lowest: [0.5 * (self.lowest[0] + self.lowest[1]); 2],
@@ -85,7 +84,7 @@ impl Scatter {
         }
     }
 
-    /// (ν, ν_B) of a mode; both are that of the lowest rings' E modes for the zero mode.
+    /// (ν, ν_B) of a mode. For the zero mode both are the E-mode power of the lowest rings.
     fn at(&self, mode: (usize, usize)) -> (f64, f64) {
         match usize::from(self.ring_of[mode]) {
             BINS => (self.lowest[0], self.lowest[0]),
@@ -93,7 +92,7 @@ impl Scatter {
         }
     }
 
-    /// Variance of Σ_x u·e over cells for both components, `u` of the same convention as the modes.
+    /// Variance of Σ_x u·e over cells for both components; `weights` u in the convention of the modes.
     pub(crate) fn of_sums(&self, decomposer: &Decomposer, weights: [&Array2<f64>; 2]) -> [f64; 2] {
         let n4 = (decomposer.grid().cells() as f64).powi(2);
         std::array::from_fn(|component| {
@@ -102,7 +101,7 @@ impl Scatter {
                 .indexed_iter()
                 .map(|(at, u)| {
                     let (e, b) = self.at(at);
-                    // K = exp(−2iφ); at the zero mode, where it is none, both powers are the same.
+                    // K = exp(−2iφ). At the zero mode K is zero, and both powers are equal.
                     let cos2 = decomposer.kernel(at).re.powi(2);
                     let own = if component == 0 { cos2 } else { 1.0 - cos2 };
                     u.norm_sqr() * (own * e + (1.0 - own) * b)
@@ -123,8 +122,8 @@ impl Scatter {
         noise / (power * power)
     }
 
-    /// Variances of the scored bandpowers of E modes whose explained part is `signal`; `own` multiplies the
-    /// noise's power by itself.
+    /// Variances of the scored bandpowers of E modes with the explained part `signal`; `own` is the factor of
+    /// ν².
     pub(crate) fn of_power(
         &self,
         bins: &Bins,
@@ -139,8 +138,8 @@ impl Scatter {
         variance
     }
 
-    /// Standard error of Q of the bandpowers `ee` divided by `response`², the response being measured on these
-    /// modes, which moves all of them together.
+    /// Standard error of Q of the bandpowers `ee` divided by `response`². The response was measured on the same
+    /// modes, so its error correlates all bandpowers.
     pub(crate) fn of_calibrated_quality(
         &self,
         bins: &Bins,
@@ -158,23 +157,22 @@ impl Scatter {
             power += t;
         });
         let of_m = self.of_cross(bins, truth);
-        // Of each bin alone, with what m adds to it and takes away; and of pairs of bins, which m joins as far as
-        // the modulus follows its number.
-        let (mut sigma_sys, mut alone, mut own_of_m, mut slopes, mut shared) =
+        // Variance of each bin, including the error of m, and covariance of pairs of bins through m.
+        let (mut sigma_sys, mut alone, mut own_of_m, mut gradients, mut shared) =
             (0.0, 0.0, 0.0, 0.0, 0.0);
         for b in SCORED {
             let apart = ee[b] / response.powi(2) - true_power[b];
-            let (slope, with_m) = (2.0 * ee[b] / response.powi(3), with_m[b] / power);
-            let by_m = slope * (slope * of_m - 2.0 * with_m);
+            let (gradient, with_m) = (2.0 * ee[b] / response.powi(3), with_m[b] / power);
+            let by_m = gradient * (gradient * of_m - 2.0 * with_m);
             let modulus = Folded::of(apart, own[b] + by_m);
-            let u = modulus.slope * bins.dln_l[b];
+            let u = modulus.gradient * bins.dln_l[b];
             sigma_sys += apart.abs() * bins.dln_l[b];
             alone += modulus.variance * bins.dln_l[b].powi(2);
             own_of_m += u * u * by_m;
-            slopes += u * slope;
+            gradients += u * gradient;
             shared += u * with_m;
         }
-        let variance = alone + slopes * (slopes * of_m - 2.0 * shared) - own_of_m;
+        let variance = alone + gradients * (gradients * of_m - 2.0 * shared) - own_of_m;
         damped(q, variance.max(0.0).sqrt() / sigma_sys)
     }
 
@@ -194,10 +192,10 @@ impl Scatter {
     }
 }
 
-/// Standard error of σ_sys where the scored bandpowers are `apart` from the truth and have these variances.
+/// Standard error of σ_sys, from the deviations `apart` of the scored bandpowers and their variances.
 ///
-/// σ_sys is a sum of |P_b − P_b^true|. The mean of each is taken as √max(0, x² − variance), and its scatter is
-/// that of the modulus of a normal number.
+/// σ_sys is a sum of |P_b − P_b^true|. Each deviation x has an assumed mean of √max(0, x² − variance); its modulus
+/// scatters like a folded normal number.
 pub(crate) fn of_sigma_sys(bins: &Bins, apart: &[f64; BINS], variance: &[f64; BINS]) -> f64 {
     SCORED
         .map(|b| Folded::of(apart[b], variance[b]).variance * bins.dln_l[b].powi(2))
@@ -205,14 +203,14 @@ pub(crate) fn of_sigma_sys(bins: &Bins, apart: &[f64; BINS], variance: &[f64; BI
         .sqrt()
 }
 
-/// Standard error of Q ∝ 1/σ_sys: that of σ_sys to first order, damped where the two are of one size, as a
-/// σ_sys that is small by chance would have Q's error without bound.
+/// Standard error of Q ∝ 1/σ_sys to first order. It is damped if σ_sys is as small as its error: a σ_sys that is
+/// small by chance would make the error unbounded.
 pub(crate) fn of_quality(bins: &Bins, q: f64, apart: &[f64; BINS], variance: &[f64; BINS]) -> f64 {
     let sigma_sys: f64 = SCORED.map(|b| apart[b].abs() * bins.dln_l[b]).sum();
     damped(q, of_sigma_sys(bins, apart, variance) / sigma_sys)
 }
 
-/// Standard error of Q where σ_sys has the error `relative` to itself.
+/// Standard error of Q for a relative error of σ_sys.
 fn damped(q: f64, relative: f64) -> f64 {
     q * relative / (1.0 + relative * relative)
 }
@@ -220,32 +218,32 @@ fn damped(q: f64, relative: f64) -> f64 {
 /// |x| of a normal number x.
 struct Folded {
     variance: f64,
-    /// How its mean changes with that of x: covariances with other numbers are as many times those of x.
-    slope: f64,
+    /// Derivative of the mean of |x| with the mean of x, which multiplies covariances of x.
+    gradient: f64,
 }
 
 impl Folded {
-    /// Where x has the variance `variance` and was found to be `found`.
+    /// For a number of this variance with the value `found`.
     fn of(found: f64, variance: f64) -> Self {
         if variance <= 0.0 {
             return Folded {
                 variance: 0.0,
-                slope: found.signum(),
+                gradient: found.signum(),
             };
         }
         let mean2 = (found * found - variance).max(0.0);
         let t = (mean2 / (2.0 * variance)).sqrt();
-        let slope = libm::erf(t);
-        let folded =
-            (2.0 * variance / std::f64::consts::PI).sqrt() * (-t * t).exp() + mean2.sqrt() * slope;
+        let gradient = libm::erf(t);
+        let folded = (2.0 * variance / std::f64::consts::PI).sqrt() * (-t * t).exp()
+            + mean2.sqrt() * gradient;
         Folded {
             variance: mean2 + variance - folded * folded,
-            slope: slope * found.signum(),
+            gradient: gradient * found.signum(),
         }
     }
 }
 
-/// Standard errors of M and A in units of C_ℓ, for bandpowers of a covariance.
+/// Standard errors of M and A in units of C_ℓ, from the covariance of the bandpowers.
 pub(crate) fn of_biases(
     bins: &Bins,
     truth: &[f64; BINS],
@@ -263,7 +261,7 @@ pub(crate) fn of_biases(
     (m.sqrt(), a.sqrt())
 }
 
-/// Standard error of √A in 10⁻⁴, for A and its error; not a number where A is not clear of zero.
+/// Standard error of √A in 10⁻⁴. Not a number if A is not significant.
 pub(crate) fn of_sqrt_a(a: f64, error: f64) -> f64 {
     match a.abs() >= CLEAR_A * error {
         true => error / (2.0 * a.abs().sqrt()) * 1e4,
@@ -282,7 +280,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_modulus_scatters_less_near_zero_and_like_its_number_far_from_it() {
+    fn a_modulus_scatters_like_a_folded_normal_number() {
         // Of |x| with mean zero: 1 − 2/π.
         let half = 1.0 - 2.0 / std::f64::consts::PI;
         assert!((Folded::of(0.5, 1.0).variance - half).abs() < 1e-12);
@@ -300,11 +298,11 @@ mod tests {
         let expected = square - mean * mean;
         assert!((Folded::of(2.0_f64.sqrt(), 1.0).variance - expected).abs() < 1e-6);
         assert_eq!(Folded::of(1.0, 0.0).variance, 0.0);
-        // It follows a number far from zero, and does not one at zero.
-        let slope = |found, variance| Folded::of(found, variance).slope;
-        assert_eq!(slope(0.5, 1.0), 0.0);
-        assert_eq!((slope(-30.0, 1.0), slope(30.0, 1.0)), (-1.0, 1.0));
-        assert_eq!((slope(-1.0, 0.0), slope(1.0, 0.0)), (-1.0, 1.0));
+        // It follows a number far from zero, but not a number at zero.
+        let gradient = |found, variance| Folded::of(found, variance).gradient;
+        assert_eq!(gradient(0.5, 1.0), 0.0);
+        assert_eq!((gradient(-30.0, 1.0), gradient(30.0, 1.0)), (-1.0, 1.0));
+        assert_eq!((gradient(-1.0, 0.0), gradient(1.0, 0.0)), (-1.0, 1.0));
         // The mean of |x| for means of x of 1 ± h.
         let mean = |m: f64| {
             let density = |x: f64| (-(x - m).powi(2) / 2.0).exp();
@@ -312,6 +310,6 @@ mod tests {
             sum.sum::<f64>() * 1e-8 / (2.0 * std::f64::consts::PI).sqrt()
         };
         let expected = (mean(1.001) - mean(0.999)) / 0.002;
-        assert!((slope(2.0_f64.sqrt(), 1.0) - expected).abs() < 1e-6);
+        assert!((gradient(2.0_f64.sqrt(), 1.0) - expected).abs() < 1e-6);
     }
 }

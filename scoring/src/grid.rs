@@ -1,17 +1,34 @@
-//! The square grid of postage stamps, and the Fourier modes that live on it.
+//! The square grid of postage stamps, and its Fourier modes.
 
 use std::ops::RangeInclusive;
 
+use ndarray::{ArrayBase, Data, Ix2};
 use serde::{Deserialize, Serialize};
 
 use crate::error::ScoringError;
 use shearq_quantities::units::{Degrees, Multipole, Pixels, Radians};
 
 /// Offset that the original scoring program adds to both components of every wave vector, so that
-/// the zero mode has a direction. It decides which of the modes at exactly ℓ_min are counted.
+/// the zero mode has a direction. It determines which of the modes at exactly ℓ_min are counted.
 pub(crate) const MODE_OFFSET: f64 = 1e-10;
 
-/// 0-based place along an axis of the stamp that holds the FITS pixel position `position`, `None` before the first.
+/// Checks that an array has a value for every cell of a grid of `side` cells per side.
+pub(crate) fn check_shape<S: Data>(
+    what: &'static str,
+    array: &ArrayBase<S, Ix2>,
+    side: usize,
+) -> Result<(), ScoringError> {
+    match array.dim() == (side, side) {
+        true => Ok(()),
+        false => Err(ScoringError::Shape {
+            what,
+            found: array.dim(),
+            side,
+        }),
+    }
+}
+
+/// 0-based index along an axis of the stamp that contains the FITS pixel position `position`. `None` before the first stamp.
 ///
 /// The 1-based index is round(x/stamp + ½), halves away from zero, as in the original. That is half a pixel
 /// less than the stamp's edge in FITS pixels. A stamp of one pixel has its centre there. Stamps from one to two
@@ -31,38 +48,37 @@ pub fn centre_of(index: usize, stamp: Pixels) -> f64 {
     index as f64 * stamp.0 + (stamp.0 + 1.0) / 2.0
 }
 
-/// A square grid of galaxies: `n` × `n` stamps of `stamp` pixels over `field` degrees a side.
+/// A square grid of galaxies: `n` × `n` stamps of `stamp` pixels, on a field of `field` degrees per side.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Grid {
-    /// Cells a side.
+    /// Cells per side.
     pub n: usize,
-    /// Pixels a side of one stamp, which is one cell.
+    /// Pixels per side of one stamp, which is one cell.
     pub stamp: Pixels,
     /// Side of the whole field.
     pub field: Degrees,
 }
 
 impl Grid {
-    /// Sides of a field in degrees: from a thousandth to the way around the sky. (Far larger ones would have
-    /// multipoles in which the offset of frequencies shows.)
+    /// Accepted sides of a field, in degrees.
     pub const FIELDS: RangeInclusive<f64> = 1e-3..=360.0;
-    /// Smallest grid accepted. Below 12 cells a side some of the bins 2 to 9 hold no modes.
+    /// Smallest accepted grid. Below 12 cells per side some of the bins 2 to 9 have no modes.
     pub const MIN_SIDE: usize = 8;
-    /// Largest grid accepted (16 million cells), against absurd sizes in damaged input.
+    /// Largest accepted grid: 16 million cells. Damaged headers can contain larger numbers.
     pub const MAX_SIDE: usize = 4000;
 
-    /// The GREAT10 layout for `n` cells a side: 48 px stamps over 10°.
+    /// The GREAT10 layout with `n` cells per side: 48 px stamps on a field of 10°.
     ///
     /// # Errors
-    /// Where `n` is outside [`Grid::MIN_SIDE`]..=[`Grid::MAX_SIDE`].
+    /// If `n` is outside [`Grid::MIN_SIDE`]..=[`Grid::MAX_SIDE`].
     pub fn great10(n: usize) -> Result<Self, ScoringError> {
         Grid::new(n, Pixels(48.0), Degrees(10.0))
     }
 
-    /// A grid of `n` cells a side.
+    /// A grid of `n` cells per side.
     ///
     /// # Errors
-    /// Where `n` or the side of the field is out of range, or the stamp's is no positive finite number.
+    /// If `n`, `field` or `stamp` is out of range.
     pub fn new(n: usize, stamp: Pixels, field: Degrees) -> Result<Self, ScoringError> {
         if !(Self::MIN_SIDE..=Self::MAX_SIDE).contains(&n) {
             return Err(ScoringError::GridSide {
@@ -73,7 +89,7 @@ impl Grid {
         }
         if !(stamp.0.is_finite() && stamp.0 > 0.0) {
             return Err(ScoringError::Length {
-                what: "stamp size in pixels",
+                what: "the side of a stamp in pixels",
                 found: stamp.0,
             });
         }
@@ -87,13 +103,13 @@ impl Grid {
         Ok(Grid { n, stamp, field })
     }
 
-    /// Side of the square grid with this many cells, `None` where they make no square.
+    /// Side of the square grid with this many cells. `None` if the number is not a square.
     pub fn side_of(cells: usize) -> Option<usize> {
         let side = cells.isqrt();
         (side * side == cells).then_some(side)
     }
 
-    /// Number of cells.
+    /// Number of cells of the grid.
     pub fn cells(&self) -> usize {
         self.n * self.n
     }
@@ -146,7 +162,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cells_and_centres_are_inverse_and_edges_round_away_from_zero() {
+    fn cells_and_centres_are_inverse() {
         let grid = Grid::great10(100).unwrap();
         for (ix, iy) in [(0, 0), (3, 99), (99, 50)] {
             let (x, y) = grid.centre(ix, iy);
@@ -162,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn stamps_of_one_pixel_have_fits_pixels_as_cells() {
+    fn stamps_of_one_pixel_are_fits_pixels() {
         let grid = Grid::new(8, Pixels(1.0), Degrees(10.0)).unwrap();
         for (ix, iy) in [(0, 0), (3, 7), (7, 5)] {
             assert_eq!(grid.cell(ix as f64 + 1.0, iy as f64 + 1.0), Some((ix, iy)));
@@ -179,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn centred_order_maps_to_fft_order_for_even_and_odd_sides() {
+    fn centred_order_maps_to_fft_order() {
         for n in [8, 9] {
             let grid = Grid::great10(n).unwrap();
             for i in 0..n {

@@ -1,24 +1,24 @@
-//! Shear power spectra from gridded ellipticity catalogues, and the metrics of merit of the GREAT10
-//! challenge: Q, Q_dn, M and A. Pure arithmetic on grids: no files, no threads.
+//! Shear power spectra from gridded ellipticity catalogues, and the metrics of the GREAT10 challenge: Q, Q_dn, M
+//! and A. Pure arithmetic on grids: no files, no threads.
 //!
 //! # Conventions
 //!
-//! * Positions are FITS pixels: 1-based, x along columns, y along rows. Fields are indexed
-//!   `[ix, iy]`, first index along x.
-//! * e₁ > 0 is elongation along +x, e₂ > 0 along the diagonal x = y. [`Shear`] and [`Distortion`]
-//!   are the two ellipticity definitions.
-//! * FFT scaling is stated in [`modes`]; bandpowers P_b ≈ ℓ²C_ℓ/2π are dimensionless, C_ℓ is in
+//! * Positions are FITS pixels: 1-based, x along columns, y along rows. Fields have the index `[ix, iy]`.
+//! * e₁ > 0 is elongation along +x, e₂ > 0 along the diagonal x = y. Shear-type ellipticities and distortions are
+//!   not converted.
+//! * [`modes`] states the scaling of Fourier transforms. Bandpowers P_b ≈ ℓ²C_ℓ/2π have no unit, C_ℓ is in
 //!   steradian, ℓ in rad⁻¹.
 //! * Noise variances are per component, galaxy and image.
 //!
-//! # Metrics of merit
+//! # Score ellipticities
 //!
 //! ```
 #![doc = include_str!("../examples/quality.rs")]
 //! ```
 //!
-//! Catalogues with positions become [`Row`]s, which [`FieldSum::add_image`] puts onto the grid and counts.
-//! Images can be added one at a time: memory is that of some twenty grids however many there are.
+//! For catalogues with positions, make [`Row`]s and add them with [`FieldSum::add_image`], which also counts odd
+//! rows. Add images to [`SetImages`] one at a time: the memory is that of some twenty grids for any number of
+//! images.
 //!
 //! # A spectrum
 //!
@@ -26,7 +26,8 @@
 #![doc = include_str!("../examples/spectrum.rs")]
 //! ```
 //!
-//! [`cross_spectrum`] gives that of pairs of images, in which noise has no mean.
+//! [`cross_spectrum`] uses pairs of images only, so noise does not bias it.
+#![forbid(unsafe_code)]
 
 pub mod bandpower;
 mod catalogue;
@@ -35,7 +36,9 @@ mod cross;
 mod diagnosis;
 mod error;
 mod errors;
+mod galaxies;
 mod grid;
+mod images;
 mod matching;
 mod metrics;
 pub mod modes;
@@ -44,16 +47,19 @@ pub mod resample;
 mod score;
 
 pub use bandpower::{BINS, Bins, Definition, SCORED};
-pub use catalogue::{FieldSum, Row, RowCounts, TrueShear, TruthSign};
+pub use catalogue::{FieldSum, OddRow, Row, RowCounts, RowFault, TrueShear, TruthSign};
 pub use convention::{Convention, ConventionClass};
 pub use cross::{CrossSpectrum, cross_spectrum};
 pub use diagnosis::{Fault, ImageFaults, sign_by_correlation, sign_by_modes};
 pub use error::ScoringError;
 pub use grid::{Grid, cell_at, centre_of};
+pub use images::SetImages;
 pub use matching::ConventionMatch;
 pub use metrics::{Metric, Metrics};
 pub use quality::{Bias, BiasFits, Quality};
+pub use resample::MAX_GROUPS;
 pub use score::{
-    Choice, ConventionScore, MAX_GROUPS, MeanShear, Noise, Options, SetImages, SetScore, SetScorer,
-    SpectrumCovariance, SpectrumScore, measured_bandpowers,
+    Choice, ConventionScore, MeanShear, Noise, Options, SetScore, SetScorer, SpectrumCovariance,
+    SpectrumScore, Unknown, measured_bandpowers,
 };
+pub use shearq_fourier::Complex64;

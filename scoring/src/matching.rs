@@ -1,14 +1,13 @@
-//! Which sign and axis convention a catalogue is in, told from the true shear over one set or several.
+//! The sign and axis convention of a catalogue, from its correlation with the true shear of one or several sets.
 
 use crate::convention::{Convention, ConventionClass};
 
-/// Standard deviations of chance at which a correlation with the truth, or a difference of two, is believed.
+/// Required significance (σ) of a correlation with the truth, and of a difference of two.
 const CLEAR: f64 = 4.0;
 
 /// How well each of the eight conventions correlates with the truth.
 ///
-/// Sets are put together with their numbers of modes as weights, so that a noisy set does not drown
-/// the others.
+/// Sets are averaged with their numbers of modes as weights, so a noisy set does not dominate.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ConventionMatch {
     /// Σ over sets of modes times correlation, by convention.
@@ -18,8 +17,8 @@ pub struct ConventionMatch {
 }
 
 impl ConventionMatch {
-    /// From the correlations of one set with `modes` scored modes. Those that are not numbers (of an
-    /// empty catalogue) say nothing.
+    /// The match of one set with these correlations over `modes` scored modes. NaN, from an empty catalogue,
+    /// counts as no correlation.
     pub fn new(correlations: [f64; 8], modes: usize) -> Self {
         let modes = modes as f64;
         ConventionMatch {
@@ -41,8 +40,7 @@ impl ConventionMatch {
         self.sums[convention.index()] / self.modes
     }
 
-    /// The convention that correlates best, of equals the standard one or else the first. It may be so by
-    /// chance.
+    /// The convention that correlates best, perhaps by chance. Of equals, the standard one or else the first.
     pub fn best(&self) -> Convention {
         let better = |best, k| match self.correlation(k) > self.correlation(best) {
             true => k,
@@ -53,13 +51,13 @@ impl ConventionMatch {
             .fold(Convention::STANDARD, better)
     }
 
-    /// The least correlation, or difference of two, that is clearly more than chance: of N modes without
-    /// anything in common it scatters by 1/√(N/2), opposite modes being conjugates.
+    /// The smallest significant correlation or difference of two. Correlations of N independent modes scatter by
+    /// 1/√(N/2), because opposite modes are conjugates.
     pub fn least_clear(&self) -> f64 {
         CLEAR * (2.0 / self.modes).sqrt()
     }
 
-    /// Whether the best convention is clearly better than chance and than every other one.
+    /// Whether the best convention is significantly better than chance and than every other convention.
     pub fn is_clear(&self) -> bool {
         let best = self.best();
         let second = Convention::ALL
@@ -70,8 +68,8 @@ impl ConventionMatch {
         self.correlation(best) - second >= self.least_clear()
     }
 
-    /// The convention to score in: the best where it is clear, otherwise the standard one, so that
-    /// noise does not choose.
+    /// The convention to score in: the best if it is significant, otherwise the standard one. Noise must not
+    /// choose it.
     pub fn convention(&self) -> Convention {
         match self.is_clear() {
             true => self.best(),
@@ -102,8 +100,8 @@ mod tests {
     }
 
     #[test]
-    fn the_best_is_taken_only_where_it_is_clear() {
-        // 800 modes: chance scatters by 0.05, and 0.2 is clear.
+    fn the_best_convention_is_used_only_if_significant() {
+        // 800 modes: chance scatters by 0.05, so 0.2 is significant.
         let clear = of((6, 0.21), (5, 0.0), 800);
         assert!((clear.least_clear() - 0.2).abs() < 1e-12);
         assert!(clear.is_clear());
@@ -116,7 +114,7 @@ mod tests {
         let close = of((6, 0.5), (5, 0.31), 800);
         assert!(!close.is_clear());
         assert_eq!(close.convention(), Convention::STANDARD);
-        // All others negative: chance is the rival.
+        // All others negative: the best must exceed chance.
         let mut r = [-0.5; 8];
         r[2] = 0.19;
         assert!(!ConventionMatch::new(r, 800).is_clear());
@@ -125,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn sets_add_up_by_their_modes() {
+    fn sets_are_weighted_by_their_modes() {
         let mut all = of((6, 0.3), (5, 0.25), 100);
         all.merge(&of((5, 0.6), (6, 0.1), 300));
         assert!((all.correlation(Convention::STANDARD) - 0.5125).abs() < 1e-12);
@@ -135,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_in_the_standard_convention() {
+    fn an_empty_match_is_the_standard_convention() {
         let nothing = ConventionMatch::new([f64::NAN; 8], 100);
         assert!(!nothing.is_clear());
         assert_eq!(nothing.best(), Convention::STANDARD);

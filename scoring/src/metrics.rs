@@ -1,43 +1,36 @@
-//! The metrics of a scored set, declared once: everything that names, prints or stores them reads this.
+//! The metrics of a scored set: the only place that declares their names and meanings.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Deserializer, Serialize};
 
-/// What one metric is and how it is printed.
+/// Name and meaning of a metric.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Metric {
     /// Name in files: columns, keys, conditions.
     pub name: &'static str,
-    /// Heading of tables, with the unit where there is one.
-    pub label: &'static str,
-    /// Decimals in tables for people.
-    pub decimals: usize,
-    /// Whether tables for people leave it out unless they are to be wide.
-    pub detail: bool,
-    /// What it is, in a sentence.
+    /// What it measures, in one sentence.
     pub meaning: &'static str,
 }
 
 macro_rules! metrics {
-    ($($name:ident: $label:literal, $decimals:literal, $detail:literal, $meaning:literal;)+) => {
-        /// Metrics of one set, of a replicate of it, or the errors of them. Not a number where unknown.
+    ($($name:ident: $meaning:literal;)+) => {
+        /// Metrics of one set or of a replicate of it, or their errors. Not a number if unknown.
         #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+        #[non_exhaustive]
         pub struct Metrics {
             $(#[doc = $meaning] pub $name: f64,)+
         }
 
         impl Metrics {
-            /// What each is, in the order of [`Metrics::values`].
-            pub const ALL: [Metric; [$($label),+].len()] = [$(Metric {
+            /// All metrics, in the order of [`Metrics::values`].
+            pub const ALL: [Metric; [$($meaning),+].len()] = [$(Metric {
                 name: stringify!($name),
-                label: $label,
-                decimals: $decimals,
-                detail: $detail,
                 meaning: $meaning,
             }),+];
 
-            /// All as an array.
+            /// All values as an array.
             pub fn values(&self) -> [f64; Self::ALL.len()] {
                 [$(self.$name),+]
             }
@@ -52,38 +45,38 @@ macro_rules! metrics {
 }
 
 metrics! {
-    q: "Q", 2, false, "Quality factor, 5·10⁻³/σ_sys.";
-    q_dn: "Q_dn", 2, false, "Quality factor after removing the noise's power.";
-    q_calibrated: "Q cal.", 2, false, "Quality factor after dividing the spectrum by (1 + m)², m by cross-correlation: what noise and scale-dependent bias leave.";
-    m_half: "M/2", 4, false, "Multiplicative bias of the power spectrum, halved.";
-    sqrt_a: "√A×10⁴", 4, false, "Additive bias of the power spectrum: sign(A)·√|A| in 10⁻⁴, C_ℓ in steradian.";
-    m_cross: "m (cross)", 4, false, "Multiplicative bias by cross-correlation of E modes with the truth.";
-    galaxy_noise: "noise", 4, false, "Noise of one galaxy's ellipticity per component, divided by the response 1 + m.";
-    m1: "m1", 4, true, "Multiplicative bias of component 1, from the galaxies.";
-    m2: "m2", 4, true, "Multiplicative bias of component 2, from the galaxies.";
-    c1: "c1", 5, true, "Additive bias of component 1, from the galaxies.";
-    c2: "c2", 5, true, "Additive bias of component 2, from the galaxies.";
-    b_power: "B mode×10⁹", 3, true, "Mean C_ℓ of the B modes over bins 2 to 9, in 10⁻⁹ steradian.";
-    eb_power: "EB×10⁹", 3, true, "Mean C_ℓ of the EB cross-spectrum over bins 2 to 9, in 10⁻⁹ steradian.";
-    sigma_sys_1e4: "σ_sys×10⁴", 4, true, "What Q is made of: the mean distance of the bandpowers from the truth, in 10⁻⁴.";
+    q: "Quality factor, 5·10⁻³/σ_sys.";
+    q_dn: "Quality factor after subtracting the power of the noise.";
+    q_calibrated: "Quality factor after dividing the spectrum by (1 + m)², with m by cross-correlation: noise and scale-dependent bias remain.";
+    m_half: "Multiplicative bias of the power spectrum, halved.";
+    sqrt_a: "Additive bias of the power spectrum: sign(A)·√|A| in 10⁻⁴, C_ℓ in steradian.";
+    m_cross: "Multiplicative bias by cross-correlation of E modes with the truth.";
+    galaxy_noise: "Noise of one galaxy's ellipticity per component, divided by the response 1 + m.";
+    m1: "Multiplicative bias of component 1, from the galaxies.";
+    m2: "Multiplicative bias of component 2, from the galaxies.";
+    c1: "Additive bias of component 1, from the galaxies.";
+    c2: "Additive bias of component 2, from the galaxies.";
+    b_power: "Mean C_ℓ of the B modes over bins 2 to 9, in 10⁻⁹ steradian.";
+    eb_power: "Mean C_ℓ of the EB cross-spectrum over bins 2 to 9, in 10⁻⁹ steradian.";
+    sigma_sys_1e4: "σ_sys, the mean distance of the bandpowers from the truth, in 10⁻⁴. Q is 5·10⁻³/σ_sys.";
 }
 
 impl Metrics {
-    /// The metric that all records have. Others are unknown to those that were written before they were thought of.
+    /// The metric that every record contains. Older records lack metrics that were added later.
     pub const ALWAYS: &str = "q";
 
-    /// The place in [`Metrics::values`] of the metric called `name`.
+    /// Index in [`Metrics::values`] of the metric called `name`.
     pub fn place(name: &str) -> Option<usize> {
         Self::ALL.iter().position(|metric| metric.name == name)
     }
 
-    /// None known.
+    /// No metric is known.
     pub fn unknown() -> Self {
         Self::from_values([f64::NAN; Self::ALL.len()])
     }
 }
 
-/// JSON has no NaN: what was written as null is read as that, and so is a metric that is not there.
+/// JSON has no NaN: null and absent metrics are read as NaN.
 impl<'de> Deserialize<'de> for Metrics {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let found = BTreeMap::<String, Option<f64>>::deserialize(deserializer)?;
@@ -101,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_names_and_fields_go_together() {
+    fn values_names_and_fields_agree() {
         let values: [f64; Metrics::ALL.len()] = std::array::from_fn(|k| k as f64);
         let metrics = Metrics::from_values(values);
         assert_eq!(metrics.values(), values);

@@ -1,12 +1,13 @@
 //! E and B modes of a complex ellipticity field on a grid.
 //!
-//! Fourier scaling is stated here once: `FFT` is the plain sum Σ f·e^{−2πi(jk/n)} without a factor,
+//! Fourier scaling: `FFT` is the plain sum Σ f·e^{−2πi(jk/n)} without a factor,
 //! `IFFT` carries 1/n². A mode's power per steradian is |FFT|²·L²/n⁴.
 
 use ndarray::Array2;
 use shearq_fourier::{Complex64, Plan64, Planner64};
 
-use crate::grid::Grid;
+use crate::error::ScoringError;
+use crate::grid::{Grid, check_shape};
 
 /// E and B modes in FFT order, first index along ℓ₁ (x), second along ℓ₂ (y).
 #[derive(Debug, Clone)]
@@ -17,12 +18,21 @@ pub struct Modes {
     pub b: Array2<Complex64>,
 }
 
-/// Two-dimensional FFT of one grid size, with the E/B kernel of that grid.
+/// Two-dimensional FFT of a grid, with its E/B kernel.
+#[derive(Clone)]
 pub struct Decomposer {
     grid: Grid,
     forward: Plan64,
     inverse: Plan64,
     kernel: Array2<Complex64>,
+}
+
+impl std::fmt::Debug for Decomposer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Decomposer")
+            .field("grid", &self.grid)
+            .finish_non_exhaustive()
+    }
 }
 
 impl Decomposer {
@@ -43,7 +53,7 @@ impl Decomposer {
         }
     }
 
-    /// The grid it was planned for.
+    /// The grid.
     pub fn grid(&self) -> Grid {
         self.grid
     }
@@ -51,9 +61,18 @@ impl Decomposer {
     /// κ = IFFT(K·FFT(field)) with K = conj(z)²/|z|², z = ℓ₁ + iℓ₂; E = FFT(Re κ), B = FFT(Im κ)
     /// (Kaiser & Squires 1993; Kitching et al. 2011, eqs 17–19).
     ///
-    /// `field` is `[ix, iy]`, of the grid's size. Going through κ matters for even grids, where the
-    /// Nyquist rows have no partner of opposite frequency.
-    pub fn decompose(&self, mut field: Array2<Complex64>) -> Modes {
+    /// `field` is `[ix, iy]`. The detour through κ matters for even grids, whose Nyquist rows have no
+    /// opposite frequency.
+    ///
+    /// # Errors
+    /// If the shape of `field` differs from the grid.
+    pub fn decompose(&self, field: Array2<Complex64>) -> Result<Modes, ScoringError> {
+        check_shape("the field", &field, self.grid.n)?;
+        Ok(self.modes_of(field))
+    }
+
+    /// [`Decomposer::decompose`] without the check.
+    pub(crate) fn modes_of(&self, mut field: Array2<Complex64>) -> Modes {
         self.transform(&mut field, &self.forward);
         field *= &self.kernel;
         self.transform(&mut field, &self.inverse);
@@ -65,18 +84,21 @@ impl Decomposer {
         Modes { e, b }
     }
 
-    /// The ellipticity field whose E and B modes are `modes`: the inverse of [`decompose`] but for
-    /// the zero mode and, on even grids, the Nyquist rows.
+    /// The ellipticity field with the E and B modes `modes`: the inverse of [`Decomposer::decompose`],
+    /// except for the zero mode and, on even grids, the Nyquist rows.
     ///
-    /// [`decompose`]: Decomposer::decompose
-    pub fn compose(&self, modes: &Modes) -> Array2<Complex64> {
+    /// # Errors
+    /// If the shape of the modes differs from the grid.
+    pub fn compose(&self, modes: &Modes) -> Result<Array2<Complex64>, ScoringError> {
+        check_shape("the E modes", &modes.e, self.grid.n)?;
+        check_shape("the B modes", &modes.b, self.grid.n)?;
         let i = Complex64::new(0.0, 1.0);
         let mut field = Array2::from_shape_fn(modes.e.dim(), |at| {
             (modes.e[at] + i * modes.b[at]) * self.kernel[at].conj()
         });
         self.transform(&mut field, &self.inverse);
         field /= Complex64::new(self.grid.cells() as f64, 0.0);
-        field
+        Ok(field)
     }
 
     /// The plain FFT of a field on the grid.
@@ -111,39 +133,38 @@ fn kernel_value(grid: &Grid, i: usize, j: usize) -> Complex64 {
     z.conj() * z.conj() / z.norm_sqr()
 }
 
-/// The same modes by the plain definition: direct sums over all cells, O(n⁴). For tests and for
-/// reading; use it on small grids only.
-pub fn decompose_naive(grid: &Grid, field: &Array2<Complex64>) -> Modes {
-    let n = grid.n;
-    let phase = |product: usize, sign: f64| {
-        let angle = sign * 2.0 * std::f64::consts::PI * (product % n) as f64 / n as f64;
-        Complex64::from_polar(1.0, angle)
-    };
-    let sum = |input: &Array2<Complex64>, sign: f64| {
-        Array2::from_shape_fn((n, n), |(k1, k2)| {
-            let mut total = Complex64::ZERO;
-            for ((j1, j2), value) in input.indexed_iter() {
-                total += value * phase(j1 * k1, sign) * phase(j2 * k2, sign);
-            }
-            total
-        })
-    };
-    let mut kappa = sum(field, -1.0);
-    for i in 0..n {
-        for j in 0..n {
-            kappa[(grid.fft_index(i), grid.fft_index(j))] *= kernel_value(grid, i, j);
-        }
-    }
-    let kappa = sum(&kappa, 1.0) / Complex64::new((n * n) as f64, 0.0);
-    Modes {
-        e: sum(&kappa.mapv(|k| Complex64::new(k.re, 0.0)), -1.0),
-        b: sum(&kappa.mapv(|k| Complex64::new(k.im, 0.0)), -1.0),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The same modes by direct sums over all cells.
+    fn decompose_naive(grid: &Grid, field: &Array2<Complex64>) -> Modes {
+        let n = grid.n;
+        let phase = |product: usize, sign: f64| {
+            let angle = sign * 2.0 * std::f64::consts::PI * (product % n) as f64 / n as f64;
+            Complex64::from_polar(1.0, angle)
+        };
+        let sum = |input: &Array2<Complex64>, sign: f64| {
+            Array2::from_shape_fn((n, n), |(k1, k2)| {
+                let mut total = Complex64::ZERO;
+                for ((j1, j2), value) in input.indexed_iter() {
+                    total += value * phase(j1 * k1, sign) * phase(j2 * k2, sign);
+                }
+                total
+            })
+        };
+        let mut kappa = sum(field, -1.0);
+        for i in 0..n {
+            for j in 0..n {
+                kappa[(grid.fft_index(i), grid.fft_index(j))] *= kernel_value(grid, i, j);
+            }
+        }
+        let kappa = sum(&kappa, 1.0) / Complex64::new((n * n) as f64, 0.0);
+        Modes {
+            e: sum(&kappa.mapv(|k| Complex64::new(k.re, 0.0)), -1.0),
+            b: sum(&kappa.mapv(|k| Complex64::new(k.im, 0.0)), -1.0),
+        }
+    }
 
     /// A reproducible field without a random-number crate: a linear congruential generator.
     fn field(n: usize, seed: u64) -> Array2<Complex64> {
@@ -168,7 +189,7 @@ mod tests {
         for n in [8, 9, 11, 12] {
             let grid = Grid::great10(n).unwrap();
             let input = field(n, n as u64);
-            let fast = Decomposer::new(grid).decompose(input.clone());
+            let fast = Decomposer::new(grid).modes_of(input.clone());
             let plain = decompose_naive(&grid, &input);
             assert!(alike(&fast.e, &plain.e), "n {n}");
             assert!(alike(&fast.b, &plain.b), "n {n}");
@@ -183,7 +204,7 @@ mod tests {
         let mut input = field(n, 3);
         let mean = input.sum() / Complex64::new((n * n) as f64, 0.0);
         input.mapv_inplace(|v| v - mean);
-        let modes = Decomposer::new(grid).decompose(input.clone());
+        let modes = Decomposer::new(grid).modes_of(input.clone());
         let power: f64 = input.iter().map(|v| v.norm_sqr()).sum::<f64>() * (n * n) as f64;
         let found: f64 = modes
             .e
@@ -210,11 +231,11 @@ mod tests {
             });
             let turned = shear.mapv(|g| g * Complex64::new(0.0, 1.0));
             let power = |m: &Array2<Complex64>| m.iter().map(|v| v.norm_sqr()).sum::<f64>();
-            let modes = decomposer.decompose(shear);
+            let modes = decomposer.modes_of(shear);
             assert!(power(&modes.b) < 1e-12 * power(&modes.e), "wave {wave:?}");
             // κ keeps the sign of the wave: E is +n²/2 at the wave vector.
             assert!((modes.e[wave].re - (n * n) as f64 / 2.0).abs() < 1e-6);
-            let modes = decomposer.decompose(turned);
+            let modes = decomposer.modes_of(turned);
             assert!(power(&modes.e) < 1e-12 * power(&modes.b));
         }
     }
@@ -224,8 +245,8 @@ mod tests {
         let n = 15;
         let grid = Grid::great10(n).unwrap();
         let decomposer = Decomposer::new(grid);
-        let mut modes = decomposer.decompose(field(n, 9));
-        let again = decomposer.decompose(decomposer.compose(&modes));
+        let mut modes = decomposer.modes_of(field(n, 9));
+        let again = decomposer.modes_of(decomposer.compose(&modes).unwrap());
         modes.e[(0, 0)] = Complex64::ZERO;
         modes.b[(0, 0)] = Complex64::ZERO;
         assert!(alike(&modes.e, &again.e));

@@ -1,4 +1,4 @@
-//! The metrics of merit: Q, Q_dn, M and A.
+//! Q, M and A of bandpowers.
 
 use serde::Serialize;
 
@@ -7,10 +7,11 @@ use crate::bandpower::{BINS, Bins, SCORED};
 /// Numerator of the quality factor (Kitching et al. 2012, eq. 1; GREAT10 handbook eq. 21).
 const Q_SCALE: f64 = 5e-3;
 
-/// A quality factor and the systematic error it comes from.
+/// A quality factor and its σ_sys.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct Quality {
-    /// Q = 5·10⁻³ / σ_sys. Infinite for a perfect submission.
+    /// Q = 5·10⁻³ / σ_sys; infinite for σ_sys = 0.
     pub q: f64,
     /// σ_sys = Σ_b |P_b − P_b^true| Δln ℓ_b over bins 2 to 9.
     pub sigma_sys: f64,
@@ -27,8 +28,7 @@ pub fn quality(bins: &Bins, measured: &[f64; BINS], truth: &[f64; BINS]) -> Qual
     }
 }
 
-/// The same with the measured bandpowers divided by `response`²: what is left once a known response is
-/// divided out of the ellipticities.
+/// Q after dividing the measured bandpowers by `response`², as if the ellipticities were divided by `response`.
 pub fn calibrated_quality(
     bins: &Bins,
     measured: &[f64; BINS],
@@ -38,20 +38,19 @@ pub fn calibrated_quality(
     quality(bins, &measured.map(|power| power / response.powi(2)), truth)
 }
 
-/// Standard error of Q, to first order, where the bandpowers have the covariance `covariance`: that of
-/// σ_sys in units of it, with each term keeping its sign. Where a bin's deviation is of the size of its
-/// own error, so is Q's, and this is a rough guide. Not a number where an estimated covariance gives σ_sys a
-/// negative variance.
+/// Standard error of Q to first order, for bandpowers with this covariance. Each deviation keeps its sign; if
+/// deviations are as small as their errors, the result is only a rough guide. Not a number if an estimated
+/// covariance gives σ_sys a negative variance.
 pub fn quality_error(
     bins: &Bins,
     measured: &[f64; BINS],
     truth: &[f64; BINS],
     covariance: &[[f64; BINS]; BINS],
 ) -> f64 {
-    let slope = |b: usize| bins.dln_l[b] * (measured[b] - truth[b]).signum();
+    let gradient = |b: usize| bins.dln_l[b] * (measured[b] - truth[b]).signum();
     let variance: f64 = SCORED
         .flat_map(|i| SCORED.map(move |j| (i, j)))
-        .map(|(i, j)| slope(i) * covariance[i][j] * slope(j))
+        .map(|(i, j)| gradient(i) * covariance[i][j] * gradient(j))
         .sum();
     let Quality { q, sigma_sys } = quality(bins, measured, truth);
     q * variance.sqrt() / sigma_sys
@@ -62,8 +61,9 @@ pub fn quality_error(
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[allow(
     non_snake_case,
-    reason = "the field's own symbols, also in the JSON output"
+    reason = "the symbols of the challenge, also in JSON output"
 )]
+#[non_exhaustive]
 pub struct Bias {
     /// Multiplicative bias M ≈ m² + 2m; the published metric is M/2.
     pub M: f64,
@@ -72,22 +72,22 @@ pub struct Bias {
     /// sign(A)·√|A|; tabulated in units of 10⁻⁴ when fitted to C_ℓ in steradian.
     pub sqrtA: f64,
     /// M/2.
-    pub m: f64,
+    pub m_half: f64,
 }
 
 /// Fits M and A to `measured` against `truth` after multiplying each bin by `scale`.
 pub fn bias(measured: &[f64; BINS], truth: &[f64; BINS], scale: impl Fn(usize) -> f64) -> Bias {
-    let (mut slope, mut intercept) = (0.0, 0.0);
+    let (mut response, mut intercept) = (0.0, 0.0);
     for (b, (of_m, of_a)) in SCORED.zip(bias_weights(truth, &scale)) {
         let apart = (measured[b] - truth[b]) * scale(b);
-        slope += of_m * apart;
+        response += of_m * apart;
         intercept += of_a * apart;
     }
     Bias {
-        M: slope,
+        M: response,
         A: intercept,
         sqrtA: intercept.signum() * intercept.abs().sqrt(),
-        m: slope / 2.0,
+        m_half: response / 2.0,
     }
 }
 
@@ -107,9 +107,10 @@ pub(crate) fn bias_weights(
     })
 }
 
-/// The same fit in the units that have been in use. The published metrics are `cl`; in ℓ²C_ℓ units
-/// M swallows the noise, whose bandpower rises like the modes' weight.
+/// The same fit in four units. The published metrics are `cl`. In ℓ²C_ℓ units M absorbs noise, because the
+/// bandpower of noise rises like the weight of the modes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct BiasFits {
     /// Bandpowers ℓ²C_ℓ/2π.
     pub l2: Bias,
@@ -121,7 +122,7 @@ pub struct BiasFits {
     pub cl_over_2pi: Bias,
 }
 
-/// Fits M and A in all units.
+/// Fits M and A in all four units; `side` of the field in radians.
 pub fn bias_fits(bins: &Bins, side: f64, measured: &[f64; BINS], truth: &[f64; BINS]) -> BiasFits {
     let cl = |b: usize| bins.to_c_l(b);
     BiasFits {

@@ -1,8 +1,9 @@
-//! Errors by the jackknife over groups of images, alone and for differences on the same images.
+//! Jackknife errors over groups of images: of a metric, and of differences on the same images.
 
-use crate::score::MAX_GROUPS;
+/// Most groups of images that the jackknife leaves out in turn.
+pub const MAX_GROUPS: usize = 20;
 
-/// Images in each jackknife group when `images` are dealt out in turn.
+/// Number of images in each jackknife group if `images` are assigned to groups in turn.
 pub fn group_sizes(images: usize) -> Vec<usize> {
     let groups = images.min(MAX_GROUPS);
     (0..groups)
@@ -11,9 +12,10 @@ pub fn group_sizes(images: usize) -> Vec<usize> {
 }
 
 /// Standard error of a metric by the delete-a-group jackknife for groups of unequal size (Busing,
-/// Meijer & van der Leeden 1999, Stat. Comput. 9, 3): `full` is the metric from all `images`,
-/// `replicates` those with each group left out. For equal groups it is Tukey's
-/// √((G−1)/G · Σ(θ_g − θ̄)²). Not a number with fewer than two groups.
+/// Meijer & van der Leeden 1999, Stat. Comput. 9, 3).
+///
+/// `full` is the metric from all `images`; `replicates` are its values with each group left out. For equal groups
+/// it is Tukey's √((G−1)/G · Σ(θ_g − θ̄)²). Not a number with fewer than two groups.
 pub fn jackknife_error(full: f64, replicates: impl IntoIterator<Item = f64>, images: usize) -> f64 {
     let sizes = group_sizes(images);
     let values: Vec<f64> = replicates.into_iter().collect();
@@ -42,8 +44,8 @@ pub fn jackknife_error(full: f64, replicates: impl IntoIterator<Item = f64>, ima
     variance.sqrt()
 }
 
-/// Mean over sets of a metric and its standard error. Sets have noise of their own, so their
-/// variances add: error = √(Σ σ²)/N, not a number where one of them is unknown.
+/// Mean of a metric over sets and its standard error. The noise of sets is independent, so variances add:
+/// error = √(Σ σ²)/N. Not a number if one error is unknown.
 pub fn mean_over_sets(values_and_errors: &[(f64, f64)]) -> (f64, f64) {
     let count = values_and_errors.len() as f64;
     let mean = values_and_errors.iter().map(|v| v.0).sum::<f64>() / count;
@@ -51,30 +53,28 @@ pub fn mean_over_sets(values_and_errors: &[(f64, f64)]) -> (f64, f64) {
     (mean, variance.sqrt() / count)
 }
 
-/// Difference of two metrics measured on the same images, in units of its own error.
+/// Difference of two metrics measured on the same images, with its error.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairedDifference {
     /// Mean over sets of (second − first).
     pub difference: f64,
-    /// Its jackknife error: noise common to both cancels in each replicate. Not a number where a set has
-    /// fewer than [`MIN_REPLICATES`].
+    /// Its jackknife error. Noise common to both cancels in each replicate. Not a number if a set has fewer
+    /// than [`MIN_REPLICATES`].
     pub error: f64,
 }
 
 impl PairedDifference {
-    /// difference / error.
+    /// Significance: difference / error.
     pub fn sigma(&self) -> f64 {
         self.difference / self.error
     }
 }
 
-/// Fewest replicates that tell the error of a difference. Noise of one image times noise of another is in
-/// none of a few replicates: from two images the error comes out up to ten times too small, from six by a
-/// quarter.
+/// Fewest replicates for the error of a difference. A few replicates miss the products of noise of two images:
+/// the error is up to ten times too small for two images, and a quarter too small for six.
 pub const MIN_REPLICATES: usize = 8;
 
-/// Paired difference over sets: each item is one set's (value, replicates) of the first and of the
-/// second variant. `None` where there is no set or replicates do not pair up.
+/// Paired difference over sets, second minus first. `None` without sets, or if the numbers of replicates differ.
 pub fn paired_difference(sets: &[PairedSet<'_>]) -> Option<PairedDifference> {
     if sets.is_empty() {
         return None;
@@ -102,18 +102,18 @@ pub fn paired_difference(sets: &[PairedSet<'_>]) -> Option<PairedDifference> {
     })
 }
 
-/// One metric of one set under two variants.
+/// One metric of one set in two configurations.
 #[derive(Debug, Clone, Copy)]
 pub struct PairedSet<'a> {
     /// Images of the set.
     pub images: usize,
-    /// The first variant's metric.
+    /// Metric of the first configuration.
     pub first: f64,
-    /// Its delete-one replicates.
+    /// Its replicates, each with one group left out.
     pub first_replicates: &'a [f64],
-    /// The second variant's metric.
+    /// Metric of the second configuration.
     pub second: f64,
-    /// Its delete-one replicates, groups in the same order.
+    /// Its replicates, groups in the same order.
     pub second_replicates: &'a [f64],
 }
 
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn images_are_dealt_to_groups_in_turn() {
+    fn images_are_assigned_to_groups_in_turn() {
         assert_eq!(group_sizes(3), vec![1, 1, 1]);
         assert_eq!(group_sizes(20), vec![1; 20]);
         let sizes = group_sizes(30);
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bias_that_falls_with_the_number_of_images_is_no_scatter() {
+    fn bias_that_depends_on_the_number_of_images_is_no_scatter() {
         // θ = S + N/K without any noise: groups of one and of two images shift it differently.
         let theta = |images: f64| 3.0 + 7.0 / images;
         let replicates = group_sizes(30).into_iter().map(|m| theta(30.0 - m as f64));
@@ -167,7 +167,7 @@ mod tests {
         let paired = pair(8, &second).unwrap();
         assert_eq!(paired.difference, 0.5);
         assert!(paired.error < 1e-15);
-        // Too few to know, and replicates that do not pair up.
+        // Too few replicates, and different numbers of them.
         let few = pair(7, &second[..7]).unwrap();
         assert!(few.difference == 0.5 && few.error.is_nan() && few.sigma().is_nan());
         assert_eq!(pair(8, &second[..7]), None);

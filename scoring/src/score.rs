@@ -1,6 +1,6 @@
-//! Scores of one set: every convention, noise, biases, null tests, and errors of all of them.
+//! Scores of one set in every convention: noise, biases, null tests and their errors.
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::Array2;
 use serde::Serialize;
 use shearq_fourier::Complex64;
 
@@ -9,34 +9,34 @@ use crate::catalogue::{FieldSum, TrueShear};
 use crate::convention::{Convention, ConventionClass};
 use crate::error::ScoringError;
 use crate::errors::{self, Scatter};
-use crate::grid::Grid;
+use crate::galaxies::ShearBias;
+use crate::grid::{Grid, check_shape};
+use crate::images::SetImages;
 use crate::matching::ConventionMatch;
 use crate::metrics::Metrics;
 use crate::modes::{Decomposer, Modes};
 use crate::quality::{BiasFits, Quality, bias_fits, calibrated_quality, quality, quality_error};
 use crate::resample::jackknife_error;
 
-/// Most groups of images that the jackknife leaves out in turn.
-pub const MAX_GROUPS: usize = 20;
-/// Errors of its own by which the response must be above zero for anything to be divided by it.
+/// Minimum significance (σ) of the response before dividing by it.
 const CLEAR_RESPONSE: f64 = 3.0;
 
-/// Which convention the metrics of a table are taken from.
+/// How to choose the convention of the metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Choice {
-    /// The one whose E modes clearly correlate best with the truth, otherwise the standard one.
+    /// The convention that correlates significantly best with the truth, otherwise the standard one.
     #[default]
     Matched,
-    /// The one with the highest Q, as the challenge's leaderboard took it.
+    /// The convention with the highest Q, as on the challenge's leaderboard.
     Best,
-    /// A fixed one.
+    /// This convention.
     Insist(Convention),
 }
 
-/// Variance of the ellipticities' noise, for Q_dn.
+/// Noise of the ellipticities, for Q_dn.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Noise {
-    /// Known: variance per component, galaxy and image.
+    /// This variance per component, galaxy and image.
     Given(f64),
     /// Measured from the scatter of the E modes between images of the set.
     #[default]
@@ -50,105 +50,21 @@ pub struct Options {
     pub definition: Definition,
     /// Noise to remove for Q_dn.
     pub noise: Noise,
-    /// Convention of the headline metrics.
+    /// Convention of the metrics.
     pub choice: Choice,
-}
-
-/// Sums of a set's images, kept in up to [`MAX_GROUPS`] groups so that each can be left out.
-///
-/// Image `k` (counted from 0 in the order added) belongs to group `k mod MAX_GROUPS`, so that two
-/// submissions of the same images are grouped alike. Memory does not grow with the images.
-#[derive(Debug, Clone)]
-pub struct SetImages {
-    groups: Vec<FieldSum>,
-    total: FieldSum,
-    next: usize,
-}
-
-impl SetImages {
-    /// No images yet.
-    pub fn new(grid: &Grid) -> Self {
-        SetImages {
-            groups: Vec::new(),
-            total: FieldSum::new(grid),
-            next: 0,
-        }
-    }
-
-    /// Images given as e₁ and e₂ on the cells `[ix, iy]`, where a value that is not finite is a galaxy
-    /// without an ellipticity.
-    ///
-    /// # Errors
-    /// Where an array is not of the grid's shape.
-    pub fn of_arrays<'a>(
-        grid: &Grid,
-        images: impl IntoIterator<Item = [ArrayView2<'a, f64>; 2]>,
-    ) -> Result<Self, ScoringError> {
-        let mut all = SetImages::new(grid);
-        for [e1, e2] in images {
-            check_shape("e1 of an image", &e1, grid)?;
-            check_shape("e2 of an image", &e2, grid)?;
-            let mut sum = FieldSum::new(grid);
-            sum.images = 1;
-            for ((cell, &e1), &e2) in e1.indexed_iter().zip(&e2) {
-                if e1.is_finite() && e2.is_finite() {
-                    (sum.e1[cell], sum.e2[cell], sum.count[cell]) = (e1, e2, 1.0);
-                }
-            }
-            all.add(&sum);
-        }
-        Ok(all)
-    }
-
-    /// Adds the sum of one image (with `images` = 1).
-    pub fn add(&mut self, image: &FieldSum) {
-        let group = self.next % MAX_GROUPS;
-        if group == self.groups.len() {
-            self.groups.push(image.clone());
-        } else {
-            self.groups[group].merge(image);
-        }
-        self.total.merge(image);
-        self.next += 1;
-    }
-
-    /// The groups.
-    pub fn groups(&self) -> &[FieldSum] {
-        &self.groups
-    }
-
-    /// The sum of all images.
-    pub fn total(&self) -> &FieldSum {
-        &self.total
-    }
-}
-
-/// Checks that an array has a value for every cell.
-fn check_shape(
-    what: &'static str,
-    array: &ArrayView2<'_, f64>,
-    grid: &Grid,
-) -> Result<(), ScoringError> {
-    match array.dim() == (grid.n, grid.n) {
-        true => Ok(()),
-        false => Err(ScoringError::Shape {
-            what,
-            found: array.dim(),
-            side: grid.n,
-        }),
-    }
 }
 
 /// One convention's spectra and metrics.
 #[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
 pub struct ConventionScore {
-    /// Which convention.
+    /// The convention.
     pub convention: Convention,
     /// E-mode bandpowers.
     pub ee: [f64; BINS],
     /// B-mode bandpowers.
     pub bb: [f64; BINS],
-    /// EB cross bandpowers; zero within noise for a sound measurement.
+    /// EB cross bandpowers; consistent with zero for a sound measurement.
     pub eb: [f64; BINS],
     /// Correlation of the E modes with the true ones over bins 2 to 9, −1 to 1.
     pub correlation: f64,
@@ -159,30 +75,48 @@ pub struct ConventionScore {
     pub quality: Quality,
     /// Q of the spectrum divided by (1 + m)², m by cross-correlation.
     pub quality_calibrated: Quality,
-    /// The same after removing the noise power; `None` where the noise is not known.
+    /// Q after subtracting the noise power; `None` if the noise is unknown.
     pub quality_dn: Option<Quality>,
-    /// E-mode bandpowers less those of noise; the former where noise is not known.
+    /// E-mode bandpowers after subtracting the noise power, if the noise is known.
     noise_free: [f64; BINS],
-    /// M and A before removing noise.
+    /// M and A before subtracting the noise power.
     pub fit: BiasFits,
-    /// M and A after removing noise.
+    /// M and A after subtracting the noise power; `None` if the noise is unknown.
     pub fit_dn: Option<BiasFits>,
 }
 
-/// What is known of a set whose true shear is the same everywhere, in the chosen convention: it has no
-/// power to compare, and its means are its metrics.
+/// Mean ellipticity of a set with constant true shear, in the chosen convention. Such a set has no power to
+/// compare; its means are its metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[non_exhaustive]
 pub struct MeanShear {
     /// Mean ellipticity of the galaxies.
     pub e: [f64; 2],
-    /// Its standard error.
+    /// Standard error of the mean.
     pub error: [f64; 2],
     /// The true shear.
     pub truth: [f64; 2],
 }
 
-/// Everything found about one set.
+/// Why a metric is not a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Unknown {
+    /// The true shear, or the component that the metric needs, is the same everywhere.
+    ConstantTruth,
+    /// The noise is unknown: it was not given, and one image cannot determine it.
+    Noise,
+    /// The measured noise power is negative, by chance.
+    NegativeNoise,
+    /// The response is less than 3σ above zero.
+    Response,
+    /// The images have no ellipticities.
+    NoEllipticities,
+}
+
+/// The score of one set.
 #[derive(Debug, Clone)]
+#[non_exhaustive]
 pub struct SetScore {
     /// The grid.
     pub grid: Grid,
@@ -192,14 +126,14 @@ pub struct SetScore {
     pub images: usize,
     /// Bandpowers of the true shear's E modes.
     pub true_ee: [f64; BINS],
-    /// Bandpowers of the true shear's B modes: nonzero where the sign of g₂ is misread.
+    /// Bandpowers of the true shear's B modes; nonzero if the sign of g₂ is wrong.
     pub true_bb: [f64; BINS],
-    /// Standard errors of the chosen convention's scored E-mode bandpowers, for the truth as it is; not numbers elsewhere
-    /// and where unknown.
+    /// Standard errors of the scored E-mode bandpowers in the chosen convention, for a fixed truth. Not numbers in
+    /// other bins, or if unknown.
     pub ee_error: [f64; BINS],
-    /// Noise bandpowers of the averaged E modes, where known.
+    /// Noise bandpowers of the averaged E modes, if known.
     pub noise: Option<[f64; BINS]>,
-    /// Noise variance per component, galaxy and image that `noise` amounts to.
+    /// Noise variance per component, galaxy and image that corresponds to `noise`.
     pub noise_variance: Option<f64>,
     /// All eight conventions, in order.
     pub conventions: Vec<ConventionScore>,
@@ -207,15 +141,15 @@ pub struct SetScore {
     pub best: Convention,
     /// How well each convention correlates with the truth.
     pub matching: ConventionMatch,
-    /// The convention of the headline metrics.
+    /// The convention of the metrics.
     pub chosen: Convention,
-    /// Headline metrics.
+    /// Metrics in the chosen convention. [`SetScore::why_unknown`] explains NaN.
     pub metrics: Metrics,
-    /// Their standard errors; not a number where unknown.
+    /// Standard errors of the metrics; not a number if unknown.
     pub errors: Metrics,
     /// The metrics with each group of images left out in turn; empty with fewer than two images.
     pub replicates: Vec<Metrics>,
-    /// Means, where the true shear is the same everywhere. All metrics but c1 and c2 are then unknown.
+    /// Means, if the true shear is the same everywhere. All metrics except c1 and c2 are then unknown.
     pub constant: Option<MeanShear>,
 }
 
@@ -225,14 +159,31 @@ impl SetScore {
         &self.conventions[self.chosen.index()]
     }
 
-    /// Whether the leaderboard's best convention is of another class than the chosen one: its Q is then
-    /// the gain from a wrong convention, not from a good measurement.
+    /// The reason if the metric called `name` is not a number.
+    pub fn why_unknown(&self, name: &str) -> Option<Unknown> {
+        let value = self.metrics.values()[Metrics::place(name)?];
+        if !value.is_nan() {
+            return None;
+        }
+        // c1 and c2 are means, so they need nothing but ellipticities.
+        Some(match name {
+            _ if self.metrics.c1.is_nan() => Unknown::NoEllipticities,
+            _ if self.constant.is_some() => Unknown::ConstantTruth,
+            "q_dn" => Unknown::Noise,
+            "galaxy_noise" if self.noise.is_none() => Unknown::Noise,
+            "galaxy_noise" if !self.metrics.q_calibrated.is_nan() => Unknown::NegativeNoise,
+            "q_calibrated" | "galaxy_noise" => Unknown::Response,
+            _ => Unknown::ConstantTruth,
+        })
+    }
+
+    /// Whether the convention with the highest Q is of another class than the chosen one. Its Q is then due to
+    /// a wrong convention, not to a good measurement.
     pub fn wrong_convention_wins(&self) -> bool {
         self.best.class() != self.chosen.class()
     }
 
-    /// Share of the scored true power that is in B modes; a truth read with the wrong sign of g₂
-    /// has about one half.
+    /// Share of B modes in the scored true power. It is about one half if the sign of g₂ is wrong.
     pub fn true_b_share(&self) -> f64 {
         let sum = |p: &[f64; BINS]| SCORED.map(|b| p[b]).sum::<f64>();
         let (e, b) = (sum(&self.true_ee), sum(&self.true_bb));
@@ -240,11 +191,12 @@ impl SetScore {
     }
 }
 
-/// Covariance of the eight bandpowers of a power-spectrum submission.
+/// Covariance of the eight scored bandpowers of a power spectrum.
 pub type SpectrumCovariance = [[f64; SCORED.end - SCORED.start]; SCORED.end - SCORED.start];
 
-/// Metrics of a power-spectrum submission; errors are not numbers where the covariance is unknown.
+/// Metrics of a power spectrum. Errors are not numbers if the covariance is unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct SpectrumScore {
     /// Q and σ_sys.
     pub quality: Quality,
@@ -252,27 +204,28 @@ pub struct SpectrumScore {
     pub quality_error: f64,
     /// M/2.
     pub m_half: f64,
-    /// Its standard error.
+    /// Standard error of M/2.
     pub m_half_error: f64,
     /// Signed √A in 10⁻⁴ (C_ℓ in steradian).
     pub sqrt_a: f64,
-    /// Its standard error.
+    /// Standard error of √A.
     pub sqrt_a_error: f64,
 }
 
-/// What the noise of a mean field is measured from: that of a group of images, or of all.
+/// Power and noise gain of the mean field of a group of images, or of all images.
 #[derive(Debug, Clone, Copy)]
 struct MeanPower {
-    /// Its E-mode bandpowers in conventions of either class.
+    /// E-mode bandpowers in conventions of either class.
     power: [[f64; BINS]; 2],
-    /// Variance of its noise per unit variance of a galaxy's.
+    /// Noise variance of the field per unit noise variance of a galaxy.
     gain: f64,
 }
 
 /// Noise bandpowers in conventions of either class.
 type NoisePower = [[f64; BINS]; 2];
 
-/// Scores submissions of one set against its true shear.
+/// Scores catalogues and power spectra of one set against its true shear.
+#[derive(Debug, Clone)]
 pub struct SetScorer {
     grid: Grid,
     options: Options,
@@ -285,15 +238,15 @@ impl SetScorer {
     /// Prepares the transforms and bins.
     ///
     /// # Errors
-    /// Where the truth is not of the grid's shape, or a given noise variance negative or not finite.
+    /// If the shape of the truth differs from the grid, or if a given noise variance is negative or not finite.
     pub fn new(grid: Grid, truth: TrueShear, options: Options) -> Result<Self, ScoringError> {
         if let Noise::Given(variance) = options.noise
             && !(variance.is_finite() && variance >= 0.0)
         {
             return Err(ScoringError::NoiseVariance(variance));
         }
-        check_shape("g1 of the truth", &truth.g1.view(), &grid)?;
-        check_shape("g2 of the truth", &truth.g2.view(), &grid)?;
+        check_shape("g1 of the truth", &truth.g1, grid.n)?;
+        check_shape("g2 of the truth", &truth.g2, grid.n)?;
         Ok(SetScorer {
             grid,
             options,
@@ -303,19 +256,24 @@ impl SetScorer {
         })
     }
 
-    /// Scores the images of a submission.
-    ///
-    /// # Errors
-    /// Where no image was added, or images of another grid.
-    pub fn score(&self, images: &SetImages) -> Result<SetScore, ScoringError> {
-        let total = &images.total;
-        if total.images == 0 {
+    /// Checks that there are images of this grid.
+    pub(crate) fn check_images(&self, images: &SetImages) -> Result<(), ScoringError> {
+        if images.total().images == 0 {
             return Err(ScoringError::NoImages);
         }
-        check_shape("the sum of the images", &total.e1.view(), &self.grid)?;
+        check_shape("the sum of the images", &images.total().e1, self.grid.n)
+    }
+
+    /// Scores the images of a set.
+    ///
+    /// # Errors
+    /// If there is no image, or if the shape of the images differs from the grid.
+    pub fn score(&self, images: &SetImages) -> Result<SetScore, ScoringError> {
+        self.check_images(images)?;
+        let total = images.total();
         let groups: Vec<MeanPower> = match self.options.noise {
             Noise::Given(_) => Vec::new(),
-            Noise::Measured => images.groups.iter().map(|g| self.mean_power(g)).collect(),
+            Noise::Measured => images.groups().iter().map(|g| self.mean_power(g)).collect(),
         };
         let noise = self.noise_power(total, &groups);
         let conventions = Convention::ALL.map(|k| {
@@ -333,21 +291,10 @@ impl SetScorer {
             Choice::Insist(k) => k,
         };
         let mut metrics = self.metrics(total, &conventions[chosen.index()]);
-        let replicates: Vec<Metrics> = match images.groups.len() {
-            0 | 1 => Vec::new(),
-            _ => (0..images.groups.len())
-                .map(|k| {
-                    let mut rest = groups.clone();
-                    if k < rest.len() {
-                        rest.remove(k);
-                    }
-                    self.replicate(total, &images.groups[k], chosen, &rest, noise.as_ref())
-                })
-                .collect(),
-        };
+        let replicates = self.replicates(images, chosen, &groups, noise.as_ref());
         let chosen_one = &conventions[chosen.index()];
         let (mut errors, ee_error) = self.errors(images, chosen_one, &metrics, &replicates);
-        // By a response that may as well be zero nothing can be divided.
+        // Nothing can be divided by a response that is consistent with zero.
         if 1.0 + metrics.m_cross < CLEAR_RESPONSE * errors.m_cross {
             for of in [&mut metrics, &mut errors] {
                 (of.q_calibrated, of.galaxy_noise) = (f64::NAN, f64::NAN);
@@ -368,8 +315,8 @@ impl SetScorer {
             grid: self.grid,
             bins: self.bins.clone(),
             images: total.images,
-            true_ee: self.bins.power(&true_modes.e, &true_modes.e),
-            true_bb: self.bins.power(&true_modes.b, &true_modes.b),
+            true_ee: self.bins.power_of(&true_modes.e, &true_modes.e),
+            true_bb: self.bins.power_of(&true_modes.b, &true_modes.b),
             ee_error,
             noise,
             noise_variance,
@@ -384,11 +331,14 @@ impl SetScorer {
         })
     }
 
-    /// How well each convention of a submission's field correlates with the truth over bins 2 to 9.
-    pub fn match_convention(&self, images: &SetImages) -> ConventionMatch {
-        let total = &images.total;
-        let correlations = Convention::ALL.map(|k| self.correlation_of(total, k));
-        ConventionMatch::new(correlations, self.scored_modes())
+    /// How well each convention correlates with the truth over bins 2 to 9.
+    ///
+    /// # Errors
+    /// If there is no image, or if the shape of the images differs from the grid.
+    pub fn match_convention(&self, images: &SetImages) -> Result<ConventionMatch, ScoringError> {
+        self.check_images(images)?;
+        let correlations = Convention::ALL.map(|k| self.correlation_of(images.total(), k));
+        Ok(ConventionMatch::new(correlations, self.scored_modes()))
     }
 
     /// The true shear.
@@ -396,7 +346,7 @@ impl SetScorer {
         &self.truth
     }
 
-    /// Modes of a submission's averaged field under a convention, and those of the truth beside it.
+    /// Modes of the averaged field in a convention, and modes of the truth to compare them with.
     pub(crate) fn both_modes(&self, sum: &FieldSum, convention: Convention) -> (Modes, Modes) {
         (
             self.modes(sum, convention),
@@ -404,7 +354,7 @@ impl SetScorer {
         )
     }
 
-    /// Correlation of a submission's E modes with the true ones over the scored bins, under a convention.
+    /// Correlation of the averaged field's E modes with the true ones over the scored bins, in a convention.
     pub(crate) fn correlation_of(&self, sum: &FieldSum, convention: Convention) -> f64 {
         let (modes, truth) = self.both_modes(sum, convention);
         self.correlation(&modes, &truth)
@@ -421,11 +371,11 @@ impl SetScorer {
         product(&truth.e, &modes.e) / power.sqrt()
     }
 
-    /// Scores a power-spectrum submission: bandpowers of bins 2 to 9 against the true E modes, with
-    /// errors where their covariance is known.
+    /// Scores a power spectrum: bandpowers of bins 2 to 9 against the true E modes. Errors need their
+    /// covariance.
     ///
     /// # Errors
-    /// Where there are not exactly eight bandpowers.
+    /// If there are not exactly eight bandpowers.
     pub fn score_spectrum(
         &self,
         powers: &[f64],
@@ -453,7 +403,7 @@ impl SetScorer {
         Ok(SpectrumScore {
             quality: quality(&self.bins, &measured, &truth),
             quality_error: quality_error(&self.bins, &measured, &truth, &covariance),
-            m_half: fit.cl.m,
+            m_half: fit.cl.m_half,
             m_half_error: m / 2.0,
             sqrt_a: fit.cl.sqrtA * 1e4,
             sqrt_a_error: errors::of_sqrt_a(fit.cl.A, a),
@@ -468,7 +418,7 @@ impl SetScorer {
             ..FieldSum::new(&self.grid)
         };
         let modes = self.true_modes(&full, Convention::STANDARD);
-        self.bins.power(&modes.e, &modes.e)
+        self.bins.power_of(&modes.e, &modes.e)
     }
 
     /// The bins in use.
@@ -476,25 +426,25 @@ impl SetScorer {
         &self.bins
     }
 
-    /// Modes of the averaged field under a convention.
+    /// Modes of the averaged field in a convention.
     ///
     /// Leaderboard: sums divided by the number of images, so that missing galaxies count as zero.
-    /// Corrected: the same field, which is the mean of the galaxies present weighted by their share
-    /// w = count/images, rescaled by 1/⟨w²⟩^½ so that its power is that of an unmasked field.
+    /// Corrected: the same field, in which a cell has the weight w = count/images, rescaled by 1/⟨w²⟩^½. Its power
+    /// then equals the power of an unmasked field.
     fn modes(&self, sum: &FieldSum, convention: Convention) -> Modes {
         let scale = self.rescaling(sum) / sum.images as f64;
         self.decomposer
-            .decompose(convention.apply(&(&sum.e1 * scale), &(&sum.e2 * scale)))
+            .modes_of(convention.field(&(&sum.e1 * scale), &(&sum.e2 * scale)))
     }
 
-    /// Modes of the true shear; in the corrected definition seen through the submission's weights,
-    /// so that missing galaxies are not mistaken for a bias.
+    /// Modes of the true shear. In the corrected definition the shear has the weights of the galaxies, so that
+    /// missing galaxies do not appear as a bias.
     fn true_modes(&self, sum: &FieldSum, convention: Convention) -> Modes {
         let standard = Convention::STANDARD;
         match self.options.definition {
             Definition::Leaderboard => self
                 .decomposer
-                .decompose(standard.apply(&self.truth.g1, &self.truth.g2)),
+                .modes_of(standard.field(&self.truth.g1, &self.truth.g2)),
             Definition::Corrected => {
                 let scale = self.rescaling(sum) / sum.images as f64;
                 let weight = if convention.transposes() {
@@ -502,8 +452,8 @@ impl SetScorer {
                 } else {
                     sum.count.clone()
                 } * scale;
-                self.decomposer.decompose(
-                    standard.apply(&(&self.truth.g1 * &weight), &(&self.truth.g2 * &weight)),
+                self.decomposer.modes_of(
+                    standard.field(&(&self.truth.g1 * &weight), &(&self.truth.g2 * &weight)),
                 )
             }
         }
@@ -524,8 +474,8 @@ impl SetScorer {
         }
     }
 
-    /// Variance of the field's noise per unit variance of a galaxy's: 1/K on the leaderboard, and
-    /// ⟨w⟩/⟨w²⟩/K in the corrected definition, where gaps are made up for by rescaling.
+    /// Noise variance of the averaged field per unit noise variance of a galaxy: 1/K on the leaderboard, and
+    /// ⟨w⟩/⟨w²⟩/K in the corrected definition, which rescales for gaps.
     fn noise_gain(&self, sum: &FieldSum) -> f64 {
         let images = sum.images as f64;
         match self.options.definition {
@@ -537,25 +487,23 @@ impl SetScorer {
         }
     }
 
-    /// E-mode bandpowers of a mean field in either class of conventions, with its noise gain. Within a
-    /// class the scored bandpowers are the same.
+    /// E-mode bandpowers of a mean field in either class of conventions, and its noise gain. All conventions of
+    /// a class have the same scored bandpowers.
     fn mean_power(&self, sum: &FieldSum) -> MeanPower {
         MeanPower {
             power: ConventionClass::BOTH.map(|class| {
                 let modes = self.modes(sum, class.representative());
-                self.bins.power(&modes.e, &modes.e)
+                self.bins.power_of(&modes.e, &modes.e)
             }),
             gain: self.noise_gain(sum),
         }
     }
 
-    /// Noise bandpowers of the E modes averaged in `sum`, which is made of `groups`; `None` where
-    /// they cannot be known.
+    /// Noise bandpowers of the E modes of `sum`, which consists of `groups`. `None` if they cannot be determined.
     ///
     /// Measured: with noise gains r_g of the groups and r of all, ⟨P(E_g)⟩ = S + σ²⟨r_g⟩ and
-    /// P(Ē) = S + σ²r, so σ²r = r(⟨P(E_g)⟩ − P(Ē)) / (⟨r_g⟩ − r). It counts whatever changes from
-    /// image to image in the E modes, and nothing else; in the wrong class of conventions half of the
-    /// intrinsic ellipticities' power are E modes, so each class has noise of its own.
+    /// P(Ē) = S + σ²r, so σ²r = r(⟨P(E_g)⟩ − P(Ē)) / (⟨r_g⟩ − r). This noise includes all E modes that change
+    /// from image to image. The classes differ: in the wrong class half of the intrinsic power is in E modes.
     fn noise_power(&self, sum: &FieldSum, groups: &[MeanPower]) -> Option<NoisePower> {
         let gain = self.noise_gain(sum);
         match self.options.noise {
@@ -583,8 +531,8 @@ impl SetScorer {
         noise: Option<&NoisePower>,
     ) -> ConventionScore {
         let side = self.grid.side().0;
-        let ee = self.bins.power(&modes.e, &modes.e);
-        let true_ee = self.bins.power(&truth.e, &truth.e);
+        let ee = self.bins.power_of(&modes.e, &modes.e);
+        let true_ee = self.bins.power_of(&truth.e, &truth.e);
         let cross = self.bins.scored_product(&truth.e, &modes.e);
         let true_power = self.bins.scored_product(&truth.e, &truth.e);
         let m_cross = cross / true_power - 1.0;
@@ -595,8 +543,8 @@ impl SetScorer {
         ConventionScore {
             convention,
             ee,
-            bb: self.bins.power(&modes.b, &modes.b),
-            eb: self.bins.power(&modes.e, &modes.b),
+            bb: self.bins.power_of(&modes.b, &modes.b),
+            eb: self.bins.power_of(&modes.e, &modes.b),
             correlation: self.correlation(modes, truth),
             m_cross,
             quality: quality(&self.bins, &ee, &true_ee),
@@ -612,8 +560,29 @@ impl SetScorer {
         }
     }
 
-    /// Headline metrics with one group of images left out; `others` are the rest. Where too few are
-    /// left to measure the noise, that of all images is scaled.
+    /// The metrics with each group of images left out in turn; none with a single group.
+    fn replicates(
+        &self,
+        images: &SetImages,
+        chosen: Convention,
+        groups: &[MeanPower],
+        noise: Option<&NoisePower>,
+    ) -> Vec<Metrics> {
+        if images.groups().len() < 2 {
+            return Vec::new();
+        }
+        let without = |(k, group)| {
+            let mut rest = groups.to_vec();
+            if k < rest.len() {
+                rest.remove(k);
+            }
+            self.replicate(images.total(), group, chosen, &rest, noise)
+        };
+        images.groups().iter().enumerate().map(without).collect()
+    }
+
+    /// The metrics without one group of images; `others` are the remaining groups. If they are too few to measure
+    /// the noise, the noise of all images is scaled.
     fn replicate(
         &self,
         total: &FieldSum,
@@ -645,7 +614,7 @@ impl SetScorer {
             q: score.quality.q,
             q_dn: score.quality_dn.map_or(f64::NAN, |quality| quality.q),
             q_calibrated: score.quality_calibrated.q,
-            m_half: score.fit.cl.m,
+            m_half: score.fit.cl.m_half,
             sqrt_a: score.fit.cl.sqrtA * 1e4,
             m_cross: score.m_cross,
             galaxy_noise: self.noise_variance(sum, score).sqrt() / (1.0 + score.m_cross).abs(),
@@ -667,8 +636,8 @@ impl SetScorer {
         }
     }
 
-    /// Noise variance of one galaxy per component: that of white noise with the power that was removed from
-    /// the scored bandpowers. Not a number where none was.
+    /// Noise variance of one galaxy per component: white noise of this variance has the power that was subtracted
+    /// from the scored bandpowers. Not a number if none was subtracted.
     fn noise_variance(&self, sum: &FieldSum, score: &ConventionScore) -> f64 {
         let unit = self.bins.white_noise(self.noise_gain(sum));
         let removed = SCORED
@@ -690,8 +659,8 @@ impl SetScorer {
         ]
     }
 
-    /// Standard errors of the metrics ([`crate::errors`]). c has the jackknife's over images where that is
-    /// larger: what moves all galaxies of an image alike shows nowhere else.
+    /// Standard errors of the metrics ([`crate::errors`]) and of the E-mode bandpowers. For c the jackknife error is
+    /// used if it is larger: only the jackknife includes shifts common to all galaxies of an image.
     fn errors(
         &self,
         images: &SetImages,
@@ -699,50 +668,65 @@ impl SetScorer {
         metrics: &Metrics,
         replicates: &[Metrics],
     ) -> (Metrics, [f64; BINS]) {
-        let (sum, bins, k) = (&images.total, &self.bins, score.convention);
-        let biases = self.biases(sum, k);
-        let [v1, v2] = {
-            let residual = |bias: &ShearBias| bias.residual.mapv(|r| r / sum.images as f64);
-            let field = Convention::STANDARD.apply(&residual(&biases[0]), &residual(&biases[1]));
-            let scatter = Scatter::new(&self.grid, bins.width, &self.decomposer.decompose(field));
-            let scatter = match self.truth.constant() {
-                Some(_) => scatter.of_one_kind(),
-                None => scatter,
-            };
-            let images = sum.images as f64;
-            let sums = |weights: [&Array2<f64>; 2]| {
-                scatter
-                    .of_sums(&self.decomposer, weights)
-                    .map(|variance| variance.sqrt() * images)
-            };
-            let m = sums([&biases[0].of_m, &biases[1].of_m]);
-            let c = sums([&biases[0].of_c, &biases[1].of_c]);
-            [(m[0], c[0]), (m[1], c[1])]
-        };
+        let [(m1, c1), (m2, c2)] = self.galaxy_errors(images.total(), score.convention);
         let jackknife = |of: fn(&Metrics) -> f64| {
-            jackknife_error(of(metrics), replicates.iter().map(of), images.total.images)
+            let replicates = replicates.iter().map(of);
+            jackknife_error(of(metrics), replicates, images.total().images)
         };
-        let c1 = v1.1.max(jackknife(|f| f.c1));
-        let c2 = v2.1.max(jackknife(|f| f.c2));
+        let means = Metrics {
+            c1: c1.max(jackknife(|f| f.c1)),
+            c2: c2.max(jackknife(|f| f.c2)),
+            ..Metrics::unknown()
+        };
         if self.truth.constant().is_some() {
-            let means = Metrics {
-                c1,
-                c2,
-                ..Metrics::unknown()
-            };
             return (means, [f64::NAN; BINS]);
         }
-        let (mut modes, truth) = (self.modes(sum, k), self.true_modes(sum, k));
+        let from_galaxies = Metrics { m1, m2, ..means };
+        self.spectrum_errors(images, score, metrics, from_galaxies)
+    }
+
+    /// Standard errors of m and c of both components, from the residuals of the galaxies.
+    fn galaxy_errors(&self, sum: &FieldSum, convention: Convention) -> [(f64, f64); 2] {
+        let images = sum.images as f64;
+        let biases = self.biases(sum, convention);
+        let residual = |bias: &ShearBias| bias.residual.mapv(|r| r / images);
+        let field = Convention::STANDARD.field(&residual(&biases[0]), &residual(&biases[1]));
+        let modes = self.decomposer.modes_of(field);
+        let scatter = Scatter::new(&self.grid, self.bins.width, &modes);
+        let scatter = match self.truth.constant() {
+            Some(_) => scatter.of_one_kind(),
+            None => scatter,
+        };
+        let sums = |weights: [&Array2<f64>; 2]| {
+            scatter
+                .of_sums(&self.decomposer, weights)
+                .map(|variance| variance.sqrt() * images)
+        };
+        let m = sums([&biases[0].of_m, &biases[1].of_m]);
+        let c = sums([&biases[0].of_c, &biases[1].of_c]);
+        [(m[0], c[0]), (m[1], c[1])]
+    }
+
+    /// Standard errors of the metrics of spectra and of the E-mode bandpowers; other errors as in `others`.
+    fn spectrum_errors(
+        &self,
+        images: &SetImages,
+        score: &ConventionScore,
+        metrics: &Metrics,
+        others: Metrics,
+    ) -> (Metrics, [f64; BINS]) {
+        let (bins, groups) = (&self.bins, images.groups().len() as f64);
+        let (mut modes, truth) = self.both_modes(images.total(), score.convention);
         let signal = &truth.e * Complex64::from(1.0 + score.m_cross);
         modes.e -= &signal;
         let scatter = Scatter::new(&self.grid, bins.width, &modes);
-        let true_ee = bins.power(&truth.e, &truth.e);
+        let true_ee = bins.power_of(&truth.e, &truth.e);
         let power = scatter.of_power(bins, &signal, 1.0);
         let apart = std::array::from_fn(|b| score.ee[b] - true_ee[b]);
-        let q_dn = match (self.options.noise, images.groups.len() as f64) {
-            (_, _) if score.quality_dn.is_none() => f64::NAN,
-            (noise, groups) => {
-                let own = match noise {
+        let q_dn = match score.quality_dn {
+            None => f64::NAN,
+            Some(_) => {
+                let own = match self.options.noise {
                     Noise::Given(_) => 1.0,
                     Noise::Measured => groups / (groups - 1.0),
                 };
@@ -764,30 +748,24 @@ impl SetScorer {
             &true_ee,
             metrics.q_calibrated,
         );
-        let galaxy_noise = {
-            let own = match (self.options.noise, images.groups.len() as f64) {
-                (Noise::Given(_), _) => 0.0,
-                (Noise::Measured, groups) => bins.variance_of_white_power() / (groups - 1.0) / 4.0,
-            };
-            metrics.galaxy_noise * (own + (m_cross / response).powi(2)).sqrt()
+        // Relative variance of the noise: half the relative error of its power, squared.
+        let own = match self.options.noise {
+            Noise::Given(_) => 0.0,
+            Noise::Measured => bins.variance_of_white_power() / (groups - 1.0) / 4.0,
         };
-        let fit = &score.fit.cl;
         let [bb, eb] = scatter.of_null_tests(bins, &signal);
         let metrics = Metrics {
             q: errors::of_quality(bins, metrics.q, &apart, &power),
             q_dn,
             q_calibrated,
             m_half: m / 2.0,
-            sqrt_a: errors::of_sqrt_a(fit.A, a),
+            sqrt_a: errors::of_sqrt_a(score.fit.cl.A, a),
             m_cross,
-            galaxy_noise,
-            m1: v1.0,
-            m2: v2.0,
-            c1,
-            c2,
+            galaxy_noise: metrics.galaxy_noise * (own + (m_cross / response).powi(2)).sqrt(),
             b_power: errors::of_mean_c_l(bins, &bb),
             eb_power: errors::of_mean_c_l(bins, &eb),
             sigma_sys_1e4: errors::of_sigma_sys(bins, &apart, &power) * 1e4,
+            ..others
         };
         let mut ee_error = [f64::NAN; BINS];
         for b in SCORED {
@@ -808,52 +786,10 @@ fn best_of(conventions: &[ConventionScore; 8]) -> Convention {
         .map_or(Convention::STANDARD, |c| c.convention)
 }
 
-/// e = (1 + m)·g + c over all galaxies of a set: least squares of each galaxy's ellipticity on its true
-/// shear, from the sums per cell.
-struct ShearBias {
-    /// Not a number where the true shear is the same everywhere; c is then the mean of e − g.
-    m: f64,
-    c: f64,
-    /// Sum per cell of what the fit leaves.
-    residual: Array2<f64>,
-    /// Weights of the sums per cell in m.
-    of_m: Array2<f64>,
-    /// Weights of the sums per cell in c.
-    of_c: Array2<f64>,
-}
-
-impl ShearBias {
-    fn new(g: &Array2<f64>, sum: Array2<f64>, count: &Array2<f64>) -> Self {
-        let galaxies = count.sum();
-        let mean = (g * count).sum() / galaxies;
-        let apart = g - mean;
-        let square = (&apart * &apart * count).sum();
-        let constant = g.iter().all(|value| *value == g[(0, 0)]);
-        let of_m = match constant {
-            true => Array2::zeros(g.dim()),
-            false => &apart / square,
-        };
-        let slope = match constant {
-            true => 1.0,
-            false => (&of_m * &sum).sum(),
-        };
-        let of_c = of_m.mapv(|w| 1.0 / galaxies - w * mean);
-        let c = sum.sum() / galaxies - slope * mean;
-        ShearBias {
-            m: if constant { f64::NAN } else { slope - 1.0 },
-            c,
-            residual: &sum - &(g.mapv(|g| slope * g + c) * count),
-            of_m,
-            of_c,
-        }
-    }
-}
-
-/// E-mode bandpowers of a submission's averaged field and the bins they refer to: what a
-/// power-spectrum submission holds. No truth is needed.
+/// E-mode bandpowers of the averaged field of `sum` and their bins. No truth is needed.
 ///
 /// # Errors
-/// Where no image was added.
+/// If there is no image, or if the shape of the sum differs from the grid.
 pub fn measured_bandpowers(
     grid: &Grid,
     sum: &FieldSum,
@@ -862,10 +798,12 @@ pub fn measured_bandpowers(
     if sum.images == 0 {
         return Err(ScoringError::NoImages);
     }
+    check_shape("e1 of the sum", &sum.e1, grid.n)?;
+    check_shape("e2 of the sum", &sum.e2, grid.n)?;
     let scale = 1.0 / sum.images as f64;
-    let field = convention.apply(&(&sum.e1 * scale), &(&sum.e2 * scale));
-    let modes = Decomposer::new(*grid).decompose(field);
+    let field = convention.field(&(&sum.e1 * scale), &(&sum.e2 * scale));
+    let modes = Decomposer::new(*grid).modes_of(field);
     let bins = Bins::new(grid, Definition::Leaderboard);
-    let power = bins.power(&modes.e, &modes.e);
+    let power = bins.power_of(&modes.e, &modes.e);
     Ok((bins, power))
 }

@@ -10,7 +10,8 @@ use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once, 
 use crate::progress::Bar;
 use crate::{print, tell};
 use shearq_files::atomic;
-use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::data::run::{Run, Source, open_data, way};
 use shearq_render::table::TableFormat;
 use shearq_results::baseline::{
@@ -19,10 +20,10 @@ use shearq_results::baseline::{
 };
 use shearq_results::views::baseline::{junit, shift_table};
 
-/// Keep metrics as baselines, and see later whether they moved.
+/// Store metrics as a baseline and check later whether they moved.
 ///
-/// A baseline is a TOML file that holds the scores with errors per set, the scatter of the
-/// ellipticities, and everything that made them: settings, data, seed, version.
+/// A baseline is a TOML file. It contains the metrics of each set with errors, the scatter of the ellipticities,
+/// and what they were measured with: settings, data, seed and version.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     #[command(subcommand)]
@@ -43,31 +44,31 @@ enum Command {
 
 /// Store metrics as a new baseline.
 ///
-/// Of folders that `measure` or `run` wrote (--measured), of a data folder (--data), or of sets simulated
-/// for it (--simulate).
+/// The metrics come from folders that `measure` or `run` wrote (--measured), from a data folder (--data), or from
+/// simulated sets (--simulate).
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("input").required(true).args(["measured", "data", "simulate"]))]
 struct RecordArguments {
     /// Name of the baseline; it must be new.
     #[arg(value_name = "NAME", value_parser = file_stem)]
     name: String,
-    /// Folders of catalogues, of the same data.
+    /// Folders that `measure` or `run` wrote, measured on the same data.
     #[arg(long, value_name = "OUT", num_args = 1.., conflicts_with_all = ["submission", "sets", "images"])]
     measured: Vec<PathBuf>,
-    /// Data folder to measure, now and at each check.
+    /// Data folder to measure, now and in each check.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Simulate the data in memory, now and at each check.
+    /// Simulate the data in memory, now and in each check.
     #[arg(long, requires_all = ["sets", "images"])]
     simulate: bool,
-    /// Submission to measure, by name or file; may be given several times [default: all that
-    /// `submissions list` shows].
+    /// Configuration: a name from `shearq submissions list` or a TOML file. May be given several times
+    /// [default: all in the list].
     #[arg(long, value_name = "NAME|FILE")]
     submission: Vec<String>,
-    /// Sets to measure, as `1,2,7-9` or `all` [default with --data: all there are].
+    /// Sets, such as `1,2,7-9` or `all` [default with --data: all sets of the folder].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
-    /// Images per set to measure, from the first on [default with --data: all there are].
+    /// Images per set, counted from the first [default with --data: all images of the folder].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     images: Option<u32>,
     #[command(flatten)]
@@ -78,36 +79,36 @@ struct RecordArguments {
     threads: Threads,
 }
 
-/// Measure baselines again and compare.
+/// Measure baselines again and compare the metrics.
 ///
-/// Named submissions and configuration files are measured with their present settings, and settings that
-/// changed are listed. A file is known if `record` measured it (--submission FILE); catalogues (--measured)
-/// have the settings stored. On the same data a metric must be the same but for rounding; on other data (--data) within noise. Q, M/2, √A
-/// and the scatter of e1 and e2 are looked at; CSV and JSON have every one, the other formats those
-/// that moved.
+/// Each configuration is measured with its present settings, and changed settings are listed. A baseline of
+/// catalogues (--measured) contains no configuration file, so its stored settings are used.
 ///
-/// Exit code 0: nothing moved; 1: something did.
+/// Compared are Q, M/2, √A and the scatter of e1 and e2. On the same data they must agree up to rounding, on other
+/// data (--data) within the noise. CSV and JSON list every metric, the other formats the moved ones.
+///
+/// Exit code 0: all agree; 1: a metric or a setting moved.
 #[derive(Debug, Args)]
 struct CheckArguments {
-    /// Names of baselines [default: all in the folder].
+    /// Names of the baselines [default: all in the folder].
     #[arg(value_name = "NAME")]
     names: Vec<String>,
-    /// Data folder to measure instead of the one recorded.
+    /// Data folder to measure instead of the recorded one.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Measure with the settings stored in the baseline, not with those of your configuration files.
+    /// Measure with the settings stored in the baseline, not with your configuration files.
     #[arg(long)]
     stored: bool,
-    /// Standard errors by which a metric may be off on other data than the baseline's.
+    /// Largest accepted shift on other data, in standard errors.
     #[arg(long, value_name = "K", default_value_t = 3.0, value_parser = positive)]
     sigma: f64,
-    /// Replace what moved. The baseline keeps the reason and what moved.
+    /// Replace the baseline if anything moved. It keeps the reason and a list of changes.
     #[arg(long, requires = "reason")]
     update: bool,
     /// Why the baseline changes.
     #[arg(long, value_name = "TEXT", requires = "update")]
     reason: Option<String>,
-    /// Write the result as JUnit XML too.
+    /// Also write the result to this file as JUnit XML.
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
     #[command(flatten)]
@@ -118,7 +119,7 @@ struct CheckArguments {
     threads: Threads,
 }
 
-/// Where baselines are kept.
+/// The folder of the baselines.
 #[derive(Debug, Args)]
 struct Place {
     /// Folder of the baselines.
@@ -126,7 +127,7 @@ struct Place {
     folder: PathBuf,
 }
 
-/// A name that is good for a file in the folder.
+/// Checks a name that becomes a file name.
 fn file_stem(text: &str) -> Result<String, String> {
     let good = |c: char| c.is_alphanumeric() || "-_.+".contains(c);
     if text.chars().all(good) && !text.starts_with('.') && !text.is_empty() {
@@ -146,12 +147,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
     let folder = &arguments.place.folder;
     let path = Baseline::path(folder, &arguments.name);
-    // Before the work; whoever is first in the end is known then.
+    // Checked before the work, and again when the file is made.
     if path.exists() {
         return Err(Baseline::exists(&path).into());
     }
     let threads = arguments.threads.number();
-    let (source, submissions) = match &arguments.data {
+    let (source, configurations) = match &arguments.data {
         None if arguments.simulate => {
             let images = arguments.images.unwrap_or(1);
             let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
@@ -177,37 +178,41 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
             of_source(arguments, Source::folder(&data, folder)?, all)?
         }
     };
-    for set in submissions.iter().flat_map(|submission| &submission.sets) {
+    for set in configurations
+        .iter()
+        .flat_map(|configuration| &configuration.sets)
+    {
         anyhow::ensure!(
             set.images.iter().copied().eq(1..=set.images.len() as u32),
-            "set {} has images {:?}; a baseline can be measured again from images 1 to N",
+            "set {}: a baseline needs consecutive images (found {:?}, expected 1 to N)",
             set.set,
             set.images
         );
     }
-    Baseline::new(source, Vec::new(), submissions).create(&path)?;
+    Baseline::new(source, Vec::new(), configurations).create(&path)?;
     tell(format_args!("recorded {}", path.display()));
     Ok(())
 }
 
-/// Measures the submissions asked for.
+/// Measures the chosen configurations on `source`.
 fn of_source(
     arguments: &RecordArguments,
     source: Source,
     wanted: Vec<Wanted>,
 ) -> anyhow::Result<(Source, Vec<BaselineConfiguration>)> {
     let (folder, threads) = (&arguments.place.folder, arguments.threads.number());
-    let submissions = chosen(&arguments.submission, folder)?
+    let configurations = chosen(&arguments.submission, folder)?
         .into_iter()
-        .map(|(submission, file)| {
-            let sets = measured(&source, folder, &submission, &wanted, threads)?;
-            Ok(BaselineConfiguration::new(&submission, file, sets)?)
+        .map(|(configuration, file)| {
+            let sets = measured(&source, folder, &configuration, &wanted, threads)?;
+            Ok(BaselineConfiguration::new(&configuration, file, sets)?)
         })
         .collect::<anyhow::Result<_>>()?;
-    Ok((source, submissions))
+    Ok((source, configurations))
 }
 
-/// The submissions called `names`, or all named ones, with their files from the folder `beside`.
+/// The configurations called `names`, or all in the registry, with the paths of their files relative to the folder
+/// `beside`.
 fn chosen(
     names: &[String],
     beside: &Path,
@@ -231,48 +236,48 @@ fn chosen(
         .collect()
 }
 
-/// Takes the metrics of folders of catalogues, and the source that all of them have, for a record in the
-/// folder `beside`.
+/// The metrics of folders of catalogues, and their common source relative to the folder `beside`.
 fn of_folders(
     folders: &[PathBuf],
     beside: &Path,
     threads: usize,
 ) -> anyhow::Result<(Source, Vec<BaselineConfiguration>)> {
     let mut first: Option<Source> = None;
-    let mut submissions = Vec::new();
+    let mut configurations = Vec::new();
     for folder in folders {
         let run = Run::require(folder)?;
         let own = run.source.moved(folder, beside)?;
         let source = first.get_or_insert_with(|| own.clone());
         anyhow::ensure!(
             *source == own,
-            "{}: it was measured from {own}, the first from {source}; a baseline has one source",
+            "{}: the folders of a baseline must have one source (found {own}, expected {source})",
             folder.display(),
         );
         let sets = metrics_of(&run, &run.source.data(folder)?, folder, threads)?;
-        submissions.push(BaselineConfiguration::new(&run.configuration, None, sets)?);
+        configurations.push(BaselineConfiguration::new(&run.configuration, None, sets)?);
     }
-    Ok((first.context("--measured names no folder")?, submissions))
+    Ok((
+        first.context("--measured: expected a folder")?,
+        configurations,
+    ))
 }
 
 /// Measures with a progress bar.
 fn measured(
     source: &Source,
     beside: &Path,
-    submission: &Configuration,
+    configuration: &Configuration,
     wanted: &[Wanted],
     threads: usize,
-) -> anyhow::Result<Vec<BaselineSet>> {
+) -> Result<Vec<BaselineSet>, PipelineError> {
     let images: u64 = wanted.iter().map(|w| u64::from(w.images)).sum();
     let side = match source {
         Source::Simulated(settings) => settings.grid,
-        // The challenge's; a folder's grid is only known when its images are opened.
+        // An estimate for the bar: a folder's grid is unknown until its images are opened.
         Source::Folder { .. } => 100,
     };
     let mut bar = Bar::new("measuring", images * (side as u64).pow(2));
-    Ok(measure(
-        source, beside, submission, wanted, threads, &mut bar,
-    )?)
+    measure(source, beside, configuration, wanted, threads, &mut bar)
 }
 
 fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
@@ -284,7 +289,7 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     };
     anyhow::ensure!(
         !names.is_empty(),
-        "{}: there is no baseline here; `baseline record` makes one",
+        "{}: found no baseline in this folder. Try: shearq baseline record NAME",
         folder.display()
     );
     let mut checks = Vec::new();
@@ -305,13 +310,13 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     let failed = checks.iter().filter(|check| check.failed()).count();
     anyhow::ensure!(
         failed == 0 || arguments.update,
-        "{failed} of {} submissions moved from their baseline",
+        "{failed} of {} configurations moved from their baseline",
         checks.len()
     );
     Ok(())
 }
 
-/// Measures one baseline again, and updates it where that is asked for.
+/// Measures one baseline again, and updates it with `--update`.
 fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Result<Vec<Checked>> {
     let baseline = Baseline::read(path)?;
     let beside = &arguments.place.folder;
@@ -320,19 +325,19 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
         None => baseline.source.clone(),
     };
     let threads = arguments.threads.number();
-    let measure = |submission: &Configuration, wanted: &[Wanted]| {
-        measured(&source, beside, submission, wanted, threads)
+    let measure = |configuration: &Configuration, wanted: &[Wanted]| {
+        measured(&source, beside, configuration, wanted, threads)
     };
     let settings = match arguments.stored {
         true => Settings::Stored,
         false => Settings::Files(beside),
     };
-    let (checks, submissions) =
+    let (checks, configurations) =
         baseline::check(name, &baseline, arguments.sigma, settings, measure)
             .with_context(|| path.display().to_string())?;
     for check in checks.iter().filter(|check| check.stored) {
         tell(format_args!(
-            "{}: {}: measured with the stored settings; the baseline does not name a configuration file",
+            "note: {}: {}: measured with the stored settings, because the baseline names no configuration file",
             path.display(),
             check.configuration
         ));
@@ -341,7 +346,7 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
     if let (true, Some(reason)) = (arguments.update, &arguments.reason) {
         if moved.is_empty() && checks.iter().all(|check| check.notes.is_empty()) {
             tell(format_args!(
-                "{}: nothing moved; it stays as it is",
+                "{}: unchanged, because nothing moved",
                 path.display()
             ));
         } else {
@@ -351,7 +356,7 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
                 from_version: baseline.version.clone(),
                 moved,
             });
-            Baseline::new(source, history, submissions).replace(path, &baseline)?;
+            Baseline::new(source, history, configurations).replace(path, &baseline)?;
             tell(format_args!("updated {}", path.display()));
         }
     }

@@ -13,20 +13,19 @@ use shearq_simulate::set::SimulationSettings;
 use shearq_studies::convergence::convergence;
 use shearq_studies::speed;
 
-/// Measure the speed on this machine: stages of a measurement, stamp sizes, convergence, threads,
-/// scoring.
+/// Measure the speed on this machine: stages of a measurement, stamp sizes, convergence, threads and scoring.
 ///
-/// Takes about a minute. Other work on the machine disturbs it; ratios within one run are safer than
-/// absolute figures. docs/speed.md explains where the time goes.
+/// It takes about a minute. Other work on the machine disturbs it, so compare ratios within one run rather than
+/// absolute times. docs/speed.md explains the results.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Name of a submission or a TOML file of your own. May be given several times.
+    /// Configuration: a name from `shearq submissions list` or a TOML file. May be given several times.
     #[arg(long, value_name = "NAME|FILE", default_values = ["23/den/star", "48/linear/star"])]
     submission: Vec<String>,
-    /// Catalogues scored.
+    /// Number of catalogues to score.
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u16).range(2..=2000))]
     catalogues: u16,
-    /// Folder for a report with plots, their data beside it.
+    /// Folder for a report with plots and their data.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
@@ -66,7 +65,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let Some(page) = &mut page {
         page.section(
             "Stages",
-            "Costs of one galaxy on one thread, and rates of many.",
+            "Cost of one galaxy on one thread, and rates with several threads.",
         );
     }
     for submission in &submissions {

@@ -13,23 +13,23 @@ use shearq_render::page::Page;
 use shearq_studies::calibration::calibrate;
 use shearq_studies::exhibits;
 
-/// Find the regularisation parameter λ for a submission, as in the paper's Sect. 4.
+/// Find the regularisation parameter λ of a configuration, as in Sect. 4 of the paper.
 ///
-/// Synthetic Sérsic galaxies with a Moffat PSF each and noise of 10, 20 and 40 dB are deconvolved for
-/// λ from 1e-6 to 1e6 by both updating rules. Printed are the λ of the best 1/RMSD at each S/N and
-/// the λ chosen; with --out, the paper's Figs 4 to 7 are drawn and their data written.
+/// Synthetic Sérsic galaxies, each with a Moffat PSF and noise of 10, 20 or 40 dB, are deconvolved by both updating
+/// rules. λ runs from 1e-6 to 1e6. The command prints the λ with the best 1/RMSD at each S/N and the chosen λ. With
+/// --out, it also draws Figs 4 to 7 of the paper and writes their data.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Name of a submission or a TOML file of your own.
+    /// Configuration: a name from `shearq submissions list` or a TOML file.
     #[arg(long, value_name = "NAME|FILE", default_value = "paper")]
     submission: String,
-    /// Galaxies; the paper has 10000.
+    /// Number of galaxies; the paper has 10000.
     #[arg(long, value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u64).range(10..=1_000_000))]
     galaxies: u64,
     /// Seed of all random numbers.
     #[arg(long, value_name = "SEED", default_value_t = 1)]
     seed: u64,
-    /// Folder for figures and data.
+    /// Folder for a report with plots and their data.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
@@ -44,7 +44,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .configuration;
     anyhow::ensure!(
         submission.network().is_some(),
-        "{} has method = \"linear\"; λ is calibrated for the network's adaptive and constant update",
+        "{} has no λ to calibrate (found method = \"linear\", expected \"network\"). Try: --submission paper",
         submission.name
     );
     if let Some(out) = &arguments.out {
@@ -79,11 +79,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         page.section("Curves", "Figs 4 to 7 of the paper.");
         exhibits::calibration_figures(&mut page, &curves)?;
         page.data("curves", &exhibits::curves_table(&curves))?;
-        page.section("λ", "The best λ at each S/N, and the one chosen.");
+        page.section("λ", "The best λ at each S/N, and the chosen λ.");
         page.table("lambda", &table)?;
         page.save()?;
         tell(format_args!(
-            "figures, data and report in {}",
+            "wrote report, plots and data to {}",
             out.display()
         ));
     }

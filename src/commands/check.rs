@@ -7,40 +7,41 @@ use clap::Args;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::Grid;
 
-use crate::{Findings, count, print};
+use crate::{Findings, count, print, tell_unread};
 use shearq_files::table::MAX_ROWS;
-use shearq_pipeline::data::layout::{DataFolder, Layout, MAX_IMAGE, read_truth_rows};
+use shearq_pipeline::data::layout::{DataFolder, Layout, read_truth_rows};
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::grid;
 use shearq_pipeline::truth::grid_of_set;
 use shearq_results::submit::check::{Expected, Finding, Severity, check};
 
-/// Validate a submission before it is sent: one line per problem, with the number of files that have it.
+/// Check a submission before you send it.
 ///
-/// PATH is a catalogue, a power-spectrum file, or a folder or archive (.tar.gz) of either, in the
-/// challenge's formats (catalogues may also be CSV, FITS or Parquet with columns x, y, e1, e2). Checked:
-/// the manifest's checksums, if there is one; readability,
-/// names, completeness against the grid, duplicates, rows outside or in excess, positions off the
-/// cells' centres, NaN, |e| > 1, constant values, copies, missing images, bins, multipoles; and, with --data,
-/// sign and axis conventions, order of rows, type of ellipticity, bias and unit of power against the true shear.
+/// PATH is a catalogue, a power-spectrum file, or a folder or archive (.tar.gz) of either. Files have the challenge's
+/// formats; catalogues may also be CSV, FITS or Parquet with the columns x, y, e1, e2.
 ///
-/// Exit code 0: no errors (perhaps warnings); 1: errors were found.
+/// The command checks names, checksums, missing and repeated galaxies and images, positions, values, copies and
+/// bins. With --data it also compares signs, axes, order of rows, type of ellipticity, bias and units with the true
+/// shear. It prints one line per problem.
+///
+/// Exit code 0: no errors, perhaps warnings; 1: errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// File, folder or archive.
+    /// File, folder or archive to check.
     path: PathBuf,
-    /// Data folder whose true shear to check against.
+    /// Data folder with the true shear.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Galaxies a side [default: that of the data's truth, or 100].
+    /// Galaxies per side of an image [default: as in the data, or 100].
     #[arg(long, value_name = "N")]
     grid: Option<usize>,
-    /// Pixels a side of a grid cell [default: that of the data's images or layout, or 48].
+    /// Pixels per side of a stamp [default: as in the data, or 48].
     #[arg(long, value_name = "PX", allow_negative_numbers = true)]
     stamp: Option<f64>,
-    /// Images that every set must have [default: as many as the highest number says].
+    /// Number of images of every set [default: the highest number found].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     images: Option<u32>,
-    /// Print JSON.
+    /// Print the findings as JSON.
     #[arg(long)]
     json: bool,
 }
@@ -58,7 +59,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let sets = data
         .as_ref()
         .map_or_else(|| Ok(Vec::new()), DataFolder::sets_with_truth)?;
-    // Without a truth, the images of the data have the grid.
+    // Without a truth, the images determine the grid.
     let first = match (&data, sets.first()) {
         (Some(data), None) => data.images(&[])?.sets().first().copied(),
         (_, first) => first.copied(),
@@ -88,6 +89,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     )?;
     let mut truth = BTreeMap::new();
     if let Some(data) = &data {
+        tell_unread(&data.images(&[])?);
         for set in sets {
             truth.insert(set, data.read_truth(set, &grid)?);
         }
@@ -97,15 +99,19 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         truth,
         images: *images,
     };
-    let findings = check(path, &expected);
+    report(&check(path, &expected), path, *json)
+}
+
+/// Prints the findings about `path`, and fails if any is an error.
+fn report(findings: &[Finding], path: &Path, json: bool) -> anyhow::Result<()> {
     let errors = findings
         .iter()
         .filter(|f| f.severity == Severity::Error)
         .count();
-    if *json {
+    if json {
         print(&(serde_json::to_string_pretty(&findings)? + "\n"))?;
     } else {
-        for (finding, files) in problems(&findings) {
+        for (finding, files) in problems(findings) {
             let severity = match finding.severity {
                 Severity::Error => "error",
                 Severity::Warning => "warning",
@@ -131,10 +137,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         };
         print(&format!("{}: {summary}\n", path.display()))?;
     }
-    if errors > 0 {
-        return Err(Findings.into());
+    match errors {
+        0 => Ok(()),
+        _ => Err(Findings.into()),
     }
-    Ok(())
 }
 
 /// The first finding of each problem, in order, and the number of files that have it.

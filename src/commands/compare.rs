@@ -21,39 +21,38 @@ use shearq_results::views::pages;
 use shearq_results::views::scores::notes;
 use shearq_results::views::verdict::verdict;
 
-/// Put measured submissions side by side, beside the published metrics, or past runs of a store.
+/// Compare the metrics of several configurations.
 ///
-/// Each OUT is a folder that `measure` or `run` wrote. Differences in Q are taken from the first and
-/// paired over the same images, so that noise common to both cancels.
+/// Each OUT is a folder that `measure` or `run` wrote. Differences in Q are relative to the first OUT and paired
+/// over the same images, so that common noise cancels. Published metrics are shown next to them.
 ///
-/// With --store the runs are those that `score --store` and `run --store` recorded. On a terminal Q
-/// per set follows as a heat map, in colours unless NO_COLOR is set.
+/// With --store, the command compares the runs that `score --store` and `run --store` recorded. A terminal also
+/// shows Q of each set as a heat map, without colours if NO_COLOR is set.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Folders of catalogues.
+    /// Folders that `measure` or `run` wrote.
     #[arg(value_name = "OUT", required_unless_present_any = ["foreign", "store"])]
     measured: Vec<PathBuf>,
-    /// Data folder with the true shear [default: the one the first OUT was measured from].
+    /// Data folder with the true shear [default: the data that the first OUT was measured from].
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Catalogues of another program, described in a TOML file (docs/formats.md). May be given
-    /// several times.
+    /// Catalogues of another program, described by a TOML file (docs/formats.md). May be given several times.
     #[arg(long, value_name = "FILE")]
     foreign: Vec<PathBuf>,
-    /// Results store whose runs to compare, instead of folders.
+    /// Results store with the runs to compare, instead of folders.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["measured", "data", "foreign", "definition", "convention", "threads"])]
     store: Option<PathBuf>,
-    /// Sets to compare: conditions on the columns of a results store that all must hold, as in
-    /// `snr=low,submission=23/*,q>50`, with = != < <= > >= and `*` for any characters.
+    /// Compare only sets that meet all conditions, such as `snr=low,submission=23/*,q>50`. A condition is a column of
+    /// a results store, one of = != < <= > >=, and a value; `*` stands for any characters.
     #[arg(long = "where", value_name = "CONDITIONS")]
     conditions: Option<Conditions>,
-    /// Metric or column to sort by, as in `q:desc`.
+    /// Metric or column to sort by, such as `q:desc`.
     #[arg(long, value_name = "FIELD[:desc]")]
     sort: Option<Order>,
-    /// Means over groups of sets instead of all sets of a run.
+    /// Average over groups of sets instead of all sets.
     #[arg(long, value_parser = named::<Grouping>())]
     group_by: Option<Grouping>,
-    /// Draw Q per run and set as PNG or SVG, by the file's ending.
+    /// Draw Q of each run and set to this file (.png or .svg).
     #[arg(long, value_name = "FILE")]
     heat_map: Option<PathBuf>,
     #[command(flatten)]
@@ -93,7 +92,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         map.save(path)?;
     }
     let sections = || Ok(vec![pages::comparison(table, &map)?]);
-    let title = "Comparison of submissions";
+    let title = "Comparison of configurations";
     arguments
         .report
         .save(title, sections, || made_by(arguments))?;
@@ -103,7 +102,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Where the metrics come from: inputs, and settings of what shearq measured.
+/// Inputs of the comparison, and settings of the folders.
 fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
     let mut made_by = Vec::new();
     for folder in &arguments.measured {
@@ -115,7 +114,7 @@ fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
     Ok(made_by)
 }
 
-/// The comparison of folders, or of groups of their sets.
+/// Compares folders, or groups of their sets.
 fn folders(arguments: &Arguments, variants: &[Variant]) -> anyhow::Result<Table> {
     if arguments.group_by.is_none() {
         return Ok(compare(variants, arguments.settings.definition()));
@@ -123,7 +122,7 @@ fn folders(arguments: &Arguments, variants: &[Variant]) -> anyhow::Result<Table>
     let runs: Vec<RunRecord> = variants.iter().map(|variant| variant.run.clone()).collect();
     let groups = Group::of(&runs, arguments.group_by, arguments.sort.as_ref())?;
     let mut table = compare_runs(&runs, &groups, arguments.group_by);
-    table.title = "Comparison of submissions".into();
+    table.title = "Comparison of configurations".into();
     for variant in variants {
         for line in notes(&variant.sets).iter().chain(&variant.unscored) {
             let line = format!("{}: {line}", variant.name);
@@ -136,7 +135,7 @@ fn folders(arguments: &Arguments, variants: &[Variant]) -> anyhow::Result<Table>
     Ok(table)
 }
 
-/// The comparison of a store's runs.
+/// Compares the runs of a store.
 fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)> {
     let (mut runs, notes) = store::read(path)?;
     if let Some(conditions) = &arguments.conditions {
@@ -144,11 +143,11 @@ fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)
     }
     anyhow::ensure!(
         !runs.is_empty(),
-        "{}: there is no recorded run{}",
+        "{}: found no recorded run{}",
         path.display(),
         match &arguments.conditions {
-            Some(_) => " for which the conditions hold",
-            None => "; `score --store` and `run --store` record them",
+            Some(_) => " that meets the conditions",
+            None => ". Try: shearq score --measured OUT --store DIR",
         }
     );
     let order = arguments.sort.as_ref();

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::{count, tell};
-use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE, MAX_SET};
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::pattern::{MAX_IMAGE, MAX_SET};
 use shearq_pipeline::gather::{Content, Files, Gathered, Gathering, Stamps, Table, gather};
 use shearq_pipeline::images::ImageId;
 

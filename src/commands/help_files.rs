@@ -1,4 +1,4 @@
-//! `shearq completions` and `shearq manual`: help for shells and for `man`.
+//! `shearq completions` and `shearq manual`: files for shells and for `man`.
 
 use std::path::PathBuf;
 
@@ -8,15 +8,15 @@ use clap_complete::Shell;
 use crate::{Cli, tell, write};
 use shearq_files::atomic;
 
-/// Print the completions of a shell.
+/// Print a script that completes shearq's options in a shell.
 #[derive(Debug, Args)]
 pub(crate) struct Completions {
-    /// The shell.
+    /// Shell to write the script for.
     #[arg(value_enum)]
     shell: Shell,
 }
 
-/// Write the manual pages.
+/// Write the manual pages for `man`.
 #[derive(Debug, Args)]
 pub(crate) struct Manual {
     /// Folder to write to.
@@ -31,7 +31,7 @@ pub(crate) fn completions(arguments: &Completions) -> anyhow::Result<()> {
 }
 
 pub(crate) fn manual(arguments: &Manual) -> anyhow::Result<()> {
-    // `--help` does the same, and has no page.
+    // `shearq help` has no page: `--help` prints the same.
     let mut cli = Cli::command().disable_help_subcommand(true);
     cli.build();
     let mut pages = Vec::new();
@@ -42,16 +42,16 @@ pub(crate) fn manual(arguments: &Manual) -> anyhow::Result<()> {
         atomic::write(arguments.out.join(file), &page)?;
     }
     tell(format_args!(
-        "{} pages in {}",
+        "wrote {} pages to {}",
         pages.len(),
         arguments.out.display()
     ));
     Ok(())
 }
 
-/// The page of a command and those of its subcommands, to which it refers, each by the name of its file.
+/// Adds the pages of a command and its subcommands, each with its file name.
 fn add_pages(name: &str, command: &Command, pages: &mut Vec<(String, Command)>) {
-    // A page is found by the name of its command.
+    // `man` finds a page by the name of its command.
     pages.push((format!("{name}.1"), command.clone().name(name.to_owned())));
     for subcommand in command.get_subcommands() {
         add_pages(

@@ -12,12 +12,11 @@ use shearq_results::mean::mean_shears;
 use shearq_results::score::without_catalogue;
 use shearq_results::views::mean::mean_table;
 
-/// Mean ellipticity of each set: the shear, where a set has one shear.
+/// Mean shear of each set, for fields of constant shear.
 ///
-/// The ellipticities are those of the catalogues, divided by their response where the submission does so. Each
-/// galaxy with an ellipticity counts alike, flagged ones have none. The error is the scatter over the root of their
-/// number, which holds for galaxies that are independent of one another; of pairs turned by 90 degrees it is too
-/// large.
+/// The mean shear is the mean ellipticity of all galaxies without a flag, divided by the mean response if the
+/// configuration does so. The error includes the error of the mean response. It assumes independent galaxies: for pairs
+/// that are rotated by 90 degrees it is too large.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
@@ -41,7 +40,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     } = arguments;
     let run = Run::require(measured)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
-    // The data need not be there any more.
+    // The data may have been removed since.
     let data = match &run.source {
         Source::Folder { .. } => run.source.data(measured).ok(),
         Source::Simulated(_) => None,

@@ -10,37 +10,36 @@ use crate::progress::{Bar, goes_on};
 use crate::{Findings, count, print, run, tell, tell_unread};
 use shearq_files::open::is_there;
 use shearq_pipeline::complete::{Fault, Results};
-use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE};
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::data::run::{RUN_FILE, Run, Source, check_folder, claim, read_record};
 use shearq_pipeline::images::{self, ImageId, Shard};
 use shearq_pipeline::simulate::{SIMULATION_FILE, SimulationRecord};
 
-/// Check that a folder written by shards is complete, and score it as `run` does.
+/// Check that a folder written in shards is complete, and score it as `run` does.
 ///
-/// Every image that should have results is looked at: whether they are there, can be read, have a row
-/// for every galaxy and were made by the folder's settings. What is missing or damaged is printed, one
-/// image a line as SET/IMAGE, and nothing is scored. The same command as before, with or without
-/// --shard, does again what is missing.
+/// For each image, the command checks that the results exist, are readable, have a row per galaxy and were made with
+/// the folder's settings. It prints missing or damaged images as SET/IMAGE and does not score them. To complete the
+/// folder, repeat the command that wrote it, with or without --shard.
 ///
-/// Scores and bandpowers are kept beside the catalogues as scores.csv and bandpowers.csv. A folder that
-/// `simulate` wrote is checked only, and so are catalogues of data without true shear.
+/// Scores and bandpowers are written to scores.csv and bandpowers.csv in the folder. Folders by `simulate` and
+/// catalogues of data without true shear are only checked.
 ///
-/// Exit code 0: complete; 1: something is missing or damaged.
+/// Exit code 0: complete; 1: images are missing or damaged.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder that `run`, `measure` or `simulate` wrote with --shard.
     out: PathBuf,
-    /// Sets that should be there, as given to `run` or `simulate` [default with images of a data
-    /// folder: all it has].
+    /// Expected sets, as given to `run` or `simulate` [default for a data folder: all its sets].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
-    /// Images per set that should be there, as given to `run --simulate` or `simulate`.
+    /// Expected images per set, as given to `run --simulate` or `simulate`.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     images: Option<u32>,
-    /// Number of shards: says which of them are to be run again.
+    /// Number of shards; prints which shards to run again.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     shards: Option<u32>,
-    /// Remove damaged results, so that they are made again. Files that are there are kept otherwise.
+    /// Remove damaged results, so that the next run makes them again.
     #[arg(long)]
     discard_damaged: bool,
     #[command(flatten)]
@@ -60,7 +59,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let path = out.join(SIMULATION_FILE);
     let record: SimulationRecord = read_record(&path)?.with_context(|| {
         format!(
-            "{}: there is neither {RUN_FILE} nor {SIMULATION_FILE}; expected a folder that `run`, `measure` or `simulate` wrote",
+            "{}: found neither {RUN_FILE} nor {SIMULATION_FILE}; expected a folder that `run`, `measure` or `simulate` wrote",
             out.display()
         )
     })?;
@@ -83,7 +82,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
         Source::Folder { .. } => {
             anyhow::ensure!(
                 arguments.images.is_none(),
-                "--images is for simulated data; here every image of {} is expected",
+                "--images applies to simulated data only; every image of {} is expected. Try: without --images",
                 run.source
             );
             let images = images::of_folder(&data, sets)?;
@@ -102,24 +101,24 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
         return Ok(());
     }
     tell(format_args!(
-        "not scored: {} has no true shear",
+        "note: not scored, because {} has no true shear",
         data.root().display()
     ));
     Ok(())
 }
 
-/// The images that a simulation should have, as the arguments say: its record does not.
+/// The expected images of a simulation, from the arguments: its record does not list them.
 fn simulated_images(arguments: &Arguments) -> anyhow::Result<Vec<ImageId>> {
     match (&arguments.sets, arguments.images) {
         (Some(sets), Some(images)) => Ok(images::of_simulation(&sets.0, images)),
         _ => anyhow::bail!(
-            "{}: the data were simulated; give the --sets and --images that should be there",
+            "{}: cannot determine the expected images of simulated data. Try: --sets LIST --images N",
             arguments.out.display()
         ),
     }
 }
 
-/// Prints what is missing or damaged.
+/// Fails with a list of missing or damaged images, if any.
 fn require_complete(
     arguments: &Arguments,
     results: &Results<'_>,
@@ -131,7 +130,7 @@ fn require_complete(
     drop(bar);
     if faults.is_empty() {
         tell(format_args!(
-            "{} complete in {out}",
+            "{out}: complete, {}",
             count(images.len(), "image")
         ));
         return Ok(());
@@ -165,7 +164,7 @@ fn require_complete(
     Err(Findings.into())
 }
 
-/// The shard that an image belongs to, where their number is known.
+/// The shard of an image, if the number of shards is known.
 fn shard_of(fault: &Fault, shards: Option<u32>) -> Option<Shard> {
     shards.map(|of| Shard::holding(fault.position, of))
 }

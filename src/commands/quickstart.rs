@@ -23,13 +23,12 @@ use shearq_results::views::scores::{per_set, verdict_line};
 use shearq_results::views::verdict::verdict;
 use shearq_simulate::set::SimulationSettings;
 
-/// The whole chain on a small simulated default: simulate, measure with three submissions, score,
-/// compare. Takes well under two minutes.
+/// Simulate a small data set, measure it with three configurations, score and compare them.
 ///
-/// It runs what these commands would: `simulate --sets 2,8 --images 10 --grid 60 --seed 2013`, then
-/// `measure` and `score --convention 5` with 23/raw/star, 23/den/star and 48/linear/star, then
-/// `compare --convention 5`, and writes report.html. The data are simulated,
-/// and few: the errors printed are what tells whether a difference is one.
+/// It takes less than two minutes and runs these commands: `simulate --sets 2,8 --images 10 --grid 60 --seed 2013`,
+/// then `measure` and `score --convention 5` for 23/raw/star, 23/den/star and 48/linear/star, then
+/// `compare --convention 5`. It also writes report.html. The data are simulated and few, so judge differences by the
+/// printed errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder to write to.

@@ -9,7 +9,7 @@ use shearq_submissions::{Configuration, Published, Registry};
 use crate::arguments::{SetList, Threads, given_once};
 use crate::progress::{Bar, goes_on};
 use crate::{print, print_table, tell};
-use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::run::{measurers, simulated_steps};
 use shearq_pipeline::simulate::simulator;
 use shearq_render::page::Page;
@@ -19,31 +19,32 @@ use shearq_studies::calibration::calibrate;
 use shearq_studies::exhibits;
 use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
 
-/// Reproduce the paper's figures and tables on simulated data.
+/// Reproduce the figures and tables of the paper on simulated data.
 ///
-/// Sect. 4: calibration of λ on synthetic galaxies (Figs 4 to 7). Sect. 5: the seven submissions of
-/// Table 1 on the 24 sets (Table 1, Figs 8 to 11), simulated and measured in memory, set by set;
-/// each finished set is kept, so a stopped run goes on where it was. The result is one HTML report,
-/// with every figure beside it as PNG and SVG and its data as CSV and Parquet. The default takes
-/// minutes; --images 200 is the challenge's size and takes hours.
+/// Sect. 4: calibration of λ on synthetic galaxies (Figs 4 to 7). Sect. 5: the seven configurations of Table 1 on 24
+/// sets (Table 1, Figs 8 to 11), simulated and measured in memory.
+///
+/// The command writes an HTML report, figures as PNG and SVG, and their data as CSV and Parquet. Finished sets are
+/// kept, so the same command resumes a stopped run. The default takes minutes; --images 200, as in the challenge,
+/// takes hours.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder to write to.
     #[arg(long, value_name = "DIR", default_value = "shearq-reproduce")]
     out: PathBuf,
-    /// Images per set, at least 2: the noise of spectra is measured between images.
+    /// Images per set, at least 2, because differences between images determine the noise of spectra.
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(2..=i64::from(MAX_IMAGE)))]
     images: u32,
-    /// Galaxies a side of an image.
+    /// Galaxies per side of a simulated image.
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u16).range(8..=400))]
     grid: u16,
-    /// Sets.
+    /// Sets, such as `1,2,7-9` or `all`.
     #[arg(long, value_name = "LIST", default_value = "all")]
     sets: SetList,
-    /// Submissions of Table 1; repeat it for several. All seven where none is named.
+    /// Configuration of Table 1. May be given several times [default: all seven].
     #[arg(long, value_name = "NAME")]
     submission: Vec<String>,
-    /// Galaxies of the calibration; the paper has 10000.
+    /// Number of galaxies for the calibration; the paper has 10000.
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(10..=1_000_000))]
     galaxies: u64,
     /// Seed of all random numbers.
@@ -108,6 +109,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             toml::to_string(&base)?,
         ),
     ];
+    study.check()?;
     let mut page = Page::new(
         out,
         "Hopfield Neural Network deconvolution, reproduced",
@@ -125,14 +127,15 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.table("calibration", &calibration)?;
     page.table("findings-lambda", &of_lambda)?;
     page.data("fig5-7-lambda", &exhibits::curves_table(&curves))?;
-    page.section("Submissions (Sect. 5)", SECT_FIVE);
+    page.section("Configurations (Sect. 5)", SECT_FIVE);
     page.table("table1", &table_one)?;
-    // Few submissions or sets may decide none.
+    // A few configurations or sets may allow no finding.
     let findings = (!findings.rows.is_empty()).then_some(findings);
     if let Some(findings) = &findings {
         page.table("findings", findings)?;
     }
     sect_five(&mut page, &results, &names)?;
+    study.check()?;
     page.save()?;
     print_table(&table_one)?;
     for table in findings.iter().chain([&of_lambda, &calibration]) {
@@ -140,17 +143,17 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         print_table(table)?;
     }
     tell(format_args!(
-        "report, figures and data in {}",
+        "wrote report, figures and data to {}",
         out.display()
     ));
     Ok(())
 }
 
-const SECT_THREE: &str = "A stamp is deconvolved by the network; the ellipticity is measured on the autocorrelation (ACF) of the result, less the mean of its edge, clipped at the radius that holds 89 % of the light that a radius encloses at most.";
-const SECT_FOUR: &str = "Exponential galaxies on stamps, convolved with a Moffat PSF each, with white noise of 10, 20 and 40 dB, deconvolved for λ from 10⁻⁶ to 10⁶ by both updating rules. Everything here is simulated.";
-const SECT_FIVE: &str = "Submissions of Table 1 on sets of Table 2. The images are simulated, not the challenge's own: distributions of S/N and size, PSF fields and shear spectra that were not published are chosen here. Figures are for the standard convention, in which the ellipticities are measured, by the leaderboard's definition; errors come from what the truth leaves unexplained.";
+const SECT_THREE: &str = "The network deconvolves a stamp. The ellipticity is measured on the autocorrelation (ACF) of the result, after subtracting the mean of its edge. The ACF is clipped at the radius that contains 89 % of the largest enclosed light.";
+const SECT_FOUR: &str = "Exponential galaxies are convolved with a Moffat PSF each and have white noise of 10, 20 or 40 dB. Both updating rules deconvolve them with λ from 10⁻⁶ to 10⁶. All data are simulated.";
+const SECT_FIVE: &str = "Configurations of Table 1 on sets of Table 2. The images are simulated, not the challenge's. Unpublished properties are chosen here: distributions of S/N and size, PSF fields and shear spectra. Metrics are for the standard convention and the leaderboard definition. Errors come from the part of the ellipticities that the truth does not explain.";
 
-/// The submissions of Table 1 with these names, in its order; all where there are none.
+/// The configurations of Table 1 with these names, in its order; all if `wanted` is empty.
 fn of_table_one(
     registry: &Registry,
     wanted: &[String],
@@ -159,7 +162,7 @@ fn of_table_one(
     let known = names(&all);
     if let Some(name) = wanted.iter().find(|name| !known.contains(name)) {
         bail!(
-            "`{name}` is not in Table 1, which has {}; `study` and `run` take any other",
+            "--submission: not in Table 1 (found {name}, expected one of {}). Try: shearq study --submission {name}",
             known.join(", ")
         );
     }
@@ -194,13 +197,13 @@ fn names(submissions: &[(Configuration, Published)]) -> Vec<String> {
     submissions.iter().map(|(s, _)| s.name.clone()).collect()
 }
 
-/// Figs 8 to 11, and the tables beside them.
+/// Figs 8 to 11 and their tables.
 fn sect_five(page: &mut Page<'_>, results: &[SetResult], names: &[String]) -> anyhow::Result<()> {
     let images = results.first().map_or(0, |set| set.images);
     page.figure(
         "fig8-q-per-set",
         &exhibits::q_per_set(results, names),
-        "As Fig. 8 of the paper: quality factor per set and submission.",
+        "As Fig. 8 of the paper: quality factor per set and configuration.",
     )?;
     let place = |name: &str| names.iter().position(|n| n == name);
     if let (Some(raw), Some(den)) = (place("23/raw/star"), place("23/den/star")) {
@@ -211,7 +214,7 @@ fn sect_five(page: &mut Page<'_>, results: &[SetResult], names: &[String]) -> an
         page.figure(
             "fig9-power-spectra",
             &exhibits::power_spectra(results, den, "23/den/star"),
-            &format!("As Fig. 9 of the paper: true and measured shear power spectra of 23/den/star. The measured ones hold the noise that {images} images leave."),
+            &format!("As Fig. 9 of the paper: true and measured shear power spectra of 23/den/star. The measured spectra contain the noise of {images} images."),
         )?;
         page.data(
             "fig9-power-spectra",

@@ -1,18 +1,17 @@
 //! `shearq run`.
 
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
-use crate::choices::named;
 use clap::Args;
 use shearq_scoring::Options;
-use shearq_submissions::Registry;
 
-use crate::arguments::{ReportFile, SetList, Sharding, SimulationArguments, Threads};
+use crate::arguments::{ReportFile, SetList, SimulationArguments};
+use crate::measure::Measuring;
 use crate::progress::{Bar, goes_on};
-use crate::{measure, print_table, score, tell, tell_unread};
+use crate::{measure, print_table, score, tell};
 use shearq_files::atomic;
-use shearq_files::table::FileFormat;
-use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::data::run::{Run, Source, open_data};
 use shearq_pipeline::images;
 use shearq_pipeline::run::run_folder;
@@ -23,25 +22,23 @@ use shearq_results::store;
 use shearq_results::views::pages;
 use shearq_results::views::scores::{bandpowers, per_set, verdict_line};
 
-/// Measure and score in one go, on a data folder or on sets that are simulated on the way.
+/// Measure and score in one step, on a data folder or on simulated sets.
 ///
-/// With --simulate no image is ever stored: stamps are drawn, measured and forgotten, so that a whole
-/// challenge (`--sets all --images 200`, 48 million galaxies) needs the room of its catalogues alone.
-/// They are those that `simulate` and `measure` would make of the same settings. Scores and
-/// bandpowers are printed and kept beside the catalogues as scores.csv and bandpowers.csv. A stopped
-/// run goes on where it was, image by image. With --shard nothing is scored until `merge`.
+/// With --simulate, stamps are drawn, measured and discarded. Only catalogues are stored, even for a whole challenge
+/// (`--sets all --images 200`, 48 million galaxies). The catalogues are equal to those of `simulate` and `measure`.
+/// Scores and bandpowers are printed and stored beside the catalogues as scores.csv and bandpowers.csv. The same command
+/// continues a run that was stopped. With --shard, `merge` scores when all shards are done.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Name of a submission (see `shearq submissions list`) or a TOML file of your own.
-    #[arg(long, value_name = "NAME|FILE")]
-    submission: String,
-    /// Data folder to measure.
+    #[command(flatten)]
+    measuring: Measuring,
+    /// Data folder.
     #[arg(long, value_name = "DIR", required_unless_present = "simulate")]
     data: Option<PathBuf>,
     /// Simulate the data in memory.
     #[arg(long, conflicts_with = "data", requires_all = ["sets", "images"])]
     simulate: bool,
-    /// Sets, as `1,2,7-9` or `all` [default with --data: all there are].
+    /// Sets, as `1,2,7-9` or `all` [default with --data: all].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
     /// Images per set, with --simulate.
@@ -49,46 +46,33 @@ pub(crate) struct Arguments {
     images: Option<u32>,
     #[command(flatten)]
     simulation: SimulationArguments,
-    /// Folder to write to.
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
-    /// Format of the catalogues [default: parquet].
-    #[arg(long, value_parser = named::<FileFormat>())]
-    catalogue_format: Option<FileFormat>,
-    /// Record the scores in this results store, which `compare --store` reads.
+    /// Results store for the scores, which `compare --store` reads.
     #[arg(long, value_name = "DIR")]
     store: Option<PathBuf>,
     #[command(flatten)]
     report: ReportFile,
-    #[command(flatten)]
-    sharding: Sharding,
-    #[command(flatten)]
-    threads: Threads,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     goes_on();
     let Arguments {
-        submission,
+        measuring,
         data,
         simulate: _,
         sets,
         images,
         simulation,
-        out,
-        catalogue_format,
         store,
         report,
-        sharding,
-        threads,
     } = arguments;
+    let (out, shard) = (&measuring.out, measuring.sharding.shard);
     anyhow::ensure!(
-        sharding.shard.is_none() || (store.is_none() && !report.is_wanted()),
-        "--shard: a part of a run is not scored, so that --store and --report have nothing to write. Try: shearq score --measured {} --store DIR, after `shearq merge`",
+        shard.is_none() || (store.is_none() && !report.is_wanted()),
+        "a shard is not scored (found --shard with --store or --report). Try: shearq score --measured {} --store DIR, after `shearq merge`",
         out.display()
     );
     let _prepared = store.as_deref().map(store::prepare).transpose()?;
-    let threads = threads.number();
+    let threads = measuring.threads();
     let wanted = match sets {
         None => &[],
         Some(list) if data.is_none() => list.simulated()?,
@@ -102,33 +86,31 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         None => Source::Simulated(simulation.settings()?),
     };
-    let submission = Registry::embedded()?.get(submission)?.configuration;
-    let run = Run::new(source, submission, catalogue_format.unwrap_or_default());
+    let run = measuring.run(source)?;
     match (&run.source, &data) {
         (Source::Simulated(settings), _) => {
-            let images = sharding.part(&images::of_simulation(wanted, images.unwrap_or(1)));
+            let images = images::of_simulation(wanted, images.unwrap_or(1));
+            let images = measuring.sharding.part(&images);
             let galaxies = images.len() as u64 * (settings.grid as u64).pow(2);
             let mut bar = Bar::new("simulating and measuring", galaxies);
-            let start = std::time::Instant::now();
+            let start = Instant::now();
             let summary = run_folder(&run, *settings, &images, out, threads, &mut bar)?;
             drop(bar);
-            measure::report(&run, &summary, start.elapsed(), threads, out);
-            measure::measured_any(&summary)?;
+            measure::report(&run, &summary, start.elapsed(), threads, out)?;
         }
         (Source::Folder { .. }, Some(data)) => {
-            let images = sharding.part(&images::of_folder(data, wanted)?);
-            tell_unread(&data.images(wanted)?);
+            let images = measuring.images(data, wanted)?;
             measure::measure(&run, data, out, &images, threads)?;
         }
         (Source::Folder { .. }, None) => {}
     }
-    if let Some(shard) = sharding.shard {
+    if let Some(shard) = shard {
         let expected = [
             sets.as_ref().map(|list| format!(" --sets {list}")),
             images.map(|images| format!(" --images {images}")),
         ];
         tell(format_args!(
-            "shard {shard} is done; `shearq merge {}{} --shards {}` scores when all are",
+            "shard {shard} is done. Score when all are done: shearq merge {}{} --shards {}",
             out.display(),
             expected.map(Option::unwrap_or_default).concat(),
             shard.of()
@@ -147,8 +129,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     report.save(&title, sections, || score::made_by(&run, out))
 }
 
-/// Scores a folder of catalogues (those of `sets`, or all), prints the scores and keeps them and the
-/// bandpowers beside the catalogues, and in the results store if there is one.
+/// Scores a folder of catalogues (of `sets`, or of all if empty) and prints the scores. Stores them with the bandpowers
+/// beside the catalogues, and in the results store if there is one.
 pub(super) fn score(
     run: &Run,
     out: &Path,

@@ -30,70 +30,68 @@ use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra, ve
 use shearq_results::{views::diagnosis, views::pages};
 use shearq_simulate::kinds::SetKind;
 
-/// Score ellipticities against the true shear: Q, Q_dn, M/2, √A.
+/// Score ellipticities against a known shear field: Q, Q_dn, M/2, √A and more.
 ///
-/// Either a folder that `measure` wrote (`--data DATA --measured OUT`), other programs' catalogues
-/// (`--data DATA --foreign FILE`), or one set from plain files (`--truth truth.csv CATALOGUE...`, one
-/// catalogue per image; CSV with a header, ASCII `x y e1 e2`, FITS or Parquet by the file's ending).
-/// Power-spectrum submissions are given by --spectra, packed submissions of either kind by --packed. With `--format json` and plain files everything about the
-/// set is printed, all eight conventions included.
+/// Score a folder that `measure` wrote with `--measured OUT`, another program's catalogues with
+/// `--data DATA --foreign FILE`, and plain files of one set with `--truth truth.csv CATALOGUE...`.
+///
+/// Plain files are one catalogue per image: CSV with a header, ASCII `x y e1 e2`, FITS or Parquet, by the file's
+/// ending. Their `--format json` lists all eight conventions. Score power spectra with --spectra, and a submission
+/// as `pack` writes it with --packed.
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "spectra", "packed", "catalogues"]))]
 pub(crate) struct Arguments {
-    /// Data folder with the true shear [default with --measured: the one measured].
+    /// Data folder with the true shear [default with --measured: the data that were measured].
     #[arg(long, value_name = "DIR", conflicts_with = "truth")]
     data: Option<PathBuf>,
-    /// Folder of catalogues that `measure` wrote.
+    /// Folder of catalogues that `measure` or `run` wrote.
     #[arg(long, value_name = "DIR", conflicts_with = "truth")]
     measured: Option<PathBuf>,
-    /// True shear of one set: x, y, g1, g2.
+    /// Table of the true shear of one set: x, y, g1, g2.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// Catalogues of that set, one per image.
+    /// Catalogues of the set of --truth, one per image.
     #[arg(value_name = "CATALOGUE", requires = "truth", conflicts_with_all = ["data", "sets", "store"])]
     catalogues: Vec<PathBuf>,
-    /// Catalogues of another program, described in a TOML file (docs/formats.md), instead of
-    /// --measured.
+    /// Catalogues of another program, described by a TOML file (docs/formats.md).
     #[arg(long, value_name = "FILE", requires = "data", conflicts_with = "truth")]
     foreign: Option<PathBuf>,
-    /// Power-spectrum submission (`index l power`): a file with --truth, a folder of
-    /// `{method}_set{set}.dat` with --data.
+    /// Power spectra (`index l power`): a file with --truth, a folder of `{method}_set{set}.dat` with --data.
     #[arg(long, value_name = "PATH", conflicts_with_all = ["noise_var", "convention", "path"])]
     spectra: Option<PathBuf>,
-    /// Packed submission, catalogues or power spectra: the folder or the archive (.tar.gz) as it is sent.
+    /// Submission as `pack` writes it: a folder or an archive (.tar.gz) of catalogues or power spectra.
     #[arg(long, value_name = "PATH", requires = "data", conflicts_with_all = ["truth", "path"])]
     packed: Option<PathBuf>,
-    /// Sets to score [default: all that were measured].
+    /// Sets, such as `1,2,7-9` or `all` [default: all that were measured].
     #[arg(long, value_name = "LIST", conflicts_with = "truth")]
     sets: Option<SetList>,
-    /// Noise variance per component, galaxy and image, for Q_dn [default: measured from the scatter
-    /// between images].
+    /// Noise variance per component, galaxy and image for Q_dn [default: from differences between images].
     #[arg(long, value_name = "V", allow_negative_numbers = true)]
     noise_var: Option<f64>,
-    /// Sign of g2 in the file given by --truth [default: the one that the file states; else the one that the
-    /// data determine; else the challenge's]. Data folders have a layout.toml for it.
+    /// Sign of g2 in the file of --truth; data folders state it in layout.toml [default: as the file states, else
+    /// as the data determine, else the challenge's].
     #[arg(long, value_enum, requires = "truth", conflicts_with_all = FOLDERS)]
     truth_sign: Option<SignArgument>,
-    /// Pixels a side of a grid cell, for --truth [default: 48].
+    /// Pixels per side of a stamp, for --truth [default: 48].
     #[arg(long, value_name = "PX", allow_negative_numbers = true, requires = "truth", conflicts_with_all = FOLDERS)]
     stamp: Option<f64>,
     /// Side of the field in degrees, for --truth [default: 10].
     #[arg(long, value_name = "DEG", requires = "truth", conflicts_with_all = FOLDERS)]
     field: Option<f64>,
-    /// Columns of the catalogues, for --truth [default: x,y,e1,e2].
+    /// Names of the catalogues' columns, for --truth [default: x,y,e1,e2].
     #[arg(long, value_name = "X,Y,E1,E2", value_delimiter = ',', num_args = 1, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     columns: Option<Vec<String>>,
-    /// Type of the ellipticities in the catalogues, for --truth. Distortions are converted to shear-type
+    /// Type of the ellipticities, `shear` or `distortion`, for --truth. Distortions are converted to shear-type
     /// ellipticities [default: shear].
     #[arg(long, value_name = "TYPE", value_parser = parse_ellipticity, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     ellipticity: Option<EllipticityType>,
-    /// A value of either component that stands for "not measured", as -99; for --truth.
+    /// Value of e1 or e2 that marks a galaxy as not measured, such as -99; for --truth.
     #[arg(long, value_name = "VALUE", allow_negative_numbers = true, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     missing: Option<f64>,
-    /// Rows with a larger |e| have no ellipticity; for --truth [default: no limit].
+    /// Treat galaxies with a larger |e| as not measured; for --truth [default: no limit].
     #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
-    /// Record the scores in this results store, which `compare --store` reads.
+    /// Record the scores in this results store, for `compare --store`.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra", "packed"])]
     store: Option<PathBuf>,
     #[command(flatten)]
@@ -106,9 +104,9 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
-/// Input that comes with a data folder, whose layout specifies the sign of g2, the stamps and the field.
+/// Options of input with a data folder. Its layout specifies the sign of g2, the stamps and the field.
 const FOLDERS: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
-/// Input other than plain catalogues.
+/// Options of input other than plain catalogues.
 const NOT_PLAIN: [&str; 7] = [
     "data", "measured", "foreign", "packed", "spectra", "sets", "store",
 ];
@@ -124,7 +122,7 @@ fn parse_ellipticity(text: &str) -> Result<EllipticityType, String> {
 /// Sign of g2 on the command line.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum SignArgument {
-    /// Minus the standard g2, as the challenge's truth files hold it.
+    /// Minus the standard g2, as in the challenge's truth files.
     Challenge,
     /// Positive along x = y.
     Standard,
@@ -157,7 +155,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         (Some(truth), None, _) => files(arguments, truth, options),
         (None, Some(spectra), Some(data)) => spectrum_folder(arguments, &data, spectra, options),
         (None, Some(_), None) => {
-            bail!("--spectra needs the true shear: --data DIR or --truth FILE")
+            bail!("--spectra needs the true shear. Try: --data DIR, or --truth FILE")
         }
         (None, None, data) => folder(arguments, data, options),
     }
@@ -187,7 +185,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
             let files = foreign.catalogues(sets)?;
             anyhow::ensure!(
                 !files.serve_all_sets() || !sets.is_empty(),
-                "{}: `catalogues` has no number of the set (expected {{set}}, or the sets to score). Try: --sets 1",
+                "{}: cannot determine the sets, because `catalogues` contains no {{set}}. Try: --sets 1",
                 path.display()
             );
             tell_unread(&files);
@@ -212,7 +210,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
                 .map(|(what, path)| (what.to_owned(), path.display().to_string()));
             (foreign.name.clone(), made_by.into(), scored, unscored)
         }
-        (None, _, _) => bail!("--foreign needs the true shear: --data DIR"),
+        (None, _, _) => bail!("--foreign needs the true shear. Try: --data DIR"),
     };
     let title = format!("Scores of {name}");
     let mut table = per_set(&scored, &title, options.definition);
@@ -223,7 +221,7 @@ fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> 
     arguments.report.save(&title, sections, || Ok(made_by))
 }
 
-/// Records scores that can be printed as asked for: nothing is kept of a command that fails after it.
+/// Records scores after checking that they can be printed, so that a failing command records nothing.
 fn record_printable(
     arguments: &Arguments,
     store: &Path,
@@ -236,7 +234,7 @@ fn record_printable(
     record(store, measured, scored, options)
 }
 
-/// What made the catalogues of a run, for reports.
+/// Source and settings of a run, for reports.
 pub(super) fn made_by(run: &Run, out: &Path) -> anyhow::Result<Vec<(String, String)>> {
     Ok(vec![
         ("Catalogues".into(), out.display().to_string()),
@@ -248,7 +246,7 @@ pub(super) fn made_by(run: &Run, out: &Path) -> anyhow::Result<Vec<(String, Stri
     ])
 }
 
-/// Records a scored run in a results store and says where.
+/// Records a scored run in a results store and prints the file name.
 pub(super) fn record(
     store: &Path,
     measured: Measured<'_>,
@@ -260,7 +258,7 @@ pub(super) fn record(
     Ok(())
 }
 
-/// Scores a submission as it is sent.
+/// Scores a submission.
 fn packed(
     arguments: &Arguments,
     data: &DataFolder,
@@ -275,7 +273,7 @@ fn packed(
         Packed::Spectra(files) => {
             anyhow::ensure!(
                 arguments.noise_var.is_none(),
-                "--noise-var is for catalogues; {} holds power spectra",
+                "--noise-var applies to catalogues only; {} contains power spectra. Try: without --noise-var",
                 path.display()
             );
             return spectra_of_sets(arguments, data, files, manifest, path, options).map_err(
@@ -291,7 +289,7 @@ fn packed(
         let images = catalogues.get(&set).into_iter().flatten();
         images.map(|(image, path)| (*image, path.clone())).collect()
     };
-    // What we measured is in our convention.
+    // Catalogues by shearq are in the standard convention.
     let own = manifest.is_some_and(|manifest| manifest.run.is_some());
     let options = Options {
         choice: match own {
@@ -336,7 +334,7 @@ fn spectrum_folder(
         };
         if let Some(other) = files.insert(set, path.clone()) {
             bail!(
-                "{}: {} is a spectrum of set {set} too; expected one method",
+                "{}: {} is also a spectrum of set {set}; expected one method",
                 path.display(),
                 other.display()
             );
@@ -344,14 +342,14 @@ fn spectrum_folder(
     }
     anyhow::ensure!(
         !files.is_empty(),
-        "{}: there is no file named {{method}}_set{{set}}.dat",
+        "{}: found no file named {{method}}_set{{set}}.dat",
         folder.display()
     );
     let manifest = Manifest::read(folder)?;
     spectra_of_sets(arguments, data, files, manifest.as_ref(), folder, options)
 }
 
-/// Scores the power spectra of `files`, by set, of a submission at `place`.
+/// Scores the power spectra `files` by set, of the submission at `place`.
 fn spectra_of_sets(
     arguments: &Arguments,
     data: &DataFolder,
@@ -362,7 +360,7 @@ fn spectra_of_sets(
 ) -> anyhow::Result<()> {
     if let Some(wanted) = &arguments.sets {
         if let Some(set) = wanted.0.iter().find(|set| !files.contains_key(set)) {
-            bail!("{}: there is no spectrum of set {set}", place.display());
+            bail!("{}: found no spectrum of set {set}", place.display());
         }
         files.retain(|set, _| wanted.0.contains(set));
     }
@@ -418,7 +416,7 @@ fn print_spectra(
     arguments.printing.print(&table)
 }
 
-/// How the truth given by `--truth` is to be read.
+/// How to read the file of `--truth`.
 fn plain_reading(arguments: &Arguments) -> Reading {
     Reading {
         field: Degrees(arguments.field.unwrap_or(10.0)),
@@ -435,7 +433,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     );
     let columns: [&str; 4] = columns.as_slice().try_into().map_err(|_| {
         anyhow::anyhow!(
-            "--columns names {} columns; expected four: x, y and the two components",
+            "--columns: wrong number of columns (found {}, expected 4: x, y, e1 and e2)",
             columns.len()
         )
     })?;
@@ -449,7 +447,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         let same = path.canonicalize().unwrap_or_else(|_| path.clone());
         anyhow::ensure!(
             seen.insert(same),
-            "{}: this catalogue is given twice; expected one for each image",
+            "{}: this catalogue is given twice; expected one per image",
             path.display()
         );
     }
@@ -468,7 +466,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     if arguments.printing.format() == TableFormat::Json {
         anyhow::ensure!(
             !arguments.printing.chooses(),
-            "--metrics: JSON of one set from plain files has everything; use --format csv for some metrics"
+            "--metrics: JSON of plain files always has all metrics. Try: --format csv"
         );
         let name = |path: &Path| path.display().to_string();
         let input = SetInput {

@@ -13,29 +13,28 @@ use crate::{print, tell};
 use shearq_pipeline::data::mosaic::Mosaic;
 use shearq_pipeline::data::run::open_data;
 use shearq_pipeline::images::ImageId;
-use shearq_pipeline::measure::{ImageSource, psf_of};
+use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::views::steps::{steps_figure, steps_row};
 
-/// Draw the steps of galaxies like the paper's Fig. 3: stamp, PSF, deconvolved, residual, ACF,
-/// clipped ACF.
+/// Plot each processing step of single galaxies, as in Fig. 3 of the paper.
 ///
-/// A row is a galaxy: its stamp as it is measured, the PSF, the deconvolved galaxy, what the stamp has beyond
-/// that galaxy seen through the PSF (noise alone where all went well), the autocorrelation of the deconvolved galaxy,
-/// and as much of it as its moments are taken of, for linear submissions times their weight. Its
-/// label has the ellipticity, and for linear submissions the response by which that of a sample is divided.
+/// Each row shows a galaxy: its stamp, the PSF, the deconvolved galaxy, the residual, the autocorrelation (ACF) of
+/// the deconvolved galaxy, and the part of the ACF whose moments are measured. The residual is the stamp minus the
+/// deconvolved galaxy convolved with the PSF; noise remains if all went well. Linear configurations multiply the ACF
+/// by a weight. The label has the ellipticity and, for linear configurations, the response to shear.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Name of a submission or a TOML file of your own.
+    /// Configuration: a name from `shearq submissions list` or a TOML file.
     #[arg(long, value_name = "NAME|FILE")]
     submission: String,
-    /// Data folder.
+    /// Data folder with the images.
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
-    /// Galaxies; INDEX counts from 1 along the rows of the grid. May be given several times.
+    /// Galaxy; INDEX counts from 1 along the rows of the grid. May be given several times.
     #[arg(long, value_name = "SET/IMAGE/INDEX", required = true)]
     galaxy: Vec<GalaxyId>,
-    /// Picture to write, .png or .svg.
+    /// File for the plot, .png or .svg.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
 }
@@ -60,7 +59,7 @@ impl FromStr for GalaxyId {
                 image: ImageId { set, image },
                 index: index as usize,
             }),
-            _ => Err("expected SET/IMAGE/INDEX, three numbers from 1".into()),
+            _ => Err("expected SET/IMAGE/INDEX such as 7/1/42, numbers from 1".into()),
         }
     }
 }
@@ -78,18 +77,16 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
-        let measurer = Measurer::new(&submission, source.mosaic().stamp)?;
-        if let Some(plan) = measurer.noise_plan() {
-            source.look(&data, plan)?;
-        }
+        let measurer = Measurer::new(&submission, source.head().mosaic.stamp)?;
+        source.survey(&data, &measurer)?;
         let Mosaic {
             columns,
             galaxies,
             stamp: side,
-        } = source.mosaic();
+        } = source.head().mosaic;
         anyhow::ensure!(
             index <= galaxies,
-            "set {} image {} has {galaxies} galaxies; galaxy {index} was asked for",
+            "--galaxy {}/{}/{index}: no such galaxy (found {index}, expected 1 to {galaxies})",
             image.set,
             image.image
         );
@@ -102,24 +99,26 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 break row;
             }
         };
-        let psf = psf_of(&row, ix, submission.psf_cut())
+        let psf = row.psfs.at(ix, submission.psf_cut(), side);
+        let psf = psf
+            .map(|star| star.psf)
             .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
         let mut worker = measurer.worker();
-        worker.set_survey(row.survey.as_ref());
-        worker.set_psf(psf.view())?;
+        let mut worker = worker.image(row.head.noise());
+        let mut worker = worker.psf(psf.view())?;
         let stamps = strip(&row.pixels, columns, side)?;
         let stamp = stamps.index_axis(Axis(0), ix);
-        let measured = worker.measure(stamp, row.header_noise)?;
+        let measured = worker.measure(stamp)?;
         anyhow::ensure!(
             measured.descent.is_some(),
             "galaxy {index} could not be measured: {}",
             measured.flags
         );
         let steps = worker.steps(stamp, psf.view(), &measured)?;
-        let own_response = response(&measured, "\nR ");
-        responses |= !own_response.is_empty();
+        let response_text = response(&measured, "\nR ");
+        responses |= !response_text.is_empty();
         let label = format!(
-            "{}/{}/{index}: {:+.3}, {:+.3}{own_response}",
+            "{}/{}/{index}: {:+.3}, {:+.3}{response_text}",
             image.set, image.image, measured.e1, measured.e2
         );
         rows.push(steps_row(&label, psf, steps));
@@ -129,7 +128,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "{}; set/image/galaxy: e1, e2{}",
         submission.name,
         match responses {
-            true => " before calibration; R: their response to shear",
+            true => " before calibration; R: response to shear",
             false => "",
         }
     );
@@ -138,9 +137,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The galaxy's own response to shear after `lead`, where the method knows it.
+/// The response of this galaxy to shear after `lead`, if the method provides it.
 fn response(measured: &Measurement, lead: &str) -> String {
-    match measured.response {
+    match measured.response_diagonal() {
         [first, second] if first.is_finite() && second.is_finite() => {
             format!("{lead}{first:.3}, {second:.3}")
         }
@@ -151,11 +150,11 @@ fn response(measured: &Measurement, lead: &str) -> String {
 fn describe(id: ImageId, index: usize, m: &Measurement) -> String {
     let stop = m.descent.map_or_else(String::new, |d| {
         let ended = match d.stop {
-            // The closed form has no energy to follow.
+            // The closed form computes no energy.
             _ if d.energy.is_nan() => "in closed form",
-            Stop::Stable => "until no neuron was to be updated",
-            Stop::EnergyRise => "until the energy fell no more",
-            Stop::MaxIterations => "as many as allowed",
+            Stop::Stable => "stable: no neuron to update",
+            Stop::EnergyRise => "energy stopped falling",
+            Stop::MaxIterations => "limit reached",
         };
         format!("{} iterations ({ended})", d.iterations)
     });

@@ -7,7 +7,8 @@ use clap::Args;
 use crate::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use crate::progress::{Bar, goes_on};
 use crate::tell;
-use shearq_pipeline::data::layout::{DataFolder, MAX_IMAGE};
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::images;
 use shearq_pipeline::simulate::{SimulationRecord, simulate_folder};
 

@@ -8,25 +8,26 @@ use shearq_submissions::{Configuration, Registry};
 use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once};
 use crate::print;
 use crate::progress::{Bar, goes_on};
-use shearq_pipeline::data::layout::MAX_IMAGE;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_render::page::Page;
 use shearq_render::table::TableFormat;
 use shearq_results::views::pages;
 use shearq_studies::contest::{bias_sets, contest_parts, contest_table};
 use shearq_studies::reproduce::{Plan, Study, run_sets};
 
-/// Hold submissions against each other and against what can be reached.
+/// Compare configurations with each other and with the Cramér–Rao bound.
 ///
-/// For every kind of set and submission: scatter of calibrated ellipticities and its ratio to the
-/// Cramér–Rao bound, multiplicative and additive bias, leakage of the PSF, Q of catalogues and of
-/// cross-spectra, and time per galaxy. Everything is simulated in memory; finished sets are kept, so a
-/// stopped study goes on where it was. Use a seed that no setting was chosen with.
+/// For each set and configuration, the command measures the scatter of calibrated ellipticities and its ratio to the
+/// bound. It also measures multiplicative and additive bias, PSF leakage, Q, and the time per galaxy.
+///
+/// The data are simulated in memory. Finished sets are kept, so the same command resumes a stopped study. Use a seed
+/// with which no setting was tuned.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Names of submissions, or TOML files of your own. May be given several times.
+    /// Configuration: a name from `shearq submissions list` or a TOML file. May be given several times.
     #[arg(long, value_name = "NAME|FILE", default_values = ["23/raw/star", "23/den/star", "48/linear/star"])]
     submission: Vec<String>,
-    /// Sets; by default one of each kind, with a fixed PSF.
+    /// Sets, such as `1,2,7-9` or `all`; the default has one set of each kind with a fixed PSF.
     #[arg(
         long,
         value_name = "LIST",
@@ -36,7 +37,7 @@ pub(crate) struct Arguments {
     /// Images per set for Q and scatter, at least 2; the challenge has 200.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=i64::from(MAX_IMAGE)))]
     images: u32,
-    /// Images per set whose galaxies are drawn eight times for the biases.
+    /// Images per set for the biases; each galaxy is drawn eight times.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     pairs: u32,
     #[command(flatten)]
@@ -103,18 +104,20 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     for submission in &plan.submissions {
         made_by.push((submission.name.clone(), toml::to_string(submission)?));
     }
-    let mut page = Page::new(out, "Submissions compared", "Simulated data", made_by);
+    study.check()?;
+    let mut page = Page::new(out, "Configurations compared", "Simulated data", made_by);
     let [shapes, quality] = contest_parts(&table);
     page.section("Ellipticities", "Scatter and biases on every kind of set.");
     page.figure(
         "study",
         &pages::contest(&table),
-        "Each submission on each set, with errors. Dashed: the Cramér–Rao bound, m of ± 0.002, no additive bias. The limit of Q is that of noise at the bound beside a perfect spectrum; shear that is lost together with noise can lead beyond it.",
+        "Each configuration on each set, with errors. Dashed: the Cramér–Rao bound, the requirement |m| < 0.002, zero additive bias. The expected Q is for noise at the bound and a perfect spectrum. A method that loses shear together with noise can exceed it.",
     )?;
     page.table("biases", &shapes)?;
     page.section("Spectra", "Quality on every kind of set, and cost.");
     page.table("quality", &quality)?;
     page.data("study", &table)?;
+    study.check()?;
     page.save()?;
     if matches!(form.format, TableFormat::Csv | TableFormat::Json) {
         return form.print(&table);

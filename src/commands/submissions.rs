@@ -10,7 +10,7 @@ use crate::{print, tell};
 use shearq_files::atomic;
 use shearq_render::table::{Cell, Heading, Table};
 
-/// List, show and start submission configurations.
+/// List, show and create configurations: the settings that `measure` uses.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     #[command(subcommand)]
@@ -19,35 +19,35 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// The embedded submissions with their published figures.
+    /// List the built-in configurations with their published metrics.
     #[command(after_help = "Example:\n  shearq submissions list --format markdown")]
     List {
         #[command(flatten)]
         form: Form,
     },
-    /// All settings of a submission, resolved, as TOML.
+    /// Print all settings of a configuration as TOML.
     #[command(after_help = "Example:\n  shearq submissions show 48/linear/star")]
     Show {
-        /// Name or file.
+        /// Configuration: a name from `shearq submissions list` or a TOML file.
         #[arg(value_name = "NAME|FILE")]
         name: String,
     },
-    /// Write a commented configuration of your own to start from.
+    /// Write a configuration file with comments, to start your own from.
     #[command(after_help = "Example:\n  shearq submissions init own.toml")]
     Init {
-        /// File to write; it must not exist.
+        /// New file to write.
         #[arg(value_name = "FILE")]
         file: PathBuf,
-        /// Method whose settings it has.
+        /// Method to configure.
         #[arg(long, value_enum, default_value_t = Method::Linear)]
         method: Method,
     },
 }
 
-/// A method to start with.
+/// Method of a new configuration.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Method {
-    /// The linear network in closed form, which is recommended.
+    /// The linear network in closed form (recommended).
     Linear,
     /// The Hopfield network of the paper.
     Network,
@@ -71,7 +71,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             };
             anyhow::ensure!(
                 atomic::write_if_absent(file, template.text()?.as_bytes())?,
-                "{}: the file exists; expected a new one",
+                "{}: the file exists; expected a new file name",
                 file.display()
             );
             tell(format_args!("wrote {}", file.display()));
@@ -117,7 +117,7 @@ fn list() -> anyhow::Result<Table> {
         ("description", "Description"),
     ];
     Ok(Table {
-        title: "Submissions".into(),
+        title: "Configurations".into(),
         headings: headings
             .iter()
             .map(|(key, label)| Heading::new(key, *label))

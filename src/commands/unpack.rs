@@ -8,20 +8,18 @@ use crate::{count, tell};
 use shearq_results::submit::archive::{read, unpack};
 use shearq_results::submit::manifest::MANIFEST_FILE;
 
-/// Unpack an archive that `pack` wrote, if it is what was packed.
+/// Unpack an archive that `pack` wrote, and verify its files.
 ///
-/// Every file is compared with the manifest's checksums. An archive with changed, missing or further
-/// files, damaged, or holding anything but plain files is refused, and nothing is left of it. The folder
-/// appears whole or not at all.
+/// The command compares every file with the checksums of the manifest. It refuses archives that are damaged, that
+/// contain changed, missing or additional files, or that contain links or folders. After a refusal no file remains.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Archive, .tar.gz.
+    /// Archive to unpack (.tar.gz or .tgz).
     archive: PathBuf,
     /// New folder to write to.
     #[arg(long, value_name = "DIR", required_unless_present = "verify")]
     out: Option<PathBuf>,
-    /// Insist on a manifest, without which there is nothing to compare with. Without --out the archive is
-    /// only verified.
+    /// Require a manifest. Without --out, only verify the archive.
     #[arg(long)]
     verify: bool,
 }
@@ -41,8 +39,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
     };
     let compared = match &unpacked.manifest {
-        Some(_) => format!("are as {MANIFEST_FILE} says"),
-        None => format!("were not verified: there is no {MANIFEST_FILE}"),
+        Some(_) => format!("agree with {MANIFEST_FILE}"),
+        None => format!("were not verified, because there is no {MANIFEST_FILE}"),
     };
     tell(format_args!(
         "{} of {} {compared}",

@@ -4,10 +4,11 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::name::EXPECTED;
+use crate::validate::OutOfRange;
 
 /// What can be wrong with a submission's name or file.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum ConfigurationError {
     /// Neither a known name nor a file.
     #[error("{}there is no submission or file named `{name}`; known submissions: {known}", from.as_ref().map_or_else(String::new, |from| format!("{}: `extends`: ", from.display())))]
@@ -54,19 +55,24 @@ pub enum ConfigurationError {
         key: &'static str,
     },
     /// A name that cannot be one.
-    #[error("the name is {found}; expected {EXPECTED}")]
+    #[error("the name is {found}; expected {expected}")]
     Name {
         /// Its beginning and length.
         found: String,
+        /// What a name must be.
+        expected: &'static str,
     },
-    /// A value out of range.
-    #[error("{path}: {message}")]
+    /// A value of a file that is out of range.
+    #[error("{path}: {error}")]
     Range {
         /// The file asked for.
         path: PathBuf,
         /// The key, its value and the accepted range.
-        message: String,
+        error: OutOfRange,
     },
+    /// A value set in code that is out of range.
+    #[error(transparent)]
+    Setting(#[from] OutOfRange),
     /// A key that the method does not use.
     #[error("{path}: line {line}: `{key}` has no effect with {reason}; expected no such key")]
     Dead {

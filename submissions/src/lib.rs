@@ -6,6 +6,8 @@
 //! `extends` either a name or another file. Unknown keys, keys that the method does not use, values out of
 //! range, unknown names and cycles are refused with the file and place.
 
+#![forbid(unsafe_code)]
+
 mod error;
 mod file;
 pub mod limits;
@@ -26,3 +28,4 @@ pub use settings::{
     Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
 };
 pub use template::Template;
+pub use validate::OutOfRange;

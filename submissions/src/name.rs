@@ -11,12 +11,15 @@ pub const MAX_NAME: usize = 100;
 /// Checks a name: 1 to [`MAX_NAME`] bytes, none of them of a control character.
 ///
 /// # Errors
-/// [`SubmissionError::Name`].
+/// [`ConfigurationError::Name`].
 pub fn check_name(name: &str) -> Result<(), ConfigurationError> {
     if (1..=MAX_NAME).contains(&name.len()) && !name.contains(is_control) {
         return Ok(());
     }
-    Err(ConfigurationError::Name { found: shown(name) })
+    Err(ConfigurationError::Name {
+        found: shown(name),
+        expected: EXPECTED,
+    })
 }
 
 /// The beginning of a name, with its control characters written out.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use crate::error::ConfigurationError;
 use crate::file::{File, Published, dead_keys, read};
@@ -173,10 +174,7 @@ impl Registry {
                 })?;
         configuration
             .validate()
-            .map_err(|error| ConfigurationError::Range {
-                path,
-                message: error.to_string(),
-            })?;
+            .map_err(|error| ConfigurationError::Range { path, error })?;
         Ok(Entry {
             configuration,
             published,
@@ -247,6 +245,20 @@ impl Registry {
     }
 }
 
+/// The path that errors about a text without a file name.
+const TEXT: &str = "settings";
+
+impl FromStr for Configuration {
+    type Err = ConfigurationError;
+
+    /// The configuration of a TOML text, as of a settings file. `extends` names an embedded configuration, or a file
+    /// relative to the working folder. A text without a name has the name `settings`.
+    fn from_str(text: &str) -> Result<Self, ConfigurationError> {
+        let entry = Registry::embedded()?.get_text(Path::new(TEXT), text)?;
+        Ok(entry.configuration)
+    }
+}
+
 /// One file of a chain.
 struct Link {
     path: PathBuf,
@@ -266,7 +278,7 @@ fn own_name(file: &File, path: &Path) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{NoiseSource, PsfForm};
+    use crate::{Denoise, LinearDeconvolution, Method, NetworkMethod, NoiseSource, PsfForm};
 
     fn write(folder: &Path, name: &str, text: &str) -> String {
         let path = folder.join(name);
@@ -340,6 +352,53 @@ mod tests {
             message.contains("own.toml") && message.contains("line 3"),
             "{message}"
         );
+    }
+
+    #[test]
+    fn a_configuration_is_parsed_from_text_and_checked() {
+        let own = "extends = \"48/linear/star\"\n[noise]\nsource = \"border\"\n";
+        let own: Configuration = own.parse().unwrap();
+        assert_eq!(own.name, "settings");
+        assert_eq!(own.noise, NoiseSource::Border { border: 4 });
+        let text = toml::to_string(&own).unwrap();
+        assert_eq!(text.parse::<Configuration>().unwrap(), own);
+        let wrong = "extends = \"48/linear/star\"\n[deconvolution]\nwindow_sigma = -6\n";
+        let error = wrong.parse::<Configuration>().unwrap_err();
+        assert!(
+            matches!(&error, ConfigurationError::Range { error, .. } if error.key == "deconvolution.window_sigma"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn settings_made_in_code_are_checked() {
+        let registry = Registry::embedded().unwrap();
+        let linear = |change: fn(&mut LinearDeconvolution)| {
+            let mut configuration = registry.get("48/linear/star").unwrap().configuration;
+            if let Method::Linear(linear) = &mut configuration.method {
+                change(&mut linear.deconvolution);
+            }
+            configuration.validate().map_err(|error| error.key)
+        };
+        assert_eq!(linear(|_| {}), Ok(()));
+        assert_eq!(
+            linear(|d| d.window_sigma = -6.0),
+            Err("deconvolution.window_sigma")
+        );
+        assert_eq!(
+            linear(|d| d.target_sigma = 1e9),
+            Err("deconvolution.target_sigma")
+        );
+        let mut network = registry.get("23/den/star").unwrap().configuration;
+        if let Method::Network(NetworkMethod {
+            denoise: Denoise::WaveletWiener(wavelet),
+            ..
+        }) = &mut network.method
+        {
+            wavelet.levels = 60;
+        }
+        let error = network.validate().unwrap_err();
+        assert_eq!((error.key, error.found.as_str()), ("denoise.levels", "60"));
     }
 
     #[test]

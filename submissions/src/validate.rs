@@ -1,22 +1,26 @@
-//! Ranges of settings, and what settings ask of each other.
+//! Ranges of settings, and conditions between settings.
 
 use serde::Serialize;
 use thiserror::Error;
 
 use crate::limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, MIN_TARGET, WINDOWS};
-use crate::name;
+use crate::name::{EXPECTED, check_name, shown};
 use crate::settings::{
     Clipping, Configuration, Denoise, LinearDeconvolution, LinearMethod, Method,
     NetworkDeconvolution, NetworkMethod, NoiseSource, Update,
 };
 
-/// A value that is out of range.
-#[derive(Debug, Error)]
+/// A setting with a value out of its range.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("`{key}` is {found}; expected {expected}")]
-pub(crate) struct OutOfRange {
-    key: &'static str,
-    found: String,
-    expected: &'static str,
+#[non_exhaustive]
+pub struct OutOfRange {
+    /// The key as a settings file has it, such as `denoise.levels`.
+    pub key: &'static str,
+    /// The value, as a settings file would have it.
+    pub found: String,
+    /// The accepted range.
+    pub expected: &'static str,
 }
 
 /// Checks a value.
@@ -56,8 +60,13 @@ fn real(
 }
 
 impl Configuration {
-    /// Checks every value against its range.
-    pub(crate) fn validate(&self) -> Result<(), OutOfRange> {
+    /// Checks every setting against its range, and against the settings that it must agree with.
+    ///
+    /// Files are checked when they are read. A configuration that is made or changed in code is checked here.
+    ///
+    /// # Errors
+    /// The first setting that is out of range.
+    pub fn validate(&self) -> Result<(), OutOfRange> {
         let Configuration {
             name,
             description: _,
@@ -66,11 +75,11 @@ impl Configuration {
             noise,
             method,
         } = self;
-        if name::check_name(name).is_err() {
+        if check_name(name).is_err() {
             return Err(OutOfRange {
                 key: "name",
-                found: name::shown(name),
-                expected: name::EXPECTED,
+                found: shown(name),
+                expected: EXPECTED,
             });
         }
         let n = stamp.size;

@@ -53,7 +53,7 @@ fn catalogues_with_mistakes_are_named_with_file_and_place() {
     refuse(
         "c.csv",
         b"x,y,e1,e2\n1e9,2,3,4\n",
-        "no row of the 1 catalogue(s) falls on the 8",
+        "no row of the 1 catalogue(s) is on the 8",
     );
     refuse("c.fits", b"", "the file is empty; expected a FITS table");
     refuse("c.fits", b"x,y,e1,e2\n1,2,3,4\n", "`SIMPLE`");

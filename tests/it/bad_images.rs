@@ -528,7 +528,7 @@ fn stamps_without_a_galaxy_are_flagged_and_noise_is_measured() {
             said.contains("nothing to scale the brightness by"),
             "{said}"
         );
-        let flags = small.measured("02", "flag");
+        let flags = small.measured("02", "flags");
         assert_eq!(flags[..8], [4.0, 4.0, 4.0, 1.0, 4.0, 4.0, noise, 0.0]);
         let e1 = small.measured("02", "e1");
         assert!(
@@ -659,7 +659,7 @@ fn a_star_that_cannot_be_used_flags_its_galaxy_alone() {
     );
     assert_eq!(
         small
-            .measured("19", "flag")
+            .measured("19", "flags")
             .iter()
             .filter(|f| **f != 0.0)
             .count(),

@@ -351,7 +351,7 @@ fn a_check_reads_the_configuration_file_unless_it_is_to_use_what_is_stored() {
     fs::remove_file(&own).unwrap();
     let message = fail(&check);
     assert!(
-        message.contains("own.toml: the configuration file is not there any more")
+        message.contains("own.toml: cannot find the configuration file of the baseline")
             && message.contains("--stored"),
         "{message}"
     );

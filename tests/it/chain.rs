@@ -113,7 +113,7 @@ fn the_chain_ends_in_scores_that_every_format_carries() {
             .contains(&q.to_string())
     );
     let shown = Cell::with_error(q, row["q_error"].as_f64(), 2);
-    let (shown, _) = shown.figures().unwrap();
+    let (shown, _) = shown.digits().unwrap();
     for format in ["table", "markdown", "latex"] {
         assert!(score(format).contains(&shown), "{format}: {shown}");
     }

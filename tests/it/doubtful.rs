@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::support::{fail, shearq, succeed, text};
+use crate::support::{Small, fail, shearq, succeed, text};
 
 /// Cells a side of the grid.
 const SIDE: usize = 32;
@@ -402,10 +402,7 @@ fn folders_are_chosen_sorted_and_grouped_like_a_store() {
     let named = rows(&["--where", "submission=48/*"]);
     assert_eq!(named.len(), 1);
     let message = fail(&["compare", text(&raw), "--where", "set=3"]);
-    assert!(
-        message.contains("no set for which the conditions hold"),
-        "{message}"
-    );
+    assert!(message.contains("no set meets the conditions"), "{message}");
     // A data folder in place of results.
     let message = fail(&["compare", text(&data), text(&raw)]);
     assert!(
@@ -428,4 +425,90 @@ fn folders_are_chosen_sorted_and_grouped_like_a_store() {
     }
     let checked = succeed(&["check", text(&sent), "--data", text(&data)]);
     assert!(!checked.contains("grid"), "{checked}");
+}
+
+/// Q in the JSON of `score`.
+fn q_of(printed: &str) -> f64 {
+    let scores: serde_json::Value = serde_json::from_str(printed).unwrap();
+    scores["Q"].as_f64().unwrap()
+}
+
+#[test]
+fn stamps_of_one_pixel_have_the_scores_of_larger_stamps() {
+    let case = Case::new();
+    let truth = case.at("data/set02/truth.csv");
+    let catalogues = case.catalogues("sound", &sound);
+    let score = |truth: &Path, catalogues: &[PathBuf], stamp: &str| {
+        let mut arguments = vec!["score", "--truth", text(truth), "--stamp", stamp];
+        arguments.extend(catalogues.iter().map(|path| text(path)));
+        arguments.extend(["--format", "json"]);
+        q_of(&succeed(&arguments))
+    };
+    let large = score(&truth, &catalogues, "48");
+    // Positions count cells: 24.5 becomes 1, 72.5 becomes 2.
+    let small = |path: &Path, separator: &str| {
+        let to = path.with_file_name(format!("small-{}", path.file_name().unwrap().display()));
+        let convert = |line: &str| {
+            let mut fields: Vec<String> = line.split(separator).map(str::to_owned).collect();
+            for field in &mut fields[..2] {
+                if let Ok(place) = field.parse::<f64>() {
+                    *field = ((place - 0.5) / 48.0 + 0.5).to_string();
+                }
+            }
+            fields.join(separator) + "\n"
+        };
+        let content = fs::read_to_string(path).unwrap();
+        let content: String = content.lines().map(convert).collect();
+        fs::write(&to, content).unwrap();
+        to
+    };
+    let truth = small(&truth, ",");
+    let catalogues: Vec<PathBuf> = catalogues.iter().map(|path| small(path, " ")).collect();
+    assert_eq!(score(&truth, &catalogues, "1"), large);
+}
+
+#[test]
+fn a_pattern_without_a_set_needs_the_sets() {
+    let case = Case::new();
+    let data = case.at("data");
+    case.catalogues("sound", &sound);
+    let describe = |name: &str, pattern: &str| {
+        let path = case.at(name);
+        let keys = "name = \"sound\"\nellipticity = \"shear\"";
+        fs::write(&path, format!("{keys}\ncatalogues = \"{pattern}\"\n")).unwrap();
+        path
+    };
+    let one = describe("one.toml", "sound/g10_v1_objs_2_{image}.M.dat");
+    let all = describe("all.toml", "sound/g10_v1_objs_{set}_{image}.M.dat");
+    let score = ["score", "--data", text(&data), "--foreign"];
+    let message = fail(&[&score[..], &[text(&one)]].concat());
+    assert!(message.contains("no {set}. Try: --sets 1"), "{message}");
+    let q = |description: &Path| {
+        let more = [text(description), "--sets", "2", "--format", "json"];
+        let printed = succeed(&[&score[..], &more].concat());
+        let table: serde_json::Value = serde_json::from_str(&printed).unwrap();
+        table["rows"][0]["q"].as_f64().unwrap()
+    };
+    assert_eq!(q(&one), q(&all));
+    let compare = ["compare", "--data", text(&data), "--foreign", text(&one)];
+    let message = fail(&compare);
+    assert!(
+        message.contains("no `catalogues` contains {set}"),
+        "{message}"
+    );
+    succeed(&[&compare[..], &["--foreign", text(&all)]].concat());
+}
+
+#[test]
+fn a_psf_stamp_that_loses_the_wings_is_doubted() {
+    let small = Small::new("2");
+    let own = small.at("own.toml");
+    for (size, doubted) in [(20, true), (32, false)] {
+        let content = format!("extends = \"48/linear/star\"\npsf.size = {size}\n");
+        fs::write(&own, content).unwrap();
+        let said = small.measure(&["--submission", text(&own)]);
+        let warning = format!("image 001: psf.size is {size} (expected 32 or more)");
+        assert_eq!(said.contains(&warning), doubted, "{said}");
+        assert_eq!(said.contains("warning"), doubted, "{said}");
+    }
 }

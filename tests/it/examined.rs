@@ -170,7 +170,7 @@ fn every_key_of_the_json_is_described() {
         &case(folder.path(), |k| Some(shear(k))),
         &["--noise-var", "0.01"],
     );
-    let docs = std::fs::read_to_string("docs/formats.md").unwrap();
+    let docs = std::fs::read_to_string("docs/files-challenge.md").unwrap();
     let docs = &docs[docs.find("## JSON of one set").unwrap()..];
     fn keys(value: &Value, found: &mut Vec<String>) {
         for (key, value) in value.as_object().into_iter().flatten() {

@@ -72,7 +72,7 @@ fn follow_the_truth(folder: &Path) {
                 let path = run.catalogue(&results, set, image);
                 let catalogue = table::read(&path, None, table::MAX_ROWS).unwrap();
                 let column = |name: &str| table::numbers(&catalogue, name, &path).unwrap();
-                let flags = column("flag");
+                let flags = column("flags");
                 assert!(
                     flags.iter().all(|f| *f == 0.0),
                     "{name}, set {set}: flagged galaxies"

@@ -62,7 +62,7 @@ fn measured(small: &Small, data: &Path, set: &str) -> Vec<Vec<u64>> {
     let _ = fs::remove_dir_all(&out);
     let measure = ["measure", "--submission", LINEAR, "--out", text(&out)];
     succeed(&[&measure[..], &["--data", text(data)]].concat());
-    ["e1", "e2", "flag"]
+    ["e1", "e2", "flags"]
         .map(|column| {
             let values = small.measured(set, column);
             values.iter().map(|value| value.to_bits()).collect()

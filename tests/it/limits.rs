@@ -39,7 +39,7 @@ fn fields_beyond_the_sky_and_shears_beyond_numbers_are_refused() {
     for field in ["1e308", "1e12", "361", "1e-300", "nan"] {
         let plain = ["score", "--truth", text(&truth), text(&catalogue)];
         let error = fail(&[&plain[..], &["--field", field]].concat());
-        has(&error, &["degrees a side; expected 0.001 to 360"]);
+        has(&error, &["degrees per side; expected 0.001 to 360"]);
     }
     for field in ["1e12", "1e-320"] {
         fs::write(
@@ -207,13 +207,16 @@ fn options_and_baselines_hold_finite_positive_limits() {
     for (text_of, words) in [
         (
             format!("{}inf{}", &sound[..start], &sound[end..]),
-            "set 2 has an infinite figure",
+            "set 2: a metric is infinite",
         ),
         (
             format!("{}{negative}", &sound[..end]),
-            "an error that is infinite or negative",
+            "its error is infinite or negative",
         ),
-        (shorter.to_owned(), "1 of 2 sets are there"),
+        (
+            shorter.to_owned(),
+            "found 1 sets, expected 2 as in `sets_held`",
+        ),
     ] {
         fs::write(&path, text_of).unwrap();
         let error = fail(&["baseline", "check", "--folder", text(&folder)]);

@@ -1,7 +1,7 @@
 //! The PSF's orientation: deconvolution undoes it, and a turned or flipped PSF does not.
 
 use ndarray::{Array2, ArrayView2};
-use shearq_measure::Measurer;
+use shearq_measure::{ImageNoise, Measurer};
 use shearq_quantities::PsfTransform;
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
@@ -42,8 +42,8 @@ fn a_round_galaxy_comes_out_round_only_with_its_own_psf() {
     let stamp = ArrayView2::from_shape((48, 48), &stamp).unwrap();
     let measure = |psf: &Array2<f64>| {
         let mut worker = measurer.worker();
-        worker.set_psf(psf.view()).unwrap();
-        let m = worker.measure(stamp, None).unwrap();
+        let mut image = worker.image(ImageNoise::Unknown);
+        let m = image.psf(psf.view()).unwrap().measure(stamp).unwrap();
         assert!(m.flags.is_empty());
         (m.e1, m.e2)
     };

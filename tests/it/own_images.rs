@@ -42,7 +42,7 @@ fn columns(small: &Small) -> Vec<Vec<u64>> {
     let mut columns = Vec::new();
     for image in 1..=2 {
         let path = small.at(&format!("out/set02/catalogue-{image:03}.parquet"));
-        let names = ["x", "y", "e1", "e2", "flag"];
+        let names = ["x", "y", "e1", "e2", "flags"];
         let table = table::read(&path, Some(&names), table::MAX_ROWS).unwrap();
         for name in names {
             let values = table::numbers(&table, name, &path).unwrap();

@@ -552,7 +552,7 @@ fn names_of_images_continue_over_cards_and_scales_are_numbers() {
         ("BSCALE  =                'NaN'", "BSCALE"),
         (
             "BSCALE  =                  0.0",
-            "the header key BSCALE is 0; expected a number by which pixels are scaled",
+            "the header key BSCALE is 0; expected a finite number (for BSCALE not zero)",
         ),
         ("BSCALE  =                1E999", "BSCALE"),
         ("BZERO   =                  NaN", "BZERO"),

@@ -185,7 +185,7 @@ fn kinds_are_those_of_simulated_sets_alone() {
             "json",
         ])
     };
-    has(&score(), &["Fiducial", "Kinds are those of GREAT10's sets"]);
+    has(&score(), &["Fiducial", "Kinds: as the GREAT10 sets"]);
     let chosen = [
         "compare",
         "--store",
@@ -199,7 +199,7 @@ fn kinds_are_those_of_simulated_sets_alone() {
     fs::remove_dir_all(&store).unwrap();
     let own = score();
     assert!(
-        !own.contains("Fiducial") && !own.contains("Kinds are those"),
+        !own.contains("Fiducial") && !own.contains("Kinds: as the"),
         "{own}"
     );
     assert!(!shearq(&chosen).status.success());

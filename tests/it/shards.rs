@@ -134,8 +134,8 @@ fn merge_lists_what_is_missing_damaged_or_of_other_settings() {
         for (line, (image, said)) in lines.iter().zip([
             ("2/1 (shard 1/4): ", "there is no such file"),
             ("2/3 (shard 3/4): ", "set02/catalogue-003"),
-            ("8/1 (shard 4/4): ", "is not that of set 8 image 1"),
-            ("8/2 (shard 1/4): ", "is not that of set 8 image 2"),
+            ("8/1 (shard 4/4): ", "does not match set 8 image 1"),
+            ("8/2 (shard 1/4): ", "does not match set 8 image 2"),
         ]) {
             assert!(line.starts_with(image) && line.contains(said), "{line}");
         }
@@ -151,10 +151,7 @@ fn merge_lists_what_is_missing_damaged_or_of_other_settings() {
         assert_eq!(contents(&out), whole);
     }
     let message = fail(&["merge", text(&at("parquet"))]);
-    assert!(
-        message.contains("give the --sets and --images"),
-        "{message}"
-    );
+    assert!(message.contains("Try: --sets LIST --images N"), "{message}");
     let message = fail(&["merge", text(root.path())]);
     assert!(
         message.contains("neither run.json nor simulation.json"),

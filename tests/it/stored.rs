@@ -120,7 +120,7 @@ fn what_was_changed_since_it_was_recorded_is_refused() {
     let message = fail(&["compare", "--store", text(&store)]);
     assert!(message.contains(text(&one.0)), "{message}");
     assert!(
-        message.contains("changed since it was recorded"),
+        message.contains("changed after it was recorded"),
         "{message}"
     );
     // Under a name of one's own it is what it is.
@@ -151,10 +151,10 @@ fn runs_are_chosen_sorted_and_grouped() {
     let mut query = vec!["compare", "--store", text(&store), "--where"];
     query.push("colour=red");
     let message = fail(&query);
-    assert!(message.contains("no column `colour`") && message.contains("set_kind"));
+    assert!(message.contains("found `colour`") && message.contains("set_kind"));
     query[3] = "--where=q>300000";
     query.pop();
-    assert!(fail(&query).contains("conditions hold"));
+    assert!(fail(&query).contains("meets the conditions"));
     let picture = recorded.at("map.png");
     let plain = succeed(&[
         "compare",
@@ -189,11 +189,11 @@ fn what_is_no_file_of_a_store_is_refused_by_name() {
     );
     fs::create_dir(recorded.at("empty")).unwrap();
     let message = fail(&["compare", "--store", text(&recorded.at("empty"))]);
-    assert!(message.contains("there is no recorded run"), "{message}");
+    assert!(message.contains("found no recorded run"), "{message}");
 }
 
 #[test]
-fn figures_are_chosen_beside_what_names_a_row_and_unknown_ones_refused_before_anything_is_kept() {
+fn metrics_are_chosen_and_unknown_ones_refused() {
     let recorded = Recorded::new();
     let store = recorded.at("store");
     let grouped = ["compare", "--store", text(&store), "--group-by", "set"];
@@ -205,7 +205,7 @@ fn figures_are_chosen_beside_what_names_a_row_and_unknown_ones_refused_before_an
     let score = ["score", "--measured", text(&raw), "--store", text(&new)];
     let message = fail(&[&score[..], &["--metrics", "q,nope"]].concat());
     assert!(
-        message.contains("no figure is called \"nope\""),
+        message.contains("found \"nope\", expected some of"),
         "{message}"
     );
     assert!(message.contains("q_dn"), "{message}");

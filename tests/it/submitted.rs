@@ -279,7 +279,7 @@ fn blank_catalogues_count_as_images_and_odd_tables_get_errors() {
     let message = String::from_utf8(nothing.stderr).unwrap();
     assert_eq!(nothing.status.code(), Some(1), "{message}");
     assert!(
-        message.contains("there is no galaxy in 1 catalogue(s)"),
+        message.contains("found no galaxy in 1 catalogue(s)"),
         "{message}"
     );
     // The same column twice, from every format.
@@ -329,7 +329,7 @@ fn differences_are_given_only_for_the_same_images() {
     assert!(
         table["notes"]
             .to_string()
-            .contains("it needs the same images as the first")
+            .contains("differences need equal images")
     );
 }
 

@@ -276,3 +276,51 @@ fn stamps_that_are_too_small_come_with_a_configuration_that_measures_them() {
         reported(&[&measure[..], &[text(&own)]].concat());
     }
 }
+
+#[test]
+fn unread_files_are_named_by_compare_pack_and_check() {
+    let small = Small::new("2");
+    small.measure(&RAW);
+    let (data, out) = (small.at("data"), small.at("out"));
+    let said = |arguments: &[&str]| {
+        let done = shearq(arguments);
+        let said = String::from_utf8([done.stdout, done.stderr].concat()).unwrap();
+        assert!(!said.contains("error: "), "{arguments:?}: {said}");
+        said.split_whitespace().collect::<Vec<_>>().join(" ")
+    };
+    let pack = |to: &str| {
+        said(&[
+            "pack",
+            "--measured",
+            text(&out),
+            "--out",
+            text(&small.at(to)),
+        ])
+    };
+    let first = small.at("first");
+    let compare = || said(&["compare", text(&out)]);
+    let check = || said(&["check", text(&first), "--data", text(&data)]);
+    for silent in [pack("first"), compare(), check()] {
+        assert!(!silent.contains("not read"), "{silent}");
+    }
+    copy(
+        &small,
+        "data/set02/galaxies-001.fits",
+        "data/set02/galaxies-03.FITS",
+    );
+    for warned in [compare(), check()] {
+        let expected = "galaxies-03.FITS: this file is not read, because of its name";
+        assert!(warned.contains("warning: "), "{warned}");
+        assert!(warned.replace("- ", "-").contains(expected), "{warned}");
+    }
+    copy(
+        &small,
+        "out/set02/catalogue-001.parquet",
+        "out/set02/catalogue-03.parquet",
+    );
+    let warned = pack("second");
+    assert!(
+        warned.contains("catalogue-03.parquet: this file is not read"),
+        "{warned}"
+    );
+}

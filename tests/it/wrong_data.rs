@@ -160,7 +160,7 @@ fn warnings(stamps: &Stamps, psf: &[f32], name: &str) -> Vec<String> {
     let psf = ArrayView2::from_shape((STAMP, STAMP), psf).unwrap();
     let given =
         (measurer.configuration().noise == shearq_submissions::NoiseSource::Header).then_some(1.0);
-    let batch = measurer.batch(stamps.view(), Psfs::Star(psf), given);
+    let batch = measurer.batch(stamps.view(), &Psfs::star(psf), given);
     let batch = match batch {
         Ok(batch) => batch,
         Err(error) => return vec![error.to_string()],
@@ -188,7 +188,7 @@ fn a_batch_with_another_noise_than_that_of_the_stamps_has_a_warning() {
     let measurer = Measurer::named(LINEAR, STAMP).unwrap();
     let psf = ArrayView2::from_shape((STAMP, STAMP), &psf).unwrap();
     for (given, silent) in [(1.0, true), (0.9, false), (2.0, false)] {
-        let batch = measurer.batch(stamps.view(), Psfs::Star(psf), Some(given));
+        let batch = measurer.batch(stamps.view(), &Psfs::star(psf), Some(given));
         let found = batch.unwrap().warnings;
         assert_eq!(found.is_empty(), silent, "{given}: {found:?}");
         let expected = "the given noise disagrees with the noise of the stamps (found ";

@@ -253,7 +253,7 @@ def measured(case, stamps, psf, fields, options):
         run = subprocess.run(command, capture_output=True, text=True)
         if run.returncode:
             sys.exit(f"{case.name}: {run.stderr}")
-        names = ["e1", "e2", "response1", "response2", "flag"]
+        names = ["e1", "e2", "R11", "R22", "flags"]
         tables = [
             parquet.read_table(out / "set01" / f"catalogue-{k:03}.parquet", columns=names)
             for k in range(1, number + 1)
@@ -330,14 +330,14 @@ def examine(case, options):
             fields += [noise, -noise]
         others.look(stamps, fields)
         found = measured(case, stamps, psf, fields, options)
-        good = (found["flag"] == 0).all((0, 1))
+        good = (found["flags"] == 0).all((0, 1))
         row = {"good": good}
         for k in (1, 2):
-            response = np.where(found["flag"] == 0, found[f"response{k}"], np.nan)
+            response = np.where(found["flags"] == 0, found[f"R{k}{k}"], np.nan)
             if good.any():
                 # Ellipticities are divided by the mean response of their image: undone, for one mean over all.
                 e = found[f"e{k}"] * np.nanmean(response, 2, keepdims=True)
-                row[k] = (e, found[f"response{k}"])
+                row[k] = (e, found[f"R{k}{k}"])
         rows.append(row)
     good = np.concatenate([row["good"] for row in rows])
     flagged = 1.0 - good.mean()

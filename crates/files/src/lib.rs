@@ -10,6 +10,7 @@ pub mod fits;
 pub mod frames;
 pub mod open;
 pub mod parquet;
+pub mod renamed;
 pub mod table;
 pub mod text;
 

@@ -13,7 +13,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     });
 
     let measurer = Measurer::named("48/linear/star", 48)?;
-    let batch = measurer.batch(stamps.view(), Psfs::Star(star.view()), Some(1.0))?;
+    let batch = measurer.batch(stamps.view(), &Psfs::star(star.view()), Some(1.0))?;
     println!("mean response: {:.2?}", batch.response);
     for galaxy in batch.galaxies.iter().filter(|g| g.flags.is_empty()) {
         println!("calibrated e = ({:+.3}, {:+.3})", galaxy.e1, galaxy.e2);

@@ -2,34 +2,21 @@
 
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
-use shearq_quantities::FunctionalPsf;
+use ndarray::{ArrayView2, ArrayView3, Axis};
 use shearq_submissions::{Configuration, Method, NoiseSource};
 
 use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
 use crate::examine::{EXAMINED_PSFS, Examination, examined_rows};
 use crate::flag::Flag;
-use crate::galaxy::{Measurer, Worker};
+use crate::galaxy::Measurer;
 use crate::measurement::Measurement;
 use crate::noise::Survey;
 use crate::pixel::Pixel;
 use crate::psf::star_psf;
+use crate::psfs::Psfs;
 use crate::warning::Warning;
-
-/// PSFs of the galaxies of a batch.
-#[derive(Debug, Clone, Copy)]
-pub enum Psfs<'a, P = f64> {
-    /// A star stamp for all, centred and at least as large as the submission needs. It is cut and
-    /// normalised.
-    Star(ArrayView2<'a, P>),
-    /// Star stamps, one each along the first axis.
-    Stars(ArrayView3<'a, P>),
-    /// Formulas, one each.
-    Functional(&'a [FunctionalPsf]),
-    /// A PSF for all that is used as it is: as large as [`star_psf`] cuts it, centred, of sum one.
-    Prepared(ArrayView2<'a, f64>),
-}
+use crate::worker::{ImageNoise, is_level};
 
 /// A batch of galaxies, measured.
 #[derive(Debug, Clone)]
@@ -65,9 +52,10 @@ impl Measurer {
         if noise.is_none() && self.noise_plan().is_some() {
             return Err(MeasureError::Noise("not given".into()));
         }
+        let psf = star_psf(psf, self.configuration().psf_cut())?;
         let mut worker = self.worker();
-        worker.set_psf(star_psf(psf, self.configuration().psf_cut())?.view())?;
-        let found = worker.measure(stamp, noise)?;
+        let mut image = worker.image(ImageNoise::of(None, noise));
+        let found = image.psf(psf.view())?.measure(stamp)?;
         if found.flags.contains(Flag::NotFinite) {
             let finite = |pixel: T| pixel.to_f32().is_finite();
             let mut pixels = stamp.indexed_iter();
@@ -91,24 +79,26 @@ impl Measurer {
     /// Where sizes or numbers do not fit, the noise level is not one, or a PSF for all cannot be used. A
     /// galaxy with pixels that are not finite (under a linear method: too many), or with a PSF of its own that cannot be
     /// used, is flagged.
-    pub fn batch<T: Pixel, P: Pixel>(
+    pub fn batch<T: Pixel>(
         &self,
         stamps: ArrayView3<'_, T>,
-        psfs: Psfs<'_, P>,
+        psfs: &Psfs<'_>,
         noise: Option<f64>,
     ) -> Result<Batch, MeasureError> {
         let (_, rows, columns) = stamps.dim();
-        let star = match psfs {
-            Psfs::Star(star) => Some(star.dim()),
-            Psfs::Stars(stars) => Some((stars.dim().1, stars.dim().2)),
-            Psfs::Functional(_) | Psfs::Prepared(_) => None,
+        check(
+            self.configuration(),
+            (rows, columns),
+            psfs.star_size(),
+            noise,
+        )?;
+        let survey = match noise {
+            None => self.survey(stamps)?,
+            Some(_) => None,
         };
-        check(self.configuration(), (rows, columns), star, noise)?;
         let mut worker = self.worker();
-        if noise.is_none() {
-            worker.set_survey(self.survey(stamps)?.as_ref());
-        }
-        let mut galaxies = [worker.measure_each(stamps, psfs, noise)?];
+        let mut image = worker.image(ImageNoise::of(survey.as_ref(), noise));
+        let mut galaxies = [image.measure_each(stamps, psfs)?];
         let response = calibrate(self.configuration(), &mut galaxies);
         let mut examination = examine(stamps)?;
         examination.add_psfs(psfs, self.configuration().psf_cut(), EXAMINED_PSFS);
@@ -152,62 +142,6 @@ impl Measurer {
     }
 }
 
-impl Worker {
-    /// Measures stamps, one each along the first axis, before any calibration. `header_noise` as in
-    /// [`Worker::measure`].
-    ///
-    /// # Errors
-    /// Where sizes or numbers do not fit, or a PSF for all cannot be used. A galaxy whose own PSF cannot be
-    /// used is flagged.
-    pub fn measure_each<T: Pixel, P: Pixel>(
-        &mut self,
-        stamps: ArrayView3<'_, T>,
-        psfs: Psfs<'_, P>,
-        header_noise: Option<f64>,
-    ) -> Result<Vec<Measurement>, MeasureError> {
-        let (cut, count) = (self.configuration().psf_cut(), stamps.len_of(Axis(0)));
-        let side = stamps.len_of(Axis(1));
-        let given = match psfs {
-            Psfs::Star(_) | Psfs::Prepared(_) => count,
-            Psfs::Stars(stars) => stars.len_of(Axis(0)),
-            Psfs::Functional(formulas) => formulas.len(),
-        };
-        if given != count {
-            return Err(MeasureError::Shape {
-                what: "PSFs",
-                found: format!("{given} galaxies"),
-                expected: format!("{count}, one each"),
-            });
-        }
-        match psfs {
-            Psfs::Star(star) => self.set_psf(star_psf(star, cut)?.view())?,
-            Psfs::Prepared(psf) => self.set_psf(psf)?,
-            Psfs::Stars(_) | Psfs::Functional(_) => {}
-        }
-        let stamps = stamps.outer_iter().enumerate();
-        let measured = stamps.map(|(k, stamp)| {
-            match psfs {
-                Psfs::Star(_) | Psfs::Prepared(_) => {}
-                Psfs::Stars(stars) => self.take(star_psf(stars.index_axis(Axis(0), k), cut)),
-                Psfs::Functional(formulas) => {
-                    let stamp = formulas[k].checked_stamp(cut.size, side);
-                    self.take(stamp.map_err(MeasureError::from));
-                }
-            }
-            self.measure(stamp, header_noise)
-        });
-        measured.collect()
-    }
-
-    /// Takes a galaxy's own PSF, without which it is flagged.
-    fn take(&mut self, psf: Result<Array2<f64>, MeasureError>) {
-        let taken = psf.and_then(|psf| self.set_psf(psf.view()));
-        if taken.is_err() {
-            self.lose_psf();
-        }
-    }
-}
-
 /// Examines as many of the stamps, one each along the first axis, as are enough.
 fn examine<T: Pixel>(stamps: ArrayView3<'_, T>) -> Result<Examination, MeasureError> {
     let (count, side, _) = stamps.dim();
@@ -231,13 +165,16 @@ pub fn strip<T>(
 ) -> Result<ArrayView3<'_, T>, MeasureError> {
     length("a strip of stamps", pixels.len(), count * side * side)?;
     let rows = ArrayView3::from_shape((side, count, side), pixels);
-    match rows {
-        Ok(rows) => Ok(rows.permuted_axes([1, 0, 2])),
-        Err(error) => Err(MeasureError::Shape {
-            what: "a strip of stamps",
-            found: format!("{count} stamps of {side} × {side} pixels"),
-            expected: error.to_string(),
-        }),
+    let rows = rows.map_err(|error| shape_error(count, side, &error))?;
+    Ok(rows.permuted_axes([1, 0, 2]))
+}
+
+/// A strip that cannot be an array.
+pub(crate) fn shape_error(count: usize, side: usize, error: &ndarray::ShapeError) -> MeasureError {
+    MeasureError::Shape {
+        what: "a strip of stamps",
+        found: format!("{count} stamps of {side} × {side} pixels"),
+        expected: error.to_string(),
     }
 }
 
@@ -249,7 +186,7 @@ fn check(
     noise: Option<f64>,
 ) -> Result<(), MeasureError> {
     let given = match (noise, configuration.noise) {
-        (Some(sigma), _) => (!(sigma >= 0.0 && sigma.is_finite())).then(|| sigma.to_string()),
+        (Some(sigma), _) => (!is_level(sigma)).then(|| sigma.to_string()),
         (None, NoiseSource::Header) => Some("not given".to_owned()),
         (None, NoiseSource::Border { .. } | NoiseSource::Image { .. }) => None,
     };
@@ -281,11 +218,10 @@ fn check(
 #[cfg(test)]
 mod tests {
     use ndarray::{Array3, s};
-    use shearq_quantities::Shear;
+    use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 
     use super::*;
     use crate::flag::Flag;
-    use shearq_quantities::PsfProfile;
 
     fn moffat(e1: f64) -> FunctionalPsf {
         let profile = PsfProfile::Moffat { beta: 3.0 };
@@ -313,7 +249,7 @@ mod tests {
         let measurer = Measurer::named("48/linear/star", 48).unwrap();
         let (stamps, psf) = (stamps(6, 48), moffat(0.02));
         let star = psf.stamp(40);
-        let batch = measurer.batch(stamps.view(), Psfs::Star(star.view()), Some(0.5));
+        let batch = measurer.batch(stamps.view(), &Psfs::star(star.view()), Some(0.5));
         let batch = batch.unwrap();
         let response = batch.response.unwrap();
         let mut means = [0.0; 2];
@@ -324,7 +260,7 @@ mod tests {
                 .unwrap();
             assert_eq!(one.response, galaxy.response);
             assert_eq!(one.e1 / response[0], galaxy.e1);
-            means = [0, 1].map(|k| means[k] + one.response[k] / 6.0);
+            means = [0, 1].map(|k| means[k] + one.response_diagonal()[k] / 6.0);
         }
         assert!((means[0] / response[0] - 1.0).abs() < 1e-12);
         assert!((means[1] / response[1] - 1.0).abs() < 1e-12);
@@ -345,7 +281,7 @@ mod tests {
             star.assign(&formula.stamp(26).mapv(|v| v as f32));
         }
         let batch = measurer
-            .batch(stamps.view(), Psfs::Stars(stars.view()), None)
+            .batch(stamps.view(), &Psfs::stars(stars.view()), None)
             .unwrap();
         assert_eq!(batch.response, None);
         for (k, galaxy) in batch.galaxies.iter().enumerate() {
@@ -356,8 +292,8 @@ mod tests {
                 (galaxy.e1, galaxy.e2, galaxy.size)
             );
         }
-        let functional = Psfs::<f64>::Functional(&formulas);
-        let drawn = measurer.batch(stamps.view(), functional, None).unwrap();
+        let functional = Psfs::functional(&formulas);
+        let drawn = measurer.batch(stamps.view(), &functional, None).unwrap();
         for (drawn, star) in drawn.galaxies.iter().zip(&batch.galaxies) {
             // Light beyond the 15 px of the submission, which each is normalised without.
             assert!((drawn.e1 - star.e1).abs() < 1e-3, "{drawn:?} {star:?}");
@@ -380,7 +316,7 @@ mod tests {
         let mut stars = Array3::zeros((3, 32, 32));
         stars.slice_mut(s![0, .., ..]).assign(&star);
         stars.slice_mut(s![1, .., ..]).assign(&star);
-        let batch = measurer.batch(stamps.view(), Psfs::Stars(stars.view()), Some(1.0));
+        let batch = measurer.batch(stamps.view(), &Psfs::stars(stars.view()), Some(1.0));
         let flags: Vec<Vec<Flag>> = batch
             .unwrap()
             .galaxies
@@ -398,7 +334,7 @@ mod tests {
         holed.slice_mut(s![.., 19..22, 26..29]).fill(f32::NAN);
         let measured = |configuration: &str, stamps: &Array3<f32>| {
             let measurer = Measurer::named(configuration, 48).unwrap();
-            let psf = Psfs::Star(star.view());
+            let psf = &Psfs::star(star.view());
             measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
         };
         let linear = "48/linear/star";
@@ -421,7 +357,7 @@ mod tests {
         framed.slice_mut(s![.., 56.., ..]).fill(f32::NAN);
         let measurer = Measurer::named(linear, 64).unwrap();
         let [whole, framed] = [&holed, &framed].map(|stamps| {
-            let psf = Psfs::Star(star.view());
+            let psf = &Psfs::star(star.view());
             measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
         });
         for (whole, framed) in whole.galaxies.iter().zip(&framed.galaxies) {
@@ -429,7 +365,7 @@ mod tests {
         }
         holed.slice_mut(s![.., 30, 30]).fill(f32::NAN);
         let network = Measurer::named("23/raw/star", 64).unwrap();
-        let network = network.batch(holed.view(), Psfs::Star(star.view()), Some(1.0));
+        let network = network.batch(holed.view(), &Psfs::star(star.view()), Some(1.0));
         let network = network.unwrap();
         assert!(
             network
@@ -475,15 +411,11 @@ mod tests {
         );
         let stars = Array3::<f32>::zeros((3, 32, 32));
         message(
-            measurer.batch(good.view(), Psfs::Stars(stars.view()), noise),
+            measurer.batch(good.view(), &Psfs::stars(stars.view()), noise),
             "PSFs of 3 galaxies; expected 2, one each",
         );
         message(
-            measurer.batch(
-                good.view(),
-                Psfs::<f64>::Prepared(star.slice(s![1.., ..])),
-                noise,
-            ),
+            measurer.batch(good.view(), &Psfs::prepared(star.slice(s![1.., ..])), noise),
             "a PSF stamp of 31 × 32 pixels; expected an even number a side, 32 to 48",
         );
         for (level, found) in [
@@ -497,7 +429,7 @@ mod tests {
         let mut dead = star.clone();
         dead[(3, 2)] = f64::INFINITY;
         message(
-            measurer.batch(good.view(), Psfs::Star(dead.view()), noise),
+            measurer.batch(good.view(), &Psfs::star(dead.view()), noise),
             "pixel (3, 4) of the PSF stamp",
         );
     }

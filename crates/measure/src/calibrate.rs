@@ -32,10 +32,10 @@ where
     };
     let count = good().count() as f64;
     // Components apart: lags on a square grid, and PSFs with a direction, tell them from each other.
-    let means = [0, 1].map(|k| good().map(|g| g.response[k]).sum::<f64>() / count);
+    let means = [0, 1].map(|k| good().map(|g| g.response_diagonal()[k]).sum::<f64>() / count);
     let usable = [0, 1].into_iter().all(|k| {
         let mut responses = RunningMean::default();
-        good().for_each(|g| responses.add(g.response[k]));
+        good().for_each(|g| responses.add(g.response_diagonal()[k]));
         let error = responses.deviation() / count.sqrt();
         means[k].is_finite() && means[k] > 0.0 && (count == 1.0 || means[k] >= CLEAR * error)
     });
@@ -64,7 +64,7 @@ mod tests {
             Measurement {
                 e1: 0.1,
                 e2: -0.2,
-                response: [r, r],
+                response: (!r.is_nan()).then_some([[r, 0.0], [0.0, r]]),
                 flags: if r.is_nan() {
                     nothing.flags
                 } else {

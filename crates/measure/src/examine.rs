@@ -4,18 +4,18 @@
 //! All numbers are medians over stamps, so that neighbours on a few of them do not matter. The sky is measured in
 //! the corners, where a galaxy has least light.
 
-use ndarray::{ArrayView2, Axis};
+use ndarray::ArrayView2;
 use shearq_submissions::PsfCut;
 
-use crate::batch::Psfs;
 use crate::error::MeasureError;
 use crate::extent::{Core, core_sums};
-use crate::galaxy::highest;
 use crate::pixel::Pixel;
+use crate::psf::Star;
 use crate::psf::examine::{self, PsfLook};
-use crate::psf::{Star, star};
+use crate::psfs::Psfs;
 use crate::surroundings::centre;
 use crate::warning::Warning;
+use crate::worker::highest;
 
 /// Pixels a side of a block, and the largest share of the stamp's side.
 const BLOCK: usize = 8;
@@ -143,33 +143,17 @@ impl Examination {
         self.psfs.extend(PsfLook::of(psf, moved));
     }
 
-    /// Examines the PSF of all galaxies, or up to `most` of those for one galaxy each, as a configuration cuts them for
-    /// stamps of `full` pixels a side. PSFs that cannot be used are left out.
-    pub fn add_psfs<P: Pixel>(&mut self, psfs: Psfs<'_, P>, cut: PsfCut, most: usize) {
-        let count = match psfs {
-            Psfs::Star(given) => return self.add_star(given, cut),
-            Psfs::Prepared(psf) => return self.add_psf(psf, None),
-            Psfs::Stars(stars) => stars.len_of(Axis(0)),
-            Psfs::Functional(formulas) => formulas.len(),
-        };
-        self.each = true;
+    /// Examines a PSF of all galaxies, or up to `most` PSFs of one galaxy each, as a configuration cuts them. PSFs that
+    /// cannot be used are left out.
+    pub fn add_psfs(&mut self, psfs: &Psfs<'_>, cut: PsfCut, most: usize) {
+        let count = psfs.count();
+        self.each |= count.is_some();
+        let count = count.unwrap_or(1);
         let some = most.min(count);
         for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
-            match psfs {
-                Psfs::Stars(stars) => self.add_star(stars.index_axis(Axis(0), at), cut),
-                Psfs::Functional(formulas) => {
-                    if let Ok(psf) = formulas[at].checked_stamp(cut.size, self.full) {
-                        self.add_psf(psf.view(), None);
-                    }
-                }
-                Psfs::Star(_) | Psfs::Prepared(_) => {}
+            if let Ok(Star { psf, moved }) = psfs.at(at, cut, self.full) {
+                self.add_psf(psf.view(), moved);
             }
-        }
-    }
-
-    fn add_star<P: Pixel>(&mut self, stamp: ArrayView2<'_, P>, cut: PsfCut) {
-        if let Ok(Star { psf, moved }) = star(stamp, cut) {
-            self.add_psf(psf.view(), moved);
         }
     }
 

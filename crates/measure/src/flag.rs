@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-/// A reason. Its number is a bit of the catalogues' column `flag`.
+/// A reason. Its number is a bit of the catalogues' column `flags`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u32)]
 pub enum Flag {

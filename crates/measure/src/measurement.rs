@@ -1,41 +1,51 @@
-//! What was measured on one galaxy.
+//! The result of measuring one galaxy.
 
 use crate::deconvolve::Descent;
-use crate::flag::{Flag, Flags};
+use crate::flag::Flags;
 
-/// What was measured on one galaxy.
+/// Response ∂e_i/∂γ_j of an ellipticity to shear, as `[i][j]`: R11, R12 and R21, R22.
+pub type ResponseMatrix = [[f64; 2]; 2];
+
+/// Result of measuring one galaxy.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub struct Measurement {
-    /// Reported ellipticity, of the submission's type; NaN if flagged.
+    /// First component of the ellipticity, of the configuration's type; NaN if flagged.
     pub e1: f64,
     /// Second component.
     pub e2: f64,
-    /// Why the galaxy could not be measured.
+    /// Reasons why the galaxy could not be measured.
     pub flags: Flags,
-    /// The galaxy's own response of e1 to γ1 and of e2 to γ2, before any calibration; NaN where it is not
-    /// measured. Fit for means over many galaxies: what sheared noise adds to the mean is subtracted from a
-    /// few of them, for all.
-    pub response: [f64; 2],
-    /// How the network ran; `None` if it did not.
+    /// Response of the reported ellipticity to shear, before calibration; `None` for the network and for galaxies that
+    /// could not be measured. Only means over many galaxies are unbiased: the mean contribution of sheared noise is
+    /// subtracted from one galaxy in four, for all.
+    pub response: Option<ResponseMatrix>,
+    /// Iterations of the network; `None` if it did not run.
     pub descent: Option<Descent>,
-    /// Noise level used, in image units; NaN if unknown.
+    /// Standard deviation of the noise that was used, in image units; NaN if unknown.
     pub noise: f64,
-    /// Sum of the deconvolved stamp, in image units; of the stamp itself under the linear method.
+    /// Sum of the deconvolved stamp in image units. For the linear method, sum of the stamp.
     pub flux: f64,
-    /// Radius of the clipped ACF in pixels; of the lags used under the linear method.
+    /// Radius of the clipped autocorrelation in pixels. For the linear method, radius of the lags that are used.
     pub radius: f64,
-    /// Qxx + Qyy of the clipped, or weighted, ACF in px².
+    /// Qxx + Qyy of the clipped, or weighted, autocorrelation in px².
     pub size: f64,
 }
 
 impl Measurement {
-    /// A galaxy with nothing measured.
-    pub(crate) fn flagged(flag: Flag) -> Self {
+    /// R11 and R22; NaN if there is no response.
+    pub fn response_diagonal(&self) -> [f64; 2] {
+        self.response
+            .map_or([f64::NAN; 2], |[[r11, _], [_, r22]]| [r11, r22])
+    }
+
+    /// A galaxy that could not be measured.
+    pub fn flagged(flag: impl Into<Flags>) -> Self {
         Measurement {
             e1: f64::NAN,
             e2: f64::NAN,
             flags: flag.into(),
-            response: [f64::NAN; 2],
+            response: None,
             descent: None,
             noise: f64::NAN,
             flux: f64::NAN,

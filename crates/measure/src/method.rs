@@ -12,7 +12,8 @@ use std::sync::Arc;
 use shearq_submissions::{Configuration, Method};
 
 use self::family::LinearFamily;
-pub(crate) use self::found::{CutWorker, Found, Images, ResponseMatrix};
+pub use self::found::AdaptedSettings;
+pub(crate) use self::found::{CutWorker, Found, Images, Sheared};
 use self::network::NetworkPlan;
 use crate::error::MeasureError;
 

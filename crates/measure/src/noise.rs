@@ -25,10 +25,10 @@ use shearq_quantities::statistics::{SCATTER, median};
 use crate::error::MeasureError;
 use crate::examine::{PEAKS, enough};
 use crate::extent::Light;
-use crate::galaxy::highest;
 use crate::pixel::Pixel;
 use crate::surroundings::{Contrasts, Missing, centre, followed, turn};
 use crate::warning::Warning;
+use crate::worker::highest;
 
 /// Pixels a side of a block.
 const BLOCK: usize = 8;
@@ -157,7 +157,7 @@ impl NoisePlan {
     /// Plans for stamps of `full` pixels a side and a covariance of lags up to `reach` along each axis.
     ///
     /// # Errors
-    /// Where the stamps are too small to have a frame, or the lags too long for its blocks.
+    /// If the stamps are smaller than 24 × 24 pixels, or the lags longer than 4 px.
     pub fn new(full: usize, reach: usize) -> Result<Self, MeasureError> {
         if full < LEAST_STAMP {
             let expected = format!(
@@ -165,7 +165,13 @@ impl NoisePlan {
             );
             return Err(MeasureError::square("stamps", (full, full), expected));
         }
-        let reach = reach.min(BLOCK / 2);
+        if reach > BLOCK / 2 {
+            return Err(MeasureError::Shape {
+                what: "a noise correlation",
+                found: format!("lags up to {reach} px"),
+                expected: format!("at most {} px", BLOCK / 2),
+            });
+        }
         let polynomials = polynomials();
         Ok(NoisePlan {
             full,
@@ -280,8 +286,22 @@ impl NoiseSurvey {
         Ok(())
     }
 
-    /// Adds what another survey of the same plan has found, as if its stamps had been added here.
-    pub fn join(&mut self, other: &Self) {
+    /// Adds the stamps of another survey, as if they had been added here.
+    ///
+    /// # Errors
+    /// If the surveys have different plans.
+    pub fn join(&mut self, other: &Self) -> Result<(), MeasureError> {
+        let plan = |plan: &NoisePlan| {
+            let NoisePlan { full, reach, .. } = plan;
+            format!("stamps of {full} × {full} pixels with lags up to {reach} px")
+        };
+        if (self.plan.full, self.plan.reach) != (other.plan.full, other.plan.reach) {
+            return Err(MeasureError::Shape {
+                what: "a noise survey",
+                found: plan(&other.plan),
+                expected: plan(&self.plan),
+            });
+        }
         self.products.extend_from_slice(&other.products);
         self.brightest.extend_from_slice(&other.brightest);
         self.typical.extend_from_slice(&other.typical);
@@ -290,6 +310,7 @@ impl NoiseSurvey {
         for (count, more) in self.counts.iter_mut().zip(other.counts) {
             *count += more;
         }
+        Ok(())
     }
 
     /// Looks for places of the stamp that are brighter than the opposite ones, and how broad its galaxy is.
@@ -831,7 +852,7 @@ mod tests {
         }
         // The last ten were added to the first.
         let [mut first, second] = parts;
-        first.join(&second);
+        first.join(&second).unwrap();
         assert_eq!(first.looked_at(), whole.looked_at());
         assert_eq!(first.incomplete(), whole.incomplete());
         let [found, expected] = [first, whole].map(|survey| survey.found().unwrap());
@@ -918,6 +939,17 @@ mod tests {
         let odd = frame(51);
         assert_eq!((odd.len(), odd[0], odd[5]), (20, (0, 0), (0, 43)));
         assert!(NoisePlan::new(23, 2).is_err());
+        let long = NoisePlan::new(48, 5).unwrap_err().to_string();
+        assert!(long.contains("lags up to 5 px"), "{long}");
+        let mut survey = NoisePlan::new(48, 3).unwrap().survey();
+        for (full, reach) in [(48, 2), (50, 3)] {
+            let other = NoisePlan::new(full, reach).unwrap().survey();
+            let refused = survey.join(&other).unwrap_err().to_string();
+            assert!(
+                refused.contains(&format!("stamps of {full} × {full} pixels with lags up to {reach} px; expected stamps of 48")),
+                "{refused}"
+            );
+        }
         let plan = NoisePlan::new(48, 3).unwrap();
         assert_eq!(plan.rows(3, 3), [0, 1, 2]);
         // Stamps one by one, as in a batch: a thousand of them, not one.

@@ -4,12 +4,12 @@ use ndarray::{Array2, ArrayView2};
 
 use crate::deconvolve::convolve;
 use crate::error::MeasureError;
-use crate::galaxy::Worker;
 use crate::measurement::Measurement;
 use crate::method::Images;
 use crate::pixel::Pixel;
 use crate::psf::cut_start;
 use crate::sizes::check_psf;
+use crate::worker::PsfWorker;
 
 /// The steps of one measurement as images.
 pub struct Steps {
@@ -27,7 +27,7 @@ pub struct Steps {
     pub used: Array2<f64>,
 }
 
-impl Worker {
+impl PsfWorker<'_> {
     /// The steps behind the last measurement, `measurement` of `stamp` with `psf`.
     ///
     /// # Errors
@@ -52,7 +52,7 @@ impl Worker {
             acf,
             weight,
             spacing,
-        } = self.method.images(&self.cut, psf);
+        } = self.worker.method.images(&self.worker.cut, psf);
         let reconvolved = convolve(deconvolved.view(), psf);
         let middle = (acf.nrows() / 2) as f64;
         let used = Array2::from_shape_fn(acf.dim(), |at| {

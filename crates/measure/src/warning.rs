@@ -151,6 +151,13 @@ pub enum Warning {
         /// Whether the difference is too large for stars that are measured as galaxies.
         fatal: bool,
     },
+    /// The headers of the PSF image and of the galaxy image state different pixel scales.
+    PixelScale {
+        /// Arcseconds per pixel of the PSF image.
+        psf: f64,
+        /// Arcseconds per pixel of the galaxy image.
+        galaxies: f64,
+    },
     /// The configuration uses so little of the PSF that its wings are missing.
     PsfSize {
         /// Pixels a side that are used.
@@ -248,6 +255,7 @@ impl Warning {
             Warning::PsfNoise { .. } => "psf-noise",
             Warning::PsfNarrow { .. } => "psf-narrow",
             Warning::PsfBroad { .. } => "psf-broad",
+            Warning::PixelScale { .. } => "pixel-scale",
             Warning::PsfSize { .. } => "psf-size",
             Warning::Flagged { .. } => "flagged",
         }
@@ -274,6 +282,20 @@ impl fmt::Display for Shown {
             2.0 - value.abs().log10().floor()
         };
         write!(f, "{value:.*}", decimals.max(0.0) as usize)
+    }
+}
+
+/// A pixel scale to six digits, without trailing zeros.
+struct Scale(f64);
+
+impl fmt::Display for Scale {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Scale(scale) = *self;
+        if !(scale.is_finite() && scale > 0.0) {
+            return write!(f, "{scale}");
+        }
+        let unit = 10f64.powf(5.0 - scale.log10().floor());
+        write!(f, "{}", (scale * unit).round() / unit)
     }
 }
 
@@ -422,6 +444,12 @@ impl fmt::Display for Warning {
                     "the PSF is {relation} the galaxies (found a FWHM of {psf:.2} px in the core, expected {expected} the {galaxies:.2} px of the galaxies). A PSF sampled with another pixel scale biases m by up to 10. Try: check the sampling of the PSF, and that the objects are not stars"
                 )
             }
+            Warning::PixelScale { psf, galaxies } => write!(
+                f,
+                "the PSF image and the galaxy image have different pixel scales (found {}, expected {} arcsec per pixel). This can bias m by 0.1 or more. Try: resample the PSF to the pixels of the galaxies, or correct its header",
+                Scale(*psf),
+                Scale(*galaxies)
+            ),
             Warning::PsfSize { size } => write!(
                 f,
                 "psf.size is {size} (expected {LEAST_PSF_SIZE} or more). The wings of the PSF that are cut off bias m, by about 0.002 at 20 px and 0.01 at 16 px for a FWHM of 3.4 px. Try: psf.size = {LEAST_PSF_SIZE}"
@@ -447,5 +475,22 @@ pub(crate) fn advice(flag: Flag) -> &'static str {
             "check that the PSF has the pixel scale of the galaxies, and that there are galaxies"
         }
         Flag::Neighbour => "check sky gradients and that the stamps are centred on the galaxies",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixel_scales_are_shown_with_the_digits_that_differ() {
+        let message = |psf: f64, galaxies: f64| Warning::PixelScale { psf, galaxies }.to_string();
+        let found = message(0.2, 0.263);
+        assert!(
+            found.contains("different pixel scales (found 0.2, expected 0.263 arcsec per pixel)"),
+            "{found}"
+        );
+        let found = message(0.200_000_000_1 * 1.001, 0.199_999_999_9);
+        assert!(found.contains("found 0.2002, expected 0.2 "), "{found}");
     }
 }

@@ -10,12 +10,12 @@ use super::PipelineError;
 use super::engine::{self, Progress};
 use super::images::ImageId;
 use super::inputs::Inputs;
-use super::measure::{metadata, open_galaxies};
 use super::simulate::SimulationRecord;
 use crate::data::layout::{DataFolder, read_truth_rows};
 use crate::data::mosaic::Mosaic;
 use crate::data::psf_table;
 use crate::data::run::{Run, Source};
+use crate::measure::{metadata, open_galaxies};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 use shearq_files::table::{self, kept, most_rows, read_metadata};
@@ -194,7 +194,7 @@ fn check_catalogue(
         None => Ok(()),
         Some((key, _)) => {
             let message = format!(
-                "its `{key}` is not that of set {} image {} of this run; it belongs to another, or to other data",
+                "its `{key}` does not match set {} image {} of this run; the file belongs to another image or to other data",
                 id.set, id.image
             );
             Err(FileError::new(path, message).into())

@@ -4,6 +4,7 @@ pub mod fingerprint;
 pub mod layout;
 pub mod listing;
 pub mod mosaic;
+pub mod pattern;
 pub mod psf_table;
 pub mod relative;
 pub mod run;

@@ -174,8 +174,10 @@ fn gather_alone(
         version: crate::VERSION,
         gathering,
     };
-    let record = serde_json::to_string_pretty(&record)
-        .map_err(FileError::doing(&which, "cannot tell what made it"))?;
+    let record = serde_json::to_string_pretty(&record).map_err(FileError::doing(
+        &which,
+        "cannot write the record of the settings",
+    ))?;
     let mut doubts = Vec::new();
     let positions = match stamps {
         Stamps::Files(_) => Vec::new(),
@@ -240,10 +242,9 @@ fn gather_alone(
             position_x: origin.position.map(|(x, _)| x),
             position_y: origin.position.map(|(_, y)| y),
         };
-        places.serialize(place).map_err(FileError::doing(
-            &target,
-            "cannot tell which stamp is which",
-        ))?;
+        places
+            .serialize(place)
+            .map_err(FileError::doing(&target, "cannot write the list of stamps"))?;
         image.add(pixels)
     };
     match stamps {

@@ -3,8 +3,9 @@
 use std::str::FromStr;
 
 use super::PipelineError;
-use crate::data::layout::{DataFolder, fill};
+use crate::data::layout::DataFolder;
 use crate::data::listing::{self, Files};
+use crate::data::pattern::fill;
 use shearq_files::FileError;
 
 /// One image of a data folder or a simulation.

@@ -12,6 +12,7 @@ pub mod grid;
 pub mod images;
 pub mod inputs;
 pub mod measure;
+mod pixel_scale;
 pub mod run;
 pub mod simulate;
 pub mod truth;
@@ -51,3 +52,8 @@ pub enum PipelineError {
     #[error("cannot start the worker threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
 }
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

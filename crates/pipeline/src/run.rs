@@ -1,34 +1,29 @@
 //! Simulating and measuring in memory: no image is stored.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, Axis};
 use shearq_measure::{
-    Measurer, NoisePlan, NoiseSurvey, Steps, Survey, Warning, Worker, calibrate, star_psf, strip,
+    ImageNoise, Measurer, NoisePlan, NoiseSurvey, Psfs, Steps, Survey, Warning, Worker, calibrate,
+    star_psf, strip,
 };
 use shearq_quantities::Shear;
 use shearq_submissions::{Configuration, PsfForm};
 
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
-use super::measure::{
-    MeasuredRow, RowPsf, StampRow, Summary, catalogues, measure_row, to_do, warnings,
-    write_catalogue,
-};
-use super::warned::Warned;
+use super::measure::{Catalogues, ImageHead, MeasuredRow, StampRow, Summary, measure_row};
 use super::{PipelineError, simulate};
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;
-use crate::data::run::{RUN_FILE, Run, claim};
+use crate::data::run::Run;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
 };
-
-/// What an image's stamps tell of it, for each measurer that measures its noise.
-pub(crate) type Surveys = Arc<[Option<Arc<Survey>>]>;
 
 /// One row of stamps to draw and measure.
 pub struct RowJob {
@@ -36,8 +31,17 @@ pub struct RowJob {
     pub fields: Arc<ImageFields>,
     /// Row of the mosaic, from 0.
     pub iy: usize,
-    /// What the image's stamps tell of it, for each measurer that measures its noise.
-    pub surveys: Surveys,
+    /// What the rows of the image share, one per measurer.
+    pub heads: Arc<[Arc<ImageHead>]>,
+}
+
+impl fmt::Debug for RowJob {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("RowJob")
+            .field("iy", &self.iy)
+            .field("heads", &self.heads)
+            .finish_non_exhaustive()
+    }
 }
 
 /// A row of stamps, measured by each measurer.
@@ -48,6 +52,7 @@ struct MeasuredJob {
 }
 
 /// A simulated image, measured.
+#[derive(Debug)]
 pub struct SimulatedImage<'a> {
     /// Its number.
     pub image: u32,
@@ -63,24 +68,23 @@ struct Scratch {
     workers: Vec<Worker>,
 }
 
-/// Plans the measurement of simulated stamps by each of `submissions`.
+/// Plans the measurement of simulated stamps by each of `configurations`.
 ///
 /// # Errors
-/// Where a submission's sizes cannot be worked with.
-pub fn measurers(submissions: &[Configuration]) -> Result<Vec<Measurer>, PipelineError> {
-    submissions
+/// If the sizes of a configuration cannot be used.
+pub fn measurers(configurations: &[Configuration]) -> Result<Vec<Measurer>, PipelineError> {
+    configurations
         .iter()
         .map(|configuration| Ok(Measurer::new(configuration, STAMP)?))
         .collect()
 }
 
-/// Simulates `images`, which are in the order of their sets, and measures them by the run's
-/// submission, into catalogues in `out` with the true shear beside them. No image is stored;
-/// catalogues that are there already, of the same settings, are kept.
+/// Simulates `images`, which are in the order of their sets, and measures them by the run's configuration. Writes
+/// catalogues to `out`, with the true shear beside them. No image is stored. Catalogues of the same settings that are
+/// there already are kept.
 ///
 /// # Errors
-/// Where a set does not exist, the folder holds results of other settings, or a file cannot be
-/// written.
+/// If a set does not exist, the folder contains results of other settings, or a file cannot be written.
 pub fn run_folder(
     run: &Run,
     settings: SimulationSettings,
@@ -89,61 +93,43 @@ pub fn run_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    let claim = claim(&out.join(RUN_FILE), run)?;
+    let mut catalogues = Catalogues::claim(run, out, images)?;
     let measurers = measurers(std::slice::from_ref(&run.configuration))?;
     let truth = DataFolder::new(out);
-    let (todo, done) = to_do(run, out, images);
-    let mut summary = Summary {
-        already: done.len(),
-        ..Summary::default()
-    };
-    let mut warned = Warned::default();
-    progress.skip((summary.already * settings.grid * settings.grid) as u64);
+    progress.skip((catalogues.done.len() * settings.grid * settings.grid) as u64);
+    let todo = std::mem::take(&mut catalogues.todo);
     for of_set in todo.chunk_by(|a, b| a.set == b.set) {
         let set = of_set[0].set;
         let todo: Vec<u32> = of_set.iter().map(|id| id.image).collect();
         let simulator = simulate::simulator(set, settings)?;
         simulate::write_truth(&truth, &simulator)?;
-        progress.note(&format!("set {set:02}"));
-        // The bar is busy meanwhile.
-        let mut found = Vec::new();
-        run_set(&simulator, &todo, &measurers, threads, progress, |image| {
-            let id = ImageId {
-                set,
-                image: image.image,
-            };
-            found.extend(warnings(&image.rows[0]).into_iter().map(|one| (id, one)));
-            // Writing would make the folder again, without the earlier catalogues.
-            claim.check()?;
-            write_catalogue(run, out, &image.rows[0], BTreeMap::new())?;
-            summary.count(&image.rows[0]);
-            Ok(())
-        })
-        .map_err(|error| claim.explain(error))?;
-        for (id, warning) in found {
-            warned.add(id, vec![warning], progress)?;
-        }
+        run_set(
+            &simulator,
+            &todo,
+            &measurers,
+            threads,
+            progress,
+            |image, progress| catalogues.add(&image.rows[0], progress),
+        )
+        .map_err(|error| catalogues.explain(error))?;
     }
-    claim.check_results(catalogues(run, out, images))?;
-    warned.finish(progress);
-    Ok(summary)
+    catalogues.finish(progress)
 }
 
-/// Simulates images of a set and measures each galaxy by all `measurers`; `done` gets the
-/// images in order.
+/// Simulates images of a set and measures each galaxy by all `measurers`. `done` gets the images in order.
 ///
-/// The galaxies are those that `simulate` would write with the same settings, and the measurements
-/// those that `measure` would make of them.
+/// The galaxies are equal to those that `simulate` writes with the same settings, and the measurements to those of
+/// `measure`.
 ///
 /// # Errors
-/// What `done` returns, or threads that cannot be started.
+/// As `done`, or if threads cannot be started.
 pub fn run_set(
     set: &SetSimulator,
     images: &[u32],
     measurers: &[Measurer],
     threads: usize,
     progress: &mut dyn Progress,
-    mut done: impl FnMut(&SimulatedImage<'_>) -> Result<(), PipelineError>,
+    mut done: impl FnMut(&SimulatedImage<'_>, &mut dyn Progress) -> Result<(), PipelineError>,
 ) -> Result<(), PipelineError> {
     let n = set.grid().n;
     let mut rows: Vec<Vec<MeasuredRow>> = measurers.iter().map(|_| Vec::new()).collect();
@@ -158,7 +144,7 @@ pub fn run_set(
         |scratch, job| draw_and_measure(set, scratch, &job),
         |measured: MeasuredJob| {
             progress.advance(n as u64);
-            let (image, iy) = (measured.rows[0].id.image, measured.rows[0].iy);
+            let (image, iy) = (measured.rows[0].head.id.image, measured.rows[0].iy);
             observed.extend(measured.observed);
             for (rows, row) in rows.iter_mut().zip(measured.rows) {
                 rows.push(row);
@@ -167,11 +153,12 @@ pub fn run_set(
                 for (rows, measurer) in rows.iter_mut().zip(measurers) {
                     calibrate(measurer.configuration(), rows);
                 }
-                done(&SimulatedImage {
+                let image = SimulatedImage {
                     image,
                     observed: &observed,
                     rows: &rows,
-                })?;
+                };
+                done(&image, progress)?;
                 rows.iter_mut().for_each(Vec::clear);
                 observed.clear();
             }
@@ -180,10 +167,10 @@ pub fn run_set(
     )
 }
 
-/// Hands out the rows of images of a set, in order, with what `measurers` find on their stamps.
+/// Hands out the rows of images of a set, in order, with the noise that each of `measurers` measures on them.
 ///
 /// # Errors
-/// Where a measurer is for stamps of another size.
+/// If a measurer is for stamps of another size.
 pub fn feed(
     set: &SetSimulator,
     images: &[u32],
@@ -192,15 +179,11 @@ pub fn feed(
 ) -> Result<(), PipelineError> {
     for &image in images {
         let fields = Arc::new(set.image_fields(image));
-        let surveys = surveys(set, &fields, measurers, feeder)?;
+        let heads = heads(set, &fields, measurers, feeder)?;
         for iy in 0..set.grid().n {
             let fields = Arc::clone(&fields);
-            let surveys = Arc::clone(&surveys);
-            if !feeder.push(RowJob {
-                fields,
-                iy,
-                surveys,
-            }) {
+            let heads = Arc::clone(&heads);
+            if !feeder.push(RowJob { fields, iy, heads }) {
                 return Ok(());
             }
         }
@@ -208,13 +191,40 @@ pub fn feed(
     Ok(())
 }
 
-/// What the stamps of a simulated image tell each measurer that measures its noise, from the rows that it would look at.
+/// What the rows of a simulated image share, one per measurer.
+fn heads(
+    set: &SetSimulator,
+    fields: &ImageFields,
+    measurers: &[Measurer],
+    feeder: &Feeder<'_, RowJob>,
+) -> Result<Arc<[Arc<ImageHead>]>, PipelineError> {
+    let surveys = surveys(set, fields, measurers, feeder)?;
+    let head = |(measurer, survey): (&Measurer, Option<Arc<Survey>>)| {
+        let warnings = Warning::of_settings(measurer.configuration());
+        Arc::new(ImageHead {
+            id: ImageId {
+                set: set.kind().set,
+                image: fields.image,
+            },
+            mosaic: Mosaic::square(set.grid().n, STAMP),
+            noise: Some(NOISE_SIGMA),
+            stated_noise: None,
+            survey,
+            warnings: warnings.into_iter().collect(),
+            run_warnings: Vec::new(),
+            prints: BTreeMap::new(),
+        })
+    };
+    Ok(measurers.iter().zip(surveys).map(head).collect())
+}
+
+/// Noise and galaxy sizes of a simulated image, for each measurer that measures them.
 fn surveys(
     set: &SetSimulator,
     fields: &ImageFields,
     measurers: &[Measurer],
     feeder: &Feeder<'_, RowJob>,
-) -> Result<Surveys, PipelineError> {
+) -> Result<Vec<Option<Arc<Survey>>>, PipelineError> {
     let n = set.grid().n;
     let empty = || -> Vec<Option<NoiseSurvey>> {
         let plans = measurers.iter().map(Measurer::noise_plan);
@@ -223,7 +233,7 @@ fn surveys(
     let Some(plan) = measurers.iter().find_map(Measurer::noise_plan) else {
         return Ok(measurers.iter().map(|_| None).collect());
     };
-    // Plans differ in their lags alone.
+    // Plans differ only in their lags.
     let rows = feeder.each(plan.rows(n, n), |iy| {
         let (pixels, _) = simulate::draw_stamps(set, fields, iy, &mut RenderScratch::new());
         let mut surveys = empty();
@@ -238,7 +248,7 @@ fn surveys(
     for row in rows {
         let found = row?;
         for (survey, more) in surveys.iter_mut().flatten().zip(found.iter().flatten()) {
-            survey.join(more);
+            survey.join(more)?;
         }
     }
     let found = surveys
@@ -253,22 +263,15 @@ fn draw_and_measure(
     job: &RowJob,
 ) -> Result<MeasuredJob, PipelineError> {
     let (pixels, observed) = simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render);
-    let rows = measure_strip(
-        set,
-        &job.fields,
-        job.iy,
-        pixels,
-        &mut scratch.workers,
-        &job.surveys,
-    )?;
+    let rows = measure_strip(set, job, pixels, &mut scratch.workers)?;
     Ok(MeasuredJob { observed, rows })
 }
 
-/// Simulates galaxy `(ix, iy)` of an image and measures it, keeping the steps; `None` where it could
-/// not be measured. Returns the PSF with them.
+/// Simulates galaxy `(ix, iy)` of an image and measures it with all intermediate steps. Returns them with the PSF,
+/// `None` if the galaxy could not be measured.
 ///
 /// # Errors
-/// Where the measurer is for stamps of another size.
+/// If the measurer is for stamps of another size.
 pub fn simulated_steps(
     set: &SetSimulator,
     measurer: &Measurer,
@@ -283,8 +286,9 @@ pub fn simulated_steps(
     let cut = measurer.configuration().psf_cut();
     let psf = fields.psf.at(ix, iy).stamp_beside(cut.size, STAMP);
     let mut worker = measurer.worker();
-    worker.set_psf(psf.view())?;
-    let measured = worker.measure(stamp, Some(NOISE_SIGMA))?;
+    let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
+    let mut worker = image.psf(psf.view())?;
+    let measured = worker.measure(stamp)?;
     if measured.descent.is_none() {
         return Ok(None);
     }
@@ -292,74 +296,59 @@ pub fn simulated_steps(
     Ok(Some((psf, steps)))
 }
 
-/// Measures a strip of simulated stamps by each worker, with the noise that was measured for it: without one
-/// the noise that was drawn.
+/// Measures a strip of simulated stamps in the place of a job's by each worker, with the noise that was measured, or
+/// else with the true noise.
 ///
 /// # Errors
 /// If the stamps have other sizes than planned.
 pub fn measure_strip(
     set: &SetSimulator,
-    fields: &ImageFields,
-    iy: usize,
+    job: &RowJob,
     pixels: Vec<f32>,
     workers: &mut [Worker],
-    surveys: &[Option<Arc<Survey>>],
 ) -> Result<Vec<MeasuredRow>, PipelineError> {
-    let mut row = StampRow {
-        id: ImageId {
-            set: set.kind().set,
-            image: fields.image,
-        },
-        iy,
-        mosaic: Mosaic::square(set.grid().n, STAMP),
-        pixels,
-        header_noise: Some(NOISE_SIGMA),
-        survey: None,
-        psf: RowPsf::Functional(Vec::new()),
-        warnings: Vec::new(),
-    };
     let mut measured = Vec::with_capacity(workers.len());
-    for (k, worker) in workers.iter_mut().enumerate() {
-        row.survey = surveys.get(k).cloned().flatten();
-        row.psf = row_psf(set, fields, iy, worker.configuration());
-        row.warnings = match iy {
-            0 => Warning::of_settings(worker.configuration())
-                .into_iter()
-                .collect(),
-            _ => Vec::new(),
+    let mut pixels = pixels;
+    for (worker, head) in workers.iter_mut().zip(job.heads.iter()) {
+        let row = StampRow {
+            head: Arc::clone(head),
+            iy: job.iy,
+            pixels,
+            psfs: row_psfs(set, &job.fields, job.iy, worker.configuration())?,
         };
         measured.push(measure_row(worker, &row)?);
+        pixels = row.pixels;
     }
     Ok(measured)
 }
 
-/// The PSFs of a row in the form that a submission uses.
-fn row_psf(
+/// The PSFs of a row in the form that a configuration uses.
+fn row_psfs(
     set: &SetSimulator,
     fields: &ImageFields,
     iy: usize,
     configuration: &Configuration,
-) -> RowPsf {
+) -> Result<Psfs<'static>, PipelineError> {
     let n = set.grid().n;
     let (size, cut) = (configuration.psf.size, configuration.psf_cut());
-    match (&fields.psf, configuration.psf.form) {
+    Ok(match (&fields.psf, configuration.psf.form) {
         (PsfField::One(psf), PsfForm::Functional) => {
-            RowPsf::Shared(Arc::new(psf.stamp_beside(cut.size, STAMP)))
+            Psfs::Prepared(psf.stamp_beside(cut.size, STAMP).into_shared())
         }
         (PsfField::One(psf), PsfForm::Star) => {
             let star = simulate::star(psf, STAMP);
             let psf = ArrayView2::from_shape((STAMP, STAMP), &star)
                 .ok()
                 .and_then(|star| star_psf(star, cut).ok());
-            // A noise-free star of the simulator's can always be cut.
-            RowPsf::Shared(Arc::new(psf.unwrap_or_else(|| Array2::zeros((size, size)))))
+            // A simulated star without noise can always be cut.
+            let psf = psf.unwrap_or_else(|| Array2::zeros((size, size)));
+            Psfs::Prepared(psf.into_shared())
         }
         (PsfField::PerGalaxy(_), PsfForm::Functional) => {
-            RowPsf::Functional((0..n).map(|ix| *fields.psf.at(ix, iy)).collect())
+            Psfs::functional((0..n).map(|ix| *fields.psf.at(ix, iy)).collect::<Vec<_>>())
         }
-        (PsfField::PerGalaxy(_), PsfForm::Star) => RowPsf::Stars {
-            pixels: simulate::draw_stars(set, fields, iy),
-            side: STAMP,
-        },
-    }
+        (PsfField::PerGalaxy(_), PsfForm::Star) => {
+            Psfs::strip(simulate::draw_stars(set, fields, iy), n, STAMP)?
+        }
+    })
 }

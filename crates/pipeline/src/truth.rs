@@ -69,7 +69,7 @@ pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileErro
             return Err(FileError::new(truth, message));
         }
         (Some(sign), _) | (None, Some(sign)) => (sign, SignBasis::Specified),
-        (None, None) => match sign_by_modes(&grid, &standard) {
+        (None, None) => match sign_by_modes(&grid, &standard).map_err(bad)? {
             Some(sign) => (sign, SignBasis::Modes(sign)),
             // Zero has no sign.
             None if standard.g2.iter().all(|g2| *g2 == 0.0) => {

@@ -19,10 +19,10 @@ impl Warned {
     ///
     /// # Errors
     /// If no catalogue should be made of the image.
-    pub(crate) fn add(
+    pub(crate) fn add<'w>(
         &mut self,
         id: ImageId,
-        warnings: Vec<Warning>,
+        warnings: impl IntoIterator<Item = &'w Warning>,
         progress: &mut dyn Progress,
     ) -> Result<(), PipelineError> {
         for warning in warnings {

@@ -496,7 +496,7 @@ impl Column {
             }
             Some(number @ Cell::Number { value, .. }) => html! {
                 td class=[class] data-value=(sort_value(*value)) {
-                    (number.figures().map_or_else(String::new, |shown| shown.0.replace('-', "−")))
+                    (number.digits().map_or_else(String::new, |shown| shown.0.replace('-', "−")))
                     @if let Some(width) = self.error_width {
                         // The space of the error is kept where there is none, so that values align.
                         @let error = error_text(number);
@@ -511,7 +511,7 @@ impl Column {
 
 /// The error of a cell as printed, where it has one.
 fn error_text(cell: &Cell) -> Option<String> {
-    cell.figures()?.1
+    cell.digits()?.1
 }
 
 /// The width of a number without sign, in digits; a decimal point takes about half of one.

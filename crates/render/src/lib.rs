@@ -4,6 +4,7 @@
 //! * [`figure`]: line plots, bars, heat maps and images, as SVG and PNG.
 //! * [`html`], [`page`]: pages that need no other file.
 //! * [`escape`]: text of unknown origin, made safe for each format.
+#![forbid(unsafe_code)]
 
 pub mod escape;
 pub mod figure;

@@ -43,7 +43,7 @@ pub enum Cell {
 }
 
 impl Cell {
-    /// Words.
+    /// A cell of words.
     pub fn text(words: impl Into<String>) -> Self {
         Cell::Text(words.into())
     }
@@ -66,9 +66,9 @@ impl Cell {
         }
     }
 
-    /// A number and its error as people read them: where there is an error, both with as many decimals as
-    /// give it two significant digits. `None` where the cell holds no number.
-    pub fn figures(&self) -> Option<(String, Option<String>)> {
+    /// A number and its error in digits for people. The error has two significant digits, and the number as many
+    /// decimals. `None` if the cell is not a number.
+    pub fn digits(&self) -> Option<(String, Option<String>)> {
         let Cell::Number {
             value,
             error,
@@ -85,13 +85,13 @@ impl Cell {
         }
         let decimals = match *error {
             Some(error) if error.is_finite() => decimals_of(error, *decimals),
-            // Of an error that is not known no digit is vouched for.
+            // Without a known error the last digits may be noise.
             Some(_) => decimals_for(*value, UNSURE).min(*decimals),
             None => *decimals,
         };
         let error = error.filter(|error| error.is_finite());
         let shown = |number: f64| match format!("{number:.decimals$}") {
-            // What rounds to nothing has no sign.
+            // A number that rounds to zero has no sign.
             zero if zero.starts_with('-') && !zero.contains(|c: char| ('1'..='9').contains(&c)) => {
                 zero[1..].to_owned()
             }
@@ -100,9 +100,9 @@ impl Cell {
         Some((shown(*value), error.map(shown)))
     }
 
-    /// A number as a sentence has it: with its error, or the word that this is not known.
+    /// A number with its error as in sentences; "error unknown" if it is unknown.
     pub fn in_words(&self) -> String {
-        match self.figures() {
+        match self.digits() {
             Some((number, Some(error))) => format!("{number} ± {error}"),
             Some((number, None)) if number != "–" => format!("{number} (error unknown)"),
             _ => "unknown".into(),
@@ -111,7 +111,7 @@ impl Cell {
 
     /// For people, words by `escape`; `latex` wraps numbers in mathematics.
     fn print(&self, escape: fn(&str) -> String, latex: bool) -> String {
-        match (self, self.figures()) {
+        match (self, self.digits()) {
             (Cell::Text(words), _) => escape(words),
             (_, None) => String::new(),
             (_, Some((number, None))) if number == "–" => number,
@@ -123,10 +123,10 @@ impl Cell {
     }
 }
 
-/// The most decimals that are printed for the sake of an error.
+/// Most decimals that the error of a number can require.
 const MOST_DECIMALS: usize = 12;
 
-/// Significant digits of a number whose error is not known.
+/// Significant digits of a number with an unknown error.
 const UNSURE: i32 = 3;
 
 /// Decimals that give `error` two significant digits; `otherwise` for an error of zero.
@@ -221,7 +221,7 @@ impl Table {
         )
     }
 
-    /// How many columns come before the first with a number that is not that of a set: they name the rows.
+    /// Number of columns that name the rows: those before the first column of numbers, except set numbers.
     fn names(&self) -> usize {
         let number = |k: &usize| {
             if self.headings[*k].key == "set" {
@@ -235,19 +235,19 @@ impl Table {
     }
 
     /// Keys of the columns after those that name the rows.
-    pub fn figures(&self) -> Vec<&'static str> {
-        let figures = self.headings.iter().skip(self.names());
-        figures.map(|heading| heading.key).collect()
+    pub fn metrics(&self) -> Vec<&'static str> {
+        let metrics = self.headings.iter().skip(self.names());
+        metrics.map(|heading| heading.key).collect()
     }
 
-    /// The columns that name the rows, but for those of detail, and those of `figures`, in this order.
+    /// The columns that name the rows, without details, followed by the columns `metrics`.
     ///
     /// # Errors
-    /// The first of `figures` that is no key of a figure.
-    pub fn chosen<'a>(&self, figures: &'a [String]) -> Result<Self, &'a str> {
+    /// The first of `metrics` that is not the key of a metric.
+    pub fn chosen<'a>(&self, metrics: &'a [String]) -> Result<Self, &'a str> {
         let names = self.names();
         let mut places: Vec<usize> = (0..names).filter(|&k| !self.headings[k].detail).collect();
-        for key in figures {
+        for key in metrics {
             let place = self.place(key).filter(|&place| place >= names);
             let place = place.ok_or(key.as_str())?;
             if !places.contains(&place) {
@@ -363,7 +363,7 @@ impl Table {
     /// for other formats.
     ///
     /// # Errors
-    /// Where two headings share a key.
+    /// If two headings have the same key.
     pub fn columns(&self) -> Result<DataFrame, TableError> {
         let mut columns = Vec::new();
         for (k, heading) in self.headings.iter().enumerate() {
@@ -522,7 +522,7 @@ mod tests {
 
     #[test]
     fn numbers_without_the_error_they_ought_to_have_are_short() {
-        let shown = |value, error| Cell::with_error(value, error, 4).figures().unwrap().0;
+        let shown = |value, error| Cell::with_error(value, error, 4).digits().unwrap().0;
         for (value, expected) in [
             (2.011, "2.01"),
             (-0.020_914, "-0.0209"),
@@ -549,15 +549,15 @@ mod tests {
     }
 
     #[test]
-    fn figures_are_chosen_beside_the_names_of_the_rows() {
+    fn metrics_are_chosen_beside_the_names_of_rows() {
         let mut whole = table();
         whole.headings.push(Heading::new("m", "m").detail());
         whole.rows[0].push(Cell::number(0.5, 1));
-        assert_eq!(whole.figures(), ["q", "m"]);
-        let keys = |figures: &[&str]| {
-            let figures: Vec<String> = figures.iter().map(|&key| key.to_owned()).collect();
+        assert_eq!(whole.metrics(), ["q", "m"]);
+        let keys = |metrics: &[&str]| {
+            let metrics: Vec<String> = metrics.iter().map(|&key| key.to_owned()).collect();
             whole
-                .chosen(&figures)
+                .chosen(&metrics)
                 .map(|table| {
                     table
                         .headings
@@ -574,7 +574,7 @@ mod tests {
         // The number of a set names a row.
         let mut sets = whole.clone();
         sets.headings[1].key = "set";
-        assert_eq!(sets.figures(), ["m"]);
+        assert_eq!(sets.metrics(), ["m"]);
         let csv = whole
             .chosen(&["m".to_owned()])
             .unwrap()

@@ -23,7 +23,7 @@ struct Column {
 impl Column {
     fn of(table: &Table, k: usize, folded: bool) -> Self {
         let cells = || table.rows.iter().filter_map(|row| row.get(k));
-        let print = |cell: &Cell| match (cell.figures(), cell) {
+        let print = |cell: &Cell| match (cell.digits(), cell) {
             (Some((value, Some(error))), _) if folded => format!("{value}\n± {error}"),
             (Some((value, Some(error))), _) => format!("{value} ± {error}"),
             (Some((value, None)), _) => value,
@@ -181,7 +181,7 @@ mod tests {
         Table {
             title: "A title of some words that is longer than a narrow terminal is wide".into(),
             headings: (0..columns)
-                .map(|k| Heading::new(key(k), format!("Figure {k}")))
+                .map(|k| Heading::new(key(k), format!("Metric {k}")))
                 .collect(),
             rows: (0..3)
                 .map(|row| {

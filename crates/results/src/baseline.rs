@@ -1,4 +1,4 @@
-//! Baselines: what was measured once, and everything that made it, in a TOML file to compare with.
+//! Baselines: stored metrics with their settings and data, in a TOML file to compare with.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use shearq_submissions::{Configuration, checked_name};
 
+use shearq_files::renamed::key_hint;
 use shearq_files::{FileError, atomic};
 use shearq_pipeline::data::run::Source;
 
@@ -13,7 +14,7 @@ mod measured;
 mod moved;
 
 pub use measured::{Wanted, measure, metrics_of};
-pub use moved::{Checked, Settings, Shift, check};
+pub use moved::{BaselineError, Checked, Settings, SettingsError, Shift, check};
 
 /// A baseline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,40 +22,39 @@ pub use moved::{Checked, Settings, Shift, check};
 pub struct Baseline {
     /// Version of shearq that measured it.
     pub version: String,
-    /// Number of sets of all submissions together, by which a file that was cut short is known. Older ones have none.
+    /// Number of sets of all configurations, to detect a truncated file. Older files have none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sets_held: Option<usize>,
-    /// Where the galaxies come from.
+    /// Source of the galaxies.
     pub source: Source,
-    /// Why it was changed, oldest first.
+    /// Changes of the baseline, oldest first.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub history: Vec<Change>,
-    /// What was measured.
+    /// The measured configurations.
     pub submissions: Vec<BaselineConfiguration>,
 }
 
-/// One submission of a baseline.
+/// One configuration of a baseline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BaselineConfiguration {
-    /// Its name.
+    /// Name of the configuration.
     #[serde(deserialize_with = "checked_name")]
     pub name: String,
-    /// Its configuration file, from the folder of the baseline. None if it is a named one, or not known.
+    /// Configuration file, relative to the folder of the baseline. `None` for a named or unknown configuration.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub file: Option<PathBuf>,
-    /// All settings. Kept as text would be, so that settings of later versions can be told apart
-    /// from them.
+    /// All settings as a TOML table, so that settings of other versions can be compared.
     pub settings: toml::Table,
-    /// Its sets, in order.
+    /// Sets in ascending order.
     pub sets: Vec<BaselineSet>,
 }
 
 impl BaselineConfiguration {
-    /// A measured submission, of the configuration `file` if it is known.
+    /// A measured configuration, with its `file` if known.
     ///
     /// # Errors
-    /// Where its settings cannot be stored.
+    /// If the settings cannot be written as TOML.
     pub fn new(
         configuration: &Configuration,
         file: Option<PathBuf>,
@@ -69,7 +69,7 @@ impl BaselineConfiguration {
     }
 }
 
-/// One set of a submission.
+/// One set of a configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BaselineSet {
@@ -81,10 +81,9 @@ pub struct BaselineSet {
     pub images: Vec<u32>,
     /// Galaxies in their catalogues.
     pub galaxies: u64,
-    /// Of these, without an ellipticity.
+    /// Number of these galaxies without an ellipticity.
     pub flagged: u64,
-    /// Value and standard error of each metric, and of the scatter (rms) of either component of the
-    /// ellipticity. An unknown error is NaN.
+    /// Value and standard error of each metric, and of the scatter (rms) of e1 and e2. An unknown error is NaN.
     pub metrics: BTreeMap<String, [f64; 2]>,
 }
 
@@ -92,16 +91,16 @@ pub struct BaselineSet {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Change {
-    /// Why.
+    /// Reason of the change.
     pub reason: String,
-    /// Version of shearq before.
+    /// Version of shearq before the change.
     pub from_version: String,
-    /// What moved.
+    /// Moved metrics and settings, one line each.
     pub moved: Vec<String>,
 }
 
 impl Baseline {
-    /// Of what this version measured.
+    /// A baseline measured by this version.
     pub fn new(
         source: Source,
         history: Vec<Change>,
@@ -124,7 +123,7 @@ impl Baseline {
     /// Names of the baselines in `folder`, in order.
     ///
     /// # Errors
-    /// Where the folder cannot be read.
+    /// If the folder cannot be read.
     pub fn names(folder: &Path) -> Result<Vec<String>, FileError> {
         let entries = std::fs::read_dir(folder)
             .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
@@ -142,19 +141,24 @@ impl Baseline {
     /// Reads a baseline.
     ///
     /// # Errors
-    /// Where it cannot be read or is not valid.
+    /// If the file cannot be read or is invalid.
     pub fn read(path: &Path) -> Result<Self, FileError> {
         let text = shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS)
             .map_err(FileError::doing(path, "cannot read the baseline"))?;
-        let baseline: Baseline = toml::from_str(&text)
-            .map_err(|error| FileError::new(path, error.to_string().trim_end()))?;
+        let baseline: Baseline = toml::from_str(&text).map_err(|error| {
+            let message = error.to_string().trim_end().to_owned();
+            match key_hint(&message, &text) {
+                Some(hint) => FileError::new(path, format!("{message}. {hint}")),
+                None => FileError::new(path, message),
+            }
+        })?;
         let wild = |set: &&BaselineSet| {
             let mut metrics = set.metrics.values();
             metrics.any(|[value, error]| value.is_infinite() || error.is_infinite() || *error < 0.0)
         };
         if let Some(set) = sets_of(&baseline.submissions).find(wild) {
             let message = format!(
-                "set {} has an infinite metric, or an error that is infinite or negative",
+                "set {}: a metric is infinite, or its error is infinite or negative",
                 set.set
             );
             return Err(FileError::new(path, message));
@@ -162,17 +166,17 @@ impl Baseline {
         let found = sets_of(&baseline.submissions).count();
         if let Some(held) = baseline.sets_held.filter(|held| *held != found) {
             let message = format!(
-                "{found} of {held} sets are there, as `sets_held` counts them: it was cut short or edited"
+                "the file was truncated or edited (found {found} sets, expected {held} as in `sets_held`)"
             );
             return Err(FileError::new(path, message));
         }
         Ok(baseline)
     }
 
-    /// Writes the baseline, which must be new.
+    /// Writes a new baseline.
     ///
     /// # Errors
-    /// Where it cannot be written, or another process was first.
+    /// If the file exists or cannot be written.
     pub fn create(&self, path: &Path) -> Result<(), FileError> {
         atomic::sweep_beside(path);
         if atomic::write_if_absent(path, self.text(path)?.as_bytes())? {
@@ -181,35 +185,35 @@ impl Baseline {
         Err(Baseline::exists(path))
     }
 
-    /// Writes the baseline in place of `earlier`, which was read from the same file before the work.
+    /// Replaces `earlier`, which was read from the same file before measuring.
     ///
     /// # Errors
-    /// Where the file has changed since, or cannot be written.
+    /// If the file has changed since, or cannot be written.
     pub fn replace(&self, path: &Path, earlier: &Baseline) -> Result<(), FileError> {
         atomic::sweep_beside(path);
-        // Until the file is replaced, other processes wait here. Without locks in the file system they do not.
+        // Other processes wait here until the file is replaced, if the file system has locks.
         let folder = path
             .parent()
             .and_then(|folder| std::fs::File::open(folder).ok());
         let _ = folder.as_ref().map(std::fs::File::lock);
-        // As texts, in which unknown errors are equal.
+        // Compared as text, because NaN equals NaN there.
         if Baseline::read(path)?.text(path)? != earlier.text(path)? {
             let name = path.file_stem().unwrap_or_default().to_string_lossy();
             let message = format!(
-                "the baseline was changed while this command measured; nothing was written. Try: shearq baseline check {name}"
+                "another process changed the baseline during this command; it was not updated. Try: shearq baseline check {name}"
             );
             return Err(FileError::new(path, message));
         }
         atomic::write(path, self.text(path)?.as_bytes())
     }
 
-    /// What is wrong where a baseline that is to be new exists.
+    /// The error for a new baseline whose file exists.
     pub fn exists(path: &Path) -> FileError {
         let name = path.file_stem().unwrap_or_default().to_string_lossy();
         FileError::new(
             path,
             format!(
-                "the baseline exists; `baseline check {name} --update --reason TEXT` changes it"
+                "the baseline exists. Try: shearq baseline check {name} --update --reason TEXT"
             ),
         )
     }
@@ -234,7 +238,7 @@ mod tests {
     use shearq_simulate::set::SimulationSettings;
 
     #[test]
-    fn of_two_that_replace_one_baseline_the_second_is_refused() {
+    fn the_second_of_two_replacements_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = Baseline::path(folder.path(), "mine");
         let of = |seed| {
@@ -246,9 +250,41 @@ mod tests {
         of(2).replace(&path, &earlier).unwrap();
         let message = of(3).replace(&path, &earlier).unwrap_err().to_string();
         assert!(
-            message.ends_with("mine.toml: the baseline was changed while this command measured; nothing was written. Try: shearq baseline check mine"),
+            message.ends_with("mine.toml: another process changed the baseline during this command; it was not updated. Try: shearq baseline check mine"),
             "{message}"
         );
         assert_eq!(Baseline::read(&path).unwrap(), of(2));
+    }
+
+    #[test]
+    fn an_old_key_names_the_new_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = Baseline::path(folder.path(), "old");
+        let source = Source::Simulated(SimulationSettings::new(1, 8));
+        let set = BaselineSet {
+            set: 2,
+            data: "a".into(),
+            images: vec![1],
+            galaxies: 1,
+            flagged: 0,
+            metrics: BTreeMap::from([("q".to_owned(), [1.0, 0.1])]),
+        };
+        let configuration = BaselineConfiguration {
+            name: "mine".into(),
+            file: None,
+            settings: toml::Table::new(),
+            sets: vec![set],
+        };
+        Baseline::new(source, Vec::new(), vec![configuration])
+            .create(&path)
+            .unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(Baseline::read(&path).is_ok() && text.contains("metrics"));
+        std::fs::write(&path, text.replace("metrics", "figures")).unwrap();
+        let message = Baseline::read(&path).unwrap_err().to_string();
+        assert!(
+            message.ends_with(". The key `figures` is now called `metrics`. Try: write the file again with this version"),
+            "{message}"
+        );
     }
 }

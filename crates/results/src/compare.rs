@@ -1,4 +1,4 @@
-//! Results held against each other: which sets they share, means over them, and paired differences.
+//! Compares scores: common sets, means over sets, and paired differences.
 
 use std::borrow::Borrow;
 use std::collections::BTreeSet;
@@ -14,42 +14,44 @@ use super::groups::Order;
 use super::row::{RunRecord, SetRecord, choice_word, definition_word};
 use super::score::{Catalogues, ScoredSet, own_catalogue, score_variants, unscored};
 use shearq_files::FileError;
-use shearq_pipeline::data::layout::{DataFolder, MAX_SET};
+use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::listing::Files;
+use shearq_pipeline::data::pattern::MAX_SET;
 use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::{PipelineError, inputs};
 
-/// One variant in a comparison.
+/// One variant in a comparison: a folder, or another program's catalogues.
+#[derive(Debug, Clone)]
 pub struct Variant {
-    /// Name of the submission.
+    /// Name of the configuration or program.
     pub name: String,
     /// Published metrics.
     pub published: Option<Published>,
-    /// Its sets, those that all variants have, in order.
+    /// The sets that all variants have, in ascending order.
     pub sets: Vec<ScoredSet>,
-    /// What of these sets was not scored.
+    /// Warnings about images and files that were not scored.
     pub unscored: Vec<String>,
-    /// What is kept of it, as in a results store.
+    /// Its record, as in a results store.
     pub run: RunRecord,
 }
 
 impl Variant {
-    /// What is kept of its sets.
+    /// Records of its sets.
     pub fn records(&self) -> Vec<SetRecord> {
         self.run.sets.clone()
     }
 }
 
-/// What is kept of sets that are all scored against one truth, whose data need no fingerprint.
+/// Records of sets that are scored against one truth, whose data need no fingerprint.
 fn records(sets: &[ScoredSet]) -> Vec<SetRecord> {
     let record = |scored: &ScoredSet| Some(SetRecord::new(scored.set?, scored, String::new()));
     sets.iter().filter_map(record).collect()
 }
 
-/// The variants for which conditions hold, with the sets for which they hold, in the order asked for.
+/// The variants and sets that meet the conditions, in the given order.
 ///
 /// # Errors
-/// If a condition is not about a column, or none is left.
+/// If a condition has an unknown column, or no set meets the conditions.
 pub fn chosen(
     variants: Vec<Variant>,
     conditions: Option<&Conditions>,
@@ -69,12 +71,12 @@ pub fn chosen(
         kept.push(variant);
     }
     if kept.is_empty() {
-        let message = "--where: there is no set for which the conditions hold";
+        let message = "--where: no set meets the conditions";
         return Err(PipelineError::Request(message.into()));
     }
     let sets: Vec<Vec<SetRecord>> = kept.iter().map(Variant::records).collect();
     if common_sets(&sets).is_empty() {
-        let message = "--where: the conditions leave no set that all have in common";
+        let message = "--where: the sets that meet the conditions have none in common";
         return Err(PipelineError::Request(message.into()));
     }
     if let Some(order) = order {
@@ -83,13 +85,13 @@ pub fn chosen(
     Ok(kept)
 }
 
-/// Variants by name with what is kept of their sets, as pictures of several of them take it.
+/// Names of variants with the records of their sets.
 pub fn by_name(variants: &[Variant]) -> Vec<(String, Vec<SetRecord>)> {
     let named = |variant: &Variant| (variant.name.clone(), variant.records());
     variants.iter().map(named).collect()
 }
 
-/// What one variant is before it is scored.
+/// A variant before it is scored.
 struct Entrant<'a> {
     name: String,
     published: Option<Published>,
@@ -109,11 +111,11 @@ pub struct Way {
     pub foreign: Choice,
 }
 
-/// Scores several results folders and other programs' catalogues, described by the files `foreign`, on the
-/// sets that all have, against the truth of `data` or of what the first folder was measured from.
+/// Scores results folders, and other programs' catalogues described by the files `foreign`, on their common sets.
+/// The truth is in `data`, or in the data that the first folder was measured from.
 ///
 /// # Errors
-/// Where a file cannot be read, the folders are not of one source, or no set is common.
+/// If a file cannot be read, the folders have several sources, or no set is common.
 pub fn score_all(
     folders: &[PathBuf],
     foreign: &[PathBuf],
@@ -128,7 +130,7 @@ pub fn score_all(
     let mut data = data.map(DataFolder::open).transpose()?;
     let mut entrants = own_entrants(folders, &mut data, threads)?;
     let data = data.ok_or_else(|| {
-        PipelineError::Request("--foreign alone needs --data DIR with the true shear".into())
+        PipelineError::Request("--foreign needs the true shear. Try: --data DIR".into())
     })?;
     for foreign in &foreign {
         entrants.push(Entrant {
@@ -140,7 +142,7 @@ pub fn score_all(
         });
     }
     if entrants.iter().all(|e| e.files.serve_all_sets()) {
-        let message = "no pattern of the catalogues has a number of the set (expected {set} in `catalogues`); nothing says which sets to compare";
+        let message = "cannot determine the sets, because no `catalogues` contains {set}. Try: add {set} to the pattern";
         return Err(PipelineError::Request(message.into()));
     }
     if let Some(entrant) = entrants.iter().find(|e| e.files.sets().is_empty()) {
@@ -149,7 +151,7 @@ pub fn score_all(
     }
     let common = |set: u32| entrants.iter().all(|e| e.files.has(set));
     if !(1..=MAX_SET).any(common) {
-        let message = "the variants have no set in common; there is nothing to compare".into();
+        let message = "the catalogues have no set in common".into();
         return Err(PipelineError::Request(message));
     }
     let readers: Vec<_> = entrants
@@ -205,7 +207,13 @@ pub fn score_all(
             Ok(Variant {
                 name: entrant.name.clone(),
                 published: entrant.published,
-                unscored: unscored(&data, &sets, &numbers)?,
+                unscored: {
+                    let unread = entrant.files.unread().into_iter();
+                    let mut lines: Vec<String> =
+                        unread.map(|line| format!("warning: {line}.")).collect();
+                    lines.extend(unscored(&data, &sets, &numbers)?);
+                    lines
+                },
                 sets,
                 run,
             })
@@ -213,7 +221,7 @@ pub fn score_all(
         .collect()
 }
 
-/// The folders that we measured; where `data` is not given, it becomes that of the first.
+/// The folders that shearq measured. `data` becomes the data of the first, if it is `None`.
 fn own_entrants(
     folders: &[PathBuf],
     data: &mut Option<DataFolder>,
@@ -230,7 +238,7 @@ fn own_entrants(
             let (beside, source) = first.get_or_insert_with(|| (folder, run.source.clone()));
             if *source != run.source.moved(folder, beside)? {
                 let message = format!(
-                    "it was measured from {}, the first from {source}; give --data DIR to score both against one truth",
+                    "the folders were measured from different data (found {}, expected {source}). Try: --data DIR with the truth of both",
                     run.source
                 );
                 return Err(FileError::new(folder, message).into());
@@ -248,7 +256,7 @@ fn own_entrants(
             inputs::verify(data, folder, &run, &[], threads)?;
         }
         entrants.push(Entrant {
-            // Published metrics belong to the embedded settings, not to a file of the same name.
+            // Published metrics belong to the built-in settings, not to a file with their name.
             published: registry
                 .get(&run.configuration.name)
                 .ok()
@@ -266,7 +274,7 @@ fn own_entrants(
     Ok(entrants)
 }
 
-/// Sets that all have.
+/// Sets that all variants have.
 pub fn common_sets(all: &[Vec<SetRecord>]) -> BTreeSet<u32> {
     all.iter()
         .map(|sets| sets.iter().map(|set| set.set).collect())
@@ -274,7 +282,7 @@ pub fn common_sets(all: &[Vec<SetRecord>]) -> BTreeSet<u32> {
         .unwrap_or_default()
 }
 
-/// Mean over sets of the metric called `name`, and its error.
+/// Mean of the metric called `name` over sets, and its error.
 pub fn mean_metric<R: Borrow<SetRecord>>(sets: &[R], name: &str) -> (f64, f64) {
     let value =
         |metrics: &Metrics| Metrics::place(name).map_or(f64::NAN, |place| metrics.values()[place]);
@@ -286,7 +294,7 @@ pub fn mean_metric<R: Borrow<SetRecord>>(sets: &[R], name: &str) -> (f64, f64) {
     mean_over_sets(&pairs)
 }
 
-/// A metric that is kept for every group of images left out, so that differences in it can be paired.
+/// A metric with jackknife replicates, so that differences can be paired.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Paired {
     /// Q.
@@ -296,7 +304,7 @@ pub enum Paired {
 }
 
 impl Paired {
-    /// Its value of a set, and those with each group left out.
+    /// Value of a set, and the values with each group of images left out.
     fn of(self, set: &SetRecord) -> (f64, &[f64]) {
         match self {
             Paired::Q => (set.metrics.q, &set.q_replicates),
@@ -305,8 +313,8 @@ impl Paired {
     }
 }
 
-/// Paired difference in a metric of `second` from `first`; `None` where they are not of the same sets, data
-/// and images, or where noise may have chosen the convention of either.
+/// Paired difference of a metric, `second` minus `first`. `None` if sets, data or images differ, or if a convention
+/// is uncertain.
 pub fn difference<R: Borrow<SetRecord>>(
     metric: Paired,
     first: &[R],

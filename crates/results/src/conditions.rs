@@ -1,4 +1,4 @@
-//! Which rows of a results store to look at.
+//! Conditions that choose rows of a results store.
 
 use std::str::FromStr;
 
@@ -8,7 +8,7 @@ use shearq_files::frames::reals;
 use super::row::{RunRecord, table_of};
 use shearq_pipeline::PipelineError;
 
-/// How a column is compared with what is asked for.
+/// How a column is compared with a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Relation {
     Is,
@@ -19,7 +19,7 @@ enum Relation {
     AtLeast,
 }
 
-/// Conditions on rows of a store, all of which must hold: `snr=low,submission=23/*,q>50`.
+/// Conditions on rows of a store, which must all be met: `snr=low,submission=23/*,q>50`.
 ///
 /// A condition is a column, one of `=`, `!=`, `<`, `<=`, `>`, `>=`, and a value. `*` in a text stands
 /// for any characters.
@@ -30,7 +30,7 @@ impl FromStr for Conditions {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        // Longer ones first: `<=` begins like `<`.
+        // Longer signs first: `<=` begins with `<`.
         const RELATIONS: [(&str, Relation); 6] = [
             ("!=", Relation::IsNot),
             ("<=", Relation::AtMost),
@@ -49,7 +49,7 @@ impl FromStr for Conditions {
             })
             .ok_or_else(|| {
                 format!(
-                    "`{part}` is no condition; expected a column, one of = != < <= > >=, and a value, as in `snr=low,q>50`"
+                    "not a condition (found `{part}`, expected a column, one of = != < <= > >=, and a value, such as `q>50`)"
                 )
             })
         };
@@ -61,10 +61,10 @@ impl FromStr for Conditions {
 }
 
 impl Conditions {
-    /// Leaves of each run the sets for which all conditions hold, and drops runs without any.
+    /// Keeps the sets of each run that meet all conditions, and drops runs without such a set.
     ///
     /// # Errors
-    /// Where there is no such column, or a value is not of the column's type.
+    /// If a column does not exist, or a value has another type than its column.
     pub fn choose(&self, mut runs: Vec<RunRecord>) -> Result<Vec<RunRecord>, PipelineError> {
         let table = table_of(&runs).map_err(|error| PipelineError::Request(error.to_string()))?;
         let mut kept = vec![true; table.height()];
@@ -90,7 +90,9 @@ fn column<'a>(table: &'a DataFrame, name: &str) -> Result<&'a Column, PipelineEr
             .map(|n| n.as_str())
             .collect();
         let names = names.join(", ");
-        PipelineError::Request(format!("the store has no column `{name}`; it has {names}"))
+        PipelineError::Request(format!(
+            "unknown column of a results store (found `{name}`, expected one of {names})"
+        ))
     })
 }
 
@@ -102,7 +104,7 @@ fn hold(column: &Column, relation: Relation, wanted: &str) -> Result<Vec<bool>, 
             Relation::Is => matches,
             Relation::IsNot => |wanted, own| !matches(wanted, own),
             _ => {
-                let message = format!("`{name}` is text; expected = or != and a text");
+                let message = format!("column `{name}` contains text; expected = or !=");
                 return Err(PipelineError::Request(message));
             }
         };
@@ -111,9 +113,11 @@ fn hold(column: &Column, relation: Relation, wanted: &str) -> Result<Vec<bool>, 
             .map(|own| holds(wanted, own.unwrap_or("")))
             .collect());
     }
-    let wanted: f64 = wanted
-        .parse()
-        .map_err(|_| PipelineError::Request(format!("`{name}` is a number; `{wanted}` is none")))?;
+    let wanted: f64 = wanted.parse().map_err(|_| {
+        PipelineError::Request(format!(
+            "column `{name}` contains numbers (found `{wanted}`, expected a number)"
+        ))
+    })?;
     let holds: fn(&f64, &f64) -> bool = match relation {
         Relation::Is => f64::eq,
         Relation::IsNot => f64::ne,
@@ -134,7 +138,7 @@ fn matches(pattern: &str, text: &str) -> bool {
     let Some(text) = text.strip_prefix(first) else {
         return false;
     };
-    // Any split of the remaining text may be the one.
+    // `*` may stand for any beginning of the remaining text.
     text.char_indices()
         .map(|(at, _)| at)
         .chain([text.len()])
@@ -154,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn conditions_are_taken_apart() {
+    fn conditions_are_parsed() {
         let conditions: Conditions = "snr=low, q>=50,psf!=fixed".parse().unwrap();
         let second = ("q".into(), Relation::AtLeast, "50".into());
         assert_eq!(conditions.0[1], second);

@@ -1,4 +1,4 @@
-//! Catalogues of other programs, described by a small TOML file.
+//! Catalogues of other programs, described by a TOML file.
 
 use std::path::{Path, PathBuf};
 
@@ -7,18 +7,20 @@ use shearq_quantities::{Distortion, Shear};
 use shearq_scoring::{FieldSum, Grid, Row, RowCounts};
 use shearq_submissions::{EllipticityType, checked_name};
 
+use crate::views::rows::fault as odd_rows;
 use shearq_files::FileError;
 use shearq_files::table::{self, most_rows};
-use shearq_pipeline::data::layout::{IMAGE_PLACEHOLDERS, check_pattern, read_rows};
+use shearq_pipeline::data::layout::read_rows;
 use shearq_pipeline::data::listing::{self, Files};
+use shearq_pipeline::data::pattern::{IMAGE_PLACEHOLDERS, check_pattern};
 
 /// How to read another program's catalogues.
 ///
 /// ```toml
 /// name = "REGAUSS"
-/// catalogues = "set{set:02}/hsm-regauss-{image:03}.csv"   # beside this file, or absolute
-/// ellipticity = "distortion"      # what the columns hold: "distortion" or "shear"
-/// report = "shear"                # what is scored [default: shear]
+/// catalogues = "set{set:02}/hsm-regauss-{image:03}.csv"   # relative to this file, or absolute
+/// ellipticity = "distortion"      # type of the columns: "distortion" or "shear"
+/// report = "shear"                # type to score [default: shear]
 /// x = "x"                         # names of the columns [defaults: x, y, e1, e2, no flag]
 /// y = "y"
 /// e1 = "e1"
@@ -26,13 +28,13 @@ use shearq_pipeline::data::listing::{self, Files};
 /// flag = "flag"                   # rows with another value than 0 have no ellipticity
 /// missing = -99                   # rows with this value in e1 or e2 have none [default: no such value]
 /// max_modulus = 1.0               # rows with a larger |e| (as reported) have none [default: no limit]
-/// position_offset = 0.0           # added to x and y to make them FITS pixels (1 for 0-based ones)
-/// e2_sign = 1                     # -1 where e2 is positive along x = -y
+/// position_offset = 0.0           # added to x and y to make them FITS pixels (1 for 0-based positions)
+/// e2_sign = 1                     # -1 if e2 is positive along x = -y
 /// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Foreign {
-    /// Name in tables.
+    /// Name of the program in tables.
     #[serde(deserialize_with = "checked_name")]
     pub name: String,
     catalogues: String,
@@ -77,7 +79,7 @@ fn one() -> i8 {
     1
 }
 
-/// The folder that a file is in; of a bare file name, the current one.
+/// The folder of a file; `.` for a bare file name.
 pub fn folder_of(path: &Path) -> &Path {
     match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
@@ -89,7 +91,7 @@ impl Foreign {
     /// Reads a description.
     ///
     /// # Errors
-    /// Where it cannot be read or is not valid.
+    /// If the file cannot be read or is invalid.
     pub fn read(path: &Path) -> Result<Self, FileError> {
         let text = shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS).map_err(
             FileError::doing(path, "cannot read the description of catalogues"),
@@ -110,32 +112,32 @@ impl Foreign {
         Ok(foreign)
     }
 
-    /// The pattern of the catalogues' names, with the folder that it is relative to.
+    /// The pattern of the catalogues' names, with its folder.
     pub fn pattern(&self) -> PathBuf {
         self.folder.join(&self.catalogues)
     }
 
-    /// The catalogues of `sets` (of all if empty) that are there.
+    /// The existing catalogues of `sets` (of all if empty).
     ///
     /// # Errors
-    /// Where a folder cannot be listed.
+    /// If a folder cannot be listed.
     pub fn catalogues(&self, sets: &[u32]) -> Result<Files, FileError> {
         listing::find(&self.folder, &self.catalogues, &[""], sets)
     }
 
-    /// One image's catalogue on the grid, as [`Foreign::rows`] has it.
+    /// The rows of one image ([`Foreign::rows`]) on the grid.
     ///
     /// # Errors
-    /// Where it cannot be read, a column is absent, or the values are no ellipticities.
+    /// If the file cannot be read, a column is absent, or the values are no ellipticities.
     pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
         sum_foreign(grid, path, self.rows(path, most_rows(grid.cells()))?)
     }
 
-    /// One image's catalogue of at most `most` rows, converted to standard signs and the reported type.
+    /// The rows of one image, at most `most`, converted to standard signs and the reported type.
     /// Flagged rows and distortions above 1 have no ellipticity.
     ///
     /// # Errors
-    /// Where it cannot be read or a column is absent.
+    /// If the file cannot be read or a column is absent.
     pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
         let mut names = vec![
             self.x.as_str(),
@@ -145,7 +147,7 @@ impl Foreign {
         ];
         names.extend(self.flag.as_deref());
         let table = table::read(path, Some(&names), most).map_err(|error| {
-            error.hint_of_columns("the description of the catalogues names them")
+            error.hint_of_columns("the description of the catalogues specifies the names")
         })?;
         let column = |name: &str| table::numbers(&table, name, path);
         let flags = self.flag.as_deref().map(column).transpose()?;
@@ -187,20 +189,20 @@ impl Foreign {
     }
 }
 
-/// Which values of other programs' ellipticities stand for "not measured".
+/// Which ellipticities of other programs mark a galaxy as not measured, and their type.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Deserialize)]
 pub struct Screen {
-    /// A value of either component.
+    /// A value of e1 or e2.
     pub missing: Option<f64>,
-    /// The largest |e| that is one, after conversion.
+    /// The largest valid |e|, after conversion.
     pub max_modulus: Option<f64>,
-    /// Whether the ellipticities are distortions, which are converted to shear-type ellipticities.
+    /// Whether to convert the ellipticities from distortions to shear-type ellipticities.
     #[serde(default)]
     pub distortion: bool,
 }
 
 impl Screen {
-    /// The row as a shear-type ellipticity, without one if its value stands for none.
+    /// The row with a shear-type ellipticity, or NaN if the galaxy was not measured.
     pub fn apply(&self, row: Row) -> Row {
         let missing = self.missing.is_some_and(|m| row.e1 == m || row.e2 == m);
         let shape = match (missing, self.distortion) {
@@ -214,10 +216,10 @@ impl Screen {
     }
 }
 
-/// Sums rows of another program, of the catalogue `path`.
+/// Sums rows of another program's catalogue `path`.
 ///
 /// # Errors
-/// Where they are not what they are taken for: values that are no ellipticities, positions in other units.
+/// If the values are no ellipticities, or the positions have other units.
 pub fn sum_foreign(
     grid: &Grid,
     path: &Path,
@@ -225,7 +227,7 @@ pub fn sum_foreign(
 ) -> Result<(FieldSum, RowCounts), FileError> {
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, rows);
-    match counts.fault(grid) {
+    match odd_rows(&counts, grid) {
         Some(fault) => Err(FileError::new(path, fault)),
         None => Ok((sum, counts)),
     }
@@ -239,5 +241,53 @@ pub fn plain_columns<'a>(
     move |grid, path| {
         let rows = read_rows(path, &columns, most_rows(grid.cells()))?;
         sum_foreign(grid, path, rows.into_iter().map(|row| screen.apply(row)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The rows of a catalogue with the columns a, b, u, v and bad, described by more keys.
+    fn rows(keys: &str, lines: &str) -> Vec<Row> {
+        let folder = tempfile::tempdir().unwrap();
+        let (toml, csv) = (folder.path().join("f.toml"), folder.path().join("1-1.csv"));
+        let names = "x = \"a\"\ny = \"b\"\ne1 = \"u\"\ne2 = \"v\"\nflag = \"bad\"";
+        let start = "name = \"F\"\ncatalogues = \"{set}-{image}.csv\"";
+        std::fs::write(&toml, format!("{start}\n{names}\n{keys}\n")).unwrap();
+        std::fs::write(&csv, format!("a,b,u,v,bad\n{lines}")).unwrap();
+        let foreign = Foreign::read(&toml).unwrap();
+        assert_eq!(foreign.catalogues(&[]).unwrap().of_set(1).len(), 1);
+        foreign.rows(&csv, 100).unwrap()
+    }
+
+    #[test]
+    fn columns_signs_offsets_and_types_are_converted() {
+        let keys = "ellipticity = \"distortion\"\ne2_sign = -1\nposition_offset = 1";
+        let found = rows(keys, "0,5,0.6,0,0\n1,5,0,0.8,0\n");
+        // χ = 2ε/(1 + ε²): 0.6 is ε = 1/3, 0.8 is ε = 1/2. Rounding leaves 1e-15.
+        assert_eq!((found[0].x, found[0].y), (1.0, 6.0));
+        assert!((found[0].e1 - 1.0 / 3.0).abs() < 1e-15, "{}", found[0].e1);
+        assert!((found[1].e2 + 0.5).abs() < 1e-15, "{}", found[1].e2);
+    }
+
+    #[test]
+    fn flagged_missing_and_large_ellipticities_are_not_measured() {
+        let keys = "ellipticity = \"shear\"\nmissing = -99\nmax_modulus = 0.5";
+        let lines = "1,1,0.1,0.2,0\n1,1,0.1,0.2,4\n1,1,-99,0.2,0\n1,1,0.4,0.4,0\n";
+        let measured: Vec<bool> = rows(keys, lines).iter().map(|r| r.e1.is_finite()).collect();
+        assert_eq!(measured, [true, false, false, false]);
+        let screen = Screen {
+            missing: Some(-99.0),
+            max_modulus: Some(0.5),
+            distortion: true,
+        };
+        let apply = |e1| {
+            let (x, y, e2) = (1.0, 1.0, 0.0);
+            screen.apply(Row { x, y, e1, e2 }).e1
+        };
+        assert!((apply(0.6) - 1.0 / 3.0).abs() < 1e-15);
+        // A distortion of 0.9 is a shear of 0.63.
+        assert!(apply(-99.0).is_nan() && apply(0.9).is_nan());
     }
 }

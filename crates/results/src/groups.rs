@@ -1,4 +1,4 @@
-//! Runs of a store, or groups of their sets, in order.
+//! Runs of a store, or groups of their sets, in sorted order.
 
 use std::cmp::Ordering;
 use std::str::FromStr;
@@ -10,13 +10,13 @@ use shearq_scoring::Metrics;
 use super::compare::mean_metric;
 use super::row::{RunRecord, SetRecord, table_of};
 
-/// Digits of a run's id in tables, as many as tell runs of a store apart.
+/// Digits of a run's id in tables, enough to distinguish the runs of a store.
 const ID_DIGITS: usize = 8;
 
-/// What the sets of a run are put together by.
+/// How the sets of a run are grouped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Grouping {
-    /// Each set alone.
+    /// Each set by itself.
     Set,
     /// The kinds of the paper's Table 2.
     SetKind,
@@ -29,7 +29,7 @@ pub enum Grouping {
 }
 
 impl Grouping {
-    /// The column of the store that tells groups apart.
+    /// The column of the store whose values define the groups.
     pub fn column(self) -> &'static str {
         match self {
             Grouping::Set => "set",
@@ -41,14 +41,14 @@ impl Grouping {
     }
 }
 
-/// What runs are sorted by: `q:desc`.
+/// Field and direction of sorting: `q:desc`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Order {
     field: String,
     descending: bool,
 }
 
-/// Fields beside the metrics that runs can be sorted by.
+/// Fields other than metrics to sort by.
 const SORTED: [&str; 5] = ["submission", "run", "version", "group", "images"];
 
 impl FromStr for Order {
@@ -59,12 +59,14 @@ impl FromStr for Order {
             None | Some((_, "asc")) => (text.trim_end_matches(":asc"), false),
             Some((field, "desc")) => (field, true),
             Some((_, other)) => {
-                return Err(format!("`{other}` is no order; expected `asc` or `desc`"));
+                return Err(format!(
+                    "unknown order (found `{other}`, expected `asc` or `desc`)"
+                ));
             }
         };
         if !SORTED.contains(&field) && Metrics::place(field).is_none() {
             return Err(format!(
-                "a table cannot be sorted by `{field}`; expected one of {}, {}",
+                "cannot sort by `{field}`; expected one of {}, {}",
                 SORTED.join(", "),
                 Metrics::ALL.map(|metric| metric.name).join(", ")
             ));
@@ -77,7 +79,7 @@ impl FromStr for Order {
 }
 
 impl Order {
-    /// Two runs in this order.
+    /// Compares two runs.
     pub(super) fn compare(&self, a: &RunRecord, b: &RunRecord) -> Ordering {
         let (a, b) = (Group::whole(a), Group::whole(b));
         in_order(&a.key(&self.field), &b.key(&self.field), self.descending)
@@ -85,14 +87,15 @@ impl Order {
 }
 
 /// A run, or a group of its sets.
+#[derive(Debug, Clone)]
 pub struct Group<'a> {
     /// The run.
     pub run: &'a RunRecord,
-    /// The first digits of its id.
+    /// First digits of the run's id.
     pub id: String,
-    /// What the group has in common: the value of the [`Grouping::column`].
+    /// The common value of the [`Grouping::column`].
     pub value: Option<AnyValue<'static>>,
-    /// Its sets, in order.
+    /// Sets in ascending order.
     pub sets: Vec<&'a SetRecord>,
 }
 
@@ -107,10 +110,10 @@ impl<'a> Group<'a> {
         }
     }
 
-    /// The groups of runs: rows of equal value stand together, and are in the order of `order`.
+    /// The groups of runs. Groups of equal value are adjacent and sorted by `order`.
     ///
     /// # Errors
-    /// Where polars cannot make a table of the runs.
+    /// If polars cannot make a table of the runs.
     pub fn of(
         runs: &'a [RunRecord],
         grouping: Option<Grouping>,
@@ -141,14 +144,14 @@ impl<'a> Group<'a> {
         }
         let (field, descending) =
             order.map_or(("group", false), |o| (o.field.as_str(), o.descending));
-        // The sort is stable: rows of a group are sorted first, and stay in that order.
+        // The second sort is stable, so it keeps the order within a group.
         groups.sort_by(|a, b| in_order(&a.key(field), &b.key(field), descending));
         let of_groups = field == "group" && descending;
         groups.sort_by(|a, b| in_order(&a.key("group"), &b.key("group"), of_groups));
         Ok(groups)
     }
 
-    /// The value sorted by.
+    /// The value to sort by.
     fn key(&self, field: &str) -> AnyValue<'_> {
         match field {
             "submission" => AnyValue::String(&self.run.configuration),
@@ -160,18 +163,18 @@ impl<'a> Group<'a> {
         }
     }
 
-    /// Images of all its sets.
+    /// Number of images of all sets.
     pub fn images(&self) -> usize {
         self.sets.iter().map(|set| set.images.len()).sum()
     }
 
-    /// Submission and run.
+    /// Names of configuration and run.
     pub fn name(&self) -> String {
         format!("{} {}", self.run.configuration, self.id)
     }
 }
 
-/// Two values of one field in order; numbers that are none come last either way.
+/// Compares two values of a field. NaN comes last in both directions.
 fn in_order(a: &AnyValue<'_>, b: &AnyValue<'_>, descending: bool) -> Ordering {
     let nan = |value: &AnyValue<'_>| matches!(value, AnyValue::Float64(x) if x.is_nan());
     let order = a.partial_cmp(b).unwrap_or(Ordering::Equal);
@@ -192,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_are_none_come_last_either_way() {
+    fn nan_comes_last_in_both_directions() {
         let (one, two, none) = (1.0, 2.0, f64::NAN);
         for (a, b, descending, expected) in [
             (one, two, false, Ordering::Less),

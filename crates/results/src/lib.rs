@@ -1,10 +1,13 @@
-//! What happens to scores: catalogues become [`score::ScoredSet`]s, of which [`row`] keeps what tables, stores
-//! and comparisons need.
+//! From catalogues to scores, comparisons and submissions to challenges.
 //!
-//! [`mean`] takes means of catalogues, [`foreign`] reads other programs' catalogues; [`store`] keeps rows in Parquet files, [`conditions`] and
-//! [`groups`] choose among them and put them together; [`compare`] holds results against each other, and
-//! [`baseline`] against what they were. [`submit`] packs and checks what is sent to a challenge;
-//! [`views`] are the tables, plots and pages.
+//! * [`score`] scores catalogues against a true shear field; [`foreign`] reads other programs' catalogues.
+//! * [`mean`] averages catalogues to one shear per set.
+//! * [`row`] is the record of a scored set, and [`store`] keeps records in Parquet files.
+//! * [`conditions`] and [`groups`] choose and group records; [`compare`] compares configurations.
+//! * [`baseline`] compares metrics with stored metrics.
+//! * [`submit`] packs and checks a submission to a challenge.
+//! * [`views`] makes tables, plots and pages.
+#![forbid(unsafe_code)]
 
 pub mod baseline;
 pub mod compare;
@@ -17,3 +20,8 @@ pub mod score;
 pub mod store;
 pub mod submit;
 pub mod views;
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -1,32 +1,33 @@
-//! Mean ellipticities: the shear of a field that has one.
+//! Mean shears of sets, for fields of constant shear.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
-
-use shearq_measure::{Flag, Warning};
-use shearq_quantities::statistics::RunningMean;
 
 use shearq_files::FileError;
 use shearq_files::table;
+use shearq_measure::{Flag, MeanShear, ShearSum, Warning};
 use shearq_pipeline::data::run::Run;
+use shearq_quantities::statistics::RunningMean;
+use shearq_submissions::Calibration;
 
-/// The mean over the galaxies of a set.
+/// The mean shear of the galaxies of a set.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct SetMean {
     /// The set.
     pub set: u32,
-    /// Images that there is a catalogue of.
+    /// Images with a catalogue.
     pub images: Vec<u32>,
     /// Galaxies with an ellipticity.
     pub galaxies: usize,
-    /// Galaxies without one.
+    /// Galaxies without an ellipticity.
     pub flagged: usize,
     /// Galaxies with each of [`Flag::ALL`].
     pub flags: [usize; Flag::ALL.len()],
-    /// Mean of e1 and e2.
-    pub mean: [f64; 2],
-    /// Standard error of the means, of galaxies that know nothing of one another.
-    pub error: [f64; 2],
-    /// Standard deviation of one galaxy.
+    /// Mean shear, with errors that include the error of the mean response of each image; `None` if all galaxies are
+    /// flagged.
+    pub shear: Option<MeanShear>,
+    /// Standard deviation of e1 and of e2 of one galaxy.
     pub scatter: [f64; 2],
 }
 
@@ -42,18 +43,19 @@ impl SetMean {
         Warning::of_counts(with, self.flagged, self.flagged + self.galaxies)
     }
 
-    /// Whether all galaxies have one ellipticity, so that their scatter is no error.
+    /// Whether all galaxies have one ellipticity, so that the error is meaningless.
     pub fn is_constant(&self) -> bool {
         self.galaxies > 1 && self.scatter == [0.0; 2]
     }
 }
 
-/// The means over the catalogues of each set of the results folder `out` (of `sets`, if there are some).
+/// The mean shear of the catalogues of each set of the results folder `out` (of `sets`, or of all if empty).
 ///
 /// # Errors
-/// Where a catalogue cannot be read, or there is none.
+/// If a catalogue cannot be read, or there is none.
 pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<SetMean>, FileError> {
     let files = run.catalogues(out, sets)?;
+    let calibrated = run.configuration.calibration() != Calibration::None;
     let mut means = Vec::new();
     for set in files.wanted(sets) {
         let catalogues = files.of_set(set);
@@ -61,7 +63,7 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<SetMean>, 
             let message = format!("there is no catalogue of set {set}");
             return Err(FileError::new(out, message));
         }
-        means.push(mean_of(set, &catalogues)?);
+        means.push(mean_of(set, &catalogues, calibrated)?);
     }
     if means.is_empty() {
         return Err(FileError::new(
@@ -72,39 +74,156 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<SetMean>, 
     Ok(means)
 }
 
-fn mean_of(set: u32, catalogues: &[(u32, PathBuf)]) -> Result<SetMean, FileError> {
-    let (mut moments, mut flagged) = ([RunningMean::default(); 2], 0);
-    let mut flags = [0; Flag::ALL.len()];
+/// The mean shear of a set from its catalogues, of ellipticities that are `calibrated` or not.
+fn mean_of(
+    set: u32,
+    catalogues: &[(u32, PathBuf)],
+    calibrated: bool,
+) -> Result<SetMean, FileError> {
+    let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
+    let (mut flags, mut flagged) = ([0; Flag::ALL.len()], 0);
     for (_, path) in catalogues {
-        let read = table::read(path, Some(&["e1", "e2", "flag"]), table::MAX_ROWS)?;
-        let (e1, e2) = (
-            table::numbers(&read, "e1", path)?,
-            table::numbers(&read, "e2", path)?,
-        );
-        for &bits in table::numbers(&read, "flag", path)?.iter() {
+        let rows = Rows::read(path, calibrated)?;
+        for &bits in rows.flags.iter() {
             for (count, flag) in flags.iter_mut().zip(Flag::ALL) {
                 *count += usize::from(bits as u32 & flag as u32 != 0);
             }
         }
-        for (&first, &second) in e1.iter().zip(e2.iter()) {
-            if first.is_finite() && second.is_finite() {
-                moments[0].add(first);
-                moments[1].add(second);
-            } else {
+        let mean = rows.mean_response();
+        for row in 0..rows.flags.len() {
+            if !rows.is_good(row) {
                 flagged += 1;
+                continue;
+            }
+            let (e, response) = (rows.e(row), rows.response(row));
+            // The ellipticities are divided by the mean response of their image.
+            sum.add(e, [0, 1].map(|k| response[k] / mean[k]), 1.0);
+            for (moment, e) in moments.iter_mut().zip(e) {
+                moment.add(e);
             }
         }
     }
-    let galaxies = moments[0].count();
-    let scatter = moments.map(|m| m.deviation());
     Ok(SetMean {
         set,
         images: catalogues.iter().map(|(image, _)| *image).collect(),
-        galaxies,
+        galaxies: moments[0].count(),
         flagged,
         flags,
-        mean: moments.map(|m| m.mean()),
-        error: scatter.map(|deviation| deviation / (galaxies as f64).sqrt()),
-        scatter,
+        shear: sum.mean().ok(),
+        scatter: moments.map(|moment| moment.deviation()),
     })
+}
+
+/// The columns of a catalogue from which a mean shear follows.
+struct Rows {
+    e: [Vec<f64>; 2],
+    flags: Vec<f64>,
+    /// R11 and R22 of calibrated ellipticities.
+    response: Option<[Vec<f64>; 2]>,
+}
+
+impl Rows {
+    fn read(path: &Path, calibrated: bool) -> Result<Self, FileError> {
+        let mut names = vec!["e1", "e2", "flags"];
+        if calibrated {
+            names.extend(["R11", "R22"]);
+        }
+        let read = table::read(path, Some(&names), table::MAX_ROWS)?;
+        let column = |name| table::numbers(&read, name, path).map(Cow::into_owned);
+        Ok(Rows {
+            e: [column("e1")?, column("e2")?],
+            flags: column("flags")?,
+            response: match calibrated {
+                true => Some([column("R11")?, column("R22")?]),
+                false => None,
+            },
+        })
+    }
+
+    fn e(&self, row: usize) -> [f64; 2] {
+        [0, 1].map(|k| self.e[k][row])
+    }
+
+    fn is_good(&self, row: usize) -> bool {
+        self.e(row).iter().all(|e| e.is_finite())
+    }
+
+    /// R11 and R22; 1 for ellipticities without calibration.
+    fn response(&self, row: usize) -> [f64; 2] {
+        let response = self.response.as_ref();
+        response.map_or([1.0; 2], |all| [0, 1].map(|k| all[k][row]))
+    }
+
+    /// Mean response of the galaxies with an ellipticity.
+    fn mean_response(&self) -> [f64; 2] {
+        let good = || (0..self.flags.len()).filter(|&row| self.is_good(row));
+        let count = good().count() as f64;
+        [0, 1].map(|k| good().map(|row| self.response(row)[k]).sum::<f64>() / count)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shearq_files::frames::frame;
+    use shearq_files::frames::polars::Column;
+    use shearq_files::table::FileFormat;
+
+    use super::*;
+
+    /// Writes a catalogue of two good galaxies, of mean response 0.5, and one flagged.
+    fn written(path: &Path, e: [f64; 2], names: [&str; 3]) {
+        let column = |name: &str, values: [f64; 3]| Column::new(name.into(), values);
+        let e = |sign: f64| [sign * e[0], sign * e[1], f64::NAN];
+        let [flags, r11, r22] = names;
+        let table = frame(vec![
+            column("e1", e(1.0)),
+            column("e2", e(-1.0)),
+            column(flags, [0.0, 0.0, 4.0]),
+            column(r11, [0.4, 0.6, f64::NAN]),
+            column(r22, [0.4, 0.6, f64::NAN]),
+        ]);
+        table::write(
+            path,
+            FileFormat::Parquet,
+            &table.unwrap(),
+            &Default::default(),
+        )
+        .unwrap();
+    }
+
+    #[test]
+    fn the_shear_is_the_mean_ellipticity_and_its_error_that_of_a_ratio() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("catalogue-001.parquet");
+        written(&path, [0.1, 0.4], ["flags", "R11", "R22"]);
+        let catalogues = [(1, path)];
+        let mean = mean_of(7, &catalogues, true).unwrap();
+        assert_eq!((mean.galaxies, mean.flagged, mean.flags[2]), (2, 1, 1));
+        let shear = mean.shear.unwrap();
+        assert!((shear.shear[0] - 0.25).abs() < 1e-15 && (shear.shear[1] + 0.25).abs() < 1e-15);
+        // Residuals 0.1 − 0.25 · 0.8 and 0.4 − 0.25 · 1.2 are ∓0.1: √(2 · 0.02)/2.
+        assert!((shear.error()[0] - 0.1).abs() < 1e-15, "{shear:?}");
+        // Without responses the residuals are ∓0.15.
+        let plain = mean_of(7, &catalogues, false).unwrap().shear.unwrap();
+        assert!((plain.error()[0] - 0.15).abs() < 1e-15, "{plain:?}");
+    }
+
+    #[test]
+    fn an_old_catalogue_is_refused_with_the_new_names_of_its_columns() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("catalogue-001.parquet");
+        for (names, expected) in [
+            (["flag", "R11", "R22"], "`flag` is now called `flags`"),
+            (
+                ["flags", "response1", "response2"],
+                "`response1` is now called `R11`",
+            ),
+        ] {
+            written(&path, [0.1, 0.4], names);
+            let error = mean_of(7, &[(1, path.clone())], true)
+                .unwrap_err()
+                .to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+    }
 }

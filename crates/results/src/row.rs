@@ -1,4 +1,4 @@
-//! Rows of results: what is kept of every scored set, and of what made it.
+//! Records of scored sets and runs.
 
 use std::path::Path;
 
@@ -17,36 +17,36 @@ use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::run::{Run, Source, nan_for_null};
 use shearq_simulate::kinds::SetKind;
 
-/// What is kept of one set's score.
+/// Record of one set's score.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SetRecord {
     /// Set number.
     pub set: u32,
-    /// Whether it is a simulated set, whose number gives its kind. Records without it are.
+    /// Whether the set was simulated; its number then gives its kind. The default is true.
     #[serde(default = "yes")]
     pub simulated: bool,
     /// Fingerprint of the set's data ([`fingerprint::of_set`]).
     pub data: String,
-    /// Numbers of the images scored.
+    /// Numbers of the scored images.
     pub images: Vec<u32>,
     /// Galaxies in their catalogues.
     pub galaxies: u64,
-    /// Of these, without an ellipticity.
+    /// Number of these galaxies without an ellipticity.
     pub flagged: u64,
     /// Metrics of the chosen convention.
     pub metrics: Metrics,
-    /// Their standard errors; not a number where unknown.
+    /// Standard errors of the metrics; NaN if unknown.
     pub errors: Metrics,
     /// Q with each group of images left out in turn, for paired differences.
     pub q_replicates: Vec<f64>,
-    /// Calibrated Q likewise; empty in records of versions that did not keep it.
+    /// Calibrated Q with each group left out; empty in records of earlier versions.
     #[serde(default, deserialize_with = "nan_for_null")]
     pub q_calibrated_replicates: Vec<f64>,
-    /// The leaderboard's Q: the best of the eight conventions.
+    /// Q of the leaderboard: the highest of the eight conventions.
     pub q_leaderboard: f64,
     /// Number of the chosen convention.
     pub convention: u8,
-    /// Whether it is known: told, or clearly matched to the truth, and not chosen by its Q.
+    /// Whether the convention is certain: given, or clearly matched to the truth.
     pub convention_known: bool,
     /// Number of the leaderboard's convention.
     pub convention_leaderboard: u8,
@@ -62,7 +62,7 @@ impl SetRecord {
         SetKind::of(self.set).filter(|_| self.simulated)
     }
 
-    /// What is kept of the scored set `set`, of data with the fingerprint `data`.
+    /// Record of the scored set `set`, whose data have the fingerprint `data`.
     pub fn new(set: u32, scored: &ScoredSet, data: String) -> Self {
         let ScoredSet {
             set: _,
@@ -94,10 +94,10 @@ impl SetRecord {
     }
 }
 
-/// What is kept of one scored run.
+/// Record of a scored run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunRecord {
-    /// Name of the submission, or of another program's catalogues.
+    /// Name of the configuration, or of another program's catalogues.
     pub configuration: String,
     /// Version of shearq.
     pub version: String,
@@ -107,15 +107,15 @@ pub struct RunRecord {
     pub source: String,
     /// Bandpower definition.
     pub definition: String,
-    /// Convention asked for: `matched`, `best` or a number.
+    /// Choice of the convention: `matched`, `best` or a number.
     pub choice: String,
-    /// `measured`, or the noise variance given.
+    /// `measured`, or the given noise variance.
     pub noise: String,
     /// The sets, in order.
     pub sets: Vec<SetRecord>,
 }
 
-/// A bandpower definition in records.
+/// Name of a bandpower definition in records.
 pub(super) fn definition_word(definition: Definition) -> &'static str {
     match definition {
         Definition::Leaderboard => "leaderboard",
@@ -123,7 +123,7 @@ pub(super) fn definition_word(definition: Definition) -> &'static str {
     }
 }
 
-/// A choice of a convention in records.
+/// Name of a choice of a convention in records.
 pub(super) fn choice_word(choice: Choice) -> String {
     match choice {
         Choice::Matched => "matched".into(),
@@ -132,23 +132,24 @@ pub(super) fn choice_word(choice: Choice) -> String {
     }
 }
 
-/// What was measured, and by what.
+/// Configuration and data of a measurement.
+#[derive(Debug, Clone)]
 pub struct Measured<'a> {
-    /// Name of the submission, or of another program's catalogues.
+    /// Name of the configuration, or of another program's catalogues.
     pub name: &'a str,
     /// All settings, as TOML.
     pub settings: String,
-    /// Where the galaxies come from.
+    /// Source of the galaxies.
     pub source: &'a Source,
-    /// Where the true shear is.
+    /// Data folder with the true shear.
     pub data: &'a DataFolder,
 }
 
 impl<'a> Measured<'a> {
-    /// A run of ours.
+    /// A run of shearq.
     ///
     /// # Errors
-    /// Where the settings cannot be written as TOML.
+    /// If the settings cannot be written as TOML.
     pub fn run(run: &'a Run, data: &'a DataFolder, folder: &Path) -> Result<Self, FileError> {
         let settings = toml::to_string(&run.configuration)
             .map_err(FileError::doing(folder, "cannot store the settings"))?;
@@ -165,7 +166,7 @@ impl RunRecord {
     /// The record of a scored run.
     ///
     /// # Errors
-    /// Where the data cannot be read for their fingerprint.
+    /// If the data cannot be read for their fingerprint.
     pub fn new(
         measured: Measured<'_>,
         scored: &[ScoredSet],
@@ -179,7 +180,7 @@ impl RunRecord {
         } = measured;
         let sets = scored
             .iter()
-            // One without a number is of no challenge.
+            // Plain files have no set number.
             .filter_map(|scored| Some((scored.set?, scored)))
             .map(|(set, scored)| {
                 let print = fingerprint::of_set(source, data, set, &scored.images)?;
@@ -205,8 +206,8 @@ impl RunRecord {
         })
     }
 
-    /// Fingerprint of what made the run: version, settings, data and the way of scoring, but not
-    /// which sets and images. Parts of one run, from several processes, have it in common.
+    /// Fingerprint of version, settings, data and way of scoring, but not of sets and images. Shards of a run share
+    /// it.
     pub fn id(&self) -> String {
         let RunRecord {
             configuration,
@@ -233,10 +234,10 @@ impl RunRecord {
         print.finish()
     }
 
-    /// The run whose sets are the rows of the table `path`.
+    /// The run whose sets are the rows of the table in `path`.
     ///
     /// # Errors
-    /// Where a column is absent or of another type, or the rows are not of one run.
+    /// If a column is absent or has another type, or the rows belong to several runs.
     pub fn from_table(table: &DataFrame, path: &Path) -> Result<Self, FileError> {
         let rows = Rows { path, table };
         let text = |name| rows.text(name, 0).map(str::to_owned);
@@ -258,7 +259,7 @@ impl RunRecord {
             let found = rows.text("run", row)?;
             if found != run.id() {
                 let message = format!(
-                    "row {}: `run` is {found}, but what made it amounts to {}; was the file edited?",
+                    "row {}: `run` disagrees with the other columns (found {found}, expected {}). Was the file edited?",
                     row + 1,
                     run.id()
                 );
@@ -269,11 +270,10 @@ impl RunRecord {
     }
 }
 
-/// A row for every set of every run, in order: what the files of a store hold, and what conditions and
-/// groups refer to.
+/// The table of a store, with a row per set of each run.
 ///
 /// # Errors
-/// Where polars cannot make it.
+/// If polars cannot make the table.
 pub fn table_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
     let ids: Vec<String> = runs.iter().map(RunRecord::id).collect();
     let rows: Vec<(&RunRecord, &str, &SetRecord)> = runs
@@ -345,12 +345,12 @@ pub fn table_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
     shearq_files::frames::frame(columns)
 }
 
-/// Name of the column with a metric's standard errors.
+/// Name of the column with the standard errors of a metric.
 fn error_of(metric: &str) -> String {
     format!("{metric}_error")
 }
 
-/// Numbers as a JSON list, with all their digits; what is not finite is null.
+/// Numbers as a JSON list with all digits; numbers that are not finite become null.
 fn list<T: ToString>(numbers: &[T]) -> String {
     let texts: Vec<String> = numbers
         .iter()
@@ -362,7 +362,7 @@ fn list<T: ToString>(numbers: &[T]) -> String {
     format!("[{}]", texts.join(","))
 }
 
-/// Rows of the table of a file.
+/// Rows of a file's table.
 struct Rows<'a> {
     path: &'a Path,
     table: &'a DataFrame,
@@ -370,7 +370,7 @@ struct Rows<'a> {
 
 impl Rows<'_> {
     fn wrong(&self, name: &str, row: usize, expected: &str) -> FileError {
-        let message = format!("row {}: column `{name}` has no {expected}", row + 1);
+        let message = format!("row {}: column `{name}`: expected a {expected}", row + 1);
         FileError::new(self.path, message)
     }
 
@@ -392,10 +392,10 @@ impl Rows<'_> {
         let column = self.table.column(name).ok();
         column
             .and_then(|column| T::try_from(column.i64().ok()?.get(row)?).ok())
-            .ok_or_else(|| self.wrong(name, row, "number that can be counted to"))
+            .ok_or_else(|| self.wrong(name, row, "number in the range of counts"))
     }
 
-    /// Numbers of a JSON list; null is NaN where `T` has it.
+    /// Numbers of a JSON list; null becomes NaN.
     fn list<T: std::str::FromStr>(&self, name: &str, row: usize) -> Result<Vec<T>, FileError> {
         let text = self.text(name, row)?;
         text.strip_prefix('[')
@@ -422,7 +422,7 @@ impl Rows<'_> {
             Ok(Metrics::from_values(values))
         };
         let images: Vec<u32> = self.list("image_numbers", row)?;
-        // Numbers that no catalogues have are not added up.
+        // Larger numbers would overflow sums.
         let at_most = |name: &str, most: u64| match self.count::<u64>(name, row)? {
             found if found <= most => Ok(found),
             found => {
@@ -447,14 +447,14 @@ impl Rows<'_> {
             metrics: metrics(&str::to_owned)?,
             errors: metrics(&error_of)?,
             q_replicates: self.list("q_replicates", row)?,
-            // Earlier versions did not keep them.
+            // Earlier versions have no such column.
             q_calibrated_replicates: match self.table.column("q_calibrated_replicates") {
                 Ok(_) => self.list("q_calibrated_replicates", row)?,
                 Err(_) => Vec::new(),
             },
             q_leaderboard: self.real("q_leaderboard", row)?,
             convention: self.count("convention", row)?,
-            // Earlier versions let each set choose.
+            // Earlier versions chose a convention per set.
             convention_known: match self.table.column("convention_known") {
                 Ok(_) => self.count::<u8>("convention_known", row)? > 0,
                 Err(_) => self.text("choice", row)?.parse::<u8>().is_ok(),

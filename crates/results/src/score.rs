@@ -6,35 +6,37 @@ use std::path::{Path, PathBuf};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
     Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, Metrics, Options,
-    RowCounts, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
+    RowCounts, ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
 };
 
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
-use shearq_pipeline::data::layout::{DataFolder, MAX_SET, read_rows};
+use shearq_pipeline::data::layout::{DataFolder, read_rows};
+use shearq_pipeline::data::pattern::MAX_SET;
 use shearq_pipeline::data::run::Run;
 use shearq_pipeline::simulate::kind_of;
 use shearq_pipeline::truth::{ReadTruth, Reading, SignBasis, read_truth, reading_of};
 use shearq_pipeline::{PipelineError, engine, inputs};
 use shearq_simulate::kinds::SetKind;
 
-/// Columns of our catalogues that are scored.
+/// The scored columns of catalogues by shearq.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 
-/// The convention of what shearq measured, which it is in by construction.
+/// The convention of catalogues by shearq, which is the standard one by construction.
 pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
 
-/// The score of one set and where its rows went.
+/// The score of one set, and how the rows of its catalogues were used.
+#[derive(Debug, Clone)]
 pub struct ScoredSet {
-    /// Its number; a set given as plain files has none.
+    /// Set number; `None` for plain files.
     pub set: Option<u32>,
-    /// Its kind, if the data were simulated.
+    /// Kind of set, if the data were simulated.
     pub kind: Option<SetKind>,
-    /// Numbers of the images scored.
+    /// Numbers of the scored images.
     pub images: Vec<u32>,
     /// The score.
     pub score: SetScore,
-    /// How the catalogues' rows were used.
+    /// Numbers of used, missing and unusable rows.
     pub rows: RowCounts,
     /// How the convention was chosen.
     pub basis: Basis,
@@ -46,17 +48,17 @@ pub struct ScoredSet {
     pub odd_images: OddImages,
 }
 
-/// Catalogues of a set with faults that their sum does not show.
+/// Catalogues of a set with faults that the sum over images does not show.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct OddImages {
-    /// Catalogues with the ellipticities of another one, and that one.
+    /// Pairs of catalogues with equal ellipticities: the copy, and the first.
     pub copies: Vec<(PathBuf, PathBuf)>,
-    /// Catalogues whose galaxies all have one ellipticity, and that ellipticity.
+    /// Catalogues whose galaxies all have one ellipticity, and this ellipticity.
     pub constant: Vec<(PathBuf, [f64; 2])>,
 }
 
 impl OddImages {
-    /// Names the images of `faults`, which were added in the order of `paths`.
+    /// Odd images by name; the images of `faults` were added in the order of `paths`.
     pub fn new(faults: &ImageFaults, paths: &[PathBuf]) -> Self {
         OddImages {
             copies: faults
@@ -71,10 +73,8 @@ impl OddImages {
                 .collect(),
         }
     }
-}
 
-impl OddImages {
-    /// With other names of the files, for those of an unpacked archive.
+    /// Renames the files, for example of an unpacked archive.
     pub fn renamed(&mut self, name: impl Fn(&Path) -> PathBuf) {
         for (copy, first) in &mut self.copies {
             (*copy, *first) = (name(copy), name(first));
@@ -91,8 +91,8 @@ fn findings(
     images: &SetImages,
     score: &SetScore,
     choice: Choice,
-) -> Vec<Fault> {
-    // The convention with the highest Q may be a wrong one.
+) -> Result<Vec<Fault>, ScoringError> {
+    // The convention with the highest Q may be wrong.
     let convention = match choice {
         Choice::Best => score.matching.convention(),
         Choice::Matched | Choice::Insist(_) => score.chosen,
@@ -100,22 +100,22 @@ fn findings(
     scorer.diagnose(images, score, convention)
 }
 
-/// What the convention of a submission's metrics rests on. It is the same for all its sets.
+/// How the convention of the metrics was chosen. It is the same for all sets of a variant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Basis {
-    /// It was told, or is that of our own measurements.
-    Told,
+    /// It was given, or the catalogues are by shearq.
+    Given,
     /// It was matched to the truth of all sets together.
     Matched(ConventionMatch),
-    /// The highest Q, set by set, as the leaderboard took it.
+    /// The highest Q of each set, as on the leaderboard.
     HighestQ,
 }
 
 impl Basis {
-    /// Whether the convention is known, so that differences from other submissions mean something.
+    /// Whether the convention is certain, so that differences from other variants are meaningful.
     pub fn is_known(&self) -> bool {
         match self {
-            Basis::Told => true,
+            Basis::Given => true,
             Basis::Matched(matching) => matching.is_clear(),
             Basis::HighestQ => false,
         }
@@ -126,10 +126,10 @@ impl Basis {
 pub type ReadImage<'a> =
     &'a (dyn Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync);
 
-/// A [`ReadImage`] for catalogues that we wrote.
+/// A [`ReadImage`] for catalogues by shearq.
 ///
 /// # Errors
-/// Where one cannot be read.
+/// If the catalogue cannot be read.
 pub fn own_catalogue(grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, read_rows(path, &COLUMNS, most_rows(grid.cells()))?);
@@ -139,7 +139,7 @@ pub fn own_catalogue(grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), 
 /// Scores one set from a truth file and one catalogue per image.
 ///
 /// # Errors
-/// Where a file cannot be read, the truth does not fill a square grid, or no row falls on it.
+/// If a file cannot be read, the truth does not fill a square grid, or no row is on the grid.
 pub fn score_files(
     truth: &Path,
     catalogues: &[PathBuf],
@@ -160,7 +160,8 @@ pub fn score_files(
         odd_images,
     } = add_up(&grid, catalogues, read, threads)?;
     if basis == SignBasis::Unknown
-        && let Some(sign) = sign_by_correlation(&shear.flipped(), images.total())
+        && let Some(sign) =
+            sign_by_correlation(&shear.flipped(), images.total()).map_err(scoring)?
     {
         basis = SignBasis::Correlation(sign);
         if sign == TruthSign::Standard {
@@ -172,28 +173,28 @@ pub fn score_files(
     Ok(ScoredSet {
         set: None,
         kind: None,
-        findings: findings(&scorer, &images, &score, options.choice),
+        findings: findings(&scorer, &images, &score, options.choice).map_err(scoring)?,
         odd_images,
         sign: basis,
         images: (1..=catalogues.len() as u32).collect(),
         basis: match options.choice {
             Choice::Matched => Basis::Matched(score.matching),
             Choice::Best => Basis::HighestQ,
-            Choice::Insist(_) => Basis::Told,
+            Choice::Insist(_) => Basis::Given,
         },
         score,
         rows,
     })
 }
 
-/// Catalogues of a set, added up.
+/// Sum of the catalogues of a set.
 struct Added {
     images: SetImages,
     rows: RowCounts,
     odd_images: OddImages,
 }
 
-/// Reads catalogues in parallel and adds them up in order.
+/// Reads catalogues in parallel and sums them in order.
 fn add_up(
     grid: &Grid,
     catalogues: &[PathBuf],
@@ -217,7 +218,9 @@ fn add_up(
         |(), path: PathBuf| Ok(read(grid, &path)?),
         |(sum, more)| {
             faults.add(&sum);
-            images.add(&sum);
+            images
+                .add(&sum)
+                .map_err(|source| PipelineError::Scoring { set: None, source })?;
             counts += more;
             Ok(())
         },
@@ -234,12 +237,12 @@ fn add_up(
     })
 }
 
-/// Why no row of `files` catalogues can be scored.
+/// The error if no row of `files` catalogues can be scored.
 fn nothing_used(counts: &RowCounts, files: usize, grid: &Grid) -> String {
     let (n, stamp) = (grid.n, grid.stamp.0);
     if counts.outside > counts.not_finite {
         return format!(
-            "no row of the {files} catalogue(s) falls on the {n} × {n} grid of {stamp} px stamps; expected x and y in pixels from 0.5 to {}. Are they sky coordinates in degrees?",
+            "no row of the {files} catalogue(s) is on the {n} × {n} grid of {stamp} px stamps; expected x and y in pixels from 0.5 to {}. Are they sky coordinates in degrees?",
             n as f64 * stamp + 0.5
         );
     }
@@ -249,28 +252,27 @@ fn nothing_used(counts: &RowCounts, files: usize, grid: &Grid) -> String {
             counts.not_finite
         );
     }
-    format!("there is no galaxy in {files} catalogue(s); expected a row per galaxy")
+    format!("found no galaxy in {files} catalogue(s); expected a row per galaxy")
 }
 
-/// Catalogues of one variant of a measurement.
+/// Catalogues of one variant.
 pub struct Catalogues<'a> {
-    /// Those of a set that are there, by image number.
+    /// The existing catalogues of a set, with their image numbers.
     pub of_set: &'a dyn Fn(u32) -> Vec<(u32, PathBuf)>,
-    /// How one is read.
+    /// Reads one catalogue.
     pub read: ReadImage<'a>,
-    /// Which convention they are scored in; [`Choice::Matched`] is one for all sets together.
+    /// Convention to score in; [`Choice::Matched`] uses one convention for all sets.
     pub choice: Choice,
 }
 
-/// A set to score, and every variant's catalogues of it.
+/// A set to score, and its catalogues of every variant.
 type SetFiles = (u32, Vec<Vec<(u32, PathBuf)>>);
 
-/// Scores several variants on sets of a data folder: all sets of which every variant has
-/// catalogues, or those of `sets`, which all must have. Of `options`, each variant has its own choice of a
-/// convention.
+/// Scores several variants on sets of a data folder: on `sets`, or if it is empty, on all sets with catalogues of every
+/// variant. The convention of `options` is replaced by the choice of each variant.
 ///
 /// # Errors
-/// Where files are absent or damaged, or there is nothing to score.
+/// If files are absent or damaged, or a set of `sets` has no catalogues.
 pub fn score_variants(
     data: &DataFolder,
     variants: &[Catalogues<'_>],
@@ -284,12 +286,12 @@ pub fn score_variants(
         let basis = match variant.choice {
             Choice::Matched => Basis::Matched(match_over_sets(data, &sets, k, variant, threads)?),
             Choice::Best => Basis::HighestQ,
-            Choice::Insist(_) => Basis::Told,
+            Choice::Insist(_) => Basis::Given,
         };
         let options = Options {
             choice: match basis {
                 Basis::Matched(matching) => Choice::Insist(matching.convention()),
-                Basis::Told | Basis::HighestQ => variant.choice,
+                Basis::Given | Basis::HighestQ => variant.choice,
             },
             ..options
         };
@@ -305,7 +307,8 @@ pub fn score_variants(
                 set: Some(*set),
                 kind: kind_of(data, *set),
                 images: files[k].iter().map(|file| file.0).collect(),
-                findings: findings(&scorer, &added.images, &score, options.choice),
+                findings: findings(&scorer, &added.images, &score, options.choice)
+                    .map_err(scoring)?,
                 odd_images: added.odd_images,
                 score,
                 rows: added.rows,
@@ -318,7 +321,7 @@ pub fn score_variants(
     Ok(scored)
 }
 
-/// The sets of which every variant has catalogues.
+/// The sets with catalogues of every variant.
 fn sets_to_score(
     variants: &[Catalogues<'_>],
     wanted: &[u32],
@@ -333,18 +336,18 @@ fn sets_to_score(
         if files.len() == variants.len() {
             sets.push((set, files));
         } else if wanted.contains(&set) {
-            let message = format!("there is no catalogue of set {set} to score");
+            let message = format!("found no catalogue of set {set} to score");
             return Err(PipelineError::Request(message));
         }
     }
     if sets.is_empty() {
-        let message = "there is no catalogue to score".into();
+        let message = "found no catalogue to score".into();
         return Err(PipelineError::Request(message));
     }
     Ok(sets)
 }
 
-/// How well each convention of the `k`-th variant goes with the truth of all sets together.
+/// How well each convention of the `k`-th variant agrees with the truth of all sets.
 fn match_over_sets(
     data: &DataFolder,
     sets: &[SetFiles],
@@ -362,12 +365,16 @@ fn match_over_sets(
             Options::default(),
             threads,
         )?;
-        all.merge(&scorer.match_convention(&added.images));
+        let found = scorer.match_convention(&added.images);
+        all.merge(&found.map_err(|source| PipelineError::Scoring {
+            set: Some(*set),
+            source,
+        })?);
     }
     Ok(all)
 }
 
-/// One set's scorer and catalogues.
+/// Scorer and summed catalogues of a set.
 fn prepare(
     data: &DataFolder,
     set: u32,
@@ -385,8 +392,8 @@ fn prepare(
     Ok((scorer, add_up(&grid, &files, read, threads)?))
 }
 
-/// Scores sets of a data folder from catalogues found by `catalogues`: all sets that have some, or
-/// those of `sets`, which then must have some.
+/// Scores sets of a data folder from catalogues found by `catalogues`: `sets`, or if it is empty, all sets with
+/// catalogues.
 ///
 /// # Errors
 /// As [`score_variants`].
@@ -407,7 +414,7 @@ pub fn score_sets(
     Ok(scored.into_iter().flatten().collect())
 }
 
-/// Scores every measured set of a results folder (or those of `sets`) against the truth of `data`.
+/// Scores `sets` of a results folder, or all if it is empty, against the truth of `data`.
 ///
 /// # Errors
 /// As [`score_sets`].
@@ -430,10 +437,10 @@ pub fn score_folder(
     )
 }
 
-/// What of the images of `data`, of `sets` (of all if empty), was not scored, a line each.
+/// Warnings about images of `data` that were not scored, in `sets` (in all if empty).
 ///
 /// # Errors
-/// Where the data's folders cannot be listed.
+/// If the folders of the data cannot be listed.
 pub fn unscored(
     data: &DataFolder,
     scored: &[ScoredSet],
@@ -445,7 +452,7 @@ pub fn unscored(
     without_catalogue(data, &numbered.collect(), sets)
 }
 
-/// The same where `used` has the images of each set that there is a catalogue of.
+/// Warnings about images without a catalogue; `used` has the images with a catalogue by set.
 ///
 /// # Errors
 /// As [`unscored`].
@@ -457,7 +464,7 @@ pub fn without_catalogue(
     let images = data.images(sets)?;
     let mut absent = Vec::new();
     let unread = images.unread().into_iter();
-    let mut lines: Vec<String> = unread.map(|line| format!("Warning: {line}.")).collect();
+    let mut lines: Vec<String> = unread.map(|line| format!("warning: {line}.")).collect();
     for set in images.sets() {
         let there = images.of_set(set);
         let Some(used) = used.get(&set) else {
@@ -476,13 +483,13 @@ pub fn without_catalogue(
     if !absent.is_empty() {
         let absent = absent.join(", ");
         lines.push(format!(
-            "warning: there are data of sets without a catalogue: {absent}."
+            "warning: no catalogue of set {absent}, which the data contain."
         ));
     }
     Ok(lines)
 }
 
-/// Means over sets of the headline metrics and their errors.
+/// Means of the metrics over sets, and their errors.
 pub fn means(scored: &[ScoredSet]) -> (Metrics, Metrics) {
     let columns: [(f64, f64); Metrics::ALL.len()] = std::array::from_fn(|k| {
         let pairs: Vec<(f64, f64)> = scored

@@ -1,7 +1,7 @@
 //! A results store: a folder with one Parquet file per recorded run, one row per set.
 //!
-//! A file's name is made of what is in it, so that processes which write into one store never meet,
-//! and recording the same run twice changes nothing. docs/formats.md describes the columns.
+//! A file's name is derived from its content. Processes that write into one store therefore do not collide, and
+//! recording a run twice has no effect. docs/formats.md describes the columns.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -14,25 +14,27 @@ use shearq_files::parquet::bare;
 use shearq_files::{FileError, atomic};
 use shearq_pipeline::data::fingerprint;
 
-/// Key and value in the footer that tell the files of a store.
+/// Key and value in the footer that identify the files of a store.
 const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");
 
-/// Most sets of one run: ten times the highest number that file names have room for.
+/// Most sets of one run: ten times the highest number in file names.
 const MAX_SETS: usize = 100_000;
-/// A store's folder. If it was made for this and is still empty in the end, it is removed.
+
+/// A store's folder. A new folder that stays empty is removed.
+#[derive(Debug)]
 #[must_use]
 pub struct Prepared(Option<PathBuf>);
 
 impl Drop for Prepared {
     fn drop(&mut self) {
         if let Some(made) = &self.0 {
-            // Fails for a folder that has files, as it should.
+            // A folder with files is not removed.
             let _ = std::fs::remove_dir(made);
         }
     }
 }
 
-/// Makes the folder of a store, so that a long run does not find out at its end that it cannot.
+/// Makes the folder of a store before a long run, which would otherwise fail at its end.
 ///
 /// # Errors
 /// If it cannot be made.
@@ -44,10 +46,10 @@ pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
     Ok(Prepared(absent.then(|| store.to_owned())))
 }
 
-/// Records a run; the file it is now in.
+/// Records a run and returns its file.
 ///
 /// # Errors
-/// Where the file cannot be written.
+/// If the file cannot be written.
 pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
     let failed = |error: TableError| bare(store, &error);
     let metadata = Metadata::from([(SCHEMA.0.to_owned(), SCHEMA.1.to_owned())]);
@@ -59,7 +61,7 @@ pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
     Ok(path)
 }
 
-/// Name of the file that holds `bytes`.
+/// Name of the file with the content `bytes`.
 fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
     let words: Vec<&str> = run
         .configuration
@@ -78,7 +80,7 @@ fn read_run(path: &Path) -> Result<RunRecord, FileError> {
     let found = metadata.get(SCHEMA.0).map(String::as_str);
     if found != Some(SCHEMA.1) {
         let message = format!(
-            "found {}, expected a file of a results store: `{}` = \"{}\" in its metadata",
+            "not a file of a results store (found {}, expected `{}` = \"{}\" in the metadata)",
             found.map_or("no schema".into(), |found| format!("schema \"{found}\"")),
             SCHEMA.0,
             SCHEMA.1
@@ -87,27 +89,26 @@ fn read_run(path: &Path) -> Result<RunRecord, FileError> {
     }
     let print = fingerprint::of_file(path)?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-    // Whoever names a file anew has it without.
+    // A renamed file has no print in its name.
     let named = stem
         .rsplit('-')
         .next()
         .filter(|end| end.len() == print.len() && end.bytes().all(|byte| byte.is_ascii_hexdigit()));
     if named.is_some_and(|named| named != print) {
         let message = format!(
-            "the file was changed since it was recorded: its content is {print}, not what its name ends in"
+            "the file was changed after it was recorded (found content {print}, expected the end of its name)"
         );
         return Err(FileError::new(path, message));
     }
     RunRecord::from_table(&table, path)
 }
 
-/// All runs of a store, by submission and id, and what should be known about them.
+/// All runs of a store, sorted by configuration and id, and warnings about them.
 ///
-/// Where several files hold the same set of the same run, the one with most images counts: the
-/// others are earlier looks at it.
+/// If several files contain one set of one run, the set with most images is used.
 ///
 /// # Errors
-/// Where there is no such folder, or a Parquet file in it is not one of a store.
+/// If the folder does not exist, or a Parquet file in it does not belong to a store.
 pub fn read(store: &Path) -> Result<(Vec<RunRecord>, Vec<String>), FileError> {
     let entries = std::fs::read_dir(store)
         .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
@@ -137,7 +138,7 @@ pub fn read(store: &Path) -> Result<(Vec<RunRecord>, Vec<String>), FileError> {
     Ok((runs.into_values().collect(), notes))
 }
 
-/// Adds the sets of another file of the same run.
+/// Adds the sets of another file of one run.
 fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<String>) {
     for set in more.sets {
         match run.sets.iter_mut().find(|own| own.set == set.set) {
@@ -145,7 +146,7 @@ fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<Stri
             Some(own) => {
                 if own.images.len() == set.images.len() {
                     notes.push(format!(
-                        "warning: {} holds set {} of a run that another file holds too, with other results on as many images; that other one counts.",
+                        "warning: {} repeats set {} of another file with other results on as many images; the other file is used.",
                         path.display(),
                         set.set
                     ));
@@ -156,4 +157,97 @@ fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<Stri
         }
     }
     run.sets.sort_by_key(|set| set.set);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::row::SetRecord;
+    use shearq_scoring::Metrics;
+
+    fn run(configuration: &str, sets: &[(u32, u32, f64)]) -> RunRecord {
+        let record = |&(set, images, q): &(u32, u32, f64)| SetRecord {
+            set,
+            simulated: true,
+            data: "d".into(),
+            images: (1..=images).collect(),
+            galaxies: 64,
+            flagged: 1,
+            metrics: {
+                let mut metrics = Metrics::unknown();
+                metrics.q = q;
+                metrics
+            },
+            errors: Metrics::unknown(),
+            q_replicates: vec![q, f64::NAN],
+            q_calibrated_replicates: Vec::new(),
+            q_leaderboard: q,
+            convention: 5,
+            convention_known: true,
+            convention_leaderboard: 6,
+        };
+        RunRecord {
+            configuration: configuration.into(),
+            version: "1".into(),
+            settings: String::new(),
+            source: "s".into(),
+            definition: "leaderboard".into(),
+            choice: "5".into(),
+            noise: "measured".into(),
+            sets: sets.iter().map(record).collect(),
+        }
+    }
+
+    #[test]
+    fn runs_are_read_back_and_more_images_replace_fewer() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = folder.path().join("store");
+        let _prepared = prepare(&store).unwrap();
+        let first = run("b", &[(2, 1, 10.0), (7, 3, 20.0)]);
+        let path = write(&store, &first).unwrap();
+        assert_eq!(write(&store, &first).unwrap(), path);
+        write(&store, &run("b", &[(2, 4, 11.0)])).unwrap();
+        write(&store, &run("a", &[(1, 1, 5.5)])).unwrap();
+        let (runs, notes) = read(&store).unwrap();
+        assert!(notes.is_empty(), "{notes:?}");
+        let found = |run: &RunRecord| -> Vec<(u32, usize, f64)> {
+            let sets = run.sets.iter();
+            sets.map(|set| (set.set, set.images.len(), set.metrics.q))
+                .collect()
+        };
+        assert_eq!(runs.len(), 2);
+        assert_eq!(
+            (runs[0].configuration.as_str(), found(&runs[0])),
+            ("a", vec![(1, 1, 5.5)])
+        );
+        assert_eq!(found(&runs[1]), [(2, 4, 11.0), (7, 3, 20.0)]);
+        assert!(runs[0].sets[0].q_replicates[1].is_nan());
+        // Other results on as many images.
+        write(&store, &run("a", &[(1, 1, 6.5)])).unwrap();
+        let (_, notes) = read(&store).unwrap();
+        assert!(
+            notes.len() == 1 && notes[0].contains("repeats set 1"),
+            "{notes:?}"
+        );
+    }
+
+    #[test]
+    fn an_edited_file_and_an_empty_folder_are_noticed() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = folder.path().join("store");
+        let prepared = prepare(&store).unwrap();
+        let path = write(&store, &run("a", &[(1, 1, 5.5)])).unwrap();
+        let other = write(&store, &run("a", &[(1, 2, 6.5)])).unwrap();
+        std::fs::rename(other, path).unwrap();
+        let message = read(&store).unwrap_err().to_string();
+        assert!(
+            message.contains("changed after it was recorded"),
+            "{message}"
+        );
+        drop(prepared);
+        assert!(store.exists());
+        let empty = folder.path().join("empty");
+        drop(prepare(&empty).unwrap());
+        assert!(!empty.exists());
+    }
 }

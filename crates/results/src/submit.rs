@@ -1,4 +1,4 @@
-//! What is handed in: challenge files, packed for sending and checked before.
+//! Submissions to a challenge: their files, archives and checks.
 
 pub mod archive;
 pub mod challenge;

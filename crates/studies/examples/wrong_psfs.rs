@@ -13,7 +13,7 @@ use ndarray::{Array2, Array3, ArrayView3, Axis};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_measure::{Examination, FunctionalPsf, Measurer, Psfs, Warning, star_psf};
+use shearq_measure::{Examination, FunctionalPsf, ImageNoise, Measurer, Psfs, Warning, star_psf};
 use shearq_quantities::Shear;
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::render::RenderScratch;
@@ -69,8 +69,9 @@ fn measured(
     let psf = star_psf(star.view(), measurer.configuration().psf_cut())?;
     let side = |stamps: ArrayView3<'_, f32>| -> Result<_, Box<dyn Error>> {
         let mut worker = measurer.worker();
-        worker.set_survey(measurer.survey(stamps)?.as_ref());
-        Ok(worker.measure_each(stamps, Psfs::<f64>::Prepared(psf.view()), Some(NOISE_SIGMA))?)
+        let survey = measurer.survey(stamps)?;
+        let mut image = worker.image(ImageNoise::of(survey.as_ref(), Some(NOISE_SIGMA)));
+        Ok(image.measure_each(stamps, &Psfs::prepared(psf.view()))?)
     };
     let mut sides = [
         side(galaxies.sides[0].view())?,
@@ -108,8 +109,8 @@ fn warned(measurer: &Measurer, galaxies: &Galaxies, star: &Array2<f64>) -> Vec<W
             println!("{error}");
         }
     }
-    let psf = Psfs::Star(star.view());
-    examination.add_psfs(psf, measurer.configuration().psf_cut(), 1);
+    let psf = Psfs::star(star.view());
+    examination.add_psfs(&psf, measurer.configuration().psf_cut(), 1);
     examination.warnings()
 }
 

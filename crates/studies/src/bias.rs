@@ -2,17 +2,16 @@
 //!
 //! Every galaxy of an image is drawn eight times: with its intrinsic ellipticity e under shears of
 //! (γ, γ) and (−γ, −γ), with −e under (γ, −γ) and (−γ, γ), each with the same noise added and taken away.
-//! Intrinsic shapes and noise cancel but for second order, so that for each component
+//! Intrinsic shapes and noise cancel to second order, so that for each component
 //!
 //! ```text
 //! m_i = (⟨e_i⟩₊ − ⟨e_i⟩₋)/2γ_i − 1,   c_i = (⟨e_i⟩₊ + ⟨e_i⟩₋)/2,
 //! ```
 //!
-//! with m far better known than the scatter of one galaxy suggests. What one component of shear does to
-//! the other of an elliptical galaxy, which has no mean but scatters, is the same for e and −e and
-//! cancels too.
+//! The error of m is far smaller than the scatter of a galaxy suggests. One component of shear also changes the other
+//! component of an elliptical galaxy. This effect is the same for e and −e, so it cancels too.
 //!
-//! As in the simulated sets, lensing leaves a galaxy's flux as it is.
+//! As in the simulated sets, lensing does not change the flux of a galaxy.
 
 use serde::{Deserialize, Serialize};
 use shearq_measure::{Measurement, Measurer, Worker};
@@ -30,12 +29,12 @@ use shearq_simulate::set::{ImageFields, STAMP, SetSimulator, Version};
 /// Shear of each component.
 pub const SHEAR: f64 = 0.02;
 
-/// Biases of a submission on one kind of set.
+/// Biases of a configuration on one kind of set.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ShearBias {
-    /// Galaxies whose versions were all measured.
+    /// Galaxies of which all versions were measured.
     pub galaxies: u64,
-    /// The others, which m and c leave out.
+    /// Other galaxies, which m and c leave out.
     pub dropped: u64,
     /// Multiplicative bias per component.
     #[serde(deserialize_with = "nan_for_null")]
@@ -49,10 +48,10 @@ pub struct ShearBias {
     /// Standard errors.
     #[serde(deserialize_with = "nan_for_null")]
     pub c_error: [f64; 2],
-    /// Additive bias along the ellipticity of the PSF, in units of it; NaN for round PSFs.
+    /// Additive bias along the ellipticity of the PSF, divided by this ellipticity; NaN for round PSFs.
     #[serde(deserialize_with = "nan_for_null")]
     pub leakage: f64,
-    /// Its standard error.
+    /// Standard error of the leakage.
     #[serde(deserialize_with = "nan_for_null")]
     pub leakage_error: f64,
 }
@@ -75,7 +74,7 @@ const COUNT: f64 = VERSIONS.len() as f64;
 /// Biases of each measurer on the galaxies of `images` of a set.
 ///
 /// # Errors
-/// Threads that cannot be started.
+/// If threads cannot be started.
 pub fn biases(
     set: &SetSimulator,
     images: &[u32],
@@ -88,7 +87,7 @@ pub fn biases(
     engine::ordered(
         threads,
         |feeder| {
-            // Versions of galaxies are as broad and as noisy as those of the set.
+            // All versions have the size and noise of the galaxies of the set.
             feed(set, images, measurers, feeder)
         },
         || {
@@ -96,20 +95,16 @@ pub fn biases(
             (RenderScratch::new(), workers)
         },
         |(render, workers), job| {
-            let RowJob {
-                fields,
-                iy,
-                surveys,
-            } = job;
+            let RowJob { fields, iy, .. } = &job;
             let mut versions = Vec::with_capacity(VERSIONS.len());
             for version in VERSIONS {
-                let strip = draw(set, &fields, iy, version, render);
-                versions.push(measure_strip(set, &fields, iy, strip, workers, &surveys)?);
+                let strip = draw(set, fields, *iy, version, render);
+                versions.push(measure_strip(set, &job, strip, workers)?);
             }
             let found = (0..measurers.len()).map(|k| {
                 let mut sums = BiasSums::default();
                 for ix in 0..n {
-                    let psf = fields.psf.at(ix, iy).shape;
+                    let psf = fields.psf.at(ix, *iy).shape;
                     let galaxy = std::array::from_fn(|v| &versions[v][k].galaxies[ix]);
                     sums.add(galaxy, psf);
                 }
@@ -185,14 +180,14 @@ impl Mean {
     }
 }
 
-/// BiasSums over galaxies.
+/// Sums over galaxies.
 #[derive(Debug, Clone, Default)]
 struct BiasSums {
     galaxies: u64,
     dropped: u64,
-    /// Half the difference between +γ and −γ, over γ.
-    slope: [Mean; 2],
-    /// The same less the mean response over versions.
+    /// Derivative of the ellipticity with shear: half the difference between +γ and −γ, divided by γ.
+    shear_response: [Mean; 2],
+    /// The same minus the mean response over versions.
     surplus: [Mean; 2],
     /// Mean of all versions.
     offset: [Mean; 2],
@@ -218,11 +213,13 @@ impl BiasSums {
                 .iter()
                 .zip(e)
                 .map(|((_, signs, _), e)| signs[k] * e);
-            let slope = with_shear.sum::<f64>() / (COUNT * SHEAR);
-            let responses = versions.iter().map(|version| version.response[k]);
+            let shear_response = with_shear.sum::<f64>() / (COUNT * SHEAR);
+            let responses = versions
+                .iter()
+                .map(|version| version.response_diagonal()[k]);
             let response = responses.sum::<f64>() / COUNT;
-            self.slope[k].add(slope);
-            self.surplus[k].add(slope - response);
+            self.shear_response[k].add(shear_response);
+            self.surplus[k].add(shear_response - response);
             self.response[k].add(response);
             let offset = e.iter().sum::<f64>() / COUNT;
             self.offset[k].add(offset);
@@ -236,7 +233,7 @@ impl BiasSums {
         self.galaxies += other.galaxies;
         self.dropped += other.dropped;
         for (mine, other) in [
-            (&mut self.slope, &other.slope),
+            (&mut self.shear_response, &other.shear_response),
             (&mut self.surplus, &other.surplus),
             (&mut self.offset, &other.offset),
             (&mut self.response, &other.response),
@@ -261,12 +258,12 @@ impl BiasSums {
             )
         };
         let surplus = match calibration {
-            Calibration::None => &self.slope,
+            Calibration::None => &self.shear_response,
             Calibration::Response => &self.surplus,
         };
         let ((mut m, m_error), (c, c_error)) = (of(surplus), of(&self.offset));
         if calibration == Calibration::None {
-            m = m.map(|slope| slope - 1.0);
+            m = m.map(|response| response - 1.0);
         }
         let psf = self.psf.value(count) * (response[0] + response[1]) / 2.0;
         ShearBias {
@@ -293,7 +290,7 @@ mod tests {
     use shearq_simulate::set::SimulationSettings;
 
     #[test]
-    fn calibrated_ellipticities_recover_shear_and_leave_the_psf_behind() {
+    fn calibrated_ellipticities_recover_shear() {
         let registry = Registry::embedded().unwrap();
         let names = ["48/linear/star", "as-printed/23/raw/star"];
         let submissions = names.map(|name| registry.get(name).unwrap().configuration);
@@ -303,8 +300,8 @@ mod tests {
         let (calibrated, raw) = (&found[0], &found[1]);
         assert_eq!((calibrated.galaxies, calibrated.dropped), (1024, 0));
         for k in 0..2 {
-            // A thousand galaxies tell m to 0.002 and c to 0.0005. A response of the wrong component or of
-            // distortions is wrong by far more.
+            // A thousand galaxies determine m to 0.002 and c to 0.0005. The response of the wrong component or of
+            // distortions differs far more.
             assert!(calibrated.m_error[k] < 0.004, "{calibrated:?}");
             assert!(calibrated.c_error[k] < 0.001, "{calibrated:?}");
             let (m, c) = (calibrated.m[k], calibrated.c[k]);

@@ -1,36 +1,33 @@
-//! What can be reached: the Cramér–Rao bound on the scatter of ellipticities, and the Q that such scatter
-//! leaves.
+//! The Cramér–Rao bound on the scatter of ellipticities, and the expected Q at this scatter.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
-use shearq_fourier::Complex64;
 use shearq_quantities::Shear;
 use shearq_quantities::statistics::RunningMean;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::quality::quality;
-use shearq_scoring::{Bins, Convention, Definition};
+use shearq_scoring::{Bins, Complex64, Convention, Definition, ScoringError};
 
 use shearq_simulate::kinds::ImageType;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, Version};
 
-/// Ellipticity by which galaxies are changed to find how their images change.
+/// Step of ellipticity for the numerical derivative of an image.
 const STEP: f64 = 0.02;
-/// Galaxies looked at.
+/// Number of galaxies in the sample.
 const GALAXIES: usize = 1000;
-/// Cells from one of them to the next: a prime, so that none is looked at twice.
+/// Cells between sampled galaxies. It is a prime, so no galaxy is sampled twice.
 const STRIDE: usize = 7919;
-/// Fields of noise behind a mean Q, which scatters by a third of itself: the mean is good to 2 %.
+/// Number of noise fields for the mean Q. Q scatters by a third, so the mean has an error of 2 %.
 const TRIALS: u32 = 200;
 
-/// Least scatter per component that an unbiased ellipticity of the set's galaxies can have, on their
-/// full stamps with their noise: root mean square over galaxies.
+/// Smallest possible scatter per component of unbiased ellipticities, and its standard error from the sample of
+/// galaxies. It is the root mean square over galaxies on full stamps with their noise.
 ///
-/// For a nearly round galaxy the change of its image with one component of ε is orthogonal to its
-/// changes with the other, with flux, size and centre, so that none of these costs information:
-/// σ(ε) = σ/‖∂I/∂ε‖. `None` for bulges off their discs' centres: such a galaxy is not nearly round. The first number
-/// is the bound, the second its standard error, of the galaxies that happen to be looked at.
+/// For a nearly round galaxy the derivatives of its image with the components of ε are orthogonal to each other
+/// and to the derivatives with flux, size and centre. None of these parameters costs information, so
+/// σ(ε) = σ/‖∂I/∂ε‖. `None` for offset bulges, which are not nearly round.
 pub fn cramer_rao(set: &SetSimulator) -> Option<(f64, f64)> {
     if set.kind().image == ImageType::OffsetBulge {
         return None;
@@ -51,7 +48,7 @@ pub fn cramer_rao(set: &SetSimulator) -> Option<(f64, f64)> {
     let count = GALAXIES.min(n * n);
     let mut variances = RunningMean::default();
     for k in 0..count {
-        // All over the field, in which PSFs vary.
+        // Sample the whole field, because PSFs vary.
         let cell = k * STRIDE % (n * n);
         let at = (cell % n, cell / n);
         let mut variance = 0.0;
@@ -72,36 +69,37 @@ pub fn cramer_rao(set: &SetSimulator) -> Option<(f64, f64)> {
     Some((bound, 0.5 * error / bound))
 }
 
-/// Mean Q of a set's spectrum where its ellipticities have white noise of `scatter` per component in each
-/// of `images` images and nothing else, whose mean power is subtracted: what sample noise leaves of a
-/// perfect method.
-pub fn sample_limit(set: &SetSimulator, scatter: f64, images: u32) -> f64 {
+/// Expected Q of a perfect method: the mean Q of spectra whose only error is white noise of `scatter` per component
+/// in each of `images` images. The mean power of the noise is subtracted.
+///
+/// # Errors
+/// If the grids of truth and set differ.
+pub fn expected_q(set: &SetSimulator, scatter: f64, images: u32) -> Result<f64, ScoringError> {
     let grid = set.grid();
     let (decomposer, bins) = (
         Decomposer::new(grid),
         Bins::new(&grid, Definition::Leaderboard),
     );
     let truth = set.truth();
-    let shear = Convention::STANDARD.apply(&truth.g1, &truth.g2);
-    let modes = decomposer.decompose(shear.clone()).e;
-    let power = bins.power(&modes, &modes);
+    let shear = Convention::STANDARD.apply(&truth.g1, &truth.g2)?;
+    let modes = decomposer.decompose(shear.clone())?.e;
+    let power = bins.power(&modes, &modes)?;
     let variance = scatter * scatter / f64::from(images);
     let mean = bins.white_noise(variance);
     let mut rng = ChaCha8Rng::seed_from_u64(u64::from(set.kind().set));
     let normal = Normal::new(0.0, variance.sqrt()).expect("a finite scatter");
-    let total: f64 = (0..TRIALS)
-        .map(|_| {
-            let noisy = shear
-                .mapv(|g| g + Complex64::new(normal.sample(&mut rng), normal.sample(&mut rng)));
-            let modes = decomposer.decompose(noisy).e;
-            let mut found = bins.power(&modes, &modes);
-            for (found, mean) in found.iter_mut().zip(mean) {
-                *found -= mean;
-            }
-            quality(&bins, &found, &power).q
-        })
-        .sum();
-    total / f64::from(TRIALS)
+    let mut total = 0.0;
+    for _ in 0..TRIALS {
+        let noisy =
+            shear.mapv(|g| g + Complex64::new(normal.sample(&mut rng), normal.sample(&mut rng)));
+        let modes = decomposer.decompose(noisy)?.e;
+        let mut found = bins.power(&modes, &modes)?;
+        for (found, mean) in found.iter_mut().zip(mean) {
+            *found -= mean;
+        }
+        total += quality(&bins, &found, &power).q;
+    }
+    Ok(total / f64::from(TRIALS))
 }
 
 #[cfg(test)]
@@ -111,25 +109,25 @@ mod tests {
     use shearq_simulate::set::SimulationSettings;
 
     #[test]
-    fn the_bound_is_that_of_the_challenges_description() {
+    fn the_bound_agrees_with_the_challenge() {
         // Fiducial at S/N 20 and 10, small, large: two digits are given.
         for (set, expected) in [(2, 0.107), (5, 0.214), (14, 0.126), (16, 0.102)] {
             let simulator = simulator(set, SimulationSettings::new(3, 12)).unwrap();
             let (found, error) = cramer_rao(&simulator).unwrap();
             assert!((found / expected - 1.0).abs() < 0.02, "set {set}: {found}");
-            // One S/N and one profile: nothing but the ellipticities' spread is left.
+            // One S/N and one profile: only the spread of ellipticities remains.
             assert!(error / found < 0.005, "set {set}: {found} ± {error}");
         }
     }
 
     #[test]
-    fn the_sample_limit_is_that_of_the_challenges_description() {
-        // 200 images with scatter at the bound: 850, 2,200 and 4,900 are given for one shear field; Q of
-        // a field goes with its own power in the widest bins, which has few modes.
+    fn the_expected_q_agrees_with_the_challenge() {
+        // 200 images with scatter at the bound: 850, 2,200 and 4,900 are published for one shear field. Q
+        // depends on the power of this field in the widest bins, which have few modes.
         let mut limits = Vec::new();
         for (scatter, expected) in [(0.214, 850.0), (0.107, 2200.0), (0.054, 4900.0)] {
             let simulator = simulator(2, SimulationSettings::new(3, 100)).unwrap();
-            let found = sample_limit(&simulator, scatter, 200);
+            let found = expected_q(&simulator, scatter, 200).unwrap();
             assert!((found / expected - 1.0).abs() < 0.15, "{found} {expected}");
             limits.push(found);
         }

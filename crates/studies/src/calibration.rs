@@ -50,7 +50,7 @@ const fn log_lambda() -> [f64; 25] {
     values
 }
 
-/// LambdaSums over galaxies at one S/N, rule and λ.
+/// Sums over galaxies at one S/N, rule and λ.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct LambdaSums {
     /// Transitions that brought a neuron nearer to the truth.

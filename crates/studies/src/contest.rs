@@ -1,40 +1,42 @@
-//! Submissions held against each other and against what can be reached: scatter, bias, Q and cost.
+//! Configurations compared with each other and with the Cramér–Rao bound: scatter, bias, Q and cost.
 
 use serde::{Deserialize, Serialize};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_submissions::Configuration;
 
 use super::bias::{ShearBias, biases};
-use super::bound::{cramer_rao, sample_limit};
+use super::bound::{cramer_rao, expected_q};
 use super::reproduce::{ConfigurationResult, Plan, SetResult, Study};
 use super::speed;
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::data::run::{read_record, write_record};
+use shearq_pipeline::data::run::read_record;
 use shearq_pipeline::engine::Progress;
 use shearq_pipeline::run::measurers;
 use shearq_pipeline::simulate::simulator;
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_simulate::kinds::SetKind;
 
-/// Biases of all submissions on one set, and the bound on their scatter.
+/// Biases of all configurations on one set, and the bound on their scatter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SetBiases {
     /// Set number.
     pub set: u32,
-    /// Cramér–Rao bound on the scatter of ε per component, where there is one.
+    /// Cramér–Rao bound on the scatter of ε per component, if there is one.
     pub bound: Option<f64>,
-    /// Its standard error.
+    /// Standard error of the bound.
     pub bound_error: Option<f64>,
-    /// Mean Q of spectra of the plan's images with a scatter at the bound.
-    pub limit: Option<f64>,
-    /// One per submission, in the plan's order.
+    /// Expected Q for the images of the plan with a scatter at the bound.
+    #[serde(rename = "limit")]
+    pub expected_q: Option<f64>,
+    /// One per configuration, in the order of the plan.
     pub biases: Vec<ShearBias>,
 }
 
-/// Measures biases on the galaxies of `images` images of each set, keeping each set's result.
+/// Measures biases on the galaxies of `images` images of each set. The result of each set is written as soon as it
+/// is known; existing results are read.
 ///
 /// # Errors
-/// Where a file cannot be written, or read back.
+/// If a file cannot be written or read, or if the folder was removed meanwhile.
 pub fn bias_sets(
     study: &Study<'_>,
     sets: &[u32],
@@ -45,9 +47,10 @@ pub fn bias_sets(
     let &Study { plan, folder, .. } = study;
     let measurers = measurers(&plan.submissions)?;
     let numbers: Vec<u32> = (1..=images).collect();
+    let path = |set: u32| folder.join(format!("bias/set{set:02}-{images}.json"));
     let mut found = Vec::new();
     for &set in sets {
-        let path = folder.join(format!("bias/set{set:02}-{images}.json"));
+        let path = path(set);
         if let Some(result) = read_record::<SetBiases>(&path)? {
             found.push(result);
             progress.skip(u64::from(images) * (plan.simulation.grid as u64).pow(2));
@@ -56,23 +59,30 @@ pub fn bias_sets(
         let simulator = simulator(set, plan.simulation)?;
         progress.note(&format!("set {set:02}"));
         let (bound, bound_error) = cramer_rao(&simulator).unzip();
+        let expected_q = bound.map(|bound| expected_q(&simulator, bound, plan.images));
         let result = SetBiases {
             set,
             bound,
             bound_error,
-            limit: bound.map(|bound| sample_limit(&simulator, bound, plan.images)),
+            expected_q: expected_q
+                .transpose()
+                .map_err(|source| PipelineError::Scoring {
+                    set: Some(set),
+                    source,
+                })?,
             biases: biases(&simulator, &numbers, &measurers, threads, progress)?,
         };
-        write_record(&path, &result)?;
+        study.keep(&path, &result)?;
         found.push(result);
     }
+    study.check_results(sets.iter().map(|&set| path(set)))?;
     Ok(found)
 }
 
-/// Everything about every submission on every set.
+/// A row for each configuration on each set, and means over sets if there are several.
 ///
 /// # Errors
-/// Where a submission's sizes cannot be worked with.
+/// If the sizes of a configuration are invalid.
 pub fn contest_table(
     plan: &Plan,
     results: &[SetResult],
@@ -90,7 +100,7 @@ pub fn contest_table(
         }
     }
     if results.len() > 1 {
-        let limits: Vec<f64> = biases.iter().filter_map(|b| b.limit).collect();
+        let limits: Vec<f64> = biases.iter().filter_map(|b| b.expected_q).collect();
         let limit = limits.iter().sum::<f64>() / limits.len() as f64;
         for (k, configuration) in plan.submissions.iter().enumerate() {
             let mean = |value: &dyn Fn(&ConfigurationResult) -> (f64, f64), decimals: usize| {
@@ -114,7 +124,7 @@ pub fn contest_table(
     let headings = [
         ("set", "Set"),
         ("kind", "Kind"),
-        ("submission", "Submission"),
+        ("submission", "Configuration"),
         ("scatter", "scatter"),
         ("scatter_over_bound", "/ bound"),
         ("m1", "m1×10³"),
@@ -125,22 +135,22 @@ pub fn contest_table(
         ("unmeasured", "unmeasured"),
         ("q", "Q catalogue"),
         ("q_spectrum", "Q spectrum"),
-        ("q_limit", "limit"),
+        ("q_limit", "expected Q"),
         ("microseconds", "µs"),
     ];
     Ok(Table {
-        title: "Submissions against each other and the bound (simulated data)".into(),
+        title: "Configurations compared with each other and the bound (simulated data)".into(),
         headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
         rows,
         notes: vec![
-            "Scatter of ε per component after dividing by its slope, and over the Cramér–Rao bound of the galaxies (none for bulges off their discs' centres), which is that of a sample of them. Where S/N differ galaxies of low S/N count less, and the scatter can be below it.".into(),
-            "m and c from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign; leakage: c along the PSF's ellipticity; unmeasured: galaxies without ellipticity, which all of these leave out.".into(),
-            "Q of the catalogues, and of cross-spectra between groups of images, in which noise has no mean; leaderboard definition, standard convention. limit: mean Q that noise at the bound leaves of a perfect spectrum.".into(),
+            "Scatter of ε per component after division by its response, and its ratio to the Cramér–Rao bound of a sample of the galaxies. Offset bulges have no bound. If S/N differ, galaxies of low S/N count less, and the scatter can be below the bound.".into(),
+            "m and c: from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign. Leakage: c along the ellipticity of the PSF. Unmeasured: galaxies without ellipticity; they are left out.".into(),
+            "Q of the catalogues, and of cross-spectra between groups of images, which noise does not bias; leaderboard definition, standard convention. Expected Q: mean Q of a perfect method with noise at the bound.".into(),
         ],
     })
 }
 
-/// Two tables that fit on a page: scatter and biases; Q and cost.
+/// The table in two parts: scatter and biases; Q and cost.
 pub fn contest_parts(table: &Table) -> [Table; 2] {
     let (biases, quality) = table.notes.split_at(2);
     let shapes = [
@@ -200,12 +210,12 @@ fn row(
         Cell::number((own.response.flagged + biases.dropped) as f64, 0),
         Cell::with_error(own.score.metrics.q, Some(own.score.errors.q), 1),
         Cell::with_error(q_spectrum, Some(q_spectrum_error), 0),
-        Cell::number(bias.limit.unwrap_or(f64::NAN), 0),
+        Cell::number(bias.expected_q.unwrap_or(f64::NAN), 0),
         Cell::number(cost, 0),
     ]
 }
 
-/// Q of a submission's cross-spectrum and its error.
+/// Q of a configuration's cross-spectrum and its error.
 fn spectrum(result: &ConfigurationResult) -> (f64, f64) {
     (
         result.q_spectrum.unwrap_or(f64::NAN),

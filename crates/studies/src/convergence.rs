@@ -11,26 +11,26 @@ use shearq_render::figure::{LinePlot, PanelGrid, Series, Style};
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_simulate::set::SimulationSettings;
 
-/// Iterations at which the energy is taken.
+/// Iterations at which the energy is recorded.
 const ITERATIONS: [usize; 12] = [1, 2, 3, 4, 6, 8, 10, 15, 20, 30, 40, 80];
-/// Iterations with momentum whose energy stands for the lowest there is.
+/// Iterations with momentum that determine the minimum of the energy.
 const MANY: usize = 1500;
 /// Names of the two updates.
 const UPDATES: [&str; 2] = ["adaptive", "accelerated"];
 
-/// Energy left above the minimum and cost, update by update and over [`ITERATIONS`].
+/// Energy above the minimum and cost, for both updates and all [`ITERATIONS`].
 pub struct Convergence {
     configuration: String,
     /// Mean over galaxies of (E − E_min)/(E₀ − E_min).
     excess: [Vec<f64>; 2],
-    /// Microseconds a galaxy.
+    /// Microseconds per galaxy.
     cost: [Vec<f64>; 2],
 }
 
-/// Runs the submission's network on simulated fiducial stamps by both updates.
+/// Runs the network of a configuration on simulated fiducial stamps with both updates.
 ///
 /// # Errors
-/// Where the submission's sizes cannot be worked with.
+/// If the sizes of the configuration are invalid.
 pub fn convergence(
     configuration: &Configuration,
     settings: SimulationSettings,
@@ -98,7 +98,7 @@ pub fn convergence(
 }
 
 impl Convergence {
-    /// The figures as a table.
+    /// The numbers as a table.
     pub fn table(&self) -> Table {
         let rows = ITERATIONS.iter().enumerate().map(|(at, iterations)| {
             let mut row = vec![Cell::number(*iterations as f64, 0)];
@@ -148,7 +148,7 @@ impl Convergence {
             columns: 2,
             plots: vec![
                 panel("iterations", &|_| iterations.clone()),
-                panel("µs a galaxy", &|k| self.cost[k].clone()),
+                panel("µs per galaxy", &|k| self.cost[k].clone()),
             ],
         }
     }

@@ -1,4 +1,4 @@
-//! The paper's figures and tables from the studies' numbers.
+//! The figures and tables of the paper from the results of the studies.
 
 mod findings;
 mod lambda;

@@ -1,5 +1,6 @@
-//! Studies: the paper's Sect. 4 (calibration of λ) and Sect. 5 (seven submissions on 24 sets), submissions
-//! against each other and against what can be reached, convergence, speed.
+//! Studies on simulated data: calibration of λ (Sect. 4 of the paper), seven configurations on 24 sets (Sect. 5),
+//! configurations compared with each other and with the Cramér–Rao bound, convergence, speed.
+#![forbid(unsafe_code)]
 
 pub mod bias;
 pub mod bound;
@@ -10,3 +11,8 @@ pub mod exhibits;
 pub mod reproduce;
 pub mod response;
 pub mod speed;
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -1,4 +1,4 @@
-//! The paper's Sect. 5: submissions on simulated sets, set by set, resumable.
+//! The paper's Sect. 5: configurations on simulated sets, set by set, resumable.
 
 use std::path::{Path, PathBuf};
 
@@ -12,6 +12,7 @@ use shearq_submissions::{Configuration, checked_name};
 
 use super::response::{Regression, Response};
 use shearq_files::FileError;
+use shearq_measure::Measurer;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::run::{Claim, claim, nan_for_null, read_record, write_record};
 use shearq_pipeline::engine::Progress;
@@ -24,7 +25,7 @@ use shearq_results::score::{Basis, OWN, OddImages, ScoredSet};
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::set::SimulationSettings;
 
-/// What a run is made from.
+/// The settings of a study.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
     /// Version of shearq.
@@ -33,60 +34,83 @@ pub struct Plan {
     pub simulation: SimulationSettings,
     /// Images per set.
     pub images: u32,
-    /// Submissions, resolved.
+    /// All settings of the configurations.
     pub submissions: Vec<Configuration>,
 }
 
-/// A folder of results that belongs to a plan for as long as this lives.
+/// A folder of results that belongs to a plan for as long as this value exists.
 #[derive(Debug)]
 pub struct Study<'a> {
-    /// What is done.
+    /// The plan.
     pub plan: &'a Plan,
-    /// Where results are kept.
+    /// The folder.
     pub folder: &'a Path,
-    _claim: Claim,
+    claim: Claim,
 }
 
 impl<'a> Study<'a> {
-    /// Makes `folder` that of `plan`.
+    /// Claims `folder` for `plan`.
     ///
     /// # Errors
-    /// Where it holds results of another plan, or cannot be written to.
+    /// If the folder contains results of another plan, or cannot be written to.
     pub fn open(plan: &'a Plan, folder: &'a Path) -> Result<Self, FileError> {
         Ok(Study {
             plan,
             folder,
-            _claim: claim(&folder.join("plan.json"), plan)?,
+            claim: claim(&folder.join("plan.json"), plan)?,
         })
+    }
+
+    /// Checks that the folder is still the claimed one.
+    ///
+    /// # Errors
+    /// If it was removed or replaced.
+    pub fn check(&self) -> Result<(), FileError> {
+        self.claim.check()
+    }
+
+    /// Writes a result to a path of the folder. Writing would create a removed folder again, without the earlier
+    /// results, so the folder is checked first.
+    pub(super) fn keep<R: Serialize>(&self, path: &Path, result: &R) -> Result<(), FileError> {
+        self.check()?;
+        write_record(path, result)
+    }
+
+    /// Checks that the folder is still the claimed one and contains all `results`.
+    pub(super) fn check_results(
+        &self,
+        results: impl IntoIterator<Item = PathBuf>,
+    ) -> Result<(), FileError> {
+        self.claim.check_results(results)
     }
 }
 
-/// One submission on one set.
+/// One configuration on one set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ConfigurationResult {
-    /// Submission's name.
+    /// Name of the configuration.
     #[serde(deserialize_with = "checked_name")]
     #[serde(rename = "submission")]
     pub configuration: String,
     /// Its score in the standard convention, leaderboard definition.
     #[serde(flatten)]
     pub score: SetRecord,
-    /// Number of the convention that the truth would tell.
+    /// Number of the convention that correlates best with the truth.
     pub convention_matched: u8,
     /// E-mode bandpowers.
     pub ee: [f64; BINS],
-    /// Their standard errors, for the truth as it is; not numbers beyond the scored bins.
+    /// Standard errors of the bandpowers for a fixed truth; not numbers outside the scored bins.
     #[serde(deserialize_with = "nan_for_null")]
     pub ee_error: [f64; BINS],
     /// Q of the cross-spectrum of the images' groups, `None` for a single image.
     pub q_spectrum: Option<f64>,
-    /// Its standard error, `None` where it is not known: with fewer than eight images.
+    /// Standard error of this Q; `None` with fewer than eight images.
     pub q_spectrum_error: Option<f64>,
-    /// How ellipticities follow the true ones.
+    /// Regression of the ellipticities on the true ones.
     pub response: Response,
 }
 
-/// All submissions on one set.
+/// All configurations on one set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SetResult {
     /// Set number.
@@ -97,20 +121,20 @@ pub struct SetResult {
     pub l: [f64; BINS],
     /// Bandpowers of the true shear.
     pub true_ee: [f64; BINS],
-    /// One per submission, in the plan's order.
+    /// One per configuration, in the order of the plan.
     pub results: Vec<ConfigurationResult>,
 }
 
-/// Where a set's result is kept.
+/// The file of a set's result.
 fn result_path(folder: &Path, set: u32) -> PathBuf {
     folder.join(format!("sets/set{set:02}.json"))
 }
 
-/// Runs the submissions on `sets`, keeping each set's result as soon as it is there; results that are
-/// there already are read.
+/// Runs the configurations of the study on `sets`. The result of each set is written as soon as it is known;
+/// existing results are read.
 ///
 /// # Errors
-/// Where a file cannot be written, or read back.
+/// If a file cannot be written or read, or if the folder was removed meanwhile.
 pub fn run_sets(
     study: &Study<'_>,
     sets: &[u32],
@@ -118,7 +142,7 @@ pub fn run_sets(
     progress: &mut dyn Progress,
 ) -> Result<Vec<SetResult>, PipelineError> {
     let &Study { plan, folder, .. } = study;
-    // Submissions that differ in name alone are measured once.
+    // Configurations that differ only in name are measured once.
     let (distinct, place) = distinct(&plan.submissions);
     let measurers = measurers(&distinct)?;
     let mut results = Vec::new();
@@ -129,95 +153,117 @@ pub fn run_sets(
             results.push(result);
             continue;
         }
-        let scoring = |source| PipelineError::Scoring {
-            set: Some(set),
-            source,
-        };
-        let simulator = simulator(set, plan.simulation)?;
-        let grid = simulator.grid();
-        let images: Vec<u32> = (1..=plan.images).collect();
-        let mut sums: Vec<(SetImages, RowCounts)> = distinct
-            .iter()
-            .map(|_| (SetImages::new(&grid), RowCounts::default()))
-            .collect();
-        let mut regressions = vec![Regression::default(); distinct.len()];
-        run_set(
-            &simulator,
-            &images,
-            &measurers,
-            threads,
-            progress,
-            |image| {
-                let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
-                for (((sum, counts), regression), rows) in each {
-                    let (field, used) = field_sum(&grid, rows);
-                    sum.add(&field);
-                    *counts += used;
-                    let measured = rows.iter().flat_map(|row| &row.galaxies);
-                    regression.add(image.observed.iter().copied().zip(measured));
-                }
-                Ok(())
-            },
-        )?;
-        progress.note(&format!("set {set:02}"));
-        let options = Options {
-            noise: Noise::Measured,
-            choice: OWN,
-            ..Options::default()
-        };
-        let scorer = SetScorer::new(grid, simulator.truth(), options).map_err(scoring)?;
-        let scored = |(sum, rows): &(SetImages, RowCounts)| {
-            Ok(ScoredSet {
-                set: Some(set),
-                kind: SetKind::of(set),
-                images: images.clone(),
-                score: scorer.score(sum)?,
-                rows: *rows,
-                basis: Basis::Told,
-                sign: SignBasis::Specified,
-                findings: Vec::new(),
-                odd_images: OddImages::default(),
-            })
-        };
-        let scored: Vec<ScoredSet> = sums
-            .iter()
-            .map(scored)
-            .collect::<Result<_, _>>()
-            .map_err(scoring)?;
-        let responses: Vec<Response> = regressions.iter().map(Regression::response).collect();
-        let result = SetResult {
-            set,
-            images: plan.images,
-            l: scored[0].score.bins.l,
-            true_ee: scored[0].score.true_ee,
-            results: plan
-                .submissions
-                .iter()
-                .zip(&place)
-                .map(|(configuration, &at)| {
-                    let score = &scored[at].score;
-                    let spectrum = spectrum_quality(score, &sums[at].0);
-                    ConfigurationResult {
-                        configuration: configuration.name.clone(),
-                        // Of what is simulated the settings are the fingerprint: those of the plan.
-                        score: SetRecord::new(set, &scored[at], String::new()),
-                        convention_matched: score.matching.best().number(),
-                        ee: score.spectra().ee,
-                        ee_error: score.ee_error,
-                        q_spectrum: spectrum.map(|(q, _)| q),
-                        q_spectrum_error: spectrum.and_then(|(_, error)| error),
-                        response: responses[at],
-                    }
-                })
-                .collect(),
-        };
-        write_record(&path, &result)?;
+        let measured = measure_set(plan, set, &measurers, threads, progress)?;
+        let result = set_result(plan, set, &measured, &place);
+        study.keep(&path, &result)?;
         results.push(result);
     }
+    study.check_results(sets.iter().map(|&set| result_path(folder, set)))?;
     Ok(results)
 }
 
-/// Q of the cross-spectrum of `images`, with its error where that is known.
+/// The score of one distinct configuration on one set.
+struct MeasuredSet {
+    scored: ScoredSet,
+    spectrum: Option<(f64, Option<f64>)>,
+    response: Response,
+}
+
+/// Simulates the images of a set, measures them with all measurers and scores the results.
+fn measure_set(
+    plan: &Plan,
+    set: u32,
+    measurers: &[Measurer],
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Vec<MeasuredSet>, PipelineError> {
+    let scoring = |source| PipelineError::Scoring {
+        set: Some(set),
+        source,
+    };
+    let simulator = simulator(set, plan.simulation)?;
+    let grid = simulator.grid();
+    let images: Vec<u32> = (1..=plan.images).collect();
+    let mut sums = vec![(SetImages::new(&grid), RowCounts::default()); measurers.len()];
+    let mut regressions = vec![Regression::default(); measurers.len()];
+    run_set(
+        &simulator,
+        &images,
+        measurers,
+        threads,
+        progress,
+        |image, _| {
+            let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
+            for (((sum, counts), regression), rows) in each {
+                let (field, used) = field_sum(&grid, rows);
+                sum.add(&field).map_err(scoring)?;
+                *counts += used;
+                let measured = rows.iter().flat_map(|row| &row.galaxies);
+                regression.add(image.observed.iter().copied().zip(measured));
+            }
+            Ok(())
+        },
+    )?;
+    progress.note(&format!("set {set:02}"));
+    let options = Options {
+        noise: Noise::Measured,
+        choice: OWN,
+        ..Options::default()
+    };
+    let scorer = SetScorer::new(grid, simulator.truth(), options).map_err(scoring)?;
+    let score = |((sum, rows), regression): (&(SetImages, RowCounts), &Regression)| {
+        let score = scorer.score(sum).map_err(scoring)?;
+        Ok(MeasuredSet {
+            spectrum: spectrum_quality(&score, sum),
+            scored: ScoredSet {
+                set: Some(set),
+                kind: SetKind::of(set),
+                images: images.clone(),
+                score,
+                rows: *rows,
+                basis: Basis::Given,
+                sign: SignBasis::Specified,
+                findings: Vec::new(),
+                odd_images: OddImages::default(),
+            },
+            response: regression.response(),
+        })
+    };
+    sums.iter().zip(&regressions).map(score).collect()
+}
+
+/// The record of a set. `place` has the index in `measured` of each configuration of the plan.
+fn set_result(plan: &Plan, set: u32, measured: &[MeasuredSet], place: &[usize]) -> SetResult {
+    let result = |(configuration, &at): (&Configuration, &usize)| {
+        let MeasuredSet {
+            scored,
+            spectrum,
+            response,
+        } = &measured[at];
+        let score = &scored.score;
+        ConfigurationResult {
+            configuration: configuration.name.clone(),
+            // The settings of the plan identify simulated data, so there is no fingerprint.
+            score: SetRecord::new(set, scored, String::new()),
+            convention_matched: score.matching.best().number(),
+            ee: score.spectra().ee,
+            ee_error: score.ee_error,
+            q_spectrum: spectrum.map(|(q, _)| q),
+            q_spectrum_error: spectrum.and_then(|(_, error)| error),
+            response: *response,
+        }
+    };
+    let first = &measured[place[0]].scored.score;
+    SetResult {
+        set,
+        images: plan.images,
+        l: first.bins.l,
+        true_ee: first.true_ee,
+        results: plan.submissions.iter().zip(place).map(result).collect(),
+    }
+}
+
+/// Q of the cross-spectrum of `images`, with its error if it is known.
 fn spectrum_quality(score: &SetScore, images: &SetImages) -> Option<(f64, Option<f64>)> {
     let cross = cross_spectrum(&score.grid, images, Convention::STANDARD).ok()?;
     let truth = &score.true_ee;
@@ -228,7 +274,7 @@ fn spectrum_quality(score: &SetScore, images: &SetImages) -> Option<(f64, Option
     Some((quality(&cross.bins, &cross.power, truth).q, error))
 }
 
-/// Submissions without repetition, and the place of each one given among them.
+/// The configurations without repetition, and the index among them of each given one.
 fn distinct(submissions: &[Configuration]) -> (Vec<Configuration>, Vec<usize>) {
     let mut kept: Vec<Configuration> = Vec::new();
     let mut place = Vec::new();
@@ -248,12 +294,12 @@ fn distinct(submissions: &[Configuration]) -> (Vec<Configuration>, Vec<usize>) {
     (kept, place)
 }
 
-/// One image's measurements on the grid, and how they were used; flagged galaxies count as missing.
+/// The measurements of one image on the grid, and how the rows were used. Flagged galaxies count as missing.
 fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> (FieldSum, RowCounts) {
     let mut sum = FieldSum::new(grid);
     let galaxies = rows.iter().flat_map(|row| {
         row.galaxies.iter().enumerate().map(|(ix, galaxy)| {
-            let (x, y) = row.mosaic.centre(ix, row.iy);
+            let (x, y) = row.head.mosaic.centre(ix, row.iy);
             Row {
                 x,
                 y,
@@ -264,4 +310,80 @@ fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> (FieldSum, RowCounts) {
     });
     let counts = sum.add_image(grid, galaxies);
     (sum, counts)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shearq_pipeline::engine::Quiet;
+    use shearq_submissions::Registry;
+
+    fn plan(names: &[&str]) -> Plan {
+        let registry = Registry::embedded().unwrap();
+        let configuration = |name: &&str| registry.get(name).unwrap().configuration;
+        Plan {
+            version: "test".into(),
+            simulation: SimulationSettings::new(5, 12),
+            images: 2,
+            submissions: names.iter().map(configuration).collect(),
+        }
+    }
+
+    /// Removes the folder as soon as the set is measured.
+    struct Remover<'a>(&'a Path);
+
+    impl Progress for Remover<'_> {
+        fn advance(&mut self, _: u64) {}
+
+        fn note(&mut self, _: &str) {
+            std::fs::remove_dir_all(self.0).unwrap();
+        }
+
+        fn warn(&mut self, _: &str) {}
+    }
+
+    #[test]
+    fn a_removed_folder_is_an_error_and_is_not_made_again() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("study");
+        let plan = plan(&["23/raw/star"]);
+        let study = Study::open(&plan, &folder).unwrap();
+        study.check().unwrap();
+        let error = run_sets(&study, &[2], 1, &mut Remover(&folder)).unwrap_err();
+        let message = error.to_string();
+        assert!(message.contains("removed or replaced"), "{message}");
+        assert!(study.check().is_err());
+        assert!(!folder.exists());
+    }
+
+    #[test]
+    fn results_are_kept_and_read_again() {
+        let root = tempfile::tempdir().unwrap();
+        let plan = plan(&["23/raw/star", "23/den/star"]);
+        let study = Study::open(&plan, root.path()).unwrap();
+        let first = run_sets(&study, &[2], 1, &mut Quiet).unwrap();
+        assert_eq!(first[0].results.len(), 2);
+        assert_eq!(first[0].results[1].configuration, "23/den/star");
+        let text = |results: &[SetResult]| serde_json::to_string(results).unwrap();
+        let again = run_sets(&study, &[2], 1, &mut Quiet).unwrap();
+        assert_eq!(text(&again), text(&first));
+        // A result that is missing at the end is an error.
+        std::fs::remove_file(result_path(root.path(), 2)).unwrap();
+        assert!(study.check_results([result_path(root.path(), 2)]).is_err());
+    }
+
+    #[test]
+    fn configurations_that_differ_only_in_name_are_measured_once() {
+        let registry = Registry::embedded().unwrap();
+        let raw = registry.get("23/raw/star").unwrap().configuration;
+        let den = registry.get("23/den/star").unwrap().configuration;
+        let renamed = Configuration {
+            name: "mine".into(),
+            description: "The same under another name".into(),
+            ..raw.clone()
+        };
+        let (kept, place) = distinct(&[raw.clone(), den.clone(), renamed]);
+        assert_eq!(place, [0, 1, 0]);
+        assert_eq!(kept, [raw, den]);
+    }
 }

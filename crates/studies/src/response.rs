@@ -1,4 +1,4 @@
-//! How measured ellipticities follow the true ones, galaxy by galaxy.
+//! Regression of measured on true ellipticities, galaxy by galaxy.
 
 use serde::{Deserialize, Serialize};
 use shearq_measure::Measurement;
@@ -15,7 +15,7 @@ pub struct Regression {
     components: [PairSums; 2],
 }
 
-/// PairSums over galaxies of one component.
+/// Sums over galaxies of one component.
 #[derive(Debug, Clone, Copy, Default)]
 struct PairSums {
     t: f64,
@@ -25,7 +25,7 @@ struct PairSums {
     ee: f64,
 }
 
-/// What a regression finds.
+/// The result of a regression.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Response {
     /// Galaxies used.
@@ -70,7 +70,7 @@ impl Regression {
         }
     }
 
-    /// The fit; not a number where there are too few galaxies.
+    /// The fit; not a number if there are too few galaxies.
     pub fn response(&self) -> Response {
         let n = self.galaxies as f64;
         let mut response = Response {
@@ -139,17 +139,9 @@ mod tests {
 
     /// A galaxy without flags.
     fn measured(e1: f64, e2: f64) -> Measurement {
-        Measurement {
-            e1,
-            e2,
-            flags: Flags::NONE,
-            response: [f64::NAN; 2],
-            descent: None,
-            noise: 1.0,
-            flux: 1.0,
-            radius: 1.0,
-            size: 1.0,
-        }
+        let mut galaxy = Measurement::flagged(Flags::NONE);
+        (galaxy.e1, galaxy.e2) = (e1, e2);
+        galaxy
     }
 
     #[test]

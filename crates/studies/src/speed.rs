@@ -9,7 +9,7 @@ use shearq_measure::parts::{
     AdaptiveMoments, ClippedAcf, Matrices, Network, Rule, Spectral, StampFft, Step, WaveletWiener,
     border_noise,
 };
-use shearq_measure::{Measurer, StampNoise};
+use shearq_measure::{ImageNoise, Measurer, StampNoise};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::{
@@ -35,14 +35,14 @@ use shearq_results::score::{COLUMNS, score_files};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, SimulationSettings};
 
-/// Different noisy galaxies that a timing runs through, so that no branch is learnt by heart.
+/// Number of different galaxies per timing, so that branches are not predictable.
 const SAMPLE: usize = 64;
-/// Longest time spent on one figure.
+/// Longest time per timing.
 const BUDGET: Duration = Duration::from_millis(400);
 /// Stamp sizes of the table of costs.
 pub const SIZES: [usize; 8] = [11, 15, 19, 23, 29, 33, 39, 48];
 
-/// Microseconds a call: the fastest of several passes over `SAMPLE` galaxies, after a warm-up.
+/// Microseconds per call: the fastest of several passes over `SAMPLE` galaxies, after a warm-up.
 pub(super) fn time(mut call: impl FnMut(usize)) -> f64 {
     for k in 0..SAMPLE {
         call(k);
@@ -64,14 +64,14 @@ fn view(stamp: &[f32]) -> ArrayView2<'_, f32> {
     ArrayView2::from_shape((STAMP, STAMP), stamp).expect("a stamp of the set's size")
 }
 
-/// Settings of a submission's network.
+/// Settings of a configuration's network.
 ///
 /// # Errors
-/// Where it has the linear method.
+/// If it has the linear method.
 pub(super) fn network_of(configuration: &Configuration) -> Result<&NetworkMethod, PipelineError> {
     configuration.network().ok_or_else(|| {
         PipelineError::Request(format!(
-            "submission {} has method = \"linear\"; expected \"network\"",
+            "configuration {} has method = \"linear\"; expected \"network\"",
             configuration.name
         ))
     })
@@ -104,22 +104,24 @@ impl Inputs {
         fields.psf.at(0, 0).stamp_beside(cut.into().size, STAMP)
     }
 
-    /// Microseconds of a whole measurement, the PSF being taken already.
+    /// Microseconds of a whole measurement of a galaxy whose PSF is set.
     fn whole(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
         let psf = self.psf(configuration.psf_cut());
         let mut worker = Measurer::new(configuration, STAMP)?.worker();
-        worker.set_psf(psf.view())?;
+        let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
+        let mut worker = image.psf(psf.view())?;
         Ok(time(|k| {
-            let _ = black_box(worker.measure(view(&self.stamps[k]), Some(NOISE_SIGMA)));
+            let _ = black_box(worker.measure(view(&self.stamps[k])));
         }))
     }
 
-    /// Microseconds of taking a PSF.
+    /// Microseconds of setting a PSF.
     fn taking_a_psf(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
         let psf = self.psf(configuration.psf_cut());
         let mut worker = Measurer::new(configuration, STAMP)?.worker();
+        let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
         Ok(time(|_| {
-            let _ = worker.set_psf(black_box(psf.view()));
+            let _ = image.psf(black_box(psf.view()));
         }))
     }
 
@@ -129,10 +131,10 @@ impl Inputs {
     }
 }
 
-/// Microseconds of a whole measurement by `submission`, the PSF being taken already.
+/// Microseconds of a whole measurement of a galaxy whose PSF is set.
 ///
 /// # Errors
-/// Where the submission's sizes cannot be worked with.
+/// If the sizes of the configuration are invalid.
 pub fn whole(
     configuration: &Configuration,
     settings: SimulationSettings,
@@ -140,10 +142,10 @@ pub fn whole(
     Inputs::new(settings)?.whole(configuration)
 }
 
-/// Cost of each stage of a measurement by `submission`, and of simulating the galaxy.
+/// Cost of each stage of a measurement, and of simulating the galaxy.
 ///
 /// # Errors
-/// Where the submission's sizes cannot be worked with.
+/// If the sizes of the configuration are invalid.
 pub fn stages(
     configuration: &Configuration,
     settings: SimulationSettings,
@@ -199,7 +201,7 @@ pub fn stages(
     rows.push((rest, whole - stages));
     rows.push(("whole measurement", whole));
     let taken = inputs.taking_a_psf(configuration)?;
-    rows.push(("take a PSF, where each galaxy has its own", taken));
+    rows.push(("set the PSF, if each galaxy has its own", taken));
     rows.push((
         "simulate",
         time(|k| {
@@ -214,8 +216,8 @@ pub fn stages(
         title: format!("Stages of {}", configuration.name),
         headings: vec![
             Heading::new("stage", "Stage"),
-            Heading::new("microseconds", "µs a galaxy"),
-            Heading::new("per_second", "galaxies a second"),
+            Heading::new("microseconds", "µs per galaxy"),
+            Heading::new("per_second", "galaxies per second"),
         ],
         rows: rows
             .into_iter()
@@ -338,7 +340,7 @@ fn linear_stages(
 /// the sizes of stamp and PSF.
 ///
 /// # Errors
-/// Where a size cannot be worked with.
+/// If a size is invalid.
 pub fn operator_forms(settings: SimulationSettings) -> Result<Table, PipelineError> {
     let inputs = Inputs::new(settings)?;
     let mut rows = Vec::new();
@@ -406,7 +408,7 @@ pub fn operator_forms(settings: SimulationSettings) -> Result<Table, PipelineErr
             Heading::new("fft_microseconds", "by FFT [µs]"),
         ],
         rows,
-        notes: vec!["Direct sums count all p²n² products, of which the kernel skips those beyond the stamp. The FFT form has no room for the rest of an iteration.".into()],
+        notes: vec!["Direct sums count all p²n² products, although the kernel skips products beyond the stamp. The FFT form does not include the rest of an iteration.".into()],
     })
 }
 
@@ -421,7 +423,7 @@ fn centre(stamp: &[f32], n: usize) -> Vec<f32> {
 /// Cost of a whole measurement against stamp size, in µs over [`SIZES`].
 ///
 /// # Errors
-/// Where the submission's sizes cannot be worked with.
+/// If the sizes of the configuration are invalid.
 pub fn size_costs(
     configuration: &Configuration,
     settings: SimulationSettings,
@@ -437,7 +439,7 @@ pub fn size_costs(
         .collect()
 }
 
-/// Costs against stamp size of several submissions as a table.
+/// Costs against stamp size of several configurations as a table.
 pub fn sizes_table(costs: &[(&str, Vec<f64>)]) -> Table {
     let mut rows = Vec::new();
     for (name, costs) in costs {
@@ -453,10 +455,10 @@ pub fn sizes_table(costs: &[(&str, Vec<f64>)]) -> Table {
     Table {
         title: "Cost against stamp size".into(),
         headings: vec![
-            Heading::new("submission", "Submission"),
+            Heading::new("submission", "Configuration"),
             Heading::new("stamp", "Stamp [px]"),
-            Heading::new("microseconds", "µs a galaxy"),
-            Heading::new("nanoseconds_per_pixel", "ns a pixel"),
+            Heading::new("microseconds", "µs per galaxy"),
+            Heading::new("nanoseconds_per_pixel", "ns per pixel"),
         ],
         rows,
         notes: Vec::new(),
@@ -469,7 +471,7 @@ pub fn sizes_figure(costs: &[(&str, Vec<f64>)]) -> LinePlot {
     LinePlot {
         title: "Cost against stamp size".into(),
         x_label: "stamp [px]".into(),
-        y_label: "µs a galaxy".into(),
+        y_label: "µs per galaxy".into(),
         series: costs
             .iter()
             .enumerate()
@@ -484,7 +486,7 @@ pub fn sizes_figure(costs: &[(&str, Vec<f64>)]) -> LinePlot {
 /// Rate of simulating and measuring in memory against the number of threads.
 ///
 /// # Errors
-/// Where the submission's sizes cannot be worked with or threads cannot be started.
+/// If the sizes of the configuration are invalid, or if threads cannot be started.
 pub fn scaling(
     configuration: &Configuration,
     settings: SimulationSettings,
@@ -497,9 +499,14 @@ pub fn scaling(
         let mut best = 0.0f64;
         for _ in 0..3 {
             let start = Instant::now();
-            run_set(&inputs.set, &[1], &measurers, threads, &mut Quiet, |_| {
-                Ok(())
-            })?;
+            run_set(
+                &inputs.set,
+                &[1],
+                &measurers,
+                threads,
+                &mut Quiet,
+                |_, _| Ok(()),
+            )?;
             best = best.max(galaxies / start.elapsed().as_secs_f64());
         }
         Ok(best)
@@ -522,7 +529,7 @@ pub fn scaling(
         title: format!("Simulating and measuring {} in memory", configuration.name),
         headings: vec![
             Heading::new("threads", "Threads"),
-            Heading::new("per_second", "galaxies a second"),
+            Heading::new("per_second", "galaxies per second"),
             Heading::new("speed_up", "speed-up"),
         ],
         rows,
@@ -533,7 +540,7 @@ pub fn scaling(
 /// Rate of scoring a set of 10,000-row catalogues from each format, in a temporary folder.
 ///
 /// # Errors
-/// Where the files cannot be written or read.
+/// If the files cannot be written or read.
 pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
     let folder = Scratch::new()?;
     let side = 100;
@@ -589,12 +596,12 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
     Ok(Table {
         title: format!("Scoring {images} catalogues of 10,000 rows, {threads} thread(s)"),
         headings: vec![
-            Heading::new("format", "FileFormat"),
+            Heading::new("format", "Format"),
             Heading::new("seconds", "seconds"),
-            Heading::new("million_rows_per_second", "million rows a second"),
+            Heading::new("million_rows_per_second", "million rows per second"),
         ],
         rows,
-        notes: vec!["Reading, adding up, spectra of eight conventions, jackknife.".into()],
+        notes: vec!["Reading, summing, spectra of eight conventions, jackknife.".into()],
     })
 }
 

@@ -1,15 +1,14 @@
-//! Bins, powers, fits and errors against plain reckoning from their definitions.
+//! Bins, powers, fits and errors against direct evaluation of their definitions.
 
 use std::f64::consts::PI;
 
 use ndarray::Array2;
-use shearq_fourier::Complex64;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::quality::{bias, bias_fits, quality, quality_error};
 use shearq_scoring::resample::{PairedDifference, PairedSet, mean_over_sets, paired_difference};
 use shearq_scoring::{
-    BINS, Bins, Choice, Convention, Definition, FieldSum, Grid, Noise, Options, Row, RowCounts,
-    SCORED, SetImages, SetScorer, TrueShear, TruthSign, measured_bandpowers,
+    BINS, Bins, Choice, Complex64, Convention, Definition, FieldSum, Grid, Noise, Options, Row,
+    RowCounts, RowFault, SCORED, SetImages, SetScorer, TrueShear, TruthSign, measured_bandpowers,
 };
 
 use crate::common::{Content, Normal, field, rows, truth};
@@ -67,19 +66,23 @@ fn close(found: f64, expected: f64, what: &str) {
 }
 
 #[test]
-fn bins_and_powers_are_those_of_their_definitions() {
+fn bins_and_powers_agree_with_their_definitions() {
     for (n, seed) in [(24, 1), (25, 2), (40, 3)] {
         let grid = Grid::great10(n).unwrap();
         let side = 10.0 * PI / 180.0;
         let width = 36.0 * (n as f64 - 1.0) / 19.0;
         let decomposer = Decomposer::new(grid);
-        let a = decomposer.decompose(field(&grid, Content::Mixed, seed)).e;
+        let a = decomposer
+            .decompose(field(&grid, Content::Mixed, seed))
+            .unwrap()
+            .e;
         let b = decomposer
             .decompose(field(&grid, Content::Mixed, seed + 50))
+            .unwrap()
             .b;
         for definition in [Definition::Leaderboard, Definition::Corrected] {
             let bins = Bins::new(&grid, definition);
-            let (power, white) = (bins.power(&a, &b), bins.white_noise(0.09));
+            let (power, white) = (bins.power(&a, &b).unwrap(), bins.white_noise(0.09));
             close(bins.width, width, "width");
             let all = binned(n, definition);
             // The multipole that stands for a bin.
@@ -159,9 +162,9 @@ fn white_noise_drawn_has_the_power_that_is_stated() {
             let noise = Array2::from_shape_fn((40, 40), |_| {
                 Complex64::new(sigma * normal.draw(), sigma * normal.draw())
             });
-            let modes = decomposer.decompose(noise);
+            let modes = decomposer.decompose(noise).unwrap();
             let (power, stated) = (
-                bins.power(&modes.e, &modes.e),
+                bins.power(&modes.e, &modes.e).unwrap(),
                 bins.white_noise(sigma * sigma),
             );
             ratio += SCORED.map(|b| power[b] / stated[b]).sum::<f64>() / (8.0 * 40.0);
@@ -172,7 +175,7 @@ fn white_noise_drawn_has_the_power_that_is_stated() {
 }
 
 #[test]
-fn figures_of_merit_are_those_of_their_definitions() {
+fn metrics_agree_with_their_definitions() {
     let grid = Grid::great10(32).unwrap();
     let bins = Bins::new(&grid, Definition::Leaderboard);
     let side = 10.0 * PI / 180.0;
@@ -213,7 +216,7 @@ fn figures_of_merit_are_those_of_their_definitions() {
     let line: [f64; BINS] = std::array::from_fn(|b| truth[b] * 1.2 - 7e-6);
     let fit = bias(&line, &truth, |_| 2.0);
     close(fit.M, 0.2, "M");
-    close(fit.m, 0.1, "M/2");
+    close(fit.m_half, 0.1, "M/2");
     close(fit.A, -1.4e-5, "A");
     close(fit.sqrtA, -(1.4e-5_f64.sqrt()), "sqrt A");
     let fits = bias_fits(&bins, side, &measured, &truth);
@@ -326,27 +329,7 @@ fn sum_of(grid: &Grid, rows: &[Row]) -> (FieldSum, RowCounts) {
 }
 
 #[test]
-fn sums_of_images_add_and_come_apart_again() {
-    let grid = Grid::great10(8).unwrap();
-    let images: Vec<FieldSum> = (0..3)
-        .map(|k| sum_of(&grid, &rows(&grid, &field(&grid, Content::Mixed, k))[..60]).0)
-        .collect();
-    let mut all = FieldSum::new(&grid);
-    images.iter().for_each(|image| all.merge(image));
-    assert_eq!(all.images, 3);
-    let rest = all.without(&images[1]);
-    assert_eq!(rest.images, 2);
-    for at in [(0, 0), (3, 5), (7, 2), (7, 7)] {
-        close(all.e1[at], images.iter().map(|i| i.e1[at]).sum(), "e1");
-        assert!((rest.e1[at] - images[0].e1[at] - images[2].e1[at]).abs() < 1e-15);
-        assert!((rest.e2[at] - images[0].e2[at] - images[2].e2[at]).abs() < 1e-15);
-        assert_eq!(rest.count[at], images[0].count[at] + images[2].count[at]);
-    }
-    assert_eq!(all.count.sum(), 180.0);
-}
-
-#[test]
-fn every_row_is_counted_once_for_what_became_of_it() {
+fn every_row_is_counted_once() {
     let grid = Grid::great10(8).unwrap();
     let row = |cell: usize, e1: f64, e2: f64| {
         let (x, y) = grid.centre(cell % 8, cell / 8);
@@ -403,74 +386,44 @@ fn every_row_is_counted_once_for_what_became_of_it() {
 }
 
 #[test]
-fn rows_that_are_not_what_they_should_be_are_refused_and_odd_ones_told() {
-    let grid = Grid::great10(8).unwrap();
+fn rows_that_are_not_ellipticities_are_a_fault() {
     let good = RowCounts {
         used: 64,
         ..RowCounts::default()
     };
-    assert_eq!(good.fault(&grid), None);
-    assert!(good.oddities("x").is_empty());
+    assert_eq!(good.fault(), None);
     let sentinel = RowCounts {
         sentinels: 3,
         first_sentinel: Some((7, -99.0, 99.0)),
         ..good
     };
-    let fault = sentinel.fault(&grid).unwrap();
-    for words in ["3 rows have a whole number", "row 7 with (-99, 99)"] {
-        assert!(fault.contains(words), "{fault}");
-    }
-    let outliers = |absurd| RowCounts {
-        absurd,
-        first_absurd: Some((2, 7.5, 0.1)),
+    let first = (7, -99.0, 99.0);
+    assert_eq!(
+        sentinel.fault(),
+        Some(RowFault::Sentinels { rows: 3, first })
+    );
+    let first = (2, 7.5, 0.1);
+    let outliers = |rows| RowCounts {
+        absurd: rows,
+        first_absurd: Some(first),
         ..good
     };
-    assert_eq!(outliers(3).fault(&grid), None);
-    let fault = outliers(4).fault(&grid).unwrap();
-    for words in ["4 of 64 rows have |e| > 5", "row 2 with (7.5, 0.1)"] {
-        assert!(fault.contains(words), "{fault}");
-    }
-    let half = RowCounts {
-        repeated: 32,
+    assert_eq!(outliers(3).fault(), None);
+    let (rows, used) = (4, 64);
+    assert_eq!(
+        outliers(4).fault(),
+        Some(RowFault::Absurd { rows, used, first })
+    );
+    let repeated = |rows| RowCounts {
+        repeated: rows,
         ..good
     };
-    assert_eq!(half.fault(&grid), None);
-    let fault = RowCounts {
-        repeated: 33,
-        ..good
-    }
-    .fault(&grid)
-    .unwrap();
-    for words in ["33 of 64 rows", "48 px", "8 × 8 grid"] {
-        assert!(fault.contains(words), "{fault}");
-    }
-    let odd = RowCounts {
-        used: 50,
-        outside: 1,
-        excess: 2,
-        not_finite: 3,
-        repeated: 4,
-        missing: 15,
-        above_one: 5,
-        absurd: 2,
-        ..RowCounts::default()
-    };
-    let lines = odd.oddities("set 7");
-    let expected = [
-        "set 7 has 1 row outside the grid and 2 beyond",
-        "4 rows of set 7",
-        "15 of 64 galaxies of set 7 are not in the catalogues",
-        "5 rows of set 7 with |e| > 1, 2 with |e| > 5",
-        "3 of 53 galaxies of set 7 have no ellipticity",
-    ];
-    assert_eq!(lines.len(), expected.len());
-    for (line, words) in lines.iter().zip(expected) {
-        assert!(line.contains(words), "{line}");
-    }
-    let outside = RowCounts { outside: 1, ..good };
-    assert_eq!(outside.oddities("x").len(), 1);
-    let excess = RowCounts { excess: 1, ..good };
-    assert_eq!(excess.oddities("x").len(), 1);
+    assert_eq!(repeated(32).fault(), None);
+    let rows = 33;
+    assert_eq!(
+        repeated(33).fault(),
+        Some(RowFault::Repeated { rows, used })
+    );
 }
 
 #[test]
@@ -506,7 +459,7 @@ fn truth_must_fill_the_grid_once_and_may_be_constant() {
 }
 
 #[test]
-fn biases_of_the_galaxies_are_least_squares_with_their_weights() {
+fn biases_of_galaxies_are_least_squares() {
     let grid = Grid::great10(12).unwrap();
     let shear = field(&grid, Content::E, 4);
     let mut images = SetImages::new(&grid);
@@ -526,7 +479,7 @@ fn biases_of_the_galaxies_are_least_squares_with_their_weights() {
                 kept.push(Row { e1, e2, ..row });
             }
         }
-        images.add(&sum_of(&grid, &kept).0);
+        images.add(&sum_of(&grid, &kept).0).unwrap();
     }
     let options = Options {
         choice: Choice::Insist(Convention::STANDARD),
@@ -540,9 +493,9 @@ fn biases_of_the_galaxies_are_least_squares_with_their_weights() {
         let count = pairs.len() as f64;
         let mean = |of: &dyn Fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>() / count;
         let (g, e) = (mean(&|p| p.0), mean(&|p| p.1));
-        let slope = mean(&|p| (p.0 - g) * (p.1 - e)) / mean(&|p| (p.0 - g).powi(2));
-        assert!((m - (slope - 1.0)).abs() < 1e-12, "{m} {slope}");
-        assert!((c - (e - slope * g)).abs() < 1e-14, "{c}");
+        let response = mean(&|p| (p.0 - g) * (p.1 - e)) / mean(&|p| (p.0 - g).powi(2));
+        assert!((m - (response - 1.0)).abs() < 1e-12, "{m} {response}");
+        assert!((c - (e - response * g)).abs() < 1e-14, "{c}");
     }
     close(score.noise_variance.unwrap(), 1e-4, "noise as given");
     // The submission's spectrum, without truth.
@@ -571,7 +524,7 @@ fn biases_of_the_galaxies_are_least_squares_with_their_weights() {
 }
 
 #[test]
-fn what_cannot_be_scored_is_refused() {
+fn invalid_input_is_refused() {
     let grid = Grid::great10(8).unwrap();
     let shear = truth(&field(&grid, Content::E, 1));
     for variance in [-1e-9, f64::NAN, f64::INFINITY] {
@@ -590,7 +543,7 @@ fn what_cannot_be_scored_is_refused() {
 }
 
 #[test]
-fn every_convention_has_its_own_words() {
+fn conventions_have_different_descriptions() {
     let mut words: Vec<&str> = Convention::ALL.iter().map(|k| k.describe()).collect();
     assert_eq!(words[4], "standard");
     assert_eq!(words[5], "e2 flipped");
@@ -682,7 +635,7 @@ fn rings(n: usize, e: &Array2<Complex64>, b: &Array2<Complex64>) -> (Array2<(f64
 }
 
 #[test]
-fn errors_are_those_of_their_formulae() {
+fn errors_agree_with_their_formulae() {
     let n = 14;
     let grid = Grid::great10(n).unwrap();
     let shear = field(&grid, Content::E, 6);
@@ -703,7 +656,7 @@ fn errors_are_those_of_their_formulae() {
                 });
             }
         }
-        images.add(&sum_of(&grid, &kept).0);
+        images.add(&sum_of(&grid, &kept).0).unwrap();
     }
     let total = images.total();
     for definition in [Definition::Leaderboard, Definition::Corrected] {
@@ -731,9 +684,10 @@ fn errors_are_those_of_their_formulae() {
                 Array2::from_shape_fn((n, n), |at| Complex64::new(a[at], b[at]))
             };
             let field = complex(&(&total.e1 * (scale / 4.0)), &(&total.e2 * (scale / 4.0)));
-            let found = decomposer.decompose(field);
+            let found = decomposer.decompose(field).unwrap();
             let t = decomposer
                 .decompose(complex(&(&g1 * &weight * scale), &(&g2 * &weight * scale)))
+                .unwrap()
                 .e;
             let signal = t.mapv(|t| t * (1.0 + f.m_cross));
             let (nu, _) = rings(n, &(&found.e - &signal), &found.b);
@@ -778,7 +732,7 @@ fn errors_are_those_of_their_formulae() {
             });
             close(errors.eb_power, mean_c_l(eb), "EB");
             let x: Vec<f64> = SCORED
-                .map(|b| score.bins.power(&t, &t)[b] * score.bins.to_c_l(b))
+                .map(|b| score.bins.power(&t, &t).unwrap()[b] * score.bins.to_c_l(b))
                 .collect();
             let mean = x.iter().sum::<f64>() / 8.0;
             let sxx: f64 = x.iter().map(|x| (x - mean).powi(2)).sum();
@@ -799,7 +753,7 @@ fn errors_are_those_of_their_formulae() {
                 false => assert!(errors.sqrt_a.is_nan()),
             }
             // Q: a sum of moduli, whose scatter is found by drawing.
-            let true_power = score.bins.power(&t, &t);
+            let true_power = score.bins.power(&t, &t).unwrap();
             let folded = |apart: f64, variance: f64| {
                 let (centre, spread) =
                     ((apart * apart - variance).max(0.0).sqrt(), variance.sqrt());
@@ -905,9 +859,11 @@ fn errors_are_those_of_their_formulae() {
         residual(&total.e1, &g1, f.m1, f.c1),
         residual(&total.e2, &g2, f.m2, f.c2),
     );
-    let left = decomposer.decompose(Array2::from_shape_fn((n, n), |at| {
-        Complex64::new(r1[at], r2[at])
-    }));
+    let left = decomposer
+        .decompose(Array2::from_shape_fn((n, n), |at| {
+            Complex64::new(r1[at], r2[at])
+        }))
+        .unwrap();
     let (nu, _) = rings(n, &left.e, &left.b);
     let galaxies = total.count.sum();
     for (component, g, m, c) in [

@@ -36,7 +36,7 @@ pub fn field(grid: &Grid, content: Content, seed: u64) -> Array2<Complex64> {
     let mut normal = Normal(seed);
     let decomposer = Decomposer::new(*grid);
     let white = Array2::from_shape_fn((n, n), |_| Complex64::new(normal.draw(), normal.draw()));
-    let Modes { mut e, mut b } = decomposer.decompose(white);
+    let Modes { mut e, mut b } = decomposer.decompose(white).unwrap();
     for ((i, j), value) in e.indexed_iter_mut() {
         let f = |k: usize| {
             if 2 * k > n {
@@ -57,7 +57,7 @@ pub fn field(grid: &Grid, content: Content, seed: u64) -> Array2<Complex64> {
     if content == Content::B {
         e.fill(Complex64::ZERO);
     }
-    decomposer.compose(&Modes { e, b })
+    decomposer.compose(&Modes { e, b }).unwrap()
 }
 
 pub fn rows(grid: &Grid, field: &Array2<Complex64>) -> Vec<Row> {

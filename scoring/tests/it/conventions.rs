@@ -47,7 +47,7 @@ fn score(grid: Grid, k: Convention, options: Options) -> SetScore {
         });
         let mut sum = FieldSum::new(&grid);
         sum.add_image(&grid, submitted(&grid, &all, k));
-        images.add(&sum);
+        images.add(&sum).unwrap();
     }
     SetScorer::new(grid, truth(&shear), options)
         .unwrap()

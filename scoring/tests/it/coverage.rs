@@ -20,9 +20,9 @@ fn shapes(grid: &Grid, normal: &mut Normal) -> Array2<Complex64> {
     let white = Array2::from_shape_fn((grid.n, grid.n), |_| {
         Complex64::new(SHAPES * normal.draw(), SHAPES * normal.draw())
     });
-    let Modes { mut e, b } = decomposer.decompose(white);
+    let Modes { mut e, b } = decomposer.decompose(white).unwrap();
     e.fill(Complex64::ZERO);
-    decomposer.compose(&Modes { e, b })
+    decomposer.compose(&Modes { e, b }).unwrap()
 }
 
 /// One kind of set.
@@ -63,7 +63,7 @@ fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(String, f6
             }
             let mut sum = FieldSum::new(grid);
             sum.add_image(grid, rows(grid, &observed));
-            images.add(&sum);
+            images.add(&sum).unwrap();
         }
         let score = scorer.score(&images).unwrap();
         let with_power =
@@ -179,7 +179,7 @@ fn paired_coverage(metric: fn(&Metrics) -> f64, images: usize, m: [f64; 2]) -> f
                     let observed = &shear * Complex64::from(1.0 + m) + own;
                     let mut sum = FieldSum::new(&grid);
                     sum.add_image(&grid, rows(&grid, &observed));
-                    measured.add(&sum);
+                    measured.add(&sum).unwrap();
                 }
             }
             let [first, second] = measured.map(|images| {

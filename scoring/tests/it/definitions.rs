@@ -54,7 +54,7 @@ fn images_of_noise(
             .map(|(_, row)| row)
             .collect();
         sum.add_image(grid, all);
-        images.add(&sum);
+        images.add(&sum).unwrap();
     }
     images
 }
@@ -99,12 +99,12 @@ fn b_only_and_mixed_fields_are_told_apart() {
         let bins = Bins::new(&grid, definition);
         let decomposer = Decomposer::new(grid);
         let power = |content| {
-            let modes = decomposer.decompose(field(&grid, content, 4));
+            let modes = decomposer.decompose(field(&grid, content, 4)).unwrap();
             let sum = |p: [f64; 20]| SCORED.map(|b| p[b]).sum::<f64>();
             (
-                sum(bins.power(&modes.e, &modes.e)),
-                sum(bins.power(&modes.b, &modes.b)),
-                sum(bins.power(&modes.e, &modes.b)),
+                sum(bins.power(&modes.e, &modes.e).unwrap()),
+                sum(bins.power(&modes.b, &modes.b).unwrap()),
+                sum(bins.power(&modes.e, &modes.b).unwrap()),
             )
         };
         let (e, b, _) = power(Content::E);
@@ -203,8 +203,10 @@ fn cross_spectra_are_the_mean_product_of_pairs_without_noise_and_know_their_erro
     let decomposer = Decomposer::new(grid);
     let mean_modes = |group: &FieldSum| {
         let mean = |e: &Array2<f64>| e / &group.count;
-        let field = Convention::STANDARD.apply(&mean(&group.e1), &mean(&group.e2));
-        decomposer.decompose(field).e
+        let field = Convention::STANDARD
+            .apply(&mean(&group.e1), &mean(&group.e2))
+            .unwrap();
+        decomposer.decompose(field).unwrap().e
     };
     let modes: Vec<_> = set.groups().iter().map(mean_modes).collect();
     let (mut all, mut pairs) = (Array2::<Complex64>::zeros((grid.n, grid.n)), 1.0);
@@ -212,11 +214,11 @@ fn cross_spectra_are_the_mean_product_of_pairs_without_noise_and_know_their_erro
     for (modes, &weight) in modes.iter().zip(&found.weights) {
         all.scaled_add(Complex64::from(weight), modes);
         pairs -= weight * weight;
-        for (own, power) in own.iter_mut().zip(found.bins.power(modes, modes)) {
+        for (own, power) in own.iter_mut().zip(found.bins.power(modes, modes).unwrap()) {
             *own += weight * weight * power;
         }
     }
-    let all = found.bins.power(&all, &all);
+    let all = found.bins.power(&all, &all).unwrap();
     for b in SCORED {
         let expected = (all[b] - own[b]) / pairs;
         assert!((found.power[b] - expected).abs() < 1e-9 * all[b], "bin {b}");
@@ -249,7 +251,11 @@ fn cross_spectra_are_the_mean_product_of_pairs_without_noise_and_know_their_erro
     // measured from is that of some hundred modes in each trial.
     assert!((mean_of(false) / mean_of(true) / 9.0 - 1.0).abs() < 0.1);
     let mut one = SetImages::new(&grid);
-    one.add(&set.groups()[0]);
+    let image = FieldSum {
+        images: 1,
+        ..set.groups()[0].clone()
+    };
+    one.add(&image).unwrap();
     assert!(cross_spectrum(&grid, &one, Convention::STANDARD).is_err());
 }
 

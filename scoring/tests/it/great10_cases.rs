@@ -51,7 +51,7 @@ fn score(case: &Path, expected: &Value) -> SetScore {
     for name in expected["files"]["catalogues"].as_array().expect("files") {
         let mut image = FieldSum::new(&grid);
         image.add_image(&grid, rows(&case.join(name.as_str().expect("name"))));
-        images.add(&image);
+        images.add(&image).unwrap();
     }
     let options = Options {
         noise: Noise::Given(expected["noise_var"].as_f64().expect("noise_var")),
@@ -104,7 +104,7 @@ impl Check<'_> {
             &expected["sqrtA"],
             0.0,
         );
-        self.close(&format!("{what}.m"), found.m, &expected["m"], 1e-3);
+        self.close(&format!("{what}.m"), found.m_half, &expected["m"], 1e-3);
     }
 
     fn fits(&mut self, what: &str, found: &BiasFits, expected: &Value) {

@@ -173,7 +173,7 @@ impl File {
         let mut compressed = 0;
         // SAFETY: the file is open.
         self.call(
-            || "cannot tell the type of the image".into(),
+            || "cannot determine the type of the image".into(),
             |raw, status| unsafe { compressed = sys::fits_is_compressed_image(raw, status) },
         )?;
         if (compressed != 0) == self.tiling.is_some() {
@@ -186,7 +186,7 @@ impl File {
     pub fn is_image(&self) -> Result<bool, FileError> {
         let mut kind = 0;
         self.call(
-            || "cannot tell what the header describes".into(),
+            || "cannot determine what the header describes".into(),
             // SAFETY: the file is open, and the pointers are to live variables.
             |raw, status| unsafe {
                 sys::ffghdt(raw, &mut kind, status);
@@ -197,7 +197,7 @@ impl File {
 
     /// Sides of the image here, the first one along x.
     pub fn sides(&self) -> Result<Vec<i64>, FileError> {
-        let doing = || "cannot tell the size of the image".into();
+        let doing = || "cannot determine the size of the image".into();
         let mut count = 0;
         // SAFETY: the file is open, and the pointers are to live variables.
         self.call(doing, |raw, status| unsafe {
@@ -216,7 +216,7 @@ impl File {
         let mut bits = 0;
         // SAFETY: the file is open, and the pointer is to a live variable.
         self.call(
-            || "cannot tell the type of the image".into(),
+            || "cannot determine the type of the image".into(),
             |raw, status| unsafe {
                 sys::ffgidt(raw, &mut bits, status);
             },
@@ -229,7 +229,7 @@ impl File {
         let (mut header, mut start, mut end) = (0, 0, 0);
         // SAFETY: the file is open, and the pointers are to live variables.
         self.call(
-            || "cannot tell where the data are".into(),
+            || "cannot determine where the data are".into(),
             |raw, status| unsafe {
                 sys::ffghadll(raw, &mut header, &mut start, &mut end, status);
             },
@@ -337,7 +337,7 @@ impl File {
         let (mut kind, mut repeat, mut width) = (0, 0, 0);
         // SAFETY: the file is open, and the pointers are to live variables.
         self.call(
-            || format!("cannot tell the type of column {column}"),
+            || format!("cannot determine the type of column {column}"),
             |raw, status| unsafe {
                 sys::ffgtclll(raw, column, &mut kind, &mut repeat, &mut width, status);
             },

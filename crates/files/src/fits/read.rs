@@ -115,7 +115,7 @@ impl ImageReader {
             let value = file.number(key)?;
             if let Some(value) = value.filter(|v| !v.is_finite() || key == "BSCALE" && *v == 0.0) {
                 return Err(file.fault(format!(
-                    "the header key {key} is {value}; expected a number by which pixels are scaled"
+                    "the header key {key} is {value}; expected a finite number (for BSCALE not zero)"
                 )));
             }
         }
@@ -198,6 +198,16 @@ impl ImageReader {
     /// Where it is there and not a number.
     pub fn number(&self, key: &str) -> Result<Option<f64>, FileError> {
         self.file.number(key)
+    }
+
+    /// A header value as text; empty if absent.
+    pub fn text(&self, key: &str) -> String {
+        self.file.text(key)
+    }
+
+    /// Goes back to the first row.
+    pub fn rewind(&mut self) {
+        self.next_row = 0;
     }
 
     /// Leaves the next `rows` rows out.
@@ -499,7 +509,7 @@ fn table_rows(file: &mut File) -> Result<usize, FileError> {
     let mut count = 0;
     // SAFETY: the file is open, and the pointers are to live variables.
     file.call(
-        || "cannot tell the number of rows".into(),
+        || "cannot determine the number of rows".into(),
         |raw, status| unsafe {
             sys::ffgnrwll(raw, &mut count, status);
         },
@@ -521,7 +531,7 @@ fn column_count(file: &File) -> Result<c_int, FileError> {
     let mut count = 0;
     // SAFETY: the file is open, and the pointers are to live variables.
     file.call(
-        || "cannot tell the number of columns".into(),
+        || "cannot determine the number of columns".into(),
         |raw, status| unsafe {
             sys::ffgncl(raw, &mut count, status);
         },

@@ -10,7 +10,7 @@ use ndarray::ArrayView2;
 use shearq_submissions::limits::{MAX_TARGET, MIN_TARGET};
 use shearq_submissions::{LinearMethod, PsfCut};
 
-use super::found::{CutWorker, Found, Images};
+use super::found::{AdaptedSettings, CutWorker, Found, Images};
 use super::linear::{LinearPlan, LinearWorker};
 use super::window;
 use crate::error::MeasureError;
@@ -156,6 +156,10 @@ impl CutWorker for FamilyWorker {
         self.members[self.at].1.set_psf(psf)
     }
 
+    fn adapted(&self) -> Option<AdaptedSettings> {
+        self.members[self.at].1.adapted()
+    }
+
     fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
         self.members[self.at].1.measure(cut, noise)
     }
@@ -176,6 +180,7 @@ mod tests {
     use crate::galaxy::Measurer;
     use crate::measurement::Measurement;
     use crate::noise::{StampNoise, Survey};
+    use crate::worker::ImageNoise;
     use shearq_quantities::{FunctionalPsf, PsfProfile};
 
     fn configuration(reference_area: f64) -> Configuration {
@@ -200,12 +205,13 @@ mod tests {
         let mut worker = Measurer::new(configuration, 48).unwrap().worker();
         let each = fwhms.iter().map(|&fwhm| {
             let psf = moffat(fwhm).stamp_beside(configuration.psf_cut().size, 48);
-            worker.set_psf(psf.view()).unwrap();
             let stamp = Array2::from_shape_fn((48, 48), |(y, x)| {
                 let (y, x) = (y as f64 - 23.5, x as f64 - 23.5);
                 (100.0 * (-(x * x / 1.2 + y * y) / (fwhm * fwhm)).exp()) as f32
             });
-            worker.measure(stamp.view(), Some(noise)).unwrap()
+            let mut image = worker.image(ImageNoise::Level(noise));
+            let mut worker = image.psf(psf.view()).unwrap();
+            worker.measure(stamp.view()).unwrap()
         });
         each.collect()
     }
@@ -240,17 +246,23 @@ mod tests {
                 noise: StampNoise::white(0.1),
                 extent,
             };
-            worker.set_survey(Some(&Arc::new(survey)));
-            worker.set_psf(psf.view()).unwrap();
-            let found = worker.measure(stamp.view(), None).unwrap();
+            let survey = Arc::new(survey);
+            let mut image = worker.image(ImageNoise::Survey(&survey));
+            let mut worker = image.psf(psf.view()).unwrap();
+            let found = worker.measure(stamp.view()).unwrap();
             assert!(found.e1.is_finite() && found.noise == 0.1, "{found:?}");
-            found.radius
+            (found.radius, worker.adapted().unwrap().window_sigma)
         };
         let [own, narrow, wide, again] = [None, Some(4.0), Some(30.0), Some(13.0)].map(&mut radius);
-        // In steps of the lags; the wide one is held by the stamp's side.
+        // In steps of the lags; the stamp's side limits the wide one.
         assert!(
-            narrow < 0.7 * own && wide > own && again == own,
-            "{narrow} {own} {wide} {again}"
+            narrow.0 < 0.7 * own.0 && wide.0 > own.0 && again == own,
+            "{narrow:?} {own:?} {wide:?} {again:?}"
+        );
+        assert!(narrow.1 < own.1 && wide.1 > own.1);
+        assert_eq!(
+            own.1,
+            configuration.linear().unwrap().deconvolution.window_sigma
         );
     }
 
@@ -262,16 +274,14 @@ mod tests {
         let star = moffat(6.0).stamp(36);
         let mut wide = Array2::zeros((48, 48));
         wide.slice_mut(ndarray::s![6..42, 6..42]).assign(&star);
+        let mut image = worker.image(ImageNoise::Level(0.1));
         let [small, large] = [&star, &wide].map(|psf| {
-            worker.set_psf(psf.view()).unwrap();
-            worker.measure(stamp.view(), Some(0.1)).unwrap()
+            let mut worker = image.psf(psf.view()).unwrap();
+            worker.measure(stamp.view()).unwrap()
         });
         assert_eq!((small.e1, small.response), (large.e1, large.response));
         for side in [30, 33, 50] {
-            assert!(
-                worker.set_psf(moffat(6.0).stamp(side).view()).is_err(),
-                "{side}"
-            );
+            assert!(image.psf(moffat(6.0).stamp(side).view()).is_err(), "{side}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What the methods have in common.
+//! The common interface of the methods.
 
 use ndarray::{Array2, ArrayView2};
 use shearq_quantities::Distortion;
@@ -6,44 +6,58 @@ use shearq_quantities::Distortion;
 use crate::deconvolve::Descent;
 use crate::error::MeasureError;
 use crate::flag::Flag;
+use crate::measurement::ResponseMatrix;
 use crate::noise::StampNoise;
 
-/// One thread's part in a method: its plan, PSF and buffers.
-pub(crate) trait CutWorker {
-    /// Takes the noise of the galaxies that follow, in units of its level; white at first. The PSF has to be
-    /// taken after it.
+/// The plan, PSF and buffers of a method in one thread.
+pub(crate) trait CutWorker: Send {
+    /// Sets the noise of the galaxies that follow, in units of its level; white at first. Call `set_psf` after it.
     fn set_noise(&mut self, _noise: &StampNoise) {}
 
-    /// Takes how broad the galaxies that follow are seen in their image, in px², where that is known. The PSF has to be
-    /// taken after it.
+    /// Sets the mean square radius per axis of the galaxies that follow, with the PSF, in px², if it is known. Call
+    /// `set_psf` after it.
     fn set_extent(&mut self, _extent: Option<f64>) {}
 
-    /// Takes a PSF.
+    /// Sets the PSF.
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;
 
-    /// Measures a cut stamp of noise level `noise`. `None` where there is no scale to work in.
+    /// The settings that were adapted to PSF and galaxies, if the method adapts any.
+    fn adapted(&self) -> Option<AdaptedSettings> {
+        None
+    }
+
+    /// Measures a cut stamp of noise level `noise`. `None` if there is no unit of brightness.
     fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError>;
 
     /// The deconvolved stamp and the autocorrelation behind the last measurement. For pictures.
     fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images;
 }
 
-/// What a method found on a stamp.
+/// Lengths of the linear method after their adaptation to the PSF and to the galaxies of a survey.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct AdaptedSettings {
+    /// σ in pixels of the Gaussian that the deconvolved stamp is convolved with.
+    pub target_sigma: f64,
+    /// σ in pixels of the window.
+    pub window_sigma: f64,
+    /// Scale in pixels of the weight of the moments.
+    pub weight_scale: f64,
+}
+
+/// Results of a method on a stamp.
 pub(crate) struct Found {
     pub(crate) descent: Descent,
     /// The distortion, or why there is none.
     pub(crate) distortion: Result<Distortion, Flag>,
-    /// Response of the distortion; NaN where the method does not know it.
-    pub(crate) response: ResponseMatrix,
-    /// Sheared noise, where the method has looked at it.
+    /// Response of the distortion, if the method determines it.
+    pub(crate) response: Option<ResponseMatrix>,
+    /// Effect of sheared noise, on the galaxies on which it is estimated.
     pub(crate) sheared_noise: Option<Sheared>,
     pub(crate) flux: f64,
     pub(crate) radius: f64,
     pub(crate) size: f64,
 }
-
-/// ∂χ_i/∂γ_j, `[i][j]`.
-pub(crate) type ResponseMatrix = [[f64; 2]; 2];
 
 /// How the response of a galaxy differs with a field of noise added and taken away, to a shear of
 /// that field alone.

@@ -23,10 +23,11 @@ use std::sync::Arc;
 use ndarray::{Array2, ArrayView2};
 use shearq_submissions::LinearMethod;
 
-use super::found::{CutWorker, Found, Images, ResponseMatrix, Sheared, image, whole};
+use super::found::{AdaptedSettings, CutWorker, Found, Images, Sheared, image, whole};
 use super::softening::Softening;
 use crate::deconvolve::{Descent, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop};
 use crate::error::MeasureError;
+use crate::measurement::ResponseMatrix;
 use crate::noise::StampNoise;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
 use crate::surroundings::{Surroundings, centre, followed};
@@ -40,6 +41,7 @@ const FIELD: f32 = 0.25;
 
 /// What one submission and stamp size need.
 pub(super) struct LinearPlan {
+    lengths: AdaptedSettings,
     iterations: u32,
     softening: Softening,
     spectral: Spectral,
@@ -59,6 +61,11 @@ impl LinearPlan {
         let scale = method.shape.weight_scale;
         let moments = AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach());
         Ok(LinearPlan {
+            lengths: AdaptedSettings {
+                target_sigma: settings.target_sigma,
+                window_sigma: settings.window_sigma,
+                weight_scale: scale,
+            },
             iterations: u32::try_from(settings.max_iterations).unwrap_or(u32::MAX),
             softening: Softening::new(method, extent, &spectral, &moments),
             moments,
@@ -163,6 +170,10 @@ impl CutWorker for LinearWorker {
         Ok(())
     }
 
+    fn adapted(&self) -> Option<AdaptedSettings> {
+        Some(self.plan.lengths)
+    }
+
     fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
         if !(noise >= 0.0 && noise.is_finite()) {
             return Ok(None);
@@ -185,10 +196,10 @@ impl CutWorker for LinearWorker {
         let shape =
             cleared.and_then(|_| plan.moments.measure(&lags.acf, softening, &mut self.values));
         self.shape = shape.as_ref().ok().copied();
-        let mut response = [[f64::NAN; 2]; 2];
+        let mut response = None;
         let mut sheared_noise = None;
         if let Ok(shape) = &shape {
-            response = Self::response(&plan, shape, lags, &mut self.values);
+            response = Some(Self::response(&plan, shape, lags, &mut self.values));
             let seed = seed_of(whole, sigma);
             if noise > 0.0 && seed.is_multiple_of(SHARE) {
                 sheared_noise = self.sheared_noise(seed, sigma, softening);

@@ -79,7 +79,7 @@ impl CutWorker for NetworkWorker {
         Ok(Some(Found {
             descent,
             distortion,
-            response: [[f64::NAN; 2]; 2],
+            response: None,
             sheared_noise: None,
             flux,
             radius,

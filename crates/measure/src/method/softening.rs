@@ -75,6 +75,7 @@ mod tests {
     use crate::extent::Moments;
     use crate::galaxy::Measurer;
     use crate::noise::{StampNoise, Survey};
+    use crate::worker::ImageNoise;
     use shearq_quantities::{FunctionalPsf, PsfProfile};
 
     /// `48/linear/star` with a PSF as large as the stamp.
@@ -129,9 +130,9 @@ mod tests {
                     extent: Some(seen),
                 });
                 let [soft, hard] = workers.each_mut().map(|worker| {
-                    worker.set_survey(Some(&survey));
-                    worker.set_psf(psf.view()).unwrap();
-                    worker.measure(stamp.view(), None).unwrap().e1
+                    let mut image = worker.image(ImageNoise::Survey(&survey));
+                    let mut worker = image.psf(psf.view()).unwrap();
+                    worker.measure(stamp.view()).unwrap().e1
                 });
                 // The mean of noise is subtracted from a stamp without: its share of the light goes as 1/ν².
                 let tolerance = 0.02 * (half_snr / snr).powi(2);

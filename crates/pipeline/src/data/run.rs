@@ -7,12 +7,13 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize};
 use shearq_submissions::Configuration;
 
-use crate::data::layout::{DataFolder, Layout, fill};
+use crate::data::layout::{DataFolder, Layout};
 use crate::data::listing::{self, Files};
+use crate::data::pattern::fill;
 use crate::data::relative;
 use shearq_files::FileError;
-use shearq_files::atomic;
 use shearq_files::table::FileFormat;
+use shearq_files::{atomic, renamed};
 use shearq_simulate::set::SimulationSettings;
 
 /// Name of the record in a folder of results.
@@ -86,7 +87,7 @@ impl Source {
 /// # Errors
 /// Where the current folder is not known.
 pub fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
-    relative::from(from, to).map_err(FileError::doing(to, "cannot tell where the folder is"))
+    relative::from(from, to).map_err(FileError::doing(to, "cannot determine where the folder is"))
 }
 
 impl std::fmt::Display for Source {
@@ -228,13 +229,16 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
         Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),
     };
     serde_json::from_str(&text).map(Some).map_err(|error| {
-        // It is JSON that says something else.
-        let other = if error.is_data() {
-            "; the results of another version have to be made anew, in another folder"
-        } else {
-            ""
+        let hint = renamed::key_hint(&error.to_string(), &text);
+        let hint = match hint {
+            Some(hint) => format!(". {hint}"),
+            // Valid JSON with other keys or types.
+            None if error.is_data() => {
+                "; the results of another version have to be made anew, in another folder".into()
+            }
+            None => String::new(),
         };
-        FileError::new(path, format!("not a record of this kind: {error}{other}"))
+        FileError::new(path, format!("not a record of this kind: {error}{hint}"))
     })
 }
 

@@ -152,7 +152,7 @@ impl Positions {
         if let Some((earlier, later)) = first {
             let (x, y) = self.all[later];
             doubts.push(format!(
-                "warning: {}: {repeated} of {count} positions are within {SAME} px of an earlier one (the first is row {} at ({x}, {y}), like row {}). Each galaxy counts as often as it is listed. Try: remove duplicates",
+                "warning: {}: {repeated} of {count} positions are within {SAME} px of an earlier one (the first is row {} at ({x}, {y}), like row {}). Each row counts as a galaxy. Try: remove duplicates",
                 path.display(),
                 later + 1,
                 earlier + 1

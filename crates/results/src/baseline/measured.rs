@@ -1,4 +1,4 @@
-//! Measuring what a baseline holds.
+//! Measures the metrics of a baseline.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -20,22 +20,23 @@ use shearq_pipeline::images::{self, ImageId};
 use shearq_pipeline::measure::measure_folder;
 use shearq_pipeline::run::run_folder;
 
-/// Names of the scatter of either component of the ellipticity.
+/// Names of the scatter of e1 and of e2.
 pub(super) const SCATTER: [&str; 2] = ["scatter_e1", "scatter_e2"];
 
-/// What a submission has of the sets and images it is to be measured on.
+/// A set to measure.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Wanted {
     /// Set number.
     pub set: u32,
-    /// Number of images, which are numbered from 1.
+    /// Number of images, counted from image 1.
     pub images: u32,
 }
 
-/// Measures a submission into a folder that is removed again, and takes its metrics. `source` is as in a
-/// record in the folder `beside`.
+/// Measures a configuration into a temporary folder and returns its metrics. Paths of `source` are relative to the
+/// folder `beside`.
 ///
 /// # Errors
-/// Where data are absent or damaged, or nothing can be written to the temporary folder.
+/// If data are absent or damaged, or the temporary folder cannot be written.
 pub fn measure(
     source: &Source,
     beside: &Path,
@@ -47,7 +48,7 @@ pub fn measure(
     let folder = Scratch::new()?;
     let out = folder.path();
     let data = match source {
-        // By a name that is not from the temporary folder.
+        // Messages must not name the temporary folder.
         Source::Folder { .. } => Some(source.data(beside)?),
         Source::Simulated(_) => None,
     };
@@ -83,7 +84,7 @@ pub fn measure(
 /// Metrics of every set in a folder of catalogues.
 ///
 /// # Errors
-/// Where a file cannot be read, or there is nothing to score.
+/// If a file cannot be read, or there is no catalogue.
 pub fn metrics_of(
     run: &Run,
     data: &DataFolder,
@@ -130,8 +131,7 @@ pub fn metrics_of(
         .collect()
 }
 
-/// Rms of e1 and e2 over a set's galaxies that have an ellipticity, each with its standard error
-/// rms/√(2N).
+/// Rms of e1 and e2 over the measured galaxies of a set, each with its standard error rms/√(2N).
 fn scatter(
     run: &Run,
     out: &Path,
@@ -157,15 +157,15 @@ fn scatter(
                 table::numbers(&table, "e1", &path)?,
                 table::numbers(&table, "e2", &path)?,
             );
-            let mut own = ([0.0; 2], 0.0);
+            let mut sums = ([0.0; 2], 0.0);
             for (e1, e2) in e1.iter().zip(e2.iter()) {
                 if e1.is_finite() && e2.is_finite() {
-                    own.0[0] += e1 * e1;
-                    own.0[1] += e2 * e2;
-                    own.1 += 1.0;
+                    sums.0[0] += e1 * e1;
+                    sums.0[1] += e2 * e2;
+                    sums.1 += 1.0;
                 }
             }
-            Ok(own)
+            Ok(sums)
         },
         |(more, galaxies): ([f64; 2], f64)| {
             squares[0] += more[0];

@@ -1,29 +1,88 @@
-//! What moved since a baseline.
+//! Metrics and settings that moved since a baseline.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use shearq_submissions::{Configuration, Registry};
+use shearq_submissions::{Configuration, ConfigurationError, Registry};
+use thiserror::Error;
 
 use super::measured::{SCATTER, Wanted};
 use super::{Baseline, BaselineConfiguration, BaselineSet};
+use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::relative::shortened;
 use shearq_pipeline::data::run::differences;
+
+/// Why a baseline cannot be checked.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum BaselineError {
+    /// The registry of configurations, or a configuration file.
+    #[error(transparent)]
+    Configuration(#[from] ConfigurationError),
+    /// The recorded configuration file is gone.
+    #[error("{}: cannot find the configuration file of the baseline. Try: shearq baseline check --stored", path.display())]
+    NoFile {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Settings that this version cannot read, write or compare.
+    #[error("settings of {configuration}")]
+    Settings {
+        /// Name of the configuration.
+        configuration: String,
+        /// What is wrong with them.
+        source: SettingsError,
+    },
+    /// Measuring failed.
+    #[error(transparent)]
+    Pipeline(#[from] PipelineError),
+    /// The data have fewer sets than the baseline.
+    #[error("set {set} could not be measured again (found no such set in the data)")]
+    NoSet {
+        /// Set number.
+        set: u32,
+    },
+}
+
+/// Settings that cannot be read, written or compared.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum SettingsError {
+    /// A value of the wrong type or an unknown key.
+    #[error(transparent)]
+    Read(#[from] toml::de::Error),
+    /// A value that TOML does not have.
+    #[error(transparent)]
+    Write(#[from] toml::ser::Error),
+    /// A value that JSON does not have.
+    #[error(transparent)]
+    Compare(#[from] serde_json::Error),
+}
+
+impl SettingsError {
+    /// The error for the configuration `name`.
+    fn of(name: &str) -> impl FnOnce(SettingsError) -> BaselineError {
+        let configuration = name.to_owned();
+        move |source| BaselineError::Settings {
+            configuration,
+            source,
+        }
+    }
+}
 
 /// Metrics that must not move.
 const CHECKED: [&str; 5] = ["q", "m_half", "sqrt_a", SCATTER[0], SCATTER[1]];
 
-/// How far a metric may be off on the same data, relative to itself: a changed digit of Q as tables
-/// print it is seen.
+/// Accepted relative shift of a metric on the same data. It detects a changed digit of Q in a table.
 ///
-/// The network works in f32, and instruction sets round its sums differently. On the project's own
-/// baseline, metrics with fused multiply-add (AVX2, AVX-512) and without differ by less than 2e-6 of
-/// themselves and 1e-5 of their standard errors, a fiftieth of what is allowed.
+/// The network works in f32, and instruction sets round its sums differently. On the project's baseline, metrics
+/// with and without fused multiply-add (AVX2, AVX-512) differ by less than 2e-6, and by less than 1e-5 standard
+/// errors. That is a fiftieth of the tolerance.
 pub const TOLERANCE: f64 = 1e-4;
 
-/// The same in units of the metric's standard error, for metrics that are nearly zero.
+/// Accepted shift in standard errors on the same data, for metrics near zero.
 pub const TOLERANCE_SIGMA: f64 = 1e-3;
 
-/// A metric of a baseline, and what it is now.
+/// A metric in the baseline and now.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shift {
     /// Set number.
@@ -34,18 +93,16 @@ pub struct Shift {
     pub before: [f64; 2],
     /// Value and standard error now.
     pub now: [f64; 2],
-    /// The difference in units of its error: that of the baseline's metric on the same data, on
-    /// others that of both.
+    /// The difference over its error: the error of the baseline on the same data, of both metrics on other data.
     pub sigma: f64,
-    /// Whether it moved by more than may be.
+    /// Whether the shift exceeds the tolerance.
     pub moved: bool,
 }
 
-/// What became of the checked metrics of a set.
+/// The shifts of the checked metrics of a set.
 ///
-/// On the same data a metric may be off by rounding alone: by [`TOLERANCE`] of itself or
-/// [`TOLERANCE_SIGMA`] of its error, whichever is more. On other data it may be off by `sigmas` standard errors of the
-/// difference.
+/// On the same data a metric may shift by rounding: by [`TOLERANCE`] of itself or [`TOLERANCE_SIGMA`] of its error,
+/// whichever is larger. On other data it may shift by `sigmas` standard errors of the difference.
 pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift> {
     let same_data = before.data == now.data && before.images == now.images;
     CHECKED
@@ -63,14 +120,14 @@ pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift
                 old[1].hypot(new[1])
             };
             let allowed = if same_data {
-                // The larger one; an unknown error leaves the other.
+                // `max` ignores an unknown error.
                 (TOLERANCE_SIGMA * error).max(TOLERANCE * old[0].abs())
             } else {
                 sigmas * error
             };
-            // On other data nothing can be told where an error is withheld; a metric that is lost is a change.
-            let untold = !same_data && error.is_nan() && difference.is_finite();
-            let within = untold || difference.abs() <= allowed;
+            // Without an error, other data cannot show a shift. A lost metric is a shift.
+            let unknown = !same_data && error.is_nan() && difference.is_finite();
+            let within = unknown || difference.abs() <= allowed;
             let neither = old[0].is_nan() && new[0].is_nan();
             Shift {
                 set: before.set,
@@ -84,18 +141,17 @@ pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift
         .collect()
 }
 
-/// Settings of a baseline that are others now, as `key: before ≠ now`; and those that it does not
-/// know, because they are newer.
+/// Changed settings of a baseline as `key: before ≠ now`, and settings that the baseline does not have.
 ///
 /// # Errors
-/// Where settings cannot be compared.
+/// If settings cannot be compared.
 fn settings_moved(
     before: &BaselineConfiguration,
     now: &Configuration,
-) -> anyhow::Result<(Vec<String>, Vec<String>)> {
+) -> Result<(Vec<String>, Vec<String>), SettingsError> {
     let mut current = toml::Table::try_from(now)?;
     let mut earlier = before.settings.clone();
-    // Words do not change results.
+    // A description does not change results.
     for table in [&mut current, &mut earlier] {
         table.remove("description");
     }
@@ -105,20 +161,20 @@ fn settings_moved(
         .partition(|line| !line.contains(": null ≠ ")))
 }
 
-/// What a check found about one submission of a baseline.
+/// Result of a check of one configuration of a baseline.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Checked {
     /// Name of the baseline.
     pub baseline: String,
-    /// Name of the submission.
+    /// Name of the configuration.
     pub configuration: String,
-    /// Every metric looked at.
+    /// Every compared metric.
     pub shifts: Vec<Shift>,
-    /// Settings that are others now.
+    /// Changed settings, as `key: before ≠ now`.
     pub settings: Vec<String>,
-    /// What should be known and is no failure.
+    /// Remarks that are no failures.
     pub notes: Vec<String>,
-    /// Whether the settings are those stored, although their configuration may have changed.
+    /// Whether stored settings were used although the configuration may have changed.
     pub stored: bool,
 }
 
@@ -128,7 +184,7 @@ impl Checked {
         !self.settings.is_empty() || self.shifts.iter().any(|shift| shift.moved)
     }
 
-    /// What moved, a line each.
+    /// One line per moved setting or metric.
     pub fn moved(&self) -> Vec<String> {
         let settings = self
             .settings
@@ -149,7 +205,7 @@ impl Checked {
     }
 }
 
-/// The submission that those with the method of `settings` rest on.
+/// The configuration that provides the defaults for the method of `settings`.
 fn base_of(settings: &toml::Table) -> &'static str {
     match settings.get("method").and_then(toml::Value::as_str) {
         Some("linear") => "48/linear/star",
@@ -157,39 +213,47 @@ fn base_of(settings: &toml::Table) -> &'static str {
     }
 }
 
-/// Which settings a baseline is measured with again. Named submissions have the present ones always.
+/// The settings to measure a baseline with. Named configurations always have their present settings.
 #[derive(Debug, Clone, Copy)]
 pub enum Settings<'a> {
-    /// Those of the configuration files, which are found from this folder.
+    /// The settings in the configuration files; their paths are relative to this folder.
     Files(&'a Path),
-    /// Those stored in the baseline.
+    /// The settings in the baseline.
     Stored,
 }
 
-/// The settings by which a submission of a baseline is measured again, and whether they are those stored because its
-/// file is not known. In stored settings, keys that the baseline does not have are the base's.
+/// The settings to measure a configuration of a baseline with, and whether stored settings replace an unknown file.
+/// A key that stored settings lack has its default.
 fn settings_now(
     before: &BaselineConfiguration,
     registry: &Registry,
     settings: Settings<'_>,
-) -> Result<(Configuration, bool), anyhow::Error> {
+) -> Result<(Configuration, bool), BaselineError> {
     if let (Settings::Files(folder), Some(file)) = (settings, &before.file) {
         let path = shortened(folder.join(file));
-        // A plain name could be one of the registry.
+        // The registry could know a plain name.
         let path = Path::new(".").join(path);
-        anyhow::ensure!(
-            path.is_file(),
-            "{}: the configuration file is not there any more. Try: shearq baseline check --stored",
-            path.display()
-        );
+        if !path.is_file() {
+            return Err(BaselineError::NoFile { path });
+        }
         return Ok((registry.get(&path.to_string_lossy())?.configuration, false));
     }
     if before.file.is_none() && registry.names().contains(&before.name) {
         return Ok((registry.get(&before.name)?.configuration, false));
     }
     let base = registry.get(base_of(&before.settings))?.configuration;
-    let mut all = toml::Table::try_from(&base)?;
-    for (key, value) in &before.settings {
+    let configuration =
+        with_defaults(&base, &before.settings).map_err(SettingsError::of(&before.name))?;
+    Ok((configuration, matches!(settings, Settings::Files(_))))
+}
+
+/// The configuration of `settings`; keys that they lack are `base`'s.
+fn with_defaults(
+    base: &Configuration,
+    settings: &toml::Table,
+) -> Result<Configuration, SettingsError> {
+    let mut all = toml::Table::try_from(base)?;
+    for (key, value) in settings {
         match (all.get_mut(key), value) {
             (Some(toml::Value::Table(section)), toml::Value::Table(own)) => {
                 section.extend(own.clone());
@@ -199,27 +263,27 @@ fn settings_now(
             }
         }
     }
-    Ok((all.try_into()?, matches!(settings, Settings::Files(_))))
+    Ok(all.try_into()?)
 }
 
-/// Holds the submissions of the baseline `name` against what they are as `measure` measures them now; what
-/// was found, and the submissions as they are now.
+/// Measures the configurations of the baseline `name` again with `measure`, and compares.
+/// Returns the checks and the configurations with their present settings and metrics.
 ///
 /// # Errors
-/// Where settings are not valid, or something cannot be measured.
+/// If settings are invalid, or measuring fails.
 pub fn check(
     name: &str,
     baseline: &Baseline,
     sigmas: f64,
     settings: Settings<'_>,
-    mut measure: impl FnMut(&Configuration, &[Wanted]) -> anyhow::Result<Vec<BaselineSet>>,
-) -> anyhow::Result<(Vec<Checked>, Vec<BaselineConfiguration>)> {
+    mut measure: impl FnMut(&Configuration, &[Wanted]) -> Result<Vec<BaselineSet>, PipelineError>,
+) -> Result<(Vec<Checked>, Vec<BaselineConfiguration>), BaselineError> {
     let registry = Registry::embedded()?;
-    let (mut checks, mut submissions) = (Vec::new(), Vec::new());
+    let (mut checks, mut configurations) = (Vec::new(), Vec::new());
     for before in &baseline.submissions {
-        let (configuration, stored) = settings_now(before, &registry, settings)
-            .map_err(|error| error.context(format!("settings of {}", before.name)))?;
-        let (settings, new) = settings_moved(before, &configuration)?;
+        let (configuration, stored) = settings_now(before, &registry, settings)?;
+        let (settings, new) =
+            settings_moved(before, &configuration).map_err(SettingsError::of(&before.name))?;
         let mut check = Checked {
             baseline: name.to_owned(),
             configuration: before.name.clone(),
@@ -242,11 +306,11 @@ pub fn check(
         let sets = measure(&configuration, &wanted)?;
         for old in &before.sets {
             let Some(now) = sets.iter().find(|now| now.set == old.set) else {
-                anyhow::bail!("set {} was not measured again", old.set);
+                return Err(BaselineError::NoSet { set: old.set });
             };
             if now.data != old.data || now.images != old.images {
                 check.notes.push(format!(
-                    "the data of set {} are not the baseline's ({} images then, {} now); its metrics may differ by {sigmas} σ",
+                    "the data of set {} are not the baseline's ({} images then, {} now). Metrics may differ by {sigmas} σ",
                     old.set,
                     old.images.len(),
                     now.images.len(),
@@ -254,14 +318,14 @@ pub fn check(
             }
             check.shifts.extend(shifts(old, now, sigmas));
         }
-        submissions.push(BaselineConfiguration::new(
-            &configuration,
-            before.file.clone(),
-            sets,
-        )?);
+        let file = before.file.clone();
+        configurations.push(
+            BaselineConfiguration::new(&configuration, file, sets)
+                .map_err(|error| SettingsError::of(&before.name)(error.into()))?,
+        );
         checks.push(check);
     }
-    Ok((checks, submissions))
+    Ok((checks, configurations))
 }
 
 #[cfg(test)]
@@ -281,7 +345,7 @@ mod tests {
     }
 
     #[test]
-    fn on_the_same_data_rounding_passes_and_on_others_noise_does() {
+    fn the_same_data_allow_rounding_and_other_data_noise() {
         let before = set("a", 80.0);
         let moved = |now: &BaselineSet| shifts(&before, now, 3.0)[0].moved;
         assert!(!moved(&set("a", 80.0 * (1.0 + 0.9 * TOLERANCE))));
@@ -297,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn a_figure_near_zero_may_be_off_by_a_part_of_its_error() {
+    fn a_metric_near_zero_may_shift_by_a_share_of_its_error() {
         let before = set("a", 0.0);
         let moved = |q: f64| shifts(&before, &set("a", q), 3.0)[0].moved;
         assert!(!moved(1.9 * TOLERANCE_SIGMA) && moved(2.1 * TOLERANCE_SIGMA));

@@ -1,4 +1,4 @@
-//! Submissions as one compressed archive (`.tar.gz`), the same bytes for the same files.
+//! Compressed archives (`.tar.gz`) of submissions; the same files give the same bytes.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -15,43 +15,43 @@ use shearq_files::FileError;
 use shearq_files::atomic::{PartFile, PartFolder, sweep_beside};
 use shearq_files::open::{is_there, open};
 
-/// Largest manifest accepted, in bytes: some two hundred for each file.
+/// Largest accepted manifest in bytes: about 200 per file, with room for covariances.
 const MAX_MANIFEST: u64 = 1 << 26;
 
-/// Most bytes that one byte of an archive may unpack to, beyond the first [`FREE`]: numbers in ASCII come
-/// to three, blank catalogues to a hundred or so.
+/// Largest accepted compression ratio beyond the first [`FREE`] bytes. ASCII numbers reach 3, blank catalogues
+/// about 100.
 const MAX_RATIO: u64 = 300;
-/// Bytes that any archive may unpack to.
+/// Unpacked bytes that any archive may have.
 const FREE: u64 = 1 << 24;
-/// Bytes that a file counts for in addition to its own, as it takes them on disk.
+/// Bytes counted per file in addition to its content, about its cost on disk.
 const FILE: u64 = 1 << 12;
-/// Most files, the manifest included: 8,000 images of each of 24 sets and some more.
+/// Most files, including the manifest: more than 8,000 images in each of 24 sets.
 pub const MAX_FILES: u64 = 200_000;
 
-/// Whether a path's ending is that of an archive.
+/// Whether a path has the ending of an archive.
 pub fn is_archive(path: &Path) -> bool {
     let name = path.to_string_lossy();
     name.ends_with(".tar.gz") || name.ends_with(".tgz")
 }
 
-/// An archive being written.
+/// Writes an archive.
 pub struct ArchiveWriter {
     builder: Builder<GzEncoder<BufWriter<File>>>,
     part: PartFile,
 }
 
 impl ArchiveWriter {
-    /// Starts an archive, which must be new.
+    /// Starts a new archive.
     ///
     /// # Errors
-    /// Where the file exists or cannot be made.
+    /// If the file exists or cannot be made.
     pub fn create(path: &Path) -> Result<Self, FileError> {
         if is_there(path) {
             return Err(exists(path));
         }
         sweep_beside(path);
         let (part, file) = PartFile::create(path)?;
-        // Neither the time nor the system of its making.
+        // Time and system would change the bytes.
         let encoder = GzBuilder::new()
             .mtime(0)
             .operating_system(UNKNOWN_SYSTEM)
@@ -65,7 +65,7 @@ impl ArchiveWriter {
     /// Adds a file.
     ///
     /// # Errors
-    /// Where it cannot be written.
+    /// If it cannot be written.
     pub fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), FileError> {
         let mut header = Header::new_gnu();
         header.set_size(bytes.len() as u64);
@@ -81,7 +81,7 @@ impl ArchiveWriter {
     /// Closes the archive and gives it its name.
     ///
     /// # Errors
-    /// Where it cannot be written.
+    /// If it cannot be written.
     pub fn finish(self) -> Result<(), FileError> {
         let ArchiveWriter { builder, part } = self;
         builder
@@ -100,35 +100,37 @@ impl ArchiveWriter {
 fn exists(path: &Path) -> FileError {
     FileError::new(
         path,
-        "the archive exists already; expected a new file. Remove it or choose another name",
+        "the archive exists already; expected a new file. Try: another name for --out",
     )
 }
 
-/// gzip's number for it.
+/// gzip's code for an unknown system.
 const UNKNOWN_SYSTEM: u8 = 255;
 
 fn cannot_write(path: &Path) -> impl FnOnce(std::io::Error) -> FileError {
     FileError::doing(path, "cannot write the archive")
 }
 
-/// What an archive holds.
+/// Content of an archive.
+#[derive(Debug, Clone)]
 pub struct Unpacked {
-    /// Its manifest, if it has one.
+    /// Manifest, if there is one.
     pub manifest: Option<Manifest>,
-    /// Its other files.
+    /// The other files by name.
     pub files: BTreeMap<String, FileSum>,
 }
 
 impl Unpacked {
-    /// Checks that the files are those of the manifest, which there must be if it is `required`.
+    /// Compares the files with the manifest, which must exist if it is `required`.
     ///
     /// # Errors
-    /// Where they are not, or it is not there.
+    /// If they disagree, or the manifest does not exist.
     pub fn verify(&self, archive: &Path, required: bool) -> Result<(), FileError> {
         let faults = match &self.manifest {
             Some(manifest) => manifest.faults(&self.files),
             None if required => {
-                let message = format!("there is no {MANIFEST_FILE} in it to verify the files by");
+                let message =
+                    format!("cannot verify the files, because there is no {MANIFEST_FILE}");
                 return Err(FileError::new(archive, message));
             }
             None => Vec::new(),
@@ -140,19 +142,19 @@ impl Unpacked {
             .iter()
             .map(|(name, message)| format!("\n  {name}: {message}"))
             .collect();
-        let message = format!("this is not what was packed:{}", lines.concat());
+        let message = format!("the files disagree with {MANIFEST_FILE}:{}", lines.concat());
         Err(FileError::new(archive, message))
     }
 }
 
-/// Unpacks the archive at `path` into the new folder `out`, which appears whole and as its manifest
-/// says or not at all. Unless the manifest is `required`, there may be none.
+/// Unpacks the archive at `path` into the new folder `out`. After an error no folder remains. The manifest must exist if
+/// it is `required`.
 ///
 /// # Errors
-/// As [`read`] and [`Unpacked::verify`], and where `out` exists or cannot be written.
+/// As [`read`] and [`Unpacked::verify`], and if `out` exists or cannot be written.
 pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
     let part = PartFolder::new(out)?;
-    // All of it, before any file is written.
+    // Read completely before any file is written.
     read(path, None)?.verify(path, required)?;
     let unpacked = read(path, Some(part.path()))?;
     unpacked.verify(path, required)?;
@@ -160,11 +162,10 @@ pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileE
     Ok(unpacked)
 }
 
-/// Reads an archive from end to end; with `into`, its files are written to that folder.
+/// Reads a whole archive and writes its files to the folder `into`, if given.
 ///
 /// # Errors
-/// Where it cannot be read to its end, holds anything but plain files without folders, or holds two
-/// of one name.
+/// If it is damaged or too large, contains anything but plain files without folders, or repeats a name.
 pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     let cannot_read = || FileError::doing::<std::io::Error>(path, "cannot read the archive");
     let file = open(path).map_err(cannot_read())?;
@@ -183,7 +184,7 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     for entry in archive.entries().map_err(cannot_read())?.raw(true) {
         let mut entry = entry.map_err(cannot_read())?;
         let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
-        // As `tar czf … -C folder .` packs a folder.
+        // `tar czf … -C folder .` starts with the folder itself.
         if name == "./" && entry.header().entry_type().is_dir() {
             continue;
         }
@@ -192,18 +193,20 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
             _ => name,
         };
         if !entry.header().entry_type().is_file() || !is_plain_name(&name) {
-            let message = format!("it holds `{name}`; expected plain files without folders");
+            let message = format!(
+                "unsupported member (found `{name}`, expected plain files without folders)"
+            );
             return Err(FileError::new(path, message));
         }
         if unpacked.files.contains_key(&name)
             || (name == MANIFEST_FILE && unpacked.manifest.is_some())
         {
-            let message = format!("it holds `{name}` twice");
+            let message = format!("the archive contains `{name}` twice");
             return Err(FileError::new(path, message));
         }
         files += 1;
         if files > MAX_FILES.min(most / FILE) {
-            let message = format!("it holds more than {} files", files - 1);
+            let message = format!("too many files (found more than {})", files - 1);
             return Err(FileError::new(path, message));
         }
         let mut bytes = Vec::new();
@@ -218,7 +221,10 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
             }
         };
         if name == MANIFEST_FILE && entry.size() > MAX_MANIFEST {
-            let message = format!("its {MANIFEST_FILE} has {} bytes", entry.size());
+            let message = format!(
+                "{MANIFEST_FILE} is too large (found {} bytes, expected at most {MAX_MANIFEST})",
+                entry.size()
+            );
             return Err(FileError::new(path, message));
         }
         let sum = FileSum::copying(&mut entry, &mut target)
@@ -231,7 +237,7 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
         let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|error| {
             FileError::new(
                 path,
-                format!("its {MANIFEST_FILE} is not one of a submission: {error}"),
+                format!("{MANIFEST_FILE} is not the manifest of a submission: {error}"),
             )
         })?;
         unpacked.manifest = Some(manifest);
@@ -244,7 +250,7 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     Ok(unpacked)
 }
 
-/// What an archive unpacks to, of which there is an end.
+/// The unpacked bytes of an archive, up to a limit.
 struct Bounded {
     decoder: GzDecoder<BufReader<File>>,
     /// Bytes read.
@@ -259,8 +265,7 @@ impl Read for Bounded {
         self.read += found as u64;
         if self.read > self.most {
             let most = self.most;
-            let message =
-                format!("it unpacks to more than {most} bytes, {MAX_RATIO} times its own");
+            let message = format!("it unpacks to more than {most} bytes");
             return Err(std::io::Error::new(
                 std::io::ErrorKind::FileTooLarge,
                 message,
@@ -270,7 +275,7 @@ impl Read for Bounded {
     }
 }
 
-/// Reads what follows the last file: blank blocks, gzip's own checksum and nothing else.
+/// Checks that only blank blocks and the checksum of gzip follow the last file.
 fn check_end(mut archive: Bounded) -> std::io::Result<()> {
     let wrong = |what| Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
     let mut buffer = [0; 4096];
@@ -280,16 +285,16 @@ fn check_end(mut archive: Bounded) -> std::io::Result<()> {
             break;
         }
         if buffer[..read].iter().any(|byte| *byte != 0) {
-            return wrong("there are data after its end");
+            return wrong("found data after the end");
         }
     }
     if archive.decoder.into_inner().read(&mut buffer)? > 0 {
-        return wrong("there are data after its end");
+        return wrong("found data after the end");
     }
     Ok(())
 }
 
-/// Whether a name is that of a file in the folder itself, on any system.
+/// Whether a name is a plain file name on any system.
 fn is_plain_name(name: &str) -> bool {
     !name.is_empty()
         && !name.starts_with('.')
@@ -325,19 +330,19 @@ mod tests {
         assert!(message.contains("it unpacks to more than"), "{message}");
         let mut empty = (0..30_000).map(|k| (format!("{k}"), &b""[..]));
         let message = refusal(&mut empty, 0);
-        assert!(message.contains("it holds more than"), "{message}");
+        assert!(message.contains("too many files"), "{message}");
         let zeros = vec![0; 64 << 20];
         let message = refusal(&mut [("a".to_owned(), &zeros[..])].into_iter(), 0);
         assert!(message.contains("it unpacks to more than"), "{message}");
     }
 
     #[test]
-    fn a_manifest_that_is_none_is_refused() {
+    fn an_invalid_manifest_is_refused() {
         for wrong in ["null", "[]", "{}", "1", "", "{\"method\": null}"] {
             let mut files = [(MANIFEST_FILE.to_owned(), wrong.as_bytes())].into_iter();
             let message = refusal(&mut files, 0);
             assert!(
-                message.contains("is not one of a submission"),
+                message.contains("is not the manifest of a submission"),
                 "{wrong}: {message}"
             );
         }

@@ -1,8 +1,8 @@
-//! The two kinds of file that the challenge takes: ellipticity catalogues and power spectra.
+//! The two kinds of files that the challenge accepts: ellipticity catalogues and power spectra.
 //!
-//! * Catalogue: ASCII `x y e1 e2`, one line a galaxy, one file an image,
+//! * Catalogue: ASCII `x y e1 e2`, one line per galaxy, one file per image,
 //!   `g10_v1_objs_{set}_{image}.{method}.dat`.
-//! * Power spectrum: ASCII `index l power`, the eight bins 2 to 9, one file a set,
+//! * Power spectrum: ASCII `index l power`, the eight bins 2 to 9, one file per set,
 //!   `{method}_set{set}.dat`; power is ℓ²C_ℓ/2π.
 
 use std::path::Path;
@@ -14,12 +14,12 @@ use shearq_scoring::{
 
 use shearq_files::FileError;
 use shearq_files::table;
-use shearq_pipeline::data::layout::{MAX_IMAGE, MAX_SET};
+use shearq_pipeline::data::pattern::{MAX_IMAGE, MAX_SET};
 
 /// One line of a power-spectrum file.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SpectrumLine {
-    /// Bin, 1-based: 2 to 9.
+    /// Number of the bin, 2 to 9.
     pub index: u32,
     /// Multipole of the bin.
     pub l: f64,
@@ -27,7 +27,7 @@ pub struct SpectrumLine {
     pub power: f64,
 }
 
-/// What a file's name says it is.
+/// The kind of a file, from its name.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Kind {
     /// Catalogue of an image.
@@ -49,7 +49,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// What is wrong with a name that is not recognised.
+    /// Text of the error for an unknown name.
     pub const EXPECTED: &str =
         "neither g10_v1_objs_{set}_{image}.{method}.dat nor {method}_set{set}.dat";
 
@@ -98,8 +98,8 @@ fn number(text: &str, most: u32) -> Option<u32> {
     text.parse().ok().filter(|number| *number <= most)
 }
 
-/// The measured galaxies of a catalogue in the challenge's format. Those without an ellipticity are left
-/// out, which the original scoring counts as zero.
+/// The measured galaxies of a catalogue in the challenge's format. Galaxies without an ellipticity are left out; the
+/// original scoring counts them as zero.
 pub fn catalogue_text(rows: &[Row]) -> String {
     let mut text = String::new();
     for Row { x, y, e1, e2 } in rows {
@@ -113,17 +113,16 @@ pub fn catalogue_text(rows: &[Row]) -> String {
 /// How a set's catalogues become a power spectrum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Spectrum {
-    /// That of the ellipticities averaged over the images, with their noise.
+    /// Spectrum of the ellipticities averaged over the images, with their noise.
     Averaged,
     /// From cross-spectra between groups of images.
     Cross,
 }
 
-/// The power spectrum of a set's images in the challenge's format, and where it is known, the
-/// covariance of its bandpowers.
+/// The power spectrum of a set in the challenge's format, and the covariance of its bandpowers, if known.
 ///
 /// # Errors
-/// Where there is one image and none to multiply it with.
+/// If a cross-spectrum has only one image.
 pub fn spectrum_text(
     grid: &Grid,
     images: &SetImages,
@@ -145,10 +144,10 @@ pub fn spectrum_text(
     Ok((text, scored))
 }
 
-/// Reads a power-spectrum file as it is; [`super::check`] says whether it is complete.
+/// Reads a power-spectrum file without checking it; [`super::check`] checks it.
 ///
 /// # Errors
-/// Where it cannot be read.
+/// If it cannot be read.
 pub fn read_spectrum(path: &Path) -> Result<Vec<SpectrumLine>, FileError> {
     let table = table::read_text(path, &["index", "l", "power"])?;
     let column = |name: &str| table::numbers(&table, name, path);
@@ -159,7 +158,7 @@ pub fn read_spectrum(path: &Path) -> Result<Vec<SpectrumLine>, FileError> {
     {
         return Err(FileError::new(
             path,
-            format!("`{odd}` is not the index of a bin"),
+            format!("not the number of a bin (found {odd}, expected 2 to 9)"),
         ));
     }
     Ok((0..index.len())
@@ -171,7 +170,7 @@ pub fn read_spectrum(path: &Path) -> Result<Vec<SpectrumLine>, FileError> {
         .collect())
 }
 
-/// The first multipole that is not that of its bin, with that bin's, and how many there are.
+/// The first line whose multipole differs from its bin's, the bin's multipole, and the number of such lines.
 pub fn wrong_multipoles<'a>(
     lines: &'a [SpectrumLine],
     bins: &Bins,
@@ -186,10 +185,10 @@ pub fn wrong_multipoles<'a>(
     Some((line, centre, 1 + wrong.count()))
 }
 
-/// The eight bandpowers of a power-spectrum file of galaxies on `grid`, in order.
+/// The eight bandpowers of a power-spectrum file for galaxies on `grid`, in order.
 ///
 /// # Errors
-/// Where the file cannot be read, its bins are not 2 to 9, or their multipoles those of another grid.
+/// If the file cannot be read, its bins are not 2 to 9, or the multipoles belong to another grid.
 pub fn read_bandpowers(path: &Path, grid: &Grid) -> Result<Vec<f64>, FileError> {
     let lines = read_spectrum(path)?;
     let bins = Bins::new(grid, Definition::Leaderboard);

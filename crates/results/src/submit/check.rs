@@ -1,4 +1,4 @@
-//! Checks of a submission before it is sent.
+//! Checks a submission before it is sent.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -13,43 +13,48 @@ use super::manifest::{Contents, FileSum, Manifest};
 use super::packed::Sent;
 use crate::score::COLUMNS;
 use crate::views::diagnosis::words;
+use crate::views::rows::fault as odd_rows;
 use shearq_files::table::most_rows;
 use shearq_pipeline::data::layout::read_rows;
+
+/// Each catalogue is read as one image on the expected grid.
+const ONE_IMAGE: &str = "one image on the expected grid";
 
 /// How bad a finding is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
-    /// Worth a look.
+    /// Probably harmless; please check.
     Warning,
-    /// The submission would not be scored as meant.
+    /// The submission would not be scored as intended.
     Error,
 }
 
-/// One thing found.
+/// A problem of a file or folder.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct Finding {
     /// File or folder.
     pub path: PathBuf,
-    /// How bad.
+    /// Severity of the problem.
     pub severity: Severity,
     /// Short name of the check.
     pub check: &'static str,
-    /// What was found and what was expected.
+    /// Problem, with what was found and expected.
     pub message: String,
 }
 
-/// What the files are checked against.
+/// Expected properties of the files.
+#[derive(Debug, Clone)]
 pub struct Expected {
-    /// The grid.
+    /// Grid of the galaxies.
     pub grid: Grid,
-    /// True shear by set, where known: then conventions and the type of ellipticity are checked.
+    /// True shear by set, if known, to check conventions and type of ellipticity.
     pub truth: BTreeMap<u32, TrueShear>,
-    /// Images that every set must have, where known.
+    /// Number of images of every set, if known.
     pub images: Option<u32>,
 }
 
-/// Largest share of a cell by which positions may be off its centre.
+/// Largest accepted distance of a position from the centre of its cell, in cells.
 const POSITION_TOLERANCE: f64 = 0.01;
 
 /// Checks a file, or all files of a folder or an archive.
@@ -81,31 +86,18 @@ fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
         }
     };
     if files.is_empty() {
-        report.error(path, "empty", "there is no file here".into());
+        report.error(path, "empty", "found no file".into());
     }
     if path.is_dir() {
         check_manifest(path, &files, &mut report);
     }
     let mut sets: BTreeMap<u32, SetFiles> = BTreeMap::new();
     let mut spectra = BTreeSet::new();
-    let mut methods: BTreeMap<String, PathBuf> = BTreeMap::new();
+    let mut methods: BTreeSet<String> = BTreeSet::new();
     for file in &files {
-        let kind = Kind::of(file);
-        match &kind {
-            None => {
-                let single = files.len() == 1 && path.is_file();
-                let message = format!("the name is {}", Kind::EXPECTED);
-                if single {
-                    report.warn(file, "name", message);
-                } else {
-                    report.error(file, "name", message);
-                }
-            }
-            Some(Kind::Catalogue { method, .. } | Kind::Spectrum { method, .. }) => {
-                methods
-                    .entry(method.clone())
-                    .or_insert_with(|| file.clone());
-            }
+        let kind = check_name(file, files.len() == 1 && path.is_file(), &mut report);
+        if let Some(Kind::Catalogue { method, .. } | Kind::Spectrum { method, .. }) = &kind {
+            methods.insert(method.clone());
         }
         let spectrum = match &kind {
             Some(kind) => matches!(kind, Kind::Spectrum { .. }),
@@ -121,47 +113,36 @@ fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
         };
         match &kind {
             Some(Kind::Catalogue { set, image, .. }) => {
-                let entry = sets.entry(*set).or_insert_with(|| SetFiles {
-                    images: SetImages::new(&expected.grid),
-                    faults: ImageFaults::default(),
-                    paths: Vec::new(),
-                    numbers: Vec::new(),
-                    first: file.clone(),
-                });
-                entry.faults.add(&sum);
-                entry.images.add(&sum);
-                entry.numbers.push(*image);
-                entry.paths.push(file.clone());
+                let entry = sets
+                    .entry(*set)
+                    .or_insert_with(|| SetFiles::new(&expected.grid, file));
+                entry.add(&sum, *image, file);
             }
-            // A lone file of another name can only belong to the only set there is.
+            // A single file with another name belongs to the only set.
             _ if files.len() == 1 && expected.truth.len() == 1 => {
-                let mut images = SetImages::new(&expected.grid);
-                let mut faults = ImageFaults::default();
-                faults.add(&sum);
-                images.add(&sum);
+                let mut entry = SetFiles::new(&expected.grid, file);
+                entry.add(&sum, 1, file);
                 for set in expected.truth.keys() {
-                    check_against_truth(*set, &images, &faults, file, expected, &mut report);
+                    check_against_truth(*set, &entry, expected, &mut report);
                 }
             }
             _ if !expected.truth.is_empty() => {
-                let message = "its name does not say of which set it is; it is not compared with the true shear";
+                let message =
+                    "not compared with the true shear, because the name contains no set number";
                 report.warn(file, "truth", message.into());
             }
             _ => {}
         }
     }
     if methods.len() > 1 {
-        let names: Vec<&str> = methods.keys().map(String::as_str).collect();
-        report.error(
-            path,
-            "method",
-            format!("files of several methods: {}", names.join(", ")),
-        );
+        let names: Vec<&str> = methods.iter().map(String::as_str).collect();
+        let message = format!("the files belong to several methods: {}", names.join(", "));
+        report.error(path, "method", message);
     }
     if path.is_dir() && !(sets.is_empty() && spectra.is_empty()) {
         for set in expected.truth.keys() {
             if !sets.contains_key(set) && !spectra.contains(set) {
-                let message = format!("there is no file for set {set}, of which there are data");
+                let message = format!("found no file of set {set}, which the data contain");
                 report.warn(path, "sets", message);
             }
         }
@@ -171,25 +152,51 @@ fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
     for (set, files) in &mut sets {
         check_copies(files, &mut report);
         check_images(*set, files, most, path, expected, &mut report);
-        let faults = &files.faults;
-        check_against_truth(
-            *set,
-            &files.images,
-            faults,
-            &files.first,
-            expected,
-            &mut report,
-        );
+        check_against_truth(*set, files, expected, &mut report);
     }
     report.findings
 }
 
+/// The kind of a file. An unknown name is an error, for a `single` file a warning.
+fn check_name(file: &Path, single: bool, report: &mut Report) -> Option<Kind> {
+    let kind = Kind::of(file);
+    if kind.is_none() {
+        let severity = match single {
+            true => Severity::Warning,
+            false => Severity::Error,
+        };
+        let message = format!("the name is {}", Kind::EXPECTED);
+        report.add(file, severity, "name", message);
+    }
+    kind
+}
+
+/// Catalogues of a set.
 struct SetFiles {
     images: SetImages,
     faults: ImageFaults,
     paths: Vec<PathBuf>,
     numbers: Vec<u32>,
     first: PathBuf,
+}
+
+impl SetFiles {
+    fn new(grid: &Grid, first: &Path) -> Self {
+        SetFiles {
+            images: SetImages::new(grid),
+            faults: ImageFaults::default(),
+            paths: Vec::new(),
+            numbers: Vec::new(),
+            first: first.to_owned(),
+        }
+    }
+
+    fn add(&mut self, sum: &FieldSum, image: u32, file: &Path) {
+        self.faults.add(sum);
+        self.images.add(sum).expect(ONE_IMAGE);
+        self.numbers.push(image);
+        self.paths.push(file.to_owned());
+    }
 }
 
 #[derive(Default)]
@@ -237,17 +244,18 @@ fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
     if manifest.contents == Contents::CrossSpectra {
         let bare = |name: &&String| !manifest.covariances.contains_key(*name);
         for name in manifest.files.keys().filter(bare) {
-            let message = "the manifest has no covariance of its bandpowers, so that scores have no errors; expected one, which takes eight images";
+            let message = "scores will have no errors, because the manifest contains no covariance (found fewer than 8 images)";
             report.warn(&folder.join(name), "covariance", message.into());
         }
     }
 }
 
-/// A file of an unknown name is a spectrum if its lines have three numbers.
+/// Whether a file with an unknown name is a spectrum: its lines have three numbers.
 fn looks_like_spectrum(path: &Path) -> bool {
     read_spectrum(path).is_ok_and(|lines| !lines.is_empty() && lines.len() <= 20)
 }
 
+/// Checks the rows of a catalogue. Returns their sum on the grid, or `None` if the file is not readable.
 fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Option<FieldSum> {
     let rows = match read_rows(path, &COLUMNS, most_rows(expected.grid.cells())) {
         Ok(rows) => rows,
@@ -260,24 +268,12 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
     let cells = grid.cells();
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, rows.iter().copied());
-    let (mut off_centre, mut offset) = (0, (0.0, 0.0));
-    for Row { x, y, .. } in &rows {
-        let Some((ix, iy)) = grid.cell(*x, *y) else {
-            continue;
-        };
-        let centre = grid.centre(ix, iy);
-        let (dx, dy) = (x - centre.0, y - centre.1);
-        if dx.abs().max(dy.abs()) > POSITION_TOLERANCE * grid.stamp.0 {
-            off_centre += 1;
-            offset = (offset.0 + dx, offset.1 + dy);
-        }
-    }
-    if let Some(fault) = counts.fault(grid) {
+    if let Some(fault) = odd_rows(&counts, grid) {
         report.error(path, "values", fault);
     }
     if counts.excess > 0 {
         let message = format!(
-            "{} rows; the {cells} cells take no more, the rest is ignored",
+            "too many rows (found {}, expected at most {cells}); the rest is ignored",
             rows.len()
         );
         report.error(path, "excess", message);
@@ -287,13 +283,13 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
             path,
             "outside",
             format!(
-                "{} rows lie outside the {1} × {1} grid",
+                "{} rows are outside the {1} × {1} grid",
                 counts.outside, grid.n
             ),
         );
     }
     if counts.missing == cells {
-        report.error(path, "missing", "no galaxy of the grid is there".into());
+        report.error(path, "missing", "no galaxy is on the grid".into());
     } else if counts.missing > 0 {
         let message = format!(
             "{} of {cells} galaxies are missing; each counts as zero",
@@ -307,21 +303,12 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
     }
     if counts.repeated > 0 {
         let message = format!(
-            "{} rows are of galaxies that have one already; their ellipticities add up",
+            "{} rows repeat a galaxy; the scoring adds their ellipticities",
             counts.repeated
         );
         report.error(path, "duplicates", message);
     }
-    if off_centre > 0 {
-        let (dx, dy) = (
-            offset.0 / f64::from(off_centre),
-            offset.1 / f64::from(off_centre),
-        );
-        let message = format!(
-            "{off_centre} positions are off the centres of their cells, on average by ({dx:+.2}, {dy:+.2}) px; positions are 1-based FITS pixels of the stamp centre"
-        );
-        report.warn(path, "positions", message);
-    }
+    check_positions(path, &rows, grid, report);
     if counts.not_finite > 0 {
         report.error(
             path,
@@ -352,18 +339,44 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
     Some(sum)
 }
 
+/// Positions that are not at the centres of their cells.
+fn check_positions(path: &Path, rows: &[Row], grid: &Grid, report: &mut Report) {
+    let (mut off_centre, mut offset) = (0, (0.0, 0.0));
+    for Row { x, y, .. } in rows {
+        let Some((ix, iy)) = grid.cell(*x, *y) else {
+            continue;
+        };
+        let centre = grid.centre(ix, iy);
+        let (dx, dy) = (x - centre.0, y - centre.1);
+        if dx.abs().max(dy.abs()) > POSITION_TOLERANCE * grid.stamp.0 {
+            off_centre += 1;
+            offset = (offset.0 + dx, offset.1 + dy);
+        }
+    }
+    if off_centre > 0 {
+        let (dx, dy) = (
+            offset.0 / f64::from(off_centre),
+            offset.1 / f64::from(off_centre),
+        );
+        let message = format!(
+            "{off_centre} positions are not at the centres of their cells (mean offset {dx:+.2}, {dy:+.2} px); expected 1-based FITS pixels of the stamp centre"
+        );
+        report.warn(path, "positions", message);
+    }
+}
+
 /// Catalogues with the ellipticities of another image of their set.
 fn check_copies(files: &SetFiles, report: &mut Report) {
     for (copy, first) in &files.faults.copies {
         let message = format!(
-            "the ellipticities are those of {}; expected an independent measurement per image",
+            "the ellipticities are copies of {}; expected an independent measurement per image",
             name_of(&files.paths[*first])
         );
         report.error(&files.paths[*copy], "copies", message);
     }
 }
 
-/// The name of a file without its folder, which may be a temporary one.
+/// The name of a file without its folder, which may be temporary.
 fn name_of(path: &Path) -> String {
     path.file_name()
         .unwrap_or_default()
@@ -371,6 +384,7 @@ fn name_of(path: &Path) -> String {
         .into_owned()
 }
 
+/// Missing images of a set, and image numbers above the expected number.
 fn check_images(
     set: u32,
     files: &mut SetFiles,
@@ -400,20 +414,20 @@ fn check_images(
     }
     let last = files.numbers.last().copied().unwrap_or(0);
     if let Some(images) = expected.images.filter(|images| last > *images) {
-        let message = format!("set {set} has an image {last}; expected {images} images");
+        let message =
+            format!("set {set}: too many images (found image {last}, expected {images} images)");
         report.error(path, "images", message);
     }
 }
 
-/// Conventions and type of ellipticity, where the truth is known.
-fn check_against_truth(
-    set: u32,
-    images: &SetImages,
-    faults: &ImageFaults,
-    path: &Path,
-    expected: &Expected,
-    report: &mut Report,
-) {
+/// Conventions and type of ellipticity, if the truth is known.
+fn check_against_truth(set: u32, files: &SetFiles, expected: &Expected, report: &mut Report) {
+    let SetFiles {
+        images,
+        faults,
+        first: path,
+        ..
+    } = files;
     if images.total().count.iter().all(|count| *count == 0.0) {
         return;
     }
@@ -431,13 +445,15 @@ fn check_against_truth(
     let Ok(score) = scorer.score(images) else {
         return;
     };
-    // Copies seem to have no noise, and constant ellipticities no response; both are reported already.
+    // Copies appear to have no noise, and constant ellipticities no response. Both are reported already.
     let explained = |fault: &Fault| match fault {
         Fault::Uncorrelated { .. } => !faults.copies.is_empty(),
         Fault::Biased { .. } => !faults.constant.is_empty(),
         _ => false,
     };
-    let found = scorer.diagnose(images, &score, Convention::STANDARD);
+    let Ok(found) = scorer.diagnose(images, &score, Convention::STANDARD) else {
+        return;
+    };
     for finding in found.into_iter().filter(|fault| !explained(fault)) {
         let (check, severity) = match finding {
             Fault::StrongTruth { .. } => ("truth", Severity::Warning),
@@ -461,6 +477,7 @@ fn check_against_truth(
     }
 }
 
+/// Bins, multipoles, powers and unit of a power spectrum.
 fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report: &mut Report) {
     let lines = match read_spectrum(path) {
         Ok(lines) => lines,
@@ -481,7 +498,7 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
     let bins = Bins::new(&expected.grid, Definition::Leaderboard);
     if let Some((SpectrumLine { index, l, .. }, centre, wrong)) = wrong_multipoles(&lines, &bins) {
         let message = format!(
-            "{wrong} of {} multipoles are not those of {n} × {n} galaxies (--grid): bin {index} has l = {l}, expected {centre:.1}",
+            "{wrong} of {} multipoles do not belong to {n} × {n} galaxies (found l = {l} in bin {index}, expected {centre:.1}). Try: --grid N",
             lines.len(),
             n = expected.grid.n
         );
@@ -498,7 +515,7 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
             report.warn(
                 path,
                 "negative",
-                format!("the power of bin {index} is negative: {power:e} (noise can do that to cross-spectra)"),
+                format!("the power of bin {index} is negative: {power:e} (possible for noisy cross-spectra)"),
             );
         }
     }
@@ -514,13 +531,57 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
                 sums.1 + true_power[line.index as usize - 1],
             )
         });
-        // Noise alone makes a cross-spectrum negative.
+        // A cross-spectrum of noise can be negative.
         let ratio = (sum / true_sum).abs();
         if !(0.01..100.0).contains(&ratio) {
             let message = format!(
-                "the power is {ratio:.1e} times the true one; the unit is ℓ²C_ℓ/2π (noise raises it, too)"
+                "the power is {ratio:.1e} times the true power; expected the unit ℓ²C_ℓ/2π. Noise also raises the power"
             );
             report.warn(path, "unit", message);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shearq_quantities::units::{Degrees, Pixels};
+
+    /// Names of the checks that a catalogue of 8 × 8 galaxies fails.
+    fn failed(edit: impl Fn(&mut Vec<[f64; 4]>)) -> Vec<&'static str> {
+        let centre = |k: usize| 24.5 + 48.0 * k as f64;
+        let e = |k: usize| 0.01 * (k as f64 - 31.5) / 32.0;
+        let mut rows: Vec<[f64; 4]> = (0..64)
+            .map(|k| [centre(k % 8), centre(k / 8), e(k), -e(k)])
+            .collect();
+        edit(&mut rows);
+        let line = |[x, y, e1, e2]: &[f64; 4]| format!("{x} {y} {e1} {e2}\n");
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("g10_v1_objs_2_1.M.dat");
+        std::fs::write(&path, rows.iter().map(line).collect::<String>()).unwrap();
+        let expected = Expected {
+            grid: Grid::new(8, Pixels(48.0), Degrees(10.0)).unwrap(),
+            truth: BTreeMap::new(),
+            images: None,
+        };
+        let findings = check(&path, &expected);
+        findings.iter().map(|finding| finding.check).collect()
+    }
+
+    #[test]
+    fn each_fault_of_a_catalogue_fails_its_check() {
+        assert!(failed(|_| {}).is_empty());
+        assert_eq!(failed(|rows| _ = rows.pop()), ["missing"]);
+        assert_eq!(failed(|rows| rows[3][0] += 1.0), ["positions"]);
+        assert_eq!(failed(|rows| rows[3][2] = 1.5), ["range"]);
+        assert_eq!(failed(|rows| rows[3][2] = f64::NAN), ["not-finite"]);
+        assert_eq!(failed(|rows| rows[3][0] = 999.0), ["outside", "missing"]);
+        assert_eq!(failed(|rows| rows[3] = rows[4]), ["missing", "duplicates"]);
+        let zero = |rows: &mut Vec<[f64; 4]>| {
+            for row in rows {
+                (row[2], row[3]) = (0.0, 0.0);
+            }
+        };
+        assert_eq!(failed(zero), ["constant"]);
     }
 }

@@ -1,4 +1,4 @@
-//! The manifest of a packed submission: its files with checksums, and what made them.
+//! The manifest of a submission: files with checksums, settings and source.
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
@@ -13,10 +13,10 @@ use crate::foreign::Foreign;
 use shearq_files::{FileError, open};
 use shearq_pipeline::data::run::{Run, read_record};
 
-/// Name of the manifest beside the files.
+/// File name of the manifest.
 pub const MANIFEST_FILE: &str = "manifest.json";
 
-/// What the files of a submission hold.
+/// Content of the files of a submission.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Contents {
@@ -25,29 +25,29 @@ pub enum Contents {
     Catalogues,
     /// Power spectra of the ellipticities averaged over the images, noise included.
     Spectra,
-    /// Shear power spectra from cross-spectra between groups of images, in which noise has no mean.
+    /// Shear power spectra from cross-spectra between groups of images; their noise averages to zero.
     CrossSpectra,
 }
 
-/// A packed submission.
+/// The manifest of a submission.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
     /// Version of shearq that packed it.
     pub version: String,
-    /// Method's name in the file names.
+    /// Name of the method in file names.
     #[serde(deserialize_with = "checked_name")]
     pub method: String,
-    /// What the files hold.
+    /// Content of the files.
     pub contents: Contents,
-    /// What the catalogues were measured from, by which settings and version.
+    /// Source, settings and version of the measurement.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub run: Option<Run>,
-    /// Description of the catalogues of another program.
+    /// Description of another program's catalogues.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub foreign: Option<Foreign>,
-    /// The files by name, but for the manifest.
+    /// The files by name, without the manifest.
     pub files: BTreeMap<String, FileSum>,
-    /// Covariance of the bandpowers of each cross-spectrum under noise, by the name of its file.
+    /// Noise covariance of the bandpowers of each cross-spectrum, by file name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub covariances: BTreeMap<String, SpectrumCovariance>,
 }
@@ -62,10 +62,10 @@ pub struct FileSum {
 }
 
 impl FileSum {
-    /// Of all that `from` has, copied to `to` on the way.
+    /// Copies `from` to `to` and returns size and checksum.
     ///
     /// # Errors
-    /// Where reading or writing fails.
+    /// If reading or writing fails.
     pub fn copying(from: &mut impl Read, to: &mut impl Write) -> std::io::Result<Self> {
         let mut hasher = Sha256::new();
         let mut bytes = 0;
@@ -88,10 +88,10 @@ impl FileSum {
         })
     }
 
-    /// Of a file.
+    /// Size and checksum of a file.
     ///
     /// # Errors
-    /// Where it cannot be read.
+    /// If it cannot be read.
     pub fn of(path: &Path) -> Result<Self, FileError> {
         open::open(path)
             .and_then(|mut file| FileSum::copying(&mut file, &mut std::io::sink()))
@@ -100,26 +100,26 @@ impl FileSum {
 }
 
 impl Manifest {
-    /// Reads that of a folder; `None` where there is none.
+    /// Reads the manifest of a folder; `None` if there is none.
     ///
     /// # Errors
-    /// Where it exists and cannot be read.
+    /// If it exists and cannot be read.
     pub fn read(folder: &Path) -> Result<Option<Self>, FileError> {
         read_record(&folder.join(MANIFEST_FILE))
     }
 
-    /// Names of files that are not as the manifest says, with what was found and what was expected.
+    /// Files that disagree with the manifest: names and messages.
     pub fn faults(&self, found: &BTreeMap<String, FileSum>) -> Vec<(String, String)> {
         let listed = self.files.iter().filter_map(|(name, sum)| {
             let message = match found.get(name) {
-                None => format!("the file is missing; {MANIFEST_FILE} lists it"),
-                Some(own) if own.bytes != sum.bytes => format!(
-                    "the file was changed: {} bytes; {MANIFEST_FILE} says {}",
-                    own.bytes, sum.bytes
+                None => format!("the file is missing, but {MANIFEST_FILE} lists it"),
+                Some(there) if there.bytes != sum.bytes => format!(
+                    "the file was changed (found {} bytes, expected {} as in {MANIFEST_FILE})",
+                    there.bytes, sum.bytes
                 ),
-                Some(own) if own != sum => format!(
-                    "the file was changed: its SHA-256 is {}; {MANIFEST_FILE} says {}",
-                    own.sha256, sum.sha256
+                Some(there) if there != sum => format!(
+                    "the file was changed (found SHA-256 {}, expected {} as in {MANIFEST_FILE})",
+                    there.sha256, sum.sha256
                 ),
                 Some(_) => return None,
             };
@@ -135,5 +135,55 @@ impl Manifest {
                 )
             });
         listed.chain(extra).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn missing_changed_and_additional_files_are_named() {
+        let sum =
+            |text: &str| FileSum::copying(&mut text.as_bytes(), &mut std::io::sink()).unwrap();
+        // The test vector "abc" of FIPS 180-4.
+        assert!(sum("abc").sha256.starts_with("ba7816bf8f01cfea"));
+        let files = |pairs: &[(&str, &str)]| -> BTreeMap<String, FileSum> {
+            let pairs = pairs.iter();
+            pairs
+                .map(|(name, text)| ((*name).to_owned(), sum(text)))
+                .collect()
+        };
+        let manifest = Manifest {
+            version: "1".into(),
+            method: "M".into(),
+            contents: Contents::Catalogues,
+            run: None,
+            foreign: None,
+            files: files(&[
+                ("gone", "x"),
+                ("longer", "x"),
+                ("other", "x"),
+                ("same", "x"),
+            ]),
+            covariances: BTreeMap::new(),
+        };
+        let found = files(&[
+            ("longer", "xx"),
+            ("more", "x"),
+            ("other", "y"),
+            ("same", "x"),
+        ]);
+        let faults = manifest.faults(&found);
+        let expected = [
+            ("gone", "missing"),
+            ("longer", "found 2 bytes, expected 1"),
+            ("other", "found SHA-256"),
+            ("more", "does not list"),
+        ];
+        assert_eq!(faults.len(), expected.len(), "{faults:?}");
+        for ((name, message), (of, part)) in faults.iter().zip(expected) {
+            assert!(name == of && message.contains(part), "{name}: {message}");
+        }
     }
 }

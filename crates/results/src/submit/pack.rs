@@ -1,4 +1,4 @@
-//! Packing: measured catalogues become the files that a challenge takes, with a manifest.
+//! Writes catalogues as a submission to a challenge, with a manifest.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -24,32 +24,37 @@ use shearq_pipeline::data::run::Run;
 use shearq_pipeline::data::run::record_text;
 use shearq_pipeline::{Progress, grid, truth};
 
-/// The catalogues that are packed.
+/// The catalogues to pack.
+#[derive(Debug, Clone, Copy)]
 pub enum Origin<'a> {
-    /// A folder that was measured.
+    /// A folder that shearq measured.
     Measured {
         /// The folder.
         folder: &'a Path,
-        /// Its record.
+        /// The record of the folder.
         run: &'a Run,
     },
     /// Catalogues of another program.
     Foreign {
-        /// Their description.
+        /// The description of the catalogues.
         foreign: &'a Foreign,
-        /// What they were measured from, which gives the grid of spectra.
+        /// The data that they were measured from, for the grid of spectra.
         data: Option<&'a DataFolder>,
     },
 }
 
 impl Origin<'_> {
-    fn catalogues(&self) -> Result<Files, FileError> {
+    /// The existing catalogues.
+    ///
+    /// # Errors
+    /// If a folder cannot be listed, or the pattern of the names contains no set.
+    pub fn catalogues(&self) -> Result<Files, FileError> {
         match self {
             Origin::Measured { folder, run } => run.catalogues(folder, &[]),
             Origin::Foreign { foreign, .. } => {
                 let files = foreign.catalogues(&[])?;
                 if files.serve_all_sets() {
-                    let message = "the pattern of the catalogues has no {set}, by which packed files are called";
+                    let message = "the pattern of the catalogues contains no {set}, which the names of packed files need";
                     return Err(FileError::new(foreign.pattern(), message));
                 }
                 Ok(files)
@@ -64,8 +69,8 @@ impl Origin<'_> {
         }
     }
 
-    /// How well each convention goes with the true shear of a set, where another program's catalogues are
-    /// packed and it is known.
+    /// How well each convention agrees with the true shear of a set, for another program's catalogues if the truth is
+    /// known.
     fn matching(
         &self,
         set: u32,
@@ -79,13 +84,15 @@ impl Origin<'_> {
                 let truth = data.read_truth(set, grid)?;
                 let scorer = SetScorer::new(*grid, truth, Options::default())
                     .map_err(|error| FileError::new(data.truth(set), error))?;
-                Ok(scorer.match_convention(images))
+                scorer
+                    .match_convention(images)
+                    .map_err(|error| FileError::new(data.truth(set), error))
             }
             _ => Ok(ConventionMatch::default()),
         }
     }
 
-    /// Grid of a set, of which `catalogue` is one.
+    /// Grid of a set with the catalogue `catalogue`.
     fn grid(&self, set: u32, catalogue: &Path) -> Result<Grid, FileError> {
         match self {
             Origin::Measured { run, .. } => {
@@ -96,28 +103,29 @@ impl Origin<'_> {
                 data: Some(data), ..
             } => truth::grid_of_set(data, set),
             Origin::Foreign { data: None, .. } => {
-                let message = "the grid is not known; --data DIR gives it for spectra";
+                let message = "cannot determine the grid of the spectra. Try: --data DIR";
                 Err(FileError::new(catalogue, message))
             }
         }
     }
 }
 
-/// What is packed, and how.
+/// What to pack, and how.
+#[derive(Debug, Clone)]
 pub struct Packing<'a> {
-    /// The catalogues.
+    /// Catalogues to pack.
     pub origin: Origin<'a>,
-    /// Method's name in file names.
+    /// Name of the method in file names.
     pub method: String,
-    /// What the files are to hold.
+    /// Content of the files.
     pub contents: Contents,
 }
 
 impl Packing<'_> {
-    /// Number of galaxies to pack, for progress bars: an estimate from the first catalogue.
+    /// Number of galaxies to pack, estimated from the first catalogue for progress bars.
     ///
     /// # Errors
-    /// Where there is no catalogue, or it cannot be read.
+    /// If there is no catalogue, or it cannot be read.
     pub fn galaxies(&self) -> Result<u64, FileError> {
         let files = self.origin.catalogues()?;
         let mut all = files.sets().into_iter().flat_map(|set| files.of_set(set));
@@ -126,39 +134,36 @@ impl Packing<'_> {
                 Origin::Measured { folder, .. } => folder.to_path_buf(),
                 Origin::Foreign { foreign, .. } => foreign.pattern(),
             };
-            return Err(FileError::new(place, "there is no catalogue here to pack"));
+            return Err(FileError::new(place, "found no catalogue to pack"));
         };
         let rows = self.origin.rows(&first, MAX_ROWS)?.len();
         Ok(((1 + all.count()) * rows) as u64)
     }
 
-    /// Writes the files and their manifest to `out`, a new folder or, by its ending, an archive, which
-    /// appears whole or not at all. The same catalogues give the same bytes. Returns the number of
-    /// files without the manifest.
+    /// Writes the files and their manifest to `out`: an archive, by its ending, or a new folder. After an error nothing
+    /// remains. The same catalogues give the same bytes. Returns the number of files without the manifest.
     ///
     /// # Errors
-    /// Where a catalogue cannot be read or `out` cannot be written.
+    /// If a catalogue cannot be read, or `out` cannot be written.
     pub fn write(&self, out: &Path, progress: &mut dyn Progress) -> Result<usize, FileError> {
+        let found = self.origin.catalogues()?;
+        let per_set = |set| match self.contents {
+            Contents::Catalogues => found.of_set(set).len(),
+            Contents::Spectra | Contents::CrossSpectra => 1,
+        };
+        check_number(found.sets().into_iter().map(per_set).sum(), out)?;
         let mut destination = Destination::create(out)?;
         let mut files = BTreeMap::new();
         let mut covariances = BTreeMap::new();
         let mut matching = ConventionMatch::default();
         let mut add = |kind: Kind, text: String| -> Result<(), FileError> {
             let (name, mut bytes) = (kind.file_name(), text.as_bytes());
-            if files.len() as u64 + 1 >= MAX_FILES {
-                let message = format!(
-                    "there are more than {} files to pack, the most that `check` and `unpack` read",
-                    MAX_FILES - 1
-                );
-                return Err(FileError::new(out, message));
-            }
             destination.add(&name, bytes)?;
             let sum = FileSum::copying(&mut bytes, &mut std::io::sink())
                 .map_err(FileError::doing(out, "cannot add up"))?;
             files.insert(name, sum);
             Ok(())
         };
-        let found = self.origin.catalogues()?;
         for set in found.sets() {
             let catalogues = found.of_set(set);
             let method = self.method.clone();
@@ -192,7 +197,7 @@ impl Packing<'_> {
         {
             let found = matching.convention();
             let message = format!(
-                "by the true shear these catalogues are in convention {} ({}), of which no spectrum can tell; let the description exchange `x` and `y` or set `e2_sign`",
+                "the catalogues are in convention {} ({}), judged by the true shear; spectra need convention 5. Try: exchange `x` and `y`, or set `e2_sign`, in the description",
                 found.number(),
                 found.describe()
             );
@@ -234,11 +239,12 @@ impl Packing<'_> {
             let rows = self.origin.rows(path, most_rows(grid.cells()))?;
             progress.advance(rows.len() as u64);
             used += sum.add_image(&grid, rows).used;
-            images.add(&sum);
+            images
+                .add(&sum)
+                .map_err(|error| FileError::new(path, error))?;
         }
         if used == 0 {
-            let message =
-                "neither this catalogue nor others of the set have an ellipticity on the grid";
+            let message = "no catalogue of the set has an ellipticity on the grid";
             return Err(FileError::new(first, message));
         }
         matching.merge(&self.origin.matching(set, &images, &grid)?);
@@ -246,7 +252,17 @@ impl Packing<'_> {
     }
 }
 
-/// Where packed files go.
+/// Refuses more files than `check` and `unpack` read. The manifest is one more file.
+fn check_number(files: usize, out: &Path) -> Result<(), FileError> {
+    if (files as u64) < MAX_FILES {
+        return Ok(());
+    }
+    let most = MAX_FILES - 1;
+    let message = format!("too many files to pack (found {files}, expected at most {most})");
+    Err(FileError::new(out, message))
+}
+
+/// Where packed files are written.
 enum Destination {
     Folder(PartFolder),
     Archive(Box<ArchiveWriter>),
@@ -277,5 +293,21 @@ impl Destination {
             Destination::Archive(archive) => archive.finish(),
             Destination::Folder(folder) => folder.finish(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn as_many_files_are_packed_as_are_read() {
+        let out = Path::new("sent.tar.gz");
+        assert!(check_number(199_999, out).is_ok());
+        let message = check_number(200_000, out).unwrap_err().to_string();
+        assert_eq!(
+            message,
+            "sent.tar.gz: too many files to pack (found 200000, expected at most 199999)"
+        );
     }
 }

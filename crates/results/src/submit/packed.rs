@@ -1,4 +1,4 @@
-//! Submissions as they are sent: the files of a folder or an archive, told apart by their names.
+//! Reads submissions: the files of a folder or an archive, recognised by their names.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,8 @@ use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
 use shearq_files::FileError;
 use shearq_files::atomic::Scratch;
 
-/// A folder or file as it was given, or the folder that an archive was unpacked to for a while.
+/// A given folder or file, or the temporary folder of an unpacked archive.
+#[derive(Debug)]
 pub struct Sent {
     path: PathBuf,
     given: PathBuf,
@@ -17,10 +18,10 @@ pub struct Sent {
 }
 
 impl Sent {
-    /// Unpacks what is an archive by its ending.
+    /// Opens a submission, and unpacks it if it has the ending of an archive.
     ///
     /// # Errors
-    /// Where it cannot be unpacked.
+    /// If it cannot be unpacked.
     pub fn open(given: &Path) -> Result<Self, FileError> {
         let given = given.to_owned();
         if !is_archive(&given) {
@@ -39,12 +40,12 @@ impl Sent {
         })
     }
 
-    /// Where the files are.
+    /// The folder or file with the content.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// How a file or the folder is called for those who gave it: as a member of the archive.
+    /// The name of a file for messages: a member of the archive, not of the temporary folder.
     pub fn as_given(&self, path: &Path) -> PathBuf {
         match path.strip_prefix(&self.path) {
             Ok(name) if name.as_os_str().is_empty() => self.given.clone(),
@@ -53,15 +54,15 @@ impl Sent {
         }
     }
 
-    /// An error about a file of it, under the name [`Sent::as_given`].
+    /// The error with the name [`Sent::as_given`].
     pub fn named(&self, error: FileError) -> FileError {
         FileError::new(self.as_given(&error.path), error.message)
     }
 
-    /// The files, without the manifest and hidden ones; a file that was given is the only one.
+    /// The files without the manifest and hidden files, or the given file.
     ///
     /// # Errors
-    /// Where the folder cannot be listed, or the file is not there.
+    /// If the folder cannot be listed, or the file does not exist.
     pub fn files(&self) -> std::io::Result<Vec<PathBuf>> {
         if !self.path.is_dir() {
             std::fs::metadata(&self.path)?;
@@ -82,34 +83,36 @@ impl Sent {
     }
 }
 
-/// What a submission holds.
+/// Content of a submission.
+#[derive(Debug, Clone)]
 pub enum Packed {
     /// Catalogues by set and image.
     Catalogues(BTreeMap<u32, BTreeMap<u32, PathBuf>>),
-    /// A power spectrum for each set.
+    /// A power spectrum per set.
     Spectra(BTreeMap<u32, PathBuf>),
 }
 
-/// A submission of one method, as its manifest says if it has one.
+/// A submission of one method.
+#[derive(Debug, Clone)]
 pub struct Submission {
-    /// The method's name.
+    /// Name of the method.
     pub method: String,
-    /// Its files.
+    /// Files of the submission.
     pub packed: Packed,
-    /// Its manifest.
+    /// Manifest, if there is one.
     pub manifest: Option<Manifest>,
 }
 
 impl Submission {
-    /// Reads what `sent` holds.
+    /// Reads the files of `sent`.
     ///
     /// # Errors
-    /// Where files are not as the manifest says, or their names not those of one kind and one method.
+    /// If files disagree with the manifest, or have several kinds or methods.
     pub fn read(sent: &Sent) -> Result<Self, FileError> {
         let whole = |message: String| FileError::new(&sent.given, message);
         if !sent.path.is_dir() {
             return Err(whole(
-                "there is no such folder; expected one, or an archive (.tar.gz)".into(),
+                "there is no such folder; expected a folder or an archive (.tar.gz)".into(),
             ));
         }
         let files = sent
@@ -141,8 +144,11 @@ impl Submission {
         methods.dedup();
         let [method] = methods.as_slice() else {
             return Err(whole(match methods.len() {
-                0 => "there is no file here".into(),
-                _ => format!("files of several methods: {}", methods.join(", ")),
+                0 => "the submission contains no files".into(),
+                _ => format!(
+                    "the files belong to several methods: {}",
+                    methods.join(", ")
+                ),
             }));
         };
         let packed = match (catalogues.is_empty(), spectra.is_empty()) {
@@ -150,7 +156,7 @@ impl Submission {
             (true, false) => Packed::Spectra(spectra),
             _ => {
                 return Err(whole(
-                    "it holds catalogues and spectra; expected one kind".into(),
+                    "the submission contains catalogues and spectra; expected one kind".into(),
                 ));
             }
         };
@@ -162,7 +168,7 @@ impl Submission {
     }
 }
 
-/// The manifest of a submission if it has one, of which its files must be those.
+/// The manifest of a submission, if it has one, after comparing the files with it.
 fn verified(sent: &Sent, files: &[PathBuf]) -> Result<Option<Manifest>, FileError> {
     let Some(manifest) = Manifest::read(&sent.path)? else {
         return Ok(None);
@@ -177,4 +183,45 @@ fn verified(sent: &Sent, files: &[PathBuf]) -> Result<Option<Manifest>, FileErro
     }
     found.verify(&sent.given, true)?;
     Ok(found.manifest)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Reads a folder of empty files.
+    fn read(names: &[&str]) -> Result<Submission, FileError> {
+        let folder = tempfile::tempdir().unwrap();
+        for name in names {
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
+        Submission::read(&Sent::open(folder.path())?)
+    }
+
+    #[test]
+    fn files_are_sorted_by_kind_set_and_image() {
+        let names = ["g10_v1_objs_2_10.M.dat", "g10_v1_objs_2_9.M.dat", ".hidden"];
+        let submission = read(&names).unwrap();
+        let Packed::Catalogues(sets) = submission.packed else {
+            panic!("catalogues are no spectra");
+        };
+        let images: Vec<u32> = sets[&2].keys().copied().collect();
+        assert_eq!((submission.method.as_str(), images), ("M", vec![9, 10]));
+        let spectra = read(&["M_set1.dat", "M_set2.dat"]).unwrap();
+        assert!(matches!(spectra.packed, Packed::Spectra(files) if files.len() == 2));
+    }
+
+    #[test]
+    fn a_submission_has_one_method_and_one_kind() {
+        let one = "g10_v1_objs_2_1.M.dat";
+        for (names, expected) in [
+            (&[][..], "contains no files"),
+            (&[one, "g10_v1_objs_2_2.N.dat"], "several methods: M, N"),
+            (&[one, "M_set2.dat"], "catalogues and spectra"),
+            (&[one, "notes.txt"], "the name is neither"),
+        ] {
+            let message = read(names).unwrap_err().to_string();
+            assert!(message.contains(expected), "{names:?}: {message}");
+        }
+    }
 }

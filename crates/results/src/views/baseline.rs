@@ -1,4 +1,4 @@
-//! What moved since a baseline: a table for people and programs, and JUnit for test reports.
+//! Checks of baselines as a table and as JUnit.
 
 use std::fmt::Write;
 
@@ -6,11 +6,11 @@ use crate::baseline::Checked;
 use shearq_render::escape::markup as escape;
 use shearq_render::table::{Cell, Heading, Table};
 
-/// Every metric of every check, or only those that moved.
+/// The metrics of all checks, or only the moved ones.
 pub fn shift_table(checks: &[Checked], all: bool) -> Table {
     let headings = [
         ("baseline", "Baseline"),
-        ("submission", "Submission"),
+        ("submission", "Configuration"),
         ("set", "Set"),
         ("metric", "Metric"),
         ("before", "Before"),
@@ -38,40 +38,40 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
             ]);
         }
     }
-    let looked: usize = checks.iter().map(|check| check.shifts.len()).sum();
+    let compared: usize = checks.iter().map(|check| check.shifts.len()).sum();
     let moved = checks
         .iter()
         .flat_map(|check| &check.shifts)
         .filter(|shift| shift.moved)
         .count();
     let mut notes = vec![format!(
-        "{moved} of {looked} metrics of {} submission(s) moved by more than rounding or noise explains. In σ: difference over the metric's standard error.",
+        "{moved} of {compared} metrics of {} configuration(s) moved by more than rounding or noise. In σ: difference over the standard error of the metric.",
         checks.len()
     )];
     for check in checks {
         let name = format!("{}, {}", check.baseline, check.configuration);
         for line in &check.settings {
-            notes.push(format!("{name}: the setting moved: {line}"));
+            notes.push(format!("{name}: the setting changed: {line}"));
         }
         for line in &check.notes {
             notes.push(format!("{name}: {line}"));
         }
     }
     Table {
-        title: "Baselines: what moved".into(),
+        title: "Shifts from baselines".into(),
         headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
         rows,
         notes,
     }
 }
 
-/// The checks as JUnit: a suite for each baseline, a case for each submission.
+/// The checks as JUnit: a suite per baseline, a case per configuration.
 pub fn junit(checks: &[Checked]) -> String {
     let mut text = String::from("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuites>\n");
     for suite in checks.chunk_by(|a, b| a.baseline == b.baseline) {
         let failures = suite.iter().filter(|check| check.failed()).count();
         let name = escape(&suite[0].baseline);
-        // Writing to a text cannot fail.
+        // Writing to a `String` cannot fail.
         let _ = writeln!(
             text,
             "  <testsuite name=\"{name}\" tests=\"{}\" failures=\"{failures}\">",

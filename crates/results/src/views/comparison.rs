@@ -1,4 +1,4 @@
-//! Submissions and recorded runs side by side: the means of their metrics, differences in Q and calibrated Q, and Q per set.
+//! Tables of configurations and recorded runs: mean metrics, differences in Q and calibrated Q, and Q per set.
 
 use std::borrow::Borrow;
 use std::collections::BTreeSet;
@@ -13,50 +13,44 @@ use crate::compare::{Paired, Variant, by_name, common_sets, difference, mean_met
 use crate::groups::{Group, Grouping};
 use crate::row::{RunRecord, SetRecord};
 use crate::views::diagnosis::of_sets;
+use crate::views::metrics::{metric_cell, metric_heading};
 use crate::views::scores::{best_is_another, definition_note, notes};
 use crate::views::verdict::verdict;
 use shearq_render::figure::{ColourMap, HeatMap};
 use shearq_render::table::{Cell, Heading, Table};
 
-/// The cell of a mean over sets of the metric called `name`.
+/// The cell with the mean of the metric called `name` over sets.
 fn mean_cell(sets: &[&SetRecord], name: &str) -> Cell {
     let (value, error) = mean_metric(sets, name);
-    let decimals = Metrics::place(name).map_or(0, |place| Metrics::ALL[place].decimals);
-    Cell::with_error(value, Some(error), decimals)
+    metric_cell(name, value, error)
 }
 
-/// The heading of the metric called `name`.
-fn metric_heading(name: &'static str) -> Heading {
-    let label = Metrics::place(name).map_or(name, |place| Metrics::ALL[place].label);
-    Heading::new(name, label)
-}
-
-/// Heading of the leaderboard's Q, a detail where it is Q itself.
+/// Heading of the leaderboard's Q, a detail if it equals Q.
 fn leaderboard_heading<'a>(sets: impl Iterator<Item = &'a SetRecord>) -> Heading {
-    let apart = sets
+    let differs = sets
         .into_iter()
         .any(|set| best_is_another(set.q_leaderboard, set.metrics.q));
     Heading {
-        detail: !apart,
+        detail: !differs,
         ..Heading::new("q_leaderboard", "Q leaderboard")
     }
 }
 
-/// The cell of the leaderboard's Q, the mean over sets.
+/// The cell with the mean of the leaderboard's Q over sets.
 fn leaderboard_cell(sets: &[&SetRecord]) -> Cell {
     let sum: f64 = sets.iter().map(|set| set.q_leaderboard).sum();
     Cell::number(sum / sets.len() as f64, 2)
 }
 
-/// Differences from the first in Q and in calibrated Q; absent of the first itself.
+/// Differences in Q and calibrated Q from the first variant; `None` for the first variant.
 type Differences = Option<[Option<PairedDifference>; 2]>;
 
-/// Those of `sets` from `first`.
+/// Differences in Q and calibrated Q, `sets` minus `first`.
 fn differences<R: Borrow<SetRecord>>(first: &[R], sets: &[R]) -> [Option<PairedDifference>; 2] {
     [Paired::Q, Paired::Calibrated].map(|metric| difference(metric, first, sets))
 }
 
-/// Headings of Q and calibrated Q, each with its difference and that one's significance.
+/// Headings of Q and calibrated Q, each with difference and significance.
 fn q_headings() -> [Heading; 6] {
     [
         metric_heading("q"),
@@ -68,7 +62,7 @@ fn q_headings() -> [Heading; 6] {
     ]
 }
 
-/// Their cells.
+/// Cells of Q and calibrated Q, each with difference and significance.
 fn q_cells(sets: &[&SetRecord], differences: Differences) -> Vec<Cell> {
     let differences = differences.unwrap_or_default();
     let of = |(name, found): (&str, Option<PairedDifference>)| {
@@ -89,22 +83,22 @@ fn q_cells(sets: &[&SetRecord], differences: Differences) -> Vec<Cell> {
         .collect()
 }
 
-/// Why differences are absent, if any are.
+/// Why differences are absent for the variants `names`.
 fn unpaired_note(names: &[&str]) -> Option<String> {
     (!names.is_empty()).then(|| {
         format!(
-            "No difference is given for {}: it needs the same images as the first, scored in one definition, and conventions that are known.",
+            "No difference for {}: differences need equal images, one definition and certain conventions.",
             names.join(", ")
         )
     })
 }
 
-/// Variants side by side over the sets that all of them have, with the significance of each one's
-/// difference in Q from the first, paired over the same images, and the published metrics.
+/// Variants side by side: means over their common sets, differences in Q from the first variant, paired over equal
+/// images, and published metrics.
 pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     let records: Vec<Vec<SetRecord>> = variants.iter().map(Variant::records).collect();
     let common = common_sets(&records);
-    let mut headings = vec![Heading::new("submission", "Submission")];
+    let mut headings = vec![Heading::new("submission", "Configuration")];
     headings.extend(q_headings());
     headings.extend([
         metric_heading("galaxy_noise"),
@@ -165,7 +159,7 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             _ => format!("Means over sets {}; {images} images in all.", list.join(", ")),
         },
         definition_note(definition),
-        "ΔQ, ΔQ cal.: from the first, with the jackknife's error of the paired difference on the same images, without an error where a set has fewer than eight images. Published: 24 sets of 200 images of the challenge's own data, not comparable in absolute value.".into(),
+        "ΔQ, ΔQ cal.: difference from the first row on the same images, with a jackknife error if each set has eight images or more. Published: for the challenge's 24 sets of 200 images, not comparable in absolute value.".into(),
     ];
     lines.extend(unpaired_note(&unpaired));
     for variant in variants {
@@ -175,18 +169,18 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     }
     lines.extend(verdict(&by_name(variants)));
     Table {
-        title: "Comparison of submissions".into(),
+        title: "Comparison of configurations".into(),
         headings,
         rows,
         notes: lines,
     }
 }
 
-/// Runs side by side: means over their sets, or over groups of them, and the difference in Q from
-/// the first row, or the first of the same group, on the same images.
+/// Runs side by side: means over sets or groups of sets, and the difference in Q from the first row, or the first row
+/// of the group, on the same images.
 pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<Grouping>) -> Table {
     let mut headings = vec![
-        Heading::new("submission", "Submission"),
+        Heading::new("submission", "Configuration"),
         Heading::new("run", "Run"),
         Heading::new("version", "Version").detail(),
     ];
@@ -278,10 +272,10 @@ fn run_notes(
         ways.join("; ")
     )];
     if grouping.is_some() {
-        notes.push("ΔQ, ΔQ cal.: from the first row of the same group.".into());
+        notes.push("ΔQ, ΔQ cal.: difference from the first row of the group.".into());
     }
     if several {
-        notes.push("warning: these runs were scored in different ways; choose one with --where definition=... or choice=...".into());
+        notes.push("warning: the runs were scored in different ways and cannot be compared. Try: --where definition=… or choice=…".into());
     }
     notes.extend(unpaired_note(unpaired));
     for run in runs {
@@ -309,7 +303,7 @@ fn run_notes(
     notes
 }
 
-/// A warning about the sets of a recorded run whose multiplicative bias is large.
+/// A warning about sets of a recorded run with a large multiplicative bias.
 fn bias_note(run: &RunRecord) -> Option<String> {
     let findings: Vec<(Option<u32>, Vec<Fault>)> = run
         .sets
@@ -335,7 +329,7 @@ fn ranges(sets: &[&SetRecord]) -> String {
     texts.collect::<Vec<_>>().join(",")
 }
 
-/// Q of each set (column) and variant or run (row), and means over each row.
+/// Q of each set (column) and variant or run (row), with means in the last column.
 pub fn q_heat_map<R: Borrow<SetRecord>>(variants: &[(String, Vec<R>)]) -> HeatMap {
     let sets: BTreeSet<u32> = variants
         .iter()
@@ -357,7 +351,7 @@ pub fn q_heat_map<R: Borrow<SetRecord>>(variants: &[(String, Vec<R>)]) -> HeatMa
     let most = values.iter().copied().fold(f64::NAN, f64::max);
     HeatMap {
         title: "Quality factor per set".into(),
-        row_label: "submission".into(),
+        row_label: "configuration".into(),
         column_label: "set".into(),
         rows: variants.iter().map(|(name, _)| name.clone()).collect(),
         columns,

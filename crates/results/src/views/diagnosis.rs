@@ -1,4 +1,4 @@
-//! Probable faults of ellipticities and of the true shear, in words.
+//! Messages about probable faults of ellipticities and of the true shear.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use shearq_scoring::{Fault, ImageFaults, TruthSign};
 use crate::score::OddImages;
 use shearq_pipeline::truth::SignBasis;
 
-/// A finding: what was found, what was expected, and what to do.
+/// The message of a finding: what was found, what was expected, and what to do.
 pub fn words(finding: &Fault) -> String {
     match *finding {
         Fault::StrongTruth { rms } => format!(
@@ -19,7 +19,7 @@ pub fn words(finding: &Fault) -> String {
             better,
             with,
         } => format!(
-            "wrong convention suspected: convention {} ({}) correlates with the true shear by {with:.2}, convention {} only by {correlation:.2}. Check the signs of e1 and e2 and the order of x and y",
+            "the convention is probably wrong: convention {} ({}) correlates with the true shear by {with:.2}, convention {} only by {correlation:.2}. Check the signs of e1 and e2 and the order of x and y",
             better.number(),
             better.describe(),
             scored.number()
@@ -51,14 +51,14 @@ pub fn words(finding: &Fault) -> String {
     }
 }
 
-/// Faults of the images of arrays, counted from 1, a sentence each.
+/// Faults of arrays of images, one sentence each; images count from 1.
 pub fn odd_arrays(faults: &ImageFaults) -> Vec<String> {
     let name = |place: usize| PathBuf::from(format!("image {}", place + 1));
     let images: Vec<PathBuf> = (0..faults.images()).map(name).collect();
     odd_images(&OddImages::new(faults, &images))
 }
 
-/// Faults of single images, a sentence each.
+/// Faults of single images, one sentence each.
 pub fn odd_images(odd: &OddImages) -> Vec<String> {
     let mut lines = Vec::new();
     let more = |count: usize| match count {
@@ -84,7 +84,7 @@ pub fn odd_images(odd: &OddImages) -> Vec<String> {
     lines
 }
 
-/// What a reader should know about the sign of the true g2, if anything.
+/// A remark on the sign of the true g2, if the reader needs it.
 pub fn sign(basis: SignBasis) -> Option<String> {
     match basis {
         SignBasis::Unknown => Some(
@@ -104,7 +104,7 @@ pub fn sign(basis: SignBasis) -> Option<String> {
     }
 }
 
-/// Findings of several sets, a line per kind: the first set with its finding in words, and the numbers of the other sets.
+/// Findings of several sets, one line per kind: the message of the first set, and the numbers of the other sets.
 pub fn of_sets<'a>(sets: impl Iterator<Item = (Option<u32>, &'a [Fault])>) -> Vec<String> {
     let mut kinds: Vec<(Fault, Vec<Option<u32>>)> = Vec::new();
     for (set, findings) in sets {
@@ -144,4 +144,33 @@ pub fn prefix(set: Option<u32>) -> String {
         || "warning: ".into(),
         |set| format!("warning: set {set:02}: "),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fault_of_several_sets_is_one_line_with_advice() {
+        let distorted = |m| Fault::Distortion { m, error: 0.1 };
+        let (two, five) = ([distorted(1.02)], [distorted(0.9)]);
+        let sets = [(Some(2), &two[..]), (Some(5), &five[..])];
+        let lines = of_sets(sets.into_iter());
+        assert_eq!(lines.len(), 1);
+        assert!(lines[0].starts_with("warning: set 02: ") && lines[0].contains("2.02 ± 0.10"));
+        assert!(lines[0].contains("(likewise in set 5). Try: --ellipticity distortion"));
+        assert!(of_sets([(None, &two[..])].into_iter())[0].starts_with("warning: the "));
+    }
+
+    #[test]
+    fn copies_and_constant_images_are_counted() {
+        let path = |name: &str| PathBuf::from(name);
+        let odd = OddImages {
+            copies: vec![(path("b"), path("a")), (path("c"), path("a"))],
+            constant: vec![(path("d"), [0.0, 0.5])],
+        };
+        let lines = odd_images(&odd);
+        assert!(lines[0].starts_with("b has the ellipticities of a, and 1 more likewise;"));
+        assert!(lines[1].starts_with("all galaxies of d have the ellipticity (0, 0.5);"));
+    }
 }

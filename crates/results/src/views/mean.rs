@@ -5,7 +5,7 @@ use shearq_submissions::{Calibration, Configuration, EllipticityType};
 use crate::mean::SetMean;
 use shearq_render::table::{Cell, Heading, Table};
 
-/// Means of sets measured by `submission`, of catalogues that are called `name`.
+/// Mean shears of sets that `configuration` measured, of the catalogues called `name`.
 pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) -> Table {
     let headings = [
         ("set", "Set"),
@@ -17,26 +17,31 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
         ("scatter2", "σ(e2)"),
     ];
     let rows = means.iter().map(|mean| {
+        let shear = |k: usize| match &mean.shear {
+            Some(found) => Cell::with_error(found.shear[k], Some(found.error()[k]), 5),
+            None => Cell::number(f64::NAN, 5),
+        };
         vec![
             Cell::number(f64::from(mean.set), 0),
             Cell::number(mean.galaxies as f64, 0),
             Cell::number(mean.flagged as f64, 0),
-            Cell::with_error(mean.mean[0], Some(mean.error[0]), 5),
-            Cell::with_error(mean.mean[1], Some(mean.error[1]), 5),
+            shear(0),
+            shear(1),
             Cell::number(mean.scatter[0], 4),
             Cell::number(mean.scatter[1], 4),
         ]
     });
     let mut notes = vec![format!(
-        "Mean ellipticities of {name} by {}, g2 along the diagonal of the pixels.",
+        "Mean ellipticities of {name} by {}. Positive g2 is a stretch along x = y.",
         configuration.name
     )];
     if configuration.calibration() == Calibration::None {
         notes.push(
-            "This submission does not divide by the response to shear: these are no shears.".into(),
+            "This configuration does not divide by the response to shear, so these are no shears."
+                .into(),
         );
     } else if configuration.ellipticity() == EllipticityType::Distortion {
-        notes.push("Of distortions, divided by their response to shear.".into());
+        notes.push("The ellipticities are distortions, divided by their response to shear.".into());
     }
     Table {
         title: "Mean shear".into(),

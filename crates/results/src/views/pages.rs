@@ -1,4 +1,4 @@
-//! Reports of scores and of comparisons as one HTML page.
+//! HTML pages of scores and comparisons.
 
 use std::path::Path;
 
@@ -10,10 +10,10 @@ use shearq_render::figure::{
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::table::{Cell, Table};
 
-/// Scores of one submission, with its spectra beside the true ones.
+/// Scores of one configuration with its spectra and the true spectra.
 ///
 /// # Errors
-/// Those of [`Picture::draw`].
+/// As [`Picture::draw`].
 pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section, FigureError> {
     let mut blocks = vec![Block::Table(table)];
     let with_power: Vec<&ScoredSet> = scored
@@ -26,28 +26,25 @@ pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section,
                 &spectra(name, &with_power),
                 PictureFormat::Svg,
                 format!("spectra-{name}"),
-                "E-mode bandpowers of the scored bins: true, measured with the noise that the images leave, which Q counts, and less that noise, which Q_dn has. Those run below the truth where shear is lost, and are left out where they are below zero.",
+                "E-mode bandpowers of the scored bins. Q uses the measured bandpowers with their noise, Q_dn without. Without noise they are below the truth if shear is lost. Negative values are not plotted.",
             )?,
         ));
     }
     Ok(Section::new(name, format!("Scores of {name}"), blocks))
 }
 
-/// Submissions side by side.
+/// Several configurations side by side.
 ///
 /// # Errors
-/// Those of [`Picture::draw`].
+/// As [`Picture::draw`].
 pub fn comparison(table: Table, map: &HeatMap) -> Result<Section, FigureError> {
     let mut blocks = Vec::new();
     for (key, caption) in [
         (
             "q_calibrated",
-            "Quality after dividing by the measured response: noise and biases that depend on scale decide.",
+            "Quality after dividing by the measured response. Noise and scale-dependent biases determine it.",
         ),
-        (
-            "m_cross",
-            "Multiplicative bias: 0 for a method that keeps the shear.",
-        ),
+        ("m_cross", "Multiplicative bias: 0 for an unbiased method."),
     ] {
         if let Some(bars) = bars(&table, key) {
             blocks.push(Block::Figure(Picture::draw(
@@ -69,10 +66,10 @@ pub fn comparison(table: Table, map: &HeatMap) -> Result<Section, FigureError> {
     Ok(Section::new("comparison", "Comparison", blocks))
 }
 
-/// A page of such sections; `settings` are what made it.
+/// Writes a page of sections with a list of `settings`.
 ///
 /// # Errors
-/// Where it cannot be written.
+/// If it cannot be written.
 pub fn save(
     path: &Path,
     title: &str,
@@ -111,15 +108,15 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
     }
 }
 
-/// Bands of what surveys to come ask of shear, in the units of the table of [`contest`]: |m| of two in a thousand.
-const BAND: f64 = 2.0;
-/// Colour of what is to be reached.
-const AIM: usize = 6;
-/// Largest m in a picture that has smaller ones too.
-const SEEN: f64 = 20.0;
+/// Requirement of future surveys on |m| in units of 10⁻³, as in the table of a study.
+const REQUIREMENT: f64 = 2.0;
+/// Colour of requirements and bounds.
+const REQUIREMENT_COLOUR: usize = 6;
+/// Largest plotted m, if any m is smaller.
+const LARGEST_M: f64 = 20.0;
 
-/// Submissions held against each other on every kind of set: scatter over its bound, biases and Q, each beside
-/// what is to be reached. `table` is that of a study, one row a set and submission.
+/// Plots of a study: scatter over the bound, biases and Q, with requirements and bounds. `table` has one row per set
+/// and configuration.
 pub fn contest(table: &Table) -> PanelGrid {
     let text = |row: &[Cell], key: &str| match table.place(key).and_then(|k| row.get(k)) {
         Some(Cell::Text(words)) => words.clone(),
@@ -129,7 +126,7 @@ pub fn contest(table: &Table) -> PanelGrid {
         Some(&Cell::Number { value, error, .. }) => (value, error.unwrap_or(f64::NAN)),
         _ => (f64::NAN, f64::NAN),
     };
-    // Rows of means have no number of a set.
+    // Rows of means have no set number.
     let rows: Vec<(f64, &[Cell])> = table
         .rows
         .iter()
@@ -153,11 +150,17 @@ pub fn contest(table: &Table) -> PanelGrid {
     let plot = |key: &str, label: &str, of_levels: &str, levels: &[f64]| {
         let level = |(k, &value): (usize, &f64)| {
             let name = if k == 0 { of_levels } else { "" };
-            Series::new(name, ends(), vec![value; 2], Style::Dashed, AIM)
+            Series::new(
+                name,
+                ends(),
+                vec![value; 2],
+                Style::Dashed,
+                REQUIREMENT_COLOUR,
+            )
         };
         let mut series: Vec<Series> = levels.iter().enumerate().map(level).collect();
         for (k, name) in names.iter().enumerate() {
-            // Beside each other, for all of them to be seen.
+            // Shifted, so that points do not hide each other.
             let aside = (k as f64 - (names.len() as f64 - 1.0) / 2.0) * 0.2;
             let own = || {
                 rows.iter()
@@ -176,34 +179,45 @@ pub fn contest(table: &Table) -> PanelGrid {
             ..LinePlot::default()
         }
     };
-    // Uncalibrated submissions would leave nothing to be seen of the others: they are beyond the picture.
+    // Uncalibrated configurations would compress the others, so their points lie outside the plot.
     let near = |key: &str, label: &str| {
-        let plot = plot(key, label, &format!("± {BAND}"), &[-BAND, BAND]);
+        let plot = plot(
+            key,
+            label,
+            &format!("± {REQUIREMENT}"),
+            &[-REQUIREMENT, REQUIREMENT],
+        );
         let beyond: Vec<bool> = rows
             .iter()
-            .map(|(_, row)| number(row, key).0.abs() > SEEN)
+            .map(|(_, row)| number(row, key).0.abs() > LARGEST_M)
             .collect();
         if !(beyond.contains(&true) && beyond.contains(&false)) {
             return plot;
         }
         LinePlot {
-            title: format!("{label}, beyond ± {SEEN} left out"),
-            y_range: Some((-SEEN, SEEN)),
+            title: format!("{label}, values beyond ± {LARGEST_M} not shown"),
+            y_range: Some((-LARGEST_M, LARGEST_M)),
             ..plot
         }
     };
     let mut q = plot("q_spectrum", "Q of cross-spectra", "", &[]);
-    let limit = rows
+    let expected = rows
         .iter()
         .map(|(_, row)| number(row, "q_limit").0)
         .collect();
     let sets = rows.iter().map(|(set, _)| *set).collect();
     q.series.insert(
         0,
-        Series::new("limit of Q", sets, limit, Style::Points, AIM),
+        Series::new(
+            "expected Q",
+            sets,
+            expected,
+            Style::Points,
+            REQUIREMENT_COLOUR,
+        ),
     );
     PanelGrid {
-        title: "Submissions against each other and what can be reached".into(),
+        title: "Configurations, requirements and the Cramér–Rao bound".into(),
         columns: 2,
         plots: vec![
             plot(
@@ -221,7 +235,7 @@ pub fn contest(table: &Table) -> PanelGrid {
     }
 }
 
-/// A column of the table as bars, one a row; `None` where no row has a value.
+/// A column of the table as bars, one per row; `None` if no row has a value.
 fn bars(table: &Table, key: &str) -> Option<BarPlot> {
     let k = table.place(key)?;
     let mut bars = BarGroup::default();

@@ -5,51 +5,45 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde_json::{Value, json};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
-    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, Metrics, SetScore,
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, SetScore,
     SpectrumScore,
 };
 
 use crate::row::SetRecord;
 use crate::score::{Basis, ScoredSet, means};
 use crate::views::diagnosis;
+use crate::views::metrics::{FORMATS, metric_cells, metric_heading};
+use crate::views::rows::oddities;
 use crate::views::spectrum;
 use crate::views::verdict::verdict;
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_simulate::kinds::SetKind;
 
-fn metric_cells(metrics: &Metrics, errors: &Metrics) -> Vec<Cell> {
-    let pairs = metrics.values().into_iter().zip(errors.values());
-    let cells = pairs.zip(Metrics::ALL);
-    cells
-        .map(|((value, error), metric)| Cell::with_error(value, Some(error), metric.decimals))
-        .collect()
-}
-
-/// What the kind of a set is called in tables.
+/// Name of a kind of set in tables.
 fn kind_label(kind: Option<SetKind>) -> String {
     kind.map_or_else(String::new, |kind| kind.image.label().to_owned())
 }
 
-/// Where kinds come from, if there are any.
+/// Explains kinds, if there are any.
 fn kinds_note(mut kinds: impl Iterator<Item = Option<SetKind>>) -> &'static str {
     match kinds.any(|kind| kind.is_some()) {
-        true => " Kinds are those of GREAT10's sets of these numbers.",
+        true => " Kinds: as the GREAT10 sets with these numbers.",
         false => "",
     }
 }
 
-/// One line that says what the metrics are.
+/// One line that explains the metrics.
 pub(super) fn definition_note(definition: Definition) -> String {
     let definition = match definition {
-        Definition::Leaderboard => "leaderboard definition (the challenge's own arithmetic)",
+        Definition::Leaderboard => "leaderboard definition (the arithmetic of the challenge)",
         Definition::Corrected => "corrected definition (azimuthal averages, fixed bins)",
     };
     format!(
-        "Metrics: {definition}. Errors: from what the truth leaves unexplained, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian; over its error it is twice as far from zero as A, and it has one where A is two of its own from zero."
+        "Metrics: {definition}. Errors: from the part that the truth does not explain, at fixed truth. √A in 10⁻⁴ for C_ℓ in steradian; its significance is twice the significance of A. Its error is blank if A is less than 2σ from zero."
     )
 }
 
-/// Which convention the metrics of a submission's sets are in, and why.
+/// The convention of the metrics, and how it was chosen.
 pub fn convention_note(scored: &[ScoredSet]) -> String {
     let Some(first) = scored.first() else {
         return String::new();
@@ -58,12 +52,10 @@ pub fn convention_note(scored: &[ScoredSet]) -> String {
     let name = format!("{} ({})", chosen.number(), chosen.describe());
     let constant = scored.iter().all(|set| set.score.constant.is_some());
     match first.basis {
-        Basis::Told => format!("Convention {name}."),
-        Basis::HighestQ => {
-            "Convention: set by set the one with the highest Q, as the leaderboard took it.".into()
-        }
+        Basis::Given => format!("Convention {name}."),
+        Basis::HighestQ => "Convention: the highest Q of each set, as on the leaderboard.".into(),
         Basis::Matched(_) if constant => {
-            format!("Convention {name}: a constant shear does not determine it.")
+            format!("Convention {name}; a constant shear does not determine it.")
         }
         Basis::Matched(matching) if matching.is_clear() => format!(
             "Convention {name}, matched to the truth of all sets together (correlation {:.2}).",
@@ -78,8 +70,8 @@ pub fn convention_note(scored: &[ScoredSet]) -> String {
     }
 }
 
-/// What readers of a submission's scores should know: its convention, sets whose leaderboard Q comes
-/// from another one, truth that looks misread, and what is odd about the catalogues.
+/// Notes on scores: the convention, sets whose leaderboard Q has another convention, and probable faults of truth and
+/// catalogues.
 pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
     let mut lines = vec![convention_note(scored)];
     let mut signs: Vec<String> = scored
@@ -101,7 +93,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         let name = set.map_or_else(|| "this set".to_owned(), |set| format!("set {set}"));
         if let Some(mean) = &score.constant {
             lines.push(format!(
-                "note: the true shear of {name} is ({}, {}) everywhere, without power to compare: mean e = ({:.5} ± {:.5}, {:.5} ± {:.5}).",
+                "note: the true shear of {name} is constant ({}, {}) and has no power to compare; mean e = ({:.5} ± {:.5}, {:.5} ± {:.5}).",
                 mean.truth[0], mean.truth[1], mean.e[0], mean.error[0], mean.e[1], mean.error[1]
             ));
         } else if score.wrong_convention_wins() {
@@ -114,16 +106,16 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
                 )
             });
             lines.push(format!(
-                "warning: in {name} the leaderboard takes {best}, where these metrics are of {chosen}."
+                "warning: {name}: the leaderboard uses {best}, these metrics {chosen}."
             ));
         }
         if score.constant.is_none() && score.true_b_share() > 0.2 {
             lines.push(format!(
-                "warning: {:.0} % of the true power of {name} is in B modes; its g2 may have the other sign (--truth-sign).",
+                "warning: {:.0} % of the true power of {name} is in B modes; g2 may have the other sign. Try: --truth-sign.",
                 100.0 * score.true_b_share()
             ));
         }
-        lines.extend(rows.oddities(&name));
+        lines.extend(oddities(rows, &name));
     }
     lines.extend(diagnosis::of_sets(
         scored.iter().map(|set| (set.set, believable(set))),
@@ -138,15 +130,15 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         .collect();
     if !blank.is_empty() {
         lines.push(format!(
-            "note: no Q cal. and noise for set {}, whose response is less than three of its errors from zero: more galaxies tell.",
+            "note: no Q cal. and noise for set {}, because the response is less than 3σ from zero. More galaxies reduce its error.",
             blank.join(", ")
         ));
     }
     lines
 }
 
-/// Findings of a set, except those that odd images explain: copies seem to have no noise, and constant
-/// ellipticities no response.
+/// Findings of a set that odd images do not explain. Copies appear to have no noise, and constant ellipticities no
+/// response.
 fn believable(set: &ScoredSet) -> &[Fault] {
     let odd = &set.odd_images;
     match set.findings.as_slice() {
@@ -156,19 +148,19 @@ fn believable(set: &ScoredSet) -> &[Fault] {
     }
 }
 
-/// The sentence that ends the notes on the scores of the configuration called `name`, if its metrics are known.
+/// The verdict on the configuration called `name`, if its metrics are known.
 pub fn verdict_line(name: &str, scored: &[ScoredSet]) -> Option<String> {
     let record = |set: &ScoredSet| SetRecord::new(set.set.unwrap_or(0), set, String::new());
     let with_power = scored.iter().filter(|set| set.score.constant.is_none());
     verdict(&[(name.to_owned(), with_power.map(record).collect())])
 }
 
-/// What a set is called in a table's first column.
+/// The first cell of a set's row.
 fn set_cell(set: Option<u32>) -> Cell {
     Cell::text(set.map_or_else(|| "–".into(), |set| format!("{set:02}")))
 }
 
-/// Metrics per set, with a row of means if there are several sets.
+/// Metrics per set, with a row of means for several sets.
 pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Table {
     if scored.iter().all(|set| set.score.constant.is_some()) {
         return constant_shear(scored, title);
@@ -178,9 +170,9 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
         Heading::new("kind", "Kind"),
         Heading::new("images", "Images").detail(),
     ];
-    headings.extend(Metrics::ALL.iter().map(|metric| Heading {
+    headings.extend(FORMATS.iter().map(|metric| Heading {
         detail: metric.detail,
-        ..Heading::new(metric.name, metric.label)
+        ..metric_heading(metric.name)
     }));
     headings.push(Heading::new("convention", "Conv.").detail());
     let apart = scored
@@ -222,7 +214,7 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
     let mut lines = vec![
         format!(
-            "Images a set: {}.{}",
+            "Images per set: {}.{}",
             counts.join(", "),
             kinds_note(scored.iter().map(|set| set.kind))
         ),
@@ -237,13 +229,13 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     }
 }
 
-/// Whether the leaderboard's Q is of another class of conventions than the metrics: within a class it is the
-/// same but for rounding, by 1e-7 at most.
+/// Whether the leaderboard's Q has another class of conventions than the metrics. Within a class Q differs by
+/// rounding only, at most 1e-7.
 pub(super) fn best_is_another(q_leaderboard: f64, q: f64) -> bool {
     (q_leaderboard / q - 1.0).abs() > 1e-6
 }
 
-/// Q of the best of the eight conventions; not a number where the truth has no power.
+/// Q of the best of the eight conventions; NaN if the truth has no power.
 fn q_leaderboard(score: &SetScore) -> f64 {
     match score.constant {
         None => score.conventions[score.best.index()].quality.q,
@@ -251,7 +243,7 @@ fn q_leaderboard(score: &SetScore) -> f64 {
     }
 }
 
-/// Means of sets whose true shear is the same everywhere.
+/// Mean ellipticities of sets with constant true shear.
 fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
     let headings = [
         ("set", "Set"),
@@ -286,7 +278,7 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
     }
 }
 
-/// Metrics of power-spectrum submissions, one row per set and one of means. `kind_of` tells the kind of a set.
+/// Metrics of power spectra, with a row per set and a row of means. `kind_of` returns the kind of a set.
 pub fn spectra(
     scored: &[(Option<u32>, SpectrumScore)],
     kind_of: impl Fn(u32) -> Option<SetKind>,
@@ -337,7 +329,7 @@ pub fn spectra(
         Definition::Corrected => "corrected",
     };
     let errors = match scored.iter().all(|s| s.1.quality_error.is_nan()) {
-        true => "There are no errors: no covariance of the bandpowers is known.",
+        true => "No errors, because no covariance of the bandpowers is known.",
         false => "Errors: from the covariance in the manifest, to first order.",
     };
     Table {
@@ -382,12 +374,14 @@ pub fn bandpowers(scored: &[ScoredSet]) -> Table {
         title: "Shear bandpowers ℓ²C_ℓ/2π of the scored bins".into(),
         headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
         rows,
-        notes: vec!["Errors: from what the truth leaves unexplained, at fixed truth.".into()],
+        notes: vec![
+            "Errors: from the part that the truth does not explain, at fixed truth.".into(),
+        ],
     }
 }
 
 fn bias_json(bias: &Bias) -> Value {
-    json!({ "M": bias.M, "A": bias.A, "sqrtA": bias.sqrtA, "m": bias.m })
+    json!({ "M": bias.M, "A": bias.A, "sqrtA": bias.sqrtA, "m": bias.m_half })
 }
 
 fn fits_json(fits: &BiasFits) -> Value {
@@ -420,7 +414,7 @@ fn class_json(score: &SetScore, representative: &ConventionScore, class: Convent
     object
 }
 
-/// Keys of [`one_set_json`] that mean nothing where the true shear is the same everywhere.
+/// Keys of [`one_set_json`] that are undefined for a constant true shear.
 const OF_TRUE_POWER: [&str; 15] = [
     "Q",
     "sigma_sys",
@@ -439,7 +433,8 @@ const OF_TRUE_POWER: [&str; 15] = [
     "classes",
 ];
 
-/// What one set's JSON says about its input.
+/// Description of the input in one set's JSON.
+#[derive(Debug, Clone)]
 pub struct SetInput {
     /// Name of the case.
     pub case: String,
@@ -451,8 +446,7 @@ pub struct SetInput {
     pub definition: Definition,
 }
 
-/// Everything about one set scored from plain files, under the names that the public scoring cases
-/// use, with errors and null tests added.
+/// All scores of one set from plain files: the keys of the public scoring cases, errors and null tests.
 pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
     let score = &scored.score;
     let best = &score.conventions[score.best.index()];
@@ -508,13 +502,13 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
             "B": class_json(score, &score.conventions[4], ConventionClass::B),
         },
     });
-    // What the public cases do not have.
+    // Keys that the public cases do not have.
     let own = json!({
         "chosen": score.chosen.number(),
         "convention_known": scored.basis.is_known(),
         "metrics": score.metrics,
         "metric_errors": score.errors,
-        "error_method": "from the modes that the truth leaves unexplained, at fixed truth; c1 and c2 at least the jackknife over images",
+        "error_method": "from the part that the truth does not explain, at fixed truth; for c1 and c2 at least the jackknife over images",
         "mean_shear": score.constant,
         "rows": scored.rows,
         "warnings": notes(std::slice::from_ref(scored)),
@@ -522,7 +516,7 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
     if let (Value::Object(object), Value::Object(own)) = (&mut object, own) {
         object.extend(own);
         if score.constant.is_some() {
-            // Nothing that needs a true power.
+            // These keys need a true power.
             for (key, value) in object.iter_mut() {
                 if OF_TRUE_POWER.contains(&key.as_str()) {
                     *value = Value::Null;

@@ -1,29 +1,29 @@
-//! The picture of a set's shear power spectrum.
+//! Plot of the shear power spectrum of a set.
 
 use shearq_scoring::{BINS, SCORED};
 
 use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_simulate::kinds::SetKind;
 
-/// Share of the highest power below which the truth has none.
+/// Share of the highest power below which true power is rounding.
 const ROUNDING: f64 = 1e-12;
 
 /// E-mode bandpowers of a set: (multipoles, truth, measured, standard errors).
 pub type Powers<'a> = [&'a [f64; BINS]; 4];
 
-/// The scored bins that have modes, of which small grids lack some: those with a multipole `l`.
+/// The scored bins with modes, which have a multipole `l`. Small grids lack some.
 pub fn bins(l: &[f64; BINS]) -> impl Iterator<Item = usize> {
     SCORED.filter(|&bin| l[bin] > 0.0)
 }
 
-/// The scored bandpowers of the true and of the measured shear, and the latter without those of its noise, where known.
+/// The scored bandpowers of the true and the measured shear, and the measured ones without noise, if it is known.
 pub fn panel(
     set: Option<u32>,
     kind: Option<SetKind>,
     [l, truth, measured, errors]: Powers<'_>,
     noise: Option<&[f64; BINS]>,
 ) -> LinePlot {
-    // Small grids have at the highest multipole a truth that is rounding alone.
+    // At the highest multipole, the truth of small grids is rounding only.
     let highest = truth[SCORED].iter().copied().fold(0.0, f64::max);
     let seen: Vec<usize> = bins(l)
         .filter(|&bin| truth[bin] > ROUNDING * highest)
@@ -41,7 +41,7 @@ pub fn panel(
     if let Some(noise) = noise {
         let rest = seen.iter().map(|&bin| measured[bin] - noise[bin]).collect();
         series.push(
-            Series::new("less its noise", scored(l), rest, Style::Points, 0)
+            Series::new("minus its noise", scored(l), rest, Style::Points, 0)
                 .with_errors(scored(errors)),
         );
     }

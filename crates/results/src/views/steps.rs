@@ -1,11 +1,11 @@
-//! The steps of a measurement as pictures, after the paper's Fig. 3.
+//! Plots of the processing steps of a measurement, as in Fig. 3 of the paper.
 
 use ndarray::Array2;
 use shearq_measure::Steps;
 
 use shearq_render::figure::{ColourMap, ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
 
-/// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, and the part of it that is used.
+/// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, and the part of the ACF that is measured.
 pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
     use ColourMap::{Diverging, Viridis};
     let panel = |title: &str, image, map, stretch| ImagePanel {
@@ -28,7 +28,7 @@ pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
     }
 }
 
-/// Several galaxies, under a title to which the version is added.
+/// Several galaxies under a title, which ends with the version.
 pub fn steps_figure(title: &str, rows: Vec<ImageRow>) -> ImageGrid {
     ImageGrid {
         title: format!("{title} (shearq {})", shearq_pipeline::VERSION),

@@ -6,27 +6,27 @@ use crate::compare::{Paired, difference, mean_metric};
 use crate::row::SetRecord;
 use shearq_render::table::Cell;
 
-/// Significance from which one configuration is said to be better than another.
+/// Significance above which one configuration is better than another.
 const CLEAR: f64 = 3.0;
 /// Most sets whose noise is listed set by set.
 const LISTED: usize = 3;
 
-/// Which configuration to use, with the metrics that decide; of a single one, its metrics. `None` of a single
-/// one whose response is not known.
-pub fn verdict<R: Borrow<SetRecord>>(submissions: &[(String, Vec<R>)]) -> Option<String> {
+/// Which configuration to use, with the decisive metrics; for a single configuration, its metrics. `None` for a single
+/// configuration with an unknown response.
+pub fn verdict<R: Borrow<SetRecord>>(configurations: &[(String, Vec<R>)]) -> Option<String> {
     let mean = |sets: &[R], name: &str| mean_metric(sets, name).0;
     let calibrated = |sets: &[R]| mean(sets, "q_calibrated");
-    let known = submissions
+    let known = configurations
         .iter()
         .filter(|(_, sets)| !sets.is_empty() && calibrated(sets).is_finite());
     let best = known.max_by(|a, b| calibrated(&a.1).total_cmp(&calibrated(&b.1)));
     let Some((place, (name, sets))) = best.and_then(|best| {
-        submissions
+        configurations
             .iter()
             .enumerate()
             .find(|(_, s)| std::ptr::eq(*s, best))
     }) else {
-        return (submissions.len() > 1)
+        return (configurations.len() > 1)
             .then(|| "Not enough data to rank the configurations.".into());
     };
     let shown = |sets: &[R], name: &str, decimals: usize| {
@@ -34,7 +34,7 @@ pub fn verdict<R: Borrow<SetRecord>>(submissions: &[(String, Vec<R>)]) -> Option
         Cell::with_error(value, Some(error), decimals).in_words()
     };
     let rivals = || {
-        let others = submissions.iter().enumerate();
+        let others = configurations.iter().enumerate();
         others
             .filter(move |(k, _)| *k != place)
             .map(|(_, rival)| rival)
@@ -58,7 +58,7 @@ pub fn verdict<R: Borrow<SetRecord>>(submissions: &[(String, Vec<R>)]) -> Option
         .filter(|(_, others)| !behind(others).is_some_and(|d| d.sigma() >= CLEAR))
         .map(|(other, _)| other.as_str())
         .collect();
-    let lead = match (submissions.len(), equal.is_empty()) {
+    let lead = match (configurations.len(), equal.is_empty()) {
         (1, _) => name.clone(),
         (_, true) => format!("Use {name}"),
         (_, false) => format!(
@@ -74,7 +74,7 @@ pub fn verdict<R: Borrow<SetRecord>>(submissions: &[(String, Vec<R>)]) -> Option
     let warning = match raised.is_empty() {
         true => String::new(),
         false => format!(
-            " Q itself is higher for {}, which lose shear and noise alike (m below zero): real analyses cannot use that.",
+            " Q itself is higher for {}, which lose shear and noise alike (m below zero). Real analyses cannot use this.",
             raised.join(" and ")
         ),
     };
@@ -108,18 +108,17 @@ mod tests {
     use super::*;
     use shearq_scoring::Metrics;
 
-    /// A submission with one set of eight images, whose calibrated Q scatters as `replicates`.
+    /// A configuration with one set of eight images, whose calibrated Q scatters as `replicates`.
     fn configuration(
         name: &str,
         q: f64,
         calibrated: f64,
         replicates: [f64; 8],
     ) -> (String, Vec<SetRecord>) {
-        let with = |q, q_calibrated, m_cross| Metrics {
-            q,
-            q_calibrated,
-            m_cross,
-            ..Metrics::unknown()
+        let with = |q, q_calibrated, m_cross| {
+            let mut metrics = Metrics::unknown();
+            (metrics.q, metrics.q_calibrated, metrics.m_cross) = (q, q_calibrated, m_cross);
+            metrics
         };
         let record = SetRecord {
             set: 2,
@@ -141,27 +140,27 @@ mod tests {
     }
 
     #[test]
-    fn a_submission_is_named_where_its_images_tell_it_from_the_others() {
+    fn the_best_configuration_is_named_if_it_is_distinguished() {
         let common = [0.5, -0.5, 0.5, -0.5, 0.5, -0.5, 0.5, -0.5];
-        let own = [0.7, -0.7, 0.3, -0.3, 0.7, -0.7, 0.3, -0.3];
-        let better = configuration("b", 10.0, 25.0, own);
-        // The noise that both have in common takes their errors of 2 down to √(7/8 · Σ 0.2²) = 0.53.
-        let told = verdict(&[configuration("a", 12.0, 20.0, common), better.clone()]).unwrap();
-        assert!(told.starts_with("Use b: m = -0.300 ± 0.010"), "{told}");
+        let replicates = [0.7, -0.7, 0.3, -0.3, 0.7, -0.7, 0.3, -0.3];
+        let better = configuration("b", 10.0, 25.0, replicates);
+        // Common noise cancels: the error of the difference is √(7/8 · Σ 0.2²) = 0.53, although each error is 2.
+        let clear = verdict(&[configuration("a", 12.0, 20.0, common), better.clone()]).unwrap();
+        assert!(clear.starts_with("Use b: m = -0.300 ± 0.010"), "{clear}");
         assert!(
-            told.contains("Q calibrated = 20.0 ± 2.0, lower by 5.00 ± 0.53"),
-            "{told}"
+            clear.contains("Q calibrated = 20.0 ± 2.0, lower by 5.00 ± 0.53"),
+            "{clear}"
         );
         assert!(
-            told.contains("Q itself is higher for a, which lose shear"),
-            "{told}"
+            clear.contains("Q itself is higher for a, which lose shear"),
+            "{clear}"
         );
-        let untold = verdict(&[configuration("a", 9.0, 24.0, common), better.clone()]).unwrap();
+        let tied = verdict(&[configuration("a", 9.0, 24.0, common), better.clone()]).unwrap();
         let start =
             "b has the highest Q calibrated, but these images do not distinguish it from a: m";
         assert!(
-            untold.starts_with(start) && !untold.contains("itself"),
-            "{untold}"
+            tied.starts_with(start) && !tied.contains("itself"),
+            "{tied}"
         );
         let unknown = verdict(&[configuration("a", 9.0, f64::NAN, common), better]).unwrap();
         assert!(

@@ -21,7 +21,7 @@ fn over_lambda(curve: &[LambdaSums], value: fn(&LambdaSums) -> f64) -> Vec<f64> 
 /// Draws Figs 4 to 7.
 ///
 /// # Errors
-/// Where a file cannot be written.
+/// If a file cannot be written.
 pub fn calibration_figures(page: &mut Page<'_>, curves: &Curves) -> Result<(), PageError> {
     page.figure(
         "fig4-ctr-snr",
@@ -68,7 +68,7 @@ fn ctr_over_snr(curves: &Curves) -> LinePlot {
     }
 }
 
-/// Figs 5 and 6: a figure of the adaptive rule against λ at the three S/N.
+/// Figs 5 and 6: a quantity of the adaptive rule against λ at the three S/N.
 fn adaptive_over_lambda(
     curves: &Curves,
     title: &str,
@@ -193,7 +193,7 @@ pub fn curves_table(curves: &Curves) -> Table {
     }
 }
 
-/// A short table for terminals: per rule and S/N, the best λ and the figures at 10⁻⁴.
+/// A short table for terminals: per rule and S/N, the best λ and the values at 10⁻⁴.
 pub fn calibration_table(curves: &Curves, configuration: &Configuration) -> Table {
     let mut rows = Vec::new();
     let mut at_edge = false;
@@ -239,7 +239,7 @@ pub fn calibration_table(curves: &Curves, configuration: &Configuration) -> Tabl
     )];
     if at_edge {
         notes.push(format!(
-            "Warning: a best λ is at the edge of what was looked at, 10^{} to 10^{}; it may lie beyond.",
+            "Warning: a best λ is at the edge of the range, 10^{} to 10^{}; the true optimum may lie beyond.",
             LOG_LAMBDA[0],
             LOG_LAMBDA[LOG_LAMBDA.len() - 1]
         ));

@@ -1,4 +1,4 @@
-//! Sect. 5: Table 1, Figs 8 to 11, and what denoising does to ellipticities.
+//! Sect. 5: Table 1, Figs 8 to 11, and the effect of denoising on ellipticities.
 
 use shearq_scoring::Metrics;
 use shearq_submissions::{Configuration, PsfForm, Published};
@@ -10,23 +10,23 @@ use shearq_render::table::{Cell, Heading, Table};
 use shearq_results::views::spectrum;
 use shearq_simulate::kinds::{ImageType, SetKind, shares};
 
-/// Figures of one submission over sets, from its place in each set's results.
+/// A metric of one configuration over sets, with its errors.
 pub(super) fn over_sets(
     results: &[SetResult],
     place: usize,
-    figure: fn(&Metrics) -> f64,
+    metric: fn(&Metrics) -> f64,
 ) -> Vec<(f64, f64)> {
     results
         .iter()
         .map(|set| &set.results[place].score)
-        .map(|score| (figure(&score.metrics), figure(&score.errors)))
+        .map(|score| (metric(&score.metrics), metric(&score.errors)))
         .collect()
 }
 
-/// Images of a set of the challenge, of which figures are published. With fewer, noise is another part of them.
+/// Images per set of the challenge. The published metrics contain the noise of so many images.
 const PUBLISHED_IMAGES: u32 = 200;
 
-/// Mean over the challenge's 24 sets of what each set here has, and its error.
+/// Mean of values with errors over the challenge's 24 sets: a kind counts as often as in the challenge.
 pub(super) fn weighted(results: &[SetResult], values: &[(f64, f64)]) -> (f64, f64) {
     let sets: Vec<u32> = results.iter().map(|set| set.set).collect();
     let shares = shares(&sets);
@@ -41,32 +41,32 @@ pub(super) fn weighted(results: &[SetResult], values: &[(f64, f64)]) -> (f64, f6
     (mean, variance.sqrt())
 }
 
-/// Mean of a submission's figure over the challenge's 24 sets, and its error.
+/// Mean of a metric of one configuration over the challenge's 24 sets, and its error.
 pub(super) fn mean_of_24(
     results: &[SetResult],
     place: usize,
-    figure: fn(&Metrics) -> f64,
+    metric: fn(&Metrics) -> f64,
 ) -> (f64, f64) {
-    weighted(results, &over_sets(results, place, figure))
+    weighted(results, &over_sets(results, place, metric))
 }
 
-/// Table 1: our figures beside the published ones.
+/// Table 1: our metrics beside the published ones.
 pub fn table_one(results: &[SetResult], submissions: &[(Configuration, Published)]) -> Table {
     let as_published = results.iter().all(|set| set.images == PUBLISHED_IMAGES);
     let mut rows = Vec::new();
     for (place, (configuration, published)) in submissions.iter().enumerate() {
-        let mean = |figure: fn(&Metrics) -> f64, decimals: usize| {
-            let (value, error) = mean_of_24(results, place, figure);
+        let mean = |metric: fn(&Metrics) -> f64, decimals: usize| {
+            let (value, error) = mean_of_24(results, place, metric);
             Cell::with_error(value, Some(error), decimals)
         };
         let given = |value: fn(&Published) -> f64, decimals: usize| {
             Cell::number(value(published), decimals)
         };
-        let apart = |figure: fn(&Metrics) -> f64, value: fn(&Published) -> f64| {
+        let apart = |metric: fn(&Metrics) -> f64, value: fn(&Published) -> f64| {
             if !as_published {
                 return Cell::Empty;
             }
-            let (mean, error) = mean_of_24(results, place, figure);
+            let (mean, error) = mean_of_24(results, place, metric);
             Cell::number((mean - value(published)) / error, 1)
         };
         let yes = |yes: bool| Cell::text(if yes { "Y" } else { "N" });
@@ -97,7 +97,7 @@ pub fn table_one(results: &[SetResult], submissions: &[(Configuration, Published
         ..Heading::new(key, label)
     };
     Table {
-        title: "Table 1: submissions over all sets (simulated data)".into(),
+        title: "Table 1: configurations over all sets (simulated data)".into(),
         headings: vec![
             Heading::new("method", "Method"),
             Heading::new("size", "Size").detail(),
@@ -118,10 +118,10 @@ pub fn table_one(results: &[SetResult], submissions: &[(Configuration, Published
         ],
         rows,
         notes: vec![
-            "Q calibrated: after dividing the bandpowers by (1 + m)², m by cross-correlation with the truth; unknown where a set's response is less than three of its errors from zero.".into(),
-            format!("Apart: ours less the published one, in standard errors of ours, where sets have {PUBLISHED_IMAGES} images as there."),
-            "Means over sets, each kind of image counting as often as among the challenge's 24; kinds that are absent do not count.".into(),
-            "Standard convention, leaderboard definition; errors from what the truth leaves unexplained. Published figures are of the challenge's own images, 200 per set.".into(),
+            "Q calibrated: after dividing the bandpowers by (1 + m)², with m by cross-correlation with the truth; unknown if the response of a set is less than 3σ above zero.".into(),
+            format!("Apart: our metric minus the published one, in our standard errors, if sets have {PUBLISHED_IMAGES} images as in the challenge."),
+            "Means over sets: each kind of image counts as often as among the challenge's 24 sets; absent kinds do not count.".into(),
+            "Standard convention, leaderboard definition. Errors come from the part of the spectra that the truth does not explain. Published metrics refer to the challenge's images, 200 per set.".into(),
         ],
     }
 }
@@ -130,7 +130,7 @@ fn set_labels(results: &[SetResult]) -> Vec<String> {
     results.iter().map(|set| set.set.to_string()).collect()
 }
 
-/// Fig. 8: Q per set and variant.
+/// Fig. 8: Q per set and configuration.
 pub fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
     let mut columns = set_labels(results);
     columns.push("mean".into());
@@ -141,7 +141,7 @@ pub fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
     });
     HeatMap {
         title: "Quality factor per set".into(),
-        row_label: "submission".into(),
+        row_label: "configuration".into(),
         column_label: "set".into(),
         rows: names.to_vec(),
         columns,
@@ -152,15 +152,15 @@ pub fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
     }
 }
 
-/// Figures of every set and submission: the data of Figs 8, 10 and 11.
+/// Metrics of every set and configuration: the data of Figs 8, 10 and 11.
 pub fn per_set_table(results: &[SetResult]) -> Table {
     let mut rows = Vec::new();
     for set in results {
         for result in &set.results {
-            let cell = |figure: fn(&Metrics) -> f64, decimals: usize| {
+            let cell = |metric: fn(&Metrics) -> f64, decimals: usize| {
                 Cell::with_error(
-                    figure(&result.score.metrics),
-                    Some(figure(&result.score.errors)),
+                    metric(&result.score.metrics),
+                    Some(metric(&result.score.errors)),
                     decimals,
                 )
             };
@@ -199,11 +199,11 @@ pub fn per_set_table(results: &[SetResult]) -> Table {
         }
     }
     Table {
-        title: "Every set and submission".into(),
+        title: "Every set and configuration".into(),
         headings: vec![
             Heading::new("set", "Set"),
             Heading::new("kind", "Kind"),
-            Heading::new("submission", "Submission"),
+            Heading::new("submission", "Configuration"),
             Heading::new("q", "Q"),
             Heading::new("q_leaderboard", "Q leaderboard"),
             Heading::new("q_dn", "Q_dn"),
@@ -271,18 +271,18 @@ pub fn power_spectra_table(results: &[SetResult], place: usize) -> Table {
     }
 }
 
-/// Figs 10 and 11: M/2 or √A per set for two submissions.
+/// Figs 10 and 11: M/2 or √A per set for the configurations at `places`.
 pub fn bias_per_set(
     results: &[SetResult],
     places: &[(usize, &str)],
-    figure: fn(&Metrics) -> f64,
+    metric: fn(&Metrics) -> f64,
     title: &str,
     y_label: &str,
 ) -> BarPlot {
     let groups = places
         .iter()
         .map(|&(place, name)| {
-            let over = over_sets(results, place, figure);
+            let over = over_sets(results, place, metric);
             BarGroup {
                 label: name.into(),
                 values: over.iter().map(|v| v.0).collect(),
@@ -303,7 +303,7 @@ pub fn bias_per_set(
 }
 
 /// Slope, scatter and offset of ellipticities at S/N 10, 20 and 40 with and without denoising: the
-/// means over the sets of those kinds for the submissions at `places`.
+/// means over the sets of these kinds for the configurations at `places`.
 pub fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table {
     let kinds = [
         (10.0, ImageType::LowSnr),
@@ -321,7 +321,7 @@ pub fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table
             if responses.is_empty() {
                 continue;
             }
-            // Sets of a kind have equally many galaxies.
+            // All sets have the same number of galaxies.
             let count = responses.len() as f64;
             let mean = |of: &dyn Fn(&Response) -> (f64, f64), decimals| {
                 let (mut value, mut square) = (0.0, 0.0);
@@ -348,7 +348,7 @@ pub fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table
         title: "Ellipticities with and without denoising (simulated data)".into(),
         headings: vec![
             Heading::new("snr", "S/N"),
-            Heading::new("submission", "Submission"),
+            Heading::new("submission", "Configuration"),
             Heading::new("slope1", "slope e1"),
             Heading::new("slope2", "slope e2"),
             Heading::new("scatter", "scatter / slope"),

@@ -1,0 +1,69 @@
+//! Ellipticity and response of the reported type, from a distortion and its response.
+
+use shearq_quantities::{Distortion, Shear};
+use shearq_submissions::EllipticityType;
+
+use crate::flag::Flag;
+use crate::measurement::ResponseMatrix;
+use crate::method::{Found, Sheared};
+
+/// The ellipticity of type `kind` with its response, if the method knows it.
+pub(crate) fn report(
+    kind: EllipticityType,
+    found: &Found,
+) -> Result<(f64, f64, Option<ResponseMatrix>), Flag> {
+    let chi = found.distortion?;
+    let (mut e1, mut e2) = of_type(kind, chi).ok_or(Flag::NoShear)?;
+    let mut response = found.response.map(|r| reported(kind, chi, r));
+    let usable = |noise: &&Sheared| {
+        let mut sides = noise.sides.iter();
+        sides.all(|(chi, _)| of_type(kind, *chi).is_some())
+    };
+    if let Some(noise) = found.sheared_noise.as_ref().filter(usable) {
+        let sides = noise.sides;
+        let [plus, minus] = sides.map(|(chi, r)| reported(kind, chi, r));
+        for (i, row) in response.iter_mut().flatten().enumerate() {
+            for (j, value) in row.iter_mut().enumerate() {
+                *value -= noise.weight * (plus[i][j] - minus[i][j]);
+            }
+        }
+        let [plus, minus] = [0, 1].map(|k| changed(kind, sides[k].0, noise.turned[k]));
+        e1 += 0.5 * noise.weight * (plus[0] - minus[0]);
+        e2 += 0.5 * noise.weight * (plus[1] - minus[1]);
+    }
+    Ok((e1, e2, response))
+}
+
+/// Change of the ellipticity of type `kind` with a change of the distortion.
+fn changed(kind: EllipticityType, chi: Distortion, by: [f64; 2]) -> [f64; 2] {
+    // Like the response to one shear that changes both components.
+    let change = reported(kind, chi, by.map(|by| [by; 2]));
+    [change[0][0], change[1][1]]
+}
+
+/// The ellipticity of type `kind` of a distortion; `None` if there is none of that type.
+fn of_type(kind: EllipticityType, chi: Distortion) -> Option<(f64, f64)> {
+    match kind {
+        EllipticityType::Distortion => Some((chi.e1, chi.e2)),
+        EllipticityType::Shear => chi.to_shear().map(|Shear { e1, e2 }| (e1, e2)),
+    }
+}
+
+/// The response of the ellipticity of type `kind`, from the response of the distortion.
+fn reported(kind: EllipticityType, chi: Distortion, r: ResponseMatrix) -> ResponseMatrix {
+    match kind {
+        EllipticityType::Distortion => r,
+        EllipticityType::Shear => {
+            // ε = χ f, f = 1/(1 + s), s = √(1 − |χ|²): ∂ε_i/∂χ_j = f δ_ij + χ_i χ_j f²/s.
+            let s = (1.0 - chi.e1 * chi.e1 - chi.e2 * chi.e2).sqrt();
+            let f = 1.0 / (1.0 + s);
+            let cross = |a: f64, b: f64| a * b * f * f / s;
+            let (own1, own2) = (f + cross(chi.e1, chi.e1), f + cross(chi.e2, chi.e2));
+            let other = cross(chi.e1, chi.e2);
+            [
+                [0, 1].map(|j| own1 * r[0][j] + other * r[1][j]),
+                [0, 1].map(|j| own2 * r[1][j] + other * r[0][j]),
+            ]
+        }
+    }
+}

@@ -1,0 +1,264 @@
+//! The mean shear of many galaxies, with an error that includes the error of the mean response.
+
+use thiserror::Error;
+
+/// The mean shear of many galaxies.
+///
+/// For the component k with weights w, ellipticities e and responses R,
+///
+/// ```text
+/// g_k      = Σ w e_k / Σ w R_kk
+/// cov(k,l) = n/(n − 1) · Σ w² (e_k − g_k R_kk)(e_l − g_l R_ll) / (Σ w R_kk · Σ w R_ll)
+/// ```
+///
+/// This is the covariance of a ratio of two means to first order (Cochran 1977, Sampling Techniques, §6.3). The
+/// residual e − gR contains the scatter of the responses, so the error includes the error of the mean response. A
+/// common factor on ellipticities and responses changes nothing. The galaxies must be independent: pairs that are
+/// rotated by 90° make the error too large, and copies make it too small.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct MeanShear {
+    /// g1 and g2.
+    pub shear: [f64; 2],
+    /// Covariance of g1 and g2; NaN for a single galaxy.
+    pub covariance: [[f64; 2]; 2],
+    /// Weighted mean responses R11 and R22.
+    pub response: [f64; 2],
+    /// Galaxies with a positive weight and without a flag.
+    pub galaxies: usize,
+    /// Galaxies with a positive weight and a flag.
+    pub flagged: usize,
+}
+
+impl MeanShear {
+    /// Standard errors of g1 and g2.
+    pub fn error(&self) -> [f64; 2] {
+        [0, 1].map(|k| self.covariance[k][k].sqrt())
+    }
+}
+
+/// Why there is no mean shear.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+#[non_exhaustive]
+pub enum MeanShearError {
+    /// No galaxy has a positive weight and no flag.
+    #[error("no galaxy without a flag has a positive weight (expected one or more)")]
+    NoGalaxies,
+    /// The mean response is not positive.
+    #[error("the mean response R{component}{component} is {found} (expected a positive number)")]
+    Response {
+        /// Component, 1 or 2.
+        component: usize,
+        /// The mean response.
+        found: f64,
+    },
+}
+
+/// Weighted sums over galaxies, from which [`MeanShear`] follows. Galaxies are added one by one.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct ShearSum {
+    weight: f64,
+    e: [f64; 2],
+    response: [f64; 2],
+    /// Sums of squared weights times products of (e1, e2, R11, R22).
+    products: [[f64; 4]; 4],
+    galaxies: usize,
+    flagged: usize,
+}
+
+impl ShearSum {
+    /// Adds a galaxy without a flag, with its responses (R11, R22) and a weight.
+    ///
+    /// Ellipticity and response must both be divided by the mean response, or neither. The response is 1 for
+    /// ellipticities without calibration. A weight of zero adds nothing. The weight must not depend on the measured
+    /// ellipticity.
+    pub fn add(&mut self, e: [f64; 2], response: [f64; 2], weight: f64) {
+        if weight == 0.0 {
+            return;
+        }
+        self.galaxies += 1;
+        self.weight += weight;
+        let values = [e[0], e[1], response[0], response[1]];
+        for k in 0..2 {
+            self.e[k] += weight * e[k];
+            self.response[k] += weight * response[k];
+        }
+        for (row, a) in self.products.iter_mut().zip(values) {
+            for (sum, b) in row.iter_mut().zip(values) {
+                *sum += weight * weight * a * b;
+            }
+        }
+    }
+
+    /// Counts a flagged galaxy.
+    pub fn add_flagged(&mut self) {
+        self.flagged += 1;
+    }
+
+    /// The mean shear of the galaxies that were added.
+    ///
+    /// # Errors
+    /// If no galaxy was added, or a mean response is not positive.
+    pub fn mean(&self) -> Result<MeanShear, MeanShearError> {
+        if self.galaxies == 0 {
+            return Err(MeanShearError::NoGalaxies);
+        }
+        let response = self.response.map(|sum| sum / self.weight);
+        for (k, &found) in response.iter().enumerate() {
+            if !(found > 0.0 && found.is_finite()) {
+                let component = k + 1;
+                return Err(MeanShearError::Response { component, found });
+            }
+        }
+        let shear = [0, 1].map(|k| self.e[k] / self.response[k]);
+        let n = self.galaxies as f64;
+        let covariance = [0, 1].map(|k| {
+            [0, 1].map(|l| {
+                let [ee, er] = [self.products[k][l], self.products[k][2 + l]];
+                let [re, rr] = [self.products[2 + k][l], self.products[2 + k][2 + l]];
+                let residuals = ee - shear[l] * er - shear[k] * re + shear[k] * shear[l] * rr;
+                // Rounding may leave a sum of squares below zero.
+                let residuals = if k == l {
+                    residuals.max(0.0)
+                } else {
+                    residuals
+                };
+                n / (n - 1.0) * residuals / (self.response[k] * self.response[l])
+            })
+        });
+        Ok(MeanShear {
+            shear,
+            covariance,
+            response,
+            galaxies: self.galaxies,
+            flagged: self.flagged,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    const TRUE_SHEAR: [f64; 2] = [0.08, -0.05];
+
+    /// A galaxy whose ellipticity responds to shear by its response, or by the mean response only.
+    fn galaxy(rng: &mut ChaCha8Rng, own_response: bool) -> ([f64; 2], [f64; 2], f64) {
+        let mut normal = || -> f64 { StandardNormal.sample(rng) };
+        let response = [0.5 + 1.2 * normal(), 0.5 + 1.2 * normal()];
+        let common = 0.05 * normal();
+        let e = [0, 1].map(|k| {
+            let slope = if own_response { response[k] } else { 0.5 };
+            TRUE_SHEAR[k] * slope + 0.04 * normal() + common
+        });
+        (e, response, rng.random_range(0.5..1.5))
+    }
+
+    /// Draws many samples of galaxies. Returns mean pulls, their standard deviations, the correlation of the two
+    /// components minus the stated one, and the standard deviation in units of the error without the response.
+    fn draws(own_response: bool) -> ([f64; 2], [f64; 2], f64, f64) {
+        const DRAWS: usize = 4000;
+        const GALAXIES: usize = 1500;
+        let mut rng = ChaCha8Rng::seed_from_u64(11);
+        let (mut sums, mut squares, mut cross, mut stated, mut naive) =
+            ([0.0; 2], [0.0; 2], 0.0, 0.0, 0.0);
+        for _ in 0..DRAWS {
+            let mut sum = ShearSum::default();
+            let mut moments = [0.0; 3];
+            for _ in 0..GALAXIES {
+                let (e, response, weight) = galaxy(&mut rng, own_response);
+                sum.add(e, response, weight);
+                for (moment, power) in moments.iter_mut().zip(0..) {
+                    *moment += e[0].powi(power);
+                }
+            }
+            let mean = sum.mean().unwrap();
+            let error = mean.error();
+            let pull = [0, 1].map(|k| (mean.shear[k] - TRUE_SHEAR[k]) / error[k]);
+            for k in 0..2 {
+                sums[k] += pull[k];
+                squares[k] += pull[k] * pull[k];
+            }
+            cross += pull[0] * pull[1];
+            stated += mean.covariance[0][1] / (error[0] * error[1]);
+            let [n, first, second] = moments;
+            let scatter = (second / n - (first / n).powi(2)).sqrt();
+            let without = scatter / n.sqrt() / mean.response[0];
+            naive += ((mean.shear[0] - TRUE_SHEAR[0]) / without).powi(2);
+        }
+        let count = DRAWS as f64;
+        (
+            sums.map(|sum| sum / count),
+            squares.map(|square| (square / count).sqrt()),
+            (cross - stated) / count,
+            (naive / count).sqrt(),
+        )
+    }
+
+    #[test]
+    fn errors_cover_the_scatter_of_repeated_draws() {
+        for own_response in [true, false] {
+            let (mean, deviation, correlation, naive) = draws(own_response);
+            for k in 0..2 {
+                // The mean pull has an error of 4000^-1/2 = 0.016. A ratio is biased by about its relative error
+                // squared, here 0.004 of the shear or 0.07 of the error.
+                assert!(mean[k].abs() < 0.12, "{own_response}: {mean:?}");
+                // The deviation has an error of 8000^-1/2 = 0.011. Terms of second order add about 0.01.
+                assert!(
+                    (deviation[k] - 1.0).abs() < 0.05,
+                    "{own_response}: {deviation:?}"
+                );
+            }
+            // Of the same origin.
+            assert!(correlation.abs() < 0.06, "{own_response}: {correlation}");
+            // The error without the response is wrong in either case: too large or too small.
+            let wrong = if own_response {
+                naive < 0.9
+            } else {
+                naive > 1.2
+            };
+            assert!(wrong, "{own_response}: {naive}");
+        }
+    }
+
+    #[test]
+    fn a_common_factor_changes_neither_shear_nor_error() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let [mut one, mut other] = [ShearSum::default(); 2];
+        for _ in 0..50 {
+            let (e, response, weight) = galaxy(&mut rng, true);
+            one.add(e, response, weight);
+            // Powers of two scale without rounding.
+            let response = [4.0 * response[0], 0.5 * response[1]];
+            other.add([4.0 * e[0], 0.5 * e[1]], response, 8.0 * weight);
+        }
+        let (one, other) = (one.mean().unwrap(), other.mean().unwrap());
+        assert_eq!(one.shear, other.shear);
+        assert_eq!(one.covariance, other.covariance);
+        assert_eq!(one.response[0], other.response[0] / 4.0);
+    }
+
+    #[test]
+    fn weights_of_zero_and_flags_do_not_count() {
+        let mut sum = ShearSum::default();
+        assert_eq!(sum.mean(), Err(MeanShearError::NoGalaxies));
+        sum.add([f64::MAX; 2], [1.0; 2], 0.0);
+        sum.add_flagged();
+        assert_eq!(sum.mean(), Err(MeanShearError::NoGalaxies));
+        sum.add([0.1, 0.2], [0.5, 2.0], 3.0);
+        let mean = sum.mean().unwrap();
+        assert_eq!((mean.galaxies, mean.flagged), (1, 1));
+        assert!((mean.shear[0] - 0.2).abs() < 1e-15 && (mean.shear[1] - 0.1).abs() < 1e-15);
+        assert!(mean.error()[0].is_nan());
+        sum.add([0.1, 0.2], [-5.0, 2.0], 3.0);
+        let error = sum.mean().unwrap_err();
+        assert!(
+            matches!(error, MeanShearError::Response { component: 1, .. }),
+            "{error}"
+        );
+    }
+}

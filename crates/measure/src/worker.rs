@@ -1,0 +1,372 @@
+//! Measuring galaxies in one thread: an image, its PSFs, its galaxies.
+//!
+//! The types fix the order. A [`Worker`] becomes an [`ImageWorker`] for an image, whose noise is known. That becomes a
+//! [`PsfWorker`] for a PSF, and only this measures galaxies.
+
+use std::sync::Arc;
+
+use ndarray::{ArrayView2, ArrayView3, Axis};
+use shearq_submissions::{Configuration, Method, NoiseSource};
+
+use crate::denoise::{DenoiseScratch, border_noise};
+use crate::ellipticity::report;
+use crate::error::{MeasureError, length};
+use crate::examine::PEAKS;
+use crate::flag::{Flag, Flags};
+use crate::galaxy::Plan;
+use crate::measurement::Measurement;
+use crate::method::{AdaptedSettings, CutWorker};
+use crate::noise::{StampNoise, Survey};
+use crate::pixel::Pixel;
+use crate::psf::cut_start;
+use crate::psfs::Psfs;
+use crate::surroundings::Missing;
+
+/// Noise levels other than zero, in image units, whose squares keep single precision beside those of [`PEAKS`].
+const LEVELS: std::ops::RangeInclusive<f64> = 1e-30..=1e18;
+
+/// Whether a noise level can be used.
+pub(crate) fn is_level(sigma: f64) -> bool {
+    sigma == 0.0 || LEVELS.contains(&sigma)
+}
+
+/// What is known about the noise of an image.
+#[derive(Debug, Clone, Copy, Default)]
+pub enum ImageNoise<'a> {
+    /// Level and correlation as measured on the stamps of the image, with the size of its galaxies.
+    Survey(&'a Arc<Survey>),
+    /// White noise of this standard deviation per pixel.
+    Level(f64),
+    /// Nothing. A configuration that does not measure the noise on each stamp flags the galaxies.
+    #[default]
+    Unknown,
+}
+
+impl<'a> ImageNoise<'a> {
+    /// A survey if there is one, otherwise a level if there is one.
+    pub fn of(survey: Option<&'a Arc<Survey>>, level: Option<f64>) -> Self {
+        match (survey, level) {
+            (Some(survey), _) => ImageNoise::Survey(survey),
+            (None, Some(level)) => ImageNoise::Level(level),
+            (None, None) => ImageNoise::Unknown,
+        }
+    }
+
+    fn survey(self) -> Option<&'a Arc<Survey>> {
+        match self {
+            ImageNoise::Survey(survey) => Some(survey),
+            ImageNoise::Level(_) | ImageNoise::Unknown => None,
+        }
+    }
+
+    fn level(self) -> f64 {
+        match self {
+            ImageNoise::Survey(survey) => survey.noise.sigma(),
+            ImageNoise::Level(level) => level,
+            ImageNoise::Unknown => f64::NAN,
+        }
+    }
+}
+
+/// Buffers of one thread. Measuring a galaxy allocates nothing.
+pub struct Worker {
+    plan: Arc<Plan>,
+    pub(crate) method: Box<dyn CutWorker>,
+    denoise: Option<DenoiseScratch>,
+    /// Full stamp, denoised in place.
+    full: Vec<f32>,
+    /// Cut stamp.
+    pub(crate) cut: Vec<f32>,
+    border: Vec<f32>,
+    missing: Missing,
+    /// The survey that the method was set to.
+    survey: Option<Arc<Survey>>,
+}
+
+/// A worker for the galaxies of one image.
+pub struct ImageWorker<'a> {
+    worker: &'a mut Worker,
+    level: f64,
+}
+
+/// A worker for galaxies of one image and one PSF.
+pub struct PsfWorker<'a> {
+    pub(crate) worker: &'a mut Worker,
+    level: f64,
+}
+
+impl Worker {
+    pub(crate) fn new(plan: Arc<Plan>) -> Self {
+        let Plan { full, n, .. } = *plan;
+        Worker {
+            method: plan.method.worker(),
+            denoise: plan.denoise.as_ref().map(|denoise| denoise.scratch()),
+            full: vec![0.0; full * full],
+            cut: vec![0.0; n * n],
+            border: Vec::with_capacity(full * full),
+            missing: Missing::new(n),
+            survey: None,
+            plan,
+        }
+    }
+
+    /// The configuration.
+    pub fn configuration(&self) -> &Configuration {
+        &self.plan.configuration
+    }
+
+    /// Prepares for the galaxies of an image with this noise.
+    ///
+    /// Noise of a survey is treated as white if its correlation is not significant. Without a survey, noise is white, and
+    /// the window is the configuration's own. The same survey as before costs nothing.
+    pub fn image(&mut self, noise: ImageNoise<'_>) -> ImageWorker<'_> {
+        let survey = noise.survey();
+        if self.survey.as_ref() != survey {
+            self.survey = survey.cloned();
+            self.method
+                .set_extent(survey.and_then(|survey| survey.extent));
+            match survey {
+                Some(survey) if survey.noise.is_correlated() => {
+                    self.method.set_noise(&survey.noise);
+                }
+                Some(_) | None => self.method.set_noise(&StampNoise::white(1.0)),
+            }
+        }
+        ImageWorker {
+            worker: self,
+            level: noise.level(),
+        }
+    }
+
+    /// Measures a galaxy in noise of `level`, without calibration. Without a usable PSF it is flagged.
+    fn measure<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+        level: f64,
+        usable_psf: bool,
+    ) -> Result<Measurement, MeasureError> {
+        let plan = Arc::clone(&self.plan);
+        let n = plan.n;
+        let whole = self.read(stamp)?;
+        if !whole && !matches!(plan.configuration.method, Method::Linear(_)) {
+            return Ok(Measurement::flagged(Flag::NotFinite));
+        }
+        if !usable_psf {
+            return Ok(Measurement::flagged(Flag::BadPsf));
+        }
+        if self.full.iter().all(|v| *v == self.full[0]) {
+            return Ok(Measurement::flagged(Flag::NoScale));
+        }
+        let noise = match plan.configuration.noise {
+            NoiseSource::Header | NoiseSource::Image { .. } => level,
+            NoiseSource::Border { border } => {
+                let found = border_noise(&self.full, plan.full, border, &mut self.border);
+                found.map_or(f64::NAN, f64::from)
+            }
+        };
+        if let (Some(filter), Some(buffers)) = (&plan.denoise, &mut self.denoise) {
+            filter.apply(&mut self.full, noise as f32, buffers);
+        }
+        let start = cut_start(plan.full, n).unwrap_or(0);
+        for (y, row) in self.cut.chunks_exact_mut(n).enumerate() {
+            let from = (start + y) * plan.full + start;
+            row.copy_from_slice(&self.full[from..from + n]);
+        }
+        if !whole && !self.missing.mend(&mut self.cut, n) {
+            return Ok(Measurement::flagged(Flag::NotFinite));
+        }
+        let no_scale = Measurement {
+            noise,
+            ..Measurement::flagged(Flag::NoScale)
+        };
+        if !PEAKS.contains(&highest(&self.cut)) || (noise.is_finite() && !is_level(noise)) {
+            return Ok(no_scale);
+        }
+        let Some(found) = self.method.measure(&self.cut, noise)? else {
+            return Ok(no_scale);
+        };
+        let measured = Measurement {
+            descent: Some(found.descent),
+            noise,
+            flux: found.flux,
+            radius: found.radius,
+            size: found.size,
+            ..Measurement::flagged(Flag::NoShear)
+        };
+        Ok(match report(plan.configuration.ellipticity(), &found) {
+            Err(flag) => Measurement {
+                flags: flag.into(),
+                ..measured
+            },
+            Ok((e1, e2, response)) => Measurement {
+                e1,
+                e2,
+                flags: Flags::NONE,
+                response,
+                ..measured
+            },
+        })
+    }
+
+    /// Copies a full stamp; whether all of its pixels are finite.
+    fn read<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) -> Result<bool, MeasureError> {
+        let full = self.plan.full;
+        if stamp.dim() != (full, full) {
+            let expected = format!("{full} × {full}");
+            return Err(MeasureError::square("a stamp", stamp.dim(), expected));
+        }
+        for (row, from) in self.full.chunks_exact_mut(full).zip(stamp.rows()) {
+            // Contiguous pixels, as in an image, are converted several at a time.
+            match from.as_slice() {
+                Some(from) => convert(row, from.iter()),
+                None => convert(row, from.iter()),
+            }
+        }
+        // No early exit, so that several pixels are tested at a time.
+        Ok(self.full.iter().fold(true, |all, v| all & v.is_finite()))
+    }
+}
+
+impl ImageWorker<'_> {
+    /// The configuration.
+    pub fn configuration(&self) -> &Configuration {
+        self.worker.configuration()
+    }
+
+    /// Prepares for galaxies with this PSF: centred, of sum one, and with the pixels that
+    /// [`star_psf`](crate::star_psf) cuts for [`Configuration::psf_cut`].
+    ///
+    /// # Errors
+    /// If the PSF has another size, or a pixel that is not finite.
+    pub fn psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<PsfWorker<'_>, MeasureError> {
+        self.worker.method.set_psf(psf)?;
+        Ok(PsfWorker {
+            worker: self.worker,
+            level: self.level,
+        })
+    }
+
+    /// Measures stamps, one per galaxy along the first axis, without calibration.
+    ///
+    /// # Errors
+    /// If sizes or numbers do not fit, or a PSF for all galaxies cannot be used. A galaxy whose own PSF cannot be used is
+    /// flagged.
+    pub fn measure_each<T: Pixel>(
+        &mut self,
+        stamps: ArrayView3<'_, T>,
+        psfs: &Psfs<'_>,
+    ) -> Result<Vec<Measurement>, MeasureError> {
+        self.each(stamps, psfs, |image, _| image.level)
+    }
+
+    /// The same for white noise with one level per stamp.
+    ///
+    /// # Errors
+    /// As [`ImageWorker::measure_each`], or if there is not one level per stamp.
+    pub fn measure_each_with_noise<T: Pixel>(
+        &mut self,
+        stamps: ArrayView3<'_, T>,
+        psfs: &Psfs<'_>,
+        levels: &[f64],
+    ) -> Result<Vec<Measurement>, MeasureError> {
+        length("noise levels", levels.len(), stamps.len_of(Axis(0)))?;
+        self.each(stamps, psfs, |_, k| levels[k])
+    }
+
+    fn each<T: Pixel>(
+        &mut self,
+        stamps: ArrayView3<'_, T>,
+        psfs: &Psfs<'_>,
+        level: impl Fn(&Self, usize) -> f64,
+    ) -> Result<Vec<Measurement>, MeasureError> {
+        let cut = self.configuration().psf_cut();
+        let (count, full, _) = stamps.dim();
+        let Some(given) = psfs.count() else {
+            match psfs {
+                Psfs::Prepared(psf) => self.worker.method.set_psf(psf.view())?,
+                _ => self
+                    .worker
+                    .method
+                    .set_psf(psfs.at(0, cut, full)?.psf.view())?,
+            }
+            let stamps = stamps.outer_iter().enumerate();
+            return stamps
+                .map(|(k, stamp)| {
+                    let level = level(self, k);
+                    self.worker.measure(stamp, level, true)
+                })
+                .collect();
+        };
+        if given != count {
+            return Err(MeasureError::Shape {
+                what: "PSFs",
+                found: format!("{given} galaxies"),
+                expected: format!("{count}, one each"),
+            });
+        }
+        let stamps = stamps.outer_iter().enumerate();
+        let measured = stamps.map(|(k, stamp)| {
+            let psf = psfs.at(k, cut, full);
+            let set = psf.and_then(|own| self.worker.method.set_psf(own.psf.view()));
+            let level = level(self, k);
+            self.worker.measure(stamp, level, set.is_ok())
+        });
+        measured.collect()
+    }
+}
+
+impl PsfWorker<'_> {
+    /// The configuration.
+    pub fn configuration(&self) -> &Configuration {
+        self.worker.configuration()
+    }
+
+    /// The settings that were adapted to the PSF, and to the galaxies of a survey. `None` for the network, which adapts
+    /// nothing.
+    pub fn adapted(&self) -> Option<AdaptedSettings> {
+        self.worker.method.adapted()
+    }
+
+    /// Measures a galaxy on its full stamp, without calibration, in the noise of the image.
+    ///
+    /// # Errors
+    /// If the stamp has another size than planned.
+    pub fn measure<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+    ) -> Result<Measurement, MeasureError> {
+        self.worker.measure(stamp, self.level, true)
+    }
+
+    /// The same in white noise of a level of its own.
+    ///
+    /// # Errors
+    /// As [`PsfWorker::measure`].
+    pub fn measure_with_noise<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+        level: f64,
+    ) -> Result<Measurement, MeasureError> {
+        self.worker.measure(stamp, level, true)
+    }
+}
+
+fn convert<'a, T: Pixel + 'a>(row: &mut [f32], from: impl Iterator<Item = &'a T>) {
+    for (value, pixel) in row.iter_mut().zip(from) {
+        *value = pixel.to_f32();
+    }
+}
+
+/// The largest pixel, or zero if none is positive. 16 running maxima let vector instructions take several at a time.
+pub(crate) fn highest(pixels: &[f32]) -> f32 {
+    const LANES: usize = 16;
+    let mut lanes = [0.0f32; LANES];
+    let chunks = pixels.chunks_exact(LANES);
+    let rest = chunks.remainder().iter().copied().fold(0.0, f32::max);
+    for chunk in chunks {
+        for (lane, value) in lanes.iter_mut().zip(chunk) {
+            *lane = lane.max(*value);
+        }
+    }
+    lanes.into_iter().fold(rest, f32::max)
+}

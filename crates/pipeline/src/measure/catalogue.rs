@@ -1,0 +1,265 @@
+//! Catalogues: their columns, their metadata, and the folder that they are written to.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use shearq_files::FileError;
+use shearq_files::frames::polars::{Column, DataFrame};
+use shearq_files::frames::{TableError, frame};
+use shearq_files::table;
+use shearq_measure::{Flag, Measurement, Warning};
+use shearq_submissions::EllipticityType;
+
+use super::row::{MeasuredRow, warnings};
+use crate::PipelineError;
+use crate::data::run::{Claim, RUN_FILE, Run, claim};
+use crate::engine::Progress;
+use crate::images::ImageId;
+use crate::warned::Warned;
+
+/// How a column follows from a measurement.
+#[derive(Debug, Clone, Copy)]
+pub enum Value {
+    /// A real number.
+    Real(fn(&Measurement) -> f64),
+    /// A whole number.
+    Whole(fn(&Measurement) -> i32),
+}
+
+/// The columns of catalogues after the position, in order. The command line and Python use the same.
+pub const COLUMNS: [(&str, Value); 16] = [
+    ("e1", Value::Real(|g| g.e1)),
+    ("e2", Value::Real(|g| g.e2)),
+    ("flags", Value::Whole(|g| g.flags.bits() as i32)),
+    (
+        "iterations",
+        Value::Whole(|g| g.descent.map_or(0, |d| d.iterations as i32)),
+    ),
+    // −1 if the network did not run.
+    (
+        "stop",
+        Value::Whole(|g| g.descent.map_or(-1, |d| d.stop.code() as i32)),
+    ),
+    (
+        "updated",
+        Value::Whole(|g| g.descent.map_or(0, |d| d.updated as i32)),
+    ),
+    (
+        "first_energy",
+        Value::Real(|g| g.descent.map_or(f64::NAN, |d| d.first_energy)),
+    ),
+    (
+        "energy",
+        Value::Real(|g| g.descent.map_or(f64::NAN, |d| d.energy)),
+    ),
+    ("noise", Value::Real(|g| g.noise)),
+    ("flux", Value::Real(|g| g.flux)),
+    ("radius", Value::Real(|g| g.radius)),
+    ("size", Value::Real(|g| g.size)),
+    ("R11", Value::Real(|g| response(g, 0, 0))),
+    ("R22", Value::Real(|g| response(g, 1, 1))),
+    ("R12", Value::Real(|g| response(g, 0, 1))),
+    ("R21", Value::Real(|g| response(g, 1, 0))),
+];
+
+/// Response of component `i` to component `j` of shear; NaN if there is none.
+fn response(galaxy: &Measurement, i: usize, j: usize) -> f64 {
+    galaxy.response.map_or(f64::NAN, |response| response[i][j])
+}
+
+/// Key of the metadata with the warnings of an image.
+const WARNINGS: &str = "warnings";
+
+/// Catalogue of one image from its rows of stamps, in order.
+///
+/// # Errors
+/// If polars cannot make the table.
+fn catalogue(rows: &[MeasuredRow]) -> Result<DataFrame, TableError> {
+    let galaxies = || rows.iter().flat_map(|row| &row.galaxies);
+    let positions = rows.iter().flat_map(|row| {
+        let mosaic = row.head.mosaic;
+        (0..row.galaxies.len()).map(move |ix| mosaic.centre(ix, row.iy))
+    });
+    let (x, y): (Vec<f64>, Vec<f64>) = positions.unzip();
+    let mut columns = vec![Column::new("x".into(), x), Column::new("y".into(), y)];
+    columns.extend(COLUMNS.iter().map(|(name, value)| match value {
+        Value::Real(of) => {
+            let values: Vec<f64> = galaxies().map(of).collect();
+            Column::new((*name).into(), values)
+        }
+        Value::Whole(of) => {
+            let values: Vec<i64> = galaxies().map(|g| i64::from(of(g))).collect();
+            Column::new((*name).into(), values)
+        }
+    }));
+    frame(columns)
+}
+
+/// What made the catalogue of an image from files with the fingerprints `prints`.
+///
+/// # Errors
+/// If the settings cannot be written as TOML.
+pub(crate) fn metadata(
+    run: &Run,
+    id: ImageId,
+    prints: BTreeMap<String, String>,
+) -> Result<BTreeMap<String, String>, PipelineError> {
+    let ellipticity = match run.configuration.ellipticity() {
+        EllipticityType::Distortion => "distortion",
+        EllipticityType::Shear => "shear",
+    };
+    let settings = toml::to_string(&run.configuration).map_err(|error| {
+        PipelineError::Request(format!("the settings cannot be stored: {error}"))
+    })?;
+    let mut all = prints;
+    all.extend(
+        [
+            ("creator", format!("shearq {}", run.version)),
+            ("submiss", run.configuration.name.clone()),
+            ("elltype", ellipticity.to_owned()),
+            ("set", id.set.to_string()),
+            ("image", id.image.to_string()),
+            ("settings", settings),
+        ]
+        .map(|(key, value)| (key.to_owned(), value)),
+    );
+    Ok(all)
+}
+
+/// Counts of a measurement.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Summary {
+    /// Images measured now.
+    pub images: usize,
+    /// Images measured before.
+    pub already: usize,
+    /// Galaxies measured now.
+    pub galaxies: u64,
+    /// Galaxies measured now that are flagged.
+    pub flagged: u64,
+    /// Galaxies measured now with each of [`Flag::ALL`].
+    pub flags: [u64; Flag::ALL.len()],
+}
+
+impl Summary {
+    /// A warning with the most frequent reason if galaxies were measured and all are flagged.
+    pub fn all_flagged(&self) -> Option<Warning> {
+        let Summary {
+            galaxies, flagged, ..
+        } = *self;
+        let with = |flag: Flag| {
+            let mut counts = self.flags.iter().zip(Flag::ALL);
+            let found = counts.find(|(_, other)| *other == flag);
+            found.map_or(0, |(count, _)| *count as usize)
+        };
+        let all = Warning::of_counts(with, flagged as usize, galaxies as usize)?;
+        (galaxies > 0 && flagged == galaxies).then_some(all)
+    }
+
+    /// Counts one image.
+    fn count(&mut self, rows: &[MeasuredRow]) {
+        self.images += 1;
+        for galaxy in rows.iter().flat_map(|row| &row.galaxies) {
+            self.galaxies += 1;
+            self.flagged += u64::from(!galaxy.flags.is_empty());
+            for (count, flag) in self.flags.iter_mut().zip(Flag::ALL) {
+                *count += u64::from(galaxy.flags.contains(flag));
+            }
+        }
+    }
+}
+
+/// Those of `images` that have no catalogue yet, and those that have one.
+pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> (Vec<ImageId>, Vec<ImageId>) {
+    images
+        .iter()
+        .partition(|id| !run.catalogue(out, id.set, id.image).is_file())
+}
+
+/// The catalogues of a run, written one by one.
+pub(crate) struct Catalogues<'a> {
+    run: &'a Run,
+    out: &'a Path,
+    images: &'a [ImageId],
+    claim: Claim,
+    /// Images without a catalogue.
+    pub(crate) todo: Vec<ImageId>,
+    /// Images that have a catalogue.
+    pub(crate) done: Vec<ImageId>,
+    summary: Summary,
+    warned: Warned,
+}
+
+impl<'a> Catalogues<'a> {
+    /// Claims the folder `out` for the catalogues of `images`.
+    ///
+    /// # Errors
+    /// If the folder contains results of other settings.
+    pub(crate) fn claim(
+        run: &'a Run,
+        out: &'a Path,
+        images: &'a [ImageId],
+    ) -> Result<Self, FileError> {
+        let claim = claim(&out.join(RUN_FILE), run)?;
+        let (todo, done) = to_do(run, out, images);
+        let summary = Summary {
+            already: done.len(),
+            ..Summary::default()
+        };
+        Ok(Catalogues {
+            run,
+            out,
+            images,
+            claim,
+            todo,
+            done,
+            summary,
+            warned: Warned::default(),
+        })
+    }
+
+    /// Shows the warnings of an image whose rows are all measured and calibrated, and writes its catalogue.
+    ///
+    /// # Errors
+    /// If a warning is fatal, or the catalogue cannot be written.
+    pub(crate) fn add(
+        &mut self,
+        rows: &[MeasuredRow],
+        progress: &mut dyn Progress,
+    ) -> Result<(), PipelineError> {
+        let head = &rows[0].head;
+        let ImageId { set, image } = head.id;
+        let found = warnings(rows);
+        self.warned
+            .add(head.id, found.iter().chain(&head.run_warnings), progress)?;
+        // Writing would make the folder again, without the earlier catalogues.
+        self.claim.check()?;
+        let path = self.run.catalogue(self.out, set, image);
+        let table = catalogue(rows).map_err(|error| FileError::new(&path, error.to_string()))?;
+        let mut metadata = metadata(self.run, head.id, head.prints.clone())?;
+        if !found.is_empty() {
+            let lines: Vec<String> = found.iter().map(Warning::to_string).collect();
+            metadata.insert(WARNINGS.into(), lines.join("\n"));
+        }
+        table::write(&path, self.run.format, &table, &metadata)?;
+        self.summary.count(rows);
+        progress.note(&format!("set {set:02} image {image:03}"));
+        Ok(())
+    }
+
+    /// The error of the work: that the folder was removed, if it was, else `error`.
+    pub(crate) fn explain(&self, error: PipelineError) -> PipelineError {
+        self.claim.explain(error)
+    }
+
+    /// Checks that all catalogues are there, and counts the warnings that were not shown.
+    ///
+    /// # Errors
+    /// If a catalogue was removed.
+    pub(crate) fn finish(self, progress: &mut dyn Progress) -> Result<Summary, PipelineError> {
+        let path = |id: &ImageId| -> PathBuf { self.run.catalogue(self.out, id.set, id.image) };
+        self.claim.check_results(self.images.iter().map(path))?;
+        self.warned.finish(progress);
+        Ok(self.summary)
+    }
+}

@@ -1,0 +1,170 @@
+//! The PSFs of an image: one for all galaxies, or one per galaxy along the rows of stamps.
+
+use std::path::Path;
+
+use ndarray::{ArcArray2, ArrayView2};
+use shearq_files::FileError;
+use shearq_files::fits::ImageReader;
+use shearq_measure::{FunctionalPsf, Psfs, Star, star};
+use shearq_submissions::{Configuration, PsfCut, PsfForm};
+
+use super::source::check_strip;
+use crate::PipelineError;
+use crate::data::layout::{DataFolder, MAX_STAMP};
+use crate::data::mosaic::Mosaic;
+use crate::data::psf_table;
+use crate::grid::whole;
+use crate::images::ImageId;
+use crate::pixel_scale;
+
+/// The PSFs of an image, read along its rows.
+pub(super) enum PsfSource {
+    Shared(ArcArray2<f64>),
+    Stars {
+        image: Box<ImageReader>,
+        side: usize,
+    },
+    Functional(Vec<FunctionalPsf>),
+}
+
+impl PsfSource {
+    /// The PSFs of row `iy`; rows are read in order.
+    ///
+    /// # Errors
+    /// If star stamps cannot be read.
+    pub(super) fn next_row(
+        &mut self,
+        mosaic: Mosaic,
+        iy: usize,
+    ) -> Result<Psfs<'static>, PipelineError> {
+        let count = mosaic.of_row(iy);
+        Ok(match self {
+            PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
+            PsfSource::Stars { image, side } => {
+                let pixels = image.read_rows(*side)?;
+                let mut stars = Psfs::strip(pixels, mosaic.columns, *side)?;
+                // The last row may be shorter.
+                stars.truncate(count);
+                stars
+            }
+            PsfSource::Functional(field) => {
+                let first = iy * mosaic.columns;
+                Psfs::functional(field[first..first + count].to_vec())
+            }
+        })
+    }
+}
+
+/// The PSFs of an image, and what is known about their file.
+pub(super) struct OpenPsfs {
+    pub(super) source: PsfSource,
+    /// Offset of the star for all galaxies in pixels, if it was moved to the centre of its stamp.
+    pub(super) moved: Option<[f64; 2]>,
+    /// Pixel scale in arcseconds, if the header states it.
+    pub(super) scale: Option<f64>,
+}
+
+/// Opens the PSFs of an image.
+///
+/// # Errors
+/// If the PSFs cannot be read, or do not fit the configuration or the galaxies.
+pub(super) fn open_psf(
+    data: &DataFolder,
+    id: ImageId,
+    configuration: &Configuration,
+    mosaic: &Mosaic,
+) -> Result<OpenPsfs, FileError> {
+    let cut = configuration.psf_cut();
+    match configuration.psf.form {
+        PsfForm::Functional => {
+            let path = data.psf_functional(id.set, id.image);
+            Ok(OpenPsfs {
+                source: open_functional(&path, cut, mosaic)?,
+                moved: None,
+                scale: None,
+            })
+        }
+        PsfForm::Star => open_stars(&data.psf_star(id.set, id.image), cut, mosaic),
+    }
+}
+
+fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSource, FileError> {
+    let rows = psf_table::read(path, mosaic)?;
+    if let Some(wide) = rows.iter().find(|psf| psf.fwhm > cut.size as f64) {
+        let message = format!(
+            "a PSF has a FWHM of {} px; expected at most the {} pixels a side of the configuration's PSF stamp",
+            wide.fwhm, cut.size
+        );
+        return Err(FileError::new(path, message));
+    }
+    let [psf] = rows.as_slice() else {
+        return Ok(PsfSource::Functional(rows));
+    };
+    let stamp = psf.stamp_beside(cut.size, mosaic.stamp);
+    if stamp.iter().any(|value| !value.is_finite()) {
+        let message = format!(
+            "a PSF with a FWHM of {} px has no light on its stamp; expected a width of about a pixel or more",
+            psf.fwhm
+        );
+        return Err(FileError::new(path, message));
+    }
+    Ok(PsfSource::Shared(stamp.into_shared()))
+}
+
+fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, FileError> {
+    let least = cut.least;
+    let mut image = ImageReader::open(path)?;
+    let scale = pixel_scale::of_header(&image);
+    let (width, height) = (image.width(), image.height());
+    let (columns, rows) = (mosaic.columns, mosaic.rows());
+    let side = match whole(&image, path, "STAMP", MAX_STAMP)? {
+        Some(side) => side,
+        // One star is never as large as a mosaic of the smallest PSF stamps that could be used.
+        None if width >= columns * least
+            && width.is_multiple_of(columns)
+            && height == rows * (width / columns) =>
+        {
+            width / columns
+        }
+        None => width,
+    };
+    if side < least {
+        let message =
+            format!("the PSF stamp has {side} pixels a side; the configuration requires {least}");
+        return Err(FileError::new(path, message));
+    }
+    let stars = whole(&image, path, "NSTAMPS", columns * rows)?;
+    if let Some(stars) = stars.filter(|stars| *stars != 1 && *stars != mosaic.galaxies) {
+        let message = format!(
+            "the header key NSTAMPS is {stars}; expected 1, or {}, one per galaxy",
+            mosaic.galaxies
+        );
+        return Err(FileError::new(path, message));
+    }
+    let one = (width, height) == (side, side);
+    if mosaic.galaxies > 1 && (width, height) == (columns * side, rows * side) {
+        check_strip(path, columns, side)?;
+        let image = Box::new(image);
+        return Ok(OpenPsfs {
+            source: PsfSource::Stars { image, side },
+            moved: None,
+            scale,
+        });
+    }
+    if !one || side > MAX_STAMP {
+        let message = format!(
+            "the star image is {width} × {height} pixels; expected one stamp, or {columns} × {rows} stamps, one per galaxy, of {0} × {0} pixels",
+            side.min(MAX_STAMP)
+        );
+        return Err(FileError::new(path, message));
+    }
+    let pixels = image.read_rows(height)?;
+    let stamp = ArrayView2::from_shape((height, width), &pixels)
+        .map_err(|error| FileError::new(path, error))?;
+    let Star { psf, moved } = star(stamp, cut).map_err(|error| FileError::new(path, error))?;
+    Ok(OpenPsfs {
+        source: PsfSource::Shared(psf.into_shared()),
+        moved,
+        scale,
+    })
+}

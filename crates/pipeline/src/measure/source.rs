@@ -1,0 +1,256 @@
+//! Images of a data folder as a stream of rows of stamps.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::Path;
+use std::sync::Arc;
+
+use shearq_files::FileError;
+use shearq_files::fits::ImageReader;
+use shearq_measure::{ImageNoise, Measurer, Psfs, Survey, Warning};
+use shearq_submissions::{Configuration, NoiseSource};
+
+use super::noise;
+use super::psfs::{OpenPsfs, PsfSource, open_psf};
+use crate::PipelineError;
+use crate::data::layout::DataFolder;
+use crate::data::mosaic::Mosaic;
+use crate::grid;
+use crate::images::ImageId;
+use crate::pixel_scale;
+
+/// Most pixels of a row of stamps, several of which are in memory at a time.
+const MAX_STRIP: usize = 1 << 24;
+
+/// What all rows of stamps of an image share.
+#[derive(Debug, Clone)]
+pub struct ImageHead {
+    /// The image.
+    pub id: ImageId,
+    /// How its stamps lie.
+    pub mosaic: Mosaic,
+    /// Noise level used without a survey, in image units.
+    pub noise: Option<f64>,
+    /// NOISESIG if the configuration uses it, for comparison with the stamps.
+    pub stated_noise: Option<f64>,
+    /// Noise and galaxy sizes measured on the stamps, if the configuration requires them.
+    pub survey: Option<Arc<Survey>>,
+    /// Warnings about this image.
+    pub warnings: Vec<Warning>,
+    /// Warnings about all images of the run, which were examined on this image.
+    pub run_warnings: Vec<Warning>,
+    /// Fingerprints of the files that the image is measured from.
+    pub prints: BTreeMap<String, String>,
+}
+
+impl ImageHead {
+    /// What is known about the noise of the image.
+    pub fn noise(&self) -> ImageNoise<'_> {
+        ImageNoise::of(self.survey.as_ref(), self.noise)
+    }
+}
+
+/// One row of stamps of an image.
+#[derive(Debug, Clone)]
+pub struct StampRow {
+    /// The image.
+    pub head: Arc<ImageHead>,
+    /// Row of the mosaic, from 0.
+    pub iy: usize,
+    /// The rows of pixels that contain the stamps.
+    pub pixels: Vec<f32>,
+    /// PSFs of the galaxies of the row.
+    pub psfs: Psfs<'static>,
+}
+
+/// An open image with its PSFs, of which rows are read one after the other.
+pub struct ImageSource {
+    head: Arc<ImageHead>,
+    image: ImageReader,
+    psfs: PsfSource,
+    next: usize,
+}
+
+impl fmt::Debug for ImageSource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ImageSource")
+            .field("head", &self.head)
+            .field("next", &self.next)
+            .finish_non_exhaustive()
+    }
+}
+
+impl ImageSource {
+    /// Opens an image and its PSFs.
+    ///
+    /// # Errors
+    /// If a file is absent, damaged or does not fit the configuration.
+    pub fn open(
+        data: &DataFolder,
+        id: ImageId,
+        configuration: &Configuration,
+    ) -> Result<Self, PipelineError> {
+        let path = data.galaxies(id.set, id.image);
+        let (image, mosaic) = open_galaxies(data, id)?;
+        let stamp = mosaic.stamp;
+        if stamp < configuration.stamp.size {
+            return Err(FileError::new(path, too_small(stamp, configuration)).into());
+        }
+        let header_noise = image.number("NOISESIG")?;
+        let uses_header = configuration.noise == NoiseSource::Header;
+        if uses_header && !header_noise.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite()) {
+            let found = header_noise.map_or("absent".into(), |sigma| sigma.to_string());
+            let other = match configuration.linear() {
+                Some(_) => "image",
+                None => "border",
+            };
+            let message = format!(
+                "the header key NOISESIG is {found}; expected a positive number, which the configuration {} requires. Try: noise.source = \"{other}\", to measure the noise",
+                configuration.name
+            );
+            return Err(FileError::new(path, message).into());
+        }
+        let OpenPsfs {
+            source: psfs,
+            moved,
+            scale,
+        } = open_psf(data, id, configuration, &mosaic)?;
+        let mut warnings: Vec<Warning> = Warning::of_settings(configuration).into_iter().collect();
+        warnings.extend(moved.map(Warning::of_moved));
+        let own_scale = pixel_scale::of_header(&image);
+        warnings.extend(pixel_scale::disagreement(scale, own_scale));
+        let head = ImageHead {
+            id,
+            mosaic,
+            noise: header_noise,
+            stated_noise: header_noise.filter(|_| uses_header),
+            survey: None,
+            warnings,
+            run_warnings: Vec::new(),
+            prints: BTreeMap::new(),
+        };
+        Ok(ImageSource {
+            head: Arc::new(head),
+            image,
+            psfs,
+            next: 0,
+        })
+    }
+
+    /// What all rows of the image share.
+    pub fn head(&self) -> &ImageHead {
+        &self.head
+    }
+
+    /// The same, to be changed before the first row is read.
+    pub(super) fn head_mut(&mut self) -> &mut ImageHead {
+        Arc::make_mut(&mut self.head)
+    }
+
+    /// Measures noise and galaxy sizes on the stamps, if the configuration of `measurer` requires it. If all stamps
+    /// have too many missing pixels, the galaxies are flagged: NOISESIG does not replace the measurement.
+    ///
+    /// # Errors
+    /// If stamps cannot be read, or have no border of noise.
+    pub fn survey(&mut self, data: &DataFolder, measurer: &Measurer) -> Result<(), PipelineError> {
+        let Some(plan) = measurer.noise_plan() else {
+            return Ok(());
+        };
+        let id = self.head.id;
+        let path = data.galaxies(id.set, id.image);
+        let mosaic = self.head.mosaic;
+        let found = noise::survey(&mut self.image, &path, mosaic, plan)?;
+        let head = self.head_mut();
+        match &found {
+            Some(survey) => {
+                let stated = head.noise;
+                head.warnings.extend(noise::disagreement(stated, survey));
+            }
+            None => {
+                head.noise = None;
+                head.warnings.push(Warning::NoNoise);
+            }
+        }
+        head.survey = found;
+        Ok(())
+    }
+
+    /// Checks whether noise is correlated that the configuration treats as white.
+    ///
+    /// # Errors
+    /// If stamps cannot be read, or have no border of noise although the configuration requires it.
+    pub(super) fn check_correlation(
+        &mut self,
+        data: &DataFolder,
+        measurer: &Measurer,
+    ) -> Result<(), PipelineError> {
+        let id = self.head.id;
+        let path = data.galaxies(id.set, id.image);
+        let found = noise::correlation(&mut self.image, &path, &self.head, measurer)?;
+        self.head_mut().run_warnings.extend(found);
+        Ok(())
+    }
+
+    /// The next row of stamps, `None` after the last.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn next_row(&mut self) -> Result<Option<StampRow>, PipelineError> {
+        let mosaic = self.head.mosaic;
+        if self.next == mosaic.rows() {
+            return Ok(None);
+        }
+        let iy = self.next;
+        self.next += 1;
+        Ok(Some(StampRow {
+            head: Arc::clone(&self.head),
+            iy,
+            pixels: self.image.read_rows(mosaic.stamp)?,
+            psfs: self.psfs.next_row(mosaic, iy)?,
+        }))
+    }
+}
+
+/// Why stamps of `stamp` pixels a side cannot be measured, with the lines of a configuration that measures them.
+fn too_small(stamp: usize, configuration: &Configuration) -> String {
+    let Configuration { name, .. } = configuration;
+    let needed = configuration.stamp.size;
+    let mut lines = format!("  extends = \"{name}\"\n  stamp.size = {stamp}");
+    if let Some(linear) = configuration.linear() {
+        // The linear method requires a window of at most a quarter of the stamp, and a PSF of the same parity.
+        let window = stamp as f64 / 4.0;
+        if linear.deconvolution.window_sigma > window {
+            lines += &format!("\n  deconvolution.window_sigma = {window}");
+        }
+        if configuration.psf.size % 2 != stamp % 2 {
+            lines += &format!("\n  psf.size = {}", configuration.psf.size - 1);
+        }
+    }
+    format!(
+        "the stamps are too small for the configuration {name} (found {stamp} px a side, expected {needed} or more). Try: --submission own.toml, with the file own.toml of these lines:\n{lines}"
+    )
+}
+
+/// Opens the galaxies of an image. Their stamps follow from the header, or else from the layout of the data.
+pub(crate) fn open_galaxies(
+    data: &DataFolder,
+    id: ImageId,
+) -> Result<(ImageReader, Mosaic), PipelineError> {
+    let path = data.galaxies(id.set, id.image);
+    let image = ImageReader::open(&path)?;
+    let mosaic = grid::of_image(data, &path, &image)?;
+    check_strip(&path, mosaic.columns, mosaic.stamp)?;
+    Ok((image, mosaic))
+}
+
+/// Checks that a row of `n` stamps of `side` pixels a side fits into memory.
+pub(crate) fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), FileError> {
+    let pixels = n * side * side;
+    if pixels <= MAX_STRIP {
+        return Ok(());
+    }
+    let message = format!(
+        "a row of {n} stamps of {side} pixels a side has {pixels} pixels; expected at most {MAX_STRIP}"
+    );
+    Err(FileError::new(path, message))
+}

@@ -1,0 +1,142 @@
+//! One SVG file for each kind of plot, compared exactly.
+//!
+//! To accept changed plots, run the test with `ACCEPT_PLOTS=1`. Look at each file before you commit it.
+#![allow(clippy::unwrap_used, reason = "a panic in a test is its failure")]
+
+use std::path::Path;
+
+use ndarray::Array2;
+use shearq_render::figure::{
+    BarGroup, BarPlot, ColourMap, Figure, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot,
+    PanelGrid, PictureFormat, Scale, Series, Style,
+};
+
+fn compare(name: &str, figure: &impl Figure) {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/golden/{name}.svg"));
+    let found = figure.render(PictureFormat::Svg).unwrap();
+    if std::env::var_os("ACCEPT_PLOTS").is_some() {
+        std::fs::write(&path, &found).unwrap();
+    }
+    let expected = std::fs::read(&path).unwrap_or_default();
+    assert!(
+        found == expected,
+        "{} differs from the plot. If the change is intended, try: ACCEPT_PLOTS=1 cargo test -p shearq-render --test golden",
+        path.display()
+    );
+}
+
+fn line(title: &str) -> LinePlot {
+    let x = vec![100.0, 200.0, 400.0, 800.0];
+    LinePlot {
+        title: title.into(),
+        x_label: "ℓ".into(),
+        y_label: "ℓ²C_ℓ/2π".into(),
+        x_log: true,
+        y_log: true,
+        series: vec![
+            Series::new(
+                "true",
+                x.clone(),
+                vec![1e-5, 2e-5, 3e-5, 5e-5],
+                Style::Line,
+                0,
+            ),
+            Series::new("noise", x.clone(), vec![1e-6; 4], Style::Dashed, 1),
+            Series::new(
+                "measured",
+                x,
+                vec![1.2e-5, 1.9e-5, 3.2e-5, 4.9e-5],
+                Style::Points,
+                2,
+            )
+            .with_errors(vec![2e-6; 4]),
+        ],
+        ..LinePlot::default()
+    }
+}
+
+#[test]
+fn a_line_plot() {
+    compare("line", &line("Shear power"));
+}
+
+#[test]
+fn panels_share_their_labels_and_legend() {
+    compare(
+        "panels",
+        &PanelGrid {
+            title: "Shear power spectra".into(),
+            columns: 2,
+            plots: ["set 2", "set 5", "set 8"].map(line).into(),
+        },
+    );
+}
+
+fn bars(categories: &[&str]) -> BarPlot {
+    let group = |label: &str, from: f64| BarGroup {
+        label: label.into(),
+        values: (0..categories.len()).map(|k| from - k as f64).collect(),
+        errors: Some(vec![0.5; categories.len()]),
+    };
+    BarPlot {
+        title: "Quality factor per set".into(),
+        x_label: "set".into(),
+        y_label: "Q".into(),
+        categories: categories.iter().map(|name| (*name).to_owned()).collect(),
+        groups: vec![group("23/raw/star", 4.0), group("23/den/star", 1.0)],
+    }
+}
+
+#[test]
+fn a_bar_plot() {
+    compare("bar", &bars(&["2", "5", "8", "mean"]));
+}
+
+#[test]
+fn long_names_of_bars_run_upwards() {
+    let names = ["a rather long name of a category"; 6];
+    compare("bar-upright", &bars(&names));
+}
+
+#[test]
+fn a_heat_map() {
+    compare(
+        "heat",
+        &HeatMap {
+            title: "Quality factor per set".into(),
+            row_label: "configuration".into(),
+            column_label: "set".into(),
+            rows: vec!["23/raw/star".into(), "48/linear/star".into()],
+            columns: ["2", "5", "8"].map(String::from).into(),
+            values: Array2::from_shape_vec((2, 3), vec![10.0, 20.5, f64::NAN, 40.0, 50.0, 60.0])
+                .unwrap(),
+            decimals: 1,
+            value_label: "Q".into(),
+            map: ColourMap::Viridis,
+        },
+    );
+}
+
+#[test]
+fn images_in_a_grid() {
+    let panel = |title: &str, map| ImagePanel {
+        title: title.into(),
+        image: Array2::from_shape_fn((4, 4), |(y, x)| (x + 4 * y) as f64),
+        map,
+        ..ImagePanel::default()
+    };
+    compare(
+        "images",
+        &ImageGrid {
+            title: "Steps of one galaxy".into(),
+            rows: vec![ImageRow {
+                label: "S/N 20".into(),
+                panels: vec![
+                    panel("stamp", ColourMap::Grey),
+                    panel("deconvolved", ColourMap::Viridis),
+                ],
+            }],
+            scale: Scale::Own,
+        },
+    );
+}

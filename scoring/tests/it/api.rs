@@ -1,0 +1,267 @@
+//! The public interface: arrays of other grids are errors, and every NaN has a reason.
+
+use ndarray::Array2;
+use shearq_scoring::modes::{Decomposer, Modes};
+use shearq_scoring::{
+    Bins, Choice, Complex64, Convention, Definition, Fault, FieldSum, Grid, MeanShear, Metrics,
+    Noise, Options, ScoringError, SetImages, SetScore, SetScorer, TrueShear, TruthSign, Unknown,
+    cross_spectrum, measured_bandpowers, sign_by_correlation, sign_by_modes,
+};
+
+use crate::common::{Content, Normal, field, truth};
+
+fn grid(n: usize) -> Grid {
+    Grid::great10(n).unwrap()
+}
+
+/// Images with the shear `response · g` and noise.
+fn images(shear: &Array2<Complex64>, count: u64, response: f64, noise: f64) -> SetImages {
+    let n = shear.nrows();
+    let arrays: Vec<[Array2<f64>; 2]> = (0..count)
+        .map(|image| {
+            let mut normal = Normal(image + 1);
+            let mut of = |part: fn(&Complex64) -> f64| {
+                shear.map(|g| response * part(g) + noise * normal.draw())
+            };
+            [of(|g| g.re), of(|g| g.im)]
+        })
+        .collect();
+    SetImages::of_arrays(
+        &grid(n),
+        arrays.iter().map(|[e1, e2]| [e1.view(), e2.view()]),
+    )
+    .unwrap()
+}
+
+fn is_shape<T>(result: Result<T, ScoringError>) -> bool {
+    matches!(result, Err(ScoringError::Shape { .. }))
+}
+
+#[test]
+fn arrays_of_another_grid_are_an_error() {
+    let (small, large) = (grid(16), grid(20));
+    let shear = field(&large, Content::E, 1);
+    let others = images(&shear, 2, 1.0, 0.01);
+    let scorer = SetScorer::new(
+        small,
+        truth(&field(&small, Content::E, 1)),
+        Options::default(),
+    )
+    .unwrap();
+    assert!(is_shape(scorer.score(&others)));
+    assert!(is_shape(scorer.match_convention(&others)));
+    let own = images(&field(&small, Content::E, 1), 2, 1.0, 0.01);
+    let score = scorer.score(&own).unwrap();
+    assert!(is_shape(scorer.diagnose(
+        &others,
+        &score,
+        Convention::STANDARD
+    )));
+    assert!(is_shape(measured_bandpowers(
+        &small,
+        others.total(),
+        Convention::STANDARD
+    )));
+    assert!(is_shape(cross_spectrum(
+        &small,
+        &others,
+        Convention::STANDARD
+    )));
+    assert!(is_shape(sign_by_modes(&small, &truth(&shear))));
+    assert!(is_shape(sign_by_correlation(&truth(&shear), own.total())));
+    let decomposer = Decomposer::new(small);
+    assert!(is_shape(decomposer.decompose(shear.clone())));
+    let modes = Decomposer::new(large).decompose(shear).unwrap();
+    assert!(is_shape(decomposer.compose(&modes)));
+    let bins = Bins::new(&small, Definition::Corrected);
+    assert!(is_shape(bins.power(&modes.e, &modes.e)));
+    let mixed = Modes {
+        e: Array2::zeros((16, 16)),
+        b: modes.b,
+    };
+    assert!(is_shape(bins.power(&mixed.e, &mixed.b)));
+    assert!(is_shape(decomposer.compose(&mixed)));
+    let (square, wide) = (Array2::zeros((16, 16)), Array2::zeros((16, 20)));
+    assert!(is_shape(Convention::STANDARD.apply(&square, &wide)));
+    assert!(is_shape(Convention::STANDARD.apply(&wide, &wide)));
+}
+
+#[test]
+fn only_single_images_of_the_grid_are_added() {
+    let own = grid(16);
+    let mut all = SetImages::new(&own);
+    let one = FieldSum {
+        images: 1,
+        ..FieldSum::new(&own)
+    };
+    for images in [0, 2] {
+        let sum = FieldSum {
+            images,
+            ..one.clone()
+        };
+        assert_eq!(all.add(&sum), Err(ScoringError::NotOneImage(images)));
+    }
+    let other = Array2::zeros((20, 20));
+    for sum in [
+        FieldSum {
+            e1: other.clone(),
+            ..one.clone()
+        },
+        FieldSum {
+            e2: other.clone(),
+            ..one.clone()
+        },
+        FieldSum {
+            count: other.clone(),
+            ..one.clone()
+        },
+    ] {
+        assert!(is_shape(all.add(&sum)));
+    }
+    assert_eq!((all.total().images, all.groups().len()), (0, 0));
+    all.add(&one).unwrap();
+    assert_eq!((all.total().images, all.groups().len()), (1, 1));
+}
+
+#[test]
+fn without_images_nothing_is_scored() {
+    let grid = grid(16);
+    let scorer = SetScorer::new(
+        grid,
+        truth(&field(&grid, Content::E, 1)),
+        Options::default(),
+    )
+    .unwrap();
+    let none = SetImages::new(&grid);
+    assert_eq!(
+        scorer.match_convention(&none).unwrap_err(),
+        ScoringError::NoImages
+    );
+    assert_eq!(scorer.score(&none).unwrap_err(), ScoringError::NoImages);
+    assert_eq!(
+        cross_spectrum(&grid, &none, Convention::STANDARD).unwrap_err(),
+        ScoringError::TooFewImages(0)
+    );
+}
+
+#[test]
+fn every_metric_that_is_not_a_number_has_a_reason() {
+    let small = grid(16);
+    let shear = field(&small, Content::E, 5);
+    let score = |truth: TrueShear, images: &SetImages, noise: Noise| -> SetScore {
+        let options = Options {
+            noise,
+            choice: Choice::Insist(Convention::STANDARD),
+            ..Options::default()
+        };
+        SetScorer::new(small, truth, options)
+            .unwrap()
+            .score(images)
+            .unwrap()
+    };
+    let unknown = |score: &SetScore| -> Vec<(&'static str, Unknown)> {
+        for (metric, value) in Metrics::ALL.iter().zip(score.metrics.values()) {
+            let reason = score.why_unknown(metric.name);
+            assert_eq!(value.is_nan(), reason.is_some(), "{}", metric.name);
+        }
+        Metrics::ALL
+            .iter()
+            .filter_map(|metric| Some((metric.name, score.why_unknown(metric.name)?)))
+            .collect()
+    };
+    let two = images(&shear, 2, 1.0, 0.001);
+    assert_eq!(unknown(&score(truth(&shear), &two, Noise::Measured)), []);
+
+    let one = images(&shear, 1, 1.0, 0.001);
+    let noise = [("q_dn", Unknown::Noise), ("galaxy_noise", Unknown::Noise)];
+    assert_eq!(unknown(&score(truth(&shear), &one, Noise::Measured)), noise);
+
+    let constant = Array2::from_elem((16, 16), Complex64::new(0.02, 0.01));
+    let constant_score = score(truth(&constant), &two, Noise::Measured);
+    let reasons = unknown(&constant_score);
+    assert_eq!(reasons.len(), Metrics::ALL.len() - 2);
+    assert!(reasons.iter().all(|(name, reason)| {
+        *reason == Unknown::ConstantTruth && !["c1", "c2"].contains(name)
+    }));
+    assert!(matches!(constant_score.constant, Some(MeanShear { .. })));
+
+    // One constant component only.
+    let flat = TrueShear {
+        g2: Array2::zeros((16, 16)),
+        ..truth(&shear)
+    };
+    let reasons = unknown(&score(flat, &two, Noise::Measured));
+    assert_eq!(reasons, [("m2", Unknown::ConstantTruth)]);
+
+    let no_response = images(&shear, 2, 0.0, 0.1);
+    let reasons = unknown(&score(truth(&shear), &no_response, Noise::Given(0.01)));
+    assert_eq!(
+        reasons,
+        [
+            ("q_calibrated", Unknown::Response),
+            ("galaxy_noise", Unknown::Response)
+        ]
+    );
+
+    let missing = Array2::from_elem((16, 16), f64::NAN);
+    let empty = SetImages::of_arrays(&small, [[missing.view(), missing.view()]; 2]).unwrap();
+    let reasons = unknown(&score(truth(&shear), &empty, Noise::Measured));
+    assert!(reasons.contains(&("c1", Unknown::NoEllipticities)));
+    assert!(
+        reasons
+            .iter()
+            .all(|(_, reason)| *reason == Unknown::NoEllipticities)
+    );
+    assert_eq!(constant_score.why_unknown("no such metric"), None);
+}
+
+#[test]
+fn the_sign_of_a_truth_follows_from_modes_and_images() {
+    let grid = grid(24);
+    let shear = field(&grid, Content::E, 3);
+    let standard = truth(&shear);
+    let set = images(&shear, 2, 1.0, 0.001);
+    assert_eq!(
+        sign_by_modes(&grid, &standard),
+        Ok(Some(TruthSign::Standard))
+    );
+    assert_eq!(
+        sign_by_modes(&grid, &standard.flipped()),
+        Ok(Some(TruthSign::Challenge))
+    );
+    assert_eq!(
+        sign_by_correlation(&standard, set.total()),
+        Ok(Some(TruthSign::Standard))
+    );
+    assert_eq!(
+        sign_by_correlation(&standard.flipped(), set.total()),
+        Ok(Some(TruthSign::Challenge))
+    );
+}
+
+#[test]
+fn shifted_rows_are_found_with_their_direction() {
+    let grid = grid(24);
+    let shear = field(&grid, Content::E, 7);
+    for (x, y) in [(1, 0), (0, -1), (1, 1), (1, -1)] {
+        // The galaxy of cell (ix, iy) lies in cell (ix + x, iy + y).
+        let from = |k: usize, by: i32| (k as i32 - by).rem_euclid(24) as usize;
+        let moved = Array2::from_shape_fn((24, 24), |(ix, iy)| shear[(from(ix, x), from(iy, y))]);
+        let set = images(&moved, 2, 1.0, 0.001);
+        let options = Options {
+            choice: Choice::Insist(Convention::STANDARD),
+            ..Options::default()
+        };
+        let scorer = SetScorer::new(grid, truth(&shear), options).unwrap();
+        let score = scorer.score(&set).unwrap();
+        let faults = scorer.diagnose(&set, &score, Convention::STANDARD).unwrap();
+        let found: Vec<(i32, i32)> = faults
+            .iter()
+            .filter_map(|fault| match fault {
+                Fault::Shifted { x, y, .. } => Some((*x, *y)),
+                _ => None,
+            })
+            .collect();
+        assert_eq!(found, [(x, y)], "{faults:?}");
+    }
+}
