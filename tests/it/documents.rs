@@ -115,7 +115,10 @@ fn commands_of_the_pages_run() {
     follow("score-a-catalogue.md", scored.path(), 4);
     let challenge = tempfile::tempdir().unwrap();
     follow("challenge.md", challenge.path(), 10);
-    written(challenge.path(), &["linear.html", "compare.html", "to-send.tar.gz"]);
+    written(
+        challenge.path(),
+        &["linear.html", "compare.html", "to-send.tar.gz"],
+    );
     let recipes = tempfile::tempdir().unwrap();
     follow("recipes.md", recipes.path(), 27);
     let files = [

@@ -44,7 +44,11 @@ fn markdown(name: &str, ledger: &[Entry]) -> String {
     assert!(!entries.is_empty(), "no table {name} in docs/ledger.csv");
     let first = entries.iter().filter(|entry| entry.row == 1);
     let columns: Vec<&str> = first.map(|entry| entry.column.as_str()).collect();
-    let mut text = format!("| {} |\n|{}\n", columns.join(" | "), "---|".repeat(columns.len()));
+    let mut text = format!(
+        "| {} |\n|{}\n",
+        columns.join(" | "),
+        "---|".repeat(columns.len())
+    );
     for row in entries.chunk_by(|a, b| a.row == b.row) {
         let found: Vec<&str> = row.iter().map(|entry| entry.column.as_str()).collect();
         assert_eq!(found, columns, "columns of {name}, row {}", row[0].row);
@@ -64,7 +68,9 @@ fn with_tables(page: &str, ledger: &[Entry]) -> (String, Vec<String>) {
     while let Some(line) = lines.next() {
         text += line;
         text.push('\n');
-        let name = line.strip_prefix("<!-- ledger: ").and_then(|rest| rest.strip_suffix(" -->"));
+        let name = line
+            .strip_prefix("<!-- ledger: ")
+            .and_then(|rest| rest.strip_suffix(" -->"));
         if let Some(name) = name {
             while lines.next_if(|line| line.starts_with('|')).is_some() {}
             text += &markdown(name, ledger);
@@ -102,12 +108,22 @@ fn each_value_of_the_ledger_has_a_run() {
     let runs: toml::Table = runs.parse().unwrap();
     let ledger = ledger();
     for entry in &ledger {
-        assert!(runs.contains_key(&entry.run), "{} has no run in docs/ledger.toml", entry.run);
+        assert!(
+            runs.contains_key(&entry.run),
+            "{} has no run in docs/ledger.toml",
+            entry.run
+        );
     }
     for (name, run) in &runs {
-        assert!(ledger.iter().any(|entry| entry.run == *name), "no value of the run {name}");
+        assert!(
+            ledger.iter().any(|entry| entry.run == *name),
+            "no value of the run {name}"
+        );
         for key in ["command", "data", "machine", "version"] {
-            assert!(run[key].as_str().is_some_and(|text| !text.is_empty()), "{name}: {key}");
+            assert!(
+                run[key].as_str().is_some_and(|text| !text.is_empty()),
+                "{name}: {key}"
+            );
         }
     }
 }
@@ -129,19 +145,28 @@ fn decimals(text: &str) -> Vec<String> {
 fn decimal_numbers_of_the_readme_are_in_the_ledger() {
     let readme = fs::read_to_string(PathBuf::from("README.md")).unwrap();
     let ledger = ledger();
-    let known: BTreeSet<String> =
-        ledger.iter().flat_map(|entry| decimals(&format!("{} {}", entry.value, entry.error))).collect();
+    let known: BTreeSet<String> = ledger
+        .iter()
+        .flat_map(|entry| decimals(&format!("{} {}", entry.value, entry.error)))
+        .collect();
     let (mut code, mut checked) = (false, 0);
     for line in readme.lines() {
         if line.starts_with("```") {
             code = !code;
         }
         // Commands, their output and versions of programs are no results.
-        if code || line.contains("Rust 1.") || line.contains("Python 3.") || line.contains("Version 0.") {
+        if code
+            || line.contains("Rust 1.")
+            || line.contains("Python 3.")
+            || line.contains("Version 0.")
+        {
             continue;
         }
         for number in decimals(line) {
-            assert!(known.contains(&number), "README.md: {number} is not in docs/ledger.csv: {line}");
+            assert!(
+                known.contains(&number),
+                "README.md: {number} is not in docs/ledger.csv: {line}"
+            );
             checked += 1;
         }
     }

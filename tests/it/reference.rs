@@ -25,7 +25,9 @@ fn commands(arguments: &[&str]) -> Vec<String> {
     let help = succeed(&[arguments, &["--help"]].concat());
     let list = help.split("Commands:\n").nth(1).unwrap_or("");
     let list = list.split("\n\n").next().unwrap_or("");
-    let names = list.lines().filter(|line| line.starts_with("  ") && !line.starts_with("   "));
+    let names = list
+        .lines()
+        .filter(|line| line.starts_with("  ") && !line.starts_with("   "));
     names
         .filter_map(|line| line.split_whitespace().next())
         .filter(|name| *name != "help")
@@ -35,11 +37,22 @@ fn commands(arguments: &[&str]) -> Vec<String> {
 
 #[test]
 fn the_page_of_commands_equals_their_help() {
-    let mut page = String::from("# Commands\n\nThis page is generated from `shearq COMMAND --help`.\n");
+    let mut page =
+        String::from("# Commands\n\nThis page is generated from `shearq COMMAND --help`.\n");
     for command in commands(&[]) {
-        write!(page, "\n## {command}\n\n```text\n{}```\n", help(&[&command])).unwrap();
+        write!(
+            page,
+            "\n## {command}\n\n```text\n{}```\n",
+            help(&[&command])
+        )
+        .unwrap();
         for sub in commands(&[&command]) {
-            write!(page, "\n### {command} {sub}\n\n```text\n{}```\n", help(&[&command, &sub])).unwrap();
+            write!(
+                page,
+                "\n### {command} {sub}\n\n```text\n{}```\n",
+                help(&[&command, &sub])
+            )
+            .unwrap();
         }
     }
     same("docs/commands.md", &page);
@@ -48,7 +61,8 @@ fn the_page_of_commands_equals_their_help() {
 /// The help without blanks at the ends of lines.
 fn help(arguments: &[&str]) -> String {
     let help = succeed(&[arguments, &["--help"]].concat());
-    help.lines().fold(String::new(), |text, line| text + line.trim_end() + "\n")
+    help.lines()
+        .fold(String::new(), |text, line| text + line.trim_end() + "\n")
 }
 
 #[test]
@@ -56,13 +70,20 @@ fn the_page_of_configurations_equals_their_templates() {
     let mut page = String::from(
         "# Configurations\n\nThis page is generated from `shearq submissions list` and the commented files of the two methods.\n\n```text\n",
     );
-    page += &succeed(&["submissions", "list"]).lines().fold(String::new(), |text, line| text + line.trim_end() + "\n");
+    page += &succeed(&["submissions", "list"])
+        .lines()
+        .fold(String::new(), |text, line| text + line.trim_end() + "\n");
     page += "```\n";
     for (title, file) in [
         ("The linear method", "submissions/named/48-linear-star.toml"),
         ("The network of the paper", "submissions/named/paper.toml"),
     ] {
-        write!(page, "\n## {title}\n\n```toml\n{}```\n", fs::read_to_string(file).unwrap()).unwrap();
+        write!(
+            page,
+            "\n## {title}\n\n```toml\n{}```\n",
+            fs::read_to_string(file).unwrap()
+        )
+        .unwrap();
     }
     same("docs/configurations.md", &page);
 }

@@ -13,10 +13,12 @@ use syn::{
     parse_quote,
 };
 
-use crate::tree::{LIBRARIES, ModulePath, Target, Tree, attributes, is_public, name_of, names};
+use crate::tree::{
+    LIBRARIES, ModulePath, Target, Tree, attributes, is_public, is_test, name_of, names,
+};
 
 /// Set this environment variable to store the API as it is.
-const ACCEPT: &str = "SHEARQ_ACCEPT_API";
+const ACCEPT: &str = "SHEARQ_ACCEPT";
 
 #[test]
 fn public_items_are_those_that_are_listed() {
@@ -205,22 +207,29 @@ impl Lister {
         let Some(Target::Module(home)) = self.tree.resolve(module, home) else {
             return Vec::new();
         };
-        let declares = |call: &syn::ItemMacro| {
-            let text = call.mac.tokens.to_string();
-            ["struct", "enum", "type", "fn", "const", "trait"]
-                .iter()
-                .any(|kind| text.contains(&format!("{kind} {name} ")))
-        };
-        let calls = self.tree.0[&home]
-            .items
-            .iter()
-            .filter_map(|item| match item {
-                Item::Macro(call) if call.ident.is_none() && declares(call) => {
-                    Some(bare_macro(call))
-                }
+        let macros = |defined: bool| {
+            let items = self.tree.0[&home].items.iter();
+            items.filter_map(move |item| match item {
+                Item::Macro(item) if item.ident.is_some() == defined => Some(item),
                 _ => None,
-            });
-        calls.collect()
+            })
+        };
+        // The name is in the call, or in the macro that is called.
+        let declares = |call: &syn::ItemMacro| {
+            let arguments = without_docs(call.mac.tokens.clone());
+            let first = arguments.into_iter().next();
+            first.is_some_and(|token| token.to_string() == *name)
+                || macros(true).any(|definition| {
+                    definition.ident.as_ref() == call.mac.path.get_ident()
+                        && definition
+                            .mac
+                            .tokens
+                            .to_string()
+                            .contains(&format!("struct {name} "))
+                })
+        };
+        let calls = macros(false).filter(|call| declares(call));
+        calls.map(bare_macro).collect()
     }
 
     /// An item with its implementations.
@@ -376,6 +385,7 @@ fn bare_impl(block: &ItemImpl) -> Option<ItemImpl> {
     kept(&mut block.attrs);
     let is_trait = block.trait_.is_some();
     block.items.retain(|item| match item {
+        ImplItem::Fn(item) if is_test(&item.attrs) => false,
         ImplItem::Fn(item) => !is_trait && matches!(item.vis, Visibility::Public(_)),
         ImplItem::Const(item) => !is_trait && matches!(item.vis, Visibility::Public(_)),
         ImplItem::Type(_) => true,
