@@ -17,7 +17,7 @@ use crate::tree::{
     LIBRARIES, ModulePath, Target, Tree, attributes, is_public, is_test, name_of, names,
 };
 
-/// Set this environment variable to store the API as it is.
+/// Set this environment variable to store the present API.
 const ACCEPT: &str = "SHEARQ_ACCEPT";
 
 #[test]
