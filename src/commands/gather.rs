@@ -10,14 +10,17 @@ use shearq_pipeline::data::pattern::{MAX_IMAGE, MAX_SET};
 use shearq_pipeline::gather::{Content, Files, Gathered, Gathering, Stamps, Table, gather};
 use shearq_pipeline::images::ImageId;
 
-/// Gather stamps of your own into a data folder that `measure` takes.
+/// Gather your stamps and PSFs into a data folder for `measure`.
 ///
-/// The sky has to be subtracted. Stamps come as FITS files of one stamp, a cube, or several extensions each, or are cut out of an exposure around
-/// positions. Pixels beyond it, those that are not finite and those that a mask is not zero for are missing: a linear
-/// submission fills some from the opposite side of the galaxy, a network flags it. The PSF is one star stamp for all, one
-/// for each galaxy in the same order, or a table of functional PSFs (x,y,profile,beta,fwhm,e1,e2; docs/formats.md),
-/// of which the positions do not matter. Beside the image a table tells which stamp is which, in the order of the
-/// catalogues.
+/// Subtract the sky first. Stamps come from FITS files of one stamp, a cube or several extensions each. Or they are cut
+/// out of an exposure around positions.
+///
+/// Pixels are missing if they are outside the exposure, not finite, or not zero in a mask. A linear configuration
+/// fills a few from the opposite side of the galaxy; a network flags the galaxy.
+///
+/// The PSF is one star stamp for all galaxies, or one per galaxy in the same order. It may also be a table of functional
+/// PSFs (x,y,profile,beta,fwhm,e1,e2; docs/files-data.md), whose positions are not used. A table next to the image lists
+/// the stamps in the order of the catalogues.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// FITS files of stamps, in the order of the galaxies.

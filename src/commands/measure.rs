@@ -20,7 +20,7 @@ use crate::{count, tell, tell_unread};
 /// Measure the galaxies of a data folder: one catalogue per image.
 ///
 /// A catalogue has one row per galaxy with its position (x, y), ellipticity (e1, e2), flags, noise and response. See
-/// docs/formats.md for all columns. Catalogues of the same settings that are in the folder already are kept. So the
+/// docs/files-catalogues.md for all columns. Catalogues of the same settings that are in the folder already are kept. So the
 /// same command continues a measurement that was stopped.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {

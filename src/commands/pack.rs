@@ -34,7 +34,7 @@ pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
     #[arg(long, value_name = "DIR", required_unless_present = "foreign")]
     measured: Option<PathBuf>,
-    /// Catalogues of another program, described by a TOML file (docs/formats.md). They are packed with the signs and
+    /// Catalogues of another program, described by a TOML file (docs/files-foreign.md). They are packed with the signs and
     /// the type of ellipticity that are scored.
     #[arg(long, value_name = "FILE", conflicts_with = "measured")]
     foreign: Option<PathBuf>,

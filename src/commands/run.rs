@@ -25,8 +25,8 @@ use shearq_results::views::scores::{bandpowers, per_set, verdict_line};
 /// Measure and score in one step, on a data folder or on simulated sets.
 ///
 /// With --simulate, stamps are drawn, measured and discarded. Only catalogues are stored, even for a whole challenge
-/// (`--sets all --images 200`, 48 million galaxies). The catalogues are equal to those of `simulate` and `measure`.
-/// Scores and bandpowers are printed and stored beside the catalogues as scores.csv and bandpowers.csv. The same command
+/// (`--sets all --images 200`, 48 million galaxies). The catalogues are equal to the output of `simulate` and `measure`.
+/// Scores and bandpowers are printed and written next to the catalogues as scores.csv and bandpowers.csv. The same command
 /// continues a run that was stopped. With --shard, `merge` scores when all shards are done.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
@@ -130,7 +130,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 }
 
 /// Scores a folder of catalogues (of `sets`, or of all if empty) and prints the scores. Stores them with the bandpowers
-/// beside the catalogues, and in the results store if there is one.
+/// next to the catalogues, and in the results store if there is one.
 pub(super) fn score(
     run: &Run,
     out: &Path,

@@ -14,11 +14,12 @@ use shearq_pipeline::simulate::{SimulationRecord, simulate_folder};
 
 /// Write simulated GREAT10-like sets: images, PSFs, true shear, intrinsic shapes.
 ///
-/// The sets are those of the paper's Table 2: galaxies of bulge and disc at S/N 20 with a Moffat PSF of 3.4 pixels
-/// (1 to 3), S/N 10 (4 to 6), 40 (7 to 9), of many S/N (10 to 12), small (13, 14), large (15, 16), of many sizes (17,
-/// 18), a Kolmogorov PSF (19, 20), many bulge fractions (21, 22) and bulges off the disc's centre (23, 24). S/N is
-/// √(Σ I²)/σ before lensing and behind a round PSF. Images already in the folder are kept if the same settings made them, so
-/// a stopped simulation goes on where it was.
+/// The sets follow Table 2 of the paper. Sets 1 to 3 have galaxies of bulge and disc at S/N 20 and a Moffat PSF of
+/// 3.4 px. The others differ by S/N 10 (4 to 6), S/N 40 (7 to 9), many S/N (10 to 12); small (13, 14), large (15, 16)
+/// and many sizes (17, 18); a Kolmogorov PSF (19, 20); many bulge fractions (21, 22); displaced bulges (23, 24).
+///
+/// S/N is √(Σ I²)/σ before lensing and behind a round PSF. Images that the same settings made are kept, so the same
+/// command resumes a stopped simulation.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Sets, as `1,2,7-9` or `all`.

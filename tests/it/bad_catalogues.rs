@@ -160,7 +160,10 @@ fn records_and_folders_that_are_not_what_they_should_be_are_refused() {
     for (content, expected) in [
         ("{", "not a record"),
         ("{}", "missing field"),
-        ("{}", "have to be made anew, in another folder"),
+        (
+            "{}",
+            "the record belongs to another version. Try: another folder",
+        ),
         ("\u{1}", "not a record"),
     ] {
         fs::write(out.join("run.json"), content).unwrap();

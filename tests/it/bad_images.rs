@@ -587,7 +587,7 @@ fn stars_that_cannot_be_used_are_refused_with_the_reason() {
         (image(&|x, y| at(x, y + 28)), &["+20.0) px off the centre"]),
         (
             fits_image(-32, &[14, 14], &[], &[0; 784]),
-            &["14 pixels a side; the submission needs 15"],
+            &["14 pixels a side; the configuration requires 15"],
         ),
         (
             fits_image(-32, &[side, 40], &[], &floats(&pixels[..side * 40])),
@@ -672,7 +672,7 @@ fn a_star_that_cannot_be_used_flags_its_galaxy_alone() {
     for (size, submission, needs) in [(40, wide.to_str().unwrap(), 48), (30, linear[1], 32)] {
         write(size);
         let message = small.fail_to_measure(&["--submission", submission]);
-        let expected = format!("{size} pixels a side; the submission needs {needs}");
+        let expected = format!("{size} pixels a side; the configuration requires {needs}");
         assert!(message.contains(&expected), "{message}");
     }
     write(40);

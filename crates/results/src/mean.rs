@@ -68,7 +68,7 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<SetMean>, 
     if means.is_empty() {
         return Err(FileError::new(
             out,
-            "there is no catalogue; expected those of `measure`",
+            "there is no catalogue; expected a folder that `measure` wrote",
         ));
     }
     Ok(means)
@@ -84,7 +84,7 @@ fn mean_of(
     let (mut flags, mut flagged) = ([0; Flag::ALL.len()], 0);
     for (_, path) in catalogues {
         let rows = Rows::read(path, calibrated)?;
-        for &bits in rows.flags.iter() {
+        for &bits in &*rows.flags {
             for (count, flag) in flags.iter_mut().zip(Flag::ALL) {
                 *count += usize::from(bits as u32 & flag as u32 != 0);
             }

@@ -29,7 +29,7 @@ const GRADIENT: f64 = 0.3;
 /// each galaxy, whose noise averages out.
 const ENOUGH_SNR: f64 = 1000.0;
 const ENOUGH_SNR_EACH: f64 = 100.0;
-/// Scatter of m and of c with a star's noise, times its S/N (docs/linear.md).
+/// Scatter of m and of c with a star's noise, times its S/N (docs/limitations.md).
 pub(crate) const M_PER_NOISE: f64 = 5.3;
 pub(crate) const C_PER_NOISE: f64 = 2.4;
 /// Noise-equivalent area in px² of the narrowest PSF that pixels can show: of a FWHM of about 1 px.

@@ -234,7 +234,7 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
             Some(hint) => format!(". {hint}"),
             // Valid JSON with other keys or types.
             None if error.is_data() => {
-                "; the results of another version have to be made anew, in another folder".into()
+                "; the record belongs to another version. Try: another folder".into()
             }
             None => String::new(),
         };

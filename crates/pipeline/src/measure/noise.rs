@@ -49,7 +49,7 @@ pub(super) fn survey(
         }
         let missing = match survey.incomplete() {
             0 => String::new(),
-            count => format!(", {count} of which have missing pixels"),
+            count => format!(", {count} of them with missing pixels"),
         };
         let examined = survey.looked_at();
         let message = format!(

@@ -2,7 +2,7 @@
 
 use shearq_scoring::{Grid, RowCounts, RowFault};
 
-/// The reason not to score these rows as they are, if there is one.
+/// The reason not to score these rows, if there is one.
 pub fn fault(counts: &RowCounts, grid: &Grid) -> Option<String> {
     let limit = RowCounts::ABSURD;
     Some(match counts.fault()? {
@@ -51,7 +51,7 @@ pub fn oddities(counts: &RowCounts, whose: &str) -> Vec<String> {
     }
     if counts.above_one > 0 {
         lines.push(format!(
-            "warning: {} of {whose} with |e| > 1, {} with |e| > {}; scored as they are.",
+            "warning: {} of {whose} with |e| > 1, {} with |e| > {}; scored unchanged.",
             rows(counts.above_one),
             counts.absurd,
             RowCounts::ABSURD

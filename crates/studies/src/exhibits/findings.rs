@@ -286,7 +286,7 @@ pub fn lambda_findings(curves: &Curves) -> Vec<Finding> {
         Finding {
             paper: "1/RMSD of the adaptive update is the better one for λ ≤ 10⁻⁴, whatever the S/N",
             here: format!(
-                "{} times that of the constant one",
+                "{} times the constant update's",
                 range(small.iter().copied(), 2)
             ),
             agrees: Some(everywhere(&small)),

@@ -239,7 +239,7 @@ pub fn calibration_table(curves: &Curves, configuration: &Configuration) -> Tabl
     )];
     if at_edge {
         notes.push(format!(
-            "Warning: a best λ is at the edge of the range, 10^{} to 10^{}; the true optimum may lie beyond.",
+            "warning: a best λ is at the edge of the range, 10^{} to 10^{}; the true optimum may lie beyond.",
             LOG_LAMBDA[0],
             LOG_LAMBDA[LOG_LAMBDA.len() - 1]
         ));
