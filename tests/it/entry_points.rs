@@ -41,7 +41,8 @@ impl Data {
     /// An image of simulated set 2.
     fn good() -> Self {
         let simulator =
-            SetSimulator::new(SetKind::of(2).unwrap(), SimulationSettings::new(SEED, GRID)).unwrap();
+            SetSimulator::new(SetKind::of(2).unwrap(), SimulationSettings::new(SEED, GRID))
+                .unwrap();
         let fields = simulator.image_fields(1);
         let mut stamps = Stamps::zeros((GRID * GRID, STAMP, STAMP));
         let mut scratch = RenderScratch::new();
@@ -145,11 +146,31 @@ const fn case(name: &'static str, spoil: fn(&mut Data), expected: Expected) -> C
 
 const CASES: [Case; 36] = [
     case("none", |_| {}, Silent("good data")),
-    case("sky 0.5σ", |d| d.stamps += 0.5, Warning("the stamps contain sky")),
-    case("sky −0.5σ", |d| d.stamps -= 0.5, Warning("the stamps contain sky")),
-    case("sky 3σ", |d| d.stamps += 3.0, Warning("the stamps contain sky")),
-    case("sky −3σ", |d| d.stamps -= 3.0, Warning("the stamps contain sky")),
-    case("sky 100σ", |d| d.stamps += 100.0, Warning("the stamps contain sky")),
+    case(
+        "sky 0.5σ",
+        |d| d.stamps += 0.5,
+        Warning("the stamps contain sky"),
+    ),
+    case(
+        "sky −0.5σ",
+        |d| d.stamps -= 0.5,
+        Warning("the stamps contain sky"),
+    ),
+    case(
+        "sky 3σ",
+        |d| d.stamps += 3.0,
+        Warning("the stamps contain sky"),
+    ),
+    case(
+        "sky −3σ",
+        |d| d.stamps -= 3.0,
+        Warning("the stamps contain sky"),
+    ),
+    case(
+        "sky 100σ",
+        |d| d.stamps += 100.0,
+        Warning("the stamps contain sky"),
+    ),
     case(
         "sky gradient 0.01 σ/px",
         |d| add_gradient(d, 0.01),
@@ -310,7 +331,11 @@ const CASES: [Case; 36] = [
         },
         Warning("stamps are copies of each other"),
     ),
-    case("blank stamps", |d| d.stamps.fill(0.0), Warning("the stamps are blank")),
+    case(
+        "blank stamps",
+        |d| d.stamps.fill(0.0),
+        Warning("the stamps are blank"),
+    ),
     case(
         "pixel values × 1e20",
         |d| d.stamps *= 1e20,
@@ -477,7 +502,9 @@ impl Folder {
 
     /// Measures in Python; none if Python cannot import shearq.
     fn python(&self, python: &str, data: &Data) -> Found {
-        let noise = data.noise.map_or("None".to_owned(), |noise| noise.to_string());
+        let noise = data
+            .noise
+            .map_or("None".to_owned(), |noise| noise.to_string());
         let script = format!(
             "import sys, warnings, numpy, shearq\n\
              warnings.simplefilter('always')\n\
@@ -519,7 +546,9 @@ fn python() -> Option<String> {
 fn every_entry_point_reports_wrong_data() {
     let python = python();
     let (good, folder) = (Data::good(), Folder::new());
-    let mut table = "| data set | batch | gather | measure | run | Python |\n|---|---|---|---|---|---|\n".to_owned();
+    let mut table =
+        "| data set | batch | gather | measure | run | Python |\n|---|---|---|---|---|---|\n"
+            .to_owned();
     let mut wrong = Vec::new();
     for case in &CASES {
         let mut data = good.clone();
@@ -604,7 +633,11 @@ fn positions(folder: &Folder, data: &Data, wrong: &mut Vec<String>) -> String {
         add(name, &found, expected);
     }
     let found = folder.run("gather", &["--stamps", text(&mosaic), "--psf", text(&psf)]);
-    add("mosaic given to `--stamps`", &found, "looks like a mosaic of stamps");
+    add(
+        "mosaic given to `--stamps`",
+        &found,
+        "looks like a mosaic of stamps",
+    );
     rows
 }
 
@@ -627,9 +660,22 @@ fn batch_compares_the_noise_in_the_call_with_the_stamps() {
 #[test]
 fn all_simulated_sets_are_measured_without_a_warning() {
     let folder = tempfile::tempdir().unwrap();
-    for (sets, name) in [("all", "48/linear/func"), ("all", "48/linear/star"), ("2,5,8,20", "23/raw/star")] {
+    for (sets, name) in [
+        ("all", "48/linear/func"),
+        ("all", "48/linear/star"),
+        ("2,5,8,20", "23/raw/star"),
+    ] {
         let out = folder.path().join(name.replace('/', "-"));
-        let run = ["run", "--simulate", "--sets", sets, "--images", "1", "--grid", "16"];
+        let run = [
+            "run",
+            "--simulate",
+            "--sets",
+            sets,
+            "--images",
+            "1",
+            "--grid",
+            "16",
+        ];
         is_silent(&[&run[..], &["--submission", name, "--out", text(&out)]].concat());
     }
 }

@@ -25,8 +25,20 @@ fn config() -> ProptestConfig {
 /// Any value of a setting: numbers at their limits, words that other settings use, and other types.
 fn setting() -> impl Strategy<Value = Value> {
     let words = [
-        "star", "functional", "linear", "network", "image", "border", "header", "response", "none", "total", "peak",
-        "shear", "distortion", "",
+        "star",
+        "functional",
+        "linear",
+        "network",
+        "image",
+        "border",
+        "header",
+        "response",
+        "none",
+        "total",
+        "peak",
+        "shear",
+        "distortion",
+        "",
     ];
     prop_oneof![
         any::<i64>().prop_map(Value::Integer),
