@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 import threading
+import warnings
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ def test_submissions_can_be_pickled_and_copied(image):
     own = shearq.submission({"extends": "48/linear/star", "noise": {"source": "border", "border": 4}})
     for submission in [shearq.submission("23/den/star"), own]:
         for again in [pickle.loads(pickle.dumps(submission)), copy.deepcopy(submission), copy.copy(submission)]:
-            assert isinstance(again, shearq.Submission)
+            assert isinstance(again, shearq.Configuration)
             for name in ("name", "description", "extends", "settings", "toml", "published"):
                 assert getattr(again, name) == getattr(submission, name), name
     measured = [shearq.measure(image.stamps, image.psf, submission=own) for own in (own, pickle.loads(pickle.dumps(own)))]
@@ -112,6 +113,12 @@ def test_galaxies_that_cannot_be_measured_are_flagged(image):
     assert shearq.Flag(int(again(image, psf=stars)["flags"][7])) == shearq.Flag.BadPsf
 
 
+def test_a_call_without_a_good_galaxy_is_an_error_with_its_cause(image):
+    stamps = np.full_like(image.stamps[:5], np.nan)
+    with pytest.raises(ValueError, match="stamps: no galaxy could be measured: 5 of 5 .*missing.*Try: check masks"):
+        again(image, stamps)
+
+
 def test_the_catalogue_knows_what_made_it_and_keeps_it(measured):
     attrs = measured.attrs
     assert attrs["submission"] == "48/linear/star" and attrs["version"] == shearq.__version__
@@ -129,6 +136,7 @@ def test_the_mean_shear_is_the_mean_ellipticity_with_weights_over_their_own_resp
     assert shear.g1 == pytest.approx(measured["e1"].mean(), rel=1e-12)
     residual = measured["e2"] - shear.g2 * measured["R22"] / measured["R22"].mean()
     assert shear.g2_error == pytest.approx(residual.std(ddof=1) / len(measured) ** 0.5, rel=1e-2)
+    assert shear.covariance[1][1] == pytest.approx(shear.g2_error**2) and shear.flagged == 0
     assert shear.galaxies == len(measured) and tuple(shear) == (shear.g1, shear.g2)
     # Weights of zero and one are a choice of rows.
     chosen = measured["flux"] > np.median(measured["flux"])
@@ -242,7 +250,8 @@ def test_noise_is_measured_on_stamps_that_hold_some(image):
     with pytest.raises(ValueError, match="noise: the noise level is not to be seen on the stamps' frames"):
         shearq.measure(point, image.psf)
     # Without anything on them there is nothing to measure.
-    assert not shearq.measure(0 * point + 3, image.psf).good.any()
+    with pytest.raises(ValueError, match="no galaxy could be measured"):
+        shearq.measure(0 * point + 3, image.psf)
 
 
 def test_progress_counts_every_galaxy_and_its_exceptions_come_through(image, measured):
@@ -274,7 +283,10 @@ import numpy as np
 import shearq
 
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-stamps = np.random.default_rng(1).normal(size=(10_000, 48, 48)).astype(np.float32).astype(sys.argv[1])
+stamps = np.random.default_rng(1).normal(size=(10_000, 48, 48)).astype(np.float32)
+y, x = np.mgrid[:48, :48] - 23.5
+stamps += (30 * np.exp(-(x * x + y * y) / 30)).astype(np.float32)
+stamps = stamps.astype(sys.argv[1])
 psf = shearq.FunctionalPsf(3.4)
 shearq.measure(stamps[:100], psf, noise=1.0)
 # The array is in memory; so is what making it took, beside which the measurement could hide.

@@ -1,12 +1,12 @@
 """shearq: galaxy shapes for weak lensing from postage stamps and PSFs, and the metrics of shear challenges.
 
 >>> import shearq
->>> cat = shearq.measure(stamps, psf, noise=sigma)     # (n, ny, nx), (py, px) and a number
+>>> cat = shearq.measure(stamps, psf)                  # (n, ny, nx) and (py, px)
 >>> cat["e1"], cat["R11"], cat["flags"]                # a structured array, calibrated by its mean response
 >>> cat.mean_shear()                                   # g1, g2 with errors
 
-Conventions: images are indexed [y, x]; e1 > 0 is elongation along +x, e2 > 0 along x = y; noise is a standard deviation
-per pixel in the image's unit; results do not depend on the number of threads, and are those of the command line.
+Conventions: images are indexed [y, x]. e1 > 0 is elongation along +x, e2 > 0 along x = y. Noise is a standard deviation
+per pixel in the unit of the image. Results have the same bits as those of the command line, for any number of threads.
 """
 
 from . import adapters
@@ -14,7 +14,7 @@ from ._measure import Catalogue, DataWarning, Flag, FunctionalPsf, MeanShear, me
 from ._score import METRICS, Score, compare, power_spectrum, score
 from ._shearq import __version__
 from ._simulate import SimulatedImage, Simulation, simulate
-from ._submissions import Submission, submission, submissions
+from ._submissions import Configuration, submission, submissions
 
 __all__ = [
     "METRICS",
@@ -26,7 +26,7 @@ __all__ = [
     "Score",
     "SimulatedImage",
     "Simulation",
-    "Submission",
+    "Configuration",
     "__version__",
     "adapters",
     "compare",

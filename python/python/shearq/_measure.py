@@ -1,4 +1,4 @@
-"""Stamps and PSFs into catalogues of calibrated ellipticities."""
+"""Measure stamps and PSFs into catalogues of calibrated ellipticities."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Flag.__doc__ = "Why a galaxy could not be measured: the bits of a catalogue's ``
     f"* ``{name}``: {meaning}." for name, _, meaning in _shearq.flags()
 )
 
-# Columns as AnaCal calls them.
+# Names of columns in AnaCal.
 _ANACAL = {"e1": "e1", "e2": "e2", "R11": "de1_dg1", "R22": "de2_dg2"}
 
 
@@ -38,7 +38,7 @@ class FunctionalPsf:
     e1, e2 : float or array of shape (n,)
         Shear-type ellipticity (1 − q)/(1 + q); e1 > 0 along +x, e2 > 0 along x = y.
     beta : float or array of shape (n,), optional
-        Exponent of a Moffat profile, above 1. A Kolmogorov profile where it is None.
+        Exponent of a Moffat profile, above 1. None gives a Kolmogorov profile.
     """
 
     __slots__ = ("_rows",)
@@ -96,20 +96,25 @@ class MeanShear:
     g1, g2 : float
         Components of the mean shear; g1 > 0 along +x, g2 > 0 along x = y.
     g1_error, g2_error : float
-        Their standard errors, from the scatter of the galaxies: shapes, noise and responses.
+        Standard errors. They include the errors of the mean responses.
+    covariance : tuple of tuple of float
+        Covariance of g1 and g2.
     response : tuple of float or None
-        Mean responses that were divided by; None where the submission measures none, so that the mean
-        ellipticity is taken as it is.
+        Mean responses R11 and R22 by which the ellipticities were divided; None if the configuration measures none.
     galaxies : int
-        Galaxies that count: those without a flag, of positive weight.
+        Galaxies without a flag and with a positive weight.
+    flagged : int
+        Galaxies with a flag and a positive weight.
     """
 
     g1: float
     g2: float
     g1_error: float
     g2_error: float
+    covariance: tuple[tuple[float, float], tuple[float, float]]
     response: tuple[float, float] | None
     galaxies: int
+    flagged: int
 
     def __iter__(self):
         return iter((self.g1, self.g2))
@@ -121,34 +126,34 @@ class Catalogue(np.ndarray):
     Fields
     ------
     e1, e2 : float64
-        Ellipticity, divided by the mean response of all galaxies that were measured together; NaN where flagged.
-    R11, R22 : float64
-        The galaxy's own response of e1 to the first component of shear, and of e2 to the second, before that
-        division; fit for means over many galaxies.
+        Ellipticity, divided by the mean response of all galaxies that were measured together; NaN if flagged.
     flags : int32
-        Why it could not be measured, bits of :class:`Flag`; 0 for a good one.
+        Reasons why the galaxy could not be measured, bits of :class:`Flag`; 0 for a good galaxy.
+    iterations, stop, updated : int32
+        Iterations of the network, why it stopped (0 stable, 1 energy rise, 2 most iterations, -1 not run), and neurons
+        above their threshold at the end.
+    first_energy, energy : float64
+        Energy of the network at its start and end, in squared image units.
     noise : float64
         Noise level used: standard deviation per pixel, in image units.
     flux : float64
-        Sum of the deconvolved stamp, of the stamp itself under the linear method, in image units.
+        Sum of the deconvolved stamp in image units; for the linear method, sum of the stamp.
     radius, size : float64
-        Radius of the piece of the autocorrelation used in pixels, and its Qxx + Qyy in px².
-    iterations, stop, updated : int32
-        How the network ended: its iterations, why it stopped (0 stable, 1 energy rise, 2 most iterations,
-        -1 not run), and neurons above their threshold at the end.
-    first_energy, energy : float64
-        The network's energy at its start and end, in squared image units.
+        Radius of the autocorrelation that is used in pixels, and its Qxx + Qyy in px².
+    R11, R22, R12, R21 : float64
+        Response of the galaxy to shear before that division: R12 is the response of e1 to the second component. Only
+        means over many galaxies are unbiased.
 
     Attributes
     ----------
     attrs : dict
-        ``response``: mean responses that e1 and e2 were divided by, or None; ``submission``: its name;
+        ``response``: mean responses by which e1 and e2 were divided, or None; ``submission``: name of the configuration;
         ``settings``: all settings as TOML; ``ellipticity``: 'shear' or 'distortion'; ``version``: of shearq.
 
     Notes
     -----
-    Indexing by a field's name gives a plain array, slices and masks of rows a catalogue. Tables of pandas, polars
-    and astropy are made from it as from any structured array; :func:`shearq.adapters.to_astropy` keeps ``attrs``.
+    The index of a field gives a plain array. Slices and masks of rows give a catalogue. pandas, polars and astropy
+    make tables from it as from any structured array; :func:`shearq.adapters.to_astropy` keeps ``attrs``.
     """
 
     attrs: dict[str, Any]
@@ -176,16 +181,16 @@ class Catalogue(np.ndarray):
         return self["flags"] == 0
 
     def mean_shear(self, weights: ArrayLike | None = None) -> MeanShear:
-        """The mean shear of the good galaxies.
+        """The mean shear of the good galaxies: Σwe/ΣwR, with the ellipticities e before calibration.
 
-        The mean ellipticity over the mean response of the rows at hand, both with the same weights. What noise does
-        to the response is in the response already.
+        The error is the error of this ratio to first order, √(Σw²(e − gR)² n/(n − 1)) / ΣwR. It assumes independent
+        galaxies.
 
         Parameters
         ----------
         weights : array of shape (n,), optional
-            Weight of each row, not negative, or whether it counts. One that depends on the measured shape biases the mean: take weights
-            from the flux or the noise. All the same by default.
+            Weight of each row, not negative, or a mask of rows. Weights must not depend on the measured shape, which
+            biases the mean; take them from the flux or the noise. Equal weights by default.
 
         Returns
         -------
@@ -194,7 +199,7 @@ class Catalogue(np.ndarray):
         Raises
         ------
         ValueError
-            Where weights do not fit, no good galaxy has any, or the mean response is not positive.
+            If weights have another shape, no good galaxy has a positive weight, or a mean response is not positive.
         """
         rows = np.atleast_1d(self)
         if weights is None:
@@ -206,28 +211,22 @@ class Catalogue(np.ndarray):
             raise ValueError(f"weights: found an array of shape {shown(weight.shape)}; expected {shown(rows.shape)}, one for each row")
         if not (np.isfinite(weight).all() and (weight >= 0).all()):
             raise ValueError("weights: found one that is negative or not finite; expected finite ones, not negative")
+        flagged = int((weight[~rows.good] > 0).sum())
         rows, weight = rows[rows.good], weight[rows.good]
-        counted = int((weight > 0).sum())
-        if counted == 0:
-            raise ValueError("weights: no galaxy without a flag has a positive one; expected one or more")
-        weight = weight / weight.max()
+        # A common factor changes nothing, but squares of weights could overflow.
+        weight = weight / weight.max(initial=np.finfo(float).tiny)
         divided = self.attrs.get("response")
-        means, errors, responses = [], [], []
-        for name, own, k in (("e1", "R11", 0), ("e2", "R22", 1)):
-            if divided is None:
-                e, response = rows[name], np.ones(len(rows))
-            else:
-                # As it was before it was divided by the mean of all.
-                e, response = rows[name] * divided[k], rows[own]
-            total = (weight * response).sum()
-            if not total > 0:
-                raise ValueError(f"{own}: the mean response is {total / weight.sum()}; expected a positive one")
-            mean = (weight * e).sum() / total
-            scatter = (weight**2 * (e - mean * response) ** 2).sum()
-            means.append(float(mean))
-            errors.append(float(np.sqrt(scatter * counted / (counted - 1)) / total) if counted > 1 else float("nan"))
-            responses.append(float(total / weight.sum()))
-        return MeanShear(*means, *errors, None if divided is None else tuple(responses), counted)
+        if divided is None:
+            columns = [rows["e1"], rows["e2"], np.ones(len(rows)), np.ones(len(rows))]
+        else:
+            # Before calibration.
+            columns = [rows["e1"] * divided[0], rows["e2"] * divided[1], rows["R11"], rows["R22"]]
+        columns = [np.ascontiguousarray(column, dtype=np.float64) for column in columns]
+        (g1, g2), covariance, response, galaxies = _shearq.mean_shear(*columns, weight)
+        covariance = tuple(map(tuple, covariance))
+        errors = [float(np.sqrt(covariance[k][k])) for k in (0, 1)]
+        response = None if divided is None else tuple(response)
+        return MeanShear(g1, g2, *errors, covariance, response, galaxies, flagged)
 
     def columns(self, names: str = "shearq") -> dict[str, np.ndarray]:
         """Ellipticities, responses and flags by the names that a program uses.
@@ -235,9 +234,8 @@ class Catalogue(np.ndarray):
         Parameters
         ----------
         names : {'shearq', 'anacal'}
-            ``'anacal'``: ``e1``, ``de1_dg1``, ``e2``, ``de2_dg2`` and ``flags``, with e1 and e2 as they were before
-            they were divided by the mean response, so that the sum of ellipticities over the sum of responses is
-            the shear. ``'shearq'``: all fields as they are.
+            ``'anacal'``: ``e1``, ``de1_dg1``, ``e2``, ``de2_dg2`` and ``flags``, with e1 and e2 before calibration.
+            The sum of ellipticities over the sum of responses is the shear. ``'shearq'``: all fields.
 
         Returns
         -------
@@ -268,37 +266,38 @@ def measure(
     Parameters
     ----------
     stamps : array of shape (n, ny, nx)
-        Postage stamps, square, at least as large as the submission needs, each with its galaxy near the middle
-        and its sky subtracted, in any unit. Of any strides, order of bytes and real type: float32 and float64 are
-        read where they lie, memory maps included; others are converted a few at a time. A list of 2-D arrays or of
-        GalSim images will do. Pixels that are not finite are missing: the network flags
-        such a galaxy, a linear submission one with many of them.
+        Square postage stamps in any unit, at least as large as the configuration requires. Each has its galaxy near
+        the middle. The sky must be subtracted. float32 and float64 are read without a copy, memory maps included;
+        other types are converted in pieces. Lists of 2-D arrays or GalSim images are accepted. Pixels that are not
+        finite are missing: the network flags such a galaxy, the linear method flags it if many are missing.
     psf : array of shape (py, px) or (n, py, px), or FunctionalPsf
-        The PSF for all, or one each, centred like the stamps and at least as large as the submission uses. It is cut
-        and normalised.
+        One PSF for all galaxies or one per galaxy, centred like the stamps, and at least as large as the configuration
+        requires. It is cut and normalised.
     noise : float or array of shape (n,), optional
-        Standard deviation of white noise per pixel in the stamps' unit, for all or one each. Without it a linear
-        submission takes the stamps for those of one image, and measures on their frames how large their noise is and how
-        it is correlated, and on the galaxies how wide a window they need; a network measures it on each stamp's border.
-    submission : str, path, mapping or Submission
-        How to measure: see :func:`shearq.submission`.
+        Standard deviation of white noise per pixel in the unit of the stamps, for all or per stamp. By default it is
+        measured. A linear configuration assumes one image, and measures noise, its correlation and the galaxy size on
+        all stamps together. A network measures the noise on the border of each stamp.
+    submission : str, path, mapping or Configuration
+        The configuration: see :func:`shearq.submission`.
     threads : int, optional
-        Worker threads; one per core by default. Results do not depend on it, bit for bit.
+        Worker threads; one per core by default. Results do not depend on it.
     progress : callable, optional
-        Called now and then, from the calling thread, with the number of galaxies done since the last call:
-        ``tqdm(total=len(stamps)).update``. An exception of it ends the measurement.
+        Called from the calling thread with the number of galaxies done since the last call:
+        ``tqdm(total=len(stamps)).update``. An exception ends the measurement.
 
     Returns
     -------
     Catalogue
-        Of shape (n,). Its numbers are those of the command line's catalogue of the same stamps, bit for bit.
+        Of shape (n,), with the same bits as a catalogue of the command line.
 
     Raises
     ------
     ValueError, TypeError
-        Where an argument does not fit. It is named, with the shape found and the one expected.
+        If an argument does not fit. The message names it, with the shape found and the shape expected.
+    ValueError
+        If all galaxies are flagged. The message names the most frequent reason.
     KeyError
-        Where there is no such submission.
+        If there is no such configuration.
 
     Warns
     -----
@@ -307,15 +306,14 @@ def measure(
 
     Notes
     -----
-    e1 and e2 are divided by the mean response of the good galaxies of this call: some thousands tell it to a per
-    cent, a handful do not. Galaxies that are measured in several calls are put together by
-    :meth:`Catalogue.mean_shear` of each, or by ``columns("anacal")``.
+    e1 and e2 are divided by the mean response of the good galaxies of this call. Its error is about a per cent for
+    some thousand galaxies. Combine several calls by :meth:`Catalogue.mean_shear` of each, or by ``columns("anacal")``.
 
     Other Python threads run meanwhile; they must not change the arrays.
 
     Examples
     --------
-    >>> cat = shearq.measure(stamps, psf, noise=sigma)
+    >>> cat = shearq.measure(stamps, psf)
     >>> cat["e1"][cat.good].mean()
     >>> shear = cat.mean_shear()
     >>> print(f"g1 = {shear.g1:+.4f} ± {shear.g1_error:.4f}")
@@ -347,7 +345,7 @@ def measure(
             raise ValueError(
                 f"noise: found an array of shape {shown(sigmas.shape)}; expected one number, or ({count},), one for each stamp"
             )
-    found, response, doubts = _shearq.measure(
+    found, response, doubts, failure = _shearq.measure(
         stamps,
         star,
         stars,
@@ -360,6 +358,8 @@ def measure(
     )
     for doubt in doubts:
         warnings.warn(doubt, DataWarning, stacklevel=2)
+    if failure is not None:
+        raise ValueError(failure)
     catalogue = np.empty(count, dtype=[(name, column.dtype) for name, column in found.items()]).view(Catalogue)
     for name, column in found.items():
         catalogue[name] = column

@@ -9,10 +9,10 @@ from typing import Any, Union
 
 from . import _shearq
 
-SubmissionLike = Union[str, "os.PathLike[str]", Mapping[str, Any], "Submission"]
+SubmissionLike = Union[str, "os.PathLike[str]", Mapping[str, Any], "Configuration"]
 
 
-class Submission:
+class Configuration:
     """How to get from a stamp to an ellipticity: all settings of a method, resolved.
 
     Attributes
@@ -39,7 +39,7 @@ class Submission:
 
     __slots__ = ("_resolved",)
 
-    def __init__(self, resolved: _shearq.Submission) -> None:
+    def __init__(self, resolved: _shearq.Configuration) -> None:
         self._resolved = resolved
 
     name = property(lambda self: self._resolved.name)
@@ -65,27 +65,27 @@ class Submission:
         return _restored, (self._resolved.parts,)
 
     def __repr__(self) -> str:
-        return f"<shearq.Submission {self.name!r}: {self.description}>"
+        return f"<shearq.Configuration {self.name!r}: {self.description}>"
 
 
-def _restored(parts: tuple[str, str | None, tuple[float, float, float] | None]) -> Submission:
+def _restored(parts: tuple[str, str | None, tuple[float, float, float] | None]) -> Configuration:
     """The submission that pickle kept."""
-    return Submission(_shearq.Submission.restored(parts))
+    return Configuration(_shearq.Configuration.restored(parts))
 
 
-def submission(of: SubmissionLike) -> Submission:
+def submission(of: SubmissionLike) -> Configuration:
     """Resolve a submission.
 
     Parameters
     ----------
-    of : str, path, mapping or Submission
+    of : str, path, mapping or Configuration
         The name of an embedded submission such as ``"48/linear/star"``, the path of a settings file, the text
         of one (more than one line, or a single assignment), or settings as a mapping:
         ``{"extends": "48/linear/star", "noise": {"source": "border", "border": 4}}``.
 
     Returns
     -------
-    Submission
+    Configuration
 
     Raises
     ------
@@ -94,14 +94,14 @@ def submission(of: SubmissionLike) -> Submission:
     ValueError
         Where a setting is unknown, of no use to the method, or out of range.
     """
-    if isinstance(of, Submission):
+    if isinstance(of, Configuration):
         return of
     if isinstance(of, Mapping):
         try:
             text = json.dumps(of, default=_plain, allow_nan=False)
         except (TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"submission: settings that are none: {error}") from None
-        return Submission(_shearq.Submission.json(text))
+        return Configuration(_shearq.Configuration.json(text))
     if not isinstance(of, (str, os.PathLike)):
         raise TypeError(
             f"submission: found {type(of).__name__}; expected a name, a path, the text of a settings file or a mapping"
@@ -112,16 +112,16 @@ def submission(of: SubmissionLike) -> Submission:
     if "\0" in name or any("\ud800" <= c <= "\udfff" for c in name):
         raise KeyError(f"submission: there is no submission or file named {name!r}")
     if "\n" in name or "=" in name:
-        return Submission(_shearq.Submission.text(name))
-    return Submission(_shearq.Submission.named(name))
+        return Configuration(_shearq.Configuration.text(name))
+    return Configuration(_shearq.Configuration.named(name))
 
 
-def submissions() -> dict[str, Submission]:
+def submissions() -> dict[str, Configuration]:
     """The embedded submissions by name: those of the paper's Table 1 in its order, and the linear ones.
 
     Returns
     -------
-    dict of str to Submission
+    dict of str to Configuration
 
     Examples
     --------
