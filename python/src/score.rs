@@ -126,6 +126,10 @@ impl<'a> Rows<'a> {
 /// fastest, or the images at positions. Returns all metrics, spectra and counts by name.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
+#[allow(
+    clippy::too_many_lines,
+    reason = "the columns of a result, one after the other"
+)]
 pub(crate) fn score<'py>(
     py: Python<'py>,
     n: usize,

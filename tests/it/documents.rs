@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::support::{fits_image, floats, pixels_of, shared, succeed, text};
+use crate::support::{fits_image, floats, pixels_of, succeed, text};
 
 /// The documents.
 pub(crate) fn pages() -> Vec<PathBuf> {
@@ -51,20 +51,12 @@ fn links_lead_to_files_and_the_summary_has_every_page() {
     }
 }
 
-/// Images in place of those that the tutorial's script renders: of GalSim's where they are, or simulated.
+/// Simulated images instead of those that the tutorial's script renders.
 fn images(folder: &Path) {
     let challenge = folder.join("challenge");
     let set = challenge.join("set02");
-    if let Some(sets) = shared("galsim-sets") {
-        fs::create_dir_all(&set).unwrap();
-        for entry in fs::read_dir(sets.join("set02")).unwrap() {
-            let from = entry.unwrap().path();
-            fs::copy(&from, set.join(from.file_name().unwrap())).unwrap();
-        }
-    } else {
-        let simulate = ["simulate", "--sets", "2", "--images", "2", "--grid", "16"];
-        succeed(&[&simulate[..], &["--out", text(&challenge)]].concat());
-    }
+    let simulate = ["simulate", "--sets", "2", "--images", "2", "--grid", "16"];
+    succeed(&[&simulate[..], &["--out", text(&challenge)]].concat());
     let (pixels, width) = pixels_of(&set.join("galaxies-001.fits"));
     let stamps: Vec<f32> = (0..100)
         .flat_map(|k| {

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::support::{shared, shearq, succeed, text};
+use crate::support::{galsim_sets, shearq, succeed, text};
 
 /// A measured small set and its packed catalogues.
 pub struct Packed {
@@ -405,10 +405,13 @@ fn each_planted_fault_in_a_spectrum_is_found() {
 }
 
 #[test]
-fn other_programs_catalogues_stand_in_the_same_table() {
-    let Some(folder) = shared("galsim-sets") else {
-        return;
-    };
+fn catalogues_of_other_programs_are_compared_in_the_same_table() {
+    for folder in galsim_sets() {
+        compare_with_other_programs(&folder.canonicalize().unwrap());
+    }
+}
+
+fn compare_with_other_programs(folder: &Path) {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
     succeed(&[
@@ -416,7 +419,7 @@ fn other_programs_catalogues_stand_in_the_same_table() {
         "--submission",
         "23/raw/star",
         "--data",
-        text(&folder),
+        text(folder),
         "--out",
         text(&at("out")),
     ]);
@@ -448,12 +451,12 @@ fn other_programs_catalogues_stand_in_the_same_table() {
     let table: Value = serde_json::from_str(&table).unwrap();
     let value = |row: usize, key: &str| table["rows"][row][key].as_f64().unwrap();
     assert_eq!(table["rows"][1]["submission"], "regauss");
-    // Shape noise of 2,048 galaxies: by its own jackknife error, from two images a set.
+    // Shape noise: the jackknife error comes from two images per set.
     for row in [1, 2] {
         let (m, error) = (value(row, "m_cross"), value(row, "m_cross_error"));
         assert!(m.abs() < 4.0 * error, "{table:#}");
     }
-    // The same galaxies as distortions respond nearly twice, and the noise is common to both.
+    // The same catalogue read as distortions responds nearly twice as much; its noise is common to both.
     let ratio = (1.0 + value(3, "m_cross")) / (1.0 + value(1, "m_cross"));
     assert!((1.5..2.0).contains(&ratio), "{ratio}");
     let broken = at("broken.toml");
@@ -462,7 +465,7 @@ fn other_programs_catalogues_stand_in_the_same_table() {
         "name = \"x\"\ncatalogues = \"{set}-{image}\"\nellipticity = \"shear\"\ncolumn = 1\n",
     )
     .unwrap();
-    let output = shearq(&["score", "--data", text(&folder), "--foreign", text(&broken)]);
+    let output = shearq(&["score", "--data", text(folder), "--foreign", text(&broken)]);
     let message = String::from_utf8(output.stderr).unwrap();
     assert!(
         message.contains("broken.toml") && message.contains("column"),

@@ -1,4 +1,4 @@
-//! What the tests share: the binary, the folders beside the project, numbers from CSV files.
+//! Helpers of several tests: the binary, images that GalSim rendered, numbers from CSV files.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -16,13 +16,13 @@ pub const PACKED: [&str; 7] = [
     "dithered",
 ];
 
-/// A folder of `shared` beside the project, in whose root tests run; says so and gives none where it is absent.
-pub fn shared(name: &str) -> Option<PathBuf> {
-    if let Ok(folder) = Path::new("../shared").join(name).canonicalize() {
-        return Some(folder);
-    }
-    eprintln!("skipped: there is no folder shared/{name} beside the project");
-    None
+/// Sets that GalSim rendered: a tenth that is stored here, and all if they are in `../shared/galsim-sets`.
+pub fn galsim_sets() -> Vec<PathBuf> {
+    let stored = Path::new("tests/data/galsim/sets");
+    assert!(stored.is_dir(), "{} is missing", stored.display());
+    let mut found = vec![stored.to_owned()];
+    found.extend(Path::new("../shared/galsim-sets").canonicalize());
+    found
 }
 
 /// Runs the binary.

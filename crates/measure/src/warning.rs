@@ -312,6 +312,7 @@ fn level(sigma: f64) -> String {
 }
 
 impl fmt::Display for Warning {
+    #[allow(clippy::too_many_lines, reason = "one arm per warning")]
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Warning::Sky {

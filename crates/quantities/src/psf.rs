@@ -504,14 +504,15 @@ mod tests {
 
     const MOFFAT: PsfProfile = PsfProfile::Moffat { beta: 3.0 };
 
-    /// GalSim's rendering of GREAT10-like sets, where it is present.
-    fn galsim_sets() -> Option<PathBuf> {
-        let folder = PathBuf::from("../../../shared/galsim-sets");
-        if folder.is_dir() {
-            return Some(folder);
-        }
-        eprintln!("skipped: {} is absent", folder.display());
-        None
+    /// PSFs that GalSim rendered: a tenth that is stored here, and all if they are beside the project.
+    fn galsim_sets() -> Vec<PathBuf> {
+        let stored = PathBuf::from("../../tests/data/galsim/sets");
+        assert!(stored.is_dir(), "{} is missing", stored.display());
+        let all = PathBuf::from("../../../shared/galsim-sets");
+        [stored, all]
+            .into_iter()
+            .filter(|folder| folder.is_dir())
+            .collect()
     }
 
     /// The first image of a FITS file of big-endian f32 with a header of one block.
@@ -569,8 +570,12 @@ mod tests {
 
     #[test]
     fn stamps_agree_with_galsim() {
-        let Some(folder) = galsim_sets() else { return };
-        for set in ["set01", "set02", "set20", "set24"] {
+        let folders = galsim_sets();
+        let sets = ["set01", "set02", "set20", "set24"];
+        for (folder, set) in folders
+            .iter()
+            .flat_map(|folder| sets.map(|set| (folder, set)))
+        {
             let image = read_fits(&folder.join(set).join("psf-001.fits"));
             let (mut worst, mut worst_scaled) = (0f64, 0f64);
             for (x, y, psf) in read_psfs(&folder.join(set).join("psf-001.csv")) {
@@ -587,7 +592,7 @@ mod tests {
             // Their stamps sum to 1, ours fall short of it by the light outside the stamp: 0.3 %
             // for Kolmogorov wings. What is left is GalSim's FFT: it drops the Moffat's light
             // beyond k = π (2e-4), and its grid folds the Kolmogorov's wings (5e-5).
-            // tests/galsim_galaxies.rs repeats both and comes within 1e-5.
+            // tests/it/galsim_galaxies.rs repeats both and comes within 1e-5.
             assert!(
                 worst < 4e-3 && worst_scaled < 5e-4,
                 "{set}: {worst:e}, {worst_scaled:e}"

@@ -612,6 +612,7 @@ mod tests {
         }
     }
 
+    #[allow(clippy::too_many_lines, reason = "a table of cases")]
     fn cases() -> Vec<Case> {
         let fiducial = (0.5, 2.3, 4.8);
         let moffat = (MOFFAT, 3.4, 0.02, -0.015);

@@ -130,6 +130,7 @@ fn drawn(psf: &FunctionalPsf, side: usize, [dx, dy]: [f64; 2]) -> Array2<f64> {
     stamp
 }
 
+#[allow(clippy::too_many_lines, reason = "one block per kind of error")]
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [cases, sets, grid, stars] = arguments.as_slice() else {

@@ -61,6 +61,10 @@ impl BarPlot {
 }
 
 impl Figure for BarPlot {
+    #[allow(
+        clippy::too_many_lines,
+        reason = "the elements of a plot in drawing order"
+    )]
     fn scene(&self) -> Result<Scene, FigureError> {
         self.check()?;
         let (categories, groups) = (self.categories.len().max(1), self.groups.len().max(1));

@@ -406,6 +406,10 @@ pub struct PanelGrid {
 }
 
 impl Figure for PanelGrid {
+    #[allow(
+        clippy::too_many_lines,
+        reason = "the elements of a plot in drawing order"
+    )]
     fn scene(&self) -> Result<Scene, FigureError> {
         self.plots.iter().try_for_each(LinePlot::check)?;
         let columns = self.columns.clamp(1, self.plots.len().max(1));

@@ -117,6 +117,7 @@ const LARGEST_M: f64 = 20.0;
 
 /// Plots of a study: scatter over the bound, biases and Q, with requirements and bounds. `table` has one row per set
 /// and configuration.
+#[allow(clippy::too_many_lines, reason = "one panel after the other")]
 pub fn contest(table: &Table) -> PanelGrid {
     let text = |row: &[Cell], key: &str| match table.place(key).and_then(|k| row.get(k)) {
         Some(Cell::Text(words)) => words.clone(),

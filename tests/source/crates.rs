@@ -1,4 +1,4 @@
-//! The crates of the workspace use those below them, and none above.
+//! A crate of the workspace uses only crates of lower levels.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -27,7 +27,7 @@ const LEVELS: [&[(&str, &str)]; 8] = [
     &[("shearq-python", "python"), ("shearq-benches", "benches")],
 ];
 
-/// Crates that do without files, frames and threads.
+/// Crates that use no files, data frames or threads.
 const PURE: [&str; 6] = [
     "shearq-fourier",
     "shearq-quantities",
@@ -42,7 +42,7 @@ fn manifest(folder: &str) -> toml::Table {
     fs::read_to_string(path).unwrap().parse().unwrap()
 }
 
-/// What a crate needs to be built: its dependencies without those of its tests.
+/// The dependencies of a crate, without its dev-dependencies.
 fn dependencies(manifest: &toml::Table) -> Vec<String> {
     let found = manifest["dependencies"].as_table().unwrap();
     found.keys().cloned().collect()
