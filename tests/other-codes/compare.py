@@ -3,7 +3,7 @@
 
     python3 compare.py --shearq target/release/shearq --work FOLDER [--methods NAME ...] [--limit 1] [--seed 20270]
 
-README.md beside this file describes the galaxies, the methods and the columns of `results.json`.
+README.md in this folder describes the galaxies, the methods and the columns of `results.json`.
 A stopped run continues where it was: finished pieces stay in FOLDER.
 """
 
@@ -123,7 +123,7 @@ class Noise:
 
 
 class Clock:
-    """CPU time of this process, in which imports and preparation that are independent of galaxies do not count."""
+    """CPU time of this process within `with`: imports and preparation do not count."""
 
     def __init__(self):
         self.seconds = 0.0
@@ -270,7 +270,7 @@ def fpfs_detected(stamps, _places, noise, _options):
             table = task.process_image(
                 image, star, variance=ANACAL_NOISE**2, cell_list=cells, noise_array=added
             )
-        # A stamp has the sum over what is detected in it: nothing contributes nothing.
+        # Sum over the detections in each stamp; a stamp without a detection has zero.
         x, y = (np.round(table[f"{axis}_det"] / SCALE).astype(int) // STAMP for axis in ("x1", "x2"))
         stamp = np.clip(y, 0, side - 1) * side + np.clip(x, 0, side - 1)
         sums = lambda values: np.bincount(stamp, values, side * side)
@@ -420,7 +420,7 @@ METHODS = {
 
 
 def measure(key, snr, piece, options):
-    """Measures one piece, or takes what was measured before."""
+    """Measures one piece, unless its file exists."""
     method = METHODS[key]
     path = options.work / f"{key}-{snr}-{piece}.npz"
     if path.exists():
@@ -447,7 +447,7 @@ def jackknife(statistic, sums):
 
 
 def summary(key, snr, options):
-    """One row of the results, or None if nothing was measured."""
+    """One row of the results, or None if no piece is measured."""
     method = METHODS[key]
     paths = sorted(options.work.glob(f"{key}-{snr}-*[0-9].npz"))
     if not paths:
