@@ -3,7 +3,7 @@
 
     python3 compare.py --shearq target/release/shearq --work FOLDER [--methods NAME ...] [--limit 1] [--seed 20270]
 
-README.md beside this file describes the galaxies, the methods and the columns of `results.json`.
+README.md in this folder describes the galaxies, the methods and the columns of `results.json`.
 A stopped run continues where it was: finished pieces stay in FOLDER.
 """
 
@@ -30,6 +30,7 @@ STAMP, SHEAR = 48, 0.02
 SNRS = (7, 10, 20, 40, 100)
 BULGE, DISC, FWHM = 2.3, 4.8, 3.4
 #: Galaxies of one piece, on a square grid, and pieces that are rendered; later pieces repeat them with new noise.
+#: Pieces come in twos with opposite noise, because then m and c do not change with the noise to first order.
 GRID = 40
 PIECE = GRID * GRID
 RENDERED = 4
@@ -110,8 +111,19 @@ def mosaic(stamps):
     return stamps.reshape(side, side, STAMP, STAMP).transpose(0, 2, 1, 3).reshape(side * STAMP, side * STAMP)
 
 
+class Noise:
+    """Gaussian noise of variance 1; the second piece of two has the opposite of the first."""
+
+    def __init__(self, piece, *seed):
+        self.random = np.random.default_rng([*seed, piece // 2])
+        self.sign = 1 - 2 * (piece % 2)
+
+    def __call__(self, shape):
+        return self.sign * self.random.standard_normal(shape, dtype=np.float32)
+
+
 class Clock:
-    """CPU time of this process, in which imports and preparation that are independent of galaxies do not count."""
+    """CPU time of this process within `with`: imports and preparation do not count."""
 
     def __init__(self):
         self.seconds = 0.0
@@ -123,12 +135,12 @@ class Clock:
         self.seconds += time.process_time() - self.start
 
 
-# A method takes stamps [version, galaxy, y, x] with noise of 1, places and a random generator. It returns
+# A method takes stamps [version, galaxy, y, x] with noise of 1, places and noise to add. It returns
 # ellipticities [version, galaxy, component], not a number if it failed, its own response of the same shape, and
 # CPU seconds. An ellipticity over its response is an estimate of ε.
 
 
-def shearq(stamps, _places, _random, options, configuration):
+def shearq(stamps, _places, _noise, options, configuration):
     children = lambda: sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
     import pyarrow.parquet as parquet
 
@@ -161,7 +173,7 @@ def shearq(stamps, _places, _random, options, configuration):
     return e, response, seconds
 
 
-def hsm(stamps, _places, _random, _options, estimator):
+def hsm(stamps, _places, _noise, _options, estimator):
     star = galsim.Image(psf_image())
     e = np.full((*stamps.shape[:2], 2), np.nan)
     clock = Clock()
@@ -188,7 +200,7 @@ def hsm(stamps, _places, _random, _options, estimator):
     return e, response, clock.seconds
 
 
-def fpfs(stamps, _places, random, _options, kernel, renoised):
+def fpfs(stamps, _places, noise, _options, kernel, renoised):
     """FPFS at the known centres: the pixel above the stamp's middle."""
     import anacal
 
@@ -199,8 +211,8 @@ def fpfs(stamps, _places, random, _options, kernel, renoised):
     at["y"], at["x"] = y.ravel(), x.ravel()
     star = psf_image(0.5)
     e, response, clock = [], [], Clock()
-    noises = added_noise(stamps, random) if renoised else [None] * len(stamps)
-    for galaxies, noise in zip(stamps, noises):
+    fields = added_noise(stamps, noise) if renoised else [None] * len(stamps)
+    for galaxies, added in zip(stamps, fields):
         image = np.ascontiguousarray(mosaic(galaxies) * ANACAL_NOISE, dtype=np.float32)
         with clock:
             table = anacal.fpfs.process_image(
@@ -210,7 +222,7 @@ def fpfs(stamps, _places, random, _options, kernel, renoised):
                 mag_zero=MAG_ZERO,
                 gal_array=image,
                 psf_array=star,
-                noise_array=noise,
+                noise_array=added,
                 detection=at,
             )
         e.append(np.stack([table["fpfs1_e1"], table["fpfs1_e2"]], 1))
@@ -218,13 +230,13 @@ def fpfs(stamps, _places, random, _options, kernel, renoised):
     return np.array(e), np.array(response), clock.seconds
 
 
-def added_noise(stamps, random):
+def added_noise(stamps, noise):
     """Noise for AnaCal's renoising, one field for each field of noise of the stamps."""
-    fields = [random.standard_normal(stamps.shape[1:], dtype=np.float32) * ANACAL_NOISE for _ in range(2)]
+    fields = [noise(stamps.shape[1:]) * ANACAL_NOISE for _ in range(2)]
     return [np.ascontiguousarray(mosaic(fields[field])) for _, field in VERSIONS]
 
 
-def fpfs_detected(stamps, _places, random, _options):
+def fpfs_detected(stamps, _places, noise, _options):
     """FPFS after AnaCal's own detection, with its detection weight and its response.
 
     Kernel, thresholds and C are the production settings of AnaCal's authors.
@@ -249,16 +261,16 @@ def fpfs_detected(stamps, _places, random, _options):
         mag_zero=MAG_ZERO,
     )
     e, response, clock = [], [], Clock()
-    for galaxies, noise in zip(stamps, added_noise(stamps, random)):
+    for galaxies, added in zip(stamps, added_noise(stamps, noise)):
         image = np.ascontiguousarray(mosaic(galaxies) * ANACAL_NOISE, dtype=np.float32)
         with clock:
             cells = anacal.geometry.get_cell_list(
                 img_nx=image.shape[1], img_ny=image.shape[0], cell_nx=250, cell_ny=250, cell_overlap=80, scale=SCALE
             )
             table = task.process_image(
-                image, star, variance=ANACAL_NOISE**2, cell_list=cells, noise_array=noise
+                image, star, variance=ANACAL_NOISE**2, cell_list=cells, noise_array=added
             )
-        # A stamp has the sum over what is detected in it: nothing contributes nothing.
+        # Sum over the detections in each stamp; a stamp without a detection has zero.
         x, y = (np.round(table[f"{axis}_det"] / SCALE).astype(int) // STAMP for axis in ("x1", "x2"))
         stamp = np.clip(y, 0, side - 1) * side + np.clip(x, 0, side - 1)
         sums = lambda values: np.bincount(stamp, values, side * side)
@@ -323,14 +335,14 @@ class Metacal:
         return e[0], ((e[1][0] - e[2][0]) / (2 * METACAL_STEP), (e[3][1] - e[4][1]) / (2 * METACAL_STEP))
 
 
-def metacal(stamps, places, random, _options):
+def metacal(stamps, places, noise, _options):
     calibrate, clock = Metacal(), Clock()
-    noises = [random.standard_normal(stamps.shape[1:]) for _ in range(2)]
+    fields = [noise(stamps.shape[1:]).astype(float) for _ in range(2)]
     e, response = np.empty((2, *stamps.shape[:2], 2))
     for version, (_, field) in enumerate(VERSIONS):
         for k in range(stamps.shape[1]):
             with clock:
-                found = calibrate(stamps[version, k].astype(float), noises[field][k], places[k])
+                found = calibrate(stamps[version, k].astype(float), fields[field][k], places[k])
             e[version, k], response[version, k] = found
     e[np.isnan(response).any(2)] = np.nan
     return e, response, clock.seconds
@@ -353,16 +365,16 @@ class Method:
 
 METHODS = {
     "shearq": Method(
-        "48/linear/star", "dithered", "shearq", "dithered", shearq, {"configuration": "48/linear/star"}, (30, 12)
+        "48/linear/star", "dithered", "shearq", "dithered", shearq, {"configuration": "48/linear/star"}, (24, 16)
     ),
     "shearq-centred": Method(
-        "48/linear/star", "centred", "shearq", "centred", shearq, {"configuration": "48/linear/star"}, (6, 4)
+        "48/linear/star", "centred", "shearq", "centred", shearq, {"configuration": "48/linear/star"}, (2, 2)
     ),
     "regauss": Method(
-        "REGAUSS", "dithered, responsivity", "galsim", "dithered", hsm, {"estimator": "REGAUSS"}, (6, 4)
+        "REGAUSS", "dithered, responsivity", "galsim", "dithered", hsm, {"estimator": "REGAUSS"}, (4, 4)
     ),
     "ksb": Method(
-        "KSB", "dithered, uncalibrated", "galsim", "dithered", hsm, {"estimator": "KSB"}, (6, 4), own_response=False
+        "KSB", "dithered, uncalibrated", "galsim", "dithered", hsm, {"estimator": "KSB"}, (4, 4), own_response=False
     ),
     "fpfs": Method(
         "FPFS",
@@ -371,7 +383,7 @@ METHODS = {
         "centred",
         fpfs,
         {"kernel": NARROW * SCALE, "renoised": True},
-        (12, 8),
+        (6, 6),
     ),
     "fpfs-wide": Method(
         "FPFS",
@@ -380,7 +392,7 @@ METHODS = {
         "centred",
         fpfs,
         {"kernel": WIDE * SCALE, "renoised": True},
-        (12, 8),
+        (24, 16),
     ),
     "fpfs-bare": Method(
         "FPFS",
@@ -389,7 +401,7 @@ METHODS = {
         "centred",
         fpfs,
         {"kernel": NARROW * SCALE, "renoised": False},
-        (12, 8),
+        (6, 6),
     ),
     "fpfs-bare-wide": Method(
         "FPFS",
@@ -398,30 +410,29 @@ METHODS = {
         "centred",
         fpfs,
         {"kernel": WIDE * SCALE, "renoised": False},
-        (12, 8),
+        (24, 16),
     ),
     "fpfs-detected": Method(
-        "FPFS", "dithered, own detection, renoised", "anacal", "dithered", fpfs_detected, {}, (8, 5)
+        "FPFS", "dithered, own detection, renoised", "anacal", "dithered", fpfs_detected, {}, (6, 6)
     ),
-    "metacal": Method("metacal", "dithered, weighted moments", "galsim", "dithered", metacal, {}, (6, 5), 200),
+    "metacal": Method("metacal", "dithered, weighted moments", "galsim", "dithered", metacal, {}, (6, 6), 200),
 }
 
 
 def measure(key, snr, piece, options):
-    """Measures one piece, or takes what was measured before."""
+    """Measures one piece, unless its file exists."""
     method = METHODS[key]
     path = options.work / f"{key}-{snr}-{piece}.npz"
     if path.exists():
         return
-    galaxies = render(options.work, method.placement, piece % RENDERED, options.seed)
-    random = np.random.default_rng([options.seed, snr, piece])
-    noise = random.standard_normal((2, PIECE, STAMP, STAMP), dtype=np.float32)
+    galaxies = render(options.work, method.placement, piece // 2 % RENDERED, options.seed)
+    noise = Noise(piece, options.seed, snr)((2, PIECE, STAMP, STAMP))
     count = method.galaxies
     stamps = np.stack(
         [snr * galaxies.stamps[(1 - sign) // 2, :count] + noise[field, :count] for sign, field in VERSIONS]
     )
-    random = np.random.default_rng([options.seed, snr, piece, 1])
-    e, response, seconds = method.run(stamps, galaxies.places[:count], random, options, **method.arguments)
+    added = Noise(piece, options.seed, snr, 1)
+    e, response, seconds = method.run(stamps, galaxies.places[:count], added, options, **method.arguments)
     part = path.with_suffix(".part.npz")
     np.savez(part, e=e.astype(np.float32), response=response.astype(np.float32), seconds=seconds)
     part.rename(path)
@@ -436,7 +447,7 @@ def jackknife(statistic, sums):
 
 
 def summary(key, snr, options):
-    """One row of the results, or None if nothing was measured."""
+    """One row of the results, or None if no piece is measured."""
     method = METHODS[key]
     paths = sorted(options.work.glob(f"{key}-{snr}-*[0-9].npz"))
     if not paths:
@@ -447,7 +458,7 @@ def summary(key, snr, options):
     sums, seconds, failed, robust = np.zeros((groups, 6, 2)), [], 0, []
     for path in paths:
         saved = np.load(path)
-        piece = int(path.stem.rsplit("-", 1)[1]) % RENDERED
+        piece = int(path.stem.rsplit("-", 1)[1]) // 2 % RENDERED
         e, response = saved["e"].astype(float), saved["response"].astype(float)
         seconds.append(float(saved["seconds"]))
         good = np.isfinite(e).all((0, 2)) & np.isfinite(response).all((0, 2))
@@ -515,6 +526,7 @@ def main():
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--snr", nargs="+", type=int, choices=SNRS, default=list(SNRS))
     parser.add_argument("--limit", type=int, help="most pieces for each method and S/N")
+    parser.add_argument("--minutes", type=float, help="stop measuring after this time, and write what there is")
     parser.add_argument("--seed", type=int, default=20270)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results.json")
     options = parser.parse_args()
@@ -524,9 +536,12 @@ def main():
         for snr in options.snr:
             pieces = METHODS[key].pieces[0 if snr < 20 else 1]
             pieces = min(pieces, options.limit or pieces)
-            tasks += [((k + 0.5) / pieces, key, snr, k) for k in range(pieces)]
+            tasks += [((k // 2 + 0.5) / pieces, key, snr, k) for k in range(pieces)]
     # All methods and S/N advance together, so that a stopped run has some of each.
+    end = time.monotonic() + 60 * (options.minutes or np.inf)
     for _, key, snr, piece in sorted(tasks):
+        if time.monotonic() > end:
+            break
         measure(key, snr, piece, options)
     least = bound()
     versions = {p: version_of(p, options) for p in sorted({METHODS[key].package for key in METHODS})}
