@@ -6,7 +6,7 @@ use shearq_submissions::{Calibration, Configuration};
 use crate::flag::Flag;
 use crate::measurement::Measurement;
 
-/// A mean response of less than so many of its errors is none.
+/// Least significance of the mean response before anything is divided by it. See docs/constants.md.
 const CLEAR: f64 = 3.0;
 
 /// Divides the ellipticities of an image, all of whose galaxies are given (in parts, such as rows), as the

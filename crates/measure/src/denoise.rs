@@ -41,7 +41,7 @@ pub struct DenoiseScratch {
     line: Vec<f32>,
 }
 
-/// The B₃-spline scaling filter.
+/// B₃-spline scaling filter of the wavelet transform. See docs/constants.md.
 const SPLINE: [f32; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
 
 impl WaveletWiener {

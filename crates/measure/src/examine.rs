@@ -17,56 +17,61 @@ use crate::surroundings::centre;
 use crate::warning::Warning;
 use crate::worker::highest;
 
-/// Pixels a side of a block, and the largest share of the stamp's side.
+/// Largest side of the corner blocks in which the sky is measured. See docs/constants.md.
 const BLOCK: usize = 8;
+/// A corner block has at most one such part of the stamp's side. See docs/constants.md.
 const BLOCK_SHARE: usize = 4;
-/// Radius in pixels within which a galaxy's light is summed.
+/// Radius within which a galaxy's light is summed. See docs/constants.md.
 const INNER: f64 = 8.0;
-/// Distances in pixels of pairs that show noise with a longer correlation than the survey covers.
+/// Distances of pixel pairs that show correlations longer than the survey covers. See
+/// docs/constants.md.
 const LONG: [usize; 2] = [4, 5];
-/// Stamps of an image that are examined: 1.2 million pixels in frames of 48 px, which know the variance to 0.15 %.
+/// Stamps of an image that are examined. They give the variance to 0.15 % for 48 px. See
+/// docs/constants.md.
 const ENOUGH: usize = 1000;
 
-/// Fewest galaxies whose core is compared with the core of the PSF, and how many times the median of all a galaxy's light
-/// may count.
+/// Fewest galaxies whose core is compared with the PSF's core. See docs/constants.md.
 const FEWEST: usize = 30;
+/// Times the median by which one galaxy's light may count. See docs/constants.md.
 const MOST: f64 = 4.0;
-/// PSFs of single galaxies of an image that are examined.
+/// PSFs of single galaxies of an image that are examined. See docs/constants.md.
 pub const EXAMINED_PSFS: usize = 100;
 
-/// Significance that every warning requires, in standard errors.
+/// Significance that every warning requires. See docs/constants.md.
 const CLEAR: f64 = 5.0;
-/// Light of the sky within 8 px, in units of the galaxy's, that changes m by less than 5·10⁻³. A share of 0.48
-/// changes m of the simulated galaxies by −0.006, by −0.013 if they are large, and by −0.011 at S/N 10.
+/// Light of the sky within 8 px, in units of the galaxy's, above which a warning is due. See
+/// docs/constants.md.
 const SKY_SHARE: f64 = 0.15;
-/// A galaxy's wings fall from the sides of a stamp to its corners; a sky is equal in both.
+/// Largest ratio of corner to side brightness of a galaxy's wings; a sky is equal in both. See
+/// docs/constants.md.
 const FALLING: f64 = 0.6;
-/// Change of that share over 8 px that changes c by less than 5·10⁻³: at 0.076 the simulated
-/// galaxies have c = 0.0035, and at S/N 10 m = −0.009.
+/// Change of the sky's share over 8 px above which a warning is due. See docs/constants.md.
 const GRADIENT_SHARE: f64 = 0.04;
-/// Offset of the galaxies in pixels: stamps that are cut half a pixel off along x and y are silent, those a whole
-/// pixel off are not.
+/// Mean offset of the galaxies above which a warning is due. See docs/constants.md.
 const OFFSET: f64 = 0.85;
-/// Scatter of the galaxies' places in pixels.
+/// Scatter of the galaxies' positions above which a warning is due. See docs/constants.md.
 const SCATTER: f64 = 2.0;
-/// Least difference of the given noise that is reported, in units of the noise: it changes m by 0.005 at S/N 20.
+/// Relative difference between given and measured noise above which a warning is due. See
+/// docs/constants.md.
 const LEAST_NOISE: f64 = 0.02;
-/// Scatter of the noise between stamps.
+/// Relative scatter of the noise between stamps above which a warning is due. See
+/// docs/constants.md.
 const DEPTHS: f64 = 0.1;
-/// Correlation at the distances `LONG`.
+/// Correlation at long distances above which a warning is due. See docs/constants.md.
 const LONG_CORRELATION: f64 = 0.03;
 /// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
 /// away from the smallest and largest numbers there are.
 pub(crate) const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
-/// Standard deviation of Gaussian numbers in units of the median of their moduli, and standard error of their
-/// median in units of the one of their mean.
+/// Standard deviation of Gaussian numbers in units of the median of their moduli. See
+/// docs/constants.md.
 const FROM_MODULI: f64 = 1.482_602_2;
+/// Standard error of a median in units of the standard error of the mean. See docs/constants.md.
 const OF_MEDIAN: f64 = 1.253_314;
 
 /// Which of `rows` rows of `columns` stamps are examined: enough for a thousand stamps, or all. They are spread
 /// evenly but not regularly, so that they do not miss what differs from row to row.
 pub fn examined_rows(columns: usize, rows: usize) -> Vec<usize> {
-    // The golden ratio's multiples fill an interval without a period.
+    /// Fractional step between examined rows, which avoids periods. See docs/constants.md.
     const STEP: f64 = 0.618_033_988_749_895;
     let count = enough(columns, rows);
     let place = |k: usize| (k as f64 + (STEP * k as f64).fract()) * rows as f64 / count as f64;

@@ -8,21 +8,20 @@ use ndarray::ArrayView2;
 
 use crate::denoise::frame;
 
-/// σ of the weight in pixels.
+/// σ of the weight for sizes of galaxies and PSFs. See docs/constants.md.
 const WEIGHT: f64 = 5.0;
-/// σ in pixels of the narrow weight for the core: light that was blurred by a PSF has no narrower core than the PSF. The
-/// cores of galaxies with cusps are hardly broader, so that they show a PSF that is too broad where extents do not.
+/// σ of the narrow weight for cores. A galaxy has no narrower core than its PSF. See
+/// docs/constants.md.
 const CORE: f64 = 1.0;
-/// Places beyond so many σ of the narrow weight do not count.
+/// Radius of the narrow weight. See docs/constants.md.
 const CORE_REACH: f64 = 5.0;
-/// Pixels that a stamp's frame is wide, whose mean is taken for the sky.
-const FRAME: usize = 2;
-/// Fewest stamps that tell the extent of their galaxies: of thirty at S/N 10 it is good to a tenth.
+/// Width of the stamp's border, whose mean is the sky. See docs/constants.md.
+const BORDER: usize = 2;
+/// Fewest stamps from which the size of their galaxies is measured. See docs/constants.md.
 const FEWEST: usize = 30;
 
-/// A stamp counts in full up to so many times the median of all, in Σ W I and in Σ W r² I, and no more beyond: neither a
-/// bad pixel nor a bright star tells how broad the galaxies are. Of galaxies of one flux, or with the spread of the
-/// simulated ones, none is beyond.
+/// Times the median by which one stamp may count, so that outliers do not matter. See
+/// docs/constants.md.
 const MOST: f64 = 4.0;
 
 /// Sums over the stamps of an image.
@@ -192,7 +191,7 @@ fn of_sums([light, squares]: [f64; 2]) -> Option<f64> {
 /// Mean of a stamp's outermost pixels.
 fn sky(pixels: &[f32], n: usize) -> f64 {
     let (mut sum, mut count) = (0.0, 0.0);
-    for value in frame(pixels, n, FRAME).flatten() {
+    for value in frame(pixels, n, BORDER).flatten() {
         sum += f64::from(*value);
         count += 1.0;
     }

@@ -30,28 +30,27 @@ use crate::surroundings::{Contrasts, Missing, centre, followed, turn};
 use crate::warning::Warning;
 use crate::worker::highest;
 
-/// Pixels a side of a block.
+/// Side of a block of border pixels. See docs/constants.md.
 const BLOCK: usize = 8;
 const PIXELS: usize = BLOCK * BLOCK;
-/// Polynomials of up to second degree.
+/// Polynomials of up to second degree that are removed from a block. See docs/constants.md.
 const POLYNOMIALS: usize = 6;
-/// Pixels a side of the smallest stamps whose frame is told from the galaxy.
+/// Side of the smallest stamps whose border is free of the galaxy. See docs/constants.md.
 const LEAST_STAMP: usize = 24;
-/// Cube root of a block's power, over the median's, beyond which it is left out, in units of the lower half's scatter. These
-/// roots scatter nearly like a Gaussian, whether noise is white or blocks have few modes of their own: what is left out of
-/// noise alone is less than 10⁻⁴ of its power where it is white, and 2·10⁻³ of that of its long waves where it is smoothed
-/// (by a Gaussian of σ = 0.7 px).
+/// Excess of a block's cube-root power above the median, beyond which it is left out. See
+/// docs/constants.md.
 const BRIGHT: f64 = 4.0;
-/// Blocks of the frame to each side of a bright one that are left out with it.
+/// Blocks to each side of a bright one that are left out with it. See docs/constants.md.
 const BESIDE: usize = 2;
-/// Brightness of a place over its opposite, in units of its noise, from which on blocks around it are left out, and how far
-/// around it, in pixels. Of stamps without neighbours a tenth loses some.
+/// Excess of a cell over the opposite cell above which the blocks around it are left out. See
+/// docs/constants.md.
 const CONTRAST: f32 = 3.5;
+/// Radius around such a cell in which blocks are left out. See docs/constants.md.
 const AROUND: f32 = 16.0;
-/// Differences of opposite blocks in units of the stamp's largest that are none: noise has one of 10⁴ below.
+/// Differences of opposite blocks that count as zero, in units of the stamp's largest. See
+/// docs/constants.md.
 const ROUNDING: f32 = 1e-4;
-/// Least share of the power of white noise that is left to a mode of correlated noise: an estimate may
-/// come near zero, and below.
+/// Least power of a mode of correlated noise, in units of white noise. See docs/constants.md.
 const LEAST_POWER: f64 = 1e-3;
 
 /// The noise of an image: its level, and the correlation of its pixels.

@@ -18,17 +18,21 @@ pub(crate) use self::missing::Missing;
 use self::profile::Profile;
 use crate::flag::Flag;
 
-/// Difference of opposite blocks that is a neighbour: in units of its noise, and of the galaxy's light.
+/// Least difference of opposite blocks that is a neighbour, in units of its noise. See
+/// docs/constants.md.
 const SIGNIFICANT: f32 = 5.0;
+/// Least difference of opposite blocks that is a neighbour, in units of the galaxy's light. See
+/// docs/constants.md.
 const BRIGHT: f32 = 0.03;
-/// Where the fit of a neighbour's profile begins, and filling, in units of its distance. Both are a compromise: the
-/// nearer, the less of its light is left, and the more noise is taken twice.
+/// Share of a neighbour's distance from the centre at which the fit of its profile begins. See
+/// docs/constants.md.
 const FITTED_FROM: f32 = 0.3;
+/// Share of a neighbour's distance from the centre at which filling begins. See docs/constants.md.
 const FILLED_FROM: f32 = 0.5;
-/// Distance in pixels of neighbours that are too near to be taken away.
+/// Distance below which a neighbour cannot be removed. See docs/constants.md.
 const TOO_NEAR: f32 = 12.0;
-/// Light of a neighbour, in units of that within 8 px of the galaxy's centre, from which on what a round profile leaves of
-/// it is no longer small beside the galaxy: two to three galaxies.
+/// Light of a neighbour, in units of the galaxy's light within 8 px, above which it cannot be
+/// removed. See docs/constants.md.
 const TOO_BRIGHT: f32 = 5.0;
 
 /// A stamp's surroundings, and room for it without neighbours.

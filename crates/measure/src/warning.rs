@@ -192,8 +192,8 @@ impl fmt::Display for Of {
     }
 }
 
-/// Pixels a side of a PSF below which a linear configuration loses too much of the wings: of a Moffat profile of FWHM
-/// 3.4 px, m changes by 0.002 at 20 px and 0.01 at 16 px.
+/// Side of a PSF stamp below which a linear configuration loses too much of the wings. See
+/// docs/constants.md.
 const LEAST_PSF_SIZE: usize = 32;
 
 impl Warning {

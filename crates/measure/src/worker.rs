@@ -359,6 +359,7 @@ fn convert<'a, T: Pixel + 'a>(row: &mut [f32], from: impl Iterator<Item = &'a T>
 
 /// The largest pixel, or zero if none is positive. 16 running maxima let vector instructions take several at a time.
 pub(crate) fn highest(pixels: &[f32]) -> f32 {
+    /// Numbers that are compared side by side. See docs/constants.md.
     const LANES: usize = 16;
     let mut lanes = [0.0f32; LANES];
     let chunks = pixels.chunks_exact(LANES);

@@ -8,8 +8,12 @@ pub trait Real: Copy + Default + PartialOrd + Send + Sync + std::fmt::Debug + 's
     fn from_f64(value: f64) -> Self;
     /// Exact.
     fn to_f64(self) -> f64;
-    /// self + a·b, fused where `FMA` says the hardware can.
+    /// self + a·b, fused if `FMA`.
     fn add_product<const FMA: bool>(self, a: Self, b: Self) -> Self;
+    /// self + other.
+    fn plus(self, other: Self) -> Self;
+    /// self · other.
+    fn times(self, other: Self) -> Self;
     /// self − other.
     fn minus(self, other: Self) -> Self;
     /// |self|.
@@ -35,6 +39,14 @@ macro_rules! real {
                 } else {
                     self + a * b
                 }
+            }
+            #[inline(always)]
+            fn plus(self, other: Self) -> Self {
+                self + other
+            }
+            #[inline(always)]
+            fn times(self, other: Self) -> Self {
+                self * other
             }
             #[inline(always)]
             fn minus(self, other: Self) -> Self {

@@ -5,11 +5,11 @@
 //! for all the rows it contributes to, and source rows outside the stamp are never looked at.
 
 use super::real::Real;
-use super::vector::Vector;
+use super::vector::{Lanes, Pair, Vector};
 
-/// Rows are padded to a multiple of this, the longest vector.
+/// Multiple to which rows are padded: the longest vector. See docs/constants.md.
 pub(super) const LANES: usize = 16;
-/// Output rows summed together.
+/// Output rows that are summed together. See docs/constants.md.
 pub(super) const BLOCK: usize = 8;
 
 /// An n×n image with zeros left and right of it, so that whole vectors can be read anywhere.
@@ -112,15 +112,8 @@ impl<T: Real> Kernel<T> {
 /// Adds what the source row `line` contributes to the output rows `LOW..HIGH` of a block. `age` is
 /// the kernel row with which it enters the first of them.
 #[inline(always)]
-fn add_row<
-    T: Real,
-    V: Vector<T>,
-    const ROWS: usize,
-    const COLUMNS: usize,
-    const LOW: usize,
-    const HIGH: usize,
->(
-    sums: &mut [[V; COLUMNS]; ROWS],
+fn add_row<T: Real, L: Lanes<T>, const ROWS: usize, const LOW: usize, const HIGH: usize>(
+    sums: &mut [L; ROWS],
     line: &[T],
     kernel: &Kernel<T>,
     age: usize,
@@ -130,15 +123,9 @@ fn add_row<
     let first = BLOCK - 1 + kernel.p - 1 - age;
     for i in 0..kernel.p {
         let weights = &kernel.weights[i * height + first..][..ROWS];
-        let mut pixels = [V::splat(T::ZERO); COLUMNS];
-        for (c, pixel) in pixels.iter_mut().enumerate() {
-            *pixel = V::load(&line[i + c * V::LANES..]);
-        }
+        let pixels = L::load(&line[i..]);
         for k in LOW..HIGH {
-            let weight = V::splat(weights[k]);
-            for c in 0..COLUMNS {
-                sums[k][c] = sums[k][c].add_product(weight, pixels[c]);
-            }
+            sums[k] = sums[k].add_product(L::splat(weights[k]), pixels);
         }
     }
 }
@@ -146,7 +133,7 @@ fn add_row<
 /// Slides `kernel` over `source` for `ROWS` output rows from `y` on and `COLUMNS` vectors from `x`
 /// on, and writes them to `out`, rows `stride` apart.
 #[inline(always)]
-fn slide<T: Real, V: Vector<T>, const ROWS: usize, const COLUMNS: usize>(
+fn slide<T: Real, L: Lanes<T>, const ROWS: usize>(
     source: &Padded<T>,
     kernel: &Kernel<T>,
     y: usize,
@@ -155,7 +142,7 @@ fn slide<T: Real, V: Vector<T>, const ROWS: usize, const COLUMNS: usize>(
     stride: usize,
 ) {
     let (p, back) = (kernel.p, kernel.back);
-    let mut sums = [[V::splat(T::ZERO); COLUMNS]; ROWS];
+    let mut sums = [L::splat(T::ZERO); ROWS];
     // Source row y + age − back enters output row y + k with kernel row age − k. The rows inside
     // the stamp:
     let from = back.saturating_sub(y);
@@ -168,7 +155,7 @@ fn slide<T: Real, V: Vector<T>, const ROWS: usize, const COLUMNS: usize>(
             let age = $age;
             if $low < $high && $high <= ROWS && from <= age && age < to {
                 let line = &source.line(y + age - back)[at..];
-                add_row::<T, V, ROWS, COLUMNS, $low, $high>(&mut sums, line, kernel, age);
+                add_row::<T, L, ROWS, $low, $high>(&mut sums, line, kernel, age);
             }
         }};
     }
@@ -187,9 +174,7 @@ fn slide<T: Real, V: Vector<T>, const ROWS: usize, const COLUMNS: usize>(
         add_all!(4, [1 2 3], [1 2 3]);
     }
     for (k, sum) in sums.iter().enumerate() {
-        for (c, sum) in sum.iter().enumerate() {
-            sum.store(&mut out[k * stride + x + c * V::LANES..]);
-        }
+        sum.store(&mut out[k * stride + x..]);
     }
 }
 
@@ -206,13 +191,13 @@ pub(super) fn slide_block<T: Real, V: Vector<T>>(
     let half = source.n - y <= BLOCK / 2;
     let mut x = 0;
     while x < source.n {
-        let vectors = (source.n - x).div_ceil(V::LANES).min(V::COLUMNS);
-        match (vectors, half) {
-            (1, false) => slide::<T, V, 8, 1>(source, kernel, y, x, out, stride),
-            (1, true) => slide::<T, V, 4, 1>(source, kernel, y, x, out, stride),
-            (_, false) => slide::<T, V, 8, 2>(source, kernel, y, x, out, stride),
-            (_, true) => slide::<T, V, 4, 2>(source, kernel, y, x, out, stride),
+        let long = source.n - x > V::LANES;
+        match (long, half) {
+            (false, false) => slide::<T, V, 8>(source, kernel, y, x, out, stride),
+            (false, true) => slide::<T, V, 4>(source, kernel, y, x, out, stride),
+            (true, false) => slide::<T, Pair<V>, 8>(source, kernel, y, x, out, stride),
+            (true, true) => slide::<T, Pair<V>, 4>(source, kernel, y, x, out, stride),
         }
-        x += vectors * V::LANES;
+        x += if long { 2 * V::LANES } else { V::LANES };
     }
 }

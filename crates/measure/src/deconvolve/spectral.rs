@@ -43,18 +43,19 @@ use crate::fft::StampFft;
 use crate::noise::StampNoise;
 use crate::sizes::{check_psf, check_sizes};
 
-/// Pixels by which the deconvolved stamp may spread beyond the stamp before it wraps around.
+/// Padding around a stamp, so that the deconvolved stamp does not wrap around. See
+/// docs/constants.md.
 const SPREAD: usize = 8;
-/// Modes with |p|² below this are left out: they are noise alone. The PSFs of the simulated sets are above
-/// 1e-3 where Γ is not yet zero; this keeps single precision finite for broader ones.
+/// Least power of the PSF's transform; modes below it are left out as pure noise. See
+/// docs/constants.md.
 const LEAST_POWER: f32 = 1e-7;
-/// |k|·σ of the largest mode, σ being Γ's, which is down to 0.09 there: farther out the noise that a PSF
-/// leaves undamped outweighs the galaxy.
+/// Largest wave number of the target Γ, times its σ. Γ is 0.09 there. See docs/constants.md.
 const CUT: f64 = 2.2;
-/// The window at the middle of an edge from which on a shear's light across the edges is told: below, m is less than
-/// 10⁻³ of the largest galaxies, and it would take a tenth of the time.
+/// Value of the window at the middle of an edge above which the edge correction is applied. See
+/// docs/constants.md.
 const LIT: f64 = 0.02;
-/// Largest lag in σ of the window: the autocorrelation of a window has √2 σ, and is down to a fifth.
+/// Largest lag of the autocorrelation in σ of the window. The window's autocorrelation is a fifth
+/// there. See docs/constants.md.
 const REACH: f64 = 2.5;
 
 /// The linear network for one stamp size.
@@ -651,6 +652,7 @@ impl Spectral {
 
 /// Fall of Γ towards its largest wave number, at 1: a quarter of a cosine, squared.
 fn taper(k: f64) -> f64 {
+    /// Share of the largest wave number at which the taper of Γ begins. See docs/constants.md.
     const FROM: f64 = 0.75;
     if k >= 1.0 {
         // The cosine would be 10⁻¹⁶, which makes modes of denormal numbers, and these take long.

@@ -1,6 +1,6 @@
 //! The high-pass of the regularisation.
 
-/// Sun's high-pass kernel d (Sect. 3.1); its elements sum to zero.
+/// High-pass kernel of the regularisation; its elements sum to zero. See docs/constants.md.
 pub(super) const SUN_KERNEL: [[f64; 3]; 3] = [
     [0.007, 0.010, 0.007],
     [0.010, -0.068, 0.010],

@@ -5,23 +5,57 @@
 
 use super::real::Real;
 
-/// `LANES` numbers that are worked on together.
-pub trait Vector<T>: Copy {
-    /// Numbers in it.
+/// `LANES` numbers that are multiplied and added together.
+pub trait Lanes<T>: Copy {
+    /// Single-precision lanes of AVX-512. See docs/constants.md.
     const LANES: usize;
-    /// Vectors of one row that are summed together, as the number of registers allows: 1 or 2.
-    const COLUMNS: usize;
-    /// Sums of squares on their way.
-    type Squares: Copy;
 
-    /// The same number everywhere.
+    /// The same number in all lanes.
     fn splat(value: T) -> Self;
     /// The first numbers of `from`.
     fn load(from: &[T]) -> Self;
     /// Writes the first numbers of `to`.
     fn store(self, to: &mut [T]);
-    /// self + a·b, fused where the hardware can.
+    /// self + a·b, fused if the hardware can.
     fn add_product(self, a: Self, b: Self) -> Self;
+}
+
+/// Two vectors of neighbouring pixels.
+#[derive(Clone, Copy)]
+pub struct Pair<V>(V, V);
+
+impl<T, V: Lanes<T>> Lanes<T> for Pair<V>
+where
+    T: Copy,
+{
+    /// Single-precision lanes of AVX-512. See docs/constants.md.
+    const LANES: usize = 2 * V::LANES;
+
+    #[inline(always)]
+    fn splat(value: T) -> Self {
+        let value = V::splat(value);
+        Pair(value, value)
+    }
+    #[inline(always)]
+    fn load(from: &[T]) -> Self {
+        Pair(V::load(from), V::load(&from[V::LANES..]))
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [T]) {
+        self.0.store(to);
+        self.1.store(&mut to[V::LANES..]);
+    }
+    #[inline(always)]
+    fn add_product(self, a: Self, b: Self) -> Self {
+        Pair(self.0.add_product(a.0, b.0), self.1.add_product(a.1, b.1))
+    }
+}
+
+/// `LANES` numbers with all operations of the network.
+pub trait Vector<T>: Lanes<T> {
+    /// Sums of squares on their way.
+    type Squares: Copy;
+
     /// self + other.
     fn plus(self, other: Self) -> Self;
     /// self − other.
@@ -58,10 +92,10 @@ impl Wide for f32 {
     #[cfg(target_arch = "x86_64")]
     type Avx512 = x86::Sixteen;
     #[cfg(target_arch = "x86_64")]
-    type Avx2 = x86::Eight;
+    type Avx2 = Portable<f32, 8, true>;
 }
 
-// Only tests run in f64: nothing is won by intrinsics.
+// Only tests run in f64.
 impl Wide for f64 {
     #[cfg(target_arch = "x86_64")]
     type Avx512 = Portable<f64, 4, true>;
@@ -84,10 +118,9 @@ impl<T: Real, const N: usize, const FMA: bool> Portable<T, N, FMA> {
     }
 }
 
-impl<T: Real, const N: usize, const FMA: bool> Vector<T> for Portable<T, N, FMA> {
+impl<T: Real, const N: usize, const FMA: bool> Lanes<T> for Portable<T, N, FMA> {
+    /// Single-precision lanes of AVX-512. See docs/constants.md.
     const LANES: usize = N;
-    const COLUMNS: usize = 1;
-    type Squares = [f64; N];
 
     #[inline(always)]
     fn splat(value: T) -> Self {
@@ -111,17 +144,22 @@ impl<T: Real, const N: usize, const FMA: bool> Vector<T> for Portable<T, N, FMA>
         }
         out
     }
+}
+
+impl<T: Real, const N: usize, const FMA: bool> Vector<T> for Portable<T, N, FMA> {
+    type Squares = [f64; N];
+
     #[inline(always)]
     fn plus(self, other: Self) -> Self {
-        self.map(other, |a, b| a.minus(T::ZERO.minus(b)))
+        self.map(other, T::plus)
     }
     #[inline(always)]
     fn minus(self, other: Self) -> Self {
-        self.map(other, |a, b| a.minus(b))
+        self.map(other, T::minus)
     }
     #[inline(always)]
     fn times(self, other: Self) -> Self {
-        self.map(other, |a, b| T::ZERO.add_product::<FMA>(a, b))
+        self.map(other, T::times)
     }
     #[inline(always)]
     fn modulus(self) -> Self {
@@ -156,8 +194,16 @@ impl<T: Real, const N: usize, const FMA: bool> Vector<T> for Portable<T, N, FMA>
         sums
     }
     #[inline(always)]
-    fn sum(sums: Self::Squares) -> f64 {
-        sums.iter().sum()
+    fn sum(mut sums: Self::Squares) -> f64 {
+        // Eight are added in pairs first, so that AVX2 rounds as its instructions do.
+        let mut width = N;
+        while width > 4 {
+            width /= 2;
+            for k in 0..width {
+                sums[k] += sums[k + width];
+            }
+        }
+        sums[..width].iter().sum()
     }
 }
 
@@ -165,7 +211,7 @@ impl<T: Real, const N: usize, const FMA: bool> Vector<T> for Portable<T, N, FMA>
 mod x86 {
     use std::arch::x86_64::*;
 
-    use super::Vector;
+    use super::{Lanes, Vector};
 
     /// Sixteen f32 of AVX-512.
     #[derive(Clone, Copy)]
@@ -174,10 +220,9 @@ mod x86 {
     // SAFETY of the unsafe blocks below: the module's `Level` uses this type only in a function
     // compiled for AVX-512F, entered where the machine has it; loads and stores are of slices of
     // sixteen numbers.
-    impl Vector<f32> for Sixteen {
+    impl Lanes<f32> for Sixteen {
+        /// Single-precision lanes of AVX-512. See docs/constants.md.
         const LANES: usize = 16;
-        const COLUMNS: usize = 2;
-        type Squares = [__m512d; 2];
 
         #[inline(always)]
         fn splat(value: f32) -> Self {
@@ -201,6 +246,11 @@ mod x86 {
             // SAFETY: see above the implementation.
             Sixteen(unsafe { _mm512_fmadd_ps(a.0, b.0, self.0) })
         }
+    }
+
+    impl Vector<f32> for Sixteen {
+        type Squares = [__m512d; 2];
+
         #[inline(always)]
         fn plus(self, other: Self) -> Self {
             // SAFETY: see above the implementation.
@@ -256,100 +306,6 @@ mod x86 {
         fn sum(sums: Self::Squares) -> f64 {
             // SAFETY: see above the implementation.
             unsafe { _mm512_reduce_add_pd(_mm512_add_pd(sums[0], sums[1])) }
-        }
-    }
-
-    /// Eight f32 of AVX2 with fused multiply-add.
-    #[derive(Clone, Copy)]
-    pub struct Eight(__m256);
-
-    // SAFETY of the unsafe blocks below: the module's `Level` uses this type only in a function
-    // compiled for AVX2 and FMA, entered where the machine has them; loads and stores are of slices
-    // of eight numbers.
-    impl Vector<f32> for Eight {
-        const LANES: usize = 8;
-        const COLUMNS: usize = 1;
-        type Squares = [__m256d; 2];
-
-        #[inline(always)]
-        fn splat(value: f32) -> Self {
-            // SAFETY: see above the implementation.
-            Eight(unsafe { _mm256_set1_ps(value) })
-        }
-        #[inline(always)]
-        fn load(from: &[f32]) -> Self {
-            let from = &from[..8];
-            // SAFETY: see above the implementation.
-            Eight(unsafe { _mm256_loadu_ps(from.as_ptr()) })
-        }
-        #[inline(always)]
-        fn store(self, to: &mut [f32]) {
-            let to = &mut to[..8];
-            // SAFETY: see above the implementation.
-            unsafe { _mm256_storeu_ps(to.as_mut_ptr(), self.0) }
-        }
-        #[inline(always)]
-        fn add_product(self, a: Self, b: Self) -> Self {
-            // SAFETY: see above the implementation.
-            Eight(unsafe { _mm256_fmadd_ps(a.0, b.0, self.0) })
-        }
-        #[inline(always)]
-        fn plus(self, other: Self) -> Self {
-            // SAFETY: see above the implementation.
-            Eight(unsafe { _mm256_add_ps(self.0, other.0) })
-        }
-        #[inline(always)]
-        fn minus(self, other: Self) -> Self {
-            // SAFETY: see above the implementation.
-            Eight(unsafe { _mm256_sub_ps(self.0, other.0) })
-        }
-        #[inline(always)]
-        fn times(self, other: Self) -> Self {
-            // SAFETY: see above the implementation.
-            Eight(unsafe { _mm256_mul_ps(self.0, other.0) })
-        }
-        #[inline(always)]
-        fn modulus(self) -> Self {
-            // SAFETY: see above the implementation.
-            Eight(unsafe { _mm256_andnot_ps(_mm256_set1_ps(-0.0), self.0) })
-        }
-        #[inline(always)]
-        fn where_greater(a: Self, b: Self, yes: Self, no: Self) -> Self {
-            // SAFETY: see above the implementation.
-            Eight(unsafe {
-                let greater = _mm256_cmp_ps::<_CMP_GT_OQ>(a.0, b.0);
-                _mm256_blendv_ps(no.0, yes.0, greater)
-            })
-        }
-        #[inline(always)]
-        fn count_greater(a: Self, b: Self) -> u32 {
-            // SAFETY: see above the implementation.
-            let bits = unsafe { _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_GT_OQ>(a.0, b.0)) };
-            bits.count_ones()
-        }
-        #[inline(always)]
-        fn no_squares() -> Self::Squares {
-            // SAFETY: see above the implementation.
-            [unsafe { _mm256_setzero_pd() }; 2]
-        }
-        #[inline(always)]
-        fn add_squares(self, sums: Self::Squares) -> Self::Squares {
-            // SAFETY: see above the implementation.
-            unsafe {
-                let low = _mm256_cvtps_pd(_mm256_castps256_ps128(self.0));
-                let high = _mm256_cvtps_pd(_mm256_extractf128_ps::<1>(self.0));
-                [
-                    _mm256_fmadd_pd(low, low, sums[0]),
-                    _mm256_fmadd_pd(high, high, sums[1]),
-                ]
-            }
-        }
-        #[inline(always)]
-        fn sum(sums: Self::Squares) -> f64 {
-            let mut lanes = [0.0; 4];
-            // SAFETY: see above the implementation; the store is of four numbers.
-            unsafe { _mm256_storeu_pd(lanes.as_mut_ptr(), _mm256_add_pd(sums[0], sums[1])) };
-            lanes.iter().sum()
         }
     }
 }

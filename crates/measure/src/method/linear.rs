@@ -32,11 +32,10 @@ use crate::noise::StampNoise;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
 use crate::surroundings::{Surroundings, centre, followed};
 
-/// One galaxy in so many is looked at with a field of noise: what it corrects is some per cent of the
-/// response at S/N 10 and less above, and needs to be known in the mean alone.
+/// One galaxy in this many is measured with a field of noise, for the noise term of the response.
+/// See docs/constants.md.
 const SHARE: u64 = 4;
-/// Level of the field of noise, in that of the galaxy's: small, for a derivative, and large beside what
-/// single precision resolves.
+/// Level of the field of noise in units of the image's noise. See docs/constants.md.
 const FIELD: f32 = 0.25;
 
 /// What one submission and stamp size need.
@@ -256,6 +255,7 @@ fn seed_of(stamp: &[f32], noise: f32) -> u64 {
 
 /// Sum of a stamp: rows in f32 side by side, which is where the time would go otherwise.
 fn sum(stamp: &[f32]) -> f64 {
+    /// Numbers that are summed side by side. See docs/constants.md.
     const LANES: usize = 16;
     let mut lanes = [0.0f32; LANES];
     let chunks = stamp.chunks_exact(LANES);

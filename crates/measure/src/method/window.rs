@@ -11,18 +11,18 @@ use shearq_submissions::limits::WINDOWS;
 
 use crate::extent::Moments;
 
-/// Steps in which the width doubles, and its power of the extent.
+/// Steps in which the window's width doubles. See docs/constants.md.
 const OCTAVE: f64 = 4.0;
+/// Power of the size with which the best width grows. See docs/constants.md.
 const POWER: f64 = 0.8;
 /// Steps from the submission's own width.
 const STEPS: RangeInclusive<i32> = -3..=3;
 
-/// Mean square per axis of the galaxies, in units of σ² of the window that is best for those of GREAT10.
+/// Mean square per axis of GREAT10's galaxies, in units of the best window's σ². See
+/// docs/constants.md.
 const USUAL: f64 = 0.1375;
 
-/// Widest in units of the stamp's side: of large galaxies on 48 px a window of 10.4 px would take another 0.9 % off the
-/// scatter, and leave m1 at −0.0013: what the PSF carries across the stamp's edges is not told, and noise on the edges adds to
-/// the response (some 0.0003 at 9.6 px and S/N 20, as its square).
+/// Widest window in units of the stamp's side. See docs/constants.md.
 const WIDEST: f64 = 0.2;
 
 /// The place of the submission's own width among all.

@@ -9,7 +9,8 @@ use super::examine::PsfLook;
 use super::star::{self, Star};
 use crate::error::MeasureError;
 
-/// S/N from which on a star counts no more: stars differ by more than their noise then.
+/// S/N above which a star counts no more: stars then differ by more than their noise. See
+/// docs/constants.md.
 const ENOUGH_SNR: f64 = 1000.0;
 
 /// The weighted mean of stars, one each along the first axis, of a sum of one each, with the square of their S/N as weights

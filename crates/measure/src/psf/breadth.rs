@@ -4,13 +4,14 @@ use std::ops::RangeInclusive;
 
 use ndarray::{ArrayView2, s};
 
-/// Steps in which lengths double.
+/// Steps in which lengths double. See docs/constants.md.
 const OCTAVE: f64 = 4.0;
 /// Steps of lengths: 0.6 to 2.8 times as long.
 pub(crate) const STEPS: RangeInclusive<i32> = -3..=6;
 
-/// Pixels that the frame is wide which tells a star's noise, and pixels a side from which on it is free of the star's light.
-const FRAME: usize = 2;
+/// Width of the border from which a star's noise is measured. See docs/constants.md.
+const BORDER: usize = 2;
+/// Side from which on the border is free of the star's light. See docs/constants.md.
 const LEAST_SIDE: usize = 12;
 
 /// Noise-equivalent area in px² of a PSF of sum one: 1/Σp², without what a star's noise adds to the sum, which is told
@@ -20,7 +21,7 @@ pub(super) fn area(psf: ArrayView2<'_, f64>) -> f64 {
     let mut sum = psf.iter().map(square).sum::<f64>();
     let n = psf.nrows();
     if n >= LEAST_SIDE {
-        let inner = psf.slice(s![FRAME..n - FRAME, FRAME..n - FRAME]);
+        let inner = psf.slice(s![BORDER..n - BORDER, BORDER..n - BORDER]);
         let frame = sum - inner.iter().map(square).sum::<f64>();
         sum -= frame * psf.len() as f64 / (psf.len() - inner.len()) as f64;
     }

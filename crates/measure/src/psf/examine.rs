@@ -12,34 +12,36 @@ use crate::extent::{Core, core_of_psf};
 use crate::warning::{Of, Warning};
 use shearq_quantities::statistics::{SCATTER, median};
 
-/// Pixels that the border is wide.
+/// Width of the PSF stamp's border. See docs/constants.md.
 const BORDER: usize = 2;
 /// Distances from the middle, in units of half the side, of the pixels with which the border is compared.
 const HALFWAY: std::ops::Range<f64> = 0.5..0.65;
-/// The slowest fall of wings, as a power of the radius. Averages over the rings of an Airy disc fall with the power 3,
-/// turbulence with 11/3.
+/// Slowest fall of a PSF's wings, as a power of the radius. See docs/constants.md.
 const FALL: f64 = 2.5;
-/// Significance that every warning requires, in standard errors.
+/// Significance that every warning requires. See docs/constants.md.
 const CLEAR: f64 = 5.0;
-/// Light of the background on the PSF's pixels, in units of the star's, above which |m| may exceed 2·10⁻³.
+/// Light of a background, in units of the star's, above which |m| may exceed 2·10⁻³. See
+/// docs/constants.md.
 const BACKGROUND: f64 = 0.1;
-/// The same of a gradient, were the background everywhere as bright as at the brighter edge.
+/// Light of a gradient extrapolated from the brighter edge, above which a warning is due. See
+/// docs/constants.md.
 const GRADIENT: f64 = 0.3;
-/// S/N of a star, √(Σ p²)/σ, below which its noise makes |m| exceed 5·10⁻³, of one star for all galaxies and of a star for
-/// each galaxy, whose noise averages out.
+/// S/N of the one star below which its noise makes |m| exceed 5·10⁻³. See docs/constants.md.
 const ENOUGH_SNR: f64 = 1000.0;
+/// The same limit for a star per galaxy, whose noise averages out. See docs/constants.md.
 const ENOUGH_SNR_EACH: f64 = 100.0;
-/// Scatter of m and of c with a star's noise, times its S/N (docs/limitations.md).
+/// Scatter of m with a star's noise, times the star's S/N. See docs/constants.md.
 pub(crate) const M_PER_NOISE: f64 = 5.3;
+/// Scatter of c with a star's noise, times the star's S/N. See docs/constants.md.
 pub(crate) const C_PER_NOISE: f64 = 2.4;
-/// Noise-equivalent area in px² of the narrowest PSF that pixels can show: of a FWHM of about 1 px.
+/// Noise-equivalent area of the narrowest PSF that pixels can show. See docs/constants.md.
 const LEAST_AREA: f64 = 6.0;
-/// Mean square of the PSF's core in units of the mean square of the galaxies' core, above which a warning and an error are
-/// due. It is 0.48 to 0.53 for simulated galaxies behind a PSF of FWHM 3.4 px, 0.75 with a PSF 1.3 times too wide
-/// (m = +0.6), 0.86 to 0.93 at 1.4 times (m = +1.1) and 0.97 to 1.06 at 1.5 times (m = +2). Stars have one.
+/// Mean square of the PSF's core in units of the galaxies', above which a warning is due. See
+/// docs/constants.md.
 const AS_BROAD: f64 = 0.83;
+/// The same ratio above which an error is due. See docs/constants.md.
 const BROADER: f64 = 1.02;
-/// Share of the PSFs of an image that a warning requires.
+/// Share of the PSFs of an image that a warning requires. See docs/constants.md.
 const MANY: f64 = 0.1;
 
 /// What one PSF shows.

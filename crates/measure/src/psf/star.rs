@@ -11,22 +11,21 @@ use shearq_submissions::PsfCut;
 use crate::error::MeasureError;
 use crate::pixel::Pixel;
 
-/// Farthest that a star may lie from the centre of its stamp along either axis, in pixels, to be cut around the centre of
-/// the stamp. Stars farther off are cut around themselves. A PSF that is cut off the centre of its wings adds its own
-/// ellipticity to that of all galaxies: about 0.01 for one pixel of a 15 px PSF of the usual width.
+/// Largest centroid offset along an axis of a star that is cut around its stamp's centre. See
+/// docs/constants.md.
 const MAX_CENTROID_OFFSET: f64 = 1.0;
 
-/// σ in pixels of the Gaussian under which a star's centroid is found, and half the side of the square that it is worked
-/// out on. It keeps out the noise of the rest of the stamp: at S/N 20 the centroid is good to a fifth of a pixel, where
-/// the centroid of the whole stamp scatters by several pixels.
+/// σ of the Gaussian weight for a star's centroid. See docs/constants.md.
 const WEIGHT: f64 = 2.0;
+/// Half the side of the square of that weight. See docs/constants.md.
 const WEIGHT_REACH: usize = 6;
-/// Step in units of the weighted centroid, which falls short of the centre by the width of the star; the largest number of
-/// steps, and the step in pixels at which they end. A star of FWHM 10 px is found to 10⁻³ px.
+/// Step in units of the weighted centroid, which falls short of the centre. See docs/constants.md.
 const STRIDE: f64 = 1.5;
+/// Most steps to the centroid. See docs/constants.md.
 const STEPS: usize = 40;
+/// Step at which the search for the centroid ends. See docs/constants.md.
 const SMALL_STEP: f64 = 1e-3;
-/// Farthest in pixels that the centroid may move from where the search starts.
+/// Largest distance of the centroid from the start of the search. See docs/constants.md.
 const FARTHEST: f64 = 3.0;
 
 /// First pixel of a centred cut of `size` from a side of `full`; `None` where it does not fit.

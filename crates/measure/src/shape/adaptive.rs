@@ -19,17 +19,17 @@ use shearq_quantities::Distortion;
 
 use crate::flag::Flag;
 
-/// Most Newton steps.
+/// Most Newton steps. See docs/constants.md.
 const MAX_STEPS: usize = 30;
-/// Largest |χ| of a weight.
+/// Largest |χ| of a weight. See docs/constants.md.
 const MAX_MODULUS: f32 = 0.98;
-/// Longest Newton step.
+/// Longest Newton step in χ. See docs/constants.md.
 const MAX_STEP: f32 = 0.3;
-/// Change of χ at which the iteration ends: what sums of a few hundred f32 terms resolve.
+/// Change of χ at which the iteration ends. See docs/constants.md.
 const CONVERGED: f32 = 3e-6;
-/// Least determinant of 1 − ∂m/∂χ: near zero the moments follow the weight whatever the galaxy.
+/// Least determinant of 1 − ∂m/∂χ; near zero the moments follow the weight. See docs/constants.md.
 const LEAST_DETERMINANT: f32 = 1e-3;
-/// Lags summed side by side.
+/// Lags that are summed side by side. See docs/constants.md.
 const LANES: usize = 16;
 
 /// Moments for one size of weight.

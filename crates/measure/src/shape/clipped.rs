@@ -7,8 +7,8 @@ use super::moments::{ClippedMoments, Moments};
 use crate::error::MeasureError;
 use crate::flag::Flag;
 
-/// Width in pixels of the frame whose mean is the background of a stamp.
-const FRAME: usize = 3;
+/// Width of the border whose mean is a stamp's background. See docs/constants.md.
+const BORDER: usize = 3;
 
 /// Autocorrelation, background and moments of n×n stamps. Allocates nothing per stamp.
 pub struct ClippedAcf {
@@ -87,7 +87,7 @@ impl ClippedAcf {
 
 /// Mean of the frame of an n×n stamp; of all its pixels where it is too small to have an inside.
 fn frame_mean(stamp: &[f32], n: usize) -> f64 {
-    let inside = FRAME..n.saturating_sub(FRAME);
+    let inside = BORDER..n.saturating_sub(BORDER);
     let (mut sum, mut count) = (0.0, 0);
     for (y, row) in stamp.chunks_exact(n).enumerate() {
         for (x, &value) in row.iter().enumerate() {
@@ -116,7 +116,7 @@ mod tests {
         let mut stamp = stamp.clone();
         if settings.background == Background::StampFrame {
             let frame = |y: usize, x: usize| {
-                let edge = |k: usize| k < FRAME || k + FRAME >= n as usize;
+                let edge = |k: usize| k < BORDER || k + BORDER >= n as usize;
                 edge(y) || edge(x)
             };
             let all: Vec<f64> = stamp

@@ -1,17 +1,17 @@
 //! Where the galaxy is on its stamp.
 
-/// σ in pixels of the weight under which the centre is found: narrow, for the centre not to follow noise.
+/// σ of the weight for the galaxy's centre, narrow so that it does not follow noise. See
+/// docs/constants.md.
 const WEIGHT: f32 = 2.0;
-/// Half the side of the square that the weight reaches over, in pixels.
+/// Half the side of the square of that weight. See docs/constants.md.
 const WEIGHT_REACH: i32 = 6;
-/// Steps to the centre.
+/// Steps to the centre. See docs/constants.md.
 const STEPS: usize = 3;
-/// Step in units of the weighted centroid, which falls short of the centre by the width of galaxies.
+/// Step in units of the weighted centroid, which falls short of the centre. See docs/constants.md.
 const STRIDE: f32 = 1.5;
-/// Offsets in pixels up to which the window stays in the middle of the stamp, and from which on it is on the
-/// galaxy. A window that followed each centroid would follow noise (m = −0.004 at S/N 20); a pixel off does no
-/// harm.
+/// Offset up to which the window stays in the middle of the stamp. See docs/constants.md.
 const STAYS: f32 = 1.25;
+/// Offset from which on the window is centred on the galaxy. See docs/constants.md.
 const FOLLOWS: f32 = 2.0;
 
 /// Centre (x, y) of the galaxy from the middle of its stamp, in pixels; (0, 0) where none is found.

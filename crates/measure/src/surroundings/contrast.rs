@@ -1,11 +1,11 @@
 //! A stamp compared with itself turned about the galaxy's centre: galaxies look nearly the same turned by 180 degrees, and
 //! neighbours do not.
 
-/// Pixels a side of the cells that blocks are made of, two along each axis, so that wherever a neighbour is, most of
-/// its core is in one of them; and least distance in pixels of their centres from the galaxy's.
+/// Side of the cells that blocks are made of, two along each axis. See docs/constants.md.
 const CELL: i32 = 3;
+/// Least distance of a cell's centre from the galaxy's. See docs/constants.md.
 const LEAST_DISTANCE: f32 = 9.0;
-/// Pixels around the centre whose sum is the galaxy's light.
+/// Half the side of the square whose sum is the galaxy's light. See docs/constants.md.
 const INNER: i32 = 8;
 
 /// Blocks of 6 × 6 pixels away from a galaxy, against their opposites.

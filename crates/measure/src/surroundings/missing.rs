@@ -7,13 +7,17 @@
 use super::centre::centre;
 use super::contrast::{opposite, turn};
 
-/// Share of a stamp that may be missing, and share of it that may be so together with the opposite pixels.
+/// Largest share of a stamp that may be missing. See docs/constants.md.
 const MOST: f32 = 0.25;
+/// Largest share of a stamp that may be missing together with the opposite pixels. See
+/// docs/constants.md.
 const MOST_TWICE: f32 = 0.02;
-/// Within so many pixels of the galaxy's centre only so many may be missing, and where the opposite one is too, so many of
-/// the eight around have to be there.
+/// Radius around the galaxy's centre with stricter limits. See docs/constants.md.
 const INSIDE: f32 = 12.0;
+/// Most missing pixels within that radius. See docs/constants.md.
 const MOST_INSIDE: usize = 24;
+/// Neighbouring pixels that must be present where a pixel and its opposite are missing. See
+/// docs/constants.md.
 const LEAST_AROUND: usize = 7;
 
 /// The pixels of a stamp that are missing, and what they are given.

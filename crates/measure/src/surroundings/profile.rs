@@ -7,17 +7,22 @@
 
 use super::contrast::opposite;
 
-/// σ in pixels of the Gaussians: from a PSF's core to the wings of a galaxy twice as large as the fiducial ones.
+/// σ of the Gaussians of a neighbour's profile, from a PSF's core to a large galaxy's wings. See
+/// docs/constants.md.
 const WIDTHS: [f32; COUNT] = [2.0, 3.5, 6.0, 10.5];
+/// Number of these Gaussians. See docs/constants.md.
 const COUNT: usize = 4;
-/// Added to the diagonal of the normal equations, in units of it: what keeps them soluble where hardly any pixel is left.
+/// Relative addition to the diagonal of the normal equations, which keeps them soluble. See
+/// docs/constants.md.
 const RIDGE: f64 = 1e-6;
 
-/// σ in pixels of the Gaussian by which a neighbour's place is found, pixels around it that count, steps, and the
-/// longest one.
+/// σ of the Gaussian weight for a neighbour's position. See docs/constants.md.
 const PLACED_BY: f32 = 3.0;
+/// Radius around a neighbour that counts for its position. See docs/constants.md.
 const AROUND: f32 = 9.0;
+/// Steps to a neighbour's position. See docs/constants.md.
 const STEPS: usize = 4;
+/// Longest step to a neighbour's position. See docs/constants.md.
 const MAX_STEP: f32 = 2.0;
 
 /// Room for the Gaussians along the axes of a stamp.

@@ -16,7 +16,8 @@ use shearq_fourier::Complex32;
 
 use super::plane::{Plane, PlaneScratch, parts};
 
-/// Pairs of real lines: the edges, and the edges times the place along them.
+/// Pairs of real lines: the edges, and the edges times the position along them. See
+/// docs/constants.md.
 const PAIRS: usize = 4;
 
 /// The edges of stamps of one size.

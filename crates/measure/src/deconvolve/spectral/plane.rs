@@ -13,7 +13,7 @@ use shearq_fourier::{Complex32, Plan32, Planner32};
 
 use crate::fft::transform_size;
 
-/// Least number of lags to a place of the coarse grid, along an axis.
+/// Least number of lags per pixel of the coarse grid, along an axis. See docs/constants.md.
 const FINER: f64 = 1.5;
 
 /// Plans for one size.
