@@ -576,7 +576,7 @@ fn every_entry_point_reports_wrong_data() {
         }
     }
     table += &positions(&folder, &good, &mut wrong);
-    println!("{table}");
+    eprintln!("{table}");
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
@@ -619,7 +619,7 @@ fn positions(folder: &Folder, data: &Data, wrong: &mut Vec<String>) -> String {
     );
     let table = folder.at("positions.csv");
     let mut rows = String::new();
-    let mut add = |name: &str, found: &Found, expected: &str| {
+    let mut add = |name: &str, found: &Found, expected: &'static str| {
         if !found.fits(Warning(expected), true) {
             wrong.push(format!("{name}: {:?}", found.messages));
         }

@@ -191,7 +191,7 @@ fn galsim_galaxies_less_the_model_are_noise() {
         let count = inner.len() as f64;
         let inner_chi2 = inner.iter().map(|m| m * m).sum::<f64>() / count;
         let inner_sum = inner.iter().sum::<f64>() / count.sqrt();
-        println!(
+        eprintln!(
             "{set}: chi2 per pixel {chi2:.5}, mean residual chi2 per pixel {mean_chi2:.3}, \
              largest {worst:.2} sigma, inner {count} pixels: chi2 {inner_chi2:.3}, \
              sum {inner_sum:.2} sigma; rms shift {:.3?}",
@@ -245,7 +245,7 @@ fn best_fit(folder: &Path, sets: &[&str]) {
     let (e1, e1_error) = best(e1(0.8), e1(1.2), 0.2);
     let e2 = |e2| chi2(Change { e2, ..TRUE });
     let (e2, e2_error) = best(e2(0.8), e2(1.2), 0.2);
-    println!(
+    eprintln!(
         "size {size:.4} ± {size_error:.4}, e1 {e1:.3} ± {e1_error:.3}, e2 {e2:.3} ± {e2_error:.3}"
     );
     for (name, value, error) in [
@@ -288,7 +288,7 @@ fn galsim_stars_are_drawn_with_the_limits_of_galsims_transform() {
                 true => f64::INFINITY,
                 false => worst.max(apart),
             });
-        println!("{set}: {worst:.1e} of the peak");
+        eprintln!("{set}: {worst:.1e} of the peak");
         assert!(worst < 2e-5, "{set}: {worst:e}");
     }
 }

@@ -65,9 +65,12 @@ fn follow_the_truth(folder: &Path) {
         let mut line = format!("{name:18}");
         for sets in &samples {
             let (mut truth, mut measured) = ([Vec::new(), Vec::new()], [Vec::new(), Vec::new()]);
-            let images = sets
-                .iter()
-                .flat_map(|set| files.of_set(*set).map(move |(image, _)| (*set, image)));
+            let images = sets.iter().flat_map(|set| {
+                files
+                    .of_set(*set)
+                    .into_iter()
+                    .map(move |(image, _)| (*set, image))
+            });
             for (set, image) in images {
                 let path = run.catalogue(&results, set, image);
                 let catalogue = table::read(&path, None, table::MAX_ROWS).unwrap();
@@ -119,6 +122,6 @@ fn follow_the_truth(folder: &Path) {
                 assert!(own.scatter < 0.27, "{name}, sets {sets:?}, e{}", k + 1);
             }
         }
-        println!("{line}   (slope and scatter of e1 and e2, sets {samples:?})");
+        eprintln!("{line}   (slope and scatter of e1 and e2, sets {samples:?})");
     }
 }

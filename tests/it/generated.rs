@@ -46,7 +46,7 @@ fn setting() -> impl Strategy<Value = Value> {
         proptest::num::f64::ANY.prop_map(Value::Float),
         (-1.0..30.0).prop_map(Value::Float),
         any::<bool>().prop_map(Value::Boolean),
-        proptest::sample::select(&words[..]).prop_map(|word| Value::String(word.to_owned())),
+        proptest::sample::select(words.to_vec()).prop_map(|word| Value::String(word.to_owned())),
         Just(Value::Array(Vec::new())),
     ]
 }
@@ -56,7 +56,7 @@ fn leaves(value: &Value, place: &[String], found: &mut Vec<Vec<String>>) {
     match value {
         Value::Table(table) => {
             for (key, inside) in table {
-                leaves(inside, &[place, &[key.clone()]].concat(), found);
+                leaves(inside, &[place, std::slice::from_ref(key)].concat(), found);
             }
         }
         _ => found.push(place.to_vec()),
@@ -82,7 +82,7 @@ proptest! {
         changes in vec((any::<prop::sample::Index>(), prop::option::of(setting())), 0..4),
     ) {
         let registry = Registry::embedded().unwrap();
-        let configuration = registry.get(name.get(registry.names())).unwrap().configuration;
+        let configuration = registry.get(&registry.names()[name.index(registry.names().len())]).unwrap().configuration;
         let mut settings = Value::try_from(&configuration).unwrap();
         for (which, value) in changes {
             let mut places = Vec::new();
@@ -109,7 +109,7 @@ proptest! {
     #[test]
     fn named_configurations_are_read_back(name in any::<prop::sample::Index>()) {
         let registry = Registry::embedded().unwrap();
-        let configuration = registry.get(name.get(registry.names())).unwrap().configuration;
+        let configuration = registry.get(&registry.names()[name.index(registry.names().len())]).unwrap().configuration;
         let text = toml::to_string(&configuration).unwrap();
         prop_assert_eq!(text.parse::<Configuration>().unwrap(), configuration);
     }
@@ -118,7 +118,7 @@ proptest! {
     #[test]
     fn catalogues_are_read_back(
         rows in vec(prop::array::uniform4(POSITIVE | NEGATIVE | NORMAL | SUBNORMAL | ZERO | QUIET_NAN), 1..40),
-        separator in prop::sample::select(&[",", ";", "\t", " "][..]),
+        separator in prop::sample::select(vec![",", ";", "\t", " "]),
     ) {
         let folder = tempfile::tempdir().unwrap();
         let at = |ending: &str| folder.path().join(format!("table.{ending}"));
@@ -152,7 +152,7 @@ proptest! {
     fn text_tables_of_any_cells_are_read_or_refused(
         cells in vec(vec("[-+0-9.eENaif\"#|, ]{0,12}", 0..6), 0..8),
         head in prop::sample::select(&["x,y,e1,e2\n", "# x y e1 e2\n", "# 1 x\n# 2 y\n# 3 e1\n# 4 e2\n", "\n", ""][..]),
-        separator in prop::sample::select(&[",", ";", "\t", " "][..]),
+        separator in prop::sample::select(vec![",", ";", "\t", " "]),
     ) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("table.csv");

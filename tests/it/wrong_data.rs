@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use ndarray::Array3;
+use shearq_files::table::{self, FileFormat};
 use shearq_simulate::set::STAMP;
 
 use crate::support::{fail, fits_image, floats, pixels_of, shearq, succeed, text};
@@ -134,7 +135,12 @@ fn noise_is_compared_with_the_header_of_every_image() {
         assert!(said.contains(&format!("): {used} is used")), "{said}");
         let stored = |image: u32| {
             let path = out.join(format!("set02/catalogue-00{image}.parquet"));
-            table::read_metadata(&path, FileFormat::Parquet, [&"warnings".to_owned()]).unwrap()
+            table::read_metadata(
+                &path,
+                FileFormat::Parquet,
+                [&"warnings".to_owned()].into_iter(),
+            )
+            .unwrap()
         };
         assert!(stored(1).is_empty());
         let warnings = &stored(2)["warnings"];

@@ -13,9 +13,7 @@ use syn::{
     parse_quote,
 };
 
-use crate::tree::{
-    LIBRARIES, ModulePath, Target, Tree, attributes, is_public, is_test, name_of, names,
-};
+use crate::tree::{LIBRARIES, ModulePath, Target, Tree, is_public, is_test, name_of, names};
 
 /// Set this environment variable to store the present API.
 const ACCEPT: &str = "SHEARQ_ACCEPT";
