@@ -3,6 +3,7 @@
 pub(crate) mod baseline;
 pub(crate) mod bench;
 pub(crate) mod calibrate;
+pub(crate) mod challenge;
 pub(crate) mod check;
 pub(crate) mod compare;
 pub(crate) mod gather;

@@ -9,7 +9,8 @@ use shearq_quantities::Shear;
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
-use crate::data::layout::{DataFolder, SIGN_KEY};
+use super::truth;
+use crate::data::layout::DataFolder;
 use crate::data::psf_table;
 use crate::data::run::{Run, Source, claim};
 use shearq_files::atomic;
@@ -88,7 +89,13 @@ pub fn simulate_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
-    simulate_into(record, images, Places { data, truth: data }, threads, progress)
+    simulate_into(
+        record,
+        images,
+        Places { data, truth: data },
+        threads,
+        progress,
+    )
 }
 
 /// Simulates `images` for a challenge: images and PSFs into `public`; settings, true shear and intrinsic shapes into
@@ -258,17 +265,8 @@ pub fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
 
 /// Writes the true shear of a set.
 pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {
-    let grid = set.grid();
-    // The comment follows the header, so that readers that skip one line or a `#` read the columns.
-    let mut text = format!("x,y,g1,g2\n# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)\n");
-    for iy in 0..grid.n {
-        for ix in 0..grid.n {
-            let (x, y) = grid.centre(ix, iy);
-            let g = set.shear_at(ix, iy);
-            text.push_str(&format!("{x},{y},{},{}\n", g.e1, g.e2));
-        }
-    }
-    Ok(atomic::write(data.truth(set.kind().set), text.as_bytes())?)
+    let path = data.truth(set.kind().set);
+    Ok(truth::write_truth(&path, &set.grid(), &set.truth())?)
 }
 
 /// Files of one image that is being written.
@@ -363,7 +361,10 @@ impl OpenImage {
         if let Some(stars) = self.stars {
             stars.finish()?;
         }
-        atomic::write(places.truth.intrinsic(set, image), self.intrinsic.as_bytes())?;
+        atomic::write(
+            places.truth.intrinsic(set, image),
+            self.intrinsic.as_bytes(),
+        )?;
         self.galaxies.finish()?;
         Ok(())
     }

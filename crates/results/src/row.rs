@@ -153,7 +153,7 @@ pub struct RunRecord {
 }
 
 /// Name of a bandpower definition in records.
-pub(super) fn definition_word(definition: Definition) -> &'static str {
+pub fn definition_word(definition: Definition) -> &'static str {
     match definition {
         Definition::Leaderboard => "leaderboard",
         Definition::Corrected => "corrected",

@@ -30,6 +30,13 @@ pub enum Contents {
     CrossSpectra,
 }
 
+impl Contents {
+    /// Whether the files are power spectra.
+    pub fn is_spectra(self) -> bool {
+        self != Contents::Catalogues
+    }
+}
+
 /// Who submits what to which challenge.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
