@@ -1,6 +1,5 @@
 //! `shearq challenge`.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Subcommand};
@@ -11,11 +10,11 @@ use shearq_challenge::judge::Judge;
 use shearq_challenge::kind::{Kind, RankBy, kind};
 use shearq_challenge::page::{Disclosure, View};
 use shearq_challenge::ranking;
-use shearq_challenge::shapes;
+use shearq_challenge::shapes::References;
 use shearq_challenge::terms::Challenge;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::pattern::MAX_IMAGE;
-use shearq_results::submit::check::{Expected, check, check_sent};
+use shearq_results::submit::check::{check, check_sent};
 use shearq_results::submit::packed::Sent;
 
 use super::check::report;
@@ -274,26 +273,27 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
         threads,
     } = arguments;
     let challenge = Challenge::read(place)?;
-    let expected = Expected {
-        grid: challenge.data.grid()?,
-        truth: BTreeMap::new(),
-        images: Some(challenge.data.images),
-        sets: challenge.data.sets.clone(),
-    };
+    let expected = challenge.expected()?;
     let Ok(sent) = Sent::open(entry) else {
         // The error is one of the findings.
         return report(&check(entry, &expected), entry, *json);
     };
     let mut findings = check_sent(&sent, &expected, &mut |_| {});
-    let data = match place.is_dir() {
-        true => Some(DataFolder::open(place)?),
+    let references = match place.is_dir() {
+        true => {
+            let (data, sets) = (DataFolder::open(place)?, &challenge.data.sets);
+            Some(References::measure(
+                &data,
+                sets,
+                expected.grid,
+                threads.number(),
+            )?)
+        }
         false => None,
     };
-    match data {
-        Some(data) if !data.images(&challenge.data.sets)?.is_empty() => {
-            findings.extend(shapes::findings(&sent, &data, threads.number())?);
-        }
-        _ => tell(format_args!(
+    match references.filter(|references| !references.is_empty()) {
+        Some(references) => findings.extend(references.findings(&sent)?),
+        None => tell(format_args!(
             "note: the shapes were not compared with the images, because {} contains no images",
             place.display()
         )),

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use shearq_files::FileError;
 use shearq_results::submit::archive::{self, is_archive};
 use shearq_results::submit::challenge::Kind;
-use shearq_results::submit::manifest::{FileSum, MANIFEST_FILE, Manifest};
+use shearq_results::submit::manifest::{Entry, FileSum, MANIFEST_FILE, Manifest};
 
 use crate::date::moment;
 use crate::seal::sha256;
@@ -149,8 +149,8 @@ pub struct Content {
     /// SHA-256 of sets, images and checksums of the files. It depends neither on the name of the method nor on the
     /// compression.
     pub sha256: String,
-    /// Manifest, if there is one.
-    pub manifest: Option<Manifest>,
+    /// Team and challenge, if a manifest states them.
+    pub entry: Option<Entry>,
 }
 
 /// Reads the manifest of an entry, and the checksum of its content.
@@ -184,7 +184,7 @@ pub fn content(sending: &Sending) -> Result<Content, FileError> {
     sums.sort_by(|a, b| a.0.cmp(&b.0));
     Ok(Content {
         sha256: sha256(&list_of(&sums)),
-        manifest,
+        entry: manifest.and_then(|manifest| manifest.entry),
     })
 }
 

@@ -15,16 +15,16 @@ use shearq_results::row::{RunRecord, SetRecord, definition_word};
 use shearq_results::score::{Basis, OddImages, ScoredSet};
 use shearq_results::store;
 use shearq_results::submit::challenge::read_bandpowers;
-use shearq_results::submit::check::{CheckedSet, Expected, Finding, Severity, check_sent};
-use shearq_results::submit::manifest::{Contents, Manifest};
+use shearq_results::submit::check::{CheckedSet, Severity, check_sent};
+use shearq_results::submit::manifest::{Contents, Entry as Team, Manifest};
 use shearq_results::submit::packed::{Packed, Sent, Submission};
-use shearq_results::views::diagnosis::words;
 use shearq_scoring::{Choice, Convention, Fault, Grid, Options, ScoringError, SetScorer};
 use shearq_simulate::kinds::SetKind;
 use shearq_submissions::check_name;
 
 use crate::inbox::{Content, Identity, Sending, content, identify};
 use crate::seal::{Key, verify};
+use crate::shapes::References;
 use crate::terms::Challenge;
 
 /// A scored entry, as the store keeps it beside its scores.
@@ -103,6 +103,7 @@ pub struct Judge {
     /// Private record.
     pub key: Key,
     id: String,
+    public: PathBuf,
     grid: Grid,
     truths: BTreeMap<u32, Truth>,
 }
@@ -147,6 +148,7 @@ impl Judge {
             challenge,
             key,
             id,
+            public: public.to_owned(),
             grid,
             truths,
         })
@@ -190,6 +192,12 @@ impl Judge {
         let known = self.entries(store)?;
         let mut round = Round::default();
         let candidates = candidates(sendings, &known, threads, &mut round)?;
+        if candidates.is_empty() {
+            return Ok(round);
+        }
+        let public = DataFolder::open(&self.public)?;
+        let sets = &self.challenge.data.sets;
+        let references = References::measure(&public, sets, self.grid, threads)?;
         engine::ordered(
             // Large entries take most of the time, so a few of them are in work at a time.
             threads,
@@ -202,7 +210,7 @@ impl Judge {
                 Ok(())
             },
             || (),
-            |(), candidate| Ok(self.judge(candidate)),
+            |(), candidate| Ok(self.judge(candidate, &references)),
             |result| {
                 progress.advance(self.challenge.data.galaxies());
                 match result {
@@ -219,24 +227,25 @@ impl Judge {
     }
 
     /// Checks and scores one entry.
-    fn judge(&self, candidate: Candidate) -> Result<RunRecord, Refused> {
+    fn judge(&self, candidate: Candidate, references: &References) -> Result<RunRecord, Refused> {
         let Candidate {
             sending,
             reference,
             identity,
             content,
         } = candidate;
-        let team = team_of(&sending, content.manifest.as_ref());
+        let team = team_of(&sending, content.entry.as_ref());
         let refuse = |reason: String| Refused {
             path: sending.path.clone(),
             team: team.clone(),
             reason,
         };
         let scored = self
-            .score(&sending, content.manifest.as_ref())
+            .score(&sending, content.entry.as_ref(), references)
             .map_err(refuse)?;
-        let entry = content.manifest.and_then(|manifest| manifest.entry);
-        let (title, contact) = entry.map_or_else(Default::default, |e| (e.title, e.contact));
+        let (title, contact) = content
+            .entry
+            .map_or_else(Default::default, |e| (e.title, e.contact));
         let info = EntryInfo {
             challenge: self.challenge.name.clone(),
             team: team.clone(),
@@ -268,9 +277,14 @@ impl Judge {
     }
 
     /// Scores the files of an entry, or gives the reason why not.
-    fn score(&self, sending: &Sending, manifest: Option<&Manifest>) -> Result<Scored, String> {
+    fn score(
+        &self,
+        sending: &Sending,
+        entry: Option<&Team>,
+        references: &References,
+    ) -> Result<Scored, String> {
         let rules = &self.challenge.rules;
-        if let Some(entry) = manifest.and_then(|manifest| manifest.entry.as_ref())
+        if let Some(entry) = entry
             && entry.challenge != self.challenge.name
         {
             return Err(format!(
@@ -280,7 +294,6 @@ impl Judge {
         }
         let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
         let sent = Sent::open(&sending.path).map_err(plain)?;
-        let named = |error: FileError| plain(sent.named(error));
         let submission = Submission::read(&sent).map_err(plain)?;
         let contents = match (&submission.packed, &submission.manifest) {
             (Packed::Catalogues(_), _) => Contents::Catalogues,
@@ -292,56 +305,15 @@ impl Judge {
         if !rules.contents.contains(&contents) {
             return Err("the challenge accepts catalogues only, because power spectra do not have its metric".into());
         }
-        let expected = Expected {
-            grid: self.grid,
-            truth: BTreeMap::new(),
-            images: Some(self.challenge.data.images),
-            sets: self.challenge.data.sets.clone(),
-        };
-        let mut sets = Vec::new();
-        let mut failed = None;
-        let findings = check_sent(&sent, &expected, &mut |set: CheckedSet<'_>| match self
-            .score_set(&set)
-        {
-            Ok(record) => sets.extend(record),
-            Err(reason) => failed = failed.take().or(Some(reason)),
-        });
-        let errors: Vec<&Finding> = findings
-            .iter()
-            .filter(|finding| finding.severity == Severity::Error)
-            .collect();
-        if let Some(first) = errors.first() {
-            let reason = reason_of(&first.path, &first.message, sending);
-            return Err(match errors.len() - 1 {
-                0 => reason,
-                more => format!("{reason} (and {more} more)"),
-            });
-        }
-        if let Some(reason) = failed {
-            return Err(reason);
-        }
-        if let Packed::Spectra(files) = &submission.packed {
-            for (&set, path) in files {
-                let Some(truth) = self.truths.get(&set) else {
-                    continue;
-                };
-                let powers = read_bandpowers(path, &self.grid).map_err(named)?;
-                let covariance = submission
-                    .manifest
-                    .as_ref()
-                    .and_then(|manifest| manifest.covariances.get(path.file_name()?.to_str()?));
-                let score = truth
-                    .scorer
-                    .score_spectrum(&powers, covariance)
-                    .map_err(|error| error.to_string())?;
-                let images = (1..=self.challenge.data.images).collect();
-                let simulated = truth.kind.is_some();
-                let print = truth.print.clone();
-                sets.push(SetRecord::of_spectrum(
-                    set, simulated, &score, images, print,
-                ));
+        let mut sets = match &submission.packed {
+            Packed::Catalogues(_) => self.catalogues(&sent, sending, references)?,
+            Packed::Spectra(files) => {
+                self.check(&sent, sending, references, &mut |_| {})?;
+                let manifest = submission.manifest.as_ref();
+                self.spectra(files, manifest)
+                    .map_err(|error| plain(sent.named(error)))?
             }
-        }
+        };
         sets.sort_by_key(|set| set.set);
         if !rules.metric.of(&sets).0.is_finite() {
             return Err(format!(
@@ -354,6 +326,78 @@ impl Judge {
             contents,
             sets,
         })
+    }
+
+    /// Checks the files of an entry. `done` gets each set of catalogues.
+    fn check(
+        &self,
+        sent: &Sent,
+        sending: &Sending,
+        references: &References,
+        done: &mut dyn FnMut(CheckedSet<'_>),
+    ) -> Result<(), String> {
+        let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
+        let mut findings = check_sent(sent, &self.challenge.expected().map_err(plain)?, done);
+        findings.extend(references.findings(sent).map_err(plain)?);
+        findings.retain(|finding| finding.severity == Severity::Error);
+        let Some(first) = findings.first() else {
+            return Ok(());
+        };
+        let reason = reason_of(&first.path, &first.message, sending);
+        Err(match findings.len() - 1 {
+            0 => reason,
+            more => format!("{reason} (and {more} more)"),
+        })
+    }
+
+    /// Checks and scores the catalogues of an entry.
+    fn catalogues(
+        &self,
+        sent: &Sent,
+        sending: &Sending,
+        references: &References,
+    ) -> Result<Vec<SetRecord>, String> {
+        let mut sets = Vec::new();
+        let mut failed = None;
+        self.check(
+            sent,
+            sending,
+            references,
+            &mut |set: CheckedSet<'_>| match self.score_set(&set) {
+                Ok(record) => sets.extend(record),
+                Err(reason) => failed = failed.take().or(Some(reason)),
+            },
+        )?;
+        failed.map_or(Ok(sets), Err)
+    }
+
+    /// Scores the power spectra of an entry.
+    fn spectra(
+        &self,
+        files: &BTreeMap<u32, PathBuf>,
+        manifest: Option<&Manifest>,
+    ) -> Result<Vec<SetRecord>, FileError> {
+        let mut sets = Vec::new();
+        for (&set, path) in files {
+            let Some(truth) = self.truths.get(&set) else {
+                continue;
+            };
+            let powers = read_bandpowers(path, &self.grid)?;
+            let covariance =
+                manifest.and_then(|manifest| manifest.covariances.get(path.file_name()?.to_str()?));
+            let score = truth
+                .scorer
+                .score_spectrum(&powers, covariance)
+                .map_err(|error| FileError::new(path, error))?;
+            sets.push(SetRecord::of_spectrum(
+                set,
+                truth.kind.is_some(),
+                &score,
+                (1..=self.challenge.data.images).collect(),
+                truth.print.clone(),
+            ));
+        }
+        Ok(sets)
     }
 
     /// The record of a set of catalogues. `None` if the set does not belong to the challenge.
@@ -373,14 +417,19 @@ impl Judge {
             .scorer
             .diagnose(images, &score, Convention::STANDARD)
             .map_err(wrong)?;
-        let of_order = |fault: &&Fault| {
-            matches!(
-                fault,
-                Fault::Convention { .. } | Fault::Swapped { .. } | Fault::Shifted { .. }
-            )
-        };
-        if let Some(fault) = faults.iter().find(of_order) {
-            return Err(format!("set {set}: {}", words(fault)));
+        // Without numbers, because correlations with the truth are secret.
+        let wrong_order = faults.iter().find_map(|fault| match fault {
+            Fault::Convention { better, .. } => Some(format!(
+                "signs or axes are wrong (found convention {}, {}; expected 5, standard)",
+                better.number(),
+                better.describe()
+            )),
+            Fault::Swapped { .. } => Some("e1 and e2 are swapped".to_owned()),
+            Fault::Shifted { .. } => Some("the galaxies are in neighbouring cells".to_owned()),
+            _ => None,
+        });
+        if let Some(reason) = wrong_order {
+            return Err(format!("set {set}: {reason}"));
         }
         let scored = ScoredSet {
             set: Some(*set),
@@ -416,9 +465,9 @@ fn reason_of(path: &Path, message: &str, sending: &Sending) -> String {
     }
 }
 
-/// Team of an entry: its folder in the inbox, or as its manifest states, or the name of the file.
-fn team_of(sending: &Sending, manifest: Option<&Manifest>) -> String {
-    let stated = manifest.and_then(|manifest| Some(manifest.entry.as_ref()?.team.clone()));
+/// Team of an entry: its folder in the inbox, or as its manifest states (`entry`), or the name of the file.
+fn team_of(sending: &Sending, entry: Option<&Team>) -> String {
+    let stated = entry.map(|entry| entry.team.clone());
     let file = || {
         let name = sending.path.file_name().unwrap_or_default();
         let name = name.to_string_lossy();
@@ -494,10 +543,8 @@ fn candidates(
     let mut archives: BTreeMap<String, PathBuf> = BTreeMap::new();
     let mut candidates = Vec::new();
     for (sending, reference, identity, content) in identified {
-        let manifest = content
-            .as_ref()
-            .and_then(|content| content.manifest.as_ref());
-        let team = team_of(&sending, manifest);
+        let entry = content.as_ref().and_then(|content| content.entry.as_ref());
+        let team = team_of(&sending, entry);
         let path = sending.path.clone();
         let refuse = |reason| round.refused.push(Refused { path, team, reason });
         if let Some(first) = archives.get(&identity.sha256) {

@@ -166,9 +166,7 @@ pub static GREAT10: Kind = Kind {
     ],
     rules: &[
         "An entry covers all images of all sets.",
-        "An entry contains one ellipticity catalogue per image, or one power spectrum per set.",
         "All images of a set have one shear field, so methods may average over them.",
-        "The metric is Q, averaged over the sets.",
     ],
 };
 

@@ -7,6 +7,7 @@ use shearq_render::figure::{Figure, FigureError, LinePlot, PictureFormat, Series
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::page::PageError;
 use shearq_render::table::{Cell, Heading, Table, TableFormat};
+use shearq_results::submit::manifest::Contents;
 use shearq_results::views::comparison::q_heat_map;
 use shearq_results::views::metrics::metric_cell;
 
@@ -17,10 +18,10 @@ use crate::ranking::{Leaderboard, Standing};
 use crate::seal::Expected;
 use crate::terms::Challenge;
 
-/// Most teams in the plot of entries; the palette has eight colours, and the expected Q needs one.
-const PLOTTED: usize = 7;
-/// Colour of the expected Q.
-const EXPECTED_COLOUR: usize = 7;
+/// Most teams in the plot of entries; the palette has eight colours, and the expected Q needs two.
+const PLOTTED: usize = 6;
+/// Colours of the expected Q of catalogues and spectra.
+const EXPECTED_COLOURS: [usize; 2] = [6, 7];
 
 /// How much of the scores is published.
 #[derive(Debug, Clone, Copy)]
@@ -46,15 +47,23 @@ pub struct View<'a> {
     pub disclosure: Disclosure,
 }
 
-/// Name of the column of a metric.
-fn key(metric: RankBy) -> &'static str {
+/// Names of the columns of a metric and its error.
+fn key(metric: RankBy) -> (&'static str, &'static str) {
     match metric {
-        RankBy::Q => "q",
-        RankBy::QCorrected => "q_corrected",
-        RankBy::QCalibrated => "q_calibrated",
-        RankBy::M => "m",
-        RankBy::C => "c",
-        RankBy::Noise => "noise",
+        RankBy::Q => ("q", "q_error"),
+        RankBy::QCorrected => ("q_corrected", "q_corrected_error"),
+        RankBy::QCalibrated => ("q_calibrated", "q_calibrated_error"),
+        RankBy::M => ("m", "m_error"),
+        RankBy::C => ("c", "c_error"),
+        RankBy::Noise => ("noise", "noise_error"),
+    }
+}
+
+/// Kind of the files of an entry, in one word.
+fn files(contents: Contents) -> &'static str {
+    match contents {
+        Contents::Catalogues => "catalogues",
+        Contents::Spectra | Contents::CrossSpectra => "spectra",
     }
 }
 
@@ -106,11 +115,10 @@ impl View<'_> {
                 Cell::text(&info.team),
                 Cell::text(&info.method),
                 Cell::text(title(info)),
-                Cell::with_error(
-                    rounded(value, digits),
-                    Some(rounded_up(error, digits)),
-                    digits,
-                ),
+                Cell::text(files(info.contents)),
+                // One cell would give the error two digits, and the value as many decimals.
+                Cell::number(rounded(value, digits), digits),
+                Cell::number(rounded_up(error, digits), digits),
                 Cell::text(day(info)),
                 Cell::number(standing.entries.len() as f64, 0),
             ]
@@ -125,7 +133,9 @@ impl View<'_> {
                 Heading::new("team", "team"),
                 Heading::new("method", "method"),
                 Heading::new("title", "title"),
-                Heading::new(key(metric), metric.label()),
+                Heading::new("files", "files"),
+                Heading::new(key(metric).0, metric.label()),
+                Heading::new(key(metric).1, "± error"),
                 Heading::new("received", "received"),
                 Heading::new("entries", "entries"),
             ],
@@ -207,12 +217,16 @@ impl View<'_> {
         let last = most.unwrap_or(1) as f64;
         let mut series = Vec::new();
         if let Some(expected) = self.expected_of_metric() {
-            for (label, value) in [
-                ("expected, catalogues", expected.catalogues),
-                ("expected, spectra", expected.spectra),
+            for (label, value, colour) in [
+                (
+                    "expected, catalogues",
+                    expected.catalogues,
+                    EXPECTED_COLOURS[0],
+                ),
+                ("expected, spectra", expected.spectra, EXPECTED_COLOURS[1]),
             ] {
                 let (x, y) = (vec![0.5, last + 0.5], vec![rounded(value, 0); 2]);
-                series.push(Series::new(label, x, y, Style::Dashed, EXPECTED_COLOUR));
+                series.push(Series::new(label, x, y, Style::Dashed, colour));
             }
         }
         for (colour, standing) in plotted.iter().enumerate() {

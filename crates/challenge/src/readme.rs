@@ -62,7 +62,7 @@ pub(crate) fn text(challenge: &Challenge) -> String {
         text.push_str(&format!("* {rule}\n"));
     }
     text.push_str(&format!(
-        "* Entries are ranked by {}. {}\n",
+        "* Entries are ranked by {}, averaged over the sets. {}\n",
         rules.metric.label(),
         rules.metric.meaning()
     ));

@@ -1,17 +1,18 @@
 //! Compares an entry with the public images: a reference measurement of one image per set finds swapped and flipped
 //! components without the true shear.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use shearq_files::FileError;
 use shearq_files::atomic::Scratch;
 use shearq_files::table::{FileFormat, most_rows};
+use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::layout::{DataFolder, read_rows};
 use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::images::ImageId;
 use shearq_pipeline::measure::measure_folder;
-use shearq_pipeline::{PipelineError, grid};
 use shearq_results::score::COLUMNS;
 use shearq_results::submit::challenge::Kind;
 use shearq_results::submit::check::{Finding, Severity};
@@ -129,67 +130,93 @@ fn product(reference: &FieldSum, sent: &FieldSum, convention: Convention) -> Pro
     sums
 }
 
-/// Findings about the catalogues of an entry. The first image of each set is measured from the public folder `data`.
-///
-/// # Errors
-/// If an image cannot be measured.
-pub fn findings(
-    sent: &Sent,
-    data: &DataFolder,
-    threads: usize,
-) -> Result<Vec<Finding>, PipelineError> {
-    let files = sent
-        .files()
-        .map_err(FileError::doing(sent.path(), "cannot list the folder"))?;
-    let mut first = std::collections::BTreeMap::new();
-    for file in files {
-        if let Some(Kind::Catalogue { set, image, .. }) = Kind::of(&file) {
-            let best = first.entry(set).or_insert_with(|| (image, file.clone()));
-            if image < best.0 {
-                *best = (image, file);
+/// Reference measurements of the first image of each set.
+#[derive(Debug)]
+pub struct References {
+    grid: Grid,
+    sets: BTreeMap<u32, FieldSum>,
+}
+
+/// Number of the image that is measured.
+const IMAGE: u32 = 1;
+
+impl References {
+    /// Measures the first image of `sets` in the public folder `data`. Sets without this image are left out.
+    ///
+    /// # Errors
+    /// If an image cannot be measured.
+    pub fn measure(
+        data: &DataFolder,
+        sets: &[u32],
+        grid: Grid,
+        threads: usize,
+    ) -> Result<Self, PipelineError> {
+        let files = data.images(sets)?;
+        let has = |set: &u32| files.of_set(*set).iter().any(|(image, _)| *image == IMAGE);
+        let ids: Vec<ImageId> = sets
+            .iter()
+            .copied()
+            .filter(has)
+            .map(|set| ImageId { set, image: IMAGE })
+            .collect();
+        let mut references = References {
+            grid,
+            sets: BTreeMap::new(),
+        };
+        if ids.is_empty() {
+            return Ok(references);
+        }
+        let folder = Scratch::new()?;
+        let configuration = Registry::embedded()
+            .and_then(|registry| registry.get(REFERENCE))
+            .map_err(|error| PipelineError::Request(error.to_string()))?
+            .configuration;
+        let source = Source::folder(data, folder.path())?;
+        let run = Run::new(source, configuration, FileFormat::Parquet);
+        measure_folder(&run, data, folder.path(), &ids, threads, &mut Quiet)?;
+        for ImageId { set, image } in ids {
+            let path = run.catalogue(folder.path(), set, image);
+            references.sets.insert(set, references.read(&path)?);
+        }
+        Ok(references)
+    }
+
+    /// Whether there was no image to measure.
+    pub fn is_empty(&self) -> bool {
+        self.sets.is_empty()
+    }
+
+    /// A catalogue on the grid.
+    fn read(&self, path: &Path) -> Result<FieldSum, FileError> {
+        let rows = read_rows(path, &COLUMNS, most_rows(self.grid.cells()))?;
+        let mut sum = FieldSum::new(&self.grid);
+        sum.add_image(&self.grid, rows);
+        Ok(sum)
+    }
+
+    /// Findings about the catalogues of an entry.
+    ///
+    /// # Errors
+    /// If the files of the entry cannot be listed.
+    pub fn findings(&self, sent: &Sent) -> Result<Vec<Finding>, FileError> {
+        let files = sent
+            .files()
+            .map_err(FileError::doing(sent.path(), "cannot list the folder"))?;
+        let mut found = Vec::new();
+        for file in files {
+            let Some(Kind::Catalogue { set, image, .. }) = Kind::of(&file) else {
+                continue;
+            };
+            let Some(reference) = self.sets.get(&set).filter(|_| image == IMAGE) else {
+                continue;
+            };
+            // An unreadable file is reported by the other checks.
+            if let Ok(own) = self.read(&file) {
+                found.extend(compare(reference, &own).map(|fault| finding(fault, sent, &file)));
             }
         }
+        Ok(found)
     }
-    let there = data.images(&[])?;
-    first.retain(|set, (image, _)| there.of_set(*set).iter().any(|(own, _)| own == image));
-    let ids: Vec<ImageId> = first
-        .iter()
-        .map(|(&set, &(image, _))| ImageId { set, image })
-        .collect();
-    if ids.is_empty() {
-        return Ok(Vec::new());
-    }
-    let folder = Scratch::new()?;
-    let configuration = Registry::embedded()
-        .and_then(|registry| registry.get(REFERENCE))
-        .map_err(|error| PipelineError::Request(error.to_string()))?
-        .configuration;
-    let source = Source::folder(data, folder.path())?;
-    let run = Run::new(source, configuration, FileFormat::Parquet);
-    measure_folder(&run, data, folder.path(), &ids, threads, &mut Quiet)?;
-    let mut found = Vec::new();
-    for (&set, (image, file)) in &first {
-        let path = run.catalogue(folder.path(), set, *image);
-        let rows = read_rows(&path, &COLUMNS, shearq_files::table::MAX_ROWS)?;
-        let n = grid::side(&path, rows.len())?;
-        let stamp = rows.first().map_or(1.0, |row| 2.0 * row.x - 1.0);
-        let grid = Grid::new(
-            n,
-            shearq_quantities::units::Pixels(stamp),
-            shearq_quantities::units::Degrees(data.layout().field_degrees),
-        )
-        .map_err(|error| FileError::new(&path, error))?;
-        let mut reference = FieldSum::new(&grid);
-        reference.add_image(&grid, rows);
-        let mut own = FieldSum::new(&grid);
-        // An unreadable file is reported by the other checks.
-        let Ok(rows) = read_rows(file, &COLUMNS, most_rows(grid.cells())) else {
-            continue;
-        };
-        own.add_image(&grid, rows);
-        found.extend(compare(&reference, &own).map(|fault| finding(fault, sent, file)));
-    }
-    Ok(found)
 }
 
 /// A fault in words.

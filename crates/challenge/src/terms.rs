@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use shearq_files::{FileError, open};
 use shearq_quantities::units::{Degrees, Pixels};
+use shearq_results::submit::check::Expected;
 use shearq_results::submit::manifest::Contents;
 use shearq_scoring::Grid;
 use shearq_submissions::{check_name, checked_name};
@@ -113,6 +114,21 @@ impl Challenge {
             .check()
             .map_err(|message| FileError::new(&path, message))?;
         Ok(challenge)
+    }
+
+    /// Properties that an entry must have.
+    ///
+    /// # Errors
+    /// If the grid is out of range.
+    pub fn expected(&self) -> Result<Expected, FileError> {
+        let Data { sets, images, .. } = &self.data;
+        let grid = self.data.grid();
+        Ok(Expected {
+            grid: grid.map_err(|error| FileError::new(CHALLENGE_FILE, error))?,
+            truth: BTreeMap::new(),
+            images: Some(*images),
+            sets: sets.clone(),
+        })
     }
 
     /// Checks every value against its range.

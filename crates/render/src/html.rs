@@ -481,11 +481,17 @@ impl Column {
         (!classes.is_empty()).then(|| classes.join(" "))
     }
 
-    /// A cell; words in the first column head their row, and stay while others scroll.
+    /// A cell. The first column heads the rows, and stays while others scroll.
     fn cell(self, k: usize, cell: Option<&Cell>) -> Markup {
         let class = self.class(false);
         match cell {
+            None | Some(Cell::Empty) if k == 0 => html! { th scope="row" class=[class] {} },
             None | Some(Cell::Empty) => html! { td class=[class] {} },
+            Some(number @ Cell::Number { value, .. }) if k == 0 => html! {
+                th scope="row" class=[class] data-value=(sort_value(*value)) {
+                    (number.digits().map_or_else(String::new, |shown| shown.0.replace('-', "−")))
+                }
+            },
             Some(Cell::Text(words)) if k == 0 => {
                 let long = words.chars().count() > LONG;
                 html! { th scope="row" class=[self.class(long)] { (Words(words)) } }
