@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_pipeline::data::layout::Layout;
-use shearq_results::compare::{Paired, mean_metric};
-use shearq_results::row::SetRecord;
+use shearq_results::compare::Paired;
+use shearq_results::row::{SetRecord, mean_metric};
 use shearq_results::submit::manifest::Contents;
 use shearq_scoring::Definition;
 
