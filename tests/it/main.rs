@@ -12,6 +12,7 @@ mod bad_images;
 mod bad_settings;
 mod baselines;
 mod chain;
+mod challenge;
 mod documents;
 mod doubtful;
 mod entry_points;
