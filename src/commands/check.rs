@@ -9,11 +9,14 @@ use shearq_scoring::Grid;
 
 use crate::{Findings, count, print, tell_unread};
 use shearq_files::table::MAX_ROWS;
-use shearq_pipeline::data::layout::{DataFolder, Layout, read_truth_rows};
+use shearq_pipeline::data::layout::{DataFolder, Layout, read_rows, read_truth_rows};
 use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::grid;
 use shearq_pipeline::truth::grid_of_set;
-use shearq_results::submit::check::{Expected, Finding, Severity, check};
+use shearq_results::score::COLUMNS;
+use shearq_results::submit::challenge::Kind;
+use shearq_results::submit::check::{Expected, Finding, Severity, check, check_sent};
+use shearq_results::submit::packed::Sent;
 
 /// Check a submission before you send it.
 ///
@@ -32,7 +35,7 @@ pub(crate) struct Arguments {
     /// Data folder with the true shear.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Galaxies per side of an image [default: as in the data, or 100].
+    /// Galaxies per side of an image [default: as in the data, or as far as the positions of the first catalogue reach].
     #[arg(long, value_name = "N")]
     grid: Option<usize>,
     /// Pixels per side of a stamp [default: as in the data, or 48].
@@ -82,6 +85,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         (None, Some(data), Some(set)) => grid::stamp_of_set(data, set)? as f64,
         _ => layout.stamp as f64,
     };
+    let sent = Sent::open(path);
+    if let (None, Ok(sent)) = (side, &sent) {
+        side = reach(sent, stamp);
+    }
     let grid = Grid::new(
         side.unwrap_or(100),
         Pixels(stamp),
@@ -100,7 +107,25 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         images: *images,
         sets: Vec::new(),
     };
-    report(&check(path, &expected), path, *json)
+    let findings = match &sent {
+        Ok(sent) => check_sent(sent, &expected, &mut |_| {}),
+        // The error is one of the findings.
+        Err(_) => check(path, &expected),
+    };
+    report(&findings, path, *json)
+}
+
+/// Side of the grid that the positions of the first catalogue reach, if at least half of its cells have a galaxy.
+fn reach(sent: &Sent, stamp: f64) -> Option<usize> {
+    let files = sent.files().ok()?;
+    let first = files
+        .iter()
+        .find(|file| !matches!(Kind::of(file), Some(Kind::Spectrum { .. })))?;
+    let rows = read_rows(first, &COLUMNS, MAX_ROWS).ok()?;
+    let last = rows.iter().map(|row| row.x.max(row.y)).fold(0.0, f64::max);
+    let side = ((last - 0.5) / stamp).ceil() as usize;
+    // A wrong position must not enlarge the grid.
+    (side >= 8 && side.checked_pow(2)? <= 2 * rows.len()).then_some(side)
 }
 
 /// Prints the findings about `path`, and fails if any is an error.

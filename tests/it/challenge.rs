@@ -326,23 +326,18 @@ fn a_challenge_runs_from_its_data_to_its_leaderboard() {
     assert!(ranked.iter().all(|(_, team)| team != "ignored"));
     // Q is that of `score`, with the decimals of the leaderboard.
     let data = pilot.at("private");
-    let score = [
-        "score",
-        "--data",
-        text(&data),
-        "--packed",
-        text(&linear),
-        "--format",
-        "json",
-    ];
-    let scores: Value = serde_json::from_str(&succeed(&score)).unwrap();
+    let score = ["score", "--data", text(&data), "--packed", text(&linear)];
+    let scores = succeed(&[&score[..], &["--format", "json"]].concat());
+    let scores: Value = serde_json::from_str(&scores).unwrap();
     let rows = scores["rows"].as_array().unwrap();
-    let q = |set: &str| {
-        rows.iter().find(|row| row["set"] == set).unwrap()["q"]
-            .as_f64()
-            .unwrap()
+    let q = |set: u32| -> f64 {
+        let of_set = |row: &&Value| {
+            let own = row["set"].as_str().and_then(|own| own.parse().ok());
+            own == Some(set)
+        };
+        rows.iter().find(of_set).unwrap()["q"].as_f64().unwrap()
     };
-    let mean = 0.5 * (q("2") + q("8"));
+    let mean = 0.5 * (q(2) + q(8));
     let own = board["rows"]
         .as_array()
         .unwrap()
@@ -445,6 +440,9 @@ fn an_entry_is_checked_without_the_truth() {
         &["--team", "Linear"],
     );
     assert_eq!(pilot.check(&linear), (vec![], true));
+    // `check` without data takes the grid from the positions.
+    let plain = succeed(&["check", text(&linear)]);
+    assert!(plain.ends_with("linear.tar.gz: no findings\n"), "{plain}");
     let swapped = pilot.edited(&linear, "swapped", |_, [x, y, e1, e2]| [x, y, e2, e1]);
     assert_eq!(pilot.check(&swapped), (vec!["convention".into()], false));
     let flipped = pilot.edited(&linear, "flipped", |_, [x, y, e1, e2]| [x, y, -e1, e2]);

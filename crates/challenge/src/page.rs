@@ -328,7 +328,8 @@ impl View<'_> {
         let mut map = q_heat_map(&rows);
         map.row_label = "entry".into();
         map.decimals = map.decimals.min(self.disclosure.digits);
-        let caption = "Q of each set. Metrics of single sets tell participants more about the true shear than their mean.";
+        let caption =
+            "Q of each set. Metrics of single sets reveal more of the true shear than their mean.";
         let picture = Picture::draw(
             &map as &dyn Figure,
             PictureFormat::Svg,

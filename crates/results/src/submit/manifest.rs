@@ -8,7 +8,7 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_scoring::SpectrumCovariance;
-use shearq_submissions::{ConfigurationError, check_name, checked_name};
+use shearq_submissions::{check_name, checked_name};
 
 use crate::foreign::Foreign;
 use shearq_files::{FileError, open};
@@ -61,26 +61,6 @@ fn checked_line<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D:
     match line.is_empty() {
         true => Ok(line),
         false => check_name(&line).map(|()| line).map_err(D::Error::custom),
-    }
-}
-
-impl Entry {
-    /// Checks the names: 1 to 100 bytes without control characters; title and contact may be empty.
-    ///
-    /// # Errors
-    /// What was found and expected.
-    pub fn check(&self) -> Result<(), ConfigurationError> {
-        let Entry {
-            challenge,
-            team,
-            title,
-            contact,
-        } = self;
-        let lines = [title, contact].into_iter().filter(|line| !line.is_empty());
-        [challenge, team]
-            .into_iter()
-            .chain(lines)
-            .try_for_each(|name| check_name(name))
     }
 }
 
