@@ -15,7 +15,7 @@ pub struct FileError {
     pub path: PathBuf,
     /// Place, what was found, what was expected.
     pub message: String,
-    /// Whether all that is wrong is that a column asked for is not there.
+    /// Whether the only fault is that a requested column is absent or that the columns have no names.
     pub no_column: bool,
 }
 
@@ -59,7 +59,23 @@ impl FileError {
         }
     }
 
-    /// With a word on where the names of columns come from, if one was not found.
+    /// About `path`, a text table without names whose first row has the fields `first`: more than the columns
+    /// `expected` that a table without names has.
+    pub fn no_names(path: &Path, first: &[impl AsRef<str>], expected: &[&str]) -> Self {
+        let message = format!(
+            "{} columns have no names (found the first row `{}`, expected {}: {}). Try: add a first line with the names",
+            first.len(),
+            names_of(first),
+            expected.len(),
+            names_of(expected)
+        );
+        FileError {
+            no_column: true,
+            ..FileError::new(path, message)
+        }
+    }
+
+    /// Adds a hint on where the names of columns are specified, if the fault is about columns.
     pub fn hint_of_columns(mut self, hint: &str) -> Self {
         if self.no_column {
             self.message = format!("{}; {hint}", self.message);

@@ -10,14 +10,17 @@
 //! `FILE[TABLE]` is a table of a FITS file, by name or number.
 
 use std::borrow::Cow;
+use std::collections::HashSet;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::frames::polars::DataFrame;
-use crate::frames::{Metadata, reals};
+use crate::frames::{Metadata, frame, reals};
 
 use crate::error::FileError;
 use crate::open::{is_there, open};
+
+pub use crate::limits::MAX_ROWS;
 use crate::{fits, parquet, text};
 
 /// A column of numbers of the table of `path`; missing ones are NaN.
@@ -91,8 +94,6 @@ impl Ending {
     }
 }
 
-/// Most rows of a table that may fill the largest grid, of 4000 × 4000 cells.
-pub const MAX_ROWS: usize = 4000 * 4000;
 /// Rows that a catalogue may have beyond those of its grid.
 const SPARE_ROWS: usize = 1 << 18;
 
@@ -131,7 +132,24 @@ impl Place {
         }
     }
 
-    /// Refuses a table of a file that has but one.
+    /// The place that `FILE[TABLE]` names, or `table` of this file if it is given.
+    ///
+    /// # Errors
+    /// If both name a table.
+    pub fn with_table(path: &Path, table: Option<&str>) -> Result<Self, FileError> {
+        let mut place = Place::of(path);
+        if let Some(name) = table
+            && let Some(other) = place.table.replace(name.to_owned())
+        {
+            let message = format!(
+                "two tables are named (found `{other}` in brackets and `{name}`, expected one)"
+            );
+            return Err(FileError::new(path, message));
+        }
+        Ok(place)
+    }
+
+    /// Refuses a table of a file that has only one.
     fn check(&self) -> Result<(), FileError> {
         match (&self.table, Ending::of(&self.path)) {
             (Some(table), Ending::Text | Ending::Parquet) => {
@@ -252,28 +270,58 @@ pub fn read_from(
     }
 }
 
+/// Columns of a truth file.
+pub const TRUTH_COLUMNS: [&str; 4] = ["x", "y", "g1", "g2"];
+
 /// Reads a truth file's x, y, g1, g2, of at most `most_rows`.
 ///
 /// # Errors
-/// Where the file cannot be read, or lacks a column.
+/// If the file cannot be read, lacks a column, or cannot have one row per cell of a square grid.
 pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
-    let names = ["x", "y", "g1", "g2"];
     match Ending::of(path) {
-        Ending::Text => read_text(path, &names),
-        Ending::Parquet | Ending::Fits => read(path, Some(&names), most_rows),
+        Ending::Text => read_text(path, &TRUTH_COLUMNS),
+        Ending::Fits => read(path, Some(&TRUTH_COLUMNS), most_rows),
+        Ending::Parquet => parquet_truth(path, most_rows),
     }
 }
 
-/// Reads the columns `names`: of a text table, which has these and no others where it has no header, or of another
-/// format.
-///
-/// # Errors
-/// Where the file cannot be read, or lacks a column.
-pub fn read_columns(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
-    match Ending::of(&Place::of(path).path) {
-        Ending::Text => read_text(path, names),
-        Ending::Parquet | Ending::Fits => read(path, Some(names), MAX_ROWS),
+/// A truth file in Parquet. A small file may repeat one row millions of times, so that the positions are checked before
+/// the shears are decoded.
+fn parquet_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
+    let [x, y, shears @ ..] = TRUTH_COLUMNS;
+    let mut columns = Vec::with_capacity(TRUTH_COLUMNS.len());
+    for position in [x, y] {
+        let table = parquet::read(path, Some(&[position]), most_rows)?;
+        check_positions(path, position, &numbers(&table, position, path)?)?;
+        columns.extend_from_slice(table.columns());
     }
+    let table = parquet::read(path, Some(&shears), most_rows)?;
+    columns.extend_from_slice(table.columns());
+    frame(columns).map_err(|error| FileError::new(path, error))
+}
+
+/// Checks that positions along one axis can be those of a square grid: n × n rows have n different values or more.
+fn check_positions(path: &Path, name: &str, values: &[f64]) -> Result<(), FileError> {
+    let side = values.len().isqrt();
+    let mut different = HashSet::new();
+    let mut last = None;
+    for value in values.iter().map(|value| value.to_bits()) {
+        if different.len() >= side {
+            return Ok(());
+        }
+        if last.replace(value) != Some(value) {
+            different.insert(value);
+        }
+    }
+    if different.len() >= side {
+        return Ok(());
+    }
+    let message = format!(
+        "column `{name}` has {} different values in {} rows; expected {side} or more, for one row per cell of a square grid",
+        different.len(),
+        values.len()
+    );
+    Err(FileError::new(path, message))
 }
 
 /// Reads an ASCII or CSV table whose columns, where it has no header, are `names`.

@@ -51,7 +51,8 @@ pub(super) struct Request<'a> {
 /// The first line that is neither empty nor a `#` comment names the columns if its first field that is
 /// not empty is not a number; otherwise the numbered comments of SExtractor do; otherwise a comment that
 /// holds all the names wanted does; otherwise the columns have numbers, from 1, if those are wanted;
-/// otherwise they are the default ones, and further ones are left alone. Fields are separated by the first of
+/// otherwise they are the default ones. A table that has more columns than these is refused: which ones are meant is
+/// not known. Fields are separated by the first of
 /// `;`, `,` and tabs that the first row has, as often as the header does, and by blanks if it has none.
 /// An empty field is NaN. A file without a row is a table without rows.
 pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, FileError> {
@@ -59,8 +60,8 @@ pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, File
     let size = std::fs::metadata(path).map_or(0, |about| about.len()) as usize;
     let head = Head::read(&mut input, path)?;
     let separator = Separator::of(head.header.as_deref(), head.first.as_deref());
-    let (names, named) = head.names(separator, request);
-    let mut rows = Rows::new(path, request, &names, named)?;
+    let names = head.names(path, separator, request)?;
+    let mut rows = Rows::new(path, request, &names)?;
     rows.most = rows.most.min(FREE_ROWS.max(size));
     input.read_rows(head, separator, &mut rows)?;
     rows.table()
@@ -463,8 +464,16 @@ impl Head {
         Some(names)
     }
 
-    /// Names of the columns, and whether the file gives them.
-    fn names(&self, separator: Separator, request: &Request<'_>) -> (Vec<String>, bool) {
+    /// Names of the columns: those that the file gives, numbers, or the default ones.
+    ///
+    /// # Errors
+    /// If the file gives no names and has more columns than there are default names.
+    fn names(
+        &self,
+        path: &Path,
+        separator: Separator,
+        request: &Request<'_>,
+    ) -> Result<Vec<String>, FileError> {
         let fields = self.fields(separator);
         let fits = |names: &Vec<String>| match request.wanted {
             Some(wanted) => wanted.iter().all(|w| names.iter().any(|n| n == w)),
@@ -474,10 +483,10 @@ impl Head {
             // Names need not be separated like numbers.
             let (names, others) = (separator.split(header), split_names(header));
             let other = !fits(&names) && fits(&others);
-            return (if other { others } else { names }, true);
+            return Ok(if other { others } else { names });
         }
         if let Some(names) = self.sextractor_names(&fields) {
-            return (names, true);
+            return Ok(names);
         }
         let numbers: Vec<String> = (1..=fields.len()).map(|k| k.to_string()).collect();
         let number = |name: &&str| name.parse::<usize>().is_ok();
@@ -485,14 +494,17 @@ impl Head {
             .wanted
             .is_some_and(|wanted| wanted.iter().all(number))
         {
-            return (numbers, false);
+            return Ok(numbers);
         }
         // The last comment that can be a header is one.
         let comments = self.comments.iter().rev();
-        match comments.map(|line| split_names(line)).find(fits) {
-            Some(names) => (names, true),
-            None => (owned(request.default_names), false),
+        if let Some(names) = comments.map(|line| split_names(line)).find(fits) {
+            return Ok(names);
         }
+        if fields.len() > request.default_names.len() {
+            return Err(FileError::no_names(path, &fields, request.default_names));
+        }
+        Ok(owned(request.default_names))
     }
 }
 
@@ -520,8 +532,6 @@ fn owned(names: &[&str]) -> Vec<String> {
 struct Rows<'a> {
     path: &'a Path,
     names: &'a [String],
-    /// Whether the file names its columns, so that every row has a field for each.
-    named: bool,
     /// Whether what is not a number is an error.
     strict: bool,
     most: usize,
@@ -533,12 +543,7 @@ struct Rows<'a> {
 }
 
 impl<'a> Rows<'a> {
-    fn new(
-        path: &'a Path,
-        request: &Request<'_>,
-        names: &'a [String],
-        named: bool,
-    ) -> Result<Self, FileError> {
+    fn new(path: &'a Path, request: &Request<'_>, names: &'a [String]) -> Result<Self, FileError> {
         let place = |name: &&str| {
             let place = names.iter().position(|own| own == name);
             place.ok_or_else(|| FileError::no_column(path, name, names))
@@ -557,7 +562,6 @@ impl<'a> Rows<'a> {
         Ok(Rows {
             path,
             names,
-            named,
             strict: request.wanted.is_some(),
             most: request.most_rows,
             slots: (0..names.len()).map(slot).collect(),
@@ -590,9 +594,8 @@ impl<'a> Rows<'a> {
             };
             self.columns[slot].push(value);
         }
-        // Without a header, the columns after the known ones are nobody's.
         let expected = self.names.len();
-        if count == expected || !self.named && count > expected {
+        if count == expected {
             return Ok(());
         }
         let names = names_of(self.names);
@@ -684,12 +687,32 @@ mod tests {
             columns("\u{feff}x,y,e1,e2\n1,2,3,4\n5,6,-7e-3,8\n"),
             expected
         );
-        assert_eq!(columns("1 2 3 4 0\n5 6 -7e-3 8 0\n"), expected);
         for blank in ["", "# no galaxies\n", "x,y,e1,e2\n"] {
             assert_eq!(columns(blank), (vec![], vec![]), "{blank:?}");
         }
         assert_eq!(table("x,y,e1,e2\n", None).unwrap().height(), 0);
         assert!(table("x,y,e1,e2\n1,2,NaN,nan\n", None).is_ok());
+    }
+
+    #[test]
+    fn columns_without_names_are_as_many_as_expected_or_numbered() {
+        let names: Option<&[&str]> = Some(&["x", "y", "e1", "e2"]);
+        for text in ["7 1 2 3 4\n8 5 6 7 8\n", "# by me\n7,1,2,3,4\n8,5,6,7,8\n"] {
+            let error = table(text, names).unwrap_err();
+            assert!(
+                error.contains(
+                    "5 columns have no names (found the first row `7, 1, 2, 3, 4`, expected 4: x, y, e1, e2). Try: add a first line with the names"
+                ),
+                "{error}"
+            );
+            assert!(table(text, None).is_err());
+            let numbered = table(text, Some(&["2", "5"])).unwrap();
+            assert_eq!(column(&numbered, "2"), [1.0, 5.0]);
+            assert_eq!(column(&numbered, "5"), [4.0, 8.0]);
+        }
+        // Later rows have as many columns as the first.
+        let error = table("1 2 3 4\n5 6 7 8 9\n", names).unwrap_err();
+        assert!(error.contains("line 2: 5 fields; expected 4"), "{error}");
     }
 
     #[test]

@@ -1,15 +1,15 @@
-//! An open FITS file: cfitsio's own functions, after what they would believe was checked.
+//! An open FITS file. Values that cfitsio does not check are checked before its functions are called.
 
-use std::ffi::{CStr, CString, c_char, c_int};
+use std::ffi::{CStr, CString, c_int};
 use std::path::Path;
 use std::ptr;
 
 use fitsio::sys;
 
 use super::cards::Cards;
-use super::lock;
+use super::cfitsio::{describe, lock};
 use super::source::Source;
-use super::tiles::Tiling;
+use super::tiling::Tiling;
 use crate::error::FileError;
 
 // Numbers of cfitsio's interface, from its fitsio.h.
@@ -20,7 +20,7 @@ const VALUE_UNDEFINED: c_int = 204;
 /// Bytes of a block of a file.
 const BLOCK: u64 = 2880;
 
-/// One of cfitsio's functions that read values of a column, of bytes or of words.
+/// A function of cfitsio that reads values of a column of bytes or of 16-bit integers.
 type ReadColumn<T> = unsafe extern "C" fn(
     *mut sys::fitsfile,
     c_int,
@@ -39,9 +39,9 @@ pub struct File {
     source: Source,
     /// Bytes of the file when cfitsio opened it.
     seen: u64,
-    /// Number of the header that it is at, from 1.
+    /// Number of the current header, from 1.
     place: c_int,
-    /// How the image there is compressed, if it is.
+    /// How the current image is compressed; `None` for an uncompressed one.
     tiling: Option<Tiling>,
     what: &'static str,
 }
@@ -63,7 +63,7 @@ impl File {
         Ok(file)
     }
 
-    /// Lets cfitsio open the file, again where it has grown, and goes to where it was.
+    /// Opens the file in cfitsio, again if it has grown, and goes to the current header.
     fn reopen(&mut self) -> Result<(), FileError> {
         let name = self.source.name()?;
         self.seen = self.source.size(0)?;
@@ -85,17 +85,17 @@ impl File {
         Err(FileError::new(self.source.path(), message))
     }
 
-    /// Closes the file where it is open, under a lock that the caller holds.
+    /// Closes the file if it is open. The caller has the lock.
     fn close(&mut self) {
         if !self.raw.is_null() {
             let mut status = 0;
-            // SAFETY: the file is open and, the pointer being null from here on, not used again.
+            // SAFETY: the file is open. The pointer becomes null, so that it is not used again.
             unsafe { sys::ffclos(self.raw, &mut status) };
             self.raw = ptr::null_mut();
         }
     }
 
-    /// Runs a cfitsio call; its error is worded as `doing`.
+    /// Calls cfitsio. An error message starts with `doing`.
     pub fn call(
         &self,
         doing: impl FnOnce() -> String,
@@ -103,7 +103,7 @@ impl File {
     ) -> Result<(), FileError> {
         let mut status = 0;
         let _guard = lock();
-        // SAFETY: it empties the stack of messages, of those of earlier calls.
+        // SAFETY: this removes the messages of earlier calls from the stack.
         unsafe { sys::ffcmsg() };
         call(self.raw, &mut status);
         if status == 0 {
@@ -117,10 +117,10 @@ impl File {
         FileError::new(self.source.path(), message)
     }
 
-    /// Goes to the next header, and says whether there is one.
+    /// Goes to the next header. Returns whether there is one.
     ///
     /// # Errors
-    /// Where it is damaged.
+    /// If the header is damaged.
     pub fn next(&mut self) -> Result<bool, FileError> {
         let start = self.extent()?[1];
         let Some(cards) = Cards::read(&mut self.source, start)? else {
@@ -394,30 +394,4 @@ impl Drop for File {
         let _guard = lock();
         self.close();
     }
-}
-
-/// The text of a buffer that cfitsio filled.
-pub fn plain(buffer: &[c_char]) -> String {
-    let bytes: Vec<u8> = buffer
-        .iter()
-        .take_while(|c| **c != 0)
-        .map(|c| c.to_ne_bytes()[0])
-        .collect();
-    String::from_utf8_lossy(&bytes).trim().to_owned()
-}
-
-/// cfitsio's words for a status with the messages on its stack, the first and closest to the cause
-/// first, which are taken from it.
-pub fn describe(status: c_int) -> String {
-    // FLEN_STATUS is 31, FLEN_ERRMSG 81.
-    let mut text = [0 as c_char; 81];
-    // SAFETY: the buffer has room for cfitsio's longest text.
-    unsafe { sys::ffgerr(status, text.as_mut_ptr()) };
-    let mut words = format!("cfitsio error {status}: {}", plain(&text));
-    // SAFETY: as above.
-    while unsafe { sys::ffgmsg(text.as_mut_ptr()) } != 0 {
-        let message = plain(&text).replace(char::is_control, " ");
-        words.push_str(&format!("; {message}"));
-    }
-    words
 }

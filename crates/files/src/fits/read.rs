@@ -1,4 +1,4 @@
-//! Reading, by cfitsio's own functions: what a header says is checked before it is believed.
+//! Reading images and tables with cfitsio. The values of a header are checked before they are used.
 
 use std::collections::BTreeMap;
 use std::ffi::{c_char, c_int};
@@ -11,11 +11,8 @@ use super::file::File;
 use super::tiles::Tiles;
 use crate::error::{FileError, names_of};
 use crate::frames::polars::{Column, DataFrame};
+use crate::limits::{MAX_ROWS, MAX_SIDE};
 
-/// Largest image side accepted, against absurd sizes in damaged headers.
-pub const MAX_SIDE: usize = 200_000;
-/// Most rows of a table accepted, and most planes of a cube: one for each galaxy of the largest grid.
-pub(super) const MAX_ROWS: usize = crate::table::MAX_ROWS;
 /// Most numbers read from a table that has fewer bytes than that on disk.
 const FREE_NUMBERS: u64 = 1 << 22;
 
@@ -126,7 +123,7 @@ impl ImageReader {
             (sides, _) => {
                 let or_cube = match dimensions {
                     Dimensions::Two => "",
-                    Dimensions::TwoOrThree => ", or 3 of a cube",
+                    Dimensions::TwoOrThree => ", or 3 for a cube",
                 };
                 return Err(file.fault(format!(
                     "the {place} image has {} dimensions; expected 2{or_cube}",

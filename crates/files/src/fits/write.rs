@@ -15,7 +15,7 @@ use fitsio::images::{ImageDescription, ImageType};
 use fitsio::sys;
 use fitsio::tables::{ColumnDataType, ColumnDescription};
 
-use super::{lock, plain_name};
+use super::cfitsio::{self, lock};
 use crate::atomic::{self, PartFile};
 use crate::error::FileError;
 
@@ -144,12 +144,7 @@ impl ImageWriter {
 
 /// Tells that the file `path` cannot be made.
 fn cannot(path: &Path) -> impl Fn(fitsio::errors::Error) -> FileError {
-    move |error| {
-        FileError::new(
-            path,
-            format!("cannot write the file: {}", super::describe(error)),
-        )
-    }
+    move |error| FileError::new(path, format!("cannot write the file: {}", describe(error)))
 }
 
 /// The blocks of the header of an image of `sides` = [columns, rows] 32-bit floats.
@@ -316,4 +311,33 @@ fn table_bytes(table: &DataFrame, header: &[(&str, Value)]) -> fitsio::errors::R
     data.resize(data.len().next_multiple_of(BLOCK), 0);
     bytes.extend(data);
     Ok(bytes)
+}
+
+/// Refuses names that cfitsio does not treat as plain: those with `[...]`, `(...)`, a leading `!` or `-`, or a trailing `+n`.
+fn plain_name(path: &Path) -> Result<(), FileError> {
+    let Some(name) = path.to_str() else {
+        return Err(FileError::new(path, "FITS file names must be UTF-8"));
+    };
+    let plus = name
+        .rsplit_once('+')
+        .is_some_and(|(_, end)| !end.is_empty() && end.bytes().all(|b| b.is_ascii_digit()));
+    if name.contains(['[', ']', '(', ')'])
+        || name.starts_with(['!', '-'])
+        || name.contains("://")
+        || plus
+    {
+        return Err(FileError::new(
+            path,
+            "FITS file names must not contain brackets or `://`, start with `!` or `-`, or end in `+` and a number",
+        ));
+    }
+    Ok(())
+}
+
+/// The text of an error of the crate `fitsio`.
+fn describe(error: fitsio::errors::Error) -> String {
+    match error {
+        fitsio::errors::Error::Fits(e) => cfitsio::describe(e.status),
+        other => other.to_string(),
+    }
 }

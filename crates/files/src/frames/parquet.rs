@@ -316,7 +316,8 @@ impl<'a> Source<'a> {
                 }
             };
         }
-        with_missing(path, column)
+        // In one piece, so that readers borrow the values instead of copying them.
+        with_missing(path, column.rechunk())
     }
 
     /// The bytes from `start`, as many as `size`, after checking that the file has them.
