@@ -7,13 +7,13 @@ use thiserror::Error;
 
 use crate::renamed;
 
-/// A file that cannot be used: which, where in it, what was found and what was expected.
+/// A file that cannot be used: its path, the place, the found and the expected value.
 #[derive(Debug, Error)]
 #[error("{}: {message}", path.display())]
 pub struct FileError {
     /// The file.
     pub path: PathBuf,
-    /// Place, what was found, what was expected.
+    /// Place, found value, expected value.
     pub message: String,
     /// Whether the only fault is that a requested column is absent or that the columns have no names.
     pub no_column: bool,
@@ -22,7 +22,7 @@ pub struct FileError {
 /// Most names of columns that a message lists.
 const SHOWN: usize = 40;
 
-/// Most characters of a message, which may quote what a file holds.
+/// Most characters of a message, which may quote contents of a file.
 const LONGEST: usize = 4000;
 
 /// Names of columns as a message lists them.

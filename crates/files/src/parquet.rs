@@ -1,4 +1,4 @@
-//! Parquet tables, by way of the crate that guards their reading.
+//! Parquet tables of numbers.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use crate::frames::{self as tables, Metadata};
 use crate::atomic;
 use crate::error::FileError;
 
-/// Reads columns of numbers, at most `most_rows` of each: those of `wanted`, or all there are.
+/// Reads columns of numbers, at most `most_rows` rows: the columns `wanted`, or all.
 pub(super) fn read(
     path: &Path,
     wanted: Option<&[&str]>,

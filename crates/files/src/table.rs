@@ -26,7 +26,7 @@ use crate::{fits, parquet, text};
 /// A column of numbers of the table of `path`; missing ones are NaN.
 ///
 /// # Errors
-/// Where it is not there.
+/// If it is absent.
 pub fn numbers<'t>(
     table: &'t DataFrame,
     name: &str,
@@ -62,7 +62,7 @@ impl FileFormat {
     }
 }
 
-/// What a file is by its ending.
+/// Format of a file by its ending.
 enum Ending {
     Parquet,
     Fits,
@@ -82,8 +82,8 @@ impl Ending {
         }
     }
 
-    /// What a file is by its first bytes: SExtractor writes FITS into `.cat` and `.ldac`. One that cannot be opened is
-    /// reported when it is read.
+    /// Format of a file by its first bytes: SExtractor writes FITS into `.cat` and `.ldac`. A file that cannot be opened
+    /// is reported when it is read.
     fn of_content(path: &Path) -> Self {
         let mut start = [0; 9];
         let read = open(path).and_then(|mut file| file.read_exact(&mut start));
@@ -94,7 +94,7 @@ impl Ending {
     }
 }
 
-/// Rows that a catalogue may have beyond those of its grid.
+/// Rows that a catalogue may have in addition to the cells of its grid.
 const SPARE_ROWS: usize = 1 << 18;
 
 /// Most rows that a catalogue of galaxies on a grid of `cells` may have: more than are scored, so that it can be
@@ -163,9 +163,9 @@ impl Place {
     }
 }
 
-/// What a table contains of its columns, before any is chosen.
+/// Names and fields of a table, before columns are chosen.
 pub struct Columns {
-    /// Lists of names, of which one has to be chosen: a header, comments that may be one, or tables of a FITS file.
+    /// Lists of names, one to be chosen: a header, comments that may be one, or the tables of a FITS file.
     pub named: Vec<Named>,
     /// Fields of the first row of a text table that has no header.
     pub unnamed: Vec<String>,
@@ -230,7 +230,7 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
 /// table of text or in Parquet has at most `most_rows`. Columns of a text table without names have numbers, from 1.
 ///
 /// # Errors
-/// Where the file cannot be read, or lacks a column.
+/// If the file cannot be read, or lacks a column.
 pub fn read(
     path: &Path,
     wanted: Option<&[&str]>,
@@ -300,7 +300,7 @@ fn parquet_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> 
     frame(columns).map_err(|error| FileError::new(path, error))
 }
 
-/// Checks that positions along one axis can be those of a square grid: n × n rows have n different values or more.
+/// Checks that positions along one axis can belong to a square grid: n × n rows have n different values or more.
 fn check_positions(path: &Path, name: &str, values: &[f64]) -> Result<(), FileError> {
     let side = values.len().isqrt();
     let mut different = HashSet::new();
@@ -324,10 +324,10 @@ fn check_positions(path: &Path, name: &str, values: &[f64]) -> Result<(), FileEr
     Err(FileError::new(path, message))
 }
 
-/// Reads an ASCII or CSV table whose columns, where it has no header, are `names`.
+/// Reads an ASCII or CSV table. `names` are the columns of a table without a header.
 ///
 /// # Errors
-/// Where the file cannot be read.
+/// If the file cannot be read.
 pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
     let request = text::Request {
         wanted: Some(names),
@@ -359,8 +359,8 @@ pub fn stated(path: &Path, key: &str) -> Result<Option<String>, FileError> {
     Ok(found.remove(key).map(|value| value.trim().to_owned()))
 }
 
-/// What is left of `metadata` in a table written as `format`: all in Parquet; in FITS what fits into a
-/// header, which is keys of at most eight characters with values of at most 68.
+/// The part of `metadata` that a table in this `format` can contain: everything in Parquet; in FITS keys of at most eight
+/// characters with values of at most 68.
 pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
     let fits = |key: &str, value: &str| key.len() <= 8 && value.len() <= 68;
     metadata
@@ -373,7 +373,7 @@ pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
 /// The values of `keys` that a table written by [`write`] carries, those that it has.
 ///
 /// # Errors
-/// Where the file cannot be read.
+/// If the file cannot be read.
 pub fn read_metadata<'a>(
     path: &Path,
     format: FileFormat,
@@ -388,11 +388,10 @@ pub fn read_metadata<'a>(
     }
 }
 
-/// Writes `table` as `format`, with the key–value pairs that say what made it, as far as
-/// they are [`kept`].
+/// Writes `table` in this `format`, with the part of `metadata` that is [`kept`].
 ///
 /// # Errors
-/// Where the file cannot be written.
+/// If the file cannot be written.
 pub fn write(
     path: &Path,
     format: FileFormat,

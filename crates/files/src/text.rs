@@ -25,10 +25,10 @@ const FREE_ROWS: usize = 1 << 20;
 const BUFFER: usize = 1 << 15;
 /// Most characters of a damaged field that a message shows.
 const SHOWN: usize = 40;
-/// What gzip-compressed files start with.
+/// First bytes of gzip-compressed files.
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 
-/// What a cell of CSV starts with so that a spreadsheet does not take `text` for a formula.
+/// Start of a cell of CSV that keeps a spreadsheet from interpreting `text` as a formula.
 pub fn formula_mark(text: &str) -> &'static str {
     match text.starts_with(['=', '+', '-', '@', '\t', '\r']) {
         true => "'",
@@ -36,7 +36,7 @@ pub fn formula_mark(text: &str) -> &'static str {
     }
 }
 
-/// What is wanted of a table.
+/// The requested part of a table.
 pub(super) struct Request<'a> {
     /// Columns to read; all, with NaN for what is not a number, if `None`.
     pub(super) wanted: Option<&'a [&'a str]>,
@@ -48,13 +48,16 @@ pub(super) struct Request<'a> {
 
 /// Reads columns.
 ///
-/// The first line that is neither empty nor a `#` comment names the columns if its first field that is
-/// not empty is not a number; otherwise the numbered comments of SExtractor do; otherwise a comment that
-/// holds all the names wanted does; otherwise the columns have numbers, from 1, if those are wanted;
-/// otherwise they are the default ones. A table that has more columns than these is refused: which ones are meant is
-/// not known. Fields are separated by the first of
-/// `;`, `,` and tabs that the first row has, as often as the header does, and by blanks if it has none.
-/// An empty field is NaN. A file without a row is a table without rows.
+/// The names of the columns are the first of these that the file has:
+///
+/// 1. the first line that is neither empty nor a `#` comment, if its first field that is not empty is not a number;
+/// 2. the numbered comments of SExtractor;
+/// 3. numbers from 1, if numbers are wanted;
+/// 4. a comment that contains all wanted names;
+/// 5. the default names. A table with more columns than these is refused, because their meaning is not known.
+///
+/// The separator is the first of `;`, `,` and tab that the first row contains as often as the header. Without one it is
+/// blanks. An empty field is NaN. A file without a row is a table without rows.
 pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, FileError> {
     let mut input = Input::open(path)?;
     let size = std::fs::metadata(path).map_or(0, |about| about.len()) as usize;
@@ -67,7 +70,7 @@ pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, File
     rows.table()
 }
 
-/// What a text table contains of its columns, before any is chosen.
+/// Names and fields of a text table, before columns are chosen.
 pub(super) struct Columns {
     /// Names, if a header or the comments of SExtractor give them.
     pub(super) names: Option<Vec<String>>,
@@ -160,7 +163,7 @@ impl Input {
         })
     }
 
-    /// Reads all rows: the first one, which `head` has, and what follows.
+    /// Reads all rows. The first one is in `head`.
     fn read_rows(
         self,
         head: Head,
@@ -191,8 +194,8 @@ fn read_delimited(
     before: u64,
     rows: &mut Rows<'_>,
 ) -> Result<(), FileError> {
-    // The reader stands behind the line feed of a row, but before it where a carriage return ends the row.
-    // So that this holds for the last row, too, a line end is added.
+    // After a row the reader is behind its line feed, but before it if a carriage return ends the row. A line end is
+    // added so that the last row does not differ.
     let (end, after): (&[u8], u64) = if crlf { (b"\r\n", 0) } else { (b"\n", 1) };
     let mut reader = delimited(delimiter).from_reader(text.chain(end));
     let mut record = StringRecord::new();
@@ -266,7 +269,7 @@ fn read_blanks(
     }
 }
 
-/// Formats that are no text tables although they are text: what their first line starts with, and how to convert them.
+/// Text formats that are no text tables: the start of their first line, and their name.
 const OTHER_FORMATS: [(&str, &str); 2] = [
     ("<?xml", "XML, such as a VOTable"),
     ("<VOTABLE", "a VOTable"),
@@ -322,7 +325,7 @@ fn delimited(delimiter: u8) -> ReaderBuilder {
     builder
 }
 
-/// What stands between the fields of a row.
+/// Separator of the fields of a row.
 #[derive(Clone, Copy)]
 enum Separator {
     /// One byte.
@@ -332,7 +335,8 @@ enum Separator {
 }
 
 impl Separator {
-    /// That of a table with these lines: one that splits both alike, or else any that splits the row.
+    /// The separator of a table with these lines: one that divides both into as many fields, or else any that divides the
+    /// row.
     fn of(header: Option<&str>, row: Option<&str>) -> Self {
         let Some(row) = row.or(header) else {
             return Separator::Blanks;
@@ -447,7 +451,7 @@ impl Head {
             };
             let letters = |c: char| c.is_ascii_alphanumeric() || c == '_';
             let identifier = name.starts_with(|c: char| c.is_ascii_alphabetic());
-            // Numbers go up from 1, to that of a column that there is.
+            // Numbers increase from 1 to at most the number of columns.
             let next = number > names.len() && (number == 1) == names.is_empty();
             if !next || number > fields.len().max(1) || !identifier || !name.chars().all(letters) {
                 return None;
@@ -532,7 +536,7 @@ fn owned(names: &[&str]) -> Vec<String> {
 struct Rows<'a> {
     path: &'a Path,
     names: &'a [String],
-    /// Whether what is not a number is an error.
+    /// Whether a field that is no number is an error.
     strict: bool,
     most: usize,
     /// Of the columns read, by place in the row.

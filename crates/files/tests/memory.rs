@@ -72,7 +72,6 @@ fn small_files_do_not_claim_memory() {
     assert!(size < 4 << 20, "{size} bytes");
     let (used, error) = peak(|| read_truth(&path, MAX_ROWS).err().map(|e| e.to_string()));
     // One column is 128 MB, and it is copied once if the file has several row groups. Four columns are 512 MB.
-    eprintln!("{size} {used}");
     assert!(used < 320 << 20, "{used} bytes");
     let error = error.expect("one position");
     assert!(

@@ -133,7 +133,7 @@ impl File {
         } else {
             self.call(
                 || format!("cannot read header {} of the file", self.place),
-                // SAFETY: the file is open, and the type of what is there is not asked for.
+                // SAFETY: the file is open, and the type of the header is not requested.
                 |raw, status| unsafe {
                     sys::ffmahd(raw, self.place, ptr::null_mut(), status);
                 },
@@ -142,7 +142,7 @@ impl File {
         Ok(true)
     }
 
-    /// Goes to the header of an extension, from 1, that was reached before.
+    /// Goes to the header of an extension that was reached before; the first is 1.
     ///
     /// # Errors
     /// If it cannot be read.
@@ -151,14 +151,14 @@ impl File {
         self.tiling = None;
         self.call(
             || format!("cannot read header {} of the file", self.place),
-            // SAFETY: the file is open, and the type of what is there is not requested.
+            // SAFETY: the file is open, and the type of the header is not requested.
             |raw, status| unsafe {
                 sys::ffmahd(raw, self.place, ptr::null_mut(), status);
             },
         )
     }
 
-    /// Number of the extension that it is at, 0 of the primary header.
+    /// Number of the current extension; 0 for the primary header.
     pub fn number_of_extension(&self) -> usize {
         usize::try_from(self.place - 1).unwrap_or(0)
     }
@@ -168,7 +168,7 @@ impl File {
         self.source.path()
     }
 
-    /// Takes out how the image here is compressed, if it is.
+    /// Moves the tiling of the current image out; `None` for an uncompressed one.
     pub fn take_tiling(&mut self) -> Result<Option<Tiling>, FileError> {
         let mut compressed = 0;
         // SAFETY: the file is open.
@@ -249,14 +249,14 @@ impl File {
         self.need_first(wanted)
     }
 
-    /// Makes sure that the file has all data here, but for what fills up their last block.
+    /// Makes sure that the file has all data of the current header. The padding of the last block may be absent.
     pub fn need_all(&mut self) -> Result<(), FileError> {
         let [start, end] = self.extent()?;
         self.need_first((end + 1).saturating_sub(BLOCK).max(start))
     }
 
-    /// Makes sure that the file can have the first `bytes` bytes of the data here: those of a gzip file
-    /// are not looked for before they are needed.
+    /// Makes sure that the file can have the first `bytes` bytes of the data here. A gzip file is unpacked later, when
+    /// they are read.
     pub fn expect(&mut self, bytes: u64) -> Result<(), FileError> {
         let wanted = self.extent()?[0].saturating_add(bytes);
         if self.source.is_packed() {
@@ -284,18 +284,18 @@ impl File {
         self.source.disk_size()
     }
 
-    /// Makes sure, when nothing else is read, that a gzip file is whole.
+    /// Makes sure that a gzip file is complete. Call it after the last data are read.
     pub fn check_end(&mut self) -> Result<(), FileError> {
         self.source.check_end()
     }
 
-    /// A numeric header value, `None` where absent or without a value.
+    /// A numeric header value; `None` if the key is absent or has no value.
     pub fn number(&self, key: &str) -> Result<Option<f64>, FileError> {
         let doing = || format!("the header key {key} is not a number");
         let name = CString::new(key).map_err(|_| self.fault(doing()))?;
         let mut value = 0.0;
         let mut present = true;
-        // SAFETY: the file is open, the name ends in a zero byte, and a comment is not asked for.
+        // SAFETY: the file is open, the name ends in a zero byte, and a comment is not requested.
         self.call(doing, |raw, status| unsafe {
             sys::ffgkyd(raw, name.as_ptr(), &mut value, ptr::null_mut(), status);
             if [KEY_NO_EXIST, VALUE_UNDEFINED].contains(status) {
@@ -379,7 +379,7 @@ impl File {
         let (row, length, mut missing) = (row as i64, length as i64, 0);
         self.call(
             || format!("cannot read the pixels of tile {row}"),
-            // SAFETY: the file is open, and there is room for the values asked for.
+            // SAFETY: the file is open, and there is room for the requested values.
             |raw, status| unsafe {
                 let (none, to) = (T::default(), values.as_mut_ptr());
                 read(raw, column, row, 1, length, none, to, &mut missing, status);

@@ -1,9 +1,11 @@
 //! Parquet files.
 //!
-//! Writing goes through polars' frame writer. Reading takes polars' footer parser and column
-//! decoder, but fetches the bytes itself: only the column chunks that are wanted are read, nothing
-//! is memory-mapped (a mapped file that shrinks kills the process), no second thread pool starts,
-//! and 8- and 16-bit integers decode into wider ones without polars' features for them.
+//! Writing uses polars' frame writer. Reading uses polars' footer parser and column decoder, but reads the bytes itself:
+//!
+//! * Only the wanted column chunks are read.
+//! * Files are not memory-mapped: a mapped file that shrinks kills the process.
+//! * No second thread pool starts.
+//! * 8- and 16-bit integers decode into wider ones without polars' features for them.
 
 use std::cell::Cell;
 use std::collections::BTreeSet;
@@ -157,7 +159,7 @@ impl<'a> Source<'a> {
                 detail: "found no regular file".into(),
             })
         };
-        // Before it is opened, which would wait for the writer of a pipe, and for what was opened.
+        // Checked before it is opened, because opening a pipe waits for its writer, and again afterwards.
         fs::metadata(path).map_err(io).and_then(length)?;
         let mut file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io).and_then(length)?;
@@ -209,7 +211,7 @@ impl<'a> Source<'a> {
         Ok(())
     }
 
-    /// Checks that all `columns` columns, however many there are, can be those of a file of this size.
+    /// Checks that a file of this size can contain this number of columns.
     fn check_values(&self, columns: usize) -> Result<(), TableError> {
         let rows = self.footer.num_rows;
         let values = (rows as u64).saturating_mul(columns as u64);
@@ -248,7 +250,7 @@ impl<'a> Source<'a> {
             .collect()
     }
 
-    /// The file's own key-value metadata, without the schema that Arrow keeps there.
+    /// The key-value metadata of the file, without Arrow's schema.
     fn key_values(&self) -> Metadata {
         let pairs = self.footer.key_value_metadata().iter().flatten();
         pairs
@@ -343,8 +345,8 @@ impl<'a> Source<'a> {
     }
 }
 
-/// Checks the length of a footer, which takes several times as much memory once it is read. The last eight
-/// bytes of a file are that length and a mark.
+/// Checks the length of a footer, because parsing needs several times as much memory. The last eight bytes of a file are
+/// this length and a mark.
 fn check_footer(file: &mut File, length: u64) -> Result<(), String> {
     let mut end = [0; 8];
     if length >= 8 {
@@ -354,7 +356,7 @@ fn check_footer(file: &mut File, length: u64) -> Result<(), String> {
     }
     let [a, b, c, d, mark @ ..] = end;
     let found = u32::from_le_bytes([a, b, c, d]);
-    // Of a file without the mark the reader says what it is not.
+    // The reader reports a file without the mark.
     match &mark == b"PAR1" && found > MAX_FOOTER {
         true => Err(format!(
             "found a footer of {found} bytes, expected at most {MAX_FOOTER}"
@@ -438,11 +440,11 @@ fn text_bytes(series: &Series) -> u64 {
     })
 }
 
-/// Unpacked size of the page that starts a column chunk, `None` where it cannot be told. The reader
-/// keeps that of a dictionary page to itself.
+/// Unpacked size of the first page of a column chunk; `None` if it cannot be determined. polars' reader does not expose
+/// the size of a dictionary page.
 ///
-/// The header of a page is a list of fields in Thrift's compact form, each a byte that tells its number
-/// and type and a value: first the type of the page, then its unpacked size.
+/// The header of a page is a list of fields in Thrift's compact form. Each is a byte with its number and type, and a
+/// value. The first is the type of the page, the second its unpacked size.
 fn unpacked_size_of_first_page(bytes: &[u8]) -> Option<u64> {
     const NEXT_FIELD_OF_32_BITS: u8 = 0x15;
     let mut rest = bytes.iter();
@@ -465,7 +467,7 @@ fn unpacked_size_of_first_page(bytes: &[u8]) -> Option<u64> {
     field()
 }
 
-/// Runs a part of polars on what a file says.
+/// Runs a part of polars on the contents of a file.
 ///
 /// Its decoders return errors for most damage, but index out of range or overflow on some; that
 /// must not take a long run down, so such a panic becomes an error too.
@@ -492,8 +494,8 @@ thread_local! {
 
 /// Catches a panic of `run` without its message on standard error.
 ///
-/// The hook that prints such messages belongs to the whole process, so it is replaced only once, by
-/// one that is silent where this thread catches and else does what the one before did.
+/// The hook that prints such messages belongs to the whole process, so it is replaced only once. The new hook is silent
+/// while this thread catches panics; otherwise it calls the hook before it.
 fn silently<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
     static HOOK: Once = Once::new();
     HOOK.call_once(|| {
@@ -510,7 +512,7 @@ fn silently<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
     result
 }
 
-/// The type into which a column declared as `declared` is decoded, if it is one that is read.
+/// The type into which a column of type `declared` is decoded; `None` if it is not supported.
 fn decoded_type(declared: &ArrowDataType) -> Option<ArrowDataType> {
     use ArrowDataType as Type;
     match declared {
