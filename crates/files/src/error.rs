@@ -61,7 +61,7 @@ impl FileError {
 
     /// About `path`, a text table without names whose first row has the fields `first`: more than the columns
     /// `expected` that a table without names has.
-    pub fn no_names(path: &Path, first: &[impl AsRef<str>], expected: &[&str]) -> Self {
+    pub(crate) fn no_names(path: &Path, first: &[impl AsRef<str>], expected: &[&str]) -> Self {
         let message = format!(
             "{} columns have no names (found the first row `{}`, expected {}: {}). Try: add a first line with the names",
             first.len(),

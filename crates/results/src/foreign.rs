@@ -42,7 +42,11 @@ pub struct Foreign {
     ellipticity: EllipticityType,
     #[serde(default = "shear")]
     report: EllipticityType,
-    #[serde(default, deserialize_with = "name_or_number")]
+    #[serde(
+        default,
+        deserialize_with = "name_or_number",
+        skip_serializing_if = "Option::is_none"
+    )]
     table: Option<String>,
     #[serde(default = "x")]
     x: String,
@@ -71,7 +75,8 @@ fn name_or_number<'de, D: Deserializer<'de>>(value: D) -> Result<Option<String>,
         Number(u32),
         Name(String),
     }
-    Ok(Some(match Table::deserialize(value)? {
+    let table = Option::<Table>::deserialize(value)?;
+    Ok(table.map(|table| match table {
         Table::Number(number) => number.to_string(),
         Table::Name(name) => name,
     }))
