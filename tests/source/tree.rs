@@ -282,3 +282,8 @@ fn imports(item: &ItemUse) -> Vec<Import> {
     flatten(&item.tree, &[], public, &mut out);
     out
 }
+
+/// Makes the root of the repository the current folder, to which all paths are relative.
+pub fn enter_root() {
+    std::env::set_current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../..")).unwrap();
+}
