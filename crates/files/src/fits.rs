@@ -12,7 +12,7 @@ mod streams;
 mod tiles;
 mod write;
 
-pub use read::{ImageReader, TableHead, read_table, read_table_keys, tables};
+pub use read::{ImageReader, TableHead, read_table, read_table_keys, read_table_parts, tables};
 pub use write::{ImageWriter, Value, write_table};
 
 use std::path::Path;
