@@ -104,7 +104,7 @@ pub struct Summed {
     catalogues: Vec<Catalogue>,
     program: String,
     truth: bool,
-    /// Whether responses were read.
+    /// Whether responses were read, or the type of the ellipticities was given.
     response: bool,
     /// Whether units are named by identifiers.
     matched: bool,
@@ -267,7 +267,7 @@ pub fn sum(request: &Request, part: impl Fn(usize) -> bool) -> Result<Summed, Bi
         catalogues,
         program: first.columns.preset.name().into(),
         truth,
-        response,
+        response: response || request.distortion.is_some(),
         matched: named_unit || first.columns.of(Role::Id).is_some(),
         design: request.design,
         by_key: match request.units {
@@ -361,6 +361,18 @@ fn equal_edges(
 }
 
 impl Summed {
+    /// Checks sums that were read from a file.
+    ///
+    /// # Errors
+    /// If their parts contradict each other.
+    pub fn checked(mut self) -> Result<Self, BiasFailure> {
+        let bins = self.edges.len().max(1);
+        let mut sums = UnitSums::new(self.sums.layout(), bins, self.catalogues.len());
+        sums.merge(self.sums)?;
+        self.sums = sums;
+        Ok(self)
+    }
+
     /// Adds the sums of other catalogues of the same list.
     ///
     /// # Errors
