@@ -7,11 +7,15 @@ use serde::{Deserialize, Serialize};
 use crate::error::BiasError;
 use crate::sums::{Layout, Row};
 
-/// Units that are kept, at least and at most, and per catalogue in between. A jackknife of 512 units determines an error
-/// to 3 %.
-const FEWEST: usize = 1024;
-const PER_CATALOGUE: usize = 512;
+/// Units that are kept, at least and at most, and per catalogue in between. A jackknife of 1000 units determines an
+/// error to 2 %.
+const FEWEST: usize = 2048;
+const PER_CATALOGUE: usize = 1024;
 const MOST: usize = 8192;
+
+/// Numbers that are kept, if that leaves at least [`FEW`] units: 64 MiB.
+const NUMBERS: usize = 1 << 23;
+const FEW: usize = 256;
 
 /// Sums per unit and bin.
 ///
@@ -91,8 +95,15 @@ impl UnitSums {
         &mut self.units[place].1[bin * length..(bin + 1) * length]
     }
 
-    fn place(&mut self, catalogue: u32, key: u64) -> usize {
+    /// Most units.
+    fn most(&self) -> usize {
+        let fit = NUMBERS / (self.bins * self.layout.len());
         let most = (PER_CATALOGUE * self.catalogues).clamp(FEWEST, MOST);
+        most.min(fit.max(FEW))
+    }
+
+    fn place(&mut self, catalogue: u32, key: u64) -> usize {
+        let most = self.most();
         let mut unit = (catalogue, shifted(key, self.shift));
         if !self.places.contains_key(&unit) && self.units.len() >= most {
             while self.units.len() >= most && self.shift < u64::BITS {
@@ -163,7 +174,7 @@ impl UnitSums {
         other.coarsen(shift);
         self.units.append(&mut other.units);
         self.renamed(|unit| unit);
-        let most = (PER_CATALOGUE * self.catalogues).clamp(FEWEST, MOST);
+        let most = self.most();
         while self.units.len() > most && self.shift < u64::BITS {
             self.coarsen(self.shift + 1);
         }

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use shearq_bias::{
-    Catalogue, Estimate, Measured, QUANTITIES, REQUIREMENTS, Verdict, student_t, verdict,
+    Catalogue, Design, Estimate, Measured, QUANTITIES, REQUIREMENTS, Verdict, student_t, verdict,
 };
 use shearq_render::escape::markup as escape;
 use shearq_render::figure::{FigureError, LinePlot, PanelGrid, PictureFormat, Series, Style};
@@ -84,9 +84,10 @@ pub fn bias_table(result: &BiasResult) -> Table {
 
 /// A bin in words.
 fn label(result: &BiasResult, [low, high]: [f64; 2]) -> String {
+    // Four significant digits.
     let edge = |edge: f64| {
-        let text = format!("{edge:.4}");
-        text.trim_end_matches('0').trim_end_matches('.').to_owned()
+        let rounded = format!("{edge:.3e}").parse::<f64>();
+        rounded.unwrap_or(edge).to_string()
     };
     match (low == f64::MIN, high == f64::MAX) {
         (true, _) => format!("{} below {}", result.binned, edge(high)),
@@ -139,7 +140,12 @@ fn notes(result: &BiasResult) -> Vec<String> {
             ));
         }
     }
-    notes.extend(verdicts(all));
+    match result.design {
+        Design::Null => notes.push(
+            "Without a true shear, c is the mean shear. It is a bias only if the galaxies have no mean shear.".into(),
+        ),
+        _ => notes.extend(verdicts(all)),
+    }
     notes
 }
 
