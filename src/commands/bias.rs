@@ -314,8 +314,8 @@ fn of_catalogues(arguments: &Arguments) -> anyhow::Result<Summed> {
         drop_missing: arguments.drop_missing,
         step: arguments.step,
     };
-    let own = |number| Shard::holding(number, shard.of()) == shard;
-    Ok(sum(&request, own)?)
+    let own = |number: usize| Shard::holding(number, shard.of()) == shard;
+    Ok(sum(&request, &own)?)
 }
 
 /// Merges files of sums.

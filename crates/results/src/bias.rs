@@ -188,7 +188,7 @@ impl Request {
 ///
 /// # Errors
 /// If a catalogue cannot be read, lacks a column, or contains values that are not usable.
-pub fn sum(request: &Request, part: impl Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
+pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     read::distinct(&request.catalogues)?;
     let reading = request.reading();
     let mut all: Vec<Vec<Source>> = Vec::new();

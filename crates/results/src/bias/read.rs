@@ -419,22 +419,24 @@ impl<'a> Part<'a> {
         };
         let psf = places.psf.map_or([0.0; 2], |psf| self.pair(psf, at));
         let psf_size = places.psf_size.map_or(1.0, |size| self.value(size, at));
-        let checked = [
-            ("e1", e[0]),
-            ("e2", e[1]),
-            ("the weight", weight),
-            ("the response or its derivative", slope[0] + slope[1]),
-            ("the PSF's ellipticity or size", psf[0] + psf[1] + psf_size),
-            (
-                "the expression of --select or --bins",
-                if binned[0].is_nan() { f64::NAN } else { 0.0 },
-            ),
-        ];
-        if let Some((what, value)) = checked.iter().find(|(_, value)| !value.is_finite()) {
+        let (slopes, psfs) = (slope[0] + slope[1], psf[0] + psf[1] + psf_size);
+        let expression = if binned[0].is_nan() { f64::NAN } else { 0.0 };
+        // A sum is finite only if all of its terms are.
+        if !(e[0] + e[1] + weight + slopes + psfs + expression).is_finite() {
             if self.reading.drop_missing {
                 about.missing += u64::from(own);
                 return Ok(());
             }
+            let checked = [
+                ("e1", e[0]),
+                ("e2", e[1]),
+                ("the weight", weight),
+                ("the response or its derivative", slopes),
+                ("the PSF's ellipticity or size", psfs),
+                ("the expression of --select or --bins", expression),
+            ];
+            let found = checked.iter().find(|(_, value)| !value.is_finite());
+            let (what, value) = found.unwrap_or(&("a number", f64::NAN));
             return Err(fault(format!(
                 "{what} is {value} in a row without a flag (expected a number). Try: --drop-missing"
             )));
@@ -496,6 +498,9 @@ impl<'a> Part<'a> {
     /// The binned quantity in the row, and under each version. Infinity if the row is not selected; NaN if a number is
     /// missing.
     fn binned(&self, at: usize) -> [f64; COUNT] {
+        if self.reading.select.is_none() && self.reading.binned.is_none() {
+            return [0.0; COUNT];
+        }
         let of = |expression: &Option<Expression>, places: &Option<Vec<usize>>, without: f64| match (
             expression, places,
         ) {
