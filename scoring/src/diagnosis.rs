@@ -15,7 +15,8 @@ use crate::error::ScoringError;
 use crate::grid::{Grid, check_shape};
 use crate::images::SetImages;
 use crate::modes::{Decomposer, Modes};
-use crate::score::{SetScore, SetScorer};
+use crate::score::SetScorer;
+use crate::set_score::SetScore;
 
 /// Significance in standard deviations from which a finding is reported.
 const CLEAR: f64 = 5.0;

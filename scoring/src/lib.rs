@@ -45,6 +45,7 @@ pub mod modes;
 pub mod quality;
 pub mod resample;
 mod score;
+mod set_score;
 
 pub use bandpower::{BINS, Bins, Definition, SCORED};
 pub use catalogue::{FieldSum, OddRow, Row, RowCounts, RowFault, TrueShear, TruthSign};
@@ -58,8 +59,8 @@ pub use matching::ConventionMatch;
 pub use metrics::{Metric, Metrics};
 pub use quality::{Bias, BiasFits, Quality};
 pub use resample::MAX_GROUPS;
-pub use score::{
-    Choice, ConventionScore, MeanShear, Noise, Options, SetScore, SetScorer, SpectrumCovariance,
-    SpectrumScore, Unknown, measured_bandpowers,
+pub use score::{Choice, Noise, Options, SetScorer, measured_bandpowers};
+pub use set_score::{
+    ConventionScore, MeanShear, SetScore, SpectrumCovariance, SpectrumScore, Unknown,
 };
 pub use shearq_fourier::Complex64;

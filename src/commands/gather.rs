@@ -36,7 +36,7 @@ pub(crate) struct Arguments {
     /// Masks of the stamps in the same order, or of the exposure. A pixel is missing if its mask is not zero.
     #[arg(long, value_name = "FILE", num_args = 1..)]
     mask: Vec<PathBuf>,
-    /// Use only masks of this name [default files: those of the stamps or the exposure].
+    /// Use only masks of this name [default files: the stamps or the exposure].
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
     /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1).

@@ -1,27 +1,38 @@
-//! What can be wrong with a submission.
+//! Faults of configurations: names, files and settings.
 
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::validate::OutOfRange;
+/// A setting with a value out of its range.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("`{key}` is {found}; expected {expected}")]
+#[non_exhaustive]
+pub struct OutOfRange {
+    /// The key as a settings file has it, such as `denoise.levels`.
+    pub key: &'static str,
+    /// The value, as a settings file would have it.
+    pub found: String,
+    /// The accepted range.
+    pub expected: &'static str,
+}
 
-/// What can be wrong with a submission's name or file.
+/// A fault in the name or file of a configuration.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ConfigurationError {
     /// Neither a known name nor a file.
-    #[error("{}there is no submission or file named `{name}`; known submissions: {known}", from.as_ref().map_or_else(String::new, |from| format!("{}: `extends`: ", from.display())))]
+    #[error("{}there is no configuration or file named `{name}`; known configurations: {known}", from.as_ref().map_or_else(String::new, |from| format!("{}: `extends`: ", from.display())))]
     Unknown {
         /// The file that names it, if one does.
         from: Option<PathBuf>,
-        /// What was asked for.
+        /// The name that was given.
         name: String,
         /// The names that exist.
         known: String,
     },
     /// A file that cannot be read.
-    #[error("cannot read the submission file {path}")]
+    #[error("cannot read the configuration file {path}")]
     Read {
         /// The file.
         path: PathBuf,
@@ -29,7 +40,7 @@ pub enum ConfigurationError {
         source: std::io::Error,
     },
     /// Not TOML, an unknown key, or a value of the wrong type.
-    #[error("in the submission file {path}: {message}")]
+    #[error("in the configuration file {path}: {message}")]
     Parse {
         /// The file.
         path: PathBuf,
@@ -39,7 +50,7 @@ pub enum ConfigurationError {
     /// A file that inherits from itself.
     #[error("{path}: `extends` goes round in a circle: {chain}")]
     Cycle {
-        /// The file asked for.
+        /// The file that was given.
         path: PathBuf,
         /// The names followed.
         chain: String,
@@ -49,7 +60,7 @@ pub enum ConfigurationError {
         "{path}: the key `{key}` is set neither here nor in what it extends; start from `extends = \"paper\"` or `extends = \"48/linear/star\"`"
     )]
     Missing {
-        /// The file asked for.
+        /// The file that was given.
         path: PathBuf,
         /// The key.
         key: &'static str,
@@ -57,15 +68,15 @@ pub enum ConfigurationError {
     /// A name that cannot be one.
     #[error("the name is {found}; expected {expected}")]
     Name {
-        /// Its beginning and length.
+        /// The beginning of the name, and its length.
         found: String,
-        /// What a name must be.
+        /// The expected form.
         expected: &'static str,
     },
     /// A value of a file that is out of range.
     #[error("{path}: {error}")]
     Range {
-        /// The file asked for.
+        /// The file that was given.
         path: PathBuf,
         /// The key, its value and the accepted range.
         error: OutOfRange,
@@ -74,7 +85,7 @@ pub enum ConfigurationError {
     #[error(transparent)]
     Setting(#[from] OutOfRange),
     /// A key that the method does not use.
-    #[error("{path}: line {line}: `{key}` has no effect with {reason}; expected no such key")]
+    #[error("{path}: line {line}: `{key}` is not used when {reason}; remove it")]
     Dead {
         /// The file.
         path: PathBuf,

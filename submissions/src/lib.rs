@@ -1,10 +1,8 @@
-//! Named submission configurations: how to get from a stamp to an ellipticity, in TOML files with
-//! inheritance.
+//! Named submission configurations: the settings of a method, in TOML files that inherit from each other.
 //!
-//! A [`Configuration`] holds every setting of its method, resolved. The seven variants of the paper's Table 1
-//! and the linear ones are embedded ([`Registry`]); a user's own file works wherever a name does, and
-//! `extends` either a name or another file. Unknown keys, keys that the method does not use, values out of
-//! range, unknown names and cycles are refused with the file and place.
+//! A [`Configuration`] has all settings of its method. The [`Registry`] has the configurations of the paper's Table 1
+//! and the linear ones. A file works wherever a name does, and `extends` a name or another file. An error names file and
+//! place of unknown keys, unused keys, values out of range, unknown names and cycles.
 
 #![forbid(unsafe_code)]
 
@@ -17,7 +15,7 @@ mod settings;
 mod template;
 mod validate;
 
-pub use error::ConfigurationError;
+pub use error::{ConfigurationError, OutOfRange};
 pub use file::Published;
 pub use name::{MAX_NAME, check_name, checked_name, is_control};
 pub use registry::{Entry, Registry};
@@ -28,4 +26,8 @@ pub use settings::{
     Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
 };
 pub use template::Template;
-pub use validate::OutOfRange;
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -434,19 +434,19 @@ mod tests {
         };
         dead(
             "extends = \"48/linear/star\"\n[shape]\nacf_share = 0.5\n",
-            "line 3: `shape.acf_share` has no effect with method = \"linear\"",
+            "line 3: `shape.acf_share` is not used when method = \"linear\"",
         );
         dead(
             "extends = \"48/linear/star\"\n[noise]\nborder = 3\n",
-            "line 3: `noise.border` has no effect with noise.source = \"image\"",
+            "line 3: `noise.border` is not used when noise.source = \"image\"",
         );
         dead(
             "extends = \"23/raw/star\"\ndenoise = { levels = 2 }\n",
-            "line 2: `denoise.levels` has no effect with denoise.method = \"none\"",
+            "line 2: `denoise.levels` is not used when denoise.method = \"none\"",
         );
         dead(
             "extends = \"23/raw/star\"\n[shape]\ncalibration = \"response\"\n",
-            "line 3: `shape.calibration` has no effect with method = \"network\"",
+            "line 3: `shape.calibration` is not used when method = \"network\"",
         );
         let child = "extends = \"dead.toml\"\n[stamp]\nsize = 29\n";
         assert!(message("child.toml", child).contains("dead.toml: line 3"));

@@ -1,27 +1,13 @@
 //! Ranges of settings, and conditions between settings.
 
-use serde::Serialize;
-use thiserror::Error;
-
+use crate::error::OutOfRange;
 use crate::limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, MIN_TARGET, WINDOWS};
 use crate::name::{EXPECTED, check_name, shown};
 use crate::settings::{
     Clipping, Configuration, Denoise, LinearDeconvolution, LinearMethod, Method,
     NetworkDeconvolution, NetworkMethod, NoiseSource, Update,
 };
-
-/// A setting with a value out of its range.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("`{key}` is {found}; expected {expected}")]
-#[non_exhaustive]
-pub struct OutOfRange {
-    /// The key as a settings file has it, such as `denoise.levels`.
-    pub key: &'static str,
-    /// The value, as a settings file would have it.
-    pub found: String,
-    /// The accepted range.
-    pub expected: &'static str,
-}
+use serde::Serialize;
 
 /// Checks a value.
 fn need(

@@ -49,7 +49,7 @@ fn submissions_with_mistakes_are_refused_with_file_and_place() {
             "extends = \"48/linear/star\"\n[shape]\nacf_share = 0.5\n",
             &[
                 "line 3",
-                "`shape.acf_share` has no effect with method = \"linear\"",
+                "`shape.acf_share` is not used when method = \"linear\"",
             ],
         ),
         (
@@ -105,7 +105,7 @@ fn submissions_with_mistakes_are_refused_with_file_and_place() {
     }
     fs::write(&path, b"extends = \"\xff\"").unwrap();
     assert!(
-        fail(&["submissions", "show", text(&path)]).contains("cannot read the submission file")
+        fail(&["submissions", "show", text(&path)]).contains("cannot read the configuration file")
     );
     assert!(fail(&["submissions", "show", text(folder.path())]).contains("no submission or file"));
 }

@@ -212,7 +212,7 @@ fn submissions_can_be_listed_shown_and_started() {
     assert_eq!(started, named);
     let message = fail(&["submissions", "show", "23/raw/stars"]);
     assert!(
-        message.contains("known submissions: subm/19/den/star"),
+        message.contains("known configurations: subm/19/den/star"),
         "{message}"
     );
 }

@@ -205,7 +205,8 @@ fn galsim_galaxies_less_the_model_are_noise() {
             "{set}: {chi2}"
         );
         assert!((mean_chi2 - 1.0).abs() < 0.12, "{set}: {mean_chi2}");
-        assert!(worst < 5.0, "{set}: {worst}");
+        // 6 × 2304 normal values exceed 5.5 with a probability of 5·10⁻⁴.
+        assert!(worst < 5.5, "{set}: {worst}");
         assert!((inner_chi2 - 1.0).abs() < 0.4, "{set}: {inner_chi2}");
         assert!(inner_sum.abs() < 4.0, "{set}: {inner_sum}");
     }

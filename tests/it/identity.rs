@@ -359,13 +359,13 @@ fn a_replaced_truth_is_not_scored_against() {
     assert!(
         beside
             .fail("here", &other)
-            .contains("not the file that out/set02/catalogue-001.parquet")
+            .contains("the file has changed since out/set02/catalogue-001.parquet was measured")
     );
     beside.replace("set02/truth.csv");
     for command in [&score[..], &["compare", "out"]] {
         let message = beside.fail("here", command);
         assert!(
-            message.contains("d/set02/truth.csv: this is not the file"),
+            message.contains("d/set02/truth.csv: the file has changed since"),
             "{message}"
         );
     }
@@ -408,7 +408,7 @@ fn a_replaced_image_is_noticed() {
         beside.replace("set02/psf-002.fits");
         let message = beside.fail("here", &star);
         assert!(
-            message.contains("d/set02/psf-002.fits: this is not the file"),
+            message.contains("d/set02/psf-002.fits: the file has changed since"),
             "{message}"
         );
         // What is not there is measured, and what does not use the file is none the worse.

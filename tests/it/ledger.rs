@@ -170,5 +170,5 @@ fn decimal_numbers_of_the_readme_are_in_the_ledger() {
             checked += 1;
         }
     }
-    assert!(checked > 10, "{checked} numbers");
+    assert!(checked > 5, "{checked} numbers");
 }

@@ -141,35 +141,42 @@ class Clock:
 
 
 def shearq(stamps, _places, _noise, options, configuration):
-    children = lambda: sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
     import pyarrow.parquet as parquet
 
-    with tempfile.TemporaryDirectory(dir=options.work) as folder:
-        data, out = Path(folder) / "data", Path(folder) / "out"
-        (data / "set01").mkdir(parents=True)
-        for number, galaxies in enumerate(stamps, 1):
-            image = fits.PrimaryHDU(mosaic(galaxies).astype(np.float32))
-            side = round(len(galaxies) ** 0.5)
-            image.header.update({"SET": 1, "IMAGE": number, "STAMP": STAMP, "NGRID": side, "NOISESIG": 1.0})
-            image.writeto(data / "set01" / f"galaxies-{number:03}.fits")
-            star = fits.PrimaryHDU(psf_image().astype(np.float32))
-            star.header["STAMP"] = STAMP
-            star.writeto(data / "set01" / f"psf-{number:03}.fits")
-        command = [options.shearq, "measure", "--submission", configuration, "--threads", "1"]
-        before = children()
-        run = subprocess.run([*command, "--data", str(data), "--out", str(out)], capture_output=True, text=True)
-        seconds = children() - before
-        if run.returncode:
-            sys.exit(f"error: shearq failed: {run.stderr}")
-        before = children()
-        subprocess.run([options.shearq, "--version"], capture_output=True, check=True)
-        seconds -= children() - before
-        tables = [parquet.read_table(out / f"set01/catalogue-{k + 1:03}.parquet") for k in range(len(stamps))]
+    def measured(images):
+        """Catalogues of images of galaxies, and CPU seconds less those of starting the program."""
+        children = lambda: sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
+        with tempfile.TemporaryDirectory(dir=options.work) as folder:
+            data, out = Path(folder) / "data", Path(folder) / "out"
+            (data / "set01").mkdir(parents=True)
+            for number, galaxies in enumerate(images, 1):
+                image = fits.PrimaryHDU(mosaic(galaxies).astype(np.float32))
+                side = round(len(galaxies) ** 0.5)
+                image.header.update({"SET": 1, "IMAGE": number, "STAMP": STAMP, "NGRID": side, "NOISESIG": 1.0})
+                image.writeto(data / "set01" / f"galaxies-{number:03}.fits")
+                star = fits.PrimaryHDU(psf_image().astype(np.float32))
+                star.header["STAMP"] = STAMP
+                star.writeto(data / "set01" / f"psf-{number:03}.fits")
+            command = [options.shearq, "measure", "--submission", configuration, "--threads", "1"]
+            before = children()
+            run = subprocess.run([*command, "--data", str(data), "--out", str(out)], capture_output=True, text=True)
+            seconds = children() - before
+            if run.returncode:
+                sys.exit(f"error: shearq failed: {run.stderr}")
+            before = children()
+            subprocess.run([options.shearq, "--version"], capture_output=True, check=True)
+            seconds -= children() - before
+            paths = [out / f"set01/catalogue-{k + 1:03}.parquet" for k in range(len(images))]
+            return [parquet.read_table(path) for path in paths], seconds
+
+    tables, _ = measured(stamps)
+    # The noise of an image costs a fixed time. Surveys have more galaxies per image, so the time is of one image.
+    _, seconds = measured([stamps.reshape(-1, STAMP, STAMP)])
     column = lambda name: np.array([table[name].to_numpy() for table in tables])
-    response = np.stack([column(f"response{k}") for k in (1, 2)], 2)
+    response = np.stack([column("R11"), column("R22")], 2)
     # Ellipticities were divided by the mean response of their image.
     e = np.stack([column(f"e{k}") for k in (1, 2)], 2) * np.nanmean(response, 1, keepdims=True)
-    e[column("flag") != 0] = np.nan
+    e[column("flags") != 0] = np.nan
     return e, response, seconds
 
 

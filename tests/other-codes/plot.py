@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draws docs/at-a-glance.svg from results.json: noise over the Cramér–Rao bound, and |m|, against S/N.
+"""Draws docs/at-a-glance.svg from results.json: noise over the Cramér–Rao bound and |m| against S/N, and time.
 
     python3 plot.py [--results results.json] [--out ../../docs/at-a-glance.svg]
 """
@@ -41,6 +41,25 @@ def style(axes):
         spine.set_color(GREY)
 
 
+def cost(axes, costs):
+    """Bars of CPU time on a log axis, each with its method and value."""
+    costs = costs[::-1]
+    axes.barh(range(len(costs)), [c[2] for c in costs], color=[c[1] for c in costs], height=0.28)
+    axes.set_xscale("log")
+    axes.set_xlim(10, 1e5)
+    axes.set_yticks([])
+    for k, (label, colour, value) in enumerate(costs):
+        axes.text(11, k + 0.2, label, color=GREY, va="bottom", fontsize=10)
+        axes.text(value * 1.15, k, f"{value:,.0f} µs", color=colour, va="center", fontsize=10)
+    axes.set_ylim(-0.5, len(costs) - 0.2)
+    axes.tick_params(colors=GREY)
+    axes.set_facecolor("none")
+    for spine in axes.spines.values():
+        spine.set_color(GREY)
+    axes.set_xlabel("µs", color=GREY)
+    axes.set_title("CPU time per galaxy", color=GREY)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--results", type=Path, default=HERE / "results.json")
@@ -50,7 +69,8 @@ def main():
     least = results["run"]["bound_at_snr_1"]
     # Fixed identifiers, and no date: the same results give the same file.
     plt.rcParams.update({"svg.hashsalt": "shearq", "svg.fonttype": "none", "font.size": 12, "font.family": "sans-serif"})
-    figure, (left, right) = plt.subplots(1, 2, figsize=(12, 5.6))
+    figure, (left, right, times) = plt.subplots(1, 3, figsize=(13.5, 5.4), width_ratios=[1.15, 1.15, 0.8])
+    costs = []
     for (method, variant), (label, colour, marker, shift) in DRAWN.items():
         rows = [r for r in results["rows"] if (r["method"], r["variant"]) == (method, variant)]
         if not rows:
@@ -64,6 +84,7 @@ def main():
         # Both components count alike.
         m = np.array([np.hypot(r["m1"], r["m2"]) / np.sqrt(2) for r in rows])
         error = np.array([np.hypot(r["m1_error"], r["m2_error"]) / np.sqrt(2) for r in rows])
+        costs.append((label, colour, next(r["cpu_us"] for r in rows if r["snr"] == 20)))
         seen = m > 2 * error
         line = dict(look, linestyle="none")
         right.errorbar(snr[seen] * shift, m[seen], error[seen], capsize=2, **line)
@@ -84,6 +105,7 @@ def main():
     right.set_ylim(1e-4, 1)
     right.axhspan(1e-4, 2e-3, color=GREY, alpha=0.12, linewidth=0)
     right.text(6.3, 1.2e-4, "below 0.002: required by coming surveys", color=GREY, va="bottom", fontsize=10)
+    cost(times, costs)
     right.set_title("|m|; arrows: upper limits of two errors", color=GREY)
     legend = figure.legend(*left.get_legend_handles_labels(), loc="lower center", ncols=4, frameon=False, labelcolor=GREY)
     legend.set_in_layout(True)

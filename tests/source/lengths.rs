@@ -5,13 +5,13 @@ use std::fs;
 use crate::tree::files;
 
 /// Most lines of a file before its tests.
-const LONGEST: usize = 700;
+const LONGEST: usize = 800;
 
 /// Files that are longer. Split them; add none.
 const KNOWN: [&str; 0] = [];
 
 #[test]
-fn files_have_at_most_700_lines() {
+fn files_have_at_most_800_lines() {
     let mut long = Vec::new();
     for path in files(&[
         "src",

@@ -84,7 +84,7 @@ impl Plan {
         plan
     }
 
-    /// The constant and the shear, as far as they are determined, with more terms.
+    /// The constant and, if m is determined, the shear, with more terms.
     fn with(&self, k: usize, more: &[usize]) -> Vec<usize> {
         let mut terms = vec![ONE];
         if self.truth && self.known[k] == Known::Both {

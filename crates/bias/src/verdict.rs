@@ -111,7 +111,7 @@ mod tests {
             (galaxies / 1000.0 - 1.962f64.powi(2)).abs() < 0.01,
             "{galaxies}"
         );
-        // Two units have an infinite-tailed t: nearly nothing is decided.
+        // With two units t is 12.7, so this value is undecided.
         let few = verdict(
             Measured {
                 value: 0.0,

@@ -1,15 +1,8 @@
-//! Galaxy shapes from postage stamps and PSFs, for weak lensing: deconvolution by a Hopfield network or its
-//! linear closed form, moments of the autocorrelation, and calibration by the response to shear. Views of
-//! arrays in, plain structs out: no files, no threads.
+//! Galaxy shapes from stamps and PSFs, for weak lensing.
 //!
-//! # One stamp
-//!
-//! ```
-#![doc = include_str!("../examples/one_stamp.rs")]
-//! ```
-//!
-//! A single galaxy's response is its own, and its ellipticity is not divided by it: see
-//! [`Measurer::stamp`].
+//! A configuration deconvolves by a Hopfield network or by its linear closed form, measures moments of the
+//! autocorrelation, and calibrates them by the response to shear. Input are views of arrays, output are plain structs.
+//! The crate reads no files and starts no threads.
 //!
 //! # A batch
 //!
@@ -17,21 +10,28 @@
 #![doc = include_str!("../examples/batch.rs")]
 //! ```
 //!
-//! The ellipticities of a [`Batch`] are divided by its mean response. PSFs may also be one each, or
-//! formulas ([`Psfs`]); pixels are `f32` or `f64`. Submissions are named configurations or settings files
-//! (`shearq_submissions`).
+//! The ellipticities of a [`Batch`] are divided by its mean response. PSFs are stars or formulas, one for all galaxies
+//! or one per galaxy ([`Psfs`]). Pixels are `f32` or `f64`.
+//!
+//! # One stamp
+//!
+//! ```
+#![doc = include_str!("../examples/one_stamp.rs")]
+//! ```
+//!
+//! The response of a single galaxy is too noisy to divide by; see [`Measurer::stamp`].
 //!
 //! # A stream
 //!
-//! A [`Measurer`] is not changed by measuring and serves all threads; each has a [`Worker`] with buffers of its
-//! own, which takes a PSF ([`Worker::set_psf`]), measures galaxies ([`Worker::measure`]) and allocates nothing
-//! for them. [`calibrate`] does the rest when an image is complete.
+//! A [`Measurer`] serves all threads. Each thread has a [`Worker`] with its own buffers; measuring a galaxy allocates
+//! nothing. The types fix the order: worker, image, PSF, galaxy. [`calibrate`] divides by the mean response when an
+//! image is complete.
 //!
 //! # Conventions
 //!
-//! Stamps are indexed `[y, x]`. e1 > 0 is elongation along +x, e2 > 0 along x = y. Noise levels are standard
-//! deviations per pixel in image units. What is wrong with a request is a [`MeasureError`]; a galaxy that
-//! cannot be measured has [`Flags`] and no ellipticity.
+//! Stamps are indexed `[y, x]`. e1 > 0 is elongation along +x, e2 > 0 along x = y. Noise is a standard deviation per
+//! pixel in image units. A request that cannot be met is a [`MeasureError`]. A galaxy that cannot be measured has
+//! [`Flags`] and no ellipticity.
 
 mod batch;
 mod calibrate;
@@ -79,3 +79,8 @@ pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use steps::Steps;
 pub use warning::{Of, Warning};
 pub use worker::{ImageNoise, ImageWorker, PsfWorker, Worker};
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -4,6 +4,7 @@
 //! catalogue is written when all rows of an image are measured.
 
 mod catalogue;
+mod head;
 mod noise;
 mod psfs;
 mod row;
@@ -16,9 +17,11 @@ use shearq_measure::{Measurer, calibrate};
 
 pub use self::catalogue::{COLUMNS, Summary, Value};
 pub(crate) use self::catalogue::{Catalogues, metadata};
+pub(crate) use self::head::check_strip;
+pub use self::head::{ImageHead, StampRow};
 pub use self::row::{MeasuredRow, measure_row};
-pub use self::source::{ImageHead, ImageSource, StampRow};
-pub(crate) use self::source::{check_strip, open_galaxies};
+pub use self::source::ImageSource;
+pub(crate) use self::source::open_galaxies;
 use crate::PipelineError;
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;

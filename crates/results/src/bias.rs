@@ -412,7 +412,7 @@ impl Summed {
         Ok(self.sums.merge(other.sums)?)
     }
 
-    /// Catalogues without rows: those of shards that are absent.
+    /// Catalogues without rows, because their shards are absent.
     pub fn absent(&self) -> Vec<&str> {
         let empty = self.catalogues.iter().filter(|own| own.rows == 0);
         empty.map(|own| own.name.as_str()).collect()

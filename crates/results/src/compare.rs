@@ -4,8 +4,8 @@ use std::borrow::Borrow;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use shearq_scoring::resample::{PairedDifference, PairedSet, mean_over_sets, paired_difference};
-use shearq_scoring::{Choice, Definition, Grid, Metrics, Options};
+use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
+use shearq_scoring::{Choice, Definition, Grid, Options};
 use shearq_submissions::{Published, Registry};
 
 use super::conditions::Conditions;
@@ -280,18 +280,6 @@ pub fn common_sets(all: &[Vec<SetRecord>]) -> BTreeSet<u32> {
         .map(|sets| sets.iter().map(|set| set.set).collect())
         .reduce(|all: BTreeSet<u32>, more| &all & &more)
         .unwrap_or_default()
-}
-
-/// Mean of the metric called `name` over sets, and its error.
-pub fn mean_metric<R: Borrow<SetRecord>>(sets: &[R], name: &str) -> (f64, f64) {
-    let value =
-        |metrics: &Metrics| Metrics::place(name).map_or(f64::NAN, |place| metrics.values()[place]);
-    let pairs: Vec<(f64, f64)> = sets
-        .iter()
-        .map(Borrow::borrow)
-        .map(|set| (value(&set.metrics), value(&set.errors)))
-        .collect();
-    mean_over_sets(&pairs)
 }
 
 /// A metric with jackknife replicates, so that differences can be paired.

@@ -7,8 +7,7 @@ use shearq_files::frames::TableError;
 use shearq_files::frames::polars::AnyValue;
 use shearq_scoring::Metrics;
 
-use super::compare::mean_metric;
-use super::row::{RunRecord, SetRecord, table_of};
+use super::row::{RunRecord, SetRecord, mean_metric, table_of};
 
 /// Digits of a run's id in tables, enough to distinguish the runs of a store.
 const ID_DIGITS: usize = 8;

@@ -1,10 +1,12 @@
 //! Records of scored sets and runs.
 
+use std::borrow::Borrow;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use shearq_files::frames::TableError;
 use shearq_files::frames::polars::{Column, DataFrame};
+use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{Choice, Definition, Metric, Metrics, Noise, Options};
 use shearq_submissions::check_name;
 
@@ -462,4 +464,16 @@ impl Rows<'_> {
             convention_leaderboard: self.count("convention_leaderboard", row)?,
         })
     }
+}
+
+/// Mean of the metric called `name` over sets, and its error.
+pub fn mean_metric<R: Borrow<SetRecord>>(sets: &[R], name: &str) -> (f64, f64) {
+    let value =
+        |metrics: &Metrics| Metrics::place(name).map_or(f64::NAN, |place| metrics.values()[place]);
+    let pairs: Vec<(f64, f64)> = sets
+        .iter()
+        .map(Borrow::borrow)
+        .map(|set| (value(&set.metrics), value(&set.errors)))
+        .collect();
+    mean_over_sets(&pairs)
 }

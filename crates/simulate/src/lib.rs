@@ -13,3 +13,8 @@ pub mod kinds;
 pub mod render;
 pub mod set;
 pub mod signal;
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -90,7 +90,7 @@ def submission(of: SubmissionLike) -> Configuration:
     Raises
     ------
     KeyError
-        Where there is no submission or file of that name.
+        If no configuration or file has that name.
     ValueError
         Where a setting is unknown, of no use to the method, or out of range.
     """
@@ -110,7 +110,7 @@ def submission(of: SubmissionLike) -> Configuration:
     if not isinstance(name, str):
         raise TypeError("submission: found a path of bytes; expected one of text")
     if "\0" in name or any("\ud800" <= c <= "\udfff" for c in name):
-        raise KeyError(f"submission: there is no submission or file named {name!r}")
+        raise KeyError(f"submission: there is no configuration or file named {name!r}")
     if "\n" in name or "=" in name:
         return Configuration(_shearq.Configuration.text(name))
     return Configuration(_shearq.Configuration.named(name))

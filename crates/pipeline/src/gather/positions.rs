@@ -143,7 +143,7 @@ impl Positions {
             return Err(FileError::new(path, message));
         }
         let mut doubts = Vec::new();
-        if 2 * beyond > count {
+        if 10 * beyond > count {
             doubts.push(format!(
                 "warning: {}: {beyond} of {count} positions are outside the exposure of {width} × {height} px. Try: check --columns and --exposure",
                 path.display()

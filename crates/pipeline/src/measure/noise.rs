@@ -8,7 +8,7 @@ use shearq_files::fits::ImageReader;
 use shearq_measure::{MeasureError, Measurer, NoisePlan, Survey, Warning, strip};
 use shearq_submissions::NoiseSource;
 
-use super::source::ImageHead;
+use super::head::ImageHead;
 use crate::PipelineError;
 use crate::data::mosaic::Mosaic;
 

@@ -7,7 +7,7 @@ use shearq_measure::{
     EXAMINED_PSFS, Examination, Measurement, Warning, Worker, examined_rows, strip,
 };
 
-use super::source::{ImageHead, StampRow};
+use super::head::{ImageHead, StampRow};
 use crate::PipelineError;
 
 /// Measurements of one row of stamps.

@@ -188,7 +188,7 @@ pub struct Limit {
     pub of: String,
     /// Largest modulus.
     pub limit: f64,
-    /// Standard errors by which the modulus must exceed it.
+    /// The modulus must exceed the limit by so many standard errors.
     pub sigma: f64,
 }
 

@@ -9,8 +9,9 @@ use shearq_scoring::resample::PairedDifference;
 use shearq_scoring::{Definition, Fault, Metrics};
 use shearq_submissions::Published;
 
-use crate::compare::{Paired, Variant, by_name, common_sets, difference, mean_metric};
+use crate::compare::{Paired, Variant, by_name, common_sets, difference};
 use crate::groups::{Group, Grouping};
+use crate::row::mean_metric;
 use crate::row::{RunRecord, SetRecord};
 use crate::views::diagnosis::of_sets;
 use crate::views::metrics::{metric_cell, metric_heading};

@@ -2,8 +2,9 @@
 
 use std::borrow::Borrow;
 
-use crate::compare::{Paired, difference, mean_metric};
+use crate::compare::{Paired, difference};
 use crate::row::SetRecord;
+use crate::row::mean_metric;
 use shearq_render::table::Cell;
 
 /// Significance above which one configuration is better than another.
