@@ -210,7 +210,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         };
         if !sources.iter().all(fits) {
             return Err(BiasFailure::Data(format!(
-                "{}: the columns differ from those of {} (expected the same columns for truth, response and PSF in all catalogues). Try: one command per kind of catalogue",
+                "{}: its columns are not the columns of {} (expected the same columns for truth, response and PSF in all catalogues). Try: one command per kind of catalogue",
                 path.display(),
                 request.catalogues[0].display()
             )));

@@ -26,7 +26,7 @@ const FUNCTIONS: [(&str, fn(f64) -> f64); 6] = [
     ("not", |a| truth(a == 0.0)),
 ];
 
-/// Operators from the loosest to the tightest; those of one level from left to right.
+/// Operators from the loosest to the tightest. Within a level the left one is applied first.
 const OPERATORS: [&[(&str, fn(f64, f64) -> f64)]; 5] = [
     &[("or", |a, b| truth(a != 0.0 || b != 0.0))],
     &[("and", |a, b| truth(a != 0.0 && b != 0.0))],
