@@ -57,7 +57,7 @@ pub enum ConfigurationError {
     },
     /// A key that no file of the chain sets.
     #[error(
-        "{path}: the key `{key}` is set neither here nor in the configuration that it extends; start from `extends = \"paper\"` or `extends = \"48/linear/star\"`"
+        "{path}: the key `{key}` is set neither here nor in what it extends; start from `extends = \"paper\"` or `extends = \"48/linear/star\"`"
     )]
     Missing {
         /// The file that was given.

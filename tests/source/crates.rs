@@ -12,6 +12,7 @@ const LEVELS: [&[(&str, &str)]; 8] = [
         ("shearq-submissions", "submissions"),
     ],
     &[
+        ("shearq-bias", "crates/bias"),
         ("shearq-scoring", "scoring"),
         ("shearq-measure", "crates/measure"),
         ("shearq-files", "crates/files"),
@@ -28,7 +29,8 @@ const LEVELS: [&[(&str, &str)]; 8] = [
 ];
 
 /// Crates that use no files, data frames or threads.
-const PURE: [&str; 6] = [
+const PURE: [&str; 7] = [
+    "shearq-bias",
     "shearq-fourier",
     "shearq-quantities",
     "shearq-submissions",

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use syn::{Attribute, Item, ItemUse, UseTree, Visibility};
 
 /// The crates with a library, by package name, and their folders.
-pub const LIBRARIES: [(&str, &str); 11] = [
+pub const LIBRARIES: [(&str, &str); 12] = [
+    ("shearq-bias", "crates/bias"),
     ("shearq-files", "crates/files"),
     ("shearq-fourier", "crates/fourier"),
     ("shearq-measure", "crates/measure"),

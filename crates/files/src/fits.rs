@@ -14,5 +14,5 @@ mod tiles;
 mod tiling;
 mod write;
 
-pub use read::{ImageReader, TableHead, read_table, read_table_keys, tables};
+pub use read::{ImageReader, TableHead, read_table, read_table_keys, read_table_parts, tables};
 pub use write::{ImageWriter, Value, write_table};

@@ -33,4 +33,6 @@ mod parquet;
 pub use ::polars::prelude as polars;
 pub use error::TableError;
 pub use frame::{Metadata, frame, reals};
-pub use parquet::{parquet_columns, parquet_metadata, read_parquet, write_parquet};
+pub use parquet::{
+    parquet_columns, parquet_metadata, read_parquet, read_parquet_groups, write_parquet,
+};

@@ -30,6 +30,29 @@ pub(super) fn read(
     Ok(table)
 }
 
+/// Reads columns of numbers or text by row groups.
+pub(super) fn read_groups(
+    path: &Path,
+    wanted: &[&str],
+    most_rows: usize,
+    mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
+) -> Result<(), FileError> {
+    enum Failure {
+        Read(tables::TableError),
+        Taken(FileError),
+    }
+    impl From<tables::TableError> for Failure {
+        fn from(error: tables::TableError) -> Self {
+            Failure::Read(error)
+        }
+    }
+    let take = |group| take(group).map_err(Failure::Taken);
+    tables::read_parquet_groups(path, wanted, most_rows, take).map_err(|failure| match failure {
+        Failure::Read(error) => bare(path, &error),
+        Failure::Taken(error) => error,
+    })
+}
+
 /// The names of the columns.
 pub(super) fn columns(path: &Path) -> Result<Vec<String>, FileError> {
     tables::parquet_columns(path).map_err(|error| bare(path, &error))

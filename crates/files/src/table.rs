@@ -273,6 +273,29 @@ pub fn read_from(
 /// Columns of a truth file.
 pub const TRUTH_COLUMNS: [&str; 4] = ["x", "y", "g1", "g2"];
 
+/// Rows of a FITS table that are read at a time.
+const PART: usize = 1 << 17;
+
+/// Reads the columns `wanted` in parts, and gives each part to `take`: row groups of a Parquet file, a fixed number of
+/// rows of a FITS table, and all of a text table. So a table may have any number of rows. In Parquet, columns of text
+/// are read too.
+///
+/// # Errors
+/// As [`read`], and those of `take`.
+pub fn read_parts(
+    place: &Place,
+    wanted: &[&str],
+    mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
+) -> Result<(), FileError> {
+    place.check()?;
+    let path = &place.path;
+    match Ending::of(path) {
+        Ending::Parquet => parquet::read_groups(path, wanted, MAX_ROWS, take),
+        Ending::Fits => fits::read_table_parts(path, wanted, place.table.as_deref(), PART, take),
+        Ending::Text => take(read_from(place, Some(wanted), MAX_ROWS)?),
+    }
+}
+
 /// Reads a truth file's x, y, g1, g2, of at most `most_rows`.
 ///
 /// # Errors
@@ -408,6 +431,43 @@ pub fn write(
             let header: Vec<(&str, fits::Value)> =
                 keys.iter().map(|(k, v)| (k.as_str(), v.clone())).collect();
             fits::write_table(path, table, &header)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::frames::frame;
+    use crate::frames::polars::Column;
+
+    use super::*;
+
+    #[test]
+    fn parts_join_to_the_whole_table() {
+        let folder = tempfile::tempdir().unwrap();
+        // More rows than a part, and not a multiple.
+        let values: Vec<f64> = (0..PART + 7).map(|k| k as f64).collect();
+        let table = frame(vec![
+            Column::new("a".into(), values.clone()),
+            Column::new("b".into(), values.iter().map(|v| -v).collect::<Vec<_>>()),
+        ])
+        .unwrap();
+        for format in [FileFormat::Fits, FileFormat::Parquet] {
+            let path = folder.path().join(format!("t.{}", format.extension()));
+            write(&path, format, &table, &Metadata::new()).unwrap();
+            let mut found = Vec::new();
+            read_parts(&Place::of(&path), &["b"], |part| {
+                found.extend(numbers(&part, "b", &path)?.iter().map(|v| -v));
+                Ok(())
+            })
+            .unwrap();
+            assert_eq!(found, values);
+            let stopped = read_parts(&Place::of(&path), &["b"], |_| {
+                Err(FileError::new(&path, "enough"))
+            });
+            assert!(stopped.unwrap_err().to_string().ends_with("enough"));
+            let missing = read_parts(&Place::of(&path), &["c"], |_| Ok(())).unwrap_err();
+            assert!(missing.no_column, "{missing}");
         }
     }
 }

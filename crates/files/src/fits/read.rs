@@ -442,8 +442,54 @@ pub fn read_table(
 ) -> Result<DataFrame, FileError> {
     let mut file = File::open(path, "table")?;
     go_to_table(&mut file, wanted, table)?;
-    let rows = table_rows(&mut file)?;
-    let descriptions = describe_columns(&file)?;
+    let rows = table_rows(&mut file, MAX_ROWS)?;
+    let chosen = choose_columns(&file, path, wanted)?;
+    let numbers = rows as u64 * chosen.len() as u64;
+    let most = FREE_NUMBERS.max(file.disk_size());
+    if numbers > most {
+        return Err(file.fault(format!(
+            "its {rows} rows of {} columns are {numbers} numbers; expected at most {most} in a file of this size",
+            chosen.len()
+        )));
+    }
+    let table = read_part(&file, &chosen, 0, rows)?;
+    file.check_end()?;
+    Ok(table)
+}
+
+/// Reads the columns `wanted` of a table, as [`read_table`], in parts of at most `most_rows`, and gives each to `take`.
+///
+/// # Errors
+/// As [`read_table`], and those of `take`.
+pub fn read_table_parts(
+    path: &Path,
+    wanted: &[&str],
+    table: Option<&str>,
+    most_rows: usize,
+    mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
+) -> Result<(), FileError> {
+    let mut file = File::open(path, "table")?;
+    go_to_table(&mut file, Some(wanted), table)?;
+    let rows = table_rows(&mut file, usize::MAX)?;
+    let chosen = choose_columns(&file, path, Some(wanted))?;
+    for first in (0..rows).step_by(most_rows) {
+        take(read_part(
+            &file,
+            &chosen,
+            first,
+            most_rows.min(rows - first),
+        )?)?;
+    }
+    file.check_end()
+}
+
+/// The descriptions of the columns `wanted`, or of all that are numbers.
+fn choose_columns(
+    file: &File,
+    path: &Path,
+    wanted: Option<&[&str]>,
+) -> Result<Vec<Description>, FileError> {
+    let descriptions = describe_columns(file)?;
     if let Some(missing) = wanted
         .into_iter()
         .flatten()
@@ -453,7 +499,7 @@ pub fn read_table(
         return Err(FileError::no_column(path, missing, &names));
     }
     let mut chosen = Vec::new();
-    for description in &descriptions {
+    for description in descriptions {
         let name = description.name.as_str();
         let number = description.repeat == 1
             && (NUMBERS.contains(&description.kind) || description.kind == TLOGICAL);
@@ -467,19 +513,20 @@ pub fn read_table(
         }
         chosen.push(description);
     }
-    let numbers = rows as u64 * chosen.len() as u64;
-    let most = FREE_NUMBERS.max(file.disk_size());
-    if numbers > most {
-        return Err(file.fault(format!(
-            "its {rows} rows of {} columns are {numbers} numbers; expected at most {most} in a file of this size",
-            chosen.len()
-        )));
-    }
-    let columns = chosen
-        .into_iter()
-        .map(|column| read_column(&file, column, rows))
+    Ok(chosen)
+}
+
+/// Some rows of columns, counted from 0.
+fn read_part(
+    file: &File,
+    columns: &[Description],
+    first: usize,
+    rows: usize,
+) -> Result<DataFrame, FileError> {
+    let columns = columns
+        .iter()
+        .map(|column| read_column(file, column, first, rows))
         .collect::<Result<_, FileError>>()?;
-    file.check_end()?;
     crate::frames::frame(columns).map_err(|error| file.fault(error.to_string()))
 }
 
@@ -499,8 +546,8 @@ pub fn read_table_keys<'a>(
     Ok(keys.map(value).filter(|(_, v)| !v.is_empty()).collect())
 }
 
-/// Number of rows of the current table, which must fit into the file.
-fn table_rows(file: &mut File) -> Result<usize, FileError> {
+/// Number of rows of the current table, at most `most`, which must fit into the file.
+fn table_rows(file: &mut File, most: usize) -> Result<usize, FileError> {
     let mut count = 0;
     // SAFETY: the file is open, and the pointers are to live variables.
     file.call(
@@ -511,10 +558,10 @@ fn table_rows(file: &mut File) -> Result<usize, FileError> {
     )?;
     let rows = usize::try_from(count)
         .ok()
-        .filter(|rows| *rows <= MAX_ROWS)
+        .filter(|rows| *rows <= most)
         .ok_or_else(|| {
             file.fault(format!(
-                "the table says it has {count} rows; expected at most {MAX_ROWS}"
+                "the table says it has {count} rows; expected at most {most}"
             ))
         })?;
     let bytes = file.number("NAXIS1")?.unwrap_or(0.0);
@@ -565,8 +612,14 @@ fn check_scale(file: &File, number: c_int, name: &str) -> Result<(), FileError> 
     Ok(())
 }
 
-/// A column as real numbers; missing ones are NaN, true is 1 and false 0.
-fn read_column(file: &File, description: &Description, rows: usize) -> Result<Column, FileError> {
+/// Rows of a column, after the first `skipped`, as real numbers; missing ones are NaN, true is 1 and false 0.
+fn read_column(
+    file: &File,
+    description: &Description,
+    skipped: usize,
+    rows: usize,
+) -> Result<Column, FileError> {
+    let first = skipped as i64 + 1;
     let doing = || format!("cannot read column `{}`", description.name);
     let mut some_missing = 0;
     if description.kind == TLOGICAL {
@@ -578,7 +631,7 @@ fn read_column(file: &File, description: &Description, rows: usize) -> Result<Co
             sys::ffgcvl(
                 raw,
                 description.number,
-                1,
+                first,
                 1,
                 rows as i64,
                 missing,
@@ -603,7 +656,7 @@ fn read_column(file: &File, description: &Description, rows: usize) -> Result<Co
         sys::ffgcvd(
             raw,
             description.number,
-            1,
+            first,
             1,
             rows as i64,
             f64::NAN,

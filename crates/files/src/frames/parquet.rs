@@ -115,6 +115,37 @@ pub fn read_parquet(
     frame(columns.collect::<Result<_, TableError>>()?)
 }
 
+/// Reads the columns `wanted` of the Parquet file at `path` by row groups, and gives each group to `take`. A row group
+/// has at most `most_rows`.
+///
+/// # Errors
+/// As [`read_parquet`], and those of `take`.
+pub fn read_parquet_groups<E: From<TableError>>(
+    path: &Path,
+    wanted: &[&str],
+    most_rows: usize,
+    mut take: impl FnMut(DataFrame) -> Result<(), E>,
+) -> Result<(), E> {
+    let mut source = Source::open(path)?;
+    let fields = source.pick(wanted)?;
+    let fields: Vec<ArrowField> = fields
+        .iter()
+        .map(|field| source.decoded(field))
+        .collect::<Result<_, TableError>>()?;
+    source.check_rows(usize::MAX)?;
+    for number in 0..source.footer.row_groups.len() {
+        let rows = source.footer.row_groups[number].num_rows();
+        if rows > most_rows {
+            let detail = format!("found a row group of {rows} rows, expected at most {most_rows}");
+            return Err(source.damaged(detail).into());
+        }
+        let column = |field| with_missing(path, source.read_chunk(field, number)?);
+        let columns = fields.iter().map(column);
+        take(frame(columns.collect::<Result<_, TableError>>()?)?)?;
+    }
+    Ok(())
+}
+
 /// The names of the columns of the Parquet file at `path`, in file order, from the footer alone.
 ///
 /// # Errors
@@ -261,65 +292,81 @@ impl<'a> Source<'a> {
 
     /// All rows of one column.
     fn read_column(&mut self, field: &ArrowField) -> Result<Column, TableError> {
-        let (path, name) = (self.path, field.name.as_str());
-        let Some(decoded) = decoded_type(&field.dtype) else {
-            return Err(TableError::UnsupportedType {
-                path: path.into(),
-                column: name.into(),
-                found: format!("{:?}", field.dtype),
-            });
-        };
-        let field = ArrowField::new(field.name.clone(), decoded, field.is_nullable);
-        let footer = self.footer.clone();
+        let field = self.decoded(field)?;
         let mut column = Series::new_empty(field.name.clone(), &DataType::from_arrow_field(&field));
-        for (number, group) in footer.row_groups.iter().enumerate() {
-            let place = format!("column `{name}`, row group {number}");
-            let damaged = |detail| TableError::Damaged {
-                path: path.into(),
-                detail: format!("{place}: {detail}"),
-            };
-            let found = group
-                .columns_under_root_iter(name)
-                .map(|mut all| (all.len(), all.next()));
-            let Some((1, Some(chunk))) = found else {
-                return Err(damaged("found no single column chunk".into()));
-            };
-            if usize::try_from(chunk.num_values()) != Ok(group.num_rows()) {
-                return Err(damaged(format!(
-                    "found {} values, expected {} as the row group has rows",
-                    chunk.num_values(),
-                    group.num_rows()
-                )));
-            }
-            let start = chunk
-                .dictionary_page_offset()
-                .unwrap_or(chunk.data_page_offset());
-            let bytes = self
-                .read_bytes(start, chunk.compressed_size())
-                .map_err(damaged)?;
-            let most =
-                unpacked_bytes(self.length).max(number_bytes(&field.dtype, group.num_rows()));
-            let series = guarded(path, &place, || decode(chunk, bytes, &field, most))?;
-            if series.len() != group.num_rows() {
-                return Err(damaged(format!(
-                    "found {} rows, expected {}",
-                    series.len(),
-                    group.num_rows()
-                )));
-            }
-            let left = self.text_left.checked_sub(text_bytes(&series));
-            self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
+        for number in 0..self.footer.row_groups.len() {
+            let series = self.read_chunk(&field, number)?;
             column = match number {
                 0 => series,
                 _ => {
                     let joined = column.append(&series);
-                    joined.map_err(|error| damaged(error.to_string()))?;
+                    joined.map_err(|error| {
+                        let name = field.name.as_str();
+                        self.damaged(format!("column `{name}`, row group {number}: {error}"))
+                    })?;
                     column
                 }
             };
         }
         // In one piece, so that readers borrow the values instead of copying them.
-        with_missing(path, column.rechunk())
+        with_missing(self.path, column.rechunk())
+    }
+
+    /// The field with the type into which it is decoded.
+    fn decoded(&self, field: &ArrowField) -> Result<ArrowField, TableError> {
+        let decoded = decoded_type(&field.dtype).ok_or_else(|| TableError::UnsupportedType {
+            path: self.path.into(),
+            column: field.name.to_string(),
+            found: format!("{:?}", field.dtype),
+        })?;
+        Ok(ArrowField::new(
+            field.name.clone(),
+            decoded,
+            field.is_nullable,
+        ))
+    }
+
+    /// The rows of a decoded column in one row group.
+    fn read_chunk(&mut self, field: &ArrowField, number: usize) -> Result<Series, TableError> {
+        let (path, name) = (self.path, field.name.as_str());
+        let footer = self.footer.clone();
+        let group = &footer.row_groups[number];
+        let place = format!("column `{name}`, row group {number}");
+        let damaged = |detail| TableError::Damaged {
+            path: path.into(),
+            detail: format!("{place}: {detail}"),
+        };
+        let found = group
+            .columns_under_root_iter(name)
+            .map(|mut all| (all.len(), all.next()));
+        let Some((1, Some(chunk))) = found else {
+            return Err(damaged("found no single column chunk".into()));
+        };
+        if usize::try_from(chunk.num_values()) != Ok(group.num_rows()) {
+            return Err(damaged(format!(
+                "found {} values, expected {} as the row group has rows",
+                chunk.num_values(),
+                group.num_rows()
+            )));
+        }
+        let start = chunk
+            .dictionary_page_offset()
+            .unwrap_or(chunk.data_page_offset());
+        let bytes = self
+            .read_bytes(start, chunk.compressed_size())
+            .map_err(damaged)?;
+        let most = unpacked_bytes(self.length).max(number_bytes(&field.dtype, group.num_rows()));
+        let series = guarded(path, &place, || decode(chunk, bytes, field, most))?;
+        if series.len() != group.num_rows() {
+            return Err(damaged(format!(
+                "found {} rows, expected {}",
+                series.len(),
+                group.num_rows()
+            )));
+        }
+        let left = self.text_left.checked_sub(text_bytes(&series));
+        self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
+        Ok(series)
     }
 
     /// The bytes from `start`, as many as `size`, after checking that the file has them.
