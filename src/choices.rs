@@ -2,6 +2,7 @@
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
+use shearq_challenge::kind::RankBy;
 use shearq_files::table::FileFormat;
 use shearq_render::table::TableFormat;
 use shearq_results::groups::Grouping;
@@ -51,6 +52,14 @@ choices! {
         Psf: "psf", "Fixed or variable PSF";
         Snr: "snr", "Class of S/N";
         Size: "size", "Class of galaxy sizes";
+    }
+    RankBy {
+        Q: "q", "Q with the arithmetic of GREAT10's leaderboard";
+        QCorrected: "q-corrected", "Q with azimuthal averages over fixed bins";
+        QCalibrated: "q-calibrated", "Q after dividing by the measured response";
+        M: "m", "Modulus of the multiplicative bias";
+        C: "c", "Modulus of the additive bias";
+        Noise: "noise", "Noise of one galaxy's ellipticity";
     }
     Contents {
         Catalogues: "catalogues", "Ellipticity catalogues";

@@ -15,8 +15,8 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use commands::{
-    baseline, bench, bias, calibrate, check, compare, gather, help_files, mean, measure, merge,
-    pack, quickstart, reproduce, run, score, show, simulate, study, submissions, unpack,
+    baseline, bench, bias, calibrate, challenge, check, compare, gather, help_files, mean, measure,
+    merge, pack, quickstart, reproduce, run, score, show, simulate, study, submissions, unpack,
 };
 use shearq_pipeline::data::listing::Files;
 use shearq_render::escape::visible;
@@ -35,6 +35,8 @@ use shearq_render::terminal::fitted;
 /// 3. `mean` prints the shear of a set with one shear. `score` compares catalogues with a known shear field.
 ///
 /// 4. `compare` shows several configurations side by side. `pack` and `check` prepare a submission to a challenge.
+///
+/// 5. `challenge` runs a challenge: blind data, entries, a leaderboard.
 ///
 /// `run` measures and scores in one step. `merge` completes a run that was split over a cluster.
 /// A configuration is a named list of settings of the method: see `shearq submissions list`.
@@ -85,6 +87,10 @@ enum Command {
         after_help = "Examples:\n  shearq baseline record mine --measured raw den\n  shearq baseline check mine"
     )]
     Baseline(baseline::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq challenge new --name pilot --sets 2,8 --images 20 --public pilot --private truth"
+    )]
+    Challenge(challenge::Arguments),
     #[command(after_help = "Example:\n  shearq check to-send.tar.gz --data data")]
     Check(check::Arguments),
     #[command(
@@ -168,6 +174,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Compare(arguments) => compare::run(&arguments),
         Command::Bias(arguments) => bias::run(&arguments),
         Command::Baseline(arguments) => baseline::run(&arguments),
+        Command::Challenge(arguments) => challenge::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Pack(arguments) => pack::run(&arguments),
         Command::Unpack(arguments) => unpack::run(&arguments),

@@ -6,7 +6,7 @@ use crate::Cli;
 
 /// The ways to use each command, and the options that each way uses. Two options without a common way must be
 /// refused.
-const WAYS: [(&str, &[&str]); 27] = [
+const WAYS: [(&str, &[&str]); 31] = [
     ("quickstart", &["out threads"]),
     (
         "simulate",
@@ -37,7 +37,7 @@ const WAYS: [(&str, &[&str]); 27] = [
         &[
             "data measured sets noise-var store format wide metrics report definition convention threads",
             "data foreign sets noise-var store format wide metrics report definition convention threads",
-            "data packed sets noise-var format wide metrics definition convention threads",
+            "data packed sets noise-var store format wide metrics definition convention threads",
             "data spectra sets format wide metrics definition threads",
             "truth CATALOGUE truth-sign stamp field columns ellipticity missing max-modulus noise-var format wide metrics report definition convention threads",
             "truth spectra truth-sign stamp field format wide metrics definition threads",
@@ -58,10 +58,25 @@ const WAYS: [(&str, &[&str]); 27] = [
             "merge bootstrap seed fail-above junit plot format wide metrics report",
         ],
     ),
+    (
+        "challenge new",
+        &[
+            "name kind public private sets images grid amplitude tilt seed metric entries-per-team opens closes contact data-version threads",
+            "name kind public private data truth-table metric entries-per-team opens closes contact data-version threads",
+        ],
+    ),
+    ("challenge check", &["ENTRY challenge json threads"]),
+    (
+        "challenge rank",
+        &["INBOX challenge truth store reference report digits detail format threads"],
+    ),
     ("check", &["PATH data grid stamp images json"]),
     (
         "pack",
-        &["measured out method kind", "foreign data out method kind"],
+        &[
+            "measured out method kind challenge team title contact entry",
+            "foreign data out method kind challenge team title contact entry",
+        ],
     ),
     ("unpack", &["ARCHIVE out verify"]),
     ("show", &["submission data galaxy out"]),
@@ -96,6 +111,7 @@ const WAYS: [(&str, &[&str]); 27] = [
     ),
     ("help", &[]),
     ("baseline help", &[]),
+    ("challenge help", &[]),
 ];
 
 /// Commands whose pairs are not compared.

@@ -98,12 +98,13 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         grid,
         truth,
         images: *images,
+        sets: Vec::new(),
     };
     report(&check(path, &expected), path, *json)
 }
 
 /// Prints the findings about `path`, and fails if any is an error.
-fn report(findings: &[Finding], path: &Path, json: bool) -> anyhow::Result<()> {
+pub(super) fn report(findings: &[Finding], path: &Path, json: bool) -> anyhow::Result<()> {
     let errors = findings
         .iter()
         .filter(|f| f.severity == Severity::Error)

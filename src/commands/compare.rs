@@ -16,6 +16,7 @@ use shearq_results::conditions::Conditions;
 use shearq_results::groups::{Group, Grouping, Order};
 use shearq_results::row::RunRecord;
 use shearq_results::store;
+use shearq_results::submit::packed::PackedCatalogues;
 use shearq_results::views::comparison::{compare, compare_runs, q_heat_map};
 use shearq_results::views::pages;
 use shearq_results::views::scores::notes;
@@ -23,14 +24,14 @@ use shearq_results::views::verdict::verdict;
 
 /// Compare the metrics of several configurations.
 ///
-/// Each OUT is a folder that `measure` or `run` wrote. Differences in Q are relative to the first OUT and paired
+/// Each OUT is a folder that `measure` or `run` wrote, or a submission as `pack` writes it: a folder or an archive. Differences in Q are relative to the first OUT and paired
 /// over the same images, so that common noise cancels. Published metrics are shown next to them.
 ///
 /// With --store, the command compares the runs that `score --store` and `run --store` recorded. A terminal also
 /// shows Q of each set as a heat map, without colours if NO_COLOR is set.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Folders that `measure` or `run` wrote.
+    /// Folders that `measure` or `run` wrote, or submissions (with --data).
     #[arg(value_name = "OUT", required_unless_present_any = ["foreign", "store"])]
     measured: Vec<PathBuf>,
     /// Data folder with the true shear [default: the data that the first OUT was measured from].
@@ -106,6 +107,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
     let mut made_by = Vec::new();
     for folder in &arguments.measured {
+        if PackedCatalogues::is_packed(folder) {
+            made_by.push(("Input".to_owned(), folder.display().to_string()));
+            continue;
+        }
         made_by.extend(score::made_by(&Run::require(folder)?, folder)?);
     }
     let paths = arguments.store.iter().chain(&arguments.foreign);

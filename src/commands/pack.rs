@@ -2,16 +2,18 @@
 
 use std::path::PathBuf;
 
-use crate::choices::named;
+use anyhow::Context;
 use clap::Args;
+use shearq_files::open::{SETTINGS, read_to_string};
 use shearq_submissions::is_control;
 
+use crate::choices::named;
 use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
 use shearq_pipeline::data::run::{Run, open_data};
 use shearq_results::foreign::Foreign;
 use shearq_results::submit::archive::is_archive;
-use shearq_results::submit::manifest::Contents;
+use shearq_results::submit::manifest::{Contents, Entry};
 use shearq_results::submit::pack::{Origin, Packing};
 
 /// Longest name of a method in bytes: a tar header has 100 for a file name.
@@ -52,9 +54,76 @@ pub(crate) struct Arguments {
     /// Name of the method in file names [default: name of the configuration or program, with `-` for `/`].
     #[arg(long, value_name = "NAME")]
     method: Option<String>,
+    #[command(flatten)]
+    entry: EntryArguments,
     /// Content of the submission.
     #[arg(long, value_parser = named::<Contents>(), default_value = "catalogues")]
     kind: Contents,
+}
+
+/// Team and challenge of an entry.
+#[derive(Debug, Args)]
+struct EntryArguments {
+    /// TOML file with the keys challenge, team, title and contact. Options replace its values.
+    #[arg(long = "entry", value_name = "FILE")]
+    file: Option<PathBuf>,
+    /// Name of the challenge.
+    #[arg(long, value_name = "NAME")]
+    challenge: Option<String>,
+    /// Name of the team.
+    #[arg(long, value_name = "NAME")]
+    team: Option<String>,
+    /// One line about the entry.
+    #[arg(long, value_name = "TEXT")]
+    title: Option<String>,
+    /// Address for questions of the organiser. It is not published.
+    #[arg(long, value_name = "TEXT")]
+    contact: Option<String>,
+}
+
+impl EntryArguments {
+    /// The entry, if any option is given.
+    fn entry(&self) -> anyhow::Result<Option<Entry>> {
+        let EntryArguments {
+            file,
+            challenge,
+            team,
+            title,
+            contact,
+        } = self;
+        let mut values = match file {
+            None => toml::Table::new(),
+            Some(path) => {
+                let text = read_to_string(path, SETTINGS);
+                let text = text.with_context(|| path.display().to_string())?;
+                text.parse().with_context(|| path.display().to_string())?
+            }
+        };
+        for (key, value) in [
+            ("challenge", challenge),
+            ("team", team),
+            ("title", title),
+            ("contact", contact),
+        ] {
+            if let Some(value) = value {
+                values.insert(key.into(), value.clone().into());
+            }
+        }
+        if values.is_empty() {
+            return Ok(None);
+        }
+        for (key, option) in [("challenge", "--challenge NAME"), ("team", "--team NAME")] {
+            anyhow::ensure!(
+                values.contains_key(key),
+                "the entry has no {key}. Try: {option}"
+            );
+        }
+        let place = || match file {
+            Some(path) => path.display().to_string(),
+            None => "the entry".into(),
+        };
+        Ok(Some(values.try_into().with_context(place)?))
+    }
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -64,8 +133,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         data,
         out,
         method,
+        entry,
         kind,
     } = arguments;
+    let entry = entry.entry()?;
     let ending = out.extension().unwrap_or_default().to_string_lossy();
     anyhow::ensure!(
         is_archive(out) || !OTHER_ARCHIVES.contains(&ending.as_ref()),
@@ -94,6 +165,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         origin,
         method,
         contents: *kind,
+        entry,
     };
     tell_unread(&packing.origin.catalogues()?);
     let mut bar = Bar::new("packing", packing.galaxies()?);

@@ -12,20 +12,19 @@ use shearq_submissions::EllipticityType;
 use crate::arguments::{Printing, ReportFile, ScoreSettings, SetList, Threads, positive};
 use crate::{print, tell, tell_unread};
 use shearq_pipeline::PipelineError;
+use shearq_pipeline::data::fingerprint;
 use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::{Run, Source};
+use shearq_pipeline::data::run::{Run, Source, way};
 use shearq_pipeline::simulate::kind_of;
 use shearq_pipeline::truth::{ReadTruth, Reading, read_truth, reading_of};
 use shearq_render::table::TableFormat;
 use shearq_results::foreign::{Foreign, Screen, folder_of, plain_columns};
-use shearq_results::row::{Measured, RunRecord};
-use shearq_results::score::{
-    COLUMNS, ReadImage, ScoredSet, own_catalogue, score_files, score_folder, score_sets, unscored,
-};
+use shearq_results::row::{Measured, RunRecord, SetRecord};
+use shearq_results::score::{COLUMNS, ScoredSet, score_files, score_folder, score_sets, unscored};
 use shearq_results::store;
 use shearq_results::submit::challenge::{Kind, read_bandpowers};
 use shearq_results::submit::manifest::Manifest;
-use shearq_results::submit::packed::{Packed, Sent, Submission};
+use shearq_results::submit::packed::{Packed, PackedCatalogues, Sent, Submission};
 use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra, verdict_line};
 use shearq_results::{views::diagnosis, views::pages};
 use shearq_simulate::kinds::SetKind;
@@ -93,7 +92,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
     /// Record the scores in this results store, for `compare --store`.
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra", "packed"])]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra"])]
     store: Option<PathBuf>,
     #[command(flatten)]
     printing: Printing,
@@ -266,56 +265,130 @@ fn packed(
     path: &Path,
     options: Options,
 ) -> anyhow::Result<()> {
+    let _prepared = arguments.store.as_deref().map(store::prepare).transpose()?;
     let sent = Sent::open(path)?;
     let submission = Submission::read(&sent)?;
+    let Packed::Spectra(files) = submission.packed else {
+        let catalogues = PackedCatalogues::new(sent, submission)?;
+        return packed_catalogues(arguments, data, path, &catalogues, options);
+    };
+    anyhow::ensure!(
+        arguments.noise_var.is_none(),
+        "--noise-var applies to catalogues only; {} contains power spectra. Try: without --noise-var",
+        path.display()
+    );
+    let named = |error: anyhow::Error| {
+        let named = |error| sent.named(error).into();
+        error.downcast().map_or_else(|other| other, named)
+    };
     let manifest = submission.manifest.as_ref();
-    let catalogues = match submission.packed {
-        Packed::Catalogues(catalogues) => catalogues,
-        Packed::Spectra(files) => {
-            anyhow::ensure!(
-                arguments.noise_var.is_none(),
-                "--noise-var applies to catalogues only; {} contains power spectra. Try: without --noise-var",
-                path.display()
-            );
-            return spectra_of_sets(arguments, data, files, manifest, path, options).map_err(
-                |error| {
-                    let named = |error| sent.named(error).into();
-                    error.downcast().map_or_else(|other| other, named)
-                },
-            );
+    let scored = score_spectra(arguments, data, files, manifest, path, options).map_err(named)?;
+    print_spectra(arguments, &scored, |set| kind_of(data, set), path, options)?;
+    let Some(store) = &arguments.store else {
+        return Ok(());
+    };
+    let made = packed_made_by(&submission.method, manifest, path, data)?;
+    let source = Source::folder(data, folder_of(path))?;
+    let mut sets = Vec::new();
+    for (set, score) in &scored {
+        let Some(set) = *set else { continue };
+        // The images that the spectrum was made from are not recorded.
+        let print = fingerprint::of_set(&source, data, set, &[])?;
+        let simulated = kind_of(data, set).is_some();
+        sets.push(SetRecord::of_spectrum(
+            set,
+            simulated,
+            score,
+            Vec::new(),
+            print,
+        ));
+    }
+    let run = RunRecord::of_records(made.measured(&source, data), sets, options)?;
+    let path = store::write(store, &run)?;
+    tell(format_args!("recorded in {}", path.display()));
+    Ok(())
+}
+
+/// Name and settings of a submission, for a store.
+struct PackedBy {
+    name: String,
+    settings: String,
+}
+
+impl PackedBy {
+    fn measured<'a>(&'a self, source: &'a Source, data: &'a DataFolder) -> Measured<'a> {
+        Measured {
+            name: &self.name,
+            settings: self.settings.clone(),
+            source,
+            data,
         }
-    };
+    }
+}
+
+fn packed_made_by(
+    method: &str,
+    manifest: Option<&Manifest>,
+    path: &Path,
+    data: &DataFolder,
+) -> anyhow::Result<PackedBy> {
+    let run = manifest.and_then(|manifest| manifest.run.as_ref());
+    Ok(PackedBy {
+        name: method.to_owned(),
+        settings: match run {
+            Some(run) => toml::to_string(&run.configuration)?,
+            // The path from the data to the submission distinguishes methods of one name.
+            None => way(data.root(), path)?.display().to_string(),
+        },
+    })
+}
+
+/// Scores the catalogues of a submission.
+fn packed_catalogues(
+    arguments: &Arguments,
+    data: &DataFolder,
+    path: &Path,
+    catalogues: &PackedCatalogues,
+    options: Options,
+) -> anyhow::Result<()> {
     let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
-    let of_set = |set| {
-        let images = catalogues.get(&set).into_iter().flatten();
-        images.map(|(image, path)| (*image, path.clone())).collect()
-    };
-    // Catalogues by shearq are in the standard convention.
-    let own = manifest.is_some_and(|manifest| manifest.run.is_some());
     let options = Options {
-        choice: match own {
+        choice: match catalogues.is_own() {
             true => arguments.settings.own_choice(),
             false => arguments.settings.choice(),
         },
         ..options
     };
-    let foreign = plain_columns(COLUMNS, Screen::default());
-    let read: ReadImage<'_> = if own { &own_catalogue } else { &foreign };
+    let read = |grid: &Grid, path: &Path| catalogues.sum(grid, path);
     let threads = arguments.threads.number();
+    let of_set = |set| catalogues.of_set(set);
     let mut scored =
-        score_sets(data, sets, of_set, read, options, threads).map_err(|error| match error {
-            PipelineError::File(error) => sent.named(error).into(),
+        score_sets(data, sets, of_set, &read, options, threads).map_err(|error| match error {
+            PipelineError::File(error) => catalogues.sent.named(error).into(),
             other => other,
         })?;
     for set in &mut scored {
-        set.odd_images.renamed(|path| sent.as_given(path));
+        set.odd_images
+            .renamed(|path| catalogues.sent.as_given(path));
     }
-    let title = format!("Scores of {}", submission.method);
+    if let Some(store) = &arguments.store {
+        let manifest = catalogues.manifest.as_ref();
+        let made = packed_made_by(&catalogues.method, manifest, path, data)?;
+        let source = Source::folder(data, folder_of(path))?;
+        record_printable(
+            arguments,
+            store,
+            made.measured(&source, data),
+            &scored,
+            options,
+        )?;
+    }
+    let title = format!("Scores of {}", catalogues.method);
     let mut table = per_set(&scored, &title, options.definition);
     table.notes.extend(unscored(data, &scored, sets)?);
     table
         .notes
-        .extend(verdict_line(&submission.method, &scored));
+        .extend(verdict_line(&catalogues.method, &scored));
     arguments.printing.print(&table)
 }
 
@@ -347,18 +420,25 @@ fn spectrum_folder(
         folder.display()
     );
     let manifest = Manifest::read(folder)?;
-    spectra_of_sets(arguments, data, files, manifest.as_ref(), folder, options)
+    let scored = score_spectra(arguments, data, files, manifest.as_ref(), folder, options)?;
+    print_spectra(
+        arguments,
+        &scored,
+        |set| kind_of(data, set),
+        folder,
+        options,
+    )
 }
 
 /// Scores the power spectra `files` by set, of the submission at `place`.
-fn spectra_of_sets(
+fn score_spectra(
     arguments: &Arguments,
     data: &DataFolder,
     mut files: BTreeMap<u32, PathBuf>,
     manifest: Option<&Manifest>,
     place: &Path,
     options: Options,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<Vec<(Option<u32>, SpectrumScore)>> {
     if let Some(wanted) = &arguments.sets {
         if let Some(set) = wanted.0.iter().find(|set| !files.contains_key(set)) {
             bail!("{}: found no spectrum of set {set}", place.display());
@@ -371,7 +451,7 @@ fn spectra_of_sets(
         let score = score_spectrum(truth, path, manifest, options)?;
         scored.push((Some(*set), score));
     }
-    print_spectra(arguments, &scored, |set| kind_of(data, set), place, options)
+    Ok(scored)
 }
 
 fn spectrum_file(

@@ -13,6 +13,7 @@ mod bad_settings;
 mod baselines;
 mod bias;
 mod chain;
+mod challenge;
 mod documents;
 mod doubtful;
 mod entry_points;

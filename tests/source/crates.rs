@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 /// The crates from the lowest level up, with their folders. A crate uses crates of lower levels only.
-const LEVELS: [&[(&str, &str)]; 8] = [
+const LEVELS: [&[(&str, &str)]; 9] = [
     &[
         ("shearq-fourier", "crates/fourier"),
         ("shearq-quantities", "crates/quantities"),
@@ -24,6 +24,7 @@ const LEVELS: [&[(&str, &str)]; 8] = [
     &[("shearq-pipeline", "crates/pipeline")],
     &[("shearq-results", "crates/results")],
     &[("shearq-studies", "crates/studies")],
+    &[("shearq-challenge", "crates/challenge")],
     &[("shearq", ".")],
     &[("shearq-python", "python"), ("shearq-benches", "benches")],
 ];

@@ -218,15 +218,26 @@ impl Scratch {
     }
 }
 
+/// Most attempts to make a temporary file or folder. A single attempt fails once in thousands.
+const ATTEMPTS: u32 = 100;
+
 /// Makes a file or folder under a temporary name for `target` by `make`, and locks it.
 fn held(
     target: &Path,
     doing: &'static str,
     mut make: impl FnMut(&Path) -> std::io::Result<fs::File>,
 ) -> Result<(PathBuf, fs::File), FileError> {
+    let mut attempts = 0;
     loop {
         let part = part_of(target)?;
-        let file = make(&part).map_err(FileError::doing(target, doing))?;
+        let file = match make(&part) {
+            // Before it was opened, another thread or process may have taken it for a leftover.
+            Err(error) if error.kind() == ErrorKind::NotFound && attempts < ATTEMPTS => {
+                attempts += 1;
+                continue;
+            }
+            made => made.map_err(FileError::doing(target, doing))?,
+        };
         // File systems without locks have none that could be taken by others.
         let _ = file.lock();
         // Before it was locked, another process may have taken it for a leftover.
@@ -448,6 +459,21 @@ mod tests {
         ];
         expected.sort();
         assert_eq!(names, expected);
+    }
+
+    #[test]
+    fn threads_that_make_temporary_folders_do_not_remove_those_of_others() {
+        let make = || {
+            for _ in 0..200 {
+                let scratch = Scratch::new().unwrap();
+                fs::write(scratch.path().join("file"), "x").unwrap();
+            }
+        };
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(make);
+            }
+        });
     }
 
     #[test]

@@ -9,7 +9,8 @@ use shearq_quantities::Shear;
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
 use super::images::ImageId;
-use crate::data::layout::{DataFolder, SIGN_KEY};
+use super::truth;
+use crate::data::layout::DataFolder;
 use crate::data::psf_table;
 use crate::data::run::{Run, Source, claim};
 use shearq_files::atomic;
@@ -88,7 +89,60 @@ pub fn simulate_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
-    let claim = claim(&data.root().join(SIMULATION_FILE), record)?;
+    simulate_into(
+        record,
+        images,
+        Places { data, truth: data },
+        threads,
+        progress,
+    )
+}
+
+/// Simulates `images` for a challenge: images and PSFs into `public`; settings, true shear and intrinsic shapes into
+/// `private`. The headers of the images contain neither the seed nor properties of the galaxies.
+///
+/// # Errors
+/// As [`simulate_folder`].
+pub fn simulate_blind(
+    record: &SimulationRecord,
+    images: &[ImageId],
+    public: &DataFolder,
+    private: &DataFolder,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<(usize, usize), PipelineError> {
+    let places = Places {
+        data: public,
+        truth: private,
+    };
+    simulate_into(record, images, places, threads, progress)
+}
+
+/// The folders of a simulation.
+#[derive(Clone, Copy)]
+struct Places<'a> {
+    /// Images and PSFs.
+    data: &'a DataFolder,
+    /// Settings, true shear and intrinsic shapes.
+    truth: &'a DataFolder,
+}
+
+impl Places<'_> {
+    /// Whether the folder of the images must not determine the true shear.
+    fn are_apart(&self) -> bool {
+        self.data.root() != self.truth.root()
+    }
+}
+
+fn simulate_into(
+    record: &SimulationRecord,
+    images: &[ImageId],
+    places: Places<'_>,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<(usize, usize), PipelineError> {
+    let Places { data, truth } = places;
+    let claim = claim(&truth.root().join(SIMULATION_FILE), record)?;
     let todo: Vec<ImageId> = images
         .iter()
         .filter(|id| !data.galaxies(id.set, id.image).is_file())
@@ -98,7 +152,7 @@ pub fn simulate_folder(
     let mut simulators = Vec::new();
     for of_set in todo.chunk_by(|a, b| a.set == b.set) {
         let simulator = simulator(of_set[0].set, record.settings)?;
-        write_truth(data, &simulator)?;
+        write_truth(truth, &simulator)?;
         simulators.push((Arc::new(simulator), of_set));
     }
     let mut made = 0;
@@ -118,13 +172,13 @@ pub fn simulate_folder(
                 None => {
                     // Writing would make the folder again, without the earlier images.
                     claim.check()?;
-                    OpenImage::create(record, data, &row.job)?
+                    OpenImage::create(record, places, &row.job)?
                 }
             };
             let last = row.job.iy + 1 == row.job.set.grid().n;
             image.add(row)?;
             if last {
-                image.finish(data)?;
+                image.finish(places)?;
                 made += 1;
             } else {
                 open = Some(image);
@@ -211,17 +265,8 @@ pub fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
 
 /// Writes the true shear of a set.
 pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {
-    let grid = set.grid();
-    // The comment follows the header, so that readers that skip one line or a `#` read the columns.
-    let mut text = format!("x,y,g1,g2\n# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)\n");
-    for iy in 0..grid.n {
-        for ix in 0..grid.n {
-            let (x, y) = grid.centre(ix, iy);
-            let g = set.shear_at(ix, iy);
-            text.push_str(&format!("{x},{y},{},{}\n", g.e1, g.e2));
-        }
-    }
-    Ok(atomic::write(data.truth(set.kind().set), text.as_bytes())?)
+    let path = data.truth(set.kind().set);
+    Ok(truth::write_truth(&path, &set.grid(), &set.truth())?)
 }
 
 /// Files of one image that is being written.
@@ -235,26 +280,31 @@ struct OpenImage {
 impl OpenImage {
     fn create(
         record: &SimulationRecord,
-        data: &DataFolder,
+        places: Places<'_>,
         job: &RowJob,
     ) -> Result<Self, PipelineError> {
+        let data = places.data;
         let (set, image) = (job.set.kind().set, job.fields.image);
         let n = job.set.grid().n;
-        let seed = i64::try_from(record.settings.seed);
         let mut header = vec![
             ("SET", Value::Int(i64::from(set))),
             ("IMAGE", Value::Int(i64::from(image))),
             ("STAMP", Value::Int(STAMP as i64)),
             ("NGRID", Value::Int(n as i64)),
-            ("SNR", Value::Real(job.set.nominal_snr())),
             ("NOISESIG", Value::Real(NOISE_SIGMA)),
             ("CREATOR", Value::Text(format!("shearq {}", record.version))),
-            ("KIND", Value::Text(job.set.kind().image.label().into())),
         ];
-        header.push(match seed {
-            Ok(seed) => ("SEED", Value::Int(seed)),
-            Err(_) => ("SEED", Value::Text(record.settings.seed.to_string())),
-        });
+        if !places.are_apart() {
+            let seed = record.settings.seed;
+            header.extend([
+                ("SNR", Value::Real(job.set.nominal_snr())),
+                ("KIND", Value::Text(job.set.kind().image.label().into())),
+                match i64::try_from(seed) {
+                    Ok(seed) => ("SEED", Value::Int(seed)),
+                    Err(_) => ("SEED", Value::Text(seed.to_string())),
+                },
+            ]);
+        }
         let side = n * STAMP;
         let galaxies = ImageWriter::create(data.galaxies(set, image), side, side, &header)?;
         let psf_path = data.psf_star(set, image);
@@ -306,12 +356,15 @@ impl OpenImage {
     }
 
     /// The galaxies are renamed last: an image with galaxies is complete.
-    fn finish(self, data: &DataFolder) -> Result<(), PipelineError> {
+    fn finish(self, places: Places<'_>) -> Result<(), PipelineError> {
         let (set, image) = (self.job.set.kind().set, self.job.fields.image);
         if let Some(stars) = self.stars {
             stars.finish()?;
         }
-        atomic::write(data.intrinsic(set, image), self.intrinsic.as_bytes())?;
+        atomic::write(
+            places.truth.intrinsic(set, image),
+            self.intrinsic.as_bytes(),
+        )?;
         self.galaxies.finish()?;
         Ok(())
     }

@@ -7,8 +7,8 @@ use shearq_scoring::{Grid, TrueShear, TruthSign, sign_by_modes};
 
 use super::grid;
 use crate::data::layout::{DataFolder, SIGN_KEY, stated_sign, truth_is_there, truth_rows};
-use shearq_files::FileError;
 use shearq_files::table::{self, MAX_ROWS};
+use shearq_files::{FileError, atomic};
 
 /// How a truth file is to be read.
 #[derive(Debug, Clone, Copy)]
@@ -86,6 +86,23 @@ pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileErro
         TruthSign::Challenge => standard.flipped(),
     };
     Ok(ReadTruth { grid, shear, basis })
+}
+
+/// Writes a true shear in the standard sign.
+///
+/// # Errors
+/// If the file cannot be written.
+pub fn write_truth(path: &Path, grid: &Grid, truth: &TrueShear) -> Result<(), FileError> {
+    // The comment follows the header, so that readers that skip one line or a `#` read the columns.
+    let mut text = format!("x,y,g1,g2\n# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)\n");
+    for iy in 0..grid.n {
+        for ix in 0..grid.n {
+            let (x, y) = grid.centre(ix, iy);
+            let (g1, g2) = (truth.g1[(ix, iy)], truth.g2[(ix, iy)]);
+            text.push_str(&format!("{x},{y},{g1},{g2}\n"));
+        }
+    }
+    atomic::write(path, text.as_bytes())
 }
 
 /// How the truth of a set of a data folder is to be read.

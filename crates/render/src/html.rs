@@ -85,6 +85,8 @@ pub enum Block {
     /// A table, which readers can sort. Its columns of detail are folded away until asked for; its
     /// values are in the page in full precision, as CSV.
     Table(Table),
+    /// The same with a field that hides rows without the words that a reader types.
+    Filtered(Table),
     /// A figure.
     Figure(Picture),
     /// Lines in a typewriter font, as they are.
@@ -351,7 +353,8 @@ impl Page {
             Block::Text(text) => html! {
                 @for paragraph in paragraphs(text) { p { (inline(&paragraph)) } }
             },
-            Block::Table(table) => self.table(table),
+            Block::Table(table) => self.table(table, false),
+            Block::Filtered(table) => self.table(table, true),
             Block::Figure(picture) => self.figure(picture),
             Block::Code(text) => code(text),
         }
@@ -392,7 +395,7 @@ impl Page {
         }
     }
 
-    fn table(&mut self, table: &Table) -> Markup {
+    fn table(&mut self, table: &Table, filtered: bool) -> Markup {
         self.tables += 1;
         let number = self.tables;
         let id = self.ids.give(&format!("table-{number}"));
@@ -403,7 +406,7 @@ impl Page {
         let csv = BASE64.encode(table.render(TableFormat::Csv));
         // The caption stands outside what scrolls; the table is named by it.
         html! {
-            div.table id=(id) {
+            div.table.filtered[filtered] id=(id) {
                 p.title id=(title) { span.number { "Table " (number) "." } " " (Words(&table.title)) }
                 div.scroll role="region" tabindex="0" aria-labelledby=(title) {
                     table aria-labelledby=(title) {
@@ -478,11 +481,17 @@ impl Column {
         (!classes.is_empty()).then(|| classes.join(" "))
     }
 
-    /// A cell; words in the first column head their row, and stay while others scroll.
+    /// A cell. The first column heads the rows, and stays while others scroll.
     fn cell(self, k: usize, cell: Option<&Cell>) -> Markup {
         let class = self.class(false);
         match cell {
+            None | Some(Cell::Empty) if k == 0 => html! { th scope="row" class=[class] {} },
             None | Some(Cell::Empty) => html! { td class=[class] {} },
+            Some(number @ Cell::Number { value, .. }) if k == 0 => html! {
+                th scope="row" class=[class] data-value=(sort_value(*value)) {
+                    (number.digits().map_or_else(String::new, |shown| shown.0.replace('-', "−")))
+                }
+            },
             Some(Cell::Text(words)) if k == 0 => {
                 let long = words.chars().count() > LONG;
                 html! { th scope="row" class=[self.class(long)] { (Words(words)) } }

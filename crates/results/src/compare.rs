@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
-use shearq_scoring::{Choice, Definition, Grid, Options};
+use shearq_scoring::{Choice, Definition, FieldSum, Grid, Options, RowCounts};
 use shearq_submissions::{Published, Registry};
 
 use super::conditions::Conditions;
@@ -13,6 +13,7 @@ use super::foreign::Foreign;
 use super::groups::Order;
 use super::row::{RunRecord, SetRecord, choice_word, definition_word};
 use super::score::{Catalogues, ScoredSet, own_catalogue, score_variants, unscored};
+use super::submit::packed::PackedCatalogues;
 use shearq_files::FileError;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::listing::Files;
@@ -95,9 +96,65 @@ pub fn by_name(variants: &[Variant]) -> Vec<(String, Vec<SetRecord>)> {
 struct Entrant<'a> {
     name: String,
     published: Option<Published>,
-    files: Files,
-    foreign: Option<&'a Foreign>,
+    catalogues: Origin<'a>,
     settings: String,
+}
+
+/// Where the catalogues of a variant come from.
+enum Origin<'a> {
+    /// A folder that shearq measured.
+    Measured(Files),
+    /// Another program.
+    Foreign(&'a Foreign, Files),
+    /// A submission.
+    Packed(Box<PackedCatalogues>),
+}
+
+impl Origin<'_> {
+    fn of_set(&self, set: u32) -> Vec<(u32, PathBuf)> {
+        match self {
+            Origin::Measured(files) | Origin::Foreign(_, files) => files.of_set(set),
+            Origin::Packed(packed) => packed.of_set(set),
+        }
+    }
+
+    fn sets(&self) -> Vec<u32> {
+        match self {
+            Origin::Measured(files) | Origin::Foreign(_, files) => files.sets(),
+            Origin::Packed(packed) => packed.sets(),
+        }
+    }
+
+    /// Whether one pattern without a set number serves all sets.
+    fn serve_all_sets(&self) -> bool {
+        match self {
+            Origin::Measured(files) | Origin::Foreign(_, files) => files.serve_all_sets(),
+            Origin::Packed(_) => false,
+        }
+    }
+
+    fn unread(&self) -> Vec<String> {
+        match self {
+            Origin::Measured(files) | Origin::Foreign(_, files) => files.unread(),
+            Origin::Packed(_) => Vec::new(),
+        }
+    }
+
+    fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
+        match self {
+            Origin::Measured(_) => own_catalogue(grid, path),
+            Origin::Foreign(foreign, _) => foreign.sum(grid, path),
+            Origin::Packed(packed) => packed.sum(grid, path),
+        }
+    }
+
+    fn choice(&self, way: Way) -> Choice {
+        match self {
+            Origin::Measured(_) => way.own,
+            Origin::Packed(packed) if packed.is_own() => way.own,
+            Origin::Foreign(..) | Origin::Packed(_) => way.foreign,
+        }
+    }
 }
 
 /// How variants are scored.
@@ -136,37 +193,34 @@ pub fn score_all(
         entrants.push(Entrant {
             name: foreign.name.clone(),
             published: None,
-            files: foreign.catalogues(&[])?,
-            foreign: Some(foreign),
+            catalogues: Origin::Foreign(foreign, foreign.catalogues(&[])?),
             settings: foreign.pattern().display().to_string(),
         });
     }
-    if entrants.iter().all(|e| e.files.serve_all_sets()) {
+    if entrants.iter().all(|e| e.catalogues.serve_all_sets()) {
         let message = "cannot determine the sets, because no `catalogues` contains {set}. Try: add {set} to the pattern";
         return Err(PipelineError::Request(message.into()));
     }
-    if let Some(entrant) = entrants.iter().find(|e| e.files.sets().is_empty()) {
+    if let Some(entrant) = entrants.iter().find(|e| e.catalogues.sets().is_empty()) {
         let message = format!("{}: there is no catalogue to score", entrant.name);
         return Err(PipelineError::Request(message));
     }
-    let common = |set: u32| entrants.iter().all(|e| e.files.has(set));
+    let common = |set: u32| {
+        entrants
+            .iter()
+            .all(|e| !e.catalogues.of_set(set).is_empty())
+    };
     if !(1..=MAX_SET).any(common) {
         let message = "the catalogues have no set in common".into();
         return Err(PipelineError::Request(message));
     }
     let readers: Vec<_> = entrants
         .iter()
-        .map(|entrant| {
-            let foreign = entrant.foreign;
-            move |grid: &Grid, path: &Path| match foreign {
-                Some(foreign) => foreign.sum(grid, path),
-                None => own_catalogue(grid, path),
-            }
-        })
+        .map(|entrant| |grid: &Grid, path: &Path| entrant.catalogues.sum(grid, path))
         .collect();
     let of_set: Vec<_> = entrants
         .iter()
-        .map(|entrant| |set: u32| entrant.files.of_set(set))
+        .map(|entrant| |set: u32| entrant.catalogues.of_set(set))
         .collect();
     let catalogues: Vec<Catalogues<'_>> = entrants
         .iter()
@@ -174,10 +228,7 @@ pub fn score_all(
         .map(|(entrant, (of_set, read))| Catalogues {
             of_set,
             read,
-            choice: match entrant.foreign {
-                Some(_) => way.foreign,
-                None => way.own,
-            },
+            choice: entrant.catalogues.choice(way),
         })
         .collect();
     let options = Options {
@@ -190,17 +241,13 @@ pub fn score_all(
         .zip(scored)
         .map(|(entrant, sets)| {
             let numbers: Vec<u32> = sets.iter().filter_map(|set| set.set).collect();
-            let choice = match entrant.foreign {
-                Some(_) => way.foreign,
-                None => way.own,
-            };
             let run = RunRecord {
                 configuration: entrant.name.clone(),
                 version: shearq_pipeline::VERSION.into(),
                 settings: entrant.settings.clone(),
                 source: data.root().display().to_string(),
                 definition: definition_word(way.definition).into(),
-                choice: choice_word(choice),
+                choice: choice_word(entrant.catalogues.choice(way)),
                 noise: "measured".into(),
                 sets: records(&sets),
             };
@@ -208,7 +255,7 @@ pub fn score_all(
                 name: entrant.name.clone(),
                 published: entrant.published,
                 unscored: {
-                    let unread = entrant.files.unread().into_iter();
+                    let unread = entrant.catalogues.unread().into_iter();
                     let mut lines: Vec<String> =
                         unread.map(|line| format!("warning: {line}.")).collect();
                     lines.extend(unscored(&data, &sets, &numbers)?);
@@ -233,6 +280,10 @@ fn own_entrants(
     let mut first: Option<(&Path, Source)> = None;
     let mut entrants = Vec::new();
     for folder in folders {
+        if PackedCatalogues::is_packed(folder) {
+            entrants.push(packed_entrant(folder, given)?);
+            continue;
+        }
         let run = Run::require(folder)?;
         if !given {
             let (beside, source) = first.get_or_insert_with(|| (folder, run.source.clone()));
@@ -263,8 +314,7 @@ fn own_entrants(
                 .filter(|entry| entry.configuration == run.configuration)
                 .and_then(|entry| entry.published),
             name: run.configuration.name.clone(),
-            files: run.catalogues(folder, &[])?,
-            foreign: None,
+            catalogues: Origin::Measured(run.catalogues(folder, &[])?),
             settings: toml::to_string(&run.configuration).map_err(FileError::doing(
                 folder,
                 "cannot write the settings as TOML",
@@ -272,6 +322,27 @@ fn own_entrants(
         });
     }
     Ok(entrants)
+}
+
+/// A submission. Its files do not lead to the data, so these must be `given`.
+fn packed_entrant(path: &Path, given: bool) -> Result<Entrant<'static>, PipelineError> {
+    if !given {
+        let message = "a submission needs the true shear. Try: --data DIR";
+        return Err(FileError::new(path, message).into());
+    }
+    let packed = PackedCatalogues::open(path)?;
+    let run = packed
+        .manifest
+        .as_ref()
+        .and_then(|manifest| manifest.run.as_ref());
+    let settings = run.map(|run| toml::to_string(&run.configuration));
+    let settings = settings.unwrap_or_else(|| Ok(path.display().to_string()));
+    Ok(Entrant {
+        name: packed.method.clone(),
+        published: None,
+        settings: settings.map_err(FileError::doing(path, "cannot write the settings as TOML"))?,
+        catalogues: Origin::Packed(Box::new(packed)),
+    })
 }
 
 /// Sets that all variants have.

@@ -7,7 +7,9 @@ use serde::{Deserialize, Serialize};
 use shearq_files::frames::TableError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_scoring::resample::mean_over_sets;
-use shearq_scoring::{Choice, Definition, Metric, Metrics, Noise, Options};
+use shearq_scoring::{
+    Choice, Convention, Definition, Metric, Metrics, Noise, Options, SpectrumScore,
+};
 use shearq_submissions::check_name;
 
 use super::score::ScoredSet;
@@ -94,6 +96,41 @@ impl SetRecord {
             convention_leaderboard: score.best.number(),
         }
     }
+
+    /// Record of the power spectrum of set `set`, made from `images`. Catalogues alone have the other metrics.
+    pub fn of_spectrum(
+        set: u32,
+        simulated: bool,
+        score: &SpectrumScore,
+        images: Vec<u32>,
+        data: String,
+    ) -> Self {
+        let (mut metrics, mut errors) = (Metrics::unknown(), Metrics::unknown());
+        metrics.q = score.quality.q;
+        metrics.m_half = score.m_half;
+        metrics.sqrt_a = score.sqrt_a;
+        metrics.sigma_sys_1e4 = score.quality.sigma_sys * 1e4;
+        errors.q = score.quality_error;
+        errors.m_half = score.m_half_error;
+        errors.sqrt_a = score.sqrt_a_error;
+        let standard = Convention::STANDARD.number();
+        SetRecord {
+            set,
+            simulated,
+            data,
+            images,
+            galaxies: 0,
+            flagged: 0,
+            metrics,
+            errors,
+            q_replicates: Vec::new(),
+            q_calibrated_replicates: Vec::new(),
+            q_leaderboard: score.quality.q,
+            convention: standard,
+            convention_known: true,
+            convention_leaderboard: standard,
+        }
+    }
 }
 
 /// Record of a scored run.
@@ -118,7 +155,7 @@ pub struct RunRecord {
 }
 
 /// Name of a bandpower definition in records.
-pub(super) fn definition_word(definition: Definition) -> &'static str {
+pub fn definition_word(definition: Definition) -> &'static str {
     match definition {
         Definition::Leaderboard => "leaderboard",
         Definition::Corrected => "corrected",
@@ -174,12 +211,7 @@ impl RunRecord {
         scored: &[ScoredSet],
         options: Options,
     ) -> Result<Self, PipelineError> {
-        let Measured {
-            name,
-            settings,
-            source,
-            data,
-        } = measured;
+        let Measured { source, data, .. } = measured;
         let sets = scored
             .iter()
             // Plain files have no set number.
@@ -189,6 +221,24 @@ impl RunRecord {
                 Ok(SetRecord::new(set, scored, print))
             })
             .collect::<Result<_, FileError>>()?;
+        RunRecord::of_records(measured, sets, options)
+    }
+
+    /// The record of a run with the records of its sets.
+    ///
+    /// # Errors
+    /// As [`RunRecord::new`].
+    pub fn of_records(
+        measured: Measured<'_>,
+        sets: Vec<SetRecord>,
+        options: Options,
+    ) -> Result<Self, PipelineError> {
+        let Measured {
+            name,
+            settings,
+            source,
+            data,
+        } = measured;
         Ok(RunRecord {
             configuration: name.to_owned(),
             version: shearq_pipeline::VERSION.into(),

@@ -75,6 +75,27 @@ pub fn cramer_rao(set: &SetSimulator) -> Option<(f64, f64)> {
 /// # Errors
 /// If the grids of truth and set differ.
 pub fn expected_q(set: &SetSimulator, scatter: f64, images: u32) -> Result<f64, ScoringError> {
+    Ok(expected_qs(set, scatter, images)?.spectra)
+}
+
+/// Expected Q of a perfect method, with and without the mean power of its noise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ExpectedQ {
+    /// Of catalogues: the noise adds to the power.
+    pub catalogues: f64,
+    /// Of spectra from which the mean power of the noise is subtracted.
+    pub spectra: f64,
+}
+
+/// As [`expected_q`], also for catalogues.
+///
+/// # Errors
+/// If the grids of truth and set differ.
+pub fn expected_qs(
+    set: &SetSimulator,
+    scatter: f64,
+    images: u32,
+) -> Result<ExpectedQ, ScoringError> {
     let grid = set.grid();
     let (decomposer, bins) = (
         Decomposer::new(grid),
@@ -88,18 +109,22 @@ pub fn expected_q(set: &SetSimulator, scatter: f64, images: u32) -> Result<f64, 
     let mean = bins.white_noise(variance);
     let mut rng = ChaCha8Rng::seed_from_u64(u64::from(set.kind().set));
     let normal = Normal::new(0.0, variance.sqrt()).expect("a finite scatter");
-    let mut total = 0.0;
+    let (mut catalogues, mut spectra) = (0.0, 0.0);
     for _ in 0..TRIALS {
         let noisy =
             shear.mapv(|g| g + Complex64::new(normal.sample(&mut rng), normal.sample(&mut rng)));
         let modes = decomposer.decompose(noisy)?.e;
         let mut found = bins.power(&modes, &modes)?;
+        catalogues += quality(&bins, &found, &power).q;
         for (found, mean) in found.iter_mut().zip(mean) {
             *found -= mean;
         }
-        total += quality(&bins, &found, &power).q;
+        spectra += quality(&bins, &found, &power).q;
     }
-    Ok(total / f64::from(TRIALS))
+    Ok(ExpectedQ {
+        catalogues: catalogues / f64::from(TRIALS),
+        spectra: spectra / f64::from(TRIALS),
+    })
 }
 
 #[cfg(test)]

@@ -70,6 +70,30 @@
     });
   };
 
+  // Hides the rows that lack one of the words.
+  const filterable = (table) => {
+    const place = table.closest(".filtered");
+    if (!place) return;
+    const field = document.createElement("input");
+    field.type = "search";
+    field.placeholder = "Filter rows";
+    field.setAttribute("aria-label", "Filter rows");
+    const count = document.createElement("span");
+    count.setAttribute("role", "status");
+    field.addEventListener("input", () => {
+      const words = field.value.toLowerCase().split(/\s+/).filter(Boolean);
+      const rows = [...table.tBodies[0].rows];
+      let shown = 0;
+      for (const row of rows) {
+        const text = row.textContent.toLowerCase();
+        row.hidden = !words.every((word) => text.includes(word));
+        if (!row.hidden) shown += 1;
+      }
+      count.textContent = words.length ? `${shown} of ${rows.length} rows` : "";
+    });
+    place.querySelector(".tools").prepend(field, count);
+  };
+
   // A table that is wider than its place has its errors below the values.
   const stackable = (table) => {
     const place = table.closest(".scroll");
@@ -144,6 +168,7 @@
     themeButton();
     for (const table of document.querySelectorAll("main table")) {
       sortable(table);
+      filterable(table);
       foldable(table, stackable(table));
     }
     document.querySelectorAll("main figure").forEach(enlargeable);

@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::{
-    Bins, Choice, Convention, Definition, Fault, FieldSum, Grid, ImageFaults, Options, Row, SCORED,
-    SetImages, SetScorer, TrueShear,
+    Bins, Choice, Convention, Definition, Fault, FieldSum, Grid, ImageFaults, Options, Row,
+    RowCounts, SCORED, SetImages, SetScorer, TrueShear,
 };
 
 use super::challenge::{Kind, SpectrumLine, read_spectrum, wrong_multipoles};
@@ -52,10 +52,25 @@ pub struct Expected {
     pub truth: BTreeMap<u32, TrueShear>,
     /// Number of images of every set, if known.
     pub images: Option<u32>,
+    /// Sets that a submission must contain; it must contain no other sets. Empty if unknown.
+    pub sets: Vec<u32>,
 }
 
 /// Largest accepted distance of a position from the centre of its cell, in cells.
 const POSITION_TOLERANCE: f64 = 0.01;
+
+/// The catalogues of a set after their check.
+#[derive(Debug)]
+pub struct CheckedSet<'a> {
+    /// Set number.
+    pub set: u32,
+    /// Sums of the images.
+    pub images: &'a SetImages,
+    /// Image numbers, in order.
+    pub numbers: &'a [u32],
+    /// How the rows were used.
+    pub rows: RowCounts,
+}
 
 /// Checks a file, or all files of a folder or an archive.
 pub fn check(path: &Path, expected: &Expected) -> Vec<Finding> {
@@ -65,17 +80,29 @@ pub fn check(path: &Path, expected: &Expected) -> Vec<Finding> {
             report.error(&error.path, "readable", error.message);
             report.findings
         }
-        Ok(sent) => {
-            let mut findings = check_files(&sent, expected);
-            for finding in &mut findings {
-                finding.path = sent.as_given(&finding.path);
-            }
-            findings
-        }
+        Ok(sent) => check_sent(&sent, expected, &mut |_| {}),
     }
 }
 
-fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
+/// Checks an open submission. `done` gets each set of catalogues, so that each file is read once and the sums of one set
+/// are in memory at a time.
+pub fn check_sent(
+    sent: &Sent,
+    expected: &Expected,
+    done: &mut dyn FnMut(CheckedSet<'_>),
+) -> Vec<Finding> {
+    let mut findings = check_files(sent, expected, done);
+    for finding in &mut findings {
+        finding.path = sent.as_given(&finding.path);
+    }
+    findings
+}
+
+fn check_files(
+    sent: &Sent,
+    expected: &Expected,
+    done: &mut dyn FnMut(CheckedSet<'_>),
+) -> Vec<Finding> {
     let path = sent.path();
     let mut report = Report::default();
     let files = match sent.files() {
@@ -91,47 +118,27 @@ fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
     if path.is_dir() {
         check_manifest(path, &files, &mut report);
     }
-    let mut sets: BTreeMap<u32, SetFiles> = BTreeMap::new();
+    let single = files.len() == 1 && path.is_file();
+    let mut catalogues: BTreeMap<u32, Vec<(u32, &PathBuf)>> = BTreeMap::new();
     let mut spectra = BTreeSet::new();
     let mut methods: BTreeSet<String> = BTreeSet::new();
     for file in &files {
-        let kind = check_name(file, files.len() == 1 && path.is_file(), &mut report);
+        let kind = check_name(file, single, &mut report);
         if let Some(Kind::Catalogue { method, .. } | Kind::Spectrum { method, .. }) = &kind {
             methods.insert(method.clone());
         }
-        let spectrum = match &kind {
-            Some(kind) => matches!(kind, Kind::Spectrum { .. }),
-            None => looks_like_spectrum(file),
-        };
-        if spectrum {
-            spectra.extend(kind.as_ref().map(Kind::set));
-            check_spectrum(file, kind.as_ref(), expected, &mut report);
-            continue;
-        }
-        let Some(sum) = check_catalogue(file, expected, &mut report) else {
-            continue;
-        };
         match &kind {
             Some(Kind::Catalogue { set, image, .. }) => {
-                let entry = sets
-                    .entry(*set)
-                    .or_insert_with(|| SetFiles::new(&expected.grid, file));
-                entry.add(&sum, *image, file);
+                catalogues.entry(*set).or_default().push((*image, file));
             }
-            // A single file with another name belongs to the only set.
-            _ if files.len() == 1 && expected.truth.len() == 1 => {
-                let mut entry = SetFiles::new(&expected.grid, file);
-                entry.add(&sum, 1, file);
-                for set in expected.truth.keys() {
-                    check_against_truth(*set, &entry, expected, &mut report);
-                }
+            Some(Kind::Spectrum { set, .. }) => {
+                spectra.insert(*set);
+                check_spectrum(file, kind.as_ref(), expected, &mut report);
             }
-            _ if !expected.truth.is_empty() => {
-                let message =
-                    "not compared with the true shear, because the name contains no set number";
-                report.warn(file, "truth", message.into());
+            None if looks_like_spectrum(file) => {
+                check_spectrum(file, None, expected, &mut report);
             }
-            _ => {}
+            None => check_unnamed(file, files.len() == 1, expected, &mut report),
         }
     }
     if methods.len() > 1 {
@@ -139,22 +146,71 @@ fn check_files(sent: &Sent, expected: &Expected) -> Vec<Finding> {
         let message = format!("the files belong to several methods: {}", names.join(", "));
         report.error(path, "method", message);
     }
-    if path.is_dir() && !(sets.is_empty() && spectra.is_empty()) {
-        for set in expected.truth.keys() {
-            if !sets.contains_key(set) && !spectra.contains(set) {
-                let message = format!("found no file of set {set}, which the data contain");
-                report.warn(path, "sets", message);
-            }
+    if path.is_dir() && !(catalogues.is_empty() && spectra.is_empty()) {
+        let found = catalogues.keys().chain(&spectra).copied().collect();
+        check_sets(path, &found, expected, &mut report);
+    }
+    let numbers = catalogues.values().flatten().map(|(image, _)| *image);
+    let most = numbers.max().unwrap_or(0).max(expected.images.unwrap_or(0));
+    for (set, of_set) in catalogues {
+        let mut files: Option<SetFiles> = None;
+        for (image, file) in of_set {
+            let Some((sum, counts)) = check_catalogue(file, expected, &mut report) else {
+                continue;
+            };
+            let files = files.get_or_insert_with(|| SetFiles::new(&expected.grid, file));
+            files.add(&sum, counts, image, file);
+        }
+        if let Some(mut files) = files {
+            check_copies(&files, &mut report);
+            check_images(set, &mut files, most, path, expected, &mut report);
+            check_against_truth(set, &files, expected, &mut report);
+            done(CheckedSet {
+                set,
+                images: &files.images,
+                numbers: &files.numbers,
+                rows: files.rows,
+            });
         }
     }
-    let most = sets.values().flat_map(|files| &files.numbers).max();
-    let most = most.copied().unwrap_or(0).max(expected.images.unwrap_or(0));
-    for (set, files) in &mut sets {
-        check_copies(files, &mut report);
-        check_images(*set, files, most, path, expected, &mut report);
-        check_against_truth(*set, files, expected, &mut report);
-    }
     report.findings
+}
+
+/// Checks a catalogue whose name contains no set. A `single` file belongs to the only set.
+fn check_unnamed(file: &Path, single: bool, expected: &Expected, report: &mut Report) {
+    let Some((sum, counts)) = check_catalogue(file, expected, report) else {
+        return;
+    };
+    if single && expected.truth.len() == 1 {
+        let mut entry = SetFiles::new(&expected.grid, file);
+        entry.add(&sum, counts, 1, file);
+        for set in expected.truth.keys() {
+            check_against_truth(*set, &entry, expected, report);
+        }
+    } else if !expected.truth.is_empty() {
+        let message = "not compared with the true shear, because the name contains no set number";
+        report.warn(file, "truth", message.into());
+    }
+}
+
+/// Sets that are absent or unknown.
+fn check_sets(path: &Path, found: &BTreeSet<u32>, expected: &Expected, report: &mut Report) {
+    if expected.sets.is_empty() {
+        for set in expected.truth.keys().filter(|set| !found.contains(set)) {
+            let message = format!("found no file of set {set}, which the data contain");
+            report.warn(path, "sets", message);
+        }
+        return;
+    }
+    let wanted: BTreeSet<u32> = expected.sets.iter().copied().collect();
+    for (sets, what) in [
+        (&wanted - found, "is missing, but the challenge contains it"),
+        (found - &wanted, "does not belong to the challenge"),
+    ] {
+        for set in sets {
+            report.error(path, "sets", format!("set {set} {what}"));
+        }
+    }
 }
 
 /// The kind of a file. An unknown name is an error, for a `single` file a warning.
@@ -177,6 +233,7 @@ struct SetFiles {
     faults: ImageFaults,
     paths: Vec<PathBuf>,
     numbers: Vec<u32>,
+    rows: RowCounts,
     first: PathBuf,
 }
 
@@ -187,11 +244,13 @@ impl SetFiles {
             faults: ImageFaults::default(),
             paths: Vec::new(),
             numbers: Vec::new(),
+            rows: RowCounts::default(),
             first: first.to_owned(),
         }
     }
 
-    fn add(&mut self, sum: &FieldSum, image: u32, file: &Path) {
+    fn add(&mut self, sum: &FieldSum, rows: RowCounts, image: u32, file: &Path) {
+        self.rows += rows;
         self.faults.add(sum);
         self.images.add(sum).expect(ONE_IMAGE);
         self.numbers.push(image);
@@ -255,8 +314,13 @@ fn looks_like_spectrum(path: &Path) -> bool {
     read_spectrum(path).is_ok_and(|lines| !lines.is_empty() && lines.len() <= 20)
 }
 
-/// Checks the rows of a catalogue. Returns their sum on the grid, or `None` if the file is not readable.
-fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Option<FieldSum> {
+/// Checks the rows of a catalogue. Returns their sum on the grid and how they were used, or `None` if the file is not
+/// readable.
+fn check_catalogue(
+    path: &Path,
+    expected: &Expected,
+    report: &mut Report,
+) -> Option<(FieldSum, RowCounts)> {
     let rows = match read_rows(path, &COLUMNS, most_rows(expected.grid.cells())) {
         Ok(rows) => rows,
         Err(error) => {
@@ -336,7 +400,7 @@ fn check_catalogue(path: &Path, expected: &Expected, report: &mut Report) -> Opt
             );
         }
     }
-    Some(sum)
+    Some((sum, counts))
 }
 
 /// Positions that are not at the centres of their cells.
@@ -563,6 +627,7 @@ mod tests {
             grid: Grid::new(8, Pixels(48.0), Degrees(10.0)).unwrap(),
             truth: BTreeMap::new(),
             images: None,
+            sets: Vec::new(),
         };
         let findings = check(&path, &expected);
         findings.iter().map(|finding| finding.check).collect()

@@ -4,10 +4,11 @@ use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::path::Path;
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_scoring::SpectrumCovariance;
-use shearq_submissions::checked_name;
+use shearq_submissions::{ConfigurationError, check_name, checked_name};
 
 use crate::foreign::Foreign;
 use shearq_files::{FileError, open};
@@ -29,6 +30,60 @@ pub enum Contents {
     CrossSpectra,
 }
 
+impl Contents {
+    /// Whether the files are power spectra.
+    pub fn is_spectra(self) -> bool {
+        self != Contents::Catalogues
+    }
+}
+
+/// Who submits what to which challenge.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Entry {
+    /// Name of the challenge.
+    #[serde(deserialize_with = "checked_name")]
+    pub challenge: String,
+    /// Name of the team.
+    #[serde(deserialize_with = "checked_name")]
+    pub team: String,
+    /// One line about the entry; may be empty.
+    #[serde(default, deserialize_with = "checked_line")]
+    pub title: String,
+    /// Address for questions of the organiser; may be empty. It is not published.
+    #[serde(default, deserialize_with = "checked_line")]
+    pub contact: String,
+}
+
+/// For `#[serde(deserialize_with)]`: reads a name that may be empty.
+fn checked_line<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
+    let line = String::deserialize(deserializer)?;
+    match line.is_empty() {
+        true => Ok(line),
+        false => check_name(&line).map(|()| line).map_err(D::Error::custom),
+    }
+}
+
+impl Entry {
+    /// Checks the names: 1 to 100 bytes without control characters; title and contact may be empty.
+    ///
+    /// # Errors
+    /// What was found and expected.
+    pub fn check(&self) -> Result<(), ConfigurationError> {
+        let Entry {
+            challenge,
+            team,
+            title,
+            contact,
+        } = self;
+        let lines = [title, contact].into_iter().filter(|line| !line.is_empty());
+        [challenge, team]
+            .into_iter()
+            .chain(lines)
+            .try_for_each(|name| check_name(name))
+    }
+}
+
 /// The manifest of a submission.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
@@ -39,6 +94,9 @@ pub struct Manifest {
     pub method: String,
     /// Content of the files.
     pub contents: Contents,
+    /// Team and challenge, if they were specified.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub entry: Option<Entry>,
     /// Source, settings and version of the measurement.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub run: Option<Run>,
@@ -158,6 +216,7 @@ mod tests {
             version: "1".into(),
             method: "M".into(),
             contents: Contents::Catalogues,
+            entry: None,
             run: None,
             foreign: None,
             files: files(&[

@@ -11,7 +11,7 @@ use shearq_scoring::{
 
 use super::archive::{ArchiveWriter, MAX_FILES, is_archive};
 use super::challenge::{Kind, Spectrum, catalogue_text, spectrum_text};
-use super::manifest::{Contents, FileSum, MANIFEST_FILE, Manifest};
+use super::manifest::{Contents, Entry, FileSum, MANIFEST_FILE, Manifest};
 use crate::foreign::Foreign;
 use crate::score::COLUMNS;
 use shearq_files::FileError;
@@ -119,6 +119,8 @@ pub struct Packing<'a> {
     pub method: String,
     /// Content of the files.
     pub contents: Contents,
+    /// Team and challenge, if they are to be recorded.
+    pub entry: Option<Entry>,
 }
 
 impl Packing<'_> {
@@ -212,6 +214,7 @@ impl Packing<'_> {
             version: shearq_pipeline::VERSION.into(),
             method: self.method.clone(),
             contents: self.contents,
+            entry: self.entry.clone(),
             run,
             foreign,
             files,

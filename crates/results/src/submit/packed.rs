@@ -6,8 +6,12 @@ use std::path::{Path, PathBuf};
 use super::archive::{self, Unpacked, is_archive};
 use super::challenge::Kind;
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
+use crate::foreign::{Screen, plain_columns};
+use crate::score::{COLUMNS, own_catalogue};
 use shearq_files::FileError;
 use shearq_files::atomic::Scratch;
+use shearq_files::open::is_there;
+use shearq_scoring::{FieldSum, Grid, RowCounts};
 
 /// A given folder or file, or the temporary folder of an unpacked archive.
 #[derive(Debug)]
@@ -165,6 +169,92 @@ impl Submission {
             packed,
             manifest,
         })
+    }
+}
+
+/// The catalogues of a submission, ready to be scored.
+#[derive(Debug)]
+pub struct PackedCatalogues {
+    /// The open folder or archive.
+    pub sent: Sent,
+    /// Name of the method.
+    pub method: String,
+    /// Manifest, if there is one.
+    pub manifest: Option<Manifest>,
+    files: BTreeMap<u32, BTreeMap<u32, PathBuf>>,
+}
+
+impl PackedCatalogues {
+    /// Whether a path is an archive, or a folder that `pack` wrote.
+    pub fn is_packed(path: &Path) -> bool {
+        is_archive(path) || is_there(&path.join(MANIFEST_FILE))
+    }
+
+    /// Opens an archive or folder of catalogues.
+    ///
+    /// # Errors
+    /// As [`Sent::open`] and [`Submission::read`], and if it contains power spectra.
+    pub fn open(path: &Path) -> Result<Self, FileError> {
+        let sent = Sent::open(path)?;
+        let submission = Submission::read(&sent)?;
+        PackedCatalogues::new(sent, submission)
+    }
+
+    /// The catalogues of a submission that was read from `sent`.
+    ///
+    /// # Errors
+    /// If it contains power spectra.
+    pub fn new(sent: Sent, submission: Submission) -> Result<Self, FileError> {
+        let Submission {
+            method,
+            packed,
+            manifest,
+        } = submission;
+        match packed {
+            Packed::Catalogues(files) => Ok(PackedCatalogues {
+                sent,
+                method,
+                manifest,
+                files,
+            }),
+            Packed::Spectra(_) => {
+                let message = format!(
+                    "this submission contains power spectra; expected catalogues. Try: shearq score --packed {} --data DIR --store DIR",
+                    sent.given.display()
+                );
+                Err(FileError::new(&sent.given, message))
+            }
+        }
+    }
+
+    /// The catalogues of a set, by image number.
+    pub fn of_set(&self, set: u32) -> Vec<(u32, PathBuf)> {
+        let images = self.files.get(&set).into_iter().flatten();
+        images.map(|(image, path)| (*image, path.clone())).collect()
+    }
+
+    /// Sets with catalogues, in order.
+    pub fn sets(&self) -> Vec<u32> {
+        self.files.keys().copied().collect()
+    }
+
+    /// Whether shearq measured the catalogues, so that their convention is the standard one.
+    pub fn is_own(&self) -> bool {
+        self.manifest
+            .as_ref()
+            .is_some_and(|manifest| manifest.run.is_some())
+    }
+
+    /// Reads one of the catalogues.
+    ///
+    /// # Errors
+    /// If it cannot be read, or the values are no ellipticities.
+    pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
+        let sum = match self.is_own() {
+            true => own_catalogue(grid, path),
+            false => plain_columns(COLUMNS, Screen::default())(grid, path),
+        };
+        sum.map_err(|error| self.sent.named(error))
     }
 }
 

@@ -1,0 +1,460 @@
+//! A new challenge: a public folder for participants and a private folder with the truth.
+
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+use shearq_files::fits::{ImageReader, ImageWriter, Value};
+use shearq_files::open::is_there;
+use shearq_files::{FileError, atomic};
+use shearq_pipeline::data::layout::{DataFolder, LAYOUT_FILE};
+use shearq_pipeline::data::pattern::fill;
+use shearq_pipeline::data::psf_table;
+use shearq_pipeline::images::{self, ImageId};
+use shearq_pipeline::simulate::{SimulationRecord, simulate_blind, simulator};
+use shearq_pipeline::truth::{
+    ReadTruth, Reading, SignBasis, grid_of_set, read_truth, reading_of, write_truth,
+};
+use shearq_pipeline::{PipelineError, Progress};
+use shearq_quantities::units::{Degrees, Pixels};
+use shearq_simulate::field::ShearSpectrum;
+use shearq_simulate::set::{STAMP, SimulationSettings};
+use shearq_studies::bound::{cramer_rao, expected_qs};
+
+use crate::date::Date;
+use crate::kind::{Kind, RankBy};
+use crate::readme;
+use crate::seal::{Expected, Key, list, seal};
+use crate::terms::{CHALLENGE_FILE, Challenge, Data, Rules};
+
+/// Name and rules of a new challenge.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    /// Name of the challenge.
+    pub name: String,
+    /// Version of the data.
+    pub version: u32,
+    /// Kind of the challenge.
+    pub kind: &'static Kind,
+    /// Metric that ranks the entries.
+    pub metric: RankBy,
+    /// Address of the organiser; may be empty.
+    pub contact: String,
+    /// Most entries of a team.
+    pub entries_per_team: Option<u32>,
+    /// First day of entries.
+    pub opens: Option<Date>,
+    /// Last day of entries.
+    pub closes: Option<Date>,
+}
+
+/// Settings of simulated images.
+#[derive(Debug, Clone)]
+pub struct Simulation {
+    /// Set numbers, in order.
+    pub sets: Vec<u32>,
+    /// Images of each set.
+    pub images: u32,
+    /// Galaxies per side of an image.
+    pub grid: usize,
+    /// Factor on the shear power; `None` to draw it from the seed.
+    pub amplitude: Option<f64>,
+    /// Extra slope of the shear power; `None` to draw it from the seed.
+    pub tilt: Option<f64>,
+    /// Seed; `None` for a seed of the operating system.
+    pub seed: Option<u64>,
+}
+
+/// The folders of a challenge.
+#[derive(Debug, Clone, Copy)]
+pub struct Folders<'a> {
+    /// Folder for participants.
+    pub public: &'a Path,
+    /// Folder that must stay secret.
+    pub private: &'a Path,
+}
+
+/// Range of the factor on the shear power that a seed determines.
+const AMPLITUDES: (f64, f64) = (0.5, 2.0);
+/// Largest extra slope of the shear power that a seed determines.
+const TILT: f64 = 0.2;
+
+impl Folders<'_> {
+    /// Checks that the public folder can become one of this challenge. Returns the key of an earlier, stopped command.
+    fn prepare(&self, plan: &Plan) -> Result<Option<Key>, FileError> {
+        let Folders { public, private } = self;
+        if is_there(&public.join(CHALLENGE_FILE)) {
+            let message = "this is a complete challenge; expected a new folder";
+            return Err(FileError::new(public, message));
+        }
+        for folder in [public, private] {
+            std::fs::create_dir_all(folder)
+                .map_err(FileError::doing(folder, "cannot make the folder"))?;
+        }
+        let real = |folder: &Path| {
+            let doing = FileError::doing(folder, "cannot find the folder");
+            folder.canonicalize().map_err(doing)
+        };
+        let (open, secret) = (real(public)?, real(private)?);
+        if open.starts_with(&secret) || secret.starts_with(&open) {
+            let message = format!(
+                "one folder contains the other (the private folder is {}); participants would get the truth",
+                private.display()
+            );
+            return Err(FileError::new(public, message));
+        }
+        let key = Key::read(private)?;
+        match &key {
+            Some(key) if (&key.name, key.version) != (&plan.name, plan.version) => {
+                let message = format!(
+                    "this folder belongs to another challenge (found {} version {}, expected {} version {})",
+                    key.name, key.version, plan.name, plan.version
+                );
+                Err(FileError::new(private, message))
+            }
+            Some(_) => Ok(key),
+            None => {
+                let mut files = Vec::new();
+                list(public, &mut files)?;
+                match files.first() {
+                    None => Ok(None),
+                    Some(_) => Err(FileError::new(
+                        public,
+                        "the folder has files already; expected a new or an empty folder",
+                    )),
+                }
+            }
+        }
+    }
+}
+
+/// The seed of a simulation. It depends on name and version, so that two challenges with one seed have different noise.
+///
+/// The first 64 bits of SHA-256("shearq challenge", name, version, seed), with a zero byte after each part.
+pub fn seed_of(name: &str, version: u32, seed: u64) -> u64 {
+    let text = format!("shearq challenge\0{name}\0{version}\0{seed}\0");
+    let digest = Sha256::digest(text.as_bytes());
+    digest[..8]
+        .iter()
+        .fold(0, |seed, byte| seed << 8 | u64::from(*byte))
+}
+
+/// A number between 0 and 1 that a seed determines, for each purpose.
+fn drawn(seed: u64, purpose: &str) -> f64 {
+    seed_of(purpose, 0, seed) as f64 / 2f64.powi(64)
+}
+
+/// Writes a challenge of simulated images. The same command resumes a stopped one. Returns the description.
+///
+/// # Errors
+/// If a folder belongs to something else, a setting is out of range, or a file cannot be written.
+pub fn simulated(
+    plan: &Plan,
+    simulation: &Simulation,
+    folders: Folders<'_>,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Challenge, PipelineError> {
+    let Simulation {
+        sets,
+        images,
+        grid,
+        amplitude,
+        tilt,
+        seed,
+    } = simulation;
+    let earlier = folders.prepare(plan)?;
+    let kept = earlier.and_then(|key| key.seed?.parse().ok());
+    if let (Some(kept), Some(seed)) = (kept, *seed)
+        && kept != seed
+    {
+        let message = "the key has another seed. Try: without --seed, or another folder";
+        return Err(FileError::new(folders.private, message).into());
+    }
+    let seed: u64 = kept.or(*seed).unwrap_or_else(rand::random);
+    let mut key = Key {
+        name: plan.name.clone(),
+        version: plan.version,
+        seed: Some(seed.to_string()),
+        public: None,
+        expected: None,
+    };
+    let secret = seed_of(&plan.name, plan.version, seed);
+    let (least, most) = AMPLITUDES;
+    let settings = SimulationSettings {
+        spectrum: ShearSpectrum {
+            amplitude: amplitude
+                .unwrap_or_else(|| least * (most / least).powf(drawn(secret, "amplitude"))),
+            tilt: tilt.unwrap_or_else(|| TILT * (2.0 * drawn(secret, "tilt") - 1.0)),
+        },
+        ..SimulationSettings::new(secret, *grid)
+    };
+    settings
+        .validate()
+        .map_err(|error| PipelineError::Request(error.to_string()))?;
+    key.write(folders.private)?;
+    let record = SimulationRecord {
+        version: shearq_pipeline::VERSION.into(),
+        settings,
+    };
+    let (public, private) = (
+        DataFolder::new(folders.public),
+        DataFolder::new(folders.private),
+    );
+    let ids = images::of_simulation(sets, *images);
+    simulate_blind(&record, &ids, &public, &private, threads, progress)?;
+    progress.note("computing the expected Q");
+    key.expected = expected(settings, sets, *images)?;
+    let data = Data {
+        sets: sets.clone(),
+        images: *images,
+        grid: *grid,
+        stamp: STAMP,
+        field_degrees: public.layout().field_degrees,
+    };
+    finish(plan, data, folders, key, threads)
+}
+
+/// Mean Q over sets of a perfect method with noise at the Cramér–Rao bound; `None` if it is unknown for all sets.
+fn expected(
+    settings: SimulationSettings,
+    sets: &[u32],
+    images: u32,
+) -> Result<Option<Expected>, PipelineError> {
+    let (mut catalogues, mut spectra, mut without) = (0.0, 0.0, Vec::new());
+    for &set in sets {
+        let simulator = simulator(set, settings)?;
+        // Without shear, no Q is defined.
+        match cramer_rao(&simulator).filter(|_| settings.spectrum.amplitude > 0.0) {
+            None => without.push(set),
+            Some((scatter, _)) => {
+                let q = expected_qs(&simulator, scatter, images).map_err(|source| {
+                    PipelineError::Scoring {
+                        set: Some(set),
+                        source,
+                    }
+                })?;
+                catalogues += q.catalogues;
+                spectra += q.spectra;
+            }
+        }
+    }
+    let count = (sets.len() - without.len()) as f64;
+    Ok((count > 0.0).then_some(Expected {
+        catalogues: catalogues / count,
+        spectra: spectra / count,
+        without,
+    }))
+}
+
+/// Writes a challenge of the images in `data`, which another program made. Headers are written anew, because the old ones
+/// may contain the seed or the shear. The true shear is in the files `truth` with `{set}` for the set number, or in the
+/// data folder.
+///
+/// # Errors
+/// If sets differ in number of images or grid, the sign of the true shear is unknown, or a file cannot be read or written.
+pub fn of_images(
+    plan: &Plan,
+    data: &DataFolder,
+    truth: Option<&str>,
+    folders: Folders<'_>,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Challenge, PipelineError> {
+    let about = about(data)?;
+    folders.prepare(plan)?;
+    let key = Key {
+        name: plan.name.clone(),
+        version: plan.version,
+        seed: None,
+        public: None,
+        expected: None,
+    };
+    key.write(folders.private)?;
+    let (public, private) = (
+        DataFolder::new(folders.public),
+        DataFolder::new(folders.private),
+    );
+    for &set in &about.sets {
+        let path = match truth {
+            Some(pattern) => fill(pattern, set, 0).into(),
+            None => data.truth(set),
+        };
+        let reading = match truth {
+            Some(_) => Reading {
+                field: Degrees(about.field_degrees),
+                stamp: Pixels(about.stamp as f64),
+                sign: None,
+            },
+            None => reading_of(data, set)?,
+        };
+        let ReadTruth { grid, shear, basis } = read_truth(&path, &reading)?;
+        if basis == SignBasis::Unknown {
+            let message = "cannot determine the sign of g2. Try: a line `# g2sign: standard` (g2 > 0 along x = y) or `# g2sign: challenge` (the other sign) in the file";
+            return Err(FileError::new(&path, message).into());
+        }
+        if grid.n != about.grid {
+            let message = format!(
+                "the true shear has {0} × {0} rows; expected {1} × {1}, as the images",
+                grid.n, about.grid
+            );
+            return Err(FileError::new(&path, message).into());
+        }
+        write_truth(&private.truth(set), &grid, &shear)?;
+        for image in 1..=about.images {
+            copy_image(data, &public, ImageId { set, image }, &about)?;
+            progress.advance((about.grid * about.grid) as u64);
+        }
+    }
+    finish(plan, about, folders, key, threads)
+}
+
+/// Sets, images and grid of a data folder, which must be the same for all sets.
+fn about(data: &DataFolder) -> Result<Data, PipelineError> {
+    let ids = images::of_folder(data, &[])?;
+    let mut about: Option<Data> = None;
+    for of_set in ids.chunk_by(|a, b| a.set == b.set) {
+        let set = of_set[0].set;
+        let path = data.galaxies(set, 1);
+        let count = of_set.len() as u32;
+        if !of_set.iter().map(|id| id.image).eq(1..=count) {
+            let message = format!("set {set}: expected consecutive images from 1 (found {count})");
+            return Err(FileError::new(path, message).into());
+        }
+        let grid = grid_of_set(data, set)?;
+        let own = Data {
+            sets: Vec::new(),
+            images: count,
+            grid: grid.n,
+            stamp: grid.stamp.0 as usize,
+            field_degrees: data.layout().field_degrees,
+        };
+        let about = about.get_or_insert_with(|| own.clone());
+        if (about.images, about.grid, about.stamp) != (own.images, own.grid, own.stamp) {
+            let message = format!(
+                "set {set} has {} images of {2} × {2} galaxies; expected {} of {3} × {3}, as the first set",
+                own.images, about.images, own.grid, about.grid
+            );
+            return Err(FileError::new(path, message).into());
+        }
+        about.sets.push(set);
+    }
+    about.ok_or_else(|| FileError::new(data.root(), "there are no galaxy images here").into())
+}
+
+/// Copies pixels and PSFs of an image under new headers.
+fn copy_image(
+    data: &DataFolder,
+    public: &DataFolder,
+    id: ImageId,
+    about: &Data,
+) -> Result<(), FileError> {
+    let ImageId { set, image } = id;
+    let numbers = [
+        ("SET", Value::Int(i64::from(set))),
+        ("IMAGE", Value::Int(i64::from(image))),
+        ("STAMP", Value::Int(about.stamp as i64)),
+    ];
+    let (star, functional) = (data.psf_star(set, image), data.psf_functional(set, image));
+    if !is_there(&star) && !is_there(&functional) {
+        return Err(FileError::new(star, "there is no PSF of this image"));
+    }
+    if is_there(&star) {
+        let mut reader = ImageReader::open(&star)?;
+        copy_pixels(&mut reader, &public.psf_star(set, image), &numbers[..2])?;
+    }
+    if is_there(&functional) {
+        let rows = psf_table::read_all(&functional)?;
+        psf_table::write(&public.psf_functional(set, image), &rows)?;
+    }
+    let mut reader = ImageReader::open(data.galaxies(set, image))?;
+    let mut header = numbers.to_vec();
+    header.push(("NGRID", Value::Int(about.grid as i64)));
+    if let Some(noise) = reader.number("NOISESIG")? {
+        header.push(("NOISESIG", Value::Real(noise)));
+    }
+    copy_pixels(&mut reader, &public.galaxies(set, image), &header)
+}
+
+fn copy_pixels(
+    from: &mut ImageReader,
+    to: &Path,
+    header: &[(&str, Value)],
+) -> Result<(), FileError> {
+    let (width, height) = (from.width(), from.height());
+    let mut writer = ImageWriter::create(to, width, height, header)?;
+    // As many rows as fit into a few megabytes.
+    let at_a_time = ((1 << 20) / width.max(1)).clamp(1, height.max(1));
+    let mut row = 0;
+    while row < height {
+        let rows = at_a_time.min(height - row);
+        writer.write_rows(&from.read_rows(rows)?)?;
+        row += rows;
+    }
+    writer.finish()
+}
+
+/// Writes description, layout and page for participants, and seals the public folder.
+fn finish(
+    plan: &Plan,
+    data: Data,
+    folders: Folders<'_>,
+    mut key: Key,
+    threads: usize,
+) -> Result<Challenge, PipelineError> {
+    let Plan {
+        name,
+        version,
+        kind,
+        metric,
+        contact,
+        entries_per_team,
+        opens,
+        closes,
+    } = plan.clone();
+    let layout = layout_text(kind, &data);
+    let challenge = Challenge {
+        name,
+        version,
+        kind,
+        contact,
+        conventions: kind
+            .conventions
+            .iter()
+            .map(|(name, text)| ((*name).to_owned(), (*text).to_owned()))
+            .collect(),
+        rules: Rules {
+            metric,
+            contents: kind
+                .contents
+                .iter()
+                .copied()
+                .filter(|contents| metric.is_of_spectra() || !contents.is_spectra())
+                .collect(),
+            entries_per_team,
+            opens,
+            closes,
+        },
+        data,
+    };
+    let Folders { public, private } = folders;
+    atomic::write(private.join(LAYOUT_FILE), layout.as_bytes())?;
+    atomic::write(public.join(LAYOUT_FILE), layout.as_bytes())?;
+    atomic::write(
+        public.join("README.md"),
+        readme::text(&challenge).as_bytes(),
+    )?;
+    let path = public.join(CHALLENGE_FILE);
+    atomic::write(&path, challenge.text(&path)?.as_bytes())?;
+    key.public = Some(seal(public, threads)?);
+    key.write(private)?;
+    Ok(challenge)
+}
+
+/// The layout of the images, without names of truth files.
+fn layout_text(kind: &Kind, data: &Data) -> String {
+    let layout = (kind.layout)();
+    format!(
+        "galaxies = {:?}\npsf_star = {:?}\npsf_functional = {:?}\nfield_degrees = {:?}\nstamp = {}\n",
+        layout.galaxies, layout.psf_star, layout.psf_functional, data.field_degrees, data.stamp
+    )
+}

@@ -1,0 +1,234 @@
+//! Finds the entries that teams sent, and identifies them by their content.
+
+use std::path::{Path, PathBuf};
+
+use shearq_files::FileError;
+use shearq_results::submit::archive::{self, is_archive};
+use shearq_results::submit::challenge::Kind;
+use shearq_results::submit::manifest::{Entry, FileSum, MANIFEST_FILE, Manifest};
+
+use crate::date::moment;
+use crate::seal::sha256;
+
+/// Folders below a given folder that are searched.
+const DEPTH: usize = 3;
+/// Endings of archives that cannot be read.
+const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"];
+
+/// An entry as it was found.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Sending {
+    /// Archive, or folder of files.
+    pub path: PathBuf,
+    /// The folder of the inbox that it was in. It is the name of the team, whatever the manifest states.
+    pub team: Option<String>,
+}
+
+/// Finds archives and folders of catalogues or spectra below `paths`, in order of their names. In an inbox, the folder of
+/// an archive is the name of its team.
+///
+/// # Errors
+/// If a path does not exist or a folder cannot be listed.
+pub fn find(paths: &[PathBuf]) -> Result<Vec<Sending>, FileError> {
+    let mut found = Vec::new();
+    for path in paths {
+        if !path.exists() {
+            let message = "there is no such file or folder; expected archives (.tar.gz) or folders of entries";
+            return Err(FileError::new(path, message));
+        }
+        search(path, None, DEPTH, &mut found)?;
+    }
+    found.sort();
+    found.dedup();
+    Ok(found)
+}
+
+fn search(
+    path: &Path,
+    team: Option<&str>,
+    depth: usize,
+    found: &mut Vec<Sending>,
+) -> Result<(), FileError> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let ending = path.extension().unwrap_or_default().to_string_lossy();
+    let other = OTHER_ARCHIVES.contains(&ending.as_ref());
+    let mut add = || {
+        found.push(Sending {
+            path: path.to_owned(),
+            team: team.map(str::to_owned),
+        });
+    };
+    if name.starts_with('.') && name != "." && name != ".." {
+        return Ok(());
+    }
+    if !path.is_dir() {
+        if is_archive(path) || other {
+            add();
+        }
+        return Ok(());
+    }
+    let mut inside: Vec<PathBuf> = std::fs::read_dir(path)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
+        .map_err(FileError::doing(path, "cannot list the folder"))?;
+    inside.sort();
+    let of_entry = |path: &PathBuf| {
+        Kind::of(path).is_some() || path.file_name().is_some_and(|name| name == MANIFEST_FILE)
+    };
+    if inside.iter().any(of_entry) {
+        add();
+        return Ok(());
+    }
+    if depth > 0 {
+        // The outermost folder is the inbox itself.
+        let team = team.map_or_else(
+            || (depth < DEPTH).then(|| name.into_owned()),
+            |team| Some(team.to_owned()),
+        );
+        for path in inside {
+            search(&path, team.as_deref(), depth - 1, found)?;
+        }
+    }
+    Ok(())
+}
+
+/// Identity of an entry.
+#[derive(Debug, Clone)]
+pub struct Identity {
+    /// SHA-256 of the archive, or of the list of a folder's files.
+    pub sha256: String,
+    /// When the file was last written, in UTC.
+    pub received: String,
+}
+
+/// Identifies an entry.
+///
+/// # Errors
+/// If it cannot be read.
+pub fn identify(sending: &Sending) -> Result<Identity, FileError> {
+    let path = &sending.path;
+    let about = path
+        .metadata()
+        .and_then(|about| about.modified())
+        .map_err(FileError::doing(path, "cannot read the file"))?;
+    let sha256 = match path.is_dir() {
+        true => sha256(&list_of(&sums(path)?)),
+        false => FileSum::of(path)?.sha256,
+    };
+    Ok(Identity {
+        sha256,
+        received: moment(about),
+    })
+}
+
+/// Names and checksums of the files of a folder.
+fn sums(folder: &Path) -> Result<Vec<(String, FileSum)>, FileError> {
+    let mut paths: Vec<PathBuf> = std::fs::read_dir(folder)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
+        .map_err(FileError::doing(folder, "cannot list the folder"))?;
+    paths.retain(|path| path.is_file());
+    paths.sort();
+    paths
+        .into_iter()
+        .map(|path| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            Ok((name.into_owned(), FileSum::of(&path)?))
+        })
+        .collect()
+}
+
+fn list_of(sums: &[(String, FileSum)]) -> Vec<u8> {
+    let lines = sums
+        .iter()
+        .map(|(name, sum)| format!("{name} {}\n", sum.sha256));
+    lines.collect::<String>().into_bytes()
+}
+
+/// Content of an entry.
+#[derive(Debug, Clone)]
+pub struct Content {
+    /// SHA-256 of sets, images and checksums of the files. It depends neither on the name of the method nor on the
+    /// compression.
+    pub sha256: String,
+    /// Team and challenge, if a manifest states them.
+    pub entry: Option<Entry>,
+}
+
+/// Reads the manifest of an entry, and the checksum of its content.
+///
+/// # Errors
+/// If the archive is damaged or too large, or its files disagree with the manifest.
+pub fn content(sending: &Sending) -> Result<Content, FileError> {
+    let path = &sending.path;
+    let (manifest, files) = match path.is_dir() {
+        true => (Manifest::read(path)?, sums(path)?),
+        false if is_archive(path) => {
+            let unpacked = archive::read(path, None)?;
+            unpacked.verify(path, false)?;
+            (unpacked.manifest, unpacked.files.into_iter().collect())
+        }
+        false => {
+            let message = "unsupported archive (found another format, expected .tar.gz or .tgz)";
+            return Err(FileError::new(path, message));
+        }
+    };
+    let mut sums: Vec<(String, FileSum)> = files
+        .into_iter()
+        .filter_map(|(name, sum)| {
+            let name = match Kind::of(Path::new(&name))? {
+                Kind::Catalogue { set, image, .. } => format!("{set} {image}"),
+                Kind::Spectrum { set, .. } => format!("{set}"),
+            };
+            Some((name, sum))
+        })
+        .collect();
+    sums.sort_by(|a, b| a.0.cmp(&b.0));
+    Ok(Content {
+        sha256: sha256(&list_of(&sums)),
+        entry: manifest.and_then(|manifest| manifest.entry),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn entries_are_found_with_the_teams_of_their_folders() {
+        let root = tempfile::tempdir().unwrap();
+        for file in [
+            "a.tar.gz",
+            "b.zip",
+            "notes.txt",
+            ".hidden.tar.gz",
+            "A team/one.tgz",
+            "A team/later/two.tar.gz",
+            "B/sent/g10_v1_objs_1_1.M.dat",
+            "B/sent/README",
+        ] {
+            let path = root.path().join(file);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, "").unwrap();
+        }
+        let found: Vec<(String, Option<String>)> = find(&[root.path().to_owned()])
+            .unwrap()
+            .into_iter()
+            .map(|sending| {
+                let path = sending.path.strip_prefix(root.path()).unwrap();
+                (path.display().to_string(), sending.team)
+            })
+            .collect();
+        let expected = [
+            ("A team/later/two.tar.gz", Some("A team")),
+            ("A team/one.tgz", Some("A team")),
+            ("B/sent", Some("B")),
+            ("a.tar.gz", None),
+            ("b.zip", None),
+        ];
+        let expected: Vec<_> = expected
+            .iter()
+            .map(|(path, team)| ((*path).to_owned(), team.map(str::to_owned)))
+            .collect();
+        assert_eq!(found, expected);
+        assert!(find(&[root.path().join("absent")]).is_err());
+    }
+}

@@ -1,0 +1,572 @@
+//! Checks entries, scores them against the true shear, and keeps them in a results store.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use shearq_files::FileError;
+use shearq_pipeline::data::fingerprint;
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::run::Source;
+use shearq_pipeline::simulate::kind_of;
+use shearq_pipeline::truth::SignBasis;
+use shearq_pipeline::{PipelineError, Progress, engine};
+use shearq_results::row::{RunRecord, SetRecord, definition_word};
+use shearq_results::score::{Basis, OddImages, ScoredSet};
+use shearq_results::store;
+use shearq_results::submit::challenge::read_bandpowers;
+use shearq_results::submit::check::{CheckedSet, Severity, check_sent};
+use shearq_results::submit::manifest::{Contents, Entry as Team, Manifest};
+use shearq_results::submit::packed::{Packed, Sent, Submission};
+use shearq_scoring::{Choice, Convention, Fault, Grid, Options, ScoringError, SetScorer};
+use shearq_simulate::kinds::SetKind;
+use shearq_submissions::check_name;
+
+use crate::inbox::{Content, Identity, Sending, content, identify};
+use crate::seal::{Key, verify};
+use crate::shapes::References;
+use crate::terms::Challenge;
+
+/// A scored entry, as the store keeps it beside its scores.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EntryInfo {
+    /// Name of the challenge.
+    pub challenge: String,
+    /// Name of the team.
+    pub team: String,
+    /// Name of the method.
+    pub method: String,
+    /// One line about the entry; may be empty.
+    pub title: String,
+    /// Address for questions; may be empty. The leaderboard does not show it.
+    pub contact: String,
+    /// When the file was last written, in UTC.
+    pub received: String,
+    /// SHA-256 of the archive.
+    pub sha256: String,
+    /// SHA-256 of sets, images and files.
+    pub content: String,
+    /// Kind of files.
+    pub contents: Contents,
+    /// Whether it is a reference of the organiser, without a rank.
+    pub reference: bool,
+}
+
+/// The settings column of an entry in a store.
+#[derive(Serialize, Deserialize)]
+struct Stored {
+    entry: EntryInfo,
+}
+
+/// A scored entry of the store.
+#[derive(Debug, Clone)]
+pub struct Entry {
+    /// Team, method and time.
+    pub info: EntryInfo,
+    /// Scores of each set.
+    pub sets: Vec<SetRecord>,
+}
+
+/// An entry that was not scored.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Refused {
+    /// The file.
+    pub path: PathBuf,
+    /// Its team, if known.
+    pub team: String,
+    /// Reason, with what was found and expected.
+    pub reason: String,
+}
+
+/// Result of a round of judging.
+#[derive(Debug, Default)]
+pub struct Round {
+    /// Entries scored now.
+    pub scored: usize,
+    /// Entries that were in the store already.
+    pub known: usize,
+    /// Entries that were not scored.
+    pub refused: Vec<Refused>,
+}
+
+/// The true shear of a set.
+struct Truth {
+    scorer: SetScorer,
+    print: String,
+    kind: Option<SetKind>,
+}
+
+/// Scores entries of one challenge.
+pub struct Judge {
+    /// The description of the challenge.
+    pub challenge: Challenge,
+    /// Private record.
+    pub key: Key,
+    id: String,
+    public: PathBuf,
+    grid: Grid,
+    truths: BTreeMap<u32, Truth>,
+}
+
+/// An entry before it is scored.
+struct Candidate {
+    sending: Sending,
+    reference: bool,
+    identity: Identity,
+    content: Content,
+}
+
+impl Judge {
+    /// Opens the public and the private folder of a challenge.
+    ///
+    /// # Errors
+    /// If they do not belong together, or the truth cannot be read.
+    pub fn open(public: &Path, private: &Path) -> Result<Self, PipelineError> {
+        let challenge = Challenge::read(public)?;
+        let (key, id) = verify(public, private)?;
+        let data = DataFolder::open(private)?;
+        let source = Source::folder(&data, private)?;
+        let grid = challenge.data.grid().map_err(unscored)?;
+        let options = Options {
+            definition: challenge.rules.metric.definition(),
+            choice: Choice::Insist(Convention::STANDARD),
+            ..Options::default()
+        };
+        let mut truths = BTreeMap::new();
+        for &set in &challenge.data.sets {
+            let truth = data.read_truth(set, &grid)?;
+            truths.insert(
+                set,
+                Truth {
+                    scorer: SetScorer::new(grid, truth, options).map_err(unscored)?,
+                    print: fingerprint::of_set(&source, &data, set, &[])?,
+                    kind: kind_of(&data, set),
+                },
+            );
+        }
+        Ok(Judge {
+            challenge,
+            key,
+            id,
+            public: public.to_owned(),
+            grid,
+            truths,
+        })
+    }
+
+    /// The entries of this challenge in a store, in order of their arrival.
+    ///
+    /// # Errors
+    /// If the store cannot be read.
+    pub fn entries(&self, store: &Path) -> Result<Vec<Entry>, FileError> {
+        let (runs, _) = store::read(store)?;
+        let mut entries: Vec<Entry> = runs
+            .into_iter()
+            .filter(|run| run.source == self.id)
+            .filter_map(|run| {
+                let stored: Stored = toml::from_str(&run.settings).ok()?;
+                Some(Entry {
+                    info: stored.entry,
+                    sets: run.sets,
+                })
+            })
+            .collect();
+        let order = |entry: &Entry| (entry.info.received.clone(), entry.info.sha256.clone());
+        entries.sort_by_key(order);
+        Ok(entries)
+    }
+
+    /// Checks and scores entries and keeps them in `store`, one file per entry. `sendings` have a mark for references.
+    /// Entries of the store are not scored again. An entry that cannot be scored does not stop the others.
+    ///
+    /// # Errors
+    /// If the store cannot be read or written.
+    pub fn round(
+        &self,
+        sendings: &[(Sending, bool)],
+        store: &Path,
+        threads: usize,
+        progress: &mut dyn Progress,
+    ) -> Result<Round, PipelineError> {
+        let _prepared = store::prepare(store)?;
+        let known = self.entries(store)?;
+        let mut round = Round::default();
+        let candidates = candidates(sendings, &known, threads, &mut round)?;
+        if candidates.is_empty() {
+            return Ok(round);
+        }
+        let public = DataFolder::open(&self.public)?;
+        let sets = &self.challenge.data.sets;
+        let references = References::measure(&public, sets, self.grid, threads)?;
+        engine::ordered(
+            // Large entries take most of the time, so a few of them are in work at a time.
+            threads,
+            |feeder| {
+                for candidate in candidates {
+                    if !feeder.push(candidate) {
+                        break;
+                    }
+                }
+                Ok(())
+            },
+            || (),
+            |(), candidate| Ok(self.judge(candidate, &references)),
+            |result| {
+                progress.advance(self.challenge.data.galaxies());
+                match result {
+                    Ok(run) => {
+                        store::write(store, &run)?;
+                        round.scored += 1;
+                    }
+                    Err(refused) => round.refused.push(refused),
+                }
+                Ok(())
+            },
+        )?;
+        Ok(round)
+    }
+
+    /// Checks and scores one entry.
+    fn judge(&self, candidate: Candidate, references: &References) -> Result<RunRecord, Refused> {
+        let Candidate {
+            sending,
+            reference,
+            identity,
+            content,
+        } = candidate;
+        let team = team_of(&sending, content.entry.as_ref());
+        let refuse = |reason: String| Refused {
+            path: sending.path.clone(),
+            team: team.clone(),
+            reason,
+        };
+        let scored = self
+            .score(&sending, content.entry.as_ref(), references)
+            .map_err(refuse)?;
+        let (title, contact) = content
+            .entry
+            .map_or_else(Default::default, |e| (e.title, e.contact));
+        let info = EntryInfo {
+            challenge: self.challenge.name.clone(),
+            team: team.clone(),
+            method: scored.method,
+            title,
+            contact,
+            received: identity.received,
+            sha256: identity.sha256,
+            content: content.sha256,
+            contents: scored.contents,
+            reference,
+        };
+        for name in [&info.team, &info.method] {
+            check_name(name).map_err(|error| refuse(error.to_string()))?;
+        }
+        let configuration = short(&format!("{}: {}", info.team, info.method));
+        let settings =
+            toml::to_string(&Stored { entry: info }).map_err(|error| refuse(error.to_string()))?;
+        Ok(RunRecord {
+            configuration,
+            version: shearq_pipeline::VERSION.into(),
+            settings,
+            source: self.id.clone(),
+            definition: definition_word(self.challenge.rules.metric.definition()).into(),
+            choice: Convention::STANDARD.number().to_string(),
+            noise: "measured".into(),
+            sets: scored.sets,
+        })
+    }
+
+    /// Scores the files of an entry, or gives the reason why not.
+    fn score(
+        &self,
+        sending: &Sending,
+        entry: Option<&Team>,
+        references: &References,
+    ) -> Result<Scored, String> {
+        let rules = &self.challenge.rules;
+        if let Some(entry) = entry
+            && entry.challenge != self.challenge.name
+        {
+            return Err(format!(
+                "the entry belongs to another challenge (found `{}`, expected `{}`)",
+                entry.challenge, self.challenge.name
+            ));
+        }
+        let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
+        let sent = Sent::open(&sending.path).map_err(plain)?;
+        let submission = Submission::read(&sent).map_err(plain)?;
+        let contents = match (&submission.packed, &submission.manifest) {
+            (Packed::Catalogues(_), _) => Contents::Catalogues,
+            (Packed::Spectra(_), Some(manifest)) if manifest.contents.is_spectra() => {
+                manifest.contents
+            }
+            (Packed::Spectra(_), _) => Contents::Spectra,
+        };
+        if !rules.contents.contains(&contents) {
+            return Err("the challenge accepts catalogues only, because power spectra do not have its metric".into());
+        }
+        let mut sets = match &submission.packed {
+            Packed::Catalogues(_) => self.catalogues(&sent, sending, references)?,
+            Packed::Spectra(files) => {
+                self.check(&sent, sending, references, &mut |_| {})?;
+                let manifest = submission.manifest.as_ref();
+                self.spectra(files, manifest)
+                    .map_err(|error| plain(sent.named(error)))?
+            }
+        };
+        sets.sort_by_key(|set| set.set);
+        if !rules.metric.of(&sets).0.is_finite() {
+            return Err(format!(
+                "{} cannot be computed, because the response is consistent with zero or the images do not determine the noise",
+                rules.metric.label()
+            ));
+        }
+        Ok(Scored {
+            method: submission.method,
+            contents,
+            sets,
+        })
+    }
+
+    /// Checks the files of an entry. `done` gets each set of catalogues.
+    fn check(
+        &self,
+        sent: &Sent,
+        sending: &Sending,
+        references: &References,
+        done: &mut dyn FnMut(CheckedSet<'_>),
+    ) -> Result<(), String> {
+        let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
+        let mut findings = check_sent(sent, &self.challenge.expected().map_err(plain)?, done);
+        findings.extend(references.findings(sent).map_err(plain)?);
+        findings.retain(|finding| finding.severity == Severity::Error);
+        let Some(first) = findings.first() else {
+            return Ok(());
+        };
+        let reason = reason_of(&first.path, &first.message, sending);
+        Err(match findings.len() - 1 {
+            0 => reason,
+            more => format!("{reason} (and {more} more)"),
+        })
+    }
+
+    /// Checks and scores the catalogues of an entry.
+    fn catalogues(
+        &self,
+        sent: &Sent,
+        sending: &Sending,
+        references: &References,
+    ) -> Result<Vec<SetRecord>, String> {
+        let mut sets = Vec::new();
+        let mut failed = None;
+        self.check(
+            sent,
+            sending,
+            references,
+            &mut |set: CheckedSet<'_>| match self.score_set(&set) {
+                Ok(record) => sets.extend(record),
+                Err(reason) => failed = failed.take().or(Some(reason)),
+            },
+        )?;
+        failed.map_or(Ok(sets), Err)
+    }
+
+    /// Scores the power spectra of an entry.
+    fn spectra(
+        &self,
+        files: &BTreeMap<u32, PathBuf>,
+        manifest: Option<&Manifest>,
+    ) -> Result<Vec<SetRecord>, FileError> {
+        let mut sets = Vec::new();
+        for (&set, path) in files {
+            let Some(truth) = self.truths.get(&set) else {
+                continue;
+            };
+            let powers = read_bandpowers(path, &self.grid)?;
+            let covariance =
+                manifest.and_then(|manifest| manifest.covariances.get(path.file_name()?.to_str()?));
+            let score = truth
+                .scorer
+                .score_spectrum(&powers, covariance)
+                .map_err(|error| FileError::new(path, error))?;
+            sets.push(SetRecord::of_spectrum(
+                set,
+                truth.kind.is_some(),
+                &score,
+                (1..=self.challenge.data.images).collect(),
+                truth.print.clone(),
+            ));
+        }
+        Ok(sets)
+    }
+
+    /// The record of a set of catalogues. `None` if the set does not belong to the challenge.
+    fn score_set(&self, checked: &CheckedSet<'_>) -> Result<Option<SetRecord>, String> {
+        let CheckedSet {
+            set,
+            images,
+            numbers,
+            rows,
+        } = checked;
+        let Some(truth) = self.truths.get(set) else {
+            return Ok(None);
+        };
+        let wrong = |error: ScoringError| format!("set {set}: {error}");
+        let score = truth.scorer.score(images).map_err(wrong)?;
+        let faults = truth
+            .scorer
+            .diagnose(images, &score, Convention::STANDARD)
+            .map_err(wrong)?;
+        // Without numbers, because correlations with the truth are secret.
+        let wrong_order = faults.iter().find_map(|fault| match fault {
+            Fault::Convention { better, .. } => Some(format!(
+                "signs or axes are wrong (found convention {}, {}; expected 5, standard)",
+                better.number(),
+                better.describe()
+            )),
+            Fault::Swapped { .. } => Some("e1 and e2 are swapped".to_owned()),
+            Fault::Shifted { .. } => Some("the galaxies are in neighbouring cells".to_owned()),
+            _ => None,
+        });
+        if let Some(reason) = wrong_order {
+            return Err(format!("set {set}: {reason}"));
+        }
+        let scored = ScoredSet {
+            set: Some(*set),
+            kind: truth.kind,
+            images: numbers.to_vec(),
+            score,
+            rows: *rows,
+            basis: Basis::Given,
+            sign: SignBasis::Specified,
+            findings: Vec::new(),
+            odd_images: OddImages::default(),
+        };
+        Ok(Some(SetRecord::new(*set, &scored, truth.print.clone())))
+    }
+}
+
+/// The scores of an entry.
+struct Scored {
+    method: String,
+    contents: Contents,
+    sets: Vec<SetRecord>,
+}
+
+fn unscored(source: ScoringError) -> PipelineError {
+    PipelineError::Scoring { set: None, source }
+}
+
+/// A message without the path of the entry, which a list of entries has already.
+fn reason_of(path: &Path, message: &str, sending: &Sending) -> String {
+    match path.strip_prefix(&sending.path) {
+        Ok(name) if !name.as_os_str().is_empty() => format!("{}: {message}", name.display()),
+        _ => message.to_owned(),
+    }
+}
+
+/// Team of an entry: its folder in the inbox, or as its manifest states (`entry`), or the name of the file.
+fn team_of(sending: &Sending, entry: Option<&Team>) -> String {
+    let stated = entry.map(|entry| entry.team.clone());
+    let file = || {
+        let name = sending.path.file_name().unwrap_or_default();
+        let name = name.to_string_lossy();
+        let endings = [".tar.gz", ".tgz"];
+        let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
+        stem.unwrap_or(&name).to_owned()
+    };
+    sending.team.clone().or(stated).unwrap_or_else(file)
+}
+
+/// The first 100 bytes of a name.
+fn short(name: &str) -> String {
+    let end = (0..=name.len().min(shearq_submissions::MAX_NAME))
+        .rev()
+        .find(|end| name.is_char_boundary(*end));
+    name[..end.unwrap_or(0)].to_owned()
+}
+
+/// The entries that must be scored. Known entries are counted; unreadable entries and copies are refused.
+fn candidates(
+    sendings: &[(Sending, bool)],
+    known: &[Entry],
+    threads: usize,
+    round: &mut Round,
+) -> Result<Vec<Candidate>, PipelineError> {
+    let earlier: BTreeSet<&str> = known
+        .iter()
+        .map(|entry| entry.info.sha256.as_str())
+        .collect();
+    let mut identified = Vec::new();
+    engine::ordered(
+        threads,
+        |feeder| {
+            for (sending, reference) in sendings {
+                if !feeder.push((sending.clone(), *reference)) {
+                    break;
+                }
+            }
+            Ok(())
+        },
+        || (),
+        |(), (sending, reference): (Sending, bool)| {
+            let found = identify(&sending).and_then(|identity| {
+                let content = match earlier.contains(identity.sha256.as_str()) {
+                    true => None,
+                    false => Some(content(&sending)?),
+                };
+                Ok((identity, content))
+            });
+            Ok((sending, reference, found))
+        },
+        |(sending, reference, found)| {
+            match found {
+                Ok((identity, content)) => identified.push((sending, reference, identity, content)),
+                Err(error) => {
+                    let reason = reason_of(&error.path, &error.message, &sending);
+                    round.refused.push(Refused {
+                        team: team_of(&sending, None),
+                        path: sending.path,
+                        reason,
+                    });
+                }
+            }
+            Ok(())
+        },
+    )?;
+    identified.sort_by(|a, b| (&a.2.received, &a.0).cmp(&(&b.2.received, &b.0)));
+    let mut contents: BTreeMap<String, String> = BTreeMap::new();
+    for Entry { info, .. } in known {
+        let name = format!("the entry of {} of {}", info.team, info.received);
+        contents.entry(info.content.clone()).or_insert(name);
+    }
+    let mut archives: BTreeMap<String, PathBuf> = BTreeMap::new();
+    let mut candidates = Vec::new();
+    for (sending, reference, identity, content) in identified {
+        let entry = content.as_ref().and_then(|content| content.entry.as_ref());
+        let team = team_of(&sending, entry);
+        let path = sending.path.clone();
+        let refuse = |reason| round.refused.push(Refused { path, team, reason });
+        if let Some(first) = archives.get(&identity.sha256) {
+            refuse(format!("identical content as {}", first.display()));
+            continue;
+        }
+        archives.insert(identity.sha256.clone(), sending.path.clone());
+        let Some(content) = content else {
+            round.known += 1;
+            continue;
+        };
+        if let Some(first) = contents.get(&content.sha256) {
+            refuse(format!("identical content as {first}"));
+            continue;
+        }
+        contents.insert(content.sha256.clone(), sending.path.display().to_string());
+        candidates.push(Candidate {
+            sending,
+            reference,
+            identity,
+            content,
+        });
+    }
+    Ok(candidates)
+}

@@ -1,0 +1,26 @@
+//! Blind challenges of shape measurement.
+//!
+//! * [`kind`] has the rules of each kind of challenge, and the metrics that rank entries.
+//! * [`terms`] is the machine-readable description of a challenge, `challenge.toml`.
+//! * [`create`] writes the public and the private folder; [`seal`] ties them together.
+//! * [`shapes`] compares an entry with the public images, without the true shear.
+//! * [`inbox`] finds entries, [`judge`] checks and scores them, and [`ranking`] ranks them.
+//! * [`page`] makes the leaderboard.
+#![forbid(unsafe_code)]
+
+pub mod create;
+pub mod date;
+pub mod inbox;
+pub mod judge;
+pub mod kind;
+pub mod page;
+pub mod ranking;
+mod readme;
+pub mod seal;
+pub mod shapes;
+pub mod terms;
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -1,0 +1,377 @@
+//! The leaderboard as a table, and as a page that works without server and network.
+
+use std::path::Path;
+
+use shearq_files::{FileError, atomic};
+use shearq_render::figure::{Figure, FigureError, LinePlot, PictureFormat, Series, Style};
+use shearq_render::html::{Block, Picture, Report, Section};
+use shearq_render::page::PageError;
+use shearq_render::table::{Cell, Heading, Table, TableFormat};
+use shearq_results::submit::manifest::Contents;
+use shearq_results::views::comparison::q_heat_map;
+use shearq_results::views::metrics::metric_cell;
+
+use crate::date::day_of;
+use crate::judge::{EntryInfo, Refused};
+use crate::kind::RankBy;
+use crate::ranking::{Leaderboard, Standing};
+use crate::seal::Expected;
+use crate::terms::Challenge;
+
+/// Most teams in the plot of entries; the palette has eight colours, and the expected Q needs two.
+const PLOTTED: usize = 6;
+/// Colours of the expected Q of catalogues and spectra.
+const EXPECTED_COLOURS: [usize; 2] = [6, 7];
+
+/// How much of the scores is published.
+#[derive(Debug, Clone, Copy)]
+pub struct Disclosure {
+    /// Decimals of the metric.
+    pub digits: usize,
+    /// Whether the metric of each set is shown.
+    pub detail: bool,
+}
+
+/// What a leaderboard shows.
+#[derive(Debug, Clone, Copy)]
+pub struct View<'a> {
+    /// The description of the challenge.
+    pub challenge: &'a Challenge,
+    /// The ranked teams.
+    pub board: &'a Leaderboard<'a>,
+    /// Entries that were not scored.
+    pub refused: &'a [Refused],
+    /// Q that a perfect method can expect, if known.
+    pub expected: Option<&'a Expected>,
+    /// How much is published.
+    pub disclosure: Disclosure,
+}
+
+/// Names of the columns of a metric and its error.
+fn key(metric: RankBy) -> (&'static str, &'static str) {
+    match metric {
+        RankBy::Q => ("q", "q_error"),
+        RankBy::QCorrected => ("q_corrected", "q_corrected_error"),
+        RankBy::QCalibrated => ("q_calibrated", "q_calibrated_error"),
+        RankBy::M => ("m", "m_error"),
+        RankBy::C => ("c", "c_error"),
+        RankBy::Noise => ("noise", "noise_error"),
+    }
+}
+
+/// Kind of the files of an entry, in one word.
+fn files(contents: Contents) -> &'static str {
+    match contents {
+        Contents::Catalogues => "catalogues",
+        Contents::Spectra | Contents::CrossSpectra => "spectra",
+    }
+}
+
+/// The nearest number with so many decimals.
+fn rounded(value: f64, digits: usize) -> f64 {
+    // Printing rounds exactly; a product with a power of ten does not.
+    format!("{value:.digits$}").parse().unwrap_or(value)
+}
+
+/// The next larger number with so many decimals, so that no error becomes zero.
+fn rounded_up(error: f64, digits: usize) -> f64 {
+    let least = 0.5 * 10f64.powi(-(digits as i32));
+    match error > 0.0 {
+        true => rounded((error + least).max(2.0 * least), digits),
+        false => error,
+    }
+}
+
+/// Day of an entry.
+fn day(info: &EntryInfo) -> String {
+    day_of(&info.received).map_or_else(String::new, |day| day.to_string())
+}
+
+/// Title of an entry, with a mark for references.
+fn title(info: &EntryInfo) -> String {
+    match (info.reference, info.title.is_empty()) {
+        (true, true) => "reference".into(),
+        (true, false) => format!("reference: {}", info.title),
+        (false, _) => info.title.clone(),
+    }
+}
+
+impl View<'_> {
+    fn metric(&self) -> RankBy {
+        self.challenge.rules.metric
+    }
+
+    /// The leaderboard: one row per team and reference.
+    pub fn table(&self) -> Table {
+        let (metric, digits) = (self.metric(), self.disclosure.digits);
+        let row = |standing: &Standing<'_>| {
+            let info = standing.best.info();
+            let rank = standing
+                .rank
+                .map_or(Cell::Empty, |rank| Cell::number(rank as f64, 0));
+            let (value, error) = (standing.best.value, standing.best.error);
+            vec![
+                rank,
+                Cell::text(&info.team),
+                Cell::text(&info.method),
+                Cell::text(title(info)),
+                Cell::text(files(info.contents)),
+                // One cell would give the error two digits, and the value as many decimals.
+                Cell::number(rounded(value, digits), digits),
+                Cell::number(rounded_up(error, digits), digits),
+                Cell::text(day(info)),
+                Cell::number(standing.entries.len() as f64, 0),
+            ]
+        };
+        let mut notes = vec![metric.meaning().to_owned()];
+        notes.push("Each team is ranked by its best entry. Teams share a rank if their difference is below its error.".into());
+        notes.extend(self.expected_note());
+        Table {
+            title: format!("Leaderboard of {}", self.challenge.name),
+            headings: vec![
+                Heading::new("rank", "rank"),
+                Heading::new("team", "team"),
+                Heading::new("method", "method"),
+                Heading::new("title", "title"),
+                Heading::new("files", "files"),
+                Heading::new(key(metric).0, metric.label()),
+                Heading::new(key(metric).1, "± error"),
+                Heading::new("received", "received"),
+                Heading::new("entries", "entries"),
+            ],
+            rows: self.board.standings.iter().map(row).collect(),
+            notes,
+        }
+    }
+
+    /// The expected Q, if the metric is Q.
+    fn expected_of_metric(&self) -> Option<&Expected> {
+        self.expected.filter(|_| self.metric() == RankBy::Q)
+    }
+
+    fn expected_note(&self) -> Option<String> {
+        let Expected {
+            catalogues,
+            spectra,
+            without,
+        } = self.expected_of_metric()?;
+        let cell = |value: f64| metric_cell("q", rounded(value, 0), f64::NAN).digits();
+        let (catalogues, spectra) = (cell(*catalogues)?.0, cell(*spectra)?.0);
+        let without = match without.as_slice() {
+            [] => String::new(),
+            sets => {
+                let sets: Vec<String> = sets.iter().map(u32::to_string).collect();
+                format!(" Sets {} are left out.", sets.join(", "))
+            }
+        };
+        Some(format!(
+            "Expected Q of a perfect method with the smallest possible noise: {catalogues} for catalogues, {spectra} for power spectra without noise power.{without}"
+        ))
+    }
+
+    /// Entries that were not scored or do not count.
+    pub fn failures(&self) -> Table {
+        let refused = self.refused.iter().map(|refused| {
+            let name = refused.path.file_name().unwrap_or_default();
+            vec![
+                Cell::text(name.to_string_lossy()),
+                Cell::text(&refused.team),
+                Cell::text(&refused.reason),
+            ]
+        });
+        let excluded = self.board.excluded.iter().map(|(info, reason)| {
+            vec![
+                Cell::text(&info.method),
+                Cell::text(&info.team),
+                Cell::text(reason),
+            ]
+        });
+        Table {
+            title: "Entries without a rank".into(),
+            headings: vec![
+                Heading::new("entry", "entry"),
+                Heading::new("team", "team"),
+                Heading::new("reason", "reason"),
+            ],
+            rows: refused.chain(excluded).collect(),
+            notes: Vec::new(),
+        }
+    }
+
+    /// The metric of each entry of the best teams.
+    fn history(&self) -> LinePlot {
+        let digits = self.disclosure.digits;
+        let metric = self.metric();
+        let plotted: Vec<&Standing<'_>> = self
+            .board
+            .standings
+            .iter()
+            .filter(|standing| standing.rank.is_some())
+            .take(PLOTTED)
+            .collect();
+        let most = plotted
+            .iter()
+            .flat_map(|s| &s.entries)
+            .map(|e| e.number)
+            .max();
+        let last = most.unwrap_or(1) as f64;
+        let mut series = Vec::new();
+        if let Some(expected) = self.expected_of_metric() {
+            for (label, value, colour) in [
+                (
+                    "expected, catalogues",
+                    expected.catalogues,
+                    EXPECTED_COLOURS[0],
+                ),
+                ("expected, spectra", expected.spectra, EXPECTED_COLOURS[1]),
+            ] {
+                let (x, y) = (vec![0.5, last + 0.5], vec![rounded(value, 0); 2]);
+                series.push(Series::new(label, x, y, Style::Dashed, colour));
+            }
+        }
+        for (colour, standing) in plotted.iter().enumerate() {
+            let entries = &standing.entries;
+            let x: Vec<f64> = entries.iter().map(|entry| entry.number as f64).collect();
+            let y: Vec<f64> = entries.iter().map(|e| rounded(e.value, digits)).collect();
+            let errors = entries
+                .iter()
+                .map(|e| rounded_up(e.error, digits))
+                .collect();
+            let name = &standing.best.info().team;
+            series.push(Series::new("", x.clone(), y.clone(), Style::Line, colour));
+            series.push(Series::new(name, x, y, Style::Points, colour).with_errors(errors));
+        }
+        LinePlot {
+            title: "Entries of the first teams".into(),
+            x_label: "entry of the team".into(),
+            x_whole: true,
+            y_label: metric.label().into(),
+            x_range: Some((0.5, last + 0.5)),
+            series,
+            ..LinePlot::default()
+        }
+    }
+
+    /// The page.
+    ///
+    /// # Errors
+    /// If a figure cannot be drawn.
+    pub fn report(&self) -> Result<Report, FigureError> {
+        let mut blocks = vec![Block::Filtered(self.table())];
+        let failures = self.failures();
+        if !self.board.standings.is_empty() {
+            let caption = format!(
+                "{} of each entry, with its error, for the first {PLOTTED} teams at most.",
+                self.metric().label()
+            );
+            let picture = Picture::draw(&self.history(), PictureFormat::Svg, "entries", caption)?;
+            blocks.push(Block::Figure(picture));
+        }
+        let mut sections = vec![Section::new("leaderboard", "Leaderboard", blocks)];
+        if self.disclosure.detail {
+            sections.push(self.detail()?);
+        }
+        if !failures.rows.is_empty() {
+            sections.push(Section::new(
+                "failures",
+                "Entries without a rank",
+                vec![Block::Filtered(failures)],
+            ));
+        }
+        let Challenge {
+            name,
+            version,
+            kind,
+            data,
+            rules,
+            ..
+        } = self.challenge;
+        let mut settings = vec![
+            ("Version of the data".to_owned(), version.to_string()),
+            ("Kind".to_owned(), kind.title.to_owned()),
+            (
+                "Data".to_owned(),
+                format!(
+                    "{} sets of {} images with {2} × {2} galaxies",
+                    data.sets.len(),
+                    data.images,
+                    data.grid
+                ),
+            ),
+            ("Metric".to_owned(), rules.metric.label().to_owned()),
+            ("Decimals".to_owned(), self.disclosure.digits.to_string()),
+        ];
+        settings.push((
+            "Program".to_owned(),
+            format!("shearq {}", shearq_pipeline::VERSION),
+        ));
+        Ok(Report {
+            title: name.clone(),
+            subtitle: format!("{}: leaderboard", kind.title),
+            sections,
+            settings,
+        })
+    }
+
+    /// Q of each set.
+    fn detail(&self) -> Result<Section, FigureError> {
+        let rows: Vec<_> = self
+            .board
+            .standings
+            .iter()
+            .map(|standing| {
+                let info = standing.best.info();
+                let name = format!("{}: {}", info.team, info.method);
+                (name, standing.best.entry.sets.clone())
+            })
+            .collect();
+        let mut map = q_heat_map(&rows);
+        map.row_label = "entry".into();
+        map.decimals = map.decimals.min(self.disclosure.digits);
+        let caption = "Q of each set. Metrics of single sets tell participants more about the true shear than their mean.";
+        let picture = Picture::draw(
+            &map as &dyn Figure,
+            PictureFormat::Svg,
+            "q-per-set",
+            caption,
+        )?;
+        Ok(Section::new(
+            "sets",
+            "Metric of each set",
+            vec![Block::Figure(picture)],
+        ))
+    }
+
+    /// Writes the page to `path`, and the table as CSV and JSON beside it.
+    ///
+    /// # Errors
+    /// If a figure cannot be drawn or a file cannot be written.
+    pub fn save(&self, path: &Path) -> Result<(), PageError> {
+        let table = self.table();
+        self.report()?.save(path)?;
+        for (ending, format) in [("csv", TableFormat::Csv), ("json", TableFormat::Json)] {
+            let beside = path.with_extension(ending);
+            if beside == path {
+                let message = "expected a name that ends in .html";
+                return Err(FileError::new(path, message).into());
+            }
+            atomic::write(beside, table.render(format).as_bytes())?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn published_numbers_have_the_decimals_of_the_organiser() {
+        assert_eq!(rounded(123.456, 1), 123.5);
+        assert_eq!(rounded(123.456, 0), 123.0);
+        // An error is rounded up and never to zero.
+        assert_eq!(rounded_up(0.0004, 1), 0.1);
+        assert_eq!(rounded_up(0.12, 1), 0.2);
+        assert!(rounded_up(f64::NAN, 1).is_nan());
+    }
+}

@@ -1,0 +1,83 @@
+//! The page for participants in the public folder.
+
+use shearq_results::submit::challenge::Kind as FileKind;
+
+use crate::terms::Challenge;
+
+/// The page, as Markdown.
+pub(crate) fn text(challenge: &Challenge) -> String {
+    let Challenge {
+        name,
+        version,
+        kind,
+        contact,
+        data,
+        conventions,
+        rules,
+    } = challenge;
+    let sets: Vec<String> = data.sets.iter().map(u32::to_string).collect();
+    let first = data.sets.first().copied().unwrap_or(1);
+    let method = || "METHOD".to_owned();
+    let catalogue = FileKind::Catalogue {
+        set: first,
+        image: 1,
+        method: method(),
+    };
+    let spectrum = FileKind::Spectrum {
+        set: first,
+        method: method(),
+    };
+    let half = 0.5 * (data.stamp as f64 + 1.0);
+    let mut text = format!(
+        "# {name}\n\nVersion {version}. Kind: {} (`{}`).\n\nMeasure the shapes of the galaxies. The true shear is secret. `challenge.toml` has the numbers below in machine-readable form.\n\n## Data\n\n",
+        kind.title, kind.name
+    );
+    text.push_str(&format!(
+        "* Sets: {}.\n* Images per set: {}, numbered from 1.\n* Galaxies per image: {2} × {2}, in stamps of {3} × {3} pixels.\n* Side of the field: {4} degrees.\n* `layout.toml` has the names of images and PSFs.\n* Verify the download with `sha256sum -c SHA256SUMS`.\n\n",
+        sets.join(", "),
+        data.images,
+        data.grid,
+        data.stamp,
+        data.field_degrees
+    ));
+    text.push_str("## Conventions\n\n");
+    for (name, meaning) in conventions {
+        text.push_str(&format!("* {name}: {meaning}.\n"));
+    }
+    text.push_str(&format!(
+        "\n## Entries\n\nAn ellipticity catalogue is an ASCII file `{}` per image with one line per galaxy: `x y e1 e2`. For example, the first galaxy:\n\n```text\n{half} {half} 0.0312 -0.0147\n```\n\n",
+        catalogue.file_name()
+    ));
+    if rules.contents.iter().any(|contents| contents.is_spectra()) {
+        text.push_str(&format!(
+            "A power spectrum is an ASCII file `{}` per set with the bins 2 to 9: `index l power`.\n\n",
+            spectrum.file_name()
+        ));
+    }
+    text.push_str(&format!(
+        "Put the files of an entry into one `.tar.gz` without folders. [shearq](https://github.com/shearq/shearq) does it for its own catalogues, and for yours if you describe them (`--foreign`):\n\n```sh\nshearq measure --data . --submission 48/linear/star --out ../catalogues\nshearq pack --measured ../catalogues --challenge \"{}\" --team TEAM --out ../entry.tar.gz\nshearq challenge check ../entry.tar.gz --challenge .\n```\n\nThe last command checks any entry, and needs no true shear. It finds missing and duplicate galaxies, swapped or flipped components, and distortions that are given as shear.\n\n## Rules\n\n",
+        name.replace(['"', '\\', '$', '`'], "")
+    ));
+    for rule in kind.rules {
+        text.push_str(&format!("* {rule}\n"));
+    }
+    text.push_str(&format!(
+        "* Entries are ranked by {}, averaged over the sets. {}\n",
+        rules.metric.label(),
+        rules.metric.meaning()
+    ));
+    text.push_str("* Entries whose difference is below its error share a rank.\n");
+    if let Some(most) = rules.entries_per_team {
+        text.push_str(&format!("* Each team may send at most {most} entries.\n"));
+    }
+    if let Some(opens) = rules.opens {
+        text.push_str(&format!("* First day: {opens} (UTC).\n"));
+    }
+    if let Some(closes) = rules.closes {
+        text.push_str(&format!("* Last day: {closes} (UTC).\n"));
+    }
+    if !contact.is_empty() {
+        text.push_str(&format!("\nContact: {contact}\n"));
+    }
+    text
+}

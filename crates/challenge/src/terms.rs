@@ -1,0 +1,153 @@
+//! The description of a challenge: `challenge.toml`.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use shearq_files::{FileError, open};
+use shearq_quantities::units::{Degrees, Pixels};
+use shearq_results::submit::check::Expected;
+use shearq_results::submit::manifest::Contents;
+use shearq_scoring::Grid;
+use shearq_submissions::{check_name, checked_name};
+
+use crate::date::Date;
+use crate::kind::{Kind, RankBy, by_name};
+
+/// Name of the description in the public folder.
+pub const CHALLENGE_FILE: &str = "challenge.toml";
+
+/// Description of a challenge. It is public.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Challenge {
+    /// Name; entries state it.
+    #[serde(deserialize_with = "checked_name")]
+    pub name: String,
+    /// Version of the data.
+    pub version: u32,
+    /// Kind of challenge.
+    #[serde(deserialize_with = "by_name")]
+    pub kind: &'static Kind,
+    /// Address of the organiser; may be empty.
+    #[serde(default)]
+    pub contact: String,
+    /// What the data are.
+    pub data: Data,
+    /// Conventions, by name.
+    pub conventions: BTreeMap<String, String>,
+    /// How entries are ranked.
+    pub rules: Rules,
+}
+
+/// Sets, images and grid of a challenge.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Data {
+    /// Set numbers.
+    pub sets: Vec<u32>,
+    /// Images of each set, numbered from 1.
+    pub images: u32,
+    /// Galaxies per side of an image.
+    pub grid: usize,
+    /// Pixels per side of a stamp.
+    pub stamp: usize,
+    /// Side of the field in degrees.
+    pub field_degrees: f64,
+}
+
+impl Data {
+    /// Galaxies in all images.
+    pub fn galaxies(&self) -> u64 {
+        self.sets.len() as u64 * u64::from(self.images) * (self.grid as u64).pow(2)
+    }
+
+    /// Grid of the galaxies.
+    ///
+    /// # Errors
+    /// If a value is out of range.
+    pub fn grid(&self) -> Result<Grid, shearq_scoring::ScoringError> {
+        Grid::new(
+            self.grid,
+            Pixels(self.stamp as f64),
+            Degrees(self.field_degrees),
+        )
+    }
+}
+
+/// Rules of a challenge.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rules {
+    /// Metric that ranks the entries.
+    pub metric: RankBy,
+    /// Accepted files.
+    pub contents: Vec<Contents>,
+    /// Most entries of a team.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub entries_per_team: Option<u32>,
+    /// First day of entries, in UTC.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub opens: Option<Date>,
+    /// Last day of entries, in UTC.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub closes: Option<Date>,
+}
+
+impl Challenge {
+    /// Reads the description in a public folder, or the file itself.
+    ///
+    /// # Errors
+    /// If there is none, or a value is out of range.
+    pub fn read(place: &Path) -> Result<Self, FileError> {
+        let path = match place.is_dir() {
+            true => place.join(CHALLENGE_FILE),
+            false => place.to_owned(),
+        };
+        let text = open::read_to_string(&path, open::SETTINGS).map_err(FileError::doing(
+            &path,
+            "cannot read the description of the challenge (expected the public folder that `shearq challenge new` wrote)",
+        ))?;
+        let challenge: Challenge =
+            toml::from_str(&text).map_err(|e| FileError::new(&path, e.to_string().trim_end()))?;
+        challenge
+            .check()
+            .map_err(|message| FileError::new(&path, message))?;
+        Ok(challenge)
+    }
+
+    /// Properties that an entry must have.
+    ///
+    /// # Errors
+    /// If the grid is out of range.
+    pub fn expected(&self) -> Result<Expected, FileError> {
+        let Data { sets, images, .. } = &self.data;
+        let grid = self.data.grid();
+        Ok(Expected {
+            grid: grid.map_err(|error| FileError::new(CHALLENGE_FILE, error))?,
+            truth: BTreeMap::new(),
+            images: Some(*images),
+            sets: sets.clone(),
+        })
+    }
+
+    /// Checks every value against its range.
+    fn check(&self) -> Result<(), String> {
+        let Data { sets, images, .. } = &self.data;
+        if sets.is_empty() || !sets.is_sorted_by(|a, b| a < b) || *images == 0 {
+            return Err("`data`: expected ascending `sets` and at least one image".into());
+        }
+        self.data
+            .grid()
+            .map_err(|error| format!("`data`: {error}"))?;
+        check_name(&self.name).map_err(|error| error.to_string())
+    }
+
+    /// The text of the file.
+    ///
+    /// # Errors
+    /// If it cannot be written as TOML.
+    pub fn text(&self, path: &Path) -> Result<String, FileError> {
+        toml::to_string(self).map_err(FileError::doing(path, "cannot write the description"))
+    }
+}

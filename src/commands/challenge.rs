@@ -1,0 +1,363 @@
+//! `shearq challenge`.
+
+use std::path::PathBuf;
+
+use clap::{ArgGroup, Args, Subcommand};
+use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
+use shearq_challenge::date::Date;
+use shearq_challenge::inbox;
+use shearq_challenge::judge::Judge;
+use shearq_challenge::kind::{Kind, RankBy, kind};
+use shearq_challenge::page::{Disclosure, View};
+use shearq_challenge::ranking;
+use shearq_challenge::shapes::References;
+use shearq_challenge::terms::Challenge;
+use shearq_pipeline::data::layout::DataFolder;
+use shearq_pipeline::data::pattern::MAX_IMAGE;
+use shearq_results::submit::check::{check, check_sent};
+use shearq_results::submit::packed::Sent;
+
+use super::check::report;
+use crate::arguments::{Form, SetList, Threads};
+use crate::choices::named;
+use crate::progress::{Bar, goes_on};
+use crate::{count, tell};
+
+/// Run a challenge: write blind data, check entries, and rank them.
+///
+/// `new` writes a public folder for participants and a private folder with the true shear. `check` checks an entry
+/// without the true shear. `rank` scores entries and writes a leaderboard (docs/run-a-challenge.md).
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    #[command(
+        after_help = "Examples:\n  shearq challenge new --name pilot --sets 2,8 --images 20 --public pilot --private truth\n  shearq challenge new --name theirs --data rendered --public theirs --private theirs-truth"
+    )]
+    New(NewArguments),
+    #[command(after_help = "Example:\n  shearq challenge check entry.tar.gz --challenge pilot")]
+    Check(CheckArguments),
+    #[command(
+        after_help = "Example:\n  shearq challenge rank inbox --challenge pilot --truth truth --store results --report leaderboard.html"
+    )]
+    Rank(RankArguments),
+}
+
+/// Write the data of a new challenge: a public and a private folder.
+///
+/// The public folder has images, PSFs, challenge.toml, checksums, and a README for participants. The private folder has
+/// the true shear, the intrinsic shapes, the seed and the settings. The public folder does not determine the private
+/// folder.
+///
+/// The images are simulated (--sets), or are those of another simulator (--data). The same command resumes a stopped
+/// simulation.
+#[derive(Debug, Args)]
+#[command(group = ArgGroup::new("source").required(true).args(["sets", "data"]))]
+struct NewArguments {
+    /// Name of the challenge. Entries state it.
+    #[arg(long, value_name = "NAME", value_parser = name)]
+    name: String,
+    /// Kind of the challenge: metric, layout and rules.
+    #[arg(long, value_name = "KIND", default_value = "great10", value_parser = kind_of)]
+    kind: &'static Kind,
+    /// New folder for participants.
+    #[arg(long, value_name = "DIR")]
+    public: PathBuf,
+    /// New folder that must stay secret.
+    #[arg(long, value_name = "DIR")]
+    private: PathBuf,
+    /// Sets to simulate, such as `1,2,7-9` or `all`.
+    #[arg(long, value_name = "LIST", requires = "images")]
+    sets: Option<SetList>,
+    /// Simulated images per set.
+    #[arg(long, value_name = "N", requires = "sets", conflicts_with = "data", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    images: Option<u32>,
+    /// Galaxies per side of a simulated image [default: 100].
+    #[arg(long, value_name = "N", conflicts_with = "data", value_parser = clap::value_parser!(u16).range(8..=400))]
+    grid: Option<u16>,
+    /// Factor on the simulated shear power spectrum [default: drawn from 0.5 to 2, and secret].
+    #[arg(
+        long,
+        value_name = "A",
+        conflicts_with = "data",
+        allow_negative_numbers = true
+    )]
+    amplitude: Option<f64>,
+    /// Extra slope of the simulated shear power spectrum [default: drawn from -0.2 to 0.2, and secret].
+    #[arg(
+        long,
+        value_name = "T",
+        conflicts_with = "data",
+        allow_negative_numbers = true
+    )]
+    tilt: Option<f64>,
+    /// Seed of all random numbers [default: from the operating system].
+    #[arg(long, value_name = "SEED", conflicts_with = "data")]
+    seed: Option<u64>,
+    /// Data folder with images and PSFs of another simulator. Pixels are copied under new headers.
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+    /// Tables of the true shear of --data: x, y, g1, g2, with `{set}` for the set number [default: as in the data folder].
+    #[arg(long, value_name = "PATTERN", requires = "data", conflicts_with_all = ["sets", "images", "grid", "amplitude", "tilt", "seed"])]
+    truth_table: Option<String>,
+    /// Metric that ranks entries [default: the metric of the kind].
+    #[arg(long, value_parser = named::<RankBy>())]
+    metric: Option<RankBy>,
+    /// Most entries of a team [default: as the kind, or any number].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    entries_per_team: Option<u32>,
+    /// First day of entries, as YYYY-MM-DD in UTC.
+    #[arg(long, value_name = "DATE")]
+    opens: Option<Date>,
+    /// Last day of entries, as YYYY-MM-DD in UTC.
+    #[arg(long, value_name = "DATE")]
+    closes: Option<Date>,
+    /// Address for participants.
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    contact: String,
+    /// Version of the data, for a second release under the same name.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    data_version: u32,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+/// Check an entry, without the true shear.
+///
+/// ENTRY is an archive (.tar.gz) or a folder of catalogues or power spectra. Grid, sets and conventions come from
+/// challenge.toml. If the images are there, one image of each set is measured for comparison. This finds swapped or
+/// flipped components, exchanged rows, and distortions that are given as shear.
+///
+/// Exit code 0: no errors, perhaps warnings; 1: errors.
+#[derive(Debug, Args)]
+struct CheckArguments {
+    /// Archive or folder to check.
+    entry: PathBuf,
+    /// Public folder of the challenge, or its challenge.toml.
+    #[arg(long, value_name = "DIR")]
+    challenge: PathBuf,
+    /// Print the findings as JSON.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+/// Check, score and rank entries.
+///
+/// INBOX is an archive, a folder of catalogues or power spectra, or a folder of such. A folder in an inbox is the name of
+/// the team of all entries in it. An entry that cannot be scored is listed with the reason.
+///
+/// Every scored entry is kept in the results store. Later runs score only new entries, so a stopped run continues, and
+/// several processes may share a store. Without INBOX, the store alone is ranked.
+#[derive(Debug, Args)]
+struct RankArguments {
+    /// Entries: archives, or folders of entries.
+    #[arg(value_name = "INBOX")]
+    inbox: Vec<PathBuf>,
+    /// Public folder of the challenge.
+    #[arg(long, value_name = "DIR")]
+    challenge: PathBuf,
+    /// Private folder of the challenge.
+    #[arg(long, value_name = "DIR")]
+    truth: PathBuf,
+    /// Results store of the entries.
+    #[arg(long, value_name = "DIR")]
+    store: PathBuf,
+    /// Entry of the organiser, which is shown without a rank. May be given several times.
+    #[arg(long, value_name = "PATH")]
+    reference: Vec<PathBuf>,
+    /// Write the leaderboard to this HTML file, and as CSV and JSON beside it.
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    /// Decimals of published metrics: more decimals tell participants more about the true shear [default: as the metric].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..=12))]
+    digits: Option<u8>,
+    /// Also publish the metric of each set.
+    #[arg(long)]
+    detail: bool,
+    #[command(flatten)]
+    form: Form,
+    #[command(flatten)]
+    threads: Threads,
+}
+
+fn name(text: &str) -> Result<String, String> {
+    shearq_submissions::check_name(text)
+        .map(|()| text.to_owned())
+        .map_err(|error| error.to_string())
+}
+
+fn kind_of(text: &str) -> Result<&'static Kind, String> {
+    kind(text).ok_or_else(|| "expected `great10`".into())
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    match &arguments.command {
+        Command::New(arguments) => new(arguments),
+        Command::Check(arguments) => check_entry(arguments),
+        Command::Rank(arguments) => rank(arguments),
+    }
+}
+
+/// Seeds below this can be found by trying all of them.
+const LEAST_SEED: u64 = 1 << 40;
+
+fn new(arguments: &NewArguments) -> anyhow::Result<()> {
+    goes_on();
+    let plan = Plan {
+        name: arguments.name.clone(),
+        version: arguments.data_version,
+        kind: arguments.kind,
+        metric: arguments.metric.unwrap_or(arguments.kind.metric),
+        contact: arguments.contact.clone(),
+        entries_per_team: arguments
+            .entries_per_team
+            .or(arguments.kind.entries_per_team),
+        opens: arguments.opens,
+        closes: arguments.closes,
+    };
+    let folders = Folders {
+        public: &arguments.public,
+        private: &arguments.private,
+    };
+    let threads = arguments.threads.number();
+    let challenge = match (&arguments.data, &arguments.sets, arguments.images) {
+        (None, Some(sets), Some(images)) => {
+            let simulation = Simulation {
+                sets: sets.simulated()?.to_vec(),
+                images,
+                grid: arguments.grid.map_or(100, usize::from),
+                amplitude: arguments.amplitude,
+                tilt: arguments.tilt,
+                seed: arguments.seed,
+            };
+            if let Some(seed) = arguments.seed.filter(|seed| *seed < LEAST_SEED) {
+                tell(format_args!(
+                    "warning: participants can find the seed by trying (found {seed}, expected at least {LEAST_SEED}). Try: without --seed"
+                ));
+            }
+            let galaxies =
+                u64::from(images) * (simulation.sets.len() * simulation.grid.pow(2)) as u64;
+            let mut bar = Bar::new("simulating", galaxies);
+            simulated(&plan, &simulation, folders, threads, &mut bar)?
+        }
+        (Some(data), ..) => {
+            let data = DataFolder::open(data)?;
+            let mut bar = Bar::new("copying", 0);
+            let truth = arguments.truth_table.as_deref();
+            of_images(&plan, &data, truth, folders, threads, &mut bar)?
+        }
+        _ => anyhow::bail!("cannot determine the data. Try: --sets LIST --images N, or --data DIR"),
+    };
+    let data = &challenge.data;
+    tell(format_args!(
+        "wrote {} of {} each to {}; keep {} secret",
+        count(data.sets.len(), "set"),
+        count(data.images as usize, "image"),
+        arguments.public.display(),
+        arguments.private.display()
+    ));
+    Ok(())
+}
+
+fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
+    let CheckArguments {
+        entry,
+        challenge: place,
+        json,
+        threads,
+    } = arguments;
+    let challenge = Challenge::read(place)?;
+    let expected = challenge.expected()?;
+    let Ok(sent) = Sent::open(entry) else {
+        // The error is one of the findings.
+        return report(&check(entry, &expected), entry, *json);
+    };
+    let mut findings = check_sent(&sent, &expected, &mut |_| {});
+    let references = match place.is_dir() {
+        true => {
+            let (data, sets) = (DataFolder::open(place)?, &challenge.data.sets);
+            Some(References::measure(
+                &data,
+                sets,
+                expected.grid,
+                threads.number(),
+            )?)
+        }
+        false => None,
+    };
+    match references.filter(|references| !references.is_empty()) {
+        Some(references) => findings.extend(references.findings(&sent)?),
+        None => tell(format_args!(
+            "note: the shapes were not compared with the images, because {} contains no images",
+            place.display()
+        )),
+    }
+    report(&findings, entry, *json)
+}
+
+fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
+    goes_on();
+    let judge = Judge::open(&arguments.challenge, &arguments.truth)?;
+    let mut sendings = Vec::new();
+    for (paths, reference) in [(&arguments.inbox, false), (&arguments.reference, true)] {
+        let found = inbox::find(paths)?;
+        sendings.extend(found.into_iter().map(|sending| (sending, reference)));
+    }
+    let galaxies = judge.challenge.data.galaxies() * sendings.len() as u64;
+    let mut bar = Bar::new("scoring", galaxies);
+    let round = judge.round(
+        &sendings,
+        &arguments.store,
+        arguments.threads.number(),
+        &mut bar,
+    )?;
+    drop(bar);
+    let entries = match arguments.store.is_dir() {
+        true => judge.entries(&arguments.store)?,
+        false => Vec::new(),
+    };
+    let rules = &judge.challenge.rules;
+    let board = ranking::rank(&entries, rules);
+    let view = View {
+        challenge: &judge.challenge,
+        board: &board,
+        refused: &round.refused,
+        expected: judge.key.expected.as_ref(),
+        disclosure: Disclosure {
+            digits: arguments
+                .digits
+                .map_or(rules.metric.decimals(), usize::from),
+            detail: arguments.detail,
+        },
+    };
+    arguments.form.print(&view.table())?;
+    for refused in &round.refused {
+        tell(format_args!(
+            "warning: {}: not scored: {}",
+            refused.path.display(),
+            refused.reason
+        ));
+    }
+    for (info, reason) in &board.excluded {
+        tell(format_args!(
+            "warning: the entry of {} of {} does not count: {reason}",
+            info.team, info.received
+        ));
+    }
+    tell(format_args!(
+        "entries: {} scored, {} scored earlier, {} not scored",
+        round.scored,
+        round.known,
+        round.refused.len()
+    ));
+    if let Some(path) = &arguments.report {
+        view.save(path)?;
+    }
+    Ok(())
+}
