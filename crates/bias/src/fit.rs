@@ -143,11 +143,10 @@ impl Plan {
 
     /// The last of `more` terms, from both components: the mean weighted by what each component contributes.
     fn joint(&self, sums: &[f64], more: &[usize]) -> f64 {
-        let extra = extra(self.layout, sums);
         let (mut sum, mut weight) = (0.0, 0.0);
-        for k in 0..2 {
+        for (k, extra) in extra(self.layout, sums).into_iter().take(2).enumerate() {
             let of = self.layout.of(sums, k);
-            if let Some((x, pivot)) = last_of(&of, &self.with(k, more), extra[k]) {
+            if let Some((x, pivot)) = last_of(&of, &self.with(k, more), extra) {
                 sum += x * pivot;
                 weight += pivot;
             }

@@ -8,16 +8,19 @@ pub struct Expression {
     root: Node,
 }
 
+type Function = fn(f64) -> f64;
+type Operator = fn(f64, f64) -> f64;
+
 #[derive(Debug, Clone)]
 enum Node {
     Number(f64),
     Column(usize),
-    Unary(fn(f64) -> f64, Box<Node>),
-    Binary(fn(f64, f64) -> f64, Box<Node>, Box<Node>),
+    Unary(Function, Box<Node>),
+    Binary(Operator, Box<Node>, Box<Node>),
 }
 
 /// Functions of one number.
-const FUNCTIONS: [(&str, fn(f64) -> f64); 6] = [
+const FUNCTIONS: [(&str, Function); 6] = [
     ("abs", f64::abs),
     ("sqrt", f64::sqrt),
     ("exp", f64::exp),
@@ -27,7 +30,7 @@ const FUNCTIONS: [(&str, fn(f64) -> f64); 6] = [
 ];
 
 /// Operators from the loosest to the tightest. Within a level the left one is applied first.
-const OPERATORS: [&[(&str, fn(f64, f64) -> f64)]; 5] = [
+const OPERATORS: [&[(&str, Operator)]; 5] = [
     &[("or", |a, b| truth(a != 0.0 || b != 0.0))],
     &[("and", |a, b| truth(a != 0.0 && b != 0.0))],
     // Longer operators first.
