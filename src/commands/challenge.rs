@@ -53,7 +53,7 @@ enum Command {
 /// the true shear, the intrinsic shapes, the seed and the settings. The public folder does not determine the private
 /// folder.
 ///
-/// The images are simulated (--sets), or are those of another simulator (--data). The same command resumes a stopped
+/// The images are simulated (--sets), or copied from another simulator (--data). The same command resumes a stopped
 /// simulation.
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("source").required(true).args(["sets", "data"]))]
@@ -171,10 +171,10 @@ struct RankArguments {
     /// Entry of the organiser, which is shown without a rank. May be given several times.
     #[arg(long, value_name = "PATH")]
     reference: Vec<PathBuf>,
-    /// Write the leaderboard to this HTML file, and as CSV and JSON beside it.
+    /// Write the leaderboard to this HTML file, and as CSV and JSON with the same name.
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// Decimals of published metrics: more decimals tell participants more about the true shear [default: as the metric].
+    /// Decimals of published metrics. More decimals reveal more of the true shear [default: as the metric].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..=12))]
     digits: Option<u8>,
     /// Also publish the metric of each set.

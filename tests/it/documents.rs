@@ -119,6 +119,16 @@ fn commands_of_the_pages_run() {
         challenge.path(),
         &["linear.html", "compare.html", "to-send.tar.gz"],
     );
+    let organised = tempfile::tempdir().unwrap();
+    follow("run-a-challenge.md", organised.path(), 7);
+    written(
+        organised.path(),
+        &[
+            "leaderboard.html",
+            "pilot/README.md",
+            "truth/set08/truth.csv",
+        ],
+    );
     let recipes = tempfile::tempdir().unwrap();
     follow("recipes.md", recipes.path(), 27);
     let files = [

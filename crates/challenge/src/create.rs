@@ -246,7 +246,7 @@ fn expected(
     }))
 }
 
-/// Writes a challenge of the images in `data`, which another program made. Headers are written anew, because the old ones
+/// Writes a challenge of the images in `data`, which another program made. New headers are written, because the old headers
 /// may contain the seed or the shear. The true shear is in the files `truth` with `{set}` for the set number, or in the
 /// data folder.
 ///

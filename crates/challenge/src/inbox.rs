@@ -58,7 +58,8 @@ fn search(
             team: team.map(str::to_owned),
         });
     };
-    if name.starts_with('.') && name != "." && name != ".." {
+    // A given path is searched whatever its name.
+    if name.starts_with('.') && depth < DEPTH {
         return Ok(());
     }
     if !path.is_dir() {

@@ -27,7 +27,7 @@ use crate::seal::{Key, verify};
 use crate::shapes::References;
 use crate::terms::Challenge;
 
-/// A scored entry, as the store keeps it beside its scores.
+/// A scored entry, as the store keeps it with its scores.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EntryInfo {
     /// Name of the challenge.

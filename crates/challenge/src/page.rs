@@ -342,7 +342,7 @@ impl View<'_> {
         ))
     }
 
-    /// Writes the page to `path`, and the table as CSV and JSON beside it.
+    /// Writes the page to `path`, and the table as CSV and JSON with the same name.
     ///
     /// # Errors
     /// If a figure cannot be drawn or a file cannot be written.

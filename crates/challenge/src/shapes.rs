@@ -22,7 +22,7 @@ use shearq_submissions::Registry;
 
 /// Configuration of the reference measurement.
 const REFERENCE: &str = "48/linear/star";
-/// Standard deviations of chance correlations by which one order of the components must be better.
+/// Required difference of two correlations, in standard deviations of chance correlations.
 const CLEAR: f64 = 5.0;
 /// Slope on the reference above which ellipticities are probably distortions, which are nearly twice as large. It is the
 /// geometric mean of 1 and 2.
@@ -97,7 +97,7 @@ impl Product {
         }
     }
 
-    /// Slope of the sent ellipticities on the reference. The noise is that of one image, so it is common to both.
+    /// Slope of the sent ellipticities on the reference. Both have the noise of one image.
     fn slope(&self) -> f64 {
         self.cross / self.reference
     }

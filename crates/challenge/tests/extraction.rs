@@ -44,7 +44,7 @@ fn decimals_limit_what_nine_entries_extract() {
     let found =
         [(6, 1), (1, 1), (0, 1), (1, 24), (0, 24)].map(|(digits, sets)| extracted(digits, sets));
     println!("{found:?}");
-    assert!(found[0] < 1e-4, "{found:?}");
+    assert!(found[0] < 1e-6, "{found:?}");
     assert!(
         found[0] < found[1] && found[1] < found[2] && found[2] < found[4],
         "{found:?}"
