@@ -2,6 +2,7 @@
 
 pub(crate) mod baseline;
 pub(crate) mod bench;
+pub(crate) mod bias;
 pub(crate) mod calibrate;
 pub(crate) mod challenge;
 pub(crate) mod check;

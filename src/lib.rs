@@ -15,7 +15,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use commands::{
-    baseline, bench, calibrate, challenge, check, compare, gather, help_files, mean, measure,
+    baseline, bench, bias, calibrate, challenge, check, compare, gather, help_files, mean, measure,
     merge, pack, quickstart, reproduce, run, score, show, simulate, study, submissions, unpack,
 };
 use shearq_pipeline::data::listing::Files;
@@ -79,6 +79,10 @@ enum Command {
         after_help = "Examples:\n  shearq compare raw den linear --format latex\n  shearq compare --store results --where 'snr=high,submission=23/*' --sort q:desc"
     )]
     Compare(compare::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq bias catalogue.fits --bins snr:5\n  shearq bias plus.parquet minus.parquet --truth shears.csv --fail-above m=2e-3@3sigma"
+    )]
+    Bias(bias::Arguments),
     #[command(
         after_help = "Examples:\n  shearq baseline record mine --measured raw den\n  shearq baseline check mine"
     )]
@@ -168,6 +172,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Merge(arguments) => merge::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
+        Command::Bias(arguments) => bias::run(&arguments),
         Command::Baseline(arguments) => baseline::run(&arguments),
         Command::Challenge(arguments) => challenge::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),

@@ -6,7 +6,7 @@ use crate::Cli;
 
 /// The ways to use each command, and the options that each way uses. Two options without a common way must be
 /// refused.
-const WAYS: [(&str, &[&str]); 30] = [
+const WAYS: [(&str, &[&str]); 31] = [
     ("quickstart", &["out threads"]),
     (
         "simulate",
@@ -48,6 +48,14 @@ const WAYS: [(&str, &[&str]); 30] = [
         &[
             "OUT data foreign where sort group-by heat-map format wide metrics report definition convention threads",
             "store where sort group-by heat-map format wide metrics report",
+        ],
+    ),
+    (
+        "bias",
+        &[
+            "CATALOGUE g1 g2 columns ellipticity flip-g2 bins select design units drop-missing step bootstrap seed fail-above junit sums shard plot format wide metrics report",
+            "CATALOGUE truth columns ellipticity flip-g2 bins select design units drop-missing step bootstrap seed fail-above junit sums shard plot format wide metrics report",
+            "merge bootstrap seed fail-above junit plot format wide metrics report",
         ],
     ),
     (

@@ -8,8 +8,8 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::Grid;
 
 use crate::{Findings, count, print, tell_unread};
-use shearq_files::table::MAX_ROWS;
-use shearq_pipeline::data::layout::{DataFolder, Layout, read_rows, read_truth_rows};
+use shearq_files::table::{MAX_ROWS, read_truth};
+use shearq_pipeline::data::layout::{DataFolder, Layout, read_rows};
 use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::grid;
 use shearq_pipeline::truth::grid_of_set;
@@ -72,7 +72,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         side = Some(match sets.is_empty() {
             true => grid_of_set(data, set)?.n,
             false => {
-                let rows = read_truth_rows(&data.truth(set), MAX_ROWS)?.len();
+                let rows = read_truth(&data.truth(set), MAX_ROWS)?.height();
                 grid::side(&data.truth(set), rows)?
             }
         });

@@ -77,7 +77,8 @@ pub(crate) struct Arguments {
     /// Side of the field in degrees, for --truth [default: 10].
     #[arg(long, value_name = "DEG", requires = "truth", conflicts_with_all = FOLDERS)]
     field: Option<f64>,
-    /// Names of the catalogues' columns, for --truth [default: x,y,e1,e2].
+    /// Names of the catalogues' columns, or their numbers if they have no names, such as 2,3,4,5; for --truth [default:
+    /// x,y,e1,e2].
     #[arg(long, value_name = "X,Y,E1,E2", value_delimiter = ',', num_args = 1, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     columns: Option<Vec<String>>,
     /// Type of the ellipticities, `shear` or `distortion`, for --truth. Distortions are converted to shear-type

@@ -320,7 +320,7 @@ fn what_cfitsio_would_divide_by_is_refused_however_it_is_written() {
         (
             "ZNAXIS",
             "ZNAXIS  = 7",
-            "7 dimensions; expected 2, or 3 of a cube",
+            "7 dimensions; expected 2, or 3 for a cube",
         ),
         ("ZBITPIX", "ZBITPIX = 64", "ZBITPIX is 64"),
         ("ZCMPTYPE", "ZCMPTYPE= 'BZIP2_1 '", "ZCMPTYPE is BZIP2_1"),

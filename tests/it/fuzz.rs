@@ -189,7 +189,7 @@ fn mutate_fits(bytes: &mut Vec<u8>, random: &mut ChaCha8Rng) {
         "HIERARCH ZTILE2",
         "HIERARCH zval1",
     ];
-    const VALUES: [&str; 30] = [
+    const VALUES: [&str; 31] = [
         "0",
         "1",
         "-1",
@@ -204,6 +204,7 @@ fn mutate_fits(bytes: &mut Vec<u8>, random: &mut ChaCha8Rng) {
         "-64",
         "999",
         "200000",
+        "16000000",
         "2147483647",
         "-2147483648",
         "9223372036854775807",

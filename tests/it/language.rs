@@ -23,7 +23,7 @@ const SOURCES: [&str; 5] = [
 const DOCUMENTED: [&str; 2] = ["src", "crates/results/src"];
 
 /// Documents whose sentences are checked for their length.
-const PAGES: [&str; 43] = [
+const PAGES: [&str; 45] = [
     "README.md",
     "CONTRIBUTING.md",
     "docs/architecture.md",
@@ -54,8 +54,9 @@ const PAGES: [&str; 43] = [
     "docs/speed.md",
     "docs/troubleshooting.md",
     "docs/upgrading.md",
+    "docs/validate-shapes.md",
     "docs/validation.md",
-    "crates/challenge/README.md",
+    "crates/bias/README.md",
     "crates/files/README.md",
     "crates/fourier/README.md",
     "crates/measure/README.md",
@@ -67,6 +68,7 @@ const PAGES: [&str; 43] = [
     "crates/studies/README.md",
     "scoring/README.md",
     "submissions/README.md",
+    "crates/challenge/README.md",
 ];
 
 /// Banned phrases and their replacement.

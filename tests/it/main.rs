@@ -11,6 +11,7 @@ mod bad_catalogues;
 mod bad_images;
 mod bad_settings;
 mod baselines;
+mod bias;
 mod chain;
 mod challenge;
 mod documents;

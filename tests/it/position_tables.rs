@@ -511,6 +511,94 @@ fn catalogues_with_a_head_of_sextractor_or_in_a_named_table_are_scored() {
         said.contains("there is no column `x`; columns found: NUMBER, X_IMAGE"),
         "{said}"
     );
+    // Five columns without names are not `x y e1 e2` and another.
+    let said = fail(&["score", "--truth", text(&truth), text(&at("bare.cat"))]);
+    for words in [
+        "bare.cat: 5 columns have no names (found the first row `0, 24.5, 24.5, ",
+        "expected 4: x, y, e1, e2). Try: add a first line with the names",
+        "`score --columns` (names, or numbers such as 2,3,4,5)",
+    ] {
+        assert!(said.contains(words), "{said}");
+    }
+    let said = fail(&[
+        "score",
+        "--truth",
+        text(&at("bare.cat")),
+        text(&at("sex.cat")),
+    ]);
+    assert!(
+        said.contains("bare.cat: 5 columns have no names") && said.contains("x, y, g1, g2)"),
+        "{said}"
+    );
+}
+
+#[test]
+fn descriptions_of_catalogues_name_a_table() {
+    let root = folder();
+    let at = |name: &str| root.path().join(name);
+    let data = at("sim");
+    let simulate = ["simulate", "--sets", "2", "--images", "1", "--grid", "8"];
+    succeed(&[&simulate[..], &["--out", text(&data)]].concat());
+    let truth = fs::read_to_string(data.join("set02/truth.csv")).unwrap();
+    let rows: Vec<Vec<f64>> = truth
+        .lines()
+        .filter(|line| !line.starts_with(['#', 'x']))
+        .map(|line| {
+            line.split(',')
+                .map(|field| field.parse().unwrap())
+                .collect()
+        })
+        .collect();
+    // Two tables with the same columns; the ellipticities of the first are zero.
+    let mut file = Vec::new();
+    for (name, factor) in [("ZERO", 1e-9), ("SHAPES", 1.0)] {
+        let columns = ["x", "y", "e1", "e2"].iter().enumerate().map(|(k, name)| {
+            let factor = if k < 2 { 1.0 } else { factor };
+            let values: Vec<f64> = rows.iter().map(|row| row[k] * factor).collect();
+            Column::new((*name).into(), values)
+        });
+        let _ = fs::remove_file(at("one.fits"));
+        write_table(&at("one.fits"), &frame(columns.collect()).unwrap(), &[]).unwrap();
+        let bytes = called(fs::read(at("one.fits")).unwrap(), name);
+        let start = if file.is_empty() { 0 } else { 2880 };
+        file.extend_from_slice(&bytes[start..]);
+    }
+    fs::write(at("cat-2-1.fits"), file).unwrap();
+    let describe = |table: &str| {
+        let keys =
+            "name = \"F\"\ncatalogues = \"cat-{set}-{image}.fits\"\nellipticity = \"shear\"\n";
+        fs::write(at("f.toml"), format!("{keys}{table}\n")).unwrap();
+    };
+    let foreign = at("f.toml");
+    let score = [
+        "score",
+        "--data",
+        text(&data),
+        "--foreign",
+        text(&foreign),
+        "--format",
+        "csv",
+    ];
+    let scored = |table: &str| {
+        describe(table);
+        succeed(&score)
+    };
+    let named = scored("table = \"SHAPES\"");
+    assert_eq!(scored("table = 2"), named);
+    assert_eq!(scored("table = \"2\""), named);
+    assert_ne!(scored("table = 1"), named);
+    for (table, expected) in [
+        ("", "2 tables have these columns (extensions 1 to 2)"),
+        (
+            "table = \"NONE\"",
+            "there is no table `NONE` in this file; tables found: 1 `ZERO`, 2 `SHAPES`",
+        ),
+        ("table = 2.5", "expected the name or the number of a table"),
+    ] {
+        describe(table);
+        let message = fail(&score);
+        assert!(message.contains(expected), "{table}: {message}");
+    }
 }
 
 #[test]

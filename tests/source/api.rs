@@ -20,6 +20,7 @@ const ACCEPT: &str = "SHEARQ_ACCEPT";
 
 #[test]
 fn public_items_are_those_that_are_listed() {
+    crate::tree::enter_root();
     let mut changed = Vec::new();
     for (name, folder) in LIBRARIES {
         let path = Path::new("docs/api").join(format!("{name}.txt"));
@@ -33,7 +34,7 @@ fn public_items_are_those_that_are_listed() {
     }
     assert!(
         changed.is_empty(),
-        "the public API is not the one listed in docs/api:\n{}\nTry: {ACCEPT}=1 cargo test --release --test source api",
+        "the public API is not the one listed in docs/api:\n{}\nTry: {ACCEPT}=1 cargo test --manifest-path tests/source/Cargo.toml api",
         changed.join("\n")
     );
 }
@@ -436,6 +437,7 @@ fn without_docs(tokens: proc_macro2::TokenStream) -> proc_macro2::TokenStream {
 
 #[test]
 fn a_listing_shows_public_items_alone() {
+    crate::tree::enter_root();
     let folder = tempfile::tempdir().unwrap();
     let source = folder.path().join("src");
     fs::create_dir(&source).unwrap();

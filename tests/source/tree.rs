@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use syn::{Attribute, Item, ItemUse, UseTree, Visibility};
 
 /// The crates with a library, by package name, and their folders.
-pub const LIBRARIES: [(&str, &str); 11] = [
+pub const LIBRARIES: [(&str, &str); 13] = [
+    ("shearq-bias", "crates/bias"),
+    ("shearq-challenge", "crates/challenge"),
     ("shearq-files", "crates/files"),
     ("shearq-fourier", "crates/fourier"),
     ("shearq-measure", "crates/measure"),
@@ -281,4 +283,9 @@ fn imports(item: &ItemUse) -> Vec<Import> {
     let public = matches!(item.vis, Visibility::Public(_));
     flatten(&item.tree, &[], public, &mut out);
     out
+}
+
+/// Makes the root of the repository the current folder, to which all paths are relative.
+pub fn enter_root() {
+    std::env::set_current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../..")).unwrap();
 }

@@ -1,8 +1,8 @@
-//! Files that appear whole or not at all.
+//! Files that are written completely or not at all.
 //!
-//! Until then they have temporary names, `.NAME.RANDOM.part`. What a killed process leaves is removed by
-//! the next one: in a folder of results by whoever has it to itself ([`remove_leftovers`]), elsewhere
-//! ([`sweep`]) by the lock that a living process holds on what it writes.
+//! Until they are complete they have temporary names, `.NAME.RANDOM.part`. The next process removes the leftovers of a
+//! killed one: [`remove_leftovers`] in a folder that one process uses alone, [`sweep`] elsewhere. A lock marks the files
+//! of a running process.
 
 use std::fs;
 use std::io::{ErrorKind, Write};
@@ -12,25 +12,24 @@ use tempfile::{TempDir, TempPath};
 
 use crate::error::FileError;
 
-/// A file on its way: written under a temporary name in the same folder, renamed by
-/// [`PartFile::finish`], removed if dropped before.
+/// A file that is being written under a temporary name in the same folder. [`PartFile::finish`] renames it. If it is
+/// dropped before, it is removed.
 ///
-/// Each has a temporary name of its own, so that processes that write the same file do not meet in it:
-/// the last one gives it its content.
+/// The temporary names differ, so that several processes can write the same file. The last one determines the content.
 #[derive(Debug)]
 pub struct PartFile {
     part: PathBuf,
     target: PathBuf,
     finished: bool,
-    /// The file with a lock on it, where there are such.
+    /// The file with a lock, on systems with locks.
     _held: fs::File,
 }
 
 impl PartFile {
-    /// Makes the folder and the file, to be written to.
+    /// Creates the folder and the file, which is open for writing.
     ///
     /// # Errors
-    /// Where either cannot be made.
+    /// If either cannot be created.
     pub fn create(target: impl AsRef<Path>) -> Result<(Self, fs::File), FileError> {
         let target = regular(target.as_ref())?;
         let (part, held) = held(&target, "cannot write the file", |part| {
@@ -48,21 +47,21 @@ impl PartFile {
         Ok((part, file))
     }
 
-    /// Where to write.
+    /// The temporary name.
     pub fn path(&self) -> &Path {
         &self.part
     }
 
-    /// What it will be called.
+    /// The final name.
     pub fn target(&self) -> &Path {
         &self.target
     }
 
-    /// Gives the file its name, for good: the content is on disk before the name, and the name before
-    /// anything that is written after it.
+    /// Gives the file its name. The content is on disk before the name, and the name before any file that is written
+    /// later.
     ///
     /// # Errors
-    /// Where it cannot be flushed to disk or renamed.
+    /// If it cannot be flushed to disk or renamed.
     pub fn finish(mut self) -> Result<(), FileError> {
         self.flush()
             .and_then(|()| fs::rename(&self.part, &self.target))
@@ -71,16 +70,15 @@ impl PartFile {
         sync_names(&self.target).map_err(FileError::doing(&self.target, "cannot write the file"))
     }
 
-    /// Gives the file its name unless a file has it by now, of which nothing changes then. Returns
-    /// whether this is the file of that name.
+    /// Gives the file its name unless another file has it. Returns whether it was renamed.
     ///
     /// # Errors
-    /// Where it cannot be flushed to disk or named.
+    /// If it cannot be flushed to disk or named.
     pub fn finish_if_absent(mut self) -> Result<bool, FileError> {
         let named = self.flush().and_then(|()| {
             let part = TempPath::try_from_path(&self.part)?;
             part.persist_noclobber(&self.target).map_err(|failure| {
-                // Only its removal can fail, which is this file's own business.
+                // Only removing the temporary file can fail, which does not matter to the caller.
                 let _ = failure.path.keep();
                 failure.error
             })
@@ -118,15 +116,15 @@ pub struct PartFolder {
     part: PathBuf,
     target: PathBuf,
     finished: bool,
-    /// The folder with a lock on it, where there are such.
+    /// The folder with a lock, on systems with locks.
     _held: fs::File,
 }
 
 impl PartFolder {
-    /// Makes the folder under a temporary name, and removes what killed processes left beside it.
+    /// Creates the folder under a temporary name, and removes leftovers of killed processes next to it.
     ///
     /// # Errors
-    /// Where it cannot be made, or `target` exists and is no empty folder.
+    /// If it cannot be created, or `target` exists and is no empty folder.
     pub fn new(target: impl AsRef<Path>) -> Result<Self, FileError> {
         let target = target.as_ref().to_owned();
         if target.exists() && !(target.is_dir() && list(&target)?.is_empty()) {
@@ -146,7 +144,7 @@ impl PartFolder {
         })
     }
 
-    /// Where to put the files.
+    /// The temporary name, for the files.
     pub fn path(&self) -> &Path {
         &self.part
     }
@@ -154,7 +152,7 @@ impl PartFolder {
     /// Gives the folder its name, its files being on disk.
     ///
     /// # Errors
-    /// Where a file cannot be flushed or the folder cannot be renamed.
+    /// If a file cannot be flushed or the folder cannot be renamed.
     pub fn finish(mut self) -> Result<(), FileError> {
         for path in list(&self.part)? {
             fs::File::open(&path)
@@ -177,8 +175,8 @@ impl Drop for PartFolder {
     }
 }
 
-/// A folder among the system's temporary ones that is removed when dropped; if it is killed before, by
-/// the next of them.
+/// A folder among the system's temporary ones that is removed when dropped. If the process is killed, the next
+/// temporary folder removes it.
 #[derive(Debug)]
 pub struct Scratch {
     folder: TempDir,
@@ -189,7 +187,7 @@ impl Scratch {
     /// Makes an empty folder that no other user can look into.
     ///
     /// # Errors
-    /// Where it cannot be made.
+    /// If it cannot be created.
     pub fn new() -> Result<Self, FileError> {
         let temporary = std::env::temp_dir();
         sweep(&temporary);
@@ -214,7 +212,7 @@ impl Scratch {
         })
     }
 
-    /// Where it is.
+    /// Its path.
     pub fn path(&self) -> &Path {
         self.folder.path()
     }
@@ -283,7 +281,7 @@ const PART: &str = ".part";
 /// process may be writing there.
 ///
 /// # Errors
-/// Where a folder cannot be listed or a leftover cannot be removed.
+/// If a folder cannot be listed or a leftover cannot be removed.
 pub fn remove_leftovers(folder: &Path) -> Result<(), FileError> {
     for path in list(folder)? {
         if path.is_dir() {
@@ -322,8 +320,8 @@ fn is_part(path: &Path) -> bool {
     own.is_some_and(|(_, own)| own.len() == 16 && own.bytes().all(|b| b.is_ascii_hexdigit()))
 }
 
-/// Removes the temporary files and folders in `folder` that no living process holds. Those that this
-/// cannot tell of or may not remove stay, and do no harm.
+/// Removes the temporary files and folders in `folder` that no running process has locked. Files without a known state
+/// or without permission stay, and do no harm.
 pub fn sweep(folder: &Path) {
     for path in list(folder).unwrap_or_default() {
         let Ok(about) = path.symlink_metadata() else {
@@ -372,7 +370,7 @@ fn sync_names(file: &Path) -> std::io::Result<()> {
     }
 }
 
-/// Elsewhere a folder cannot be opened as a file.
+/// On other systems a folder cannot be opened as a file.
 #[cfg(not(unix))]
 fn sync_names(_file: &Path) -> std::io::Result<()> {
     Ok(())
@@ -381,15 +379,15 @@ fn sync_names(_file: &Path) -> std::io::Result<()> {
 /// Writes `bytes` to `target`, whole or not at all.
 ///
 /// # Errors
-/// Where the file cannot be written.
+/// If the file cannot be written.
 pub fn write(target: impl AsRef<Path>, bytes: &[u8]) -> Result<(), FileError> {
     written(target, bytes)?.finish()
 }
 
-/// The same unless `target` exists, of which nothing changes then. Returns whether it was written.
+/// Like [`write`], but does not replace an existing `target`. Returns whether it was written.
 ///
 /// # Errors
-/// Where the file cannot be written.
+/// If the file cannot be written.
 pub fn write_if_absent(target: impl AsRef<Path>, bytes: &[u8]) -> Result<bool, FileError> {
     written(target, bytes)?.finish_if_absent()
 }

@@ -7,22 +7,22 @@ use thiserror::Error;
 
 use crate::renamed;
 
-/// A file that cannot be used: which, where in it, what was found and what was expected.
+/// A file that cannot be used: its path, the place, the found and the expected value.
 #[derive(Debug, Error)]
 #[error("{}: {message}", path.display())]
 pub struct FileError {
     /// The file.
     pub path: PathBuf,
-    /// Place, what was found, what was expected.
+    /// Place, found value, expected value.
     pub message: String,
-    /// Whether all that is wrong is that a column asked for is not there.
+    /// Whether the only fault is that a requested column is absent or that the columns have no names.
     pub no_column: bool,
 }
 
 /// Most names of columns that a message lists.
 const SHOWN: usize = 40;
 
-/// Most characters of a message, which may quote what a file holds.
+/// Most characters of a message, which may quote contents of a file.
 const LONGEST: usize = 4000;
 
 /// Names of columns as a message lists them.
@@ -59,7 +59,23 @@ impl FileError {
         }
     }
 
-    /// With a word on where the names of columns come from, if one was not found.
+    /// About `path`, a text table without names whose first row has the fields `first`: more than the columns
+    /// `expected` that a table without names has.
+    pub(crate) fn no_names(path: &Path, first: &[impl AsRef<str>], expected: &[&str]) -> Self {
+        let message = format!(
+            "{} columns have no names (found the first row `{}`, expected {}: {}). Try: add a first line with the names",
+            first.len(),
+            names_of(first),
+            expected.len(),
+            names_of(expected)
+        );
+        FileError {
+            no_column: true,
+            ..FileError::new(path, message)
+        }
+    }
+
+    /// Adds a hint on where the names of columns are specified, if the fault is about columns.
     pub fn hint_of_columns(mut self, hint: &str) -> Self {
         if self.no_column {
             self.message = format!("{}; {hint}", self.message);

@@ -1,8 +1,7 @@
-//! Frames of named columns, which are polars' own, kept in Parquet files.
+//! polars' frames of named columns, in Parquet files.
 //!
-//! [`frame`] makes one of columns, [`write_parquet`] puts it into any writer, with text metadata,
-//! [`read_parquet`] takes all or some of its columns from a file that may be damaged, and
-//! [`parquet_columns`] and [`parquet_metadata`] read the footer alone.
+//! [`frame`] makes a frame from columns. [`write_parquet`] writes it with text metadata. [`read_parquet`] reads all or
+//! some columns of a file that may be damaged. [`parquet_columns`] and [`parquet_metadata`] read only the footer.
 //!
 //! ```
 //! use shearq_files::frames::polars::Column;
@@ -34,4 +33,6 @@ mod parquet;
 pub use ::polars::prelude as polars;
 pub use error::TableError;
 pub use frame::{Metadata, frame, reals};
-pub use parquet::{parquet_columns, parquet_metadata, read_parquet, write_parquet};
+pub use parquet::{
+    parquet_columns, parquet_metadata, read_parquet, read_parquet_groups, write_parquet,
+};

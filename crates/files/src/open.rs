@@ -1,29 +1,30 @@
-//! Opening files for reading: the one place that does, so that nothing but a file is ever read. A pipe
-//! would wait for a writer for ever, and a device gives bytes without end.
+//! Opening files for reading. All reading starts here, so that only regular files are read. Opening a pipe may wait
+//! for ever, and a device may have no end.
 
 use std::fs::{File, Metadata};
 use std::io::{Error, ErrorKind, Read};
 use std::path::Path;
 
-/// Most bytes of a file of data that is read whole: some hundred times those of a challenge's catalogue.
+/// Most bytes of a data file that is read completely: some hundred times the size of a challenge's catalogue.
 pub const DATA: u64 = 1 << 27;
-/// Most bytes of a file of settings: ten times those of a run or a baseline of all sets. Once they are
-/// taken apart they need twenty times as much memory.
+/// Most bytes of a settings file: ten times the size of a run or a baseline of all sets. Parsing needs twenty times as
+/// much memory.
 pub const SETTINGS: u64 = 1 << 22;
 
 /// Opens a regular file, or a link to one.
 ///
 /// # Errors
-/// Where it cannot be opened or is not a file.
+/// If it cannot be opened or is not a regular file.
 pub fn open(path: &Path) -> std::io::Result<File> {
-    // Before, as opening a pipe waits and opening a device may act; after, for what was opened.
+    // Checked before, because opening a pipe waits and opening a device may act. Checked after, because the name may
+    // have changed its file.
     regular(&std::fs::metadata(path)?)?;
     let file = File::open(path)?;
     regular(&file.metadata()?)?;
     Ok(file)
 }
 
-/// Whether there is anything of this name, be it what it may: who reads it says what is wrong with it.
+/// Whether anything has this name. The reader reports it if it is no regular file.
 pub fn is_there(path: &Path) -> bool {
     std::fs::symlink_metadata(path)
         .map_or_else(|error| error.kind() != ErrorKind::NotFound, |_| true)
@@ -32,7 +33,7 @@ pub fn is_there(path: &Path) -> bool {
 /// All bytes of a file.
 ///
 /// # Errors
-/// As [`open`], and where there are more than `most` of them.
+/// As [`open`], and if there are more than `most` bytes.
 pub fn read(path: &Path, most: u64) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(most + 1).read_to_end(&mut bytes)?;
@@ -47,7 +48,7 @@ pub fn read(path: &Path, most: u64) -> std::io::Result<Vec<u8>> {
 /// All of a file as text.
 ///
 /// # Errors
-/// As [`read`], and where it is not UTF-8.
+/// As [`read`], and if it is not UTF-8.
 pub fn read_to_string(path: &Path, most: u64) -> std::io::Result<String> {
     String::from_utf8(read(path, most)?).map_err(|error| {
         let message = format!("byte {} is not UTF-8", error.utf8_error().valid_up_to() + 1);

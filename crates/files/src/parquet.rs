@@ -1,4 +1,4 @@
-//! Parquet tables, by way of the crate that guards their reading.
+//! Parquet tables of numbers.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use crate::frames::{self as tables, Metadata};
 use crate::atomic;
 use crate::error::FileError;
 
-/// Reads columns of numbers, at most `most_rows` of each: those of `wanted`, or all there are.
+/// Reads columns of numbers, at most `most_rows` rows: the columns `wanted`, or all.
 pub(super) fn read(
     path: &Path,
     wanted: Option<&[&str]>,
@@ -28,6 +28,29 @@ pub(super) fn read(
     }
     table = table.drop_many(texts);
     Ok(table)
+}
+
+/// Reads columns of numbers or text by row groups.
+pub(super) fn read_groups(
+    path: &Path,
+    wanted: &[&str],
+    most_rows: usize,
+    mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
+) -> Result<(), FileError> {
+    enum Failure {
+        Read(tables::TableError),
+        Taken(FileError),
+    }
+    impl From<tables::TableError> for Failure {
+        fn from(error: tables::TableError) -> Self {
+            Failure::Read(error)
+        }
+    }
+    let take = |group| take(group).map_err(Failure::Taken);
+    tables::read_parquet_groups(path, wanted, most_rows, take).map_err(|failure| match failure {
+        Failure::Read(error) => bare(path, &error),
+        Failure::Taken(error) => error,
+    })
 }
 
 /// The names of the columns.

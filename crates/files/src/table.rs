@@ -10,20 +10,23 @@
 //! `FILE[TABLE]` is a table of a FITS file, by name or number.
 
 use std::borrow::Cow;
+use std::collections::HashSet;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::frames::polars::DataFrame;
-use crate::frames::{Metadata, reals};
+use crate::frames::{Metadata, frame, reals};
 
 use crate::error::FileError;
 use crate::open::{is_there, open};
+
+pub use crate::limits::MAX_ROWS;
 use crate::{fits, parquet, text};
 
 /// A column of numbers of the table of `path`; missing ones are NaN.
 ///
 /// # Errors
-/// Where it is not there.
+/// If it is absent.
 pub fn numbers<'t>(
     table: &'t DataFrame,
     name: &str,
@@ -59,7 +62,7 @@ impl FileFormat {
     }
 }
 
-/// What a file is by its ending.
+/// Format of a file by its ending.
 enum Ending {
     Parquet,
     Fits,
@@ -79,8 +82,8 @@ impl Ending {
         }
     }
 
-    /// What a file is by its first bytes: SExtractor writes FITS into `.cat` and `.ldac`. One that cannot be opened is
-    /// reported when it is read.
+    /// Format of a file by its first bytes: SExtractor writes FITS into `.cat` and `.ldac`. A file that cannot be opened
+    /// is reported when it is read.
     fn of_content(path: &Path) -> Self {
         let mut start = [0; 9];
         let read = open(path).and_then(|mut file| file.read_exact(&mut start));
@@ -91,9 +94,7 @@ impl Ending {
     }
 }
 
-/// Most rows of a table that may fill the largest grid, of 4000 × 4000 cells.
-pub const MAX_ROWS: usize = 4000 * 4000;
-/// Rows that a catalogue may have beyond those of its grid.
+/// Rows that a catalogue may have in addition to the cells of its grid.
 const SPARE_ROWS: usize = 1 << 18;
 
 /// Most rows that a catalogue of galaxies on a grid of `cells` may have: more than are scored, so that it can be
@@ -131,7 +132,24 @@ impl Place {
         }
     }
 
-    /// Refuses a table of a file that has but one.
+    /// The place that `FILE[TABLE]` names, or `table` of this file if it is given.
+    ///
+    /// # Errors
+    /// If both name a table.
+    pub fn with_table(path: &Path, table: Option<&str>) -> Result<Self, FileError> {
+        let mut place = Place::of(path);
+        if let Some(name) = table
+            && let Some(other) = place.table.replace(name.to_owned())
+        {
+            let message = format!(
+                "two tables are named (found `{other}` in brackets and `{name}`, expected one)"
+            );
+            return Err(FileError::new(path, message));
+        }
+        Ok(place)
+    }
+
+    /// Refuses a table of a file that has only one.
     fn check(&self) -> Result<(), FileError> {
         match (&self.table, Ending::of(&self.path)) {
             (Some(table), Ending::Text | Ending::Parquet) => {
@@ -145,9 +163,9 @@ impl Place {
     }
 }
 
-/// What a table contains of its columns, before any is chosen.
+/// Names and fields of a table, before columns are chosen.
 pub struct Columns {
-    /// Lists of names, of which one has to be chosen: a header, comments that may be one, or tables of a FITS file.
+    /// Lists of names, one to be chosen: a header, comments that may be one, or the tables of a FITS file.
     pub named: Vec<Named>,
     /// Fields of the first row of a text table that has no header.
     pub unnamed: Vec<String>,
@@ -212,7 +230,7 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
 /// table of text or in Parquet has at most `most_rows`. Columns of a text table without names have numbers, from 1.
 ///
 /// # Errors
-/// Where the file cannot be read, or lacks a column.
+/// If the file cannot be read, or lacks a column.
 pub fn read(
     path: &Path,
     wanted: Option<&[&str]>,
@@ -252,34 +270,87 @@ pub fn read_from(
     }
 }
 
+/// Columns of a truth file.
+pub const TRUTH_COLUMNS: [&str; 4] = ["x", "y", "g1", "g2"];
+
+/// Rows of a FITS table that are read at a time.
+const PART: usize = 1 << 17;
+
+/// Reads the columns `wanted` in parts, and gives each part to `take`: row groups of a Parquet file, a fixed number of
+/// rows of a FITS table, and all of a text table. So a table may have any number of rows. In Parquet, columns of text
+/// are read too.
+///
+/// # Errors
+/// As [`read`], and those of `take`.
+pub fn read_parts(
+    place: &Place,
+    wanted: &[&str],
+    mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
+) -> Result<(), FileError> {
+    place.check()?;
+    let path = &place.path;
+    match Ending::of(path) {
+        Ending::Parquet => parquet::read_groups(path, wanted, MAX_ROWS, take),
+        Ending::Fits => fits::read_table_parts(path, wanted, place.table.as_deref(), PART, take),
+        Ending::Text => take(read_from(place, Some(wanted), MAX_ROWS)?),
+    }
+}
+
 /// Reads a truth file's x, y, g1, g2, of at most `most_rows`.
 ///
 /// # Errors
-/// Where the file cannot be read, or lacks a column.
+/// If the file cannot be read, lacks a column, or cannot have one row per cell of a square grid.
 pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
-    let names = ["x", "y", "g1", "g2"];
     match Ending::of(path) {
-        Ending::Text => read_text(path, &names),
-        Ending::Parquet | Ending::Fits => read(path, Some(&names), most_rows),
+        Ending::Text => read_text(path, &TRUTH_COLUMNS),
+        Ending::Fits => read(path, Some(&TRUTH_COLUMNS), most_rows),
+        Ending::Parquet => parquet_truth(path, most_rows),
     }
 }
 
-/// Reads the columns `names`: of a text table, which has these and no others where it has no header, or of another
-/// format.
-///
-/// # Errors
-/// Where the file cannot be read, or lacks a column.
-pub fn read_columns(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
-    match Ending::of(&Place::of(path).path) {
-        Ending::Text => read_text(path, names),
-        Ending::Parquet | Ending::Fits => read(path, Some(names), MAX_ROWS),
+/// A truth file in Parquet. A small file may repeat one row millions of times, so that the positions are checked before
+/// the shears are decoded.
+fn parquet_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
+    let [x, y, shears @ ..] = TRUTH_COLUMNS;
+    let mut columns = Vec::with_capacity(TRUTH_COLUMNS.len());
+    for position in [x, y] {
+        let table = parquet::read(path, Some(&[position]), most_rows)?;
+        check_positions(path, position, &numbers(&table, position, path)?)?;
+        columns.extend_from_slice(table.columns());
     }
+    let table = parquet::read(path, Some(&shears), most_rows)?;
+    columns.extend_from_slice(table.columns());
+    frame(columns).map_err(|error| FileError::new(path, error))
 }
 
-/// Reads an ASCII or CSV table whose columns, where it has no header, are `names`.
+/// Checks that positions along one axis can belong to a square grid: n × n rows have n different values or more.
+fn check_positions(path: &Path, name: &str, values: &[f64]) -> Result<(), FileError> {
+    let side = values.len().isqrt();
+    let mut different = HashSet::new();
+    let mut last = None;
+    for value in values.iter().map(|value| value.to_bits()) {
+        if different.len() >= side {
+            return Ok(());
+        }
+        if last.replace(value) != Some(value) {
+            different.insert(value);
+        }
+    }
+    if different.len() >= side {
+        return Ok(());
+    }
+    let message = format!(
+        "column `{name}` has {} different values in {} rows; expected {side} or more, for one row per cell of a square grid",
+        different.len(),
+        values.len()
+    );
+    Err(FileError::new(path, message))
+}
+
+/// Reads an ASCII or CSV table. `names` are the columns of a table without a header.
 ///
 /// # Errors
-/// Where the file cannot be read.
+/// If the file cannot be read.
 pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
     let request = text::Request {
         wanted: Some(names),
@@ -311,8 +382,8 @@ pub fn stated(path: &Path, key: &str) -> Result<Option<String>, FileError> {
     Ok(found.remove(key).map(|value| value.trim().to_owned()))
 }
 
-/// What is left of `metadata` in a table written as `format`: all in Parquet; in FITS what fits into a
-/// header, which is keys of at most eight characters with values of at most 68.
+/// The part of `metadata` that a table in this `format` can contain: everything in Parquet; in FITS keys of at most eight
+/// characters with values of at most 68.
 pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
     let fits = |key: &str, value: &str| key.len() <= 8 && value.len() <= 68;
     metadata
@@ -325,7 +396,7 @@ pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
 /// The values of `keys` that a table written by [`write`] carries, those that it has.
 ///
 /// # Errors
-/// Where the file cannot be read.
+/// If the file cannot be read.
 pub fn read_metadata<'a>(
     path: &Path,
     format: FileFormat,
@@ -340,11 +411,10 @@ pub fn read_metadata<'a>(
     }
 }
 
-/// Writes `table` as `format`, with the key–value pairs that say what made it, as far as
-/// they are [`kept`].
+/// Writes `table` in this `format`, with the part of `metadata` that is [`kept`].
 ///
 /// # Errors
-/// Where the file cannot be written.
+/// If the file cannot be written.
 pub fn write(
     path: &Path,
     format: FileFormat,
@@ -361,6 +431,43 @@ pub fn write(
             let header: Vec<(&str, fits::Value)> =
                 keys.iter().map(|(k, v)| (k.as_str(), v.clone())).collect();
             fits::write_table(path, table, &header)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::frames::frame;
+    use crate::frames::polars::Column;
+
+    use super::*;
+
+    #[test]
+    fn parts_join_to_the_whole_table() {
+        let folder = tempfile::tempdir().unwrap();
+        // More rows than a part, and not a multiple.
+        let values: Vec<f64> = (0..PART + 7).map(|k| k as f64).collect();
+        let table = frame(vec![
+            Column::new("a".into(), values.clone()),
+            Column::new("b".into(), values.iter().map(|v| -v).collect::<Vec<_>>()),
+        ])
+        .unwrap();
+        for format in [FileFormat::Fits, FileFormat::Parquet] {
+            let path = folder.path().join(format!("t.{}", format.extension()));
+            write(&path, format, &table, &Metadata::new()).unwrap();
+            let mut found = Vec::new();
+            read_parts(&Place::of(&path), &["b"], |part| {
+                found.extend(numbers(&part, "b", &path)?.iter().map(|v| -v));
+                Ok(())
+            })
+            .unwrap();
+            assert_eq!(found, values);
+            let stopped = read_parts(&Place::of(&path), &["b"], |_| {
+                Err(FileError::new(&path, "enough"))
+            });
+            assert!(stopped.unwrap_err().to_string().ends_with("enough"));
+            let missing = read_parts(&Place::of(&path), &["c"], |_| Ok(())).unwrap_err();
+            assert!(missing.no_column, "{missing}");
         }
     }
 }

@@ -25,10 +25,10 @@ const FREE_ROWS: usize = 1 << 20;
 const BUFFER: usize = 1 << 15;
 /// Most characters of a damaged field that a message shows.
 const SHOWN: usize = 40;
-/// What gzip-compressed files start with.
+/// First bytes of gzip-compressed files.
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 
-/// What a cell of CSV starts with so that a spreadsheet does not take `text` for a formula.
+/// Start of a cell of CSV that keeps a spreadsheet from interpreting `text` as a formula.
 pub fn formula_mark(text: &str) -> &'static str {
     match text.starts_with(['=', '+', '-', '@', '\t', '\r']) {
         true => "'",
@@ -36,7 +36,7 @@ pub fn formula_mark(text: &str) -> &'static str {
     }
 }
 
-/// What is wanted of a table.
+/// The requested part of a table.
 pub(super) struct Request<'a> {
     /// Columns to read; all, with NaN for what is not a number, if `None`.
     pub(super) wanted: Option<&'a [&'a str]>,
@@ -48,25 +48,29 @@ pub(super) struct Request<'a> {
 
 /// Reads columns.
 ///
-/// The first line that is neither empty nor a `#` comment names the columns if its first field that is
-/// not empty is not a number; otherwise the numbered comments of SExtractor do; otherwise a comment that
-/// holds all the names wanted does; otherwise the columns have numbers, from 1, if those are wanted;
-/// otherwise they are the default ones, and further ones are left alone. Fields are separated by the first of
-/// `;`, `,` and tabs that the first row has, as often as the header does, and by blanks if it has none.
-/// An empty field is NaN. A file without a row is a table without rows.
+/// The names of the columns are the first of these that the file has:
+///
+/// 1. the first line that is neither empty nor a `#` comment, if its first field that is not empty is not a number;
+/// 2. the numbered comments of SExtractor;
+/// 3. numbers from 1, if numbers are wanted;
+/// 4. a comment that contains all wanted names;
+/// 5. the default names. A table with more columns than these is refused, because their meaning is not known.
+///
+/// The separator is the first of `;`, `,` and tab that the first row contains as often as the header. Without one it is
+/// blanks. An empty field is NaN. A file without a row is a table without rows.
 pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, FileError> {
     let mut input = Input::open(path)?;
     let size = std::fs::metadata(path).map_or(0, |about| about.len()) as usize;
     let head = Head::read(&mut input, path)?;
     let separator = Separator::of(head.header.as_deref(), head.first.as_deref());
-    let (names, named) = head.names(separator, request);
-    let mut rows = Rows::new(path, request, &names, named)?;
+    let names = head.names(path, separator, request)?;
+    let mut rows = Rows::new(path, request, &names)?;
     rows.most = rows.most.min(FREE_ROWS.max(size));
     input.read_rows(head, separator, &mut rows)?;
     rows.table()
 }
 
-/// What a text table contains of its columns, before any is chosen.
+/// Names and fields of a text table, before columns are chosen.
 pub(super) struct Columns {
     /// Names, if a header or the comments of SExtractor give them.
     pub(super) names: Option<Vec<String>>,
@@ -159,7 +163,7 @@ impl Input {
         })
     }
 
-    /// Reads all rows: the first one, which `head` has, and what follows.
+    /// Reads all rows. The first one is in `head`.
     fn read_rows(
         self,
         head: Head,
@@ -190,8 +194,8 @@ fn read_delimited(
     before: u64,
     rows: &mut Rows<'_>,
 ) -> Result<(), FileError> {
-    // The reader stands behind the line feed of a row, but before it where a carriage return ends the row.
-    // So that this holds for the last row, too, a line end is added.
+    // After a row the reader is behind its line feed, but before it if a carriage return ends the row. A line end is
+    // added so that the last row does not differ.
     let (end, after): (&[u8], u64) = if crlf { (b"\r\n", 0) } else { (b"\n", 1) };
     let mut reader = delimited(delimiter).from_reader(text.chain(end));
     let mut record = StringRecord::new();
@@ -265,7 +269,7 @@ fn read_blanks(
     }
 }
 
-/// Formats that are no text tables although they are text: what their first line starts with, and how to convert them.
+/// Text formats that are no text tables: the start of their first line, and their name.
 const OTHER_FORMATS: [(&str, &str); 2] = [
     ("<?xml", "XML, such as a VOTable"),
     ("<VOTABLE", "a VOTable"),
@@ -321,7 +325,7 @@ fn delimited(delimiter: u8) -> ReaderBuilder {
     builder
 }
 
-/// What stands between the fields of a row.
+/// Separator of the fields of a row.
 #[derive(Clone, Copy)]
 enum Separator {
     /// One byte.
@@ -331,7 +335,8 @@ enum Separator {
 }
 
 impl Separator {
-    /// That of a table with these lines: one that splits both alike, or else any that splits the row.
+    /// The separator of a table with these lines: one that divides both into as many fields, or else any that divides the
+    /// row.
     fn of(header: Option<&str>, row: Option<&str>) -> Self {
         let Some(row) = row.or(header) else {
             return Separator::Blanks;
@@ -446,7 +451,7 @@ impl Head {
             };
             let letters = |c: char| c.is_ascii_alphanumeric() || c == '_';
             let identifier = name.starts_with(|c: char| c.is_ascii_alphabetic());
-            // Numbers go up from 1, to that of a column that there is.
+            // Numbers increase from 1 to at most the number of columns.
             let next = number > names.len() && (number == 1) == names.is_empty();
             if !next || number > fields.len().max(1) || !identifier || !name.chars().all(letters) {
                 return None;
@@ -463,8 +468,16 @@ impl Head {
         Some(names)
     }
 
-    /// Names of the columns, and whether the file gives them.
-    fn names(&self, separator: Separator, request: &Request<'_>) -> (Vec<String>, bool) {
+    /// Names of the columns: those that the file gives, numbers, or the default ones.
+    ///
+    /// # Errors
+    /// If the file gives no names and has more columns than there are default names.
+    fn names(
+        &self,
+        path: &Path,
+        separator: Separator,
+        request: &Request<'_>,
+    ) -> Result<Vec<String>, FileError> {
         let fields = self.fields(separator);
         let fits = |names: &Vec<String>| match request.wanted {
             Some(wanted) => wanted.iter().all(|w| names.iter().any(|n| n == w)),
@@ -474,10 +487,10 @@ impl Head {
             // Names need not be separated like numbers.
             let (names, others) = (separator.split(header), split_names(header));
             let other = !fits(&names) && fits(&others);
-            return (if other { others } else { names }, true);
+            return Ok(if other { others } else { names });
         }
         if let Some(names) = self.sextractor_names(&fields) {
-            return (names, true);
+            return Ok(names);
         }
         let numbers: Vec<String> = (1..=fields.len()).map(|k| k.to_string()).collect();
         let number = |name: &&str| name.parse::<usize>().is_ok();
@@ -485,14 +498,17 @@ impl Head {
             .wanted
             .is_some_and(|wanted| wanted.iter().all(number))
         {
-            return (numbers, false);
+            return Ok(numbers);
         }
         // The last comment that can be a header is one.
         let comments = self.comments.iter().rev();
-        match comments.map(|line| split_names(line)).find(fits) {
-            Some(names) => (names, true),
-            None => (owned(request.default_names), false),
+        if let Some(names) = comments.map(|line| split_names(line)).find(fits) {
+            return Ok(names);
         }
+        if fields.len() > request.default_names.len() {
+            return Err(FileError::no_names(path, &fields, request.default_names));
+        }
+        Ok(owned(request.default_names))
     }
 }
 
@@ -520,9 +536,7 @@ fn owned(names: &[&str]) -> Vec<String> {
 struct Rows<'a> {
     path: &'a Path,
     names: &'a [String],
-    /// Whether the file names its columns, so that every row has a field for each.
-    named: bool,
-    /// Whether what is not a number is an error.
+    /// Whether a field that is no number is an error.
     strict: bool,
     most: usize,
     /// Of the columns read, by place in the row.
@@ -533,12 +547,7 @@ struct Rows<'a> {
 }
 
 impl<'a> Rows<'a> {
-    fn new(
-        path: &'a Path,
-        request: &Request<'_>,
-        names: &'a [String],
-        named: bool,
-    ) -> Result<Self, FileError> {
+    fn new(path: &'a Path, request: &Request<'_>, names: &'a [String]) -> Result<Self, FileError> {
         let place = |name: &&str| {
             let place = names.iter().position(|own| own == name);
             place.ok_or_else(|| FileError::no_column(path, name, names))
@@ -557,7 +566,6 @@ impl<'a> Rows<'a> {
         Ok(Rows {
             path,
             names,
-            named,
             strict: request.wanted.is_some(),
             most: request.most_rows,
             slots: (0..names.len()).map(slot).collect(),
@@ -590,9 +598,8 @@ impl<'a> Rows<'a> {
             };
             self.columns[slot].push(value);
         }
-        // Without a header, the columns after the known ones are nobody's.
         let expected = self.names.len();
-        if count == expected || !self.named && count > expected {
+        if count == expected {
             return Ok(());
         }
         let names = names_of(self.names);
@@ -684,12 +691,32 @@ mod tests {
             columns("\u{feff}x,y,e1,e2\n1,2,3,4\n5,6,-7e-3,8\n"),
             expected
         );
-        assert_eq!(columns("1 2 3 4 0\n5 6 -7e-3 8 0\n"), expected);
         for blank in ["", "# no galaxies\n", "x,y,e1,e2\n"] {
             assert_eq!(columns(blank), (vec![], vec![]), "{blank:?}");
         }
         assert_eq!(table("x,y,e1,e2\n", None).unwrap().height(), 0);
         assert!(table("x,y,e1,e2\n1,2,NaN,nan\n", None).is_ok());
+    }
+
+    #[test]
+    fn columns_without_names_are_as_many_as_expected_or_numbered() {
+        let names: Option<&[&str]> = Some(&["x", "y", "e1", "e2"]);
+        for text in ["7 1 2 3 4\n8 5 6 7 8\n", "# by me\n7,1,2,3,4\n8,5,6,7,8\n"] {
+            let error = table(text, names).unwrap_err();
+            assert!(
+                error.contains(
+                    "5 columns have no names (found the first row `7, 1, 2, 3, 4`, expected 4: x, y, e1, e2). Try: add a first line with the names"
+                ),
+                "{error}"
+            );
+            assert!(table(text, None).is_err());
+            let numbered = table(text, Some(&["2", "5"])).unwrap();
+            assert_eq!(column(&numbered, "2"), [1.0, 5.0]);
+            assert_eq!(column(&numbered, "5"), [4.0, 8.0]);
+        }
+        // Later rows have as many columns as the first.
+        let error = table("1 2 3 4\n5 6 7 8 9\n", names).unwrap_err();
+        assert!(error.contains("line 2: 5 fields; expected 4"), "{error}");
     }
 
     #[test]

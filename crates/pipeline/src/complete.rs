@@ -11,7 +11,7 @@ use super::engine::{self, Progress};
 use super::images::ImageId;
 use super::inputs::Inputs;
 use super::simulate::SimulationRecord;
-use crate::data::layout::{DataFolder, read_truth_rows};
+use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;
 use crate::data::psf_table;
 use crate::data::run::{Run, Source};
@@ -169,7 +169,7 @@ impl Results<'_> {
             let truth = data.truth(id.set);
             check_rows(
                 &truth,
-                read_truth_rows(&truth, cells.saturating_add(1))?.len(),
+                table::read_truth(&truth, cells.saturating_add(1))?.height(),
                 cells,
             )?;
         }

@@ -6,8 +6,8 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, TrueShear, TruthSign, sign_by_modes};
 
 use super::grid;
-use crate::data::layout::{DataFolder, SIGN_KEY, read_truth_rows, stated_sign, truth_is_there};
-use shearq_files::table::MAX_ROWS;
+use crate::data::layout::{DataFolder, SIGN_KEY, stated_sign, truth_is_there, truth_rows};
+use shearq_files::table::{self, MAX_ROWS};
 use shearq_files::{FileError, atomic};
 
 /// How a truth file is to be read.
@@ -51,11 +51,13 @@ pub struct ReadTruth {
 /// If the file cannot be read, does not fill a square grid, or states another sign of g2 than `reading`.
 pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileError> {
     truth_is_there(truth)?;
-    let rows = read_truth_rows(truth, MAX_ROWS)?;
+    let table = table::read_truth(truth, MAX_ROWS)?;
+    let rows = truth_rows(truth, &table)?;
     let side = grid::side(truth, rows.len())?;
     let bad = |error: shearq_scoring::ScoringError| FileError::new(truth, error);
     let grid = Grid::new(side, reading.stamp, reading.field).map_err(bad)?;
     let standard = TrueShear::from_rows(&grid, TruthSign::Standard, rows).map_err(bad)?;
+    drop(table);
     let (sign, basis) = match (stated_sign(truth)?, reading.sign) {
         (Some(stated), Some(specified)) if stated != specified => {
             let word = |sign| match sign {

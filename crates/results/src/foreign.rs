@@ -2,14 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use shearq_quantities::{Distortion, Shear};
 use shearq_scoring::{FieldSum, Grid, Row, RowCounts};
 use shearq_submissions::{EllipticityType, checked_name};
 
 use crate::views::rows::fault as odd_rows;
 use shearq_files::FileError;
-use shearq_files::table::{self, most_rows};
+use shearq_files::table::{self, Place, most_rows};
 use shearq_pipeline::data::layout::read_rows;
 use shearq_pipeline::data::listing::{self, Files};
 use shearq_pipeline::data::pattern::{IMAGE_PLACEHOLDERS, check_pattern};
@@ -21,6 +21,7 @@ use shearq_pipeline::data::pattern::{IMAGE_PLACEHOLDERS, check_pattern};
 /// catalogues = "set{set:02}/hsm-regauss-{image:03}.csv"   # relative to this file, or absolute
 /// ellipticity = "distortion"      # type of the columns: "distortion" or "shear"
 /// report = "shear"                # type to score [default: shear]
+/// table = "OBJECTS"               # FITS table, by name or number [default: the one with these columns]
 /// x = "x"                         # names of the columns [defaults: x, y, e1, e2, no flag]
 /// y = "y"
 /// e1 = "e1"
@@ -41,6 +42,12 @@ pub struct Foreign {
     ellipticity: EllipticityType,
     #[serde(default = "shear")]
     report: EllipticityType,
+    #[serde(
+        default,
+        deserialize_with = "name_or_number",
+        skip_serializing_if = "Option::is_none"
+    )]
+    table: Option<String>,
     #[serde(default = "x")]
     x: String,
     #[serde(default = "y")]
@@ -58,6 +65,21 @@ pub struct Foreign {
     e2_sign: i8,
     #[serde(skip)]
     folder: PathBuf,
+}
+
+/// The name or the number of a table.
+fn name_or_number<'de, D: Deserializer<'de>>(value: D) -> Result<Option<String>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "expected the name or the number of a table")]
+    enum Table {
+        Number(u32),
+        Name(String),
+    }
+    let table = Option::<Table>::deserialize(value)?;
+    Ok(table.map(|table| match table {
+        Table::Number(number) => number.to_string(),
+        Table::Name(name) => name,
+    }))
 }
 
 fn shear() -> EllipticityType {
@@ -146,7 +168,8 @@ impl Foreign {
             self.e2.as_str(),
         ];
         names.extend(self.flag.as_deref());
-        let table = table::read(path, Some(&names), most).map_err(|error| {
+        let place = Place::with_table(path, self.table.as_deref())?;
+        let table = table::read_from(&place, Some(&names), most).map_err(|error| {
             error.hint_of_columns("the description of the catalogues specifies the names")
         })?;
         let column = |name: &str| table::numbers(&table, name, path);

@@ -1,6 +1,7 @@
 //! From catalogues to scores, comparisons and submissions to challenges.
 //!
 //! * [`score`] scores catalogues against a true shear field; [`foreign`] reads other programs' catalogues.
+//! * [`bias`] estimates m and c of catalogues of any program.
 //! * [`mean`] averages catalogues to one shear per set.
 //! * [`row`] is the record of a scored set, and [`store`] keeps records in Parquet files.
 //! * [`conditions`] and [`groups`] choose and group records; [`compare`] compares configurations.
@@ -10,6 +11,7 @@
 #![forbid(unsafe_code)]
 
 pub mod baseline;
+pub mod bias;
 pub mod compare;
 pub mod conditions;
 pub mod foreign;

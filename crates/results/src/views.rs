@@ -1,6 +1,7 @@
 //! Scores as tables, plots and pages.
 
 pub mod baseline;
+pub mod bias;
 pub mod comparison;
 pub mod diagnosis;
 pub mod mean;

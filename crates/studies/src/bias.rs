@@ -14,6 +14,7 @@
 //! As in the simulated sets, lensing does not change the flux of a galaxy.
 
 use serde::{Deserialize, Serialize};
+use shearq_bias::{BiasError, Errors, Estimate, Layout, Row, UnitSums, estimate};
 use shearq_measure::{Measurement, Measurer, Worker};
 use shearq_quantities::Shear;
 use shearq_submissions::Calibration;
@@ -68,9 +69,6 @@ const VERSIONS: [(f64, [f64; 2], f32); 8] = [
     (-1.0, [1.0, -1.0], -1.0),
     (-1.0, [-1.0, 1.0], -1.0),
 ];
-/// Their number.
-const COUNT: f64 = VERSIONS.len() as f64;
-
 /// Biases of each measurer on the galaxies of `images` of a set.
 ///
 /// # Errors
@@ -83,7 +81,15 @@ pub fn biases(
     progress: &mut dyn Progress,
 ) -> Result<Vec<ShearBias>, PipelineError> {
     let n = set.grid().n;
-    let mut sums = vec![BiasSums::default(); measurers.len()];
+    let empty = || -> Vec<BiasSums> {
+        let calibrations = measurers
+            .iter()
+            .map(|own| own.configuration().calibration());
+        calibrations
+            .map(|calibration| BiasSums::new(calibration, images.len()))
+            .collect()
+    };
+    let mut sums = empty();
     engine::ordered(
         threads,
         |feeder| {
@@ -101,30 +107,26 @@ pub fn biases(
                 let strip = draw(set, fields, *iy, version, render);
                 versions.push(measure_strip(set, &job, strip, workers)?);
             }
-            let found = (0..measurers.len()).map(|k| {
-                let mut sums = BiasSums::default();
+            let mut found = empty();
+            for (k, sums) in found.iter_mut().enumerate() {
                 for ix in 0..n {
                     let psf = fields.psf.at(ix, *iy).shape;
                     let galaxy = std::array::from_fn(|v| &versions[v][k].galaxies[ix]);
-                    sums.add(galaxy, psf);
+                    sums.add((fields.image, (*iy * n + ix) as u64), galaxy, psf);
                 }
-                sums
-            });
-            Ok(found.collect())
+            }
+            Ok(found)
         },
         |row: Vec<BiasSums>| {
             progress.advance(n as u64);
             for (sums, more) in sums.iter_mut().zip(row) {
-                sums.merge(&more);
+                sums.merge(more)
+                    .map_err(|error| PipelineError::Request(error.to_string()))?;
             }
             Ok(())
         },
     )?;
-    Ok(sums
-        .iter()
-        .zip(measurers)
-        .map(|(sums, measurer)| sums.bias(measurer.configuration().calibration()))
-        .collect())
+    Ok(sums.into_iter().map(BiasSums::bias).collect())
 }
 
 /// A strip of stamps of one version of a row's galaxies.
@@ -152,129 +154,96 @@ fn draw(
     strip
 }
 
-/// Mean and its error from sums.
-#[derive(Debug, Clone, Copy, Default)]
-struct Mean {
-    sum: f64,
-    square: f64,
-}
-
-impl Mean {
-    fn add(&mut self, value: f64) {
-        self.sum += value;
-        self.square += value * value;
-    }
-
-    fn merge(&mut self, other: &Self) {
-        self.sum += other.sum;
-        self.square += other.square;
-    }
-
-    fn value(&self, count: f64) -> f64 {
-        self.sum / count
-    }
-
-    fn error(&self, count: f64) -> f64 {
-        let mean = self.value(count);
-        ((self.square / count - mean * mean).max(0.0) / (count - 1.0)).sqrt()
-    }
-}
-
 /// Sums over galaxies.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 struct BiasSums {
     galaxies: u64,
     dropped: u64,
-    /// Derivative of the ellipticity with shear: half the difference between +γ and −γ, divided by γ.
-    shear_response: [Mean; 2],
-    /// The same minus the mean response over versions.
-    surplus: [Mean; 2],
-    /// Mean of all versions.
-    offset: [Mean; 2],
-    /// Offset times the PSF's ellipticity, over components.
-    along: Mean,
-    /// Square of the PSF's ellipticity.
-    psf: Mean,
-    /// Mean response over versions, per component.
-    response: [Mean; 2],
+    /// Of all versions of each galaxy, which is a unit.
+    units: UnitSums,
+    /// The mean ellipticity of all versions along the PSF, per ellipticity of the PSF.
+    leakage: UnitSums,
+    /// Whether ellipticities are divided by the mean response.
+    calibrated: bool,
 }
 
 impl BiasSums {
-    fn add(&mut self, versions: [&Measurement; VERSIONS.len()], psf: Shear) {
+    fn new(calibration: Calibration, images: usize) -> Self {
+        let sums = UnitSums::new(Layout::default(), 1, images);
+        BiasSums {
+            galaxies: 0,
+            dropped: 0,
+            leakage: sums.clone(),
+            units: sums,
+            calibrated: calibration == Calibration::Response,
+        }
+    }
+
+    /// Adds galaxy `key` of an image.
+    fn add(
+        &mut self,
+        (image, key): (u32, u64),
+        versions: [&Measurement; VERSIONS.len()],
+        psf: Shear,
+    ) {
         if versions.iter().any(|version| !version.flags.is_empty()) {
             self.dropped += 1;
             return;
         }
         self.galaxies += 1;
-        let mut along = 0.0;
-        for (k, psf) in [psf.e1, psf.e2].into_iter().enumerate() {
-            let e = versions.map(|version| [version.e1, version.e2][k]);
-            let with_shear = VERSIONS
-                .iter()
-                .zip(e)
-                .map(|((_, signs, _), e)| signs[k] * e);
-            let shear_response = with_shear.sum::<f64>() / (COUNT * SHEAR);
-            let responses = versions
-                .iter()
-                .map(|version| version.response_diagonal()[k]);
-            let response = responses.sum::<f64>() / COUNT;
-            self.shear_response[k].add(shear_response);
-            self.surplus[k].add(shear_response - response);
-            self.response[k].add(response);
-            let offset = e.iter().sum::<f64>() / COUNT;
-            self.offset[k].add(offset);
-            along += offset * psf;
+        for ((_, signs, _), version) in VERSIONS.iter().zip(versions) {
+            let slope = match self.calibrated {
+                true => version.response_diagonal(),
+                false => [1.0; 2],
+            };
+            let row = Row {
+                e: [version.e1, version.e2],
+                weight: 1.0,
+                slope,
+                g: signs.map(|sign| sign * SHEAR),
+                ..Row::default()
+            };
+            self.units.add(image, key, 0, &row);
+            // Regression through zero: Σ e·p over Σ R p².
+            let p = [psf.e1, psf.e2];
+            let along = Row {
+                e: [0, 1].map(|k| (p[0] * row.e[0] + p[1] * row.e[1]) * f64::from(1 - k)),
+                slope: [
+                    (slope[0] + slope[1]) / 2.0 * (p[0] * p[0] + p[1] * p[1]),
+                    1.0,
+                ],
+                ..row
+            };
+            self.leakage.add(image, key, 0, &along);
         }
-        self.along.add(along);
-        self.psf.add(psf.e1 * psf.e1 + psf.e2 * psf.e2);
     }
 
-    fn merge(&mut self, other: &Self) {
+    fn merge(&mut self, other: Self) -> Result<(), BiasError> {
         self.galaxies += other.galaxies;
         self.dropped += other.dropped;
-        for (mine, other) in [
-            (&mut self.shear_response, &other.shear_response),
-            (&mut self.surplus, &other.surplus),
-            (&mut self.offset, &other.offset),
-            (&mut self.response, &other.response),
-        ] {
-            mine[0].merge(&other[0]);
-            mine[1].merge(&other[1]);
-        }
-        self.along.merge(&other.along);
-        self.psf.merge(&other.psf);
+        self.units.merge(other.units)?;
+        self.leakage.merge(other.leakage)
     }
 
-    fn bias(&self, calibration: Calibration) -> ShearBias {
-        let count = self.galaxies as f64;
-        let response = match calibration {
-            Calibration::None => [1.0; 2],
-            Calibration::Response => self.response.map(|mean| mean.value(count)),
+    /// The biases; NaN without an estimate.
+    fn bias(self) -> ShearBias {
+        let found = estimate(&self.units, 0, true, Errors::Jackknife).ok();
+        let leakage = estimate(&self.leakage, 0, false, Errors::Jackknife).ok();
+        let of = |found: &Option<Estimate>, key: &str| {
+            let value = found.as_ref().and_then(|found| found.value(key));
+            value.map_or([f64::NAN; 2], |found| [found.value, found.error])
         };
-        let of = |means: &[Mean; 2]| {
-            (
-                [0, 1].map(|k| means[k].value(count) / response[k]),
-                [0, 1].map(|k| means[k].error(count) / response[k]),
-            )
-        };
-        let surplus = match calibration {
-            Calibration::None => &self.shear_response,
-            Calibration::Response => &self.surplus,
-        };
-        let ((mut m, m_error), (c, c_error)) = (of(surplus), of(&self.offset));
-        if calibration == Calibration::None {
-            m = m.map(|response| response - 1.0);
-        }
-        let psf = self.psf.value(count) * (response[0] + response[1]) / 2.0;
+        let [m1, m2, c1, c2] = ["m1", "m2", "c1", "c2"].map(|key| of(&found, key));
+        let [leakage, leakage_error] = of(&leakage, "c1");
         ShearBias {
             galaxies: self.galaxies,
             dropped: self.dropped,
-            m,
-            m_error,
-            c,
-            c_error,
-            leakage: self.along.value(count) / psf,
-            leakage_error: self.along.error(count) / psf,
+            m: [m1[0], m2[0]],
+            m_error: [m1[1], m2[1]],
+            c: [c1[0], c2[0]],
+            c_error: [c1[1], c2[1]],
+            leakage,
+            leakage_error,
         }
     }
 }

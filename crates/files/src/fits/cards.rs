@@ -1,5 +1,5 @@
-//! Header cards as cfitsio reads them, before it does: some of them it divides by, and for some it
-//! takes memory, while it opens a header.
+//! Header cards, read as cfitsio reads them, but before it opens the header. While opening, cfitsio divides by some
+//! values and allocates memory for others without checking them.
 
 use std::collections::BTreeMap;
 use std::ffi::{c_char, c_int};
@@ -7,8 +7,7 @@ use std::ops::RangeInclusive;
 
 use fitsio::sys;
 
-use super::file::plain;
-use super::lock;
+use super::cfitsio::{lock, plain};
 use super::source::Source;
 use crate::error::FileError;
 
@@ -20,22 +19,26 @@ const BLOCK: usize = 2880;
 const MOST: u64 = 1 << 22;
 /// Longest value that cfitsio has room for.
 const LONGEST_VALUE: usize = 70;
-/// Longest comment that it has room for.
+/// Longest comment that cfitsio has room for.
 const LONGEST_COMMENT: usize = 72;
-/// Keys that describe a compressed image; `#` stands for a number.
-const KEYS: [&str; 10] = [
-    "ZIMAGE", "ZCMPTYPE", "ZBITPIX", "ZNAXIS", "ZNAXIS#", "ZTILE#", "ZVAL#", "ZNAME#", "ZQUANTIZ",
-    "ZDITHER0",
+/// Number of columns of a table. cfitsio allocates and fills 160 bytes per column while it opens the header.
+const COLUMNS: &str = "TFIELDS";
+/// Most columns of a table in the FITS standard 4.0, section 7.
+const MOST_COLUMNS: usize = 999;
+/// Keys that are kept: the number of columns, and the description of a compressed image; `#` stands for a number.
+const KEYS: [&str; 11] = [
+    COLUMNS, "ZIMAGE", "ZCMPTYPE", "ZBITPIX", "ZNAXIS", "ZNAXIS#", "ZTILE#", "ZVAL#", "ZNAME#",
+    "ZQUANTIZ", "ZDITHER0",
 ];
 
-/// The keys of a header that describe a compressed image, by name in capitals, with their values.
+/// The [`KEYS`] of a header, by name in capitals, with their values.
 pub struct Cards(BTreeMap<String, String>);
 
 impl Cards {
-    /// Of the header that starts at a byte of the file; `None` where the file ends there.
+    /// Reads the header that starts at byte `start` of the file; `None` if the file ends there.
     ///
     /// # Errors
-    /// Where the header has no end, a card that cfitsio has no room for, or two of these keys.
+    /// If the header has no end, a card that is too long for cfitsio, one of these keys twice, or too many columns.
     pub fn read(source: &mut Source, start: u64) -> Result<Option<Self>, FileError> {
         let mut cards = BTreeMap::new();
         let mut at = start;
@@ -53,7 +56,11 @@ impl Cards {
             }
             for (k, card) in block.chunks_exact(CARD).enumerate() {
                 if card.starts_with(b"END     ") {
-                    return Ok(Some(Cards(cards)));
+                    let cards = Cards(cards);
+                    cards
+                        .number(COLUMNS, 0..=MOST_COLUMNS)
+                        .map_err(|message| FileError::new(source.path(), message))?;
+                    return Ok(Some(cards));
                 }
                 let wrong = |what: String| {
                     let byte = at + (k * CARD) as u64;
@@ -74,17 +81,17 @@ impl Cards {
         }
     }
 
-    /// The text of a key, without quotes; `None` where it is absent.
+    /// The text of a key, without quotes; `None` if the key is absent.
     pub fn text(&self, key: &str) -> Option<&str> {
         let value = self.0.get(key)?;
         let inner = value.strip_prefix('\'').and_then(|v| v.strip_suffix('\''));
         Some(inner.unwrap_or(value).trim_end())
     }
 
-    /// The whole number of a key, which must be in a range; `None` where it is absent.
+    /// The whole number of a key, which must be in a range; `None` if the key is absent.
     ///
     /// # Errors
-    /// What else was found.
+    /// If the value is not such a number.
     pub fn number(&self, key: &str, range: RangeInclusive<usize>) -> Result<Option<usize>, String> {
         let Some(value) = self.0.get(key) else {
             return Ok(None);
@@ -103,11 +110,11 @@ fn parse(card: &[u8]) -> Result<(String, String), String> {
     for (to, from) in text.iter_mut().zip(card) {
         *to = c_char::from_ne_bytes([*from]);
     }
-    // Longer than anything that a card can hold.
+    // Longer than any text of a card.
     let [mut name, mut value, mut comment] = [[0 as c_char; 2 * CARD + 2]; 3];
     let (mut length, mut status): (c_int, c_int) = (0, 0);
     let _guard = lock();
-    // SAFETY: the card ends in a zero byte, and what is found of it has room.
+    // SAFETY: the card ends in a zero byte, and each buffer is longer than a card.
     unsafe {
         sys::ffgknm(
             text.as_mut_ptr(),

@@ -1,15 +1,15 @@
-//! An open FITS file: cfitsio's own functions, after what they would believe was checked.
+//! An open FITS file. Values that cfitsio does not check are checked before its functions are called.
 
-use std::ffi::{CStr, CString, c_char, c_int};
+use std::ffi::{CStr, CString, c_int};
 use std::path::Path;
 use std::ptr;
 
 use fitsio::sys;
 
 use super::cards::Cards;
-use super::lock;
+use super::cfitsio::{describe, lock};
 use super::source::Source;
-use super::tiles::Tiling;
+use super::tiling::Tiling;
 use crate::error::FileError;
 
 // Numbers of cfitsio's interface, from its fitsio.h.
@@ -20,7 +20,7 @@ const VALUE_UNDEFINED: c_int = 204;
 /// Bytes of a block of a file.
 const BLOCK: u64 = 2880;
 
-/// One of cfitsio's functions that read values of a column, of bytes or of words.
+/// A function of cfitsio that reads values of a column of bytes or of 16-bit integers.
 type ReadColumn<T> = unsafe extern "C" fn(
     *mut sys::fitsfile,
     c_int,
@@ -39,9 +39,9 @@ pub struct File {
     source: Source,
     /// Bytes of the file when cfitsio opened it.
     seen: u64,
-    /// Number of the header that it is at, from 1.
+    /// Number of the current header, from 1.
     place: c_int,
-    /// How the image there is compressed, if it is.
+    /// How the current image is compressed; `None` for an uncompressed one.
     tiling: Option<Tiling>,
     what: &'static str,
 }
@@ -63,7 +63,7 @@ impl File {
         Ok(file)
     }
 
-    /// Lets cfitsio open the file, again where it has grown, and goes to where it was.
+    /// Opens the file in cfitsio, again if it has grown, and goes to the current header.
     fn reopen(&mut self) -> Result<(), FileError> {
         let name = self.source.name()?;
         self.seen = self.source.size(0)?;
@@ -85,17 +85,17 @@ impl File {
         Err(FileError::new(self.source.path(), message))
     }
 
-    /// Closes the file where it is open, under a lock that the caller holds.
+    /// Closes the file if it is open. The caller has the lock.
     fn close(&mut self) {
         if !self.raw.is_null() {
             let mut status = 0;
-            // SAFETY: the file is open and, the pointer being null from here on, not used again.
+            // SAFETY: the file is open. The pointer becomes null, so that it is not used again.
             unsafe { sys::ffclos(self.raw, &mut status) };
             self.raw = ptr::null_mut();
         }
     }
 
-    /// Runs a cfitsio call; its error is worded as `doing`.
+    /// Calls cfitsio. An error message starts with `doing`.
     pub fn call(
         &self,
         doing: impl FnOnce() -> String,
@@ -103,7 +103,7 @@ impl File {
     ) -> Result<(), FileError> {
         let mut status = 0;
         let _guard = lock();
-        // SAFETY: it empties the stack of messages, of those of earlier calls.
+        // SAFETY: this removes the messages of earlier calls from the stack.
         unsafe { sys::ffcmsg() };
         call(self.raw, &mut status);
         if status == 0 {
@@ -117,10 +117,10 @@ impl File {
         FileError::new(self.source.path(), message)
     }
 
-    /// Goes to the next header, and says whether there is one.
+    /// Goes to the next header. Returns whether there is one.
     ///
     /// # Errors
-    /// Where it is damaged.
+    /// If the header is damaged.
     pub fn next(&mut self) -> Result<bool, FileError> {
         let start = self.extent()?[1];
         let Some(cards) = Cards::read(&mut self.source, start)? else {
@@ -133,7 +133,7 @@ impl File {
         } else {
             self.call(
                 || format!("cannot read header {} of the file", self.place),
-                // SAFETY: the file is open, and the type of what is there is not asked for.
+                // SAFETY: the file is open, and the type of the header is not requested.
                 |raw, status| unsafe {
                     sys::ffmahd(raw, self.place, ptr::null_mut(), status);
                 },
@@ -142,7 +142,7 @@ impl File {
         Ok(true)
     }
 
-    /// Goes to the header of an extension, from 1, that was reached before.
+    /// Goes to the header of an extension that was reached before; the first is 1.
     ///
     /// # Errors
     /// If it cannot be read.
@@ -151,14 +151,14 @@ impl File {
         self.tiling = None;
         self.call(
             || format!("cannot read header {} of the file", self.place),
-            // SAFETY: the file is open, and the type of what is there is not requested.
+            // SAFETY: the file is open, and the type of the header is not requested.
             |raw, status| unsafe {
                 sys::ffmahd(raw, self.place, ptr::null_mut(), status);
             },
         )
     }
 
-    /// Number of the extension that it is at, 0 of the primary header.
+    /// Number of the current extension; 0 for the primary header.
     pub fn number_of_extension(&self) -> usize {
         usize::try_from(self.place - 1).unwrap_or(0)
     }
@@ -168,7 +168,7 @@ impl File {
         self.source.path()
     }
 
-    /// Takes out how the image here is compressed, if it is.
+    /// Moves the tiling of the current image out; `None` for an uncompressed one.
     pub fn take_tiling(&mut self) -> Result<Option<Tiling>, FileError> {
         let mut compressed = 0;
         // SAFETY: the file is open.
@@ -249,14 +249,14 @@ impl File {
         self.need_first(wanted)
     }
 
-    /// Makes sure that the file has all data here, but for what fills up their last block.
+    /// Makes sure that the file has all data of the current header. The padding of the last block may be absent.
     pub fn need_all(&mut self) -> Result<(), FileError> {
         let [start, end] = self.extent()?;
         self.need_first((end + 1).saturating_sub(BLOCK).max(start))
     }
 
-    /// Makes sure that the file can have the first `bytes` bytes of the data here: those of a gzip file
-    /// are not looked for before they are needed.
+    /// Makes sure that the file can have the first `bytes` bytes of the data here. A gzip file is unpacked later, when
+    /// they are read.
     pub fn expect(&mut self, bytes: u64) -> Result<(), FileError> {
         let wanted = self.extent()?[0].saturating_add(bytes);
         if self.source.is_packed() {
@@ -284,18 +284,18 @@ impl File {
         self.source.disk_size()
     }
 
-    /// Makes sure, when nothing else is read, that a gzip file is whole.
+    /// Makes sure that a gzip file is complete. Call it after the last data are read.
     pub fn check_end(&mut self) -> Result<(), FileError> {
         self.source.check_end()
     }
 
-    /// A numeric header value, `None` where absent or without a value.
+    /// A numeric header value; `None` if the key is absent or has no value.
     pub fn number(&self, key: &str) -> Result<Option<f64>, FileError> {
         let doing = || format!("the header key {key} is not a number");
         let name = CString::new(key).map_err(|_| self.fault(doing()))?;
         let mut value = 0.0;
         let mut present = true;
-        // SAFETY: the file is open, the name ends in a zero byte, and a comment is not asked for.
+        // SAFETY: the file is open, the name ends in a zero byte, and a comment is not requested.
         self.call(doing, |raw, status| unsafe {
             sys::ffgkyd(raw, name.as_ptr(), &mut value, ptr::null_mut(), status);
             if [KEY_NO_EXIST, VALUE_UNDEFINED].contains(status) {
@@ -379,7 +379,7 @@ impl File {
         let (row, length, mut missing) = (row as i64, length as i64, 0);
         self.call(
             || format!("cannot read the pixels of tile {row}"),
-            // SAFETY: the file is open, and there is room for the values asked for.
+            // SAFETY: the file is open, and there is room for the requested values.
             |raw, status| unsafe {
                 let (none, to) = (T::default(), values.as_mut_ptr());
                 read(raw, column, row, 1, length, none, to, &mut missing, status);
@@ -394,30 +394,4 @@ impl Drop for File {
         let _guard = lock();
         self.close();
     }
-}
-
-/// The text of a buffer that cfitsio filled.
-pub fn plain(buffer: &[c_char]) -> String {
-    let bytes: Vec<u8> = buffer
-        .iter()
-        .take_while(|c| **c != 0)
-        .map(|c| c.to_ne_bytes()[0])
-        .collect();
-    String::from_utf8_lossy(&bytes).trim().to_owned()
-}
-
-/// cfitsio's words for a status with the messages on its stack, the first and closest to the cause
-/// first, which are taken from it.
-pub fn describe(status: c_int) -> String {
-    // FLEN_STATUS is 31, FLEN_ERRMSG 81.
-    let mut text = [0 as c_char; 81];
-    // SAFETY: the buffer has room for cfitsio's longest text.
-    unsafe { sys::ffgerr(status, text.as_mut_ptr()) };
-    let mut words = format!("cfitsio error {status}: {}", plain(&text));
-    // SAFETY: as above.
-    while unsafe { sys::ffgmsg(text.as_mut_ptr()) } != 0 {
-        let message = plain(&text).replace(char::is_control, " ");
-        words.push_str(&format!("; {message}"));
-    }
-    words
 }

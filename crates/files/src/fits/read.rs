@@ -1,4 +1,4 @@
-//! Reading, by cfitsio's own functions: what a header says is checked before it is believed.
+//! Reading images and tables with cfitsio. The values of a header are checked before they are used.
 
 use std::collections::BTreeMap;
 use std::ffi::{c_char, c_int};
@@ -11,11 +11,8 @@ use super::file::File;
 use super::tiles::Tiles;
 use crate::error::{FileError, names_of};
 use crate::frames::polars::{Column, DataFrame};
+use crate::limits::{MAX_ROWS, MAX_SIDE};
 
-/// Largest image side accepted, against absurd sizes in damaged headers.
-pub const MAX_SIDE: usize = 200_000;
-/// Most rows of a table accepted, and most planes of a cube: one for each galaxy of the largest grid.
-pub(super) const MAX_ROWS: usize = crate::table::MAX_ROWS;
 /// Most numbers read from a table that has fewer bytes than that on disk.
 const FREE_NUMBERS: u64 = 1 << 22;
 
@@ -31,9 +28,9 @@ pub struct ImageReader {
     file: File,
     width: usize,
     height: usize,
-    /// Images of a cube, one of a plain image.
+    /// Images of a cube; 1 for a plain image.
     planes: usize,
-    /// Whether nothing is read after it, so that a compressed file has to end well.
+    /// Whether this is the last image that is read, so that a gzip file must be complete after it.
     last: bool,
     next_row: usize,
     pixels: Pixels,
@@ -41,9 +38,9 @@ pub struct ImageReader {
 
 /// How the pixels of an image are stored.
 enum Pixels {
-    /// As they are, in so many bytes each.
+    /// Uncompressed, with this number of bytes per pixel.
     Plain(u64),
-    /// By tiles.
+    /// Compressed in tiles.
     Tiles(Tiles),
 }
 
@@ -55,12 +52,11 @@ enum Dimensions {
 }
 
 impl ImageReader {
-    /// Opens the first image of a file: the primary one, or that of the first extension where the
-    /// primary is empty (as fpack writes it).
+    /// Opens the first image of a file: the primary image, or the first extension if the primary header has no
+    /// image (as fpack writes it).
     ///
     /// # Errors
-    /// Where the file cannot be read or holds no two-dimensional image of sensible size, or not all
-    /// of it.
+    /// If the file cannot be read, has no two-dimensional image of an accepted size, or is truncated.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, FileError> {
         let mut file = File::open(path.as_ref(), "image")?;
         let mut place = "primary";
@@ -75,12 +71,11 @@ impl ImageReader {
         ImageReader::here(file, place, Dimensions::Two)
     }
 
-    /// Opens the first image or cube of a file of which more may follow. The planes of a cube are read as if
-    /// their rows were those of one image.
+    /// Opens the first image or cube of a file. [`ImageReader::next_stack`] opens the others. The rows of all planes
+    /// of a cube follow each other, as in one image.
     ///
     /// # Errors
-    /// Where the file cannot be read, holds no image, or one of other dimensions, of no sensible size, or not
-    /// all of it.
+    /// If the file cannot be read, has no image, has one with other dimensions or of no accepted size, or is truncated.
     pub fn open_stack(path: impl AsRef<Path>) -> Result<Self, FileError> {
         let path = path.as_ref();
         let file = File::open(path, "image")?;
@@ -126,7 +121,7 @@ impl ImageReader {
             (sides, _) => {
                 let or_cube = match dimensions {
                     Dimensions::Two => "",
-                    Dimensions::TwoOrThree => ", or 3 of a cube",
+                    Dimensions::TwoOrThree => ", or 3 for a cube",
                 };
                 return Err(file.fault(format!(
                     "the {place} image has {} dimensions; expected 2{or_cube}",
@@ -167,7 +162,7 @@ impl ImageReader {
         })
     }
 
-    /// Its name, EXTNAME; empty where it has none.
+    /// Its name, EXTNAME; empty if it has none.
     pub fn name(&self) -> String {
         self.file.text("EXTNAME")
     }
@@ -182,7 +177,7 @@ impl ImageReader {
         self.height
     }
 
-    /// Planes of a cube, 1 of an image.
+    /// Planes of a cube; 1 for an image.
     pub fn planes(&self) -> usize {
         self.planes
     }
@@ -192,10 +187,10 @@ impl ImageReader {
         self.height * self.planes
     }
 
-    /// A numeric header value, `None` where absent.
+    /// A numeric header value; `None` if absent.
     ///
     /// # Errors
-    /// Where it is there and not a number.
+    /// If the value is not a number.
     pub fn number(&self, key: &str) -> Result<Option<f64>, FileError> {
         self.file.number(key)
     }
@@ -210,7 +205,7 @@ impl ImageReader {
         self.next_row = 0;
     }
 
-    /// Leaves the next `rows` rows out.
+    /// Skips the next `rows` rows.
     pub fn skip_rows(&mut self, rows: usize) {
         self.next_row = (self.next_row + rows).min(self.rows());
     }
@@ -219,7 +214,7 @@ impl ImageReader {
     /// image of integers, have the value of its key BLANK, are NaN.
     ///
     /// # Errors
-    /// Where the pixels cannot be read, as in a damaged file.
+    /// If the pixels cannot be read, as in a damaged file.
     pub fn read_rows(&mut self, rows: usize) -> Result<Vec<f32>, FileError> {
         let first = self.next_row;
         let last = (first + rows).min(self.rows());
@@ -233,8 +228,8 @@ impl ImageReader {
         Ok(pixels)
     }
 
-    /// A square of `side` pixels a side, row-major, of which the lower left pixel is column `x` and row `y` of the
-    /// image, both from 0. Beyond the image it is NaN.
+    /// A square of `side` × `side` pixels, row-major. Its lower left pixel is at column `x` and row `y` of the image, both
+    /// from 0. Pixels outside the image are NaN.
     ///
     /// # Errors
     /// As [`ImageReader::read_rows`].
@@ -266,14 +261,14 @@ impl ImageReader {
 
     /// Reads as many pixels as there is room for, from the one at `first`, from 0.
     fn fill(&mut self, first: usize, pixels: &mut [f32]) -> Result<(), FileError> {
-        // cfitsio writes to the second unasked.
+        // cfitsio always writes to the second.
         let (mut blank, mut some_blank) = (f32::NAN, 0);
         let start = (first + 1) as i64;
         let (width, rows) = (self.width, self.rows());
         let last = (first + pixels.len()).div_ceil(width);
         self.file.call(
             || format!("cannot read rows {} to {last} of {rows}", first / width + 1),
-            // SAFETY: the file is open, and there is room for all the pixels asked for.
+            // SAFETY: the file is open, and there is room for all requested pixels.
             |raw, status| unsafe {
                 sys::ffgpv(
                     raw,
@@ -335,7 +330,7 @@ impl TableHead {
         }
     }
 
-    /// Whether it is the one that FITS_LDAC keeps the header of an image in.
+    /// Whether it contains the header of an image, as in FITS_LDAC.
     fn is_image_head(&self) -> bool {
         self.name.eq_ignore_ascii_case("LDAC_IMHEAD")
     }
@@ -435,8 +430,8 @@ fn go_to_table(
     file.go_to(number)
 }
 
-/// Columns of a table of a file: those of `wanted`, or all that are numbers. The table is the one that `table` names
-/// (EXTNAME) or numbers (the first extension is 1); otherwise the one that has the columns wanted; otherwise the first.
+/// Columns of a table of a file: the columns `wanted`, or all columns of numbers. `table` is the name (EXTNAME) or number
+/// (the first extension is 1) of the table. Without it, the table with the wanted columns is read, or else the first.
 ///
 /// # Errors
 /// If the file cannot be read, has no such table or several, or lacks a column.
@@ -447,8 +442,54 @@ pub fn read_table(
 ) -> Result<DataFrame, FileError> {
     let mut file = File::open(path, "table")?;
     go_to_table(&mut file, wanted, table)?;
-    let rows = table_rows(&mut file)?;
-    let descriptions = describe_columns(&file)?;
+    let rows = table_rows(&mut file, MAX_ROWS)?;
+    let chosen = choose_columns(&file, path, wanted)?;
+    let numbers = rows as u64 * chosen.len() as u64;
+    let most = FREE_NUMBERS.max(file.disk_size());
+    if numbers > most {
+        return Err(file.fault(format!(
+            "its {rows} rows of {} columns are {numbers} numbers; expected at most {most} in a file of this size",
+            chosen.len()
+        )));
+    }
+    let table = read_part(&file, &chosen, 0, rows)?;
+    file.check_end()?;
+    Ok(table)
+}
+
+/// Reads the columns `wanted` of a table, as [`read_table`], in parts of at most `most_rows`, and gives each to `take`.
+///
+/// # Errors
+/// As [`read_table`], and those of `take`.
+pub fn read_table_parts(
+    path: &Path,
+    wanted: &[&str],
+    table: Option<&str>,
+    most_rows: usize,
+    mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
+) -> Result<(), FileError> {
+    let mut file = File::open(path, "table")?;
+    go_to_table(&mut file, Some(wanted), table)?;
+    let rows = table_rows(&mut file, usize::MAX)?;
+    let chosen = choose_columns(&file, path, Some(wanted))?;
+    for first in (0..rows).step_by(most_rows) {
+        take(read_part(
+            &file,
+            &chosen,
+            first,
+            most_rows.min(rows - first),
+        )?)?;
+    }
+    file.check_end()
+}
+
+/// The descriptions of the columns `wanted`, or of all that are numbers.
+fn choose_columns(
+    file: &File,
+    path: &Path,
+    wanted: Option<&[&str]>,
+) -> Result<Vec<Description>, FileError> {
+    let descriptions = describe_columns(file)?;
     if let Some(missing) = wanted
         .into_iter()
         .flatten()
@@ -458,7 +499,7 @@ pub fn read_table(
         return Err(FileError::no_column(path, missing, &names));
     }
     let mut chosen = Vec::new();
-    for description in &descriptions {
+    for description in descriptions {
         let name = description.name.as_str();
         let number = description.repeat == 1
             && (NUMBERS.contains(&description.kind) || description.kind == TLOGICAL);
@@ -472,26 +513,27 @@ pub fn read_table(
         }
         chosen.push(description);
     }
-    let numbers = rows as u64 * chosen.len() as u64;
-    let most = FREE_NUMBERS.max(file.disk_size());
-    if numbers > most {
-        return Err(file.fault(format!(
-            "its {rows} rows of {} columns are {numbers} numbers; expected at most {most} in a file of this size",
-            chosen.len()
-        )));
-    }
-    let columns = chosen
-        .into_iter()
-        .map(|column| read_column(&file, column, rows))
+    Ok(chosen)
+}
+
+/// Some rows of columns, counted from 0.
+fn read_part(
+    file: &File,
+    columns: &[Description],
+    first: usize,
+    rows: usize,
+) -> Result<DataFrame, FileError> {
+    let columns = columns
+        .iter()
+        .map(|column| read_column(file, column, first, rows))
         .collect::<Result<_, FileError>>()?;
-    file.check_end()?;
     crate::frames::frame(columns).map_err(|error| file.fault(error.to_string()))
 }
 
-/// Text values of the header of a file's first extension, of those of `keys` that are there.
+/// Text values of `keys` in the header of a file's first extension. Absent keys are left out.
 ///
 /// # Errors
-/// Where the file cannot be read or has no extension.
+/// If the file cannot be read or has no extension.
 pub fn read_table_keys<'a>(
     path: &Path,
     keys: impl Iterator<Item = &'a String>,
@@ -504,8 +546,8 @@ pub fn read_table_keys<'a>(
     Ok(keys.map(value).filter(|(_, v)| !v.is_empty()).collect())
 }
 
-/// Rows of the table here, which the file must be able to hold.
-fn table_rows(file: &mut File) -> Result<usize, FileError> {
+/// Number of rows of the current table, at most `most`, which must fit into the file.
+fn table_rows(file: &mut File, most: usize) -> Result<usize, FileError> {
     let mut count = 0;
     // SAFETY: the file is open, and the pointers are to live variables.
     file.call(
@@ -516,10 +558,10 @@ fn table_rows(file: &mut File) -> Result<usize, FileError> {
     )?;
     let rows = usize::try_from(count)
         .ok()
-        .filter(|rows| *rows <= MAX_ROWS)
+        .filter(|rows| *rows <= most)
         .ok_or_else(|| {
             file.fault(format!(
-                "the table says it has {count} rows; expected at most {MAX_ROWS}"
+                "the table says it has {count} rows; expected at most {most}"
             ))
         })?;
     let bytes = file.number("NAXIS1")?.unwrap_or(0.0);
@@ -555,7 +597,7 @@ fn describe_columns(file: &File) -> Result<Vec<Description>, FileError> {
         .collect()
 }
 
-/// Refuses a column that is scaled by zero or by what is no number.
+/// Refuses a column if its scale is zero, or if its scale or offset is not finite.
 fn check_scale(file: &File, number: c_int, name: &str) -> Result<(), FileError> {
     for (key, zero) in [("TSCAL", false), ("TZERO", true)] {
         let key = format!("{key}{number}");
@@ -570,8 +612,14 @@ fn check_scale(file: &File, number: c_int, name: &str) -> Result<(), FileError> 
     Ok(())
 }
 
-/// A column as real numbers; missing ones are NaN, true is 1 and false 0.
-fn read_column(file: &File, description: &Description, rows: usize) -> Result<Column, FileError> {
+/// Rows of a column, after the first `skipped`, as real numbers; missing ones are NaN, true is 1 and false 0.
+fn read_column(
+    file: &File,
+    description: &Description,
+    skipped: usize,
+    rows: usize,
+) -> Result<Column, FileError> {
+    let first = skipped as i64 + 1;
     let doing = || format!("cannot read column `{}`", description.name);
     let mut some_missing = 0;
     if description.kind == TLOGICAL {
@@ -583,7 +631,7 @@ fn read_column(file: &File, description: &Description, rows: usize) -> Result<Co
             sys::ffgcvl(
                 raw,
                 description.number,
-                1,
+                first,
                 1,
                 rows as i64,
                 missing,
@@ -608,7 +656,7 @@ fn read_column(file: &File, description: &Description, rows: usize) -> Result<Co
         sys::ffgcvd(
             raw,
             description.number,
-            1,
+            first,
             1,
             rows as i64,
             f64::NAN,

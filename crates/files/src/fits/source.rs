@@ -1,8 +1,7 @@
-//! The bytes of a FITS file, as it is or as gzip packed it.
+//! The bytes of a FITS file, plain or compressed by gzip.
 //!
-//! cfitsio would unpack a gzip file into memory, all of it, before it looks at the header. Here a
-//! nameless temporary file takes what was unpacked, as far as somebody needs it: the header first, and
-//! the pixels when they are read.
+//! cfitsio would unpack a whole gzip file into memory before it reads the header. Here the file is unpacked into a
+//! nameless temporary file, step by step: the header first, and the pixels when they are read.
 
 use std::ffi::CString;
 use std::fs::File;
@@ -23,13 +22,13 @@ const STEP: u64 = 1 << 23;
 pub struct Source {
     /// Its name in errors.
     path: PathBuf,
-    /// What cfitsio reads.
+    /// The plain file that cfitsio reads.
     file: File,
     /// Bytes in it.
     size: u64,
     /// Bytes on disk.
     disk: u64,
-    /// What is still packed.
+    /// The part that is not yet unpacked.
     packed: Option<MultiGzDecoder<BufReader<File>>>,
 }
 
@@ -138,7 +137,7 @@ impl Source {
     /// Reads a gzip file to its checksum.
     ///
     /// # Errors
-    /// Where it is truncated, damaged, or has far more than was needed of it.
+    /// If it is truncated, damaged, or much longer than the part that was read.
     pub fn check_end(&mut self) -> Result<(), FileError> {
         let Some(packed) = &mut self.packed else {
             return Ok(());
@@ -164,7 +163,7 @@ fn open_file_name(file: &File) -> Vec<u8> {
     format!("/dev/fd/{}", file.as_raw_fd()).into_bytes()
 }
 
-/// A file's name as cfitsio leaves it: one that starts with a tilde would be looked for in somebody's home.
+/// A name that cfitsio does not change. cfitsio replaces a tilde at the start by a home folder.
 fn literal(name: &[u8]) -> Vec<u8> {
     let here: &[u8] = if name.starts_with(b"~") { b"./" } else { b"" };
     [here, name].concat()

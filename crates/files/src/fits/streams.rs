@@ -1,7 +1,7 @@
 //! Whether the bytes of a compressed tile can be unpacked.
 //!
-//! cfitsio's decoders believe what they read: they take no notice of the end of their input, and some
-//! write as many pixels as it says. Each tile is therefore gone through here before cfitsio gets it.
+//! cfitsio's decoders do not check their input: they read beyond its end, and some write as many pixels as it claims.
+//! Each tile is therefore checked here before cfitsio decodes it.
 
 use std::io::Read;
 
@@ -10,7 +10,7 @@ use flate2::bufread::GzDecoder;
 /// How tiles are compressed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Coding {
-    /// RICE_1, by blocks of so many pixels of so many bytes.
+    /// RICE_1.
     Rice {
         /// Pixels of a block.
         block: usize,
@@ -36,10 +36,10 @@ struct Bits<'a> {
 }
 
 impl Bits<'_> {
-    /// Bits of which [`Bits::window`] has at least as many.
+    /// Least number of valid bits in [`Bits::window`].
     const SEEN: u32 = 57;
 
-    /// The bits from the next one on, followed by zeros.
+    /// The next bits, followed by zeros.
     fn window(&self) -> u64 {
         let rest = self.bytes.get(self.next / 8..).unwrap_or_default();
         let eight = rest.first_chunk().copied().unwrap_or_else(|| {
@@ -57,7 +57,7 @@ impl Bits<'_> {
         Ok(value as usize)
     }
 
-    /// Leaves bits out, all of which must be there.
+    /// Skips bits, which must all be there.
     fn skip(&mut self, count: usize) -> Result<(), Damaged> {
         self.next = self.next.saturating_add(count);
         if self.next <= self.bytes.len() * 8 {
@@ -67,7 +67,7 @@ impl Bits<'_> {
         }
     }
 
-    /// Leaves zeros out and the one after them.
+    /// Skips zeros and the one after them.
     fn skip_zeros(&mut self) -> Result<(), Damaged> {
         loop {
             let zeros = self.window().leading_zeros();
@@ -86,7 +86,7 @@ pub fn check_rice(
     block: usize,
     pixel_bytes: usize,
 ) -> Result<(), Damaged> {
-    // Bits that tell how many of a difference are stored as they are, and the number that means all.
+    // Bits of a block's header, and its value for a block whose differences are stored in full.
     let (width, all) = match pixel_bytes {
         1 => (3, 6),
         2 => (4, 14),
@@ -140,7 +140,7 @@ pub fn check_plio(words: &[i16]) -> Result<(), Damaged> {
     if first < 1 || last > words.len() {
         return Err(Damaged);
     }
-    // An instruction that takes the next word for its own cannot be the last one.
+    // An instruction that uses the next word cannot be the last one.
     const SET_HIGH: i16 = 1;
     match words[..last].last() {
         Some(word) if word / 4096 == SET_HIGH && last == words.len() => Err(Damaged),
@@ -188,8 +188,7 @@ pub fn check_hcompress(bytes: &[u8], pixels: usize) -> Result<(), Damaged> {
     tile.bits.skip(signs)
 }
 
-/// The coefficients of an HCOMPRESS tile on their way: bit planes of quadrants, each plane as it is or
-/// as a quadtree.
+/// The coefficients of an HCOMPRESS tile: bit planes of quadrants. Each plane is stored directly or as a quadtree.
 struct Quadtrees<'a> {
     bits: Bits<'a>,
     /// Whether a coefficient is not zero.
@@ -199,7 +198,7 @@ struct Quadtrees<'a> {
 }
 
 impl Quadtrees<'_> {
-    /// Goes through the planes of the quadrant of `nx` × `ny` coefficients from `start`.
+    /// Reads the planes of the quadrant of `nx` × `ny` coefficients from `start`.
     fn quadrant(&mut self, start: usize, nx: usize, ny: usize, planes: u8) -> Result<(), Damaged> {
         const DIRECT: usize = 0;
         const TREE: usize = 15;

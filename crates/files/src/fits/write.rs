@@ -1,5 +1,5 @@
-//! FITS files that are written. cfitsio makes their headers and lays out their tables, in memory; the bytes go to disk
-//! by the standard library, which tells of every one that a full or a broken disk did not take.
+//! Writing FITS files. cfitsio makes headers and tables in memory. The standard library writes the bytes to disk, because
+//! it reports every write that fails.
 
 use std::ffi::{CStr, CString, c_int};
 use std::fs::File;
@@ -15,7 +15,7 @@ use fitsio::images::{ImageDescription, ImageType};
 use fitsio::sys;
 use fitsio::tables::{ColumnDataType, ColumnDescription};
 
-use super::{lock, plain_name};
+use super::cfitsio::{self, lock};
 use crate::atomic::{self, PartFile};
 use crate::error::FileError;
 
@@ -50,7 +50,7 @@ impl ImageWriter {
     /// Starts an image of 32-bit floats.
     ///
     /// # Errors
-    /// Where the file cannot be made.
+    /// If the file cannot be created.
     pub fn create(
         path: impl AsRef<Path>,
         width: usize,
@@ -76,7 +76,7 @@ impl ImageWriter {
     /// Writes the next rows.
     ///
     /// # Errors
-    /// Where they cannot be written, or are not whole rows of this image.
+    /// If they cannot be written, or are not whole rows of this image.
     pub fn write_rows(&mut self, pixels: &[f32]) -> Result<(), FileError> {
         let rows = pixels.len() / self.width;
         if rows * self.width != pixels.len() || self.next_row + rows > self.height {
@@ -99,13 +99,12 @@ impl ImageWriter {
     /// Closes the file and gives it its name.
     ///
     /// # Errors
-    /// Where rows are missing or the file cannot be written.
+    /// If rows are missing or the file cannot be written.
     pub fn finish(self) -> Result<(), FileError> {
         self.closed()?.finish()
     }
 
-    /// The same unless a file has its name by now, of which nothing changes then. Returns whether this is the file
-    /// of that name.
+    /// Like [`ImageWriter::finish`], but does not replace an existing file. Returns whether the file was written.
     ///
     /// # Errors
     /// As [`ImageWriter::finish`].
@@ -142,14 +141,9 @@ impl ImageWriter {
     }
 }
 
-/// Tells that the file `path` cannot be made.
+/// The error for a file `path` that cannot be written.
 fn cannot(path: &Path) -> impl Fn(fitsio::errors::Error) -> FileError {
-    move |error| {
-        FileError::new(
-            path,
-            format!("cannot write the file: {}", super::describe(error)),
-        )
-    }
+    move |error| FileError::new(path, format!("cannot write the file: {}", describe(error)))
 }
 
 /// The blocks of the header of an image of `sides` = [columns, rows] 32-bit floats.
@@ -171,7 +165,7 @@ fn image_header(sides: [usize; 2], header: &[(&str, Value)]) -> fitsio::errors::
 fn header_blocks(file: &mut FitsFile) -> fitsio::errors::Result<Vec<u8>> {
     let (mut status, mut keys, mut text) = (0, 0, ptr::null_mut());
     // SAFETY: the file is open. Flushed, it counts its rows in the header. cfitsio makes the text, which ends in a zero
-    // byte, and is told to free it.
+    // byte, and frees it on request.
     let mut cards = unsafe {
         sys::ffflus(file.as_raw(), &mut status);
         sys::ffhdr2str(
@@ -209,7 +203,7 @@ fn write_header(
 
 /// Writes a real number to the header in use with all its digits; [`FitsHdu::write_key`] keeps fifteen.
 fn write_real(file: &mut FitsFile, key: &str, value: f64) -> fitsio::errors::Result<()> {
-    /// Significant digits that tell any two numbers apart; negative where leading zeros do not count.
+    /// Significant digits that distinguish any two numbers; negative if leading zeros do not count.
     const DIGITS: c_int = -17;
     let name = CString::new(key)?;
     let mut status = 0;
@@ -253,7 +247,7 @@ impl Values {
 /// Writes `table` as the only binary table of a file, with `header` keys of at most eight characters.
 ///
 /// # Errors
-/// Where the file cannot be written.
+/// If the file cannot be written.
 pub fn write_table(
     path: &Path,
     table: &DataFrame,
@@ -316,4 +310,33 @@ fn table_bytes(table: &DataFrame, header: &[(&str, Value)]) -> fitsio::errors::R
     data.resize(data.len().next_multiple_of(BLOCK), 0);
     bytes.extend(data);
     Ok(bytes)
+}
+
+/// Refuses names that cfitsio does not treat as plain: those with `[...]`, `(...)`, a leading `!` or `-`, or a trailing `+n`.
+fn plain_name(path: &Path) -> Result<(), FileError> {
+    let Some(name) = path.to_str() else {
+        return Err(FileError::new(path, "FITS file names must be UTF-8"));
+    };
+    let plus = name
+        .rsplit_once('+')
+        .is_some_and(|(_, end)| !end.is_empty() && end.bytes().all(|b| b.is_ascii_digit()));
+    if name.contains(['[', ']', '(', ')'])
+        || name.starts_with(['!', '-'])
+        || name.contains("://")
+        || plus
+    {
+        return Err(FileError::new(
+            path,
+            "FITS file names must not contain brackets or `://`, start with `!` or `-`, or end in `+` and a number",
+        ));
+    }
+    Ok(())
+}
+
+/// The text of an error of the crate `fitsio`.
+fn describe(error: fitsio::errors::Error) -> String {
+    match error {
+        fitsio::errors::Error::Fits(e) => cfitsio::describe(e.status),
+        other => other.to_string(),
+    }
 }

@@ -1,5 +1,4 @@
-//! What can go wrong with a table, worded with the file, the place, what was found and what was
-//! expected.
+//! Errors of tables. Messages contain the file, the place, the found and the expected value.
 
 use std::path::PathBuf;
 
@@ -12,7 +11,7 @@ pub enum TableError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: std::io::Error,
     },
     /// The file is no Parquet file, or a damaged or truncated one.
@@ -20,7 +19,7 @@ pub enum TableError {
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What was found to be wrong.
+        /// The fault.
         detail: String,
     },
     /// The file has more rows than the caller can use.
@@ -42,7 +41,7 @@ pub enum TableError {
     MissingColumn {
         /// The file.
         path: PathBuf,
-        /// The name asked for.
+        /// The requested name.
         wanted: String,
         /// The names in the file, in file order.
         present: Vec<String>,
@@ -75,7 +74,7 @@ pub enum TableError {
         /// How many of its values are missing.
         count: usize,
     },
-    /// Two columns of a table have one name, or one column was asked for twice.
+    /// Two columns of a table have one name, or one column was requested twice.
     #[error("column `{name}` is named twice; expected every name once")]
     DuplicateColumn {
         /// The name.
@@ -98,7 +97,7 @@ pub enum TableError {
     /// Columns that make no frame for another reason.
     #[error("cannot make a table: {detail}")]
     Invalid {
-        /// What polars says.
+        /// The message of polars.
         detail: String,
     },
     /// A metadata key is one that the file format uses for itself.
@@ -110,7 +109,7 @@ pub enum TableError {
     /// Writing failed, in the encoder or in the writer behind it.
     #[error("cannot write the Parquet table: {detail}")]
     Write {
-        /// What went wrong.
+        /// The fault.
         detail: String,
     },
 }

@@ -7,7 +7,7 @@ use polars::prelude::{ChunkedArray, Column, DataFrame, DataType, PolarsNumericTy
 
 use super::TableError;
 
-/// Text by name that a file keeps beside its columns.
+/// Text by name, which a file contains in addition to its columns.
 pub type Metadata = BTreeMap<String, String>;
 
 /// The frame of `columns`, in this order.
@@ -37,9 +37,8 @@ pub fn frame(columns: Vec<Column>) -> Result<DataFrame, TableError> {
     })
 }
 
-/// The values of a column of numbers as 64-bit floats, NaN where one is missing; true is 1, false 0, and
-/// integers beyond ±2⁵³ are rounded. `None` for a column of anything else. What the column holds as such
-/// floats in one piece is lent, not copied.
+/// The values of a column of numbers as 64-bit floats; `None` for another column. A missing value is NaN, true is 1 and
+/// false 0. Integers beyond ±2⁵³ are rounded. 64-bit floats in one piece are borrowed, not copied.
 pub fn reals(column: &Column) -> Option<Cow<'_, [f64]>> {
     let series = column.as_materialized_series();
     if let Ok(all) = series.f64()

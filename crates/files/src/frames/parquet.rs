@@ -1,9 +1,11 @@
 //! Parquet files.
 //!
-//! Writing goes through polars' frame writer. Reading takes polars' footer parser and column
-//! decoder, but fetches the bytes itself: only the column chunks that are wanted are read, nothing
-//! is memory-mapped (a mapped file that shrinks kills the process), no second thread pool starts,
-//! and 8- and 16-bit integers decode into wider ones without polars' features for them.
+//! Writing uses polars' frame writer. Reading uses polars' footer parser and column decoder, but reads the bytes itself:
+//!
+//! * Only the wanted column chunks are read.
+//! * Files are not memory-mapped: a mapped file that shrinks kills the process.
+//! * No second thread pool starts.
+//! * 8- and 16-bit integers decode into wider ones without polars' features for them.
 
 use std::cell::Cell;
 use std::collections::BTreeSet;
@@ -113,6 +115,37 @@ pub fn read_parquet(
     frame(columns.collect::<Result<_, TableError>>()?)
 }
 
+/// Reads the columns `wanted` of the Parquet file at `path` by row groups, and gives each group to `take`. A row group
+/// has at most `most_rows`.
+///
+/// # Errors
+/// As [`read_parquet`], and those of `take`.
+pub fn read_parquet_groups<E: From<TableError>>(
+    path: &Path,
+    wanted: &[&str],
+    most_rows: usize,
+    mut take: impl FnMut(DataFrame) -> Result<(), E>,
+) -> Result<(), E> {
+    let mut source = Source::open(path)?;
+    let fields = source.pick(wanted)?;
+    let fields: Vec<ArrowField> = fields
+        .iter()
+        .map(|field| source.decoded(field))
+        .collect::<Result<_, TableError>>()?;
+    source.check_rows(usize::MAX)?;
+    for number in 0..source.footer.row_groups.len() {
+        let rows = source.footer.row_groups[number].num_rows();
+        if rows > most_rows {
+            let detail = format!("found a row group of {rows} rows, expected at most {most_rows}");
+            return Err(source.damaged(detail).into());
+        }
+        let column = |field| with_missing(path, source.read_chunk(field, number)?);
+        let columns = fields.iter().map(column);
+        take(frame(columns.collect::<Result<_, TableError>>()?)?)?;
+    }
+    Ok(())
+}
+
 /// The names of the columns of the Parquet file at `path`, in file order, from the footer alone.
 ///
 /// # Errors
@@ -157,7 +190,7 @@ impl<'a> Source<'a> {
                 detail: "found no regular file".into(),
             })
         };
-        // Before it is opened, which would wait for the writer of a pipe, and for what was opened.
+        // Checked before it is opened, because opening a pipe waits for its writer, and again afterwards.
         fs::metadata(path).map_err(io).and_then(length)?;
         let mut file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io).and_then(length)?;
@@ -209,7 +242,7 @@ impl<'a> Source<'a> {
         Ok(())
     }
 
-    /// Checks that all `columns` columns, however many there are, can be those of a file of this size.
+    /// Checks that a file of this size can contain this number of columns.
     fn check_values(&self, columns: usize) -> Result<(), TableError> {
         let rows = self.footer.num_rows;
         let values = (rows as u64).saturating_mul(columns as u64);
@@ -248,7 +281,7 @@ impl<'a> Source<'a> {
             .collect()
     }
 
-    /// The file's own key-value metadata, without the schema that Arrow keeps there.
+    /// The key-value metadata of the file, without Arrow's schema.
     fn key_values(&self) -> Metadata {
         let pairs = self.footer.key_value_metadata().iter().flatten();
         pairs
@@ -259,64 +292,81 @@ impl<'a> Source<'a> {
 
     /// All rows of one column.
     fn read_column(&mut self, field: &ArrowField) -> Result<Column, TableError> {
-        let (path, name) = (self.path, field.name.as_str());
-        let Some(decoded) = decoded_type(&field.dtype) else {
-            return Err(TableError::UnsupportedType {
-                path: path.into(),
-                column: name.into(),
-                found: format!("{:?}", field.dtype),
-            });
-        };
-        let field = ArrowField::new(field.name.clone(), decoded, field.is_nullable);
-        let footer = self.footer.clone();
+        let field = self.decoded(field)?;
         let mut column = Series::new_empty(field.name.clone(), &DataType::from_arrow_field(&field));
-        for (number, group) in footer.row_groups.iter().enumerate() {
-            let place = format!("column `{name}`, row group {number}");
-            let damaged = |detail| TableError::Damaged {
-                path: path.into(),
-                detail: format!("{place}: {detail}"),
-            };
-            let found = group
-                .columns_under_root_iter(name)
-                .map(|mut all| (all.len(), all.next()));
-            let Some((1, Some(chunk))) = found else {
-                return Err(damaged("found no single column chunk".into()));
-            };
-            if usize::try_from(chunk.num_values()) != Ok(group.num_rows()) {
-                return Err(damaged(format!(
-                    "found {} values, expected {} as the row group has rows",
-                    chunk.num_values(),
-                    group.num_rows()
-                )));
-            }
-            let start = chunk
-                .dictionary_page_offset()
-                .unwrap_or(chunk.data_page_offset());
-            let bytes = self
-                .read_bytes(start, chunk.compressed_size())
-                .map_err(damaged)?;
-            let most =
-                unpacked_bytes(self.length).max(number_bytes(&field.dtype, group.num_rows()));
-            let series = guarded(path, &place, || decode(chunk, bytes, &field, most))?;
-            if series.len() != group.num_rows() {
-                return Err(damaged(format!(
-                    "found {} rows, expected {}",
-                    series.len(),
-                    group.num_rows()
-                )));
-            }
-            let left = self.text_left.checked_sub(text_bytes(&series));
-            self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
+        for number in 0..self.footer.row_groups.len() {
+            let series = self.read_chunk(&field, number)?;
             column = match number {
                 0 => series,
                 _ => {
                     let joined = column.append(&series);
-                    joined.map_err(|error| damaged(error.to_string()))?;
+                    joined.map_err(|error| {
+                        let name = field.name.as_str();
+                        self.damaged(format!("column `{name}`, row group {number}: {error}"))
+                    })?;
                     column
                 }
             };
         }
-        with_missing(path, column)
+        // In one piece, so that readers borrow the values instead of copying them.
+        with_missing(self.path, column.rechunk())
+    }
+
+    /// The field with the type into which it is decoded.
+    fn decoded(&self, field: &ArrowField) -> Result<ArrowField, TableError> {
+        let decoded = decoded_type(&field.dtype).ok_or_else(|| TableError::UnsupportedType {
+            path: self.path.into(),
+            column: field.name.to_string(),
+            found: format!("{:?}", field.dtype),
+        })?;
+        Ok(ArrowField::new(
+            field.name.clone(),
+            decoded,
+            field.is_nullable,
+        ))
+    }
+
+    /// The rows of a decoded column in one row group.
+    fn read_chunk(&mut self, field: &ArrowField, number: usize) -> Result<Series, TableError> {
+        let (path, name) = (self.path, field.name.as_str());
+        let footer = self.footer.clone();
+        let group = &footer.row_groups[number];
+        let place = format!("column `{name}`, row group {number}");
+        let damaged = |detail| TableError::Damaged {
+            path: path.into(),
+            detail: format!("{place}: {detail}"),
+        };
+        let found = group
+            .columns_under_root_iter(name)
+            .map(|mut all| (all.len(), all.next()));
+        let Some((1, Some(chunk))) = found else {
+            return Err(damaged("found no single column chunk".into()));
+        };
+        if usize::try_from(chunk.num_values()) != Ok(group.num_rows()) {
+            return Err(damaged(format!(
+                "found {} values, expected {} as the row group has rows",
+                chunk.num_values(),
+                group.num_rows()
+            )));
+        }
+        let start = chunk
+            .dictionary_page_offset()
+            .unwrap_or(chunk.data_page_offset());
+        let bytes = self
+            .read_bytes(start, chunk.compressed_size())
+            .map_err(damaged)?;
+        let most = unpacked_bytes(self.length).max(number_bytes(&field.dtype, group.num_rows()));
+        let series = guarded(path, &place, || decode(chunk, bytes, field, most))?;
+        if series.len() != group.num_rows() {
+            return Err(damaged(format!(
+                "found {} rows, expected {}",
+                series.len(),
+                group.num_rows()
+            )));
+        }
+        let left = self.text_left.checked_sub(text_bytes(&series));
+        self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
+        Ok(series)
     }
 
     /// The bytes from `start`, as many as `size`, after checking that the file has them.
@@ -342,8 +392,8 @@ impl<'a> Source<'a> {
     }
 }
 
-/// Checks the length of a footer, which takes several times as much memory once it is read. The last eight
-/// bytes of a file are that length and a mark.
+/// Checks the length of a footer, because parsing needs several times as much memory. The last eight bytes of a file are
+/// this length and a mark.
 fn check_footer(file: &mut File, length: u64) -> Result<(), String> {
     let mut end = [0; 8];
     if length >= 8 {
@@ -353,7 +403,7 @@ fn check_footer(file: &mut File, length: u64) -> Result<(), String> {
     }
     let [a, b, c, d, mark @ ..] = end;
     let found = u32::from_le_bytes([a, b, c, d]);
-    // Of a file without the mark the reader says what it is not.
+    // The reader reports a file without the mark.
     match &mark == b"PAR1" && found > MAX_FOOTER {
         true => Err(format!(
             "found a footer of {found} bytes, expected at most {MAX_FOOTER}"
@@ -437,11 +487,11 @@ fn text_bytes(series: &Series) -> u64 {
     })
 }
 
-/// Unpacked size of the page that starts a column chunk, `None` where it cannot be told. The reader
-/// keeps that of a dictionary page to itself.
+/// Unpacked size of the first page of a column chunk; `None` if it cannot be determined. polars' reader does not expose
+/// the size of a dictionary page.
 ///
-/// The header of a page is a list of fields in Thrift's compact form, each a byte that tells its number
-/// and type and a value: first the type of the page, then its unpacked size.
+/// The header of a page is a list of fields in Thrift's compact form. Each is a byte with its number and type, and a
+/// value. The first is the type of the page, the second its unpacked size.
 fn unpacked_size_of_first_page(bytes: &[u8]) -> Option<u64> {
     const NEXT_FIELD_OF_32_BITS: u8 = 0x15;
     let mut rest = bytes.iter();
@@ -464,7 +514,7 @@ fn unpacked_size_of_first_page(bytes: &[u8]) -> Option<u64> {
     field()
 }
 
-/// Runs a part of polars on what a file says.
+/// Runs a part of polars on the contents of a file.
 ///
 /// Its decoders return errors for most damage, but index out of range or overflow on some; that
 /// must not take a long run down, so such a panic becomes an error too.
@@ -491,8 +541,8 @@ thread_local! {
 
 /// Catches a panic of `run` without its message on standard error.
 ///
-/// The hook that prints such messages belongs to the whole process, so it is replaced only once, by
-/// one that is silent where this thread catches and else does what the one before did.
+/// The hook that prints such messages belongs to the whole process, so it is replaced only once. The new hook is silent
+/// while this thread catches panics; otherwise it calls the hook before it.
 fn silently<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
     static HOOK: Once = Once::new();
     HOOK.call_once(|| {
@@ -509,7 +559,7 @@ fn silently<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
     result
 }
 
-/// The type into which a column declared as `declared` is decoded, if it is one that is read.
+/// The type into which a column of type `declared` is decoded; `None` if it is not supported.
 fn decoded_type(declared: &ArrowDataType) -> Option<ArrowDataType> {
     use ArrowDataType as Type;
     match declared {

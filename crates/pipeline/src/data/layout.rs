@@ -254,7 +254,8 @@ impl DataFolder {
     pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
         let path = self.truth(set);
         truth_is_there(&path)?;
-        let rows = read_truth_rows(&path, table::most_rows(grid.cells()))?;
+        let table = table::read_truth(&path, table::most_rows(grid.cells()))?;
+        let rows = truth_rows(&path, &table)?;
         TrueShear::from_rows(grid, self.truth_sign(set)?, rows)
             .map_err(|error| FileError::new(&path, error))
     }
@@ -316,16 +317,16 @@ pub fn stated_sign(path: &Path) -> Result<Option<TruthSign>, FileError> {
     }
 }
 
-/// Rows (x, y, g1, g2) of a truth file, at most `most`: CSV with that header, or ASCII columns in that order.
+/// Rows (x, y, g1, g2) of the table of a truth file. Each row is made when it is needed: all rows of the largest grid
+/// are 512 MB.
 ///
 /// # Errors
-/// If the file cannot be read.
-pub fn read_truth_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
-    rows_of(
-        path,
-        &table::read_truth(path, most)?,
-        &["x", "y", "g1", "g2"],
-    )
+/// If a column does not contain numbers.
+pub fn truth_rows<'t>(
+    path: &Path,
+    table: &'t DataFrame,
+) -> Result<impl ExactSizeIterator<Item = Row> + use<'t>, FileError> {
+    rows_of(path, table, &table::TRUTH_COLUMNS)
 }
 
 /// Rows of a catalogue, at most `most`, from four named columns.
@@ -333,22 +334,24 @@ pub fn read_truth_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> 
 /// # Errors
 /// If the file cannot be read or a column is absent.
 pub fn read_rows(path: &Path, names: &[&str; 4], most: usize) -> Result<Vec<Row>, FileError> {
-    let hint = "`score --columns` or a description (--foreign) names others";
+    let hint = "`score --columns` (names, or numbers such as 2,3,4,5) or a description (--foreign) names others";
     let table =
         table::read(path, Some(names), most).map_err(|error| error.hint_of_columns(hint))?;
-    rows_of(path, &table, names)
+    Ok(rows_of(path, &table, names)?.collect())
 }
 
-fn rows_of(path: &Path, table: &DataFrame, names: &[&str; 4]) -> Result<Vec<Row>, FileError> {
+fn rows_of<'t>(
+    path: &Path,
+    table: &'t DataFrame,
+    names: &[&str; 4],
+) -> Result<impl ExactSizeIterator<Item = Row> + use<'t>, FileError> {
     let column = |name: &str| table::numbers(table, name, path);
     let (x, y) = (column(names[0])?, column(names[1])?);
     let (e1, e2) = (column(names[2])?, column(names[3])?);
-    Ok((0..x.len())
-        .map(|k| Row {
-            x: x[k],
-            y: y[k],
-            e1: e1[k],
-            e2: e2[k],
-        })
-        .collect())
+    Ok((0..x.len()).map(move |k| Row {
+        x: x[k],
+        y: y[k],
+        e1: e1[k],
+        e2: e2[k],
+    }))
 }

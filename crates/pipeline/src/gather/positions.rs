@@ -54,15 +54,7 @@ impl Positions {
     /// # Errors
     /// If the table cannot be read, its columns are not clear, or a value is no position.
     pub(super) fn read(table: Table<'_>) -> Result<Self, FileError> {
-        let mut place = Place::of(table.path);
-        if let Some(name) = table.table
-            && let Some(other) = place.table.replace(name.to_owned())
-        {
-            let message = format!(
-                "two tables are named (found `{other}` in brackets and --table {name}, expected one)"
-            );
-            return Err(FileError::new(table.path, message));
-        }
+        let mut place = Place::with_table(table.path, table.table)?;
         let columns = table::columns(&place)?;
         let [x, y] = match table.columns {
             Some(names) => given(&place, &columns, names)?,

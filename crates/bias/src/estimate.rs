@@ -1,0 +1,191 @@
+//! Estimates with errors from a jackknife or bootstrap over units.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::error::{BiasError, MIN_SIGMA};
+use crate::fit::{self, ESTIMATES, Estimates, Known, Plan, RESPONSE};
+use crate::sums::{WEIGHT, WEIGHT2};
+use crate::units::{UnitSums, add};
+
+/// A quantity that is estimated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Quantity {
+    /// Key in CSV and JSON.
+    pub key: &'static str,
+    /// Name in tables.
+    pub label: &'static str,
+    /// What it is.
+    pub meaning: &'static str,
+}
+
+const fn quantity(key: &'static str, label: &'static str, meaning: &'static str) -> Quantity {
+    Quantity {
+        key,
+        label,
+        meaning,
+    }
+}
+
+/// The quantities, in the order in which they are estimated.
+pub const QUANTITIES: [Quantity; ESTIMATES] = [
+    quantity("m1", "m1", "multiplicative bias of g1"),
+    quantity("c1", "c1", "additive bias of g1"),
+    quantity("m2", "m2", "multiplicative bias of g2"),
+    quantity("c2", "c2", "additive bias of g2"),
+    quantity("m_plus", "m+", "multiplicative bias along the PSF"),
+    quantity("c_plus", "c+", "additive bias along the PSF"),
+    quantity(
+        "m_cross",
+        "m×",
+        "multiplicative bias at 45 degrees to the PSF",
+    ),
+    quantity("c_cross", "c×", "additive bias at 45 degrees to the PSF"),
+    quantity("alpha", "α", "shear per ellipticity of the PSF"),
+    quantity("alpha1", "α1", "the same of component 1"),
+    quantity("alpha2", "α2", "the same of component 2"),
+    quantity(
+        "alpha_size",
+        "dα/dlnT",
+        "change of α with a relative change of PSF size",
+    ),
+    quantity("q1", "q1", "quadratic term of g1"),
+    quantity("q2", "q2", "quadratic term of g2"),
+    quantity("m12", "m12", "change of the estimate of g1 with g2"),
+    quantity("m21", "m21", "change of the estimate of g2 with g1"),
+    quantity("r1", "⟨R11⟩", "mean response of component 1"),
+    quantity("r2", "⟨R22⟩", "mean response of component 2"),
+];
+
+/// How errors are determined.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Errors {
+    /// Leave out one unit at a time.
+    #[default]
+    Jackknife,
+    /// Draw units with replacement, so many times.
+    Bootstrap {
+        /// Number of draws.
+        draws: u32,
+        /// Seed of the random numbers.
+        seed: u64,
+    },
+}
+
+/// A value with its standard error.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measured {
+    /// The value.
+    pub value: f64,
+    /// Its standard error.
+    pub error: f64,
+}
+
+/// Estimates of a bin.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub struct Estimate {
+    /// Galaxies.
+    pub galaxies: usize,
+    /// (Σ w)² / Σ w²: as many galaxies of equal weight have the same information.
+    pub effective: f64,
+    /// Units.
+    pub units: usize,
+    values: Estimates,
+    errors: Estimates,
+    /// Per component: whether m assumes that c is zero, because all true shears are equal.
+    pub assumes_no_c: [bool; 2],
+}
+
+impl Estimate {
+    /// The quantity called `key`; `None` if the data do not determine it.
+    pub fn value(&self, key: &str) -> Option<Measured> {
+        let place = QUANTITIES.iter().position(|quantity| quantity.key == key)?;
+        let (value, error) = (self.values[place], self.errors[place]);
+        value.is_finite().then_some(Measured { value, error })
+    }
+}
+
+/// Estimates of the units of a bin, with a known true shear or not.
+///
+/// # Errors
+/// If no galaxy or only one unit was added, or a mean response has less than five standard errors.
+pub fn estimate(
+    sums: &UnitSums,
+    bin: usize,
+    truth: bool,
+    errors: Errors,
+) -> Result<Estimate, BiasError> {
+    let units = sums.of_bin(bin);
+    let mut total = vec![0.0; sums.layout().len()];
+    for unit in &units {
+        add(&mut total, unit);
+    }
+    if fit::count(&total) == 0.0 {
+        return Err(BiasError::NoGalaxies);
+    }
+    if units.len() < 2 {
+        return Err(BiasError::FewUnits { found: units.len() });
+    }
+    let plan = Plan::new(sums.layout(), &total, truth);
+    let values = plan.estimates(&total);
+    let errors = match errors {
+        Errors::Jackknife => jackknife(&plan, &total, &units),
+        Errors::Bootstrap { draws, seed } => bootstrap(&plan, &units, draws, seed),
+    };
+    for (component, place) in (1..).zip(RESPONSE) {
+        let (found, error) = (values[place], errors[place]);
+        // Rounding leaves an error of 10⁻¹⁶ for a response of 1.
+        if !(found > MIN_SIGMA * error && found > 0.0) {
+            return Err(BiasError::Response {
+                component,
+                found,
+                error,
+            });
+        }
+    }
+    Ok(Estimate {
+        galaxies: fit::count(&total) as usize,
+        effective: total[WEIGHT] * total[WEIGHT] / total[WEIGHT2],
+        units: units.len(),
+        values,
+        errors,
+        assumes_no_c: [0, 1].map(|k| plan.known[k] == Known::OnlyM),
+    })
+}
+
+/// Standard errors from leaving out each unit: (n − 1)/n Σ (θ − ⟨θ⟩)².
+fn jackknife(plan: &Plan, total: &[f64], units: &[&[f64]]) -> Estimates {
+    let mut rest = vec![0.0; total.len()];
+    let left_out = units.iter().map(|unit| {
+        for ((rest, total), unit) in rest.iter_mut().zip(total).zip(*unit) {
+            *rest = total - unit;
+        }
+        plan.estimates(&rest)
+    });
+    let n = units.len() as f64;
+    squares(&left_out.collect::<Vec<_>>()).map(|sum| ((n - 1.0) / n * sum).sqrt())
+}
+
+/// Standard deviations over draws of as many units with replacement.
+fn bootstrap(plan: &Plan, units: &[&[f64]], draws: u32, seed: u64) -> Estimates {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut total = vec![0.0; units[0].len()];
+    let drawn = (0..draws).map(|_| {
+        total.fill(0.0);
+        for _ in units {
+            add(&mut total, units[rng.random_range(0..units.len())]);
+        }
+        plan.estimates(&total)
+    });
+    let drawn: Vec<Estimates> = drawn.collect();
+    squares(&drawn).map(|sum| (sum / (f64::from(draws) - 1.0)).sqrt())
+}
+
+/// Sums of squared deviations from the mean.
+fn squares(all: &[Estimates]) -> Estimates {
+    std::array::from_fn(|k| {
+        let mean = all.iter().map(|values| values[k]).sum::<f64>() / all.len() as f64;
+        all.iter().map(|values| (values[k] - mean).powi(2)).sum()
+    })
+}

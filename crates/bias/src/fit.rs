@@ -1,0 +1,225 @@
+//! The estimates that follow from sums.
+
+use crate::sums::{
+    COUNT, Component, Layout, MOST, ONE, OTHER, OWN, PSF, PSF_SIZE, SIZE, SQUARE, WEIGHT,
+};
+
+/// Places of the estimates in a list. The first eight are m and c of the components 1, 2, + and ×.
+pub(crate) const M: [usize; 4] = [0, 2, 4, 6];
+pub(crate) const C: [usize; 4] = [1, 3, 5, 7];
+pub(crate) const LEAKAGE: usize = 8;
+pub(crate) const LEAKAGE_OF: [usize; 2] = [9, 10];
+pub(crate) const SIZE_LEAKAGE: usize = 11;
+pub(crate) const QUADRATIC: [usize; 2] = [12, 13];
+pub(crate) const CROSS: [usize; 2] = [14, 15];
+pub(crate) const RESPONSE: [usize; 2] = [16, 17];
+/// Number of estimates.
+pub(crate) const ESTIMATES: usize = 18;
+
+/// Estimates; NaN for those that the data do not determine.
+pub(crate) type Estimates = [f64; ESTIMATES];
+
+/// Smallest pivot of a scaled matrix that counts as different from zero. The sums of up to 10⁹ rows have rounding
+/// errors below 10⁻¹²; shears that differ by 0.1 % of their mean leave a pivot of 10⁻⁶.
+const SMALLEST: f64 = 1e-9;
+
+/// Which of m and c the true shears determine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Known {
+    Both,
+    /// All shears are equal and not zero; c is assumed to be zero.
+    OnlyM,
+    /// All shears are zero or unknown.
+    OnlyC,
+}
+
+/// Which estimates the sums of all units determine.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Plan {
+    layout: Layout,
+    truth: bool,
+    pub(crate) known: [Known; 4],
+    quadratic: [bool; 2],
+    cross: [bool; 2],
+    leakage: bool,
+    size_leakage: bool,
+}
+
+impl Plan {
+    /// Of the sums of all units, with a known true shear or not.
+    pub(crate) fn new(layout: Layout, sums: &[f64], truth: bool) -> Self {
+        let extra = extra(layout, sums);
+        let mut plan = Plan {
+            layout,
+            truth,
+            known: [Known::OnlyC; 4],
+            quadratic: [false; 2],
+            cross: [false; 2],
+            leakage: false,
+            size_leakage: false,
+        };
+        for k in 0..layout.components() {
+            let of = layout.of(sums, k);
+            let extra = extra[k];
+            let zero = of.slope(OWN, OWN, extra) == 0.0;
+            plan.known[k] = match (truth && !zero, solve(&of, &[ONE, OWN], extra)) {
+                (false, _) => Known::OnlyC,
+                (true, Some(_)) => Known::Both,
+                (true, None) => Known::OnlyM,
+            };
+            if k < 2 && plan.known[k] == Known::Both {
+                plan.quadratic[k] = solve(&of, &[ONE, OWN, SQUARE], extra).is_some();
+                plan.cross[k] = solve(&of, &[ONE, OWN, OTHER], extra).is_some();
+            }
+        }
+        if layout.psf {
+            let of = |k| layout.of(sums, k);
+            let all = |terms: &[usize]| {
+                (0..2).all(|k| solve(&of(k), &plan.with(k, terms), extra[k]).is_some())
+            };
+            let (leakage, size_leakage) = (all(&[PSF]), all(&[PSF, PSF_SIZE]));
+            plan.leakage = leakage;
+            plan.size_leakage = leakage && size_leakage;
+        }
+        plan
+    }
+
+    /// The constant and, if m is determined, the shear, with more terms.
+    fn with(&self, k: usize, more: &[usize]) -> Vec<usize> {
+        let mut terms = vec![ONE];
+        if self.truth && self.known[k] == Known::Both {
+            terms.push(OWN);
+        }
+        terms.extend(more);
+        terms
+    }
+
+    /// The estimates of sums.
+    pub(crate) fn estimates(&self, sums: &[f64]) -> Estimates {
+        let layout = self.layout;
+        let extra = extra(layout, sums);
+        let mut found = [f64::NAN; ESTIMATES];
+        for k in 0..layout.components() {
+            let of = layout.of(sums, k);
+            let extra = extra[k];
+            match self.known[k] {
+                Known::Both => {
+                    if let Some([c, slope, ..]) = solve(&of, &[ONE, OWN], extra) {
+                        (found[M[k]], found[C[k]]) = (slope - 1.0, c);
+                    }
+                }
+                Known::OnlyM => {
+                    found[M[k]] = of.with_e[OWN] / of.slope(OWN, OWN, extra) - 1.0;
+                }
+                Known::OnlyC => found[C[k]] = of.with_e[ONE] / of.slope(ONE, ONE, extra),
+            }
+        }
+        for k in 0..2 {
+            let of = layout.of(sums, k);
+            found[RESPONSE[k]] = of.slope(ONE, ONE, extra[k]) / sums[WEIGHT];
+            let last = |terms: &[usize]| {
+                let solved = solve(&of, terms, extra[k]);
+                solved.map_or(f64::NAN, |x| x[terms.len() - 1])
+            };
+            if self.quadratic[k] {
+                found[QUADRATIC[k]] = last(&[ONE, OWN, SQUARE]);
+            }
+            if self.cross[k] {
+                found[CROSS[k]] = last(&[ONE, OWN, OTHER]);
+            }
+            if self.leakage {
+                found[LEAKAGE_OF[k]] = last(&self.with(k, &[PSF]));
+            }
+        }
+        if self.leakage {
+            found[LEAKAGE] = self.joint(sums, &[PSF]);
+        }
+        if self.size_leakage {
+            // Change of the leakage with a relative change of the size.
+            found[SIZE_LEAKAGE] = self.joint(sums, &[PSF, PSF_SIZE]) * sums[SIZE] / sums[WEIGHT];
+        }
+        found
+    }
+
+    /// The last of `more` terms, from both components: the mean weighted by what each component contributes.
+    fn joint(&self, sums: &[f64], more: &[usize]) -> f64 {
+        let (mut sum, mut weight) = (0.0, 0.0);
+        for (k, extra) in extra(self.layout, sums).into_iter().take(2).enumerate() {
+            let of = self.layout.of(sums, k);
+            if let Some((x, pivot)) = last_of(&of, &self.with(k, more), extra) {
+                sum += x * pivot;
+                weight += pivot;
+            }
+        }
+        sum / weight
+    }
+}
+
+/// Number of rows.
+pub(crate) fn count(sums: &[f64]) -> f64 {
+    sums[COUNT]
+}
+
+/// Mean response from sheared versions, per component.
+fn extra(layout: Layout, sums: &[f64]) -> [f64; 4] {
+    if !layout.versions {
+        return [0.0; 4];
+    }
+    let difference =
+        |k: usize| layout.version_mean(sums, 2 * k) - layout.version_mean(sums, 2 * k + 1);
+    let [a, b] = [difference(0), difference(1)];
+    [a, b, (a + b) / 2.0, (a + b) / 2.0]
+}
+
+type Solution = [f64; MOST];
+
+/// Solves Σ_t x_t Σ w R z_s z_t = Σ w e z_s over the given terms; `None` if the terms are not independent.
+fn solve(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<Solution> {
+    eliminate(of, terms, extra).map(|(x, _)| x)
+}
+
+/// The last unknown with its pivot, which is its weight in a mean.
+fn last_of(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(f64, f64)> {
+    eliminate(of, terms, extra).map(|(x, pivot)| (x[terms.len() - 1], pivot))
+}
+
+/// Gaussian elimination of a symmetric matrix without exchange of rows, after scaling its diagonal to ±1.
+fn eliminate(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(Solution, f64)> {
+    let n = terms.len();
+    let mut a = [[0.0; MOST + 1]; MOST];
+    let mut scale = [0.0; MOST];
+    for (i, &s) in terms.iter().enumerate() {
+        scale[i] = of.slope(s, s, extra).abs().sqrt();
+        if !(scale[i] > 0.0 && scale[i].is_finite()) {
+            return None;
+        }
+    }
+    for (i, &s) in terms.iter().enumerate() {
+        for (j, &t) in terms.iter().enumerate() {
+            a[i][j] = of.slope(s, t, extra) / (scale[i] * scale[j]);
+        }
+        a[i][n] = of.with_e[s] / scale[i];
+    }
+    for i in 0..n {
+        let pivot = a[i];
+        if pivot[i].abs() < SMALLEST {
+            return None;
+        }
+        for row in a.iter_mut().take(n).skip(i + 1) {
+            let factor = row[i] / pivot[i];
+            for (value, above) in row.iter_mut().zip(pivot).take(n + 1) {
+                *value -= factor * above;
+            }
+        }
+    }
+    let mut x = [0.0; MOST];
+    for i in (0..n).rev() {
+        let known: f64 = (i + 1..n).map(|j| a[i][j] * x[j]).sum();
+        x[i] = (a[i][n] - known) / a[i][i];
+    }
+    let pivot = a[n - 1][n - 1] * scale[n - 1] * scale[n - 1];
+    for (x, scale) in x.iter_mut().zip(scale).take(n) {
+        *x /= scale;
+    }
+    Some((x, pivot))
+}

@@ -1,0 +1,44 @@
+//! Multiplicative and additive bias of shear estimates, from sums that merge.
+//!
+//! For each component k the mean of the ellipticities e with weights w and responses R follows
+//!
+//! ```text
+//! e_k = R_k ((1 + m_k) g_k + c_k + α p_k + …) + noise
+//! ```
+//!
+//! with the true shear g and the ellipticity p of the PSF. The terms z = (1, g, p, …) are known without noise, but
+//! the response R of a galaxy is noisy. A least-squares fit on R z would therefore be biased. The estimates solve
+//!
+//! ```text
+//! Σ_t x_t Σ w R z_s z_t = Σ w e z_s   for each term s
+//! ```
+//!
+//! in which R enters linearly (an instrumental-variable estimator with instruments z). For two catalogues under ±γ
+//! this is (⟨e⟩₊/⟨R⟩₊ − ⟨e⟩₋/⟨R⟩₋)/2γ − 1. Weights enter both sides. If the weight depends on the shear, w R is
+//! replaced by d(w e)/dg = w R + e dw/dg.
+//!
+//! * [`Row`] and [`Layout`]: one galaxy, and the terms that are summed.
+//! * [`UnitSums`]: sums per unit and bin, in bounded memory; they merge.
+//! * [`Design`]: how catalogues belong together, recognised from their true shears.
+//! * [`estimate`]: values with errors; [`Verdict`]: comparison with a requirement.
+#![forbid(unsafe_code)]
+
+mod design;
+mod error;
+mod estimate;
+mod fit;
+mod sums;
+mod units;
+mod verdict;
+
+pub use design::{Catalogue, Design, Grouping, Range, group};
+pub use error::BiasError;
+pub use estimate::{Errors, Estimate, Measured, QUANTITIES, Quantity, estimate};
+pub use sums::{Layout, Row, VERSIONS, Version};
+pub use units::UnitSums;
+pub use verdict::{REQUIREMENTS, Requirement, Verdict, student_t, verdict};
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

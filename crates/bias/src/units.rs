@@ -1,0 +1,237 @@
+//! Sums per unit and bin, in bounded memory.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::BiasError;
+use crate::sums::{Layout, Row};
+
+/// Units that are kept, at least and at most, and per catalogue in between. A jackknife of 1000 units determines an
+/// error to 2 %.
+const FEWEST: usize = 2048;
+const PER_CATALOGUE: usize = 1024;
+const MOST: usize = 8192;
+
+/// Numbers that are kept, if that leaves at least [`FEW`] units: 64 MiB.
+const NUMBERS: usize = 1 << 23;
+const FEW: usize = 256;
+
+/// Sums per unit and bin.
+///
+/// A unit is named by its catalogue and a key: the number of a row, or the hash of an identifier. If there are too many
+/// units, neighbouring keys are joined, so the memory does not grow with the number of rows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct UnitSums {
+    layout: Layout,
+    bins: usize,
+    catalogues: usize,
+    /// Units have the same key after shifting it by so many bits.
+    shift: u32,
+    units: Vec<((u32, u64), Vec<f64>)>,
+    #[serde(skip)]
+    places: BTreeMap<(u32, u64), usize>,
+    #[serde(skip)]
+    last: Option<((u32, u64), usize)>,
+}
+
+impl UnitSums {
+    /// No rows yet, for so many bins and catalogues.
+    pub fn new(layout: Layout, bins: usize, catalogues: usize) -> Self {
+        UnitSums {
+            layout,
+            bins,
+            catalogues,
+            shift: 0,
+            units: Vec::new(),
+            places: BTreeMap::new(),
+            last: None,
+        }
+    }
+
+    /// Which sums there are.
+    pub fn layout(&self) -> Layout {
+        self.layout
+    }
+
+    /// Number of bins.
+    pub fn bins(&self) -> usize {
+        self.bins
+    }
+
+    /// Adds a galaxy.
+    ///
+    /// # Panics
+    /// If there is no such bin.
+    pub fn add(&mut self, catalogue: u32, key: u64, bin: usize, row: &Row) {
+        let layout = self.layout;
+        layout.add(self.sums(catalogue, key, bin), row);
+    }
+
+    /// Adds an ellipticity of the sheared version of number `version` in [`crate::VERSIONS`].
+    ///
+    /// # Panics
+    /// If there is no such bin or version.
+    pub fn add_version(
+        &mut self,
+        catalogue: u32,
+        key: u64,
+        bin: usize,
+        version: usize,
+        (e, weight): ([f64; 2], f64),
+    ) {
+        let layout = self.layout;
+        layout.add_version(self.sums(catalogue, key, bin), version, e, weight);
+    }
+
+    /// The sums of a unit and bin.
+    fn sums(&mut self, catalogue: u32, key: u64, bin: usize) -> &mut [f64] {
+        let unit = (catalogue, shifted(key, self.shift));
+        let place = match self.last {
+            Some((last, place)) if last == unit => place,
+            _ => self.place(catalogue, key),
+        };
+        let length = self.layout.len();
+        &mut self.units[place].1[bin * length..(bin + 1) * length]
+    }
+
+    /// Most units.
+    fn most(&self) -> usize {
+        let fit = NUMBERS / (self.bins * self.layout.len());
+        let most = (PER_CATALOGUE * self.catalogues).clamp(FEWEST, MOST);
+        most.min(fit.max(FEW))
+    }
+
+    fn place(&mut self, catalogue: u32, key: u64) -> usize {
+        let most = self.most();
+        let mut unit = (catalogue, shifted(key, self.shift));
+        if !self.places.contains_key(&unit) && self.units.len() >= most {
+            while self.units.len() >= most && self.shift < u64::BITS {
+                self.coarsen(self.shift + 1);
+            }
+            unit = (catalogue, shifted(key, self.shift));
+        }
+        let place = match self.places.get(&unit) {
+            Some(&place) => place,
+            None => {
+                self.units
+                    .push((unit, vec![0.0; self.bins * self.layout.len()]));
+                self.places.insert(unit, self.units.len() - 1);
+                self.units.len() - 1
+            }
+        };
+        self.last = Some((unit, place));
+        place
+    }
+
+    /// Joins units whose keys are equal after a larger shift.
+    fn coarsen(&mut self, shift: u32) {
+        let by = shift - self.shift;
+        self.shift = shift;
+        self.renamed(|(catalogue, key)| (catalogue, shifted(key, by)));
+    }
+
+    /// Gives units other names, and joins those with the same name. The order follows the names.
+    fn renamed(&mut self, name: impl Fn((u32, u64)) -> (u32, u64)) {
+        let mut joined: BTreeMap<(u32, u64), Vec<f64>> = BTreeMap::new();
+        for (unit, sums) in self.units.drain(..) {
+            match joined.entry(name(unit)) {
+                std::collections::btree_map::Entry::Vacant(free) => {
+                    free.insert(sums);
+                }
+                std::collections::btree_map::Entry::Occupied(mut there) => {
+                    add(there.get_mut(), &sums);
+                }
+            }
+        }
+        self.units = joined.into_iter().collect();
+        let places = self.units.iter().enumerate();
+        self.places = places.map(|(place, (unit, _))| (*unit, place)).collect();
+        self.last = None;
+    }
+
+    /// Adds the sums of other rows of the same catalogues.
+    ///
+    /// # Errors
+    /// If the sums differ in layout or bins.
+    pub fn merge(&mut self, mut other: UnitSums) -> Result<(), BiasError> {
+        if (self.layout, self.bins) != (other.layout, other.bins) {
+            return Err(BiasError::Unlike(format!(
+                "other columns or bins (found {:?} with {} bins, expected {:?} with {})",
+                other.layout, other.bins, self.layout, self.bins
+            )));
+        }
+        let length = self.bins * self.layout.len();
+        if let Some((_, sums)) = other.units.iter().find(|(_, sums)| sums.len() != length) {
+            return Err(BiasError::Unlike(format!(
+                "a unit of another length (found {} numbers, expected {length})",
+                sums.len()
+            )));
+        }
+        let shift = self.shift.max(other.shift);
+        self.catalogues = self.catalogues.max(other.catalogues);
+        self.coarsen(shift);
+        other.coarsen(shift);
+        self.units.append(&mut other.units);
+        self.renamed(|unit| unit);
+        let most = self.most();
+        while self.units.len() > most && self.shift < u64::BITS {
+            self.coarsen(self.shift + 1);
+        }
+        Ok(())
+    }
+
+    /// The same sums with a unit for each key, whatever the catalogue: the same row or identifier in all catalogues.
+    pub fn by_key(mut self) -> Self {
+        self.renamed(|(_, key)| (0, key));
+        self
+    }
+
+    /// The same sums with a unit for each group of catalogues.
+    pub fn by_group(mut self, group: impl Fn(u32) -> u32) -> Self {
+        self.renamed(|(catalogue, _)| (group(catalogue), 0));
+        self
+    }
+
+    /// The sums of each unit of a bin that has a galaxy.
+    pub(crate) fn of_bin(&self, bin: usize) -> Vec<&[f64]> {
+        let length = self.layout.len();
+        let of_bin = |sums: &'_ [f64]| bin * length..(bin + 1) * length.min(sums.len());
+        let all = self.units.iter().map(|(_, sums)| &sums[of_bin(sums)]);
+        all.filter(|sums| sums.iter().any(|sum| *sum != 0.0))
+            .collect()
+    }
+
+    /// The same sums with all bins joined to one.
+    pub fn all_bins(&self) -> Self {
+        let length = self.layout.len();
+        let joined = |sums: &Vec<f64>| {
+            let mut all = vec![0.0; length];
+            for bin in sums.chunks_exact(length) {
+                add(&mut all, bin);
+            }
+            all
+        };
+        UnitSums {
+            bins: 1,
+            units: self
+                .units
+                .iter()
+                .map(|(unit, sums)| (*unit, joined(sums)))
+                .collect(),
+            places: self.places.clone(),
+            last: None,
+            ..*self
+        }
+    }
+}
+
+fn shifted(key: u64, shift: u32) -> u64 {
+    key.checked_shr(shift).unwrap_or(0)
+}
+
+pub(crate) fn add(sums: &mut [f64], more: &[f64]) {
+    for (sum, more) in sums.iter_mut().zip(more) {
+        *sum += more;
+    }
+}

@@ -1,0 +1,554 @@
+//! Multiplicative and additive bias of catalogues of any program.
+//!
+//! [`Request`] specifies catalogues and options. [`sum`] reads the catalogues into sums that merge ([`Summed`]), and
+//! [`Summed::result`] estimates.
+
+pub mod columns;
+pub mod expression;
+mod read;
+pub mod truth;
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+use shearq_bias::{
+    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, UnitSums, estimate, group,
+};
+use shearq_files::FileError;
+use thiserror::Error;
+
+use columns::{Names, Preset, Role};
+use expression::Expression;
+use read::{Reading, Source};
+use truth::Truth;
+
+/// Why there is no result.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum BiasFailure {
+    /// A file.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// The data determine no bias.
+    #[error(transparent)]
+    Bias(#[from] BiasError),
+    /// The catalogues do not fit the options.
+    #[error("{0}")]
+    Data(String),
+}
+
+/// Bins of an expression of columns.
+#[derive(Debug, Clone)]
+pub struct Binning {
+    /// What is binned.
+    pub of: Expression,
+    /// The edges, or a number of bins with equally many galaxies.
+    pub edges: Edges,
+}
+
+/// Edges of bins.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Edges {
+    /// So many bins with equally many galaxies.
+    Equal(usize),
+    /// Increasing edges. The last bin contains its upper edge.
+    Given(Vec<f64>),
+}
+
+/// Which galaxies form an independent unit.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub enum Units {
+    /// Recognised from the columns and the design.
+    #[default]
+    Recognised,
+    /// The same rows of all catalogues.
+    Rows,
+    /// Whole catalogues, or groups of them.
+    Catalogues,
+    /// Galaxies with the same value in this column.
+    Column(String),
+}
+
+/// What is read, and how.
+#[derive(Debug, Clone)]
+pub struct Request {
+    /// Catalogues.
+    pub catalogues: Vec<PathBuf>,
+    /// Names of columns.
+    pub names: Names,
+    /// True shear.
+    pub truth: Truth,
+    /// Whether ellipticities are distortions; `None` if the names of the columns decide.
+    pub distortion: Option<bool>,
+    /// Whether the true g2 has the opposite sign.
+    pub flip_g2: bool,
+    /// Bins.
+    pub bins: Option<Binning>,
+    /// Rows that count.
+    pub select: Option<Expression>,
+    /// The design; recognised if `None`.
+    pub design: Option<Design>,
+    /// Units of the errors.
+    pub units: Units,
+    /// Whether rows with missing numbers are left out.
+    pub drop_missing: bool,
+    /// Artificial shear of metacalibration.
+    pub step: f64,
+}
+
+/// Sums of catalogues.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Summed {
+    version: String,
+    sums: UnitSums,
+    catalogues: Vec<Catalogue>,
+    program: String,
+    truth: bool,
+    /// Whether responses were read, or the type of the ellipticities was given.
+    response: bool,
+    /// Whether units are named by identifiers.
+    matched: bool,
+    design: Option<Design>,
+    by_key: Option<bool>,
+    /// Text of the binned expression.
+    binned: String,
+    edges: Vec<f64>,
+}
+
+/// Estimates of one bin.
+#[derive(Debug, Clone)]
+pub struct BinResult {
+    /// Lower and upper edge; `None` for all galaxies.
+    pub edges: Option<[f64; 2]>,
+    /// The estimates, or why there are none.
+    pub estimate: Result<Estimate, BiasError>,
+}
+
+/// Estimates of all galaxies and of bins.
+#[derive(Debug, Clone)]
+#[non_exhaustive]
+pub struct BiasResult {
+    /// All galaxies first, then each bin.
+    pub bins: Vec<BinResult>,
+    /// What the bins are bins of.
+    pub binned: String,
+    /// The design.
+    pub design: Design,
+    /// What a unit is.
+    pub unit: &'static str,
+    /// Whether errors may be too large, because rows of catalogues do not correspond.
+    pub misaligned: bool,
+    /// The catalogues.
+    pub catalogues: Vec<Catalogue>,
+    /// The program that wrote them.
+    pub program: String,
+}
+
+impl BiasResult {
+    /// The estimates of all galaxies.
+    ///
+    /// # Errors
+    /// If there are none.
+    pub fn all(&self) -> Result<&Estimate, BiasError> {
+        let first = self.bins.first().map(|bin| bin.estimate.as_ref());
+        first
+            .unwrap_or(Err(&BiasError::NoGalaxies))
+            .map_err(Clone::clone)
+    }
+}
+
+/// Most values from which the edges of bins with equally many galaxies are determined.
+const SAMPLE: usize = 1 << 20;
+
+/// Most bins.
+pub const MOST_BINS: usize = 100;
+
+impl Request {
+    fn reading(&self) -> Reading {
+        Reading {
+            names: self.names.clone(),
+            truth: self.truth.clone(),
+            distortion: self.distortion,
+            flip_g2: self.flip_g2,
+            select: self.select.clone(),
+            binned: self.bins.as_ref().map(|bins| bins.of.clone()),
+            drop_missing: self.drop_missing,
+            step: self.step,
+            neighbours: self.design == Some(Design::Rotated) && self.catalogues.len() == 1,
+            unit: match &self.units {
+                Units::Recognised => None,
+                Units::Column(name) => Some(name.clone()),
+                Units::Rows | Units::Catalogues => Some(String::new()),
+            },
+        }
+    }
+}
+
+/// Sums the catalogues of a request for which `part` holds, given their number.
+///
+/// # Errors
+/// If a catalogue cannot be read, lacks a column, or contains values that are not usable.
+pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
+    read::distinct(&request.catalogues)?;
+    let reading = request.reading();
+    let mut all: Vec<Vec<Source>> = Vec::new();
+    for path in &request.catalogues {
+        all.push(read::sources(path, &reading)?);
+    }
+    let first = &all[0][0];
+    let layout = Layout {
+        psf: first.has_psf(),
+        versions: first.has_version_rows() || first.selects_versions(&reading),
+    };
+    let (truth, response) = (known(&request.truth, first), has_response(first));
+    for (path, sources) in request.catalogues.iter().zip(&all) {
+        let fits = |source: &Source| {
+            known(&request.truth, source) == truth
+                && has_response(source) == response
+                && source.has_psf() == layout.psf
+                && source.columns.preset == first.columns.preset
+        };
+        if !sources.iter().all(fits) {
+            return Err(BiasFailure::Data(format!(
+                "{}: its columns are not the columns of {} (expected the same columns for truth, response and PSF in all catalogues). Try: one command per kind of catalogue",
+                path.display(),
+                request.catalogues[0].display()
+            )));
+        }
+    }
+    let edges = match &request.bins {
+        None => Vec::new(),
+        Some(bins) => match &bins.edges {
+            Edges::Given(edges) => edges.clone(),
+            Edges::Equal(count) => equal_edges(request, &reading, &all, *count)?,
+        },
+    };
+    // The last bin is of galaxies outside of the edges.
+    let bins = edges.len().max(1);
+    let mut sums = UnitSums::new(layout, bins, request.catalogues.len());
+    let mut catalogues = Vec::new();
+    for (number, (path, sources)) in request.catalogues.iter().zip(&all).enumerate() {
+        if !part(number) {
+            catalogues.push(Catalogue {
+                name: path.display().to_string(),
+                ..Catalogue::default()
+            });
+            continue;
+        }
+        let selects = sources[0].selects_versions(&reading);
+        catalogues.push(read::rows(path, &reading, sources, |item| {
+            let number = number as u32;
+            let row = &item.row;
+            let scaled = row.e.map(|e| e / (2.0 * request.step));
+            if let Some(version) = item.version {
+                if let Some(bin) = bin_of(&edges, item.binned[0]) {
+                    sums.add_version(number, item.key, bin, version, (scaled, row.weight));
+                }
+                return Ok(());
+            }
+            if let Some(bin) = bin_of(&edges, item.binned[0]) {
+                sums.add(number, item.key, bin, row);
+            }
+            if selects {
+                for (version, value) in item.binned[1..].iter().enumerate() {
+                    if let Some(bin) = bin_of(&edges, *value) {
+                        sums.add_version(number, item.key, bin, version, (scaled, row.weight));
+                    }
+                }
+            }
+            Ok(())
+        })?);
+    }
+    let named_unit = matches!(request.units, Units::Column(_))
+        || request.units == Units::Recognised && first.columns.of(Role::Unit).is_some();
+    Ok(Summed {
+        version: env!("CARGO_PKG_VERSION").into(),
+        sums,
+        catalogues,
+        program: first.columns.preset.name().into(),
+        truth,
+        response: response || request.distortion.is_some(),
+        matched: named_unit || first.columns.of(Role::Id).is_some(),
+        design: request.design,
+        by_key: match request.units {
+            Units::Rows | Units::Column(_) => Some(true),
+            Units::Catalogues => Some(false),
+            Units::Recognised => named_unit.then_some(true),
+        },
+        binned: request
+            .bins
+            .as_ref()
+            .map_or_else(String::new, |bins| bins.of.text().to_owned()),
+        edges,
+    })
+}
+
+/// Whether the true shear is known.
+fn known(truth: &Truth, source: &Source) -> bool {
+    !matches!(truth, Truth::Columns) || source.columns.have(&[Role::G1, Role::G2])
+}
+
+/// Whether the catalogue has responses.
+fn has_response(source: &Source) -> bool {
+    source.has_version_rows()
+        || source.columns.preset == Preset::Metacal
+        || source.columns.have(&[Role::R11])
+}
+
+/// The bin of a value; the last one is outside of all edges. `None` for a row that is not selected.
+fn bin_of(edges: &[f64], value: f64) -> Option<usize> {
+    if !value.is_finite() {
+        return None;
+    }
+    let Some((last, _)) = edges.split_last() else {
+        return Some(0);
+    };
+    let outside = edges.len() - 1;
+    if value == *last {
+        return Some(outside - 1);
+    }
+    let above = edges.partition_point(|edge| *edge <= value);
+    Some(if above == 0 { outside } else { above - 1 })
+}
+
+/// Edges of bins with equally many galaxies without artificial shear, from a sample of the catalogues.
+fn equal_edges(
+    request: &Request,
+    reading: &Reading,
+    all: &[Vec<Source>],
+    count: usize,
+) -> Result<Vec<f64>, BiasFailure> {
+    let (mut values, mut stride, mut number) = (Vec::new(), 1u64, 0u64);
+    for (path, sources) in request.catalogues.iter().zip(all) {
+        read::rows(path, reading, sources, |item| {
+            if item.version.is_none() && item.binned[0].is_finite() {
+                if number % stride == 0 {
+                    values.push(item.binned[0]);
+                }
+                number += 1;
+            }
+            if values.len() > SAMPLE {
+                // Every second value of the sample remains.
+                let mut odd = false;
+                values.retain(|_| {
+                    odd = !odd;
+                    odd
+                });
+                stride *= 2;
+            }
+            Ok(())
+        })?;
+    }
+    values.sort_unstable_by(f64::total_cmp);
+    let (Some(low), Some(high)) = (values.first(), values.last()) else {
+        return Err(BiasError::NoGalaxies.into());
+    };
+    let mut edges = vec![*low];
+    edges.extend((1..count).map(|k| values[k * values.len() / count]));
+    edges.push(*high);
+    if !edges.windows(2).all(|pair| pair[0] < pair[1]) {
+        return Err(BiasFailure::Data(format!(
+            "--bins: `{}` has too few different values for {count} bins with equally many galaxies. Try: fewer bins or given edges",
+            reading.binned.as_ref().map_or("", Expression::text)
+        )));
+    }
+    // A sample may lack the extreme values.
+    if stride > 1 {
+        edges[0] = f64::MIN;
+        edges[count] = f64::MAX;
+    }
+    Ok(edges)
+}
+
+impl Summed {
+    /// Checks sums that were read from a file.
+    ///
+    /// # Errors
+    /// If their parts contradict each other.
+    pub fn checked(mut self) -> Result<Self, BiasFailure> {
+        let bins = self.edges.len().max(1);
+        let mut sums = UnitSums::new(self.sums.layout(), bins, self.catalogues.len());
+        sums.merge(self.sums)?;
+        self.sums = sums;
+        Ok(self)
+    }
+
+    /// Adds the sums of other catalogues of the same list.
+    ///
+    /// # Errors
+    /// If the lists, options or columns differ, or a catalogue is in both.
+    pub fn merge(&mut self, other: Summed) -> Result<(), BiasFailure> {
+        let unlike = |what: &str| {
+            let message = format!("the sums do not belong together: they have {what}");
+            Err(BiasFailure::Data(message))
+        };
+        if self.version != other.version {
+            return unlike("different versions");
+        }
+        let names = |all: &[Catalogue]| -> Vec<String> {
+            all.iter().map(|catalogue| catalogue.name.clone()).collect()
+        };
+        if names(&self.catalogues) != names(&other.catalogues) {
+            return unlike("different lists of catalogues");
+        }
+        if (&self.binned, &self.edges) != (&other.binned, &other.edges)
+            || (self.truth, self.matched, self.design, self.by_key)
+                != (other.truth, other.matched, other.design, other.by_key)
+        {
+            return unlike("different options");
+        }
+        for (own, more) in self.catalogues.iter_mut().zip(other.catalogues) {
+            match (own.rows, more.rows) {
+                (0, _) => *own = more,
+                (_, 0) => {}
+                _ => {
+                    return Err(BiasFailure::Data(format!(
+                        "{}: the catalogue is in two files of sums",
+                        own.name
+                    )));
+                }
+            }
+        }
+        Ok(self.sums.merge(other.sums)?)
+    }
+
+    /// Catalogues without rows, because their shards are absent.
+    pub fn absent(&self) -> Vec<&str> {
+        let empty = self.catalogues.iter().filter(|own| own.rows == 0);
+        empty.map(|own| own.name.as_str()).collect()
+    }
+
+    /// The estimates.
+    ///
+    /// # Errors
+    /// If no galaxy counts, an ellipticity is constant, the mean response is too close to zero, or the ellipticities do
+    /// not follow the true shear.
+    pub fn result(self, errors: Errors) -> Result<BiasResult, BiasFailure> {
+        self.check_values()?;
+        let design = self
+            .design
+            .unwrap_or_else(|| Design::of(&self.catalogues, self.truth));
+        let Grouping {
+            sums,
+            unit,
+            misaligned,
+        } = group(
+            self.sums,
+            &self.catalogues,
+            design,
+            self.by_key,
+            self.matched,
+        );
+        let all = estimate(&sums.all_bins(), 0, self.truth, errors)?;
+        check_slopes(&all, self.response)?;
+        let mut bins = vec![BinResult {
+            edges: None,
+            estimate: Ok(all),
+        }];
+        for (bin, edges) in self.edges.windows(2).enumerate() {
+            bins.push(BinResult {
+                edges: Some([edges[0], edges[1]]),
+                estimate: estimate(&sums, bin, self.truth, errors),
+            });
+        }
+        Ok(BiasResult {
+            bins,
+            binned: self.binned,
+            design,
+            unit,
+            misaligned,
+            catalogues: self.catalogues,
+            program: self.program,
+        })
+    }
+
+    /// Refuses catalogues without usable rows, and constant ellipticities.
+    fn check_values(&self) -> Result<(), BiasFailure> {
+        let total = |of: fn(&Catalogue) -> u64| self.catalogues.iter().map(of).sum::<u64>();
+        let rows = total(|c| c.rows);
+        let (flagged, unweighted) = (total(|c| c.flagged), total(|c| c.unweighted));
+        let (unselected, missing) = (total(|c| c.unselected), total(|c| c.missing));
+        let used = rows.saturating_sub(flagged + unweighted + unselected + missing);
+        if used == 0 {
+            return Err(BiasFailure::Data(format!(
+                "no galaxy can be used (found {rows} rows: {flagged} with a flag, {unweighted} with a weight of zero or less, {unselected} not selected, {missing} with missing numbers)"
+            )));
+        }
+        for k in 0..2 {
+            let ranges = self.catalogues.iter().filter(|c| c.rows > 0);
+            let (low, high) = ranges.fold((f64::MAX, f64::MIN), |(low, high), c| {
+                let own = c.ellipticity[k];
+                (low.min(own.low), high.max(own.high))
+            });
+            if used > 1 && low == high {
+                return Err(BiasFailure::Data(format!(
+                    "e{} is {low} in all {used} rows (expected different values)",
+                    k + 1
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Significance at which an implausible slope is refused.
+const SIGNIFICANT: f64 = 5.0;
+
+/// Refuses ellipticities that follow minus the true shear, or do not follow it, and distortions without responses.
+fn check_slopes(all: &Estimate, response: bool) -> Result<(), BiasFailure> {
+    let slopes = ["m1", "m2"].map(|key| {
+        let m = all.value(key).filter(|m| m.error.is_finite())?;
+        Some((1.0 + m.value, SIGNIFICANT * m.error))
+    });
+    let negative = slopes.map(|slope| slope.is_some_and(|(slope, error)| slope + error < 0.0));
+    let shown = |k: usize| slopes[k].map_or(f64::NAN, |(slope, _)| slope);
+    let refused = |text: String| Err(BiasFailure::Data(text));
+    match negative {
+        [false, false] => {}
+        [false, true] => {
+            return refused(format!(
+                "e2 follows minus the true g2 (found a slope of {:.3}, expected about 1). Try: --flip-g2",
+                shown(1)
+            ));
+        }
+        [true, _] => {
+            return refused(format!(
+                "e1 follows minus the true g1 (found a slope of {:.3}, expected about 1). Try: check the sign of the truth",
+                shown(0)
+            ));
+        }
+    }
+    let known = || slopes.iter().flatten();
+    // A response below 0.1 is no calibration error: rows and true shears do not belong together.
+    if known().count() > 0 && known().all(|(slope, error)| slope + error < 0.1) {
+        return refused(format!(
+            "the ellipticities do not follow the true shear (found slopes of {:.3} and {:.3}, expected about 1). Try: check the order of the rows, or join by id",
+            shown(0),
+            shown(1)
+        ));
+    }
+    // A distortion responds by 2 (1 − ⟨χ²⟩/2), which is 1.6 to 2 for galaxies.
+    let like = |(slope, error): &(f64, f64)| (1.5..2.1).contains(slope) && slope - error > 1.3;
+    if !response && known().count() > 0 && known().all(like) {
+        return refused(format!(
+            "the ellipticities look like distortions (found slopes of {:.3} and {:.3}, expected about 1). Try: --ellipticity distortion, or --ellipticity shear to keep them",
+            shown(0),
+            shown(1)
+        ));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bins_contain_their_lower_edges_and_the_last_its_upper_edge() {
+        let edges = [1.0, 2.0, 4.0];
+        let bins = [0.5, 1.0, 1.9, 2.0, 4.0, 4.1].map(|value| bin_of(&edges, value));
+        assert_eq!(bins, [2, 0, 0, 1, 1, 2].map(Some));
+        assert_eq!(bin_of(&[], 3.0), Some(0));
+        assert_eq!(bin_of(&edges, f64::INFINITY), None);
+    }
+}

@@ -1,0 +1,599 @@
+//! Rows of catalogues, as the sums need them.
+
+use std::borrow::Cow;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use shearq_bias::{Catalogue, Row, VERSIONS};
+use shearq_files::FileError;
+use shearq_files::frames::polars::DataFrame;
+use shearq_files::table::{self, Place};
+use shearq_quantities::Distortion;
+
+use super::columns::{Columns, Names, Preset, Role};
+use super::expression::Expression;
+use super::truth::{self, Truth};
+
+/// How catalogues are read.
+#[derive(Debug, Clone)]
+pub(super) struct Reading {
+    pub(super) names: Names,
+    pub(super) truth: Truth,
+    pub(super) distortion: Option<bool>,
+    pub(super) flip_g2: bool,
+    pub(super) select: Option<Expression>,
+    /// What the bins are bins of.
+    pub(super) binned: Option<Expression>,
+    pub(super) drop_missing: bool,
+    /// Artificial shear of metacalibration.
+    pub(super) step: f64,
+    /// Whether two neighbouring rows form a unit.
+    pub(super) neighbours: bool,
+    /// Column that names the unit; `None` for the recognised one, empty for none.
+    pub(super) unit: Option<String>,
+}
+
+/// Versions of a catalogue: the unsheared one and [`VERSIONS`].
+const COUNT: usize = 1 + VERSIONS.len();
+
+/// A row that counts.
+pub(super) struct Item {
+    /// Unit.
+    pub(super) key: u64,
+    /// The version of the row; `None` without artificial shear.
+    pub(super) version: Option<usize>,
+    pub(super) row: Row,
+    /// The binned quantity in the row, and under each version that has it; NaN if the row is not selected.
+    pub(super) binned: [f64; COUNT],
+}
+
+/// A table of a catalogue with its columns.
+pub(super) struct Source {
+    place: Place,
+    /// The version of all rows, if a FITS file has one table per version.
+    version: Option<Option<usize>>,
+    pub(super) columns: Columns,
+    /// Names of all columns that are read.
+    wanted: Vec<String>,
+    /// Places of the columns of expressions among them: of the rows, and under each version.
+    selected: Vec<Option<Vec<usize>>>,
+    binned: Vec<Option<Vec<usize>>>,
+}
+
+impl Source {
+    /// Whether the selection is also known for each sheared version, so that its response follows.
+    pub(super) fn selects_versions(&self, reading: &Reading) -> bool {
+        let all = |places: &[Option<Vec<usize>>]| places.iter().all(Option::is_some);
+        self.columns.preset == Preset::Metacal
+            && (reading.select.is_some() || reading.binned.is_some())
+            && all(&self.selected)
+            && all(&self.binned)
+    }
+
+    /// Whether rows belong to versions.
+    pub(super) fn has_version_rows(&self) -> bool {
+        self.version.is_some() || self.columns.of(Role::Version).is_some()
+    }
+
+    /// Whether rows have the ellipticity of the PSF.
+    pub(super) fn has_psf(&self) -> bool {
+        self.columns.have(&[Role::Psf1, Role::Psf2])
+    }
+
+    /// Column that names the unit.
+    fn unit<'a>(&'a self, reading: &'a Reading) -> Option<&'a str> {
+        match &reading.unit {
+            Some(name) if name.is_empty() => None,
+            Some(name) => Some(name),
+            None => self.columns.of(Role::Unit),
+        }
+    }
+}
+
+/// Finds the tables of a catalogue and their columns.
+pub(super) fn sources(path: &Path, reading: &Reading) -> Result<Vec<Source>, FileError> {
+    let place = Place::of(path);
+    let found = table::columns(&place)?;
+    let version = |name: &str| {
+        let sheared = VERSIONS.iter().position(|(known, _)| *known == name);
+        match (name, sheared) {
+            ("noshear", _) => Some(None),
+            (_, Some(number)) => Some(Some(number)),
+            _ => None,
+        }
+    };
+    let mut tables = Vec::new();
+    for list in &found.named {
+        let Some((number, shown)) = list.table.as_ref().filter(|_| place.table.is_none()) else {
+            continue;
+        };
+        let name = shown.split('`').nth(1).unwrap_or_default();
+        if let Some(version) = version(&name.to_ascii_lowercase()) {
+            let place = Place {
+                path: place.path.clone(),
+                table: Some(number.to_string()),
+            };
+            tables.push(source(place, Some(version), &list.names, reading)?);
+        }
+    }
+    if tables.len() == COUNT {
+        return Ok(tables);
+    }
+    let lists = || {
+        found
+            .named
+            .iter()
+            .filter(|list| !list.doubtful || found.named.len() == 1)
+    };
+    let one = lists()
+        .find(|list| Columns::find(path, &list.names, &reading.names).is_ok())
+        .or_else(|| lists().next());
+    let Some(list) = one else {
+        return Err(FileError::new(
+            path,
+            format!(
+                "the columns have no names (found {} fields, expected a header such as `e1,e2`). Try: write a first line with names",
+                found.unnamed.len()
+            ),
+        ));
+    };
+    let place = match (&place.table, &list.table) {
+        (None, Some((number, _))) => Place {
+            table: Some(number.to_string()),
+            ..place
+        },
+        _ => place,
+    };
+    Ok(vec![source(place, None, &list.names, reading)?])
+}
+
+fn source(
+    place: Place,
+    version: Option<Option<usize>>,
+    names: &[String],
+    reading: &Reading,
+) -> Result<Source, FileError> {
+    let columns = Columns::find(&place.path, names, &reading.names)?;
+    let skipped = |role: &Role| match role {
+        Role::G1 | Role::G2 => !matches!(reading.truth, Truth::Columns),
+        Role::Unit => true,
+        _ => false,
+    };
+    let all = columns.all().filter(|(role, _)| !skipped(role));
+    let mut wanted: Vec<String> = Vec::new();
+    for (_, name) in all {
+        if !wanted.iter().any(|own| own == name) {
+            wanted.push(name.to_owned());
+        }
+    }
+    let mut place_of = |name: &str| -> Option<usize> {
+        if !names.iter().any(|own| own == name) {
+            return None;
+        }
+        let known = wanted.iter().position(|own| own == name);
+        Some(known.unwrap_or_else(|| {
+            wanted.push(name.to_owned());
+            wanted.len() - 1
+        }))
+    };
+    let mut places =
+        |expression: &Option<Expression>| -> Result<Vec<Option<Vec<usize>>>, FileError> {
+            let Some(expression) = expression else {
+                return Ok(vec![Some(Vec::new()); COUNT]);
+            };
+            let mut own = Vec::new();
+            for name in expression.columns() {
+                let found = place_of(name).or_else(|| place_of(&format!("{name}_noshear")));
+                own.push(found.ok_or_else(|| FileError::no_column(&place.path, name, names))?);
+            }
+            let mut all = vec![Some(own)];
+            for (version, _) in VERSIONS {
+                let sheared = |name: &String| {
+                    let base = name.strip_suffix("_noshear").unwrap_or(name);
+                    place_of(&format!("{base}_{version}"))
+                };
+                all.push(expression.columns().iter().map(sheared).collect());
+            }
+            Ok(all)
+        };
+    let (selected, binned) = (places(&reading.select)?, places(&reading.binned)?);
+    let mut source = Source {
+        place,
+        version,
+        columns,
+        wanted: Vec::new(),
+        selected,
+        binned,
+    };
+    if let Some(unit) = source.unit(reading) {
+        if !names.iter().any(|own| own == unit) {
+            return Err(FileError::no_column(&source.place.path, unit, names));
+        }
+        if !wanted.iter().any(|own| own == unit) {
+            wanted.push(unit.to_owned());
+        }
+    }
+    source.wanted = wanted;
+    Ok(source)
+}
+
+/// Reads the rows of a catalogue and gives those that count to `take`, with a description of the catalogue.
+pub(super) fn rows(
+    path: &Path,
+    reading: &Reading,
+    sources: &[Source],
+    mut take: impl FnMut(&Item) -> Result<(), FileError>,
+) -> Result<Catalogue, FileError> {
+    let mut about = Catalogue {
+        name: path.display().to_string(),
+        ..Catalogue::default()
+    };
+    let constant = reading.truth.of_catalogue(path)?;
+    // Rows of each version so far.
+    let mut counts = [0u64; COUNT];
+    for source in sources {
+        let divisor = match source.columns.preset {
+            Preset::Shearq => mean_response(source)?,
+            _ => [1.0; 2],
+        };
+        let wanted: Vec<&str> = source.wanted.iter().map(String::as_str).collect();
+        let mut first = 0;
+        table::read_parts(&source.place, &wanted, |frame| {
+            let part = Part::new(source, reading, &frame, constant, divisor)?;
+            for at in 0..part.rows {
+                part.row(at, first + at, &mut counts, &mut about, &mut take)?;
+            }
+            first += part.rows;
+            Ok(())
+        })?;
+    }
+    about.rows = counts[0];
+    Ok(about)
+}
+
+/// Mean responses of the good rows of a catalogue by shearq: its ellipticities are divided by them. 1 if there are
+/// none.
+fn mean_response(source: &Source) -> Result<[f64; 2], FileError> {
+    let names = [Role::E1, Role::R11, Role::R22].map(|role| source.columns.of(role).unwrap_or(""));
+    let (mut sums, mut count) = ([0.0; 2], 0.0);
+    table::read_parts(&source.place, &names, |frame| {
+        let column = |name| table::numbers(&frame, name, &source.place.path);
+        let [e1, r11, r22] = [column(names[0])?, column(names[1])?, column(names[2])?];
+        for row in 0..e1.len() {
+            if e1[row].is_finite() {
+                count += 1.0;
+                sums[0] += r11[row];
+                sums[1] += r22[row];
+            }
+        }
+        Ok(())
+    })?;
+    let means = sums.map(|sum| sum / count);
+    Ok(match means.iter().all(|mean| mean.is_finite()) {
+        true => means,
+        false => [f64::NAN; 2],
+    })
+}
+
+/// Columns of some rows.
+struct Part<'a> {
+    source: &'a Source,
+    reading: &'a Reading,
+    rows: usize,
+    columns: Vec<Cow<'a, [f64]>>,
+    /// Places of the columns of roles.
+    places: Places,
+    versions: Option<Vec<Option<usize>>>,
+    unit: Option<usize>,
+    constant: Option<[f64; 2]>,
+    divisor: [f64; 2],
+    distortion: bool,
+}
+
+/// Place of the column of each role.
+#[derive(Default)]
+struct Places {
+    e: [usize; 2],
+    weight: Option<usize>,
+    response: Option<[usize; 2]>,
+    derivative: Option<[usize; 2]>,
+    flag: Option<usize>,
+    shear: Option<[usize; 2]>,
+    psf: Option<[usize; 2]>,
+    psf_size: Option<usize>,
+    id: Option<usize>,
+    sheared: Option<[[usize; 2]; 2]>,
+}
+
+impl Places {
+    fn of(source: &Source) -> Self {
+        let place = |role| {
+            let name = source.columns.of(role)?;
+            source.wanted.iter().position(|own| own == name)
+        };
+        let pair = |a, b| Some([place(a)?, place(b)?]);
+        let sheared = || {
+            let (one, two) = (pair(Role::E1p, Role::E1m)?, pair(Role::E2p, Role::E2m)?);
+            Some([one, two])
+        };
+        Places {
+            e: pair(Role::E1, Role::E2).unwrap_or_default(),
+            weight: place(Role::Weight),
+            response: pair(Role::R11, Role::R22),
+            derivative: pair(Role::Dw1, Role::Dw2),
+            flag: place(Role::Flag),
+            shear: pair(Role::G1, Role::G2),
+            psf: pair(Role::Psf1, Role::Psf2),
+            psf_size: place(Role::PsfSize),
+            id: place(Role::Id),
+            sheared: sheared(),
+        }
+    }
+}
+
+impl<'a> Part<'a> {
+    fn new(
+        source: &'a Source,
+        reading: &'a Reading,
+        frame: &'a DataFrame,
+        constant: Option<[f64; 2]>,
+        divisor: [f64; 2],
+    ) -> Result<Self, FileError> {
+        let path = &source.place.path;
+        let version = source.columns.of(Role::Version);
+        let mut columns = Vec::new();
+        for name in &source.wanted {
+            columns.push(match Some(name.as_str()) == version {
+                true => Cow::Borrowed(&[][..]),
+                false => table::numbers(frame, name, path)?,
+            });
+        }
+        let versions = version
+            .map(|name| versions(frame, name, path))
+            .transpose()?;
+        let unit = source.unit(reading);
+        Ok(Part {
+            source,
+            reading,
+            rows: frame.height(),
+            columns,
+            places: Places::of(source),
+            versions,
+            unit: unit.and_then(|name| source.wanted.iter().position(|own| own == name)),
+            constant,
+            divisor,
+            distortion: reading.distortion.unwrap_or(source.columns.distortion),
+        })
+    }
+
+    fn value(&self, column: usize, at: usize) -> f64 {
+        self.columns[column][at]
+    }
+
+    fn pair(&self, columns: [usize; 2], at: usize) -> [f64; 2] {
+        columns.map(|column| self.columns[column][at])
+    }
+
+    /// Gives a row to `take` if it counts. `number` counts rows of the table from 0.
+    fn row(
+        &self,
+        at: usize,
+        number: usize,
+        counts: &mut [u64; COUNT],
+        about: &mut Catalogue,
+        take: &mut impl FnMut(&Item) -> Result<(), FileError>,
+    ) -> Result<(), FileError> {
+        let places = &self.places;
+        let version = match (&self.versions, self.source.version) {
+            (Some(versions), _) => versions[at],
+            (None, version) => version.flatten(),
+        };
+        let count = &mut counts[version.map_or(0, |version| version + 1)];
+        let index = *count;
+        *count += 1;
+        let own = version.is_none();
+        if places.flag.is_some_and(|flag| self.value(flag, at) != 0.0) {
+            about.flagged += u64::from(own);
+            return Ok(());
+        }
+        let weight = places.weight.map_or(1.0, |weight| self.value(weight, at));
+        if weight <= 0.0 {
+            about.unweighted += u64::from(own);
+            return Ok(());
+        }
+        let fault = |what: String| {
+            let row = number + 1;
+            FileError::new(&self.source.place.path, format!("row {row}: {what}"))
+        };
+        let binned = self.binned(at);
+        if binned[0].is_infinite() {
+            about.unselected += u64::from(own);
+            if binned[1..].iter().all(|value| value.is_infinite()) {
+                return Ok(());
+            }
+        }
+        let Some((e, slope)) = self.shape(at, weight) else {
+            // A distortion above 1 has no shear.
+            about.flagged += u64::from(own);
+            return Ok(());
+        };
+        let psf = places.psf.map_or([0.0; 2], |psf| self.pair(psf, at));
+        let psf_size = places.psf_size.map_or(1.0, |size| self.value(size, at));
+        let (slopes, psfs) = (slope[0] + slope[1], psf[0] + psf[1] + psf_size);
+        let expression = if binned[0].is_nan() { f64::NAN } else { 0.0 };
+        // A sum is finite only if all of its terms are.
+        if !(e[0] + e[1] + weight + slopes + psfs + expression).is_finite() {
+            if self.reading.drop_missing {
+                about.missing += u64::from(own);
+                return Ok(());
+            }
+            let checked = [
+                ("e1", e[0]),
+                ("e2", e[1]),
+                ("the weight", weight),
+                ("the response or its derivative", slopes),
+                ("the PSF's ellipticity or size", psfs),
+                ("the expression of --select or --bins", expression),
+            ];
+            let found = checked.iter().find(|(_, value)| !value.is_finite());
+            let (what, value) = found.unwrap_or(&("a number", f64::NAN));
+            return Err(fault(format!(
+                "{what} is {value} in a row without a flag (expected a number). Try: --drop-missing"
+            )));
+        }
+        let mut g = self.truth(at).map_err(&fault)?;
+        truth::check(g).map_err(&fault)?;
+        if self.reading.flip_g2 {
+            g[1] = -g[1];
+        }
+        if own {
+            for k in 0..2 {
+                about.shear[k].add(g[k]);
+                about.ellipticity[k].add(e[k]);
+            }
+        }
+        take(&Item {
+            key: self.key(at, index),
+            version,
+            row: Row {
+                e,
+                weight,
+                slope,
+                g,
+                psf,
+                psf_size,
+            },
+            binned,
+        })
+    }
+
+    /// The ellipticity, and the derivative of the weighted ellipticity with shear.
+    fn shape(&self, at: usize, weight: f64) -> Option<([f64; 2], [f64; 2])> {
+        let places = &self.places;
+        let mut e = self.pair(places.e, at);
+        if self.distortion && e.iter().all(|e| e.is_finite()) {
+            let shear = Distortion::new(e[0], e[1]).to_shear()?;
+            e = [shear.e1, shear.e2];
+        }
+        if self.source.has_version_rows() {
+            // The response follows from the versions.
+            return Some((e, [0.0; 2]));
+        }
+        let step = 2.0 * self.reading.step;
+        let response = if let Some(sheared) = places.sheared {
+            sheared.map(|[plus, minus]| (self.value(plus, at) - self.value(minus, at)) / step)
+        } else if let Some(response) = places.response.filter(|_| !self.divisor[0].is_nan()) {
+            let response = self.pair(response, at);
+            [0, 1].map(|k| response[k] / self.divisor[k])
+        } else {
+            [1.0; 2]
+        };
+        let derivative = places.derivative.map_or([0.0; 2], |d| self.pair(d, at));
+        Some((
+            e,
+            [0, 1].map(|k| weight * response[k] + e[k] * derivative[k]),
+        ))
+    }
+
+    /// The binned quantity in the row, and under each version. Infinity if the row is not selected; NaN if a number is
+    /// missing.
+    fn binned(&self, at: usize) -> [f64; COUNT] {
+        if self.reading.select.is_none() && self.reading.binned.is_none() {
+            return [0.0; COUNT];
+        }
+        let of = |expression: &Option<Expression>, places: &Option<Vec<usize>>, without: f64| match (
+            expression, places,
+        ) {
+            (None, _) => without,
+            (Some(expression), Some(places)) => expression.value(&|k| self.value(places[k], at)),
+            (Some(_), None) => f64::INFINITY,
+        };
+        std::array::from_fn(|version| {
+            let selected = of(&self.reading.select, &self.source.selected[version], 1.0);
+            if selected == 0.0 || selected.is_infinite() {
+                return f64::INFINITY;
+            }
+            let binned = of(&self.reading.binned, &self.source.binned[version], 0.0);
+            if selected.is_nan() { f64::NAN } else { binned }
+        })
+    }
+
+    fn truth(&self, at: usize) -> Result<[f64; 2], String> {
+        if let Some(shear) = self.constant {
+            return Ok(shear);
+        }
+        if let Truth::Galaxies(galaxies) = &self.reading.truth {
+            let id = self.places.id.ok_or(
+                "the catalogue has no identifier to find the true shear with. Try: --columns id=NAME",
+            )?;
+            let id = self.value(id, at);
+            return galaxies.get(&id.to_bits()).copied().ok_or_else(|| {
+                format!("the table of true shears does not contain the identifier {id}")
+            });
+        }
+        Ok(self.places.shear.map_or([0.0; 2], |g| self.pair(g, at)))
+    }
+
+    /// The key of the unit of a row, the `index`-th of its version.
+    fn key(&self, at: usize, index: u64) -> u64 {
+        if let Some(unit) = self.unit {
+            return hash(self.value(unit, at));
+        }
+        match self.places.id {
+            Some(id) if !self.reading.neighbours => hash(self.value(id, at)),
+            _ => index >> u32::from(self.reading.neighbours),
+        }
+    }
+}
+
+/// A number with evenly distributed bits (the finaliser of SplitMix64).
+fn hash(value: f64) -> u64 {
+    let mut bits = value.to_bits().wrapping_add(0x9e37_79b9_7f4a_7c15);
+    bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    bits ^ (bits >> 31)
+}
+
+/// The versions that a column of text names.
+fn versions(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<Option<usize>>, FileError> {
+    let fault = |found: &str| {
+        FileError::new(
+            path,
+            format!(
+                "column `{name}`: unknown version (found {found}, expected noshear, 1p, 1m, 2p or 2m)"
+            ),
+        )
+    };
+    let column = frame.column(name).map_err(|_| fault("no such column"))?;
+    let texts = column.str().map_err(|_| fault("no text"))?;
+    let mut known: HashMap<&str, Option<usize>> = HashMap::from([("noshear", None)]);
+    known.extend(
+        VERSIONS
+            .iter()
+            .enumerate()
+            .map(|(k, (name, _))| (*name, Some(k))),
+    );
+    texts
+        .iter()
+        .map(|text| {
+            let text = text.unwrap_or("nothing");
+            known
+                .get(text)
+                .copied()
+                .ok_or_else(|| fault(&format!("`{text}`")))
+        })
+        .collect()
+}
+
+/// Paths of catalogues, each once.
+///
+/// # Errors
+/// If a catalogue is given twice.
+pub(super) fn distinct(paths: &[PathBuf]) -> Result<(), FileError> {
+    for (k, path) in paths.iter().enumerate() {
+        if paths[..k].contains(path) {
+            return Err(FileError::new(path, "the catalogue is given twice"));
+        }
+    }
+    Ok(())
+}

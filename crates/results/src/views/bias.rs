@@ -1,0 +1,424 @@
+//! Shear bias as tables, plots, verdicts and JUnit.
+
+use std::fmt::Write;
+
+use shearq_bias::{
+    Catalogue, Design, Estimate, Measured, QUANTITIES, REQUIREMENTS, Verdict, student_t, verdict,
+};
+use shearq_render::escape::markup as escape;
+use shearq_render::figure::{FigureError, LinePlot, PanelGrid, PictureFormat, Series, Style};
+use shearq_render::html::{Block, Picture, Section};
+use shearq_render::table::{Cell, Heading, Table};
+
+use crate::bias::BiasResult;
+
+/// Units above which Student's t differs from a normal distribution by less than 5 %.
+const MANY_UNITS: usize = 30;
+
+/// Quantities of the narrow table.
+const MAIN: [&str; 4] = ["m1", "m2", "c1", "c2"];
+
+/// Estimates of all galaxies and of each bin, one row each, with the verdict as notes.
+pub fn bias_table(result: &BiasResult) -> Table {
+    let mut headings = vec![
+        Heading::new("bin", "Bin"),
+        Heading::new("n", "Galaxies"),
+        Heading::new("low", "From").detail(),
+        Heading::new("high", "To").detail(),
+        Heading::new("n_effective", "Effective").detail(),
+        Heading::new("units", "Units").detail(),
+    ];
+    let estimates: Vec<&Estimate> = result
+        .bins
+        .iter()
+        .filter_map(|bin| bin.estimate.as_ref().ok())
+        .collect();
+    let known = |key: &str| estimates.iter().any(|found| found.value(key).is_some());
+    let details = QUANTITIES.iter().map(|quantity| quantity.key);
+    let details = details.filter(|key| !MAIN.contains(key) && known(key));
+    let keys: Vec<&'static str> = MAIN.into_iter().chain(details).collect();
+    for key in &keys {
+        let found = QUANTITIES.iter().find(|quantity| quantity.key == *key);
+        let heading = Heading::new(key, found.map_or(*key, |quantity| quantity.label));
+        let main = MAIN.contains(key) || *key == "alpha";
+        headings.push(if main { heading } else { heading.detail() });
+    }
+    let mut notes = notes(result);
+    let mut rows = Vec::new();
+    for bin in &result.bins {
+        let label = bin
+            .edges
+            .map_or("all".to_owned(), |edges| label(result, edges));
+        let [low, high] = bin.edges.unwrap_or([f64::NAN; 2]);
+        let found = bin.estimate.as_ref().ok();
+        if let Err(error) = &bin.estimate {
+            notes.push(format!("No estimate of {label}: {error}."));
+        }
+        let count = |of: fn(&Estimate) -> f64| Cell::number(found.map_or(0.0, of), 0);
+        let mut row = vec![
+            Cell::text(label),
+            count(|found| found.galaxies as f64),
+            Cell::number(low, 4),
+            Cell::number(high, 4),
+            count(|found| found.effective),
+            count(|found| found.units as f64),
+        ];
+        row.extend(keys.iter().map(|key| {
+            let value = found.and_then(|found| found.value(key));
+            let unknown = Measured {
+                value: f64::NAN,
+                error: f64::NAN,
+            };
+            let Measured { value, error } = value.unwrap_or(unknown);
+            Cell::with_error(value, Some(error), 6)
+        }));
+        rows.push(row);
+    }
+    Table {
+        title: "Shear bias".into(),
+        headings,
+        rows,
+        notes,
+    }
+}
+
+/// A bin in words.
+fn label(result: &BiasResult, [low, high]: [f64; 2]) -> String {
+    // Four significant digits.
+    let edge = |edge: f64| {
+        let rounded = format!("{edge:.3e}").parse::<f64>();
+        rounded.unwrap_or(edge).to_string()
+    };
+    match (low == f64::MIN, high == f64::MAX) {
+        (true, _) => format!("{} below {}", result.binned, edge(high)),
+        (false, true) => format!("{} from {}", result.binned, edge(low)),
+        _ => format!("{} {} to {}", result.binned, edge(low), edge(high)),
+    }
+}
+
+/// Design, units, rows that do not count, and verdicts.
+fn notes(result: &BiasResult) -> Vec<String> {
+    let Ok(all) = result.all() else {
+        return Vec::new();
+    };
+    let mut notes = vec![
+        format!(
+            "Design: {} ({}). Columns: {}.",
+            result.design.name(),
+            result.design.meaning(),
+            result.program
+        ),
+        format!("Errors are from {} units: {}.", all.units, result.unit),
+    ];
+    if all.units < MANY_UNITS {
+        notes.push(format!(
+            "With {} units, 95 % confidence is {:.2} standard errors (Student's t).",
+            all.units,
+            student_t(0.975, all.units - 1)
+        ));
+    }
+    if result.misaligned {
+        notes.push(
+            "The catalogues of different shears have different numbers of rows, so errors may be too large. Try: a column of identifiers".into(),
+        );
+    }
+    let total = |of: fn(&Catalogue) -> u64| result.catalogues.iter().map(of).sum::<u64>();
+    for (count, what) in [
+        (total(|c| c.flagged), "with a flag"),
+        (total(|c| c.unweighted), "with a weight of zero or less"),
+        (total(|c| c.unselected), "that --select excludes"),
+        (total(|c| c.missing), "with missing numbers"),
+    ] {
+        if count > 0 {
+            notes.push(format!("Left out: {count} rows {what}."));
+        }
+    }
+    for (k, assumes) in (1..).zip(all.assumes_no_c) {
+        if assumes {
+            notes.push(format!(
+                "All true g{k} are equal, so m{k} assumes that c{k} is zero."
+            ));
+        }
+    }
+    match result.design {
+        Design::Null => notes.push(
+            "Without a true shear, c is the mean shear. It is a bias only if the galaxies have no mean shear.".into(),
+        ),
+        _ => notes.extend(verdicts(all)),
+    }
+    notes
+}
+
+/// Estimates against published requirements, at 95 % confidence.
+fn verdicts(all: &Estimate) -> Vec<String> {
+    let mut lines = Vec::new();
+    for requirement in REQUIREMENTS {
+        let mut parts = Vec::new();
+        for component in [1, 2] {
+            let key = format!("{}{component}", requirement.of);
+            let Some(measured) = all.value(&key).filter(|found| found.error.is_finite()) else {
+                continue;
+            };
+            let found = verdict(measured, requirement.limit, all.galaxies, all.units);
+            parts.push(match found {
+                Verdict::Met => format!("{key} met"),
+                Verdict::NotMet => format!("{key} not met"),
+                Verdict::Undecided { galaxies } => {
+                    format!("{key} undecided (about {galaxies:.1e} galaxies would decide)")
+                }
+            });
+        }
+        if !parts.is_empty() {
+            lines.push(format!(
+                "{} requires |{}| below {:e}: {}.",
+                requirement.name,
+                requirement.of,
+                requirement.limit,
+                parts.join(", ")
+            ));
+        }
+    }
+    lines
+}
+
+/// A limit of `--fail-above`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Limit {
+    /// `m` or `c` for both components, or one quantity.
+    pub of: String,
+    /// Largest modulus.
+    pub limit: f64,
+    /// The modulus must exceed the limit by so many standard errors.
+    pub sigma: f64,
+}
+
+impl std::str::FromStr for Limit {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let expected =
+            || format!("found `{text}`, expected QUANTITY=LIMIT or QUANTITY=LIMIT@Ksigma");
+        let (of, rest) = text.split_once('=').ok_or_else(expected)?;
+        let (limit, sigma) = rest.split_once('@').unwrap_or((rest, "0"));
+        let sigma = sigma.strip_suffix("sigma").unwrap_or(sigma);
+        let number = |text: &str| {
+            text.parse()
+                .ok()
+                .filter(|n: &f64| n.is_finite() && *n >= 0.0)
+        };
+        let (limit, sigma) = number(limit).zip(number(sigma)).ok_or_else(expected)?;
+        let known = ["m", "c"].contains(&of) || QUANTITIES.iter().any(|own| own.key == of);
+        if !known {
+            return Err(format!(
+                "unknown quantity (found `{of}`, expected m, c, m1, c1, …)"
+            ));
+        }
+        Ok(Limit {
+            of: of.to_owned(),
+            limit,
+            sigma,
+        })
+    }
+}
+
+/// A quantity checked against a limit.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Checked {
+    /// The quantity.
+    pub key: String,
+    /// What was found and expected, in words.
+    pub text: String,
+    /// Whether the limit is exceeded, or the quantity is unknown.
+    pub failed: bool,
+}
+
+/// Checks the estimates of all galaxies. A limit of `m` or `c` applies to the components that are known.
+pub fn check(all: &Estimate, limits: &[Limit]) -> Vec<Checked> {
+    let mut checks = Vec::new();
+    for limit in limits {
+        let keys: Vec<String> = match limit.of.as_str() {
+            of @ ("m" | "c") => [1, 2]
+                .map(|k| format!("{of}{k}"))
+                .into_iter()
+                .filter(|key| all.value(key).is_some())
+                .collect(),
+            of => vec![of.to_owned()],
+        };
+        if keys.is_empty() {
+            checks.push(unknown(&limit.of));
+        }
+        for key in keys {
+            let Some(Measured { value, error }) = all.value(&key) else {
+                checks.push(unknown(&key));
+                continue;
+            };
+            // An unknown error fails too.
+            let passed = value.abs() - limit.sigma * error <= limit.limit;
+            checks.push(Checked {
+                text: format!(
+                    "|{key}| exceeds its limit (found {value:.2e} ± {error:.1e}, expected at most {:e} within {} standard errors)",
+                    limit.limit, limit.sigma
+                ),
+                key,
+                failed: !passed,
+            });
+        }
+    }
+    checks
+}
+
+fn unknown(key: &str) -> Checked {
+    Checked {
+        key: key.to_owned(),
+        text: format!("{key} is unknown (expected a true shear that determines it)"),
+        failed: true,
+    }
+}
+
+/// Checks as JUnit: one suite, a case per quantity.
+pub fn junit(checks: &[Checked]) -> String {
+    let failures = checks.iter().filter(|check| check.failed).count();
+    let mut text = format!(
+        "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuites>\n  <testsuite name=\"shear bias\" tests=\"{}\" failures=\"{failures}\">\n",
+        checks.len()
+    );
+    for check in checks {
+        let name = escape(&check.key);
+        // Writing to a `String` cannot fail.
+        let _ = write!(text, "    <testcase classname=\"bias\" name=\"{name}\"");
+        match check.failed {
+            true => {
+                let words = escape(&check.text);
+                let _ = writeln!(text, "><failure message=\"{words}\"/></testcase>");
+            }
+            false => text.push_str("/>\n"),
+        }
+    }
+    text + "  </testsuite>\n</testsuites>\n"
+}
+
+/// Plots of m and c in bins, or of all galaxies, with the tightest published requirements as dashed lines.
+pub fn bias_plot(result: &BiasResult) -> PanelGrid {
+    let plots = ['m', 'c'].map(|of| {
+        let limits = REQUIREMENTS
+            .iter()
+            .filter(|requirement| requirement.of == of);
+        let limit = limits
+            .map(|requirement| requirement.limit)
+            .fold(f64::MAX, f64::min);
+        let mut series = Vec::new();
+        let (mut left, mut right) = (f64::MAX, f64::MIN);
+        for (component, colour) in [(1, 0), (2, 1)] {
+            let key = format!("{of}{component}");
+            let (mut x, mut y, mut errors) = (Vec::new(), Vec::new(), Vec::new());
+            for bin in result.bins.iter().filter(|bin| is_shown(result, bin.edges)) {
+                let found = bin
+                    .estimate
+                    .as_ref()
+                    .ok()
+                    .and_then(|found| found.value(&key));
+                let (Some(Measured { value, error }), at) = (found, middle(bin.edges)) else {
+                    continue;
+                };
+                (left, right) = (left.min(at), right.max(at));
+                x.push(at);
+                y.push(value);
+                errors.push(error);
+            }
+            if !x.is_empty() {
+                series.push(Series::new(&key, x, y, Style::Points, colour).with_errors(errors));
+            }
+        }
+        if left > right {
+            (left, right) = (0.0, 1.0);
+        }
+        let margin = if left < right { 0.0 } else { 0.5 };
+        for (label, value) in [
+            (format!("requirement {limit:e}"), limit),
+            (String::new(), -limit),
+        ] {
+            let ends = vec![left - margin, right + margin];
+            series.push(Series::new(&label, ends, vec![value; 2], Style::Dashed, 7));
+        }
+        LinePlot {
+            title: match of {
+                'm' => "Multiplicative bias".into(),
+                _ => "Additive bias".into(),
+            },
+            x_label: match result.binned.as_str() {
+                "" => "all galaxies".into(),
+                binned => binned.into(),
+            },
+            y_label: of.into(),
+            series,
+            ..LinePlot::default()
+        }
+    });
+    PanelGrid {
+        title: "Shear bias".into(),
+        columns: 2,
+        plots: plots.into(),
+    }
+}
+
+/// Bins are shown, and all galaxies if there are no bins.
+fn is_shown(result: &BiasResult, edges: Option<[f64; 2]>) -> bool {
+    edges.is_some() || result.bins.len() == 1
+}
+
+/// Where a bin is on the axis.
+fn middle(edges: Option<[f64; 2]>) -> f64 {
+    match edges {
+        None => 0.0,
+        Some([f64::MIN, high]) => high,
+        Some([low, f64::MAX]) => low,
+        Some([low, high]) => 0.5 * (low + high),
+    }
+}
+
+/// The section of a report.
+///
+/// # Errors
+/// If the plot cannot be drawn.
+pub fn section(result: &BiasResult, table: Table) -> Result<Section, FigureError> {
+    let caption = "m and c with standard errors. Dashed: the tightest published requirements.";
+    let picture = Picture::draw(&bias_plot(result), PictureFormat::Svg, "bias", caption)?;
+    let meaning = QUANTITIES
+        .iter()
+        .filter(|quantity| table.place(quantity.key).is_some());
+    let meaning: Vec<String> = meaning
+        .map(|quantity| format!("**{}**: {}.", quantity.label, quantity.meaning))
+        .collect();
+    let sources = REQUIREMENTS.map(|requirement| {
+        format!(
+            "{} |{}| < {:e}: {}.",
+            requirement.name, requirement.of, requirement.limit, requirement.source
+        )
+    });
+    let blocks = vec![
+        Block::Figure(picture),
+        Block::Table(table),
+        Block::Text(meaning.join("\n\n")),
+        Block::Text(sources.join("\n\n")),
+    ];
+    Ok(Section::new("bias", "Shear bias", blocks))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limits_are_parsed_or_refused() {
+        let parse = |text: &str| text.parse::<Limit>();
+        let limit = parse("m=2e-3@3sigma").unwrap();
+        assert_eq!(
+            (limit.of.as_str(), limit.limit, limit.sigma),
+            ("m", 2e-3, 3.0)
+        );
+        assert_eq!(parse("c1=1e-4").unwrap().sigma, 0.0);
+        for wrong in ["m", "m=", "m=x", "m=1@", "q9=1", "m=-1", "m=1@nan"] {
+            assert!(parse(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,343 @@
+//! `shearq bias`.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use clap::{Args, ValueEnum};
+use shearq_bias::{Design, Errors};
+
+use crate::arguments::{Printing, ReportFile, positive};
+use crate::{Findings, tell};
+use shearq_files::{atomic, open};
+use shearq_pipeline::images::Shard;
+use shearq_render::figure::{Figure, PictureFormat};
+use shearq_results::bias::columns::Names;
+use shearq_results::bias::expression::Expression;
+use shearq_results::bias::truth::Truth;
+use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, sum};
+use shearq_results::views::bias::{Limit, bias_plot, bias_table, check, junit, section};
+use shearq_submissions::EllipticityType;
+
+/// Multiplicative and additive bias (m and c) of any program's catalogues.
+///
+/// Catalogues are FITS, Parquet or text tables with columns e1 and e2. Optional columns are the weight w, the responses
+/// R11 and R22, a flag, and the true shear g1 and g2. Columns of HSM, ngmix metacal, metadetect and AnaCal are
+/// recognised.
+///
+/// The design is recognised from the true shears: pairs of +γ and −γ, arms, one shear per catalogue, or shears that vary
+/// within a catalogue. Errors are from a jackknife over independent units. The output names design and units.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// Catalogues, all with the same columns; FILE[TABLE] is one table of a FITS file.
+    #[arg(
+        value_name = "CATALOGUE",
+        required_unless_present = "merge",
+        conflicts_with = "merge"
+    )]
+    catalogues: Vec<PathBuf>,
+    /// True g1 of all catalogues.
+    #[arg(long, value_name = "G1", allow_negative_numbers = true, requires = "g2", conflicts_with_all = ["truth", "merge"])]
+    g1: Option<f64>,
+    /// True g2 of all catalogues.
+    #[arg(long, value_name = "G2", allow_negative_numbers = true, requires = "g1", conflicts_with_all = ["truth", "merge"])]
+    g2: Option<f64>,
+    /// Table of true shears: columns catalogue, g1, g2 or id, g1, g2 [default: columns g1 and g2 of the catalogues].
+    #[arg(long, value_name = "FILE", conflicts_with = "merge")]
+    truth: Option<PathBuf>,
+    /// Names of columns, such as `e1=g_1,e2=g_2,w=weight`; `ROLE=none` ignores a column that would be recognised.
+    #[arg(
+        long,
+        value_name = "ROLE=COLUMN",
+        value_delimiter = ',',
+        conflicts_with = "merge"
+    )]
+    columns: Vec<String>,
+    /// Type of the ellipticities [default: distortion for columns of HSM that are distortions, else shear].
+    #[arg(long, value_enum, conflicts_with = "merge")]
+    ellipticity: Option<TypeArgument>,
+    /// Use minus the true g2.
+    #[arg(long, conflicts_with = "merge")]
+    flip_g2: bool,
+    /// Also estimate in bins of a column or expression: `snr:5` has five bins with equally many galaxies,
+    /// `flux/flux_error:5,10,20` has these edges.
+    #[arg(long, value_name = "EXPRESSION:BINS", value_parser = parse_bins, conflicts_with = "merge")]
+    bins: Option<Binning>,
+    /// Use only rows for which this holds, such as `snr > 10 and size < 4`.
+    #[arg(long, value_name = "EXPRESSION", value_parser = Expression::parse, conflicts_with = "merge")]
+    select: Option<Expression>,
+    /// How catalogues belong together [default: recognised from the true shears].
+    #[arg(long, value_enum, conflicts_with = "merge")]
+    design: Option<DesignArgument>,
+    /// Independent units for errors: `rows`, `catalogues` or a column, such as `seed` [default: a column pair, seed or
+    /// patch; else groups of catalogues if there are 20 or more; else rows].
+    #[arg(long, value_name = "UNIT", conflicts_with = "merge")]
+    units: Option<String>,
+    /// Leave out rows with missing numbers.
+    #[arg(long, conflicts_with = "merge")]
+    drop_missing: bool,
+    /// Artificial shear of metacalibration.
+    #[arg(long, value_name = "G", default_value_t = 0.01, value_parser = positive, conflicts_with = "merge")]
+    step: f64,
+    /// Errors from so many bootstrap draws of units instead of a jackknife.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(10..=100_000))]
+    bootstrap: Option<u32>,
+    /// Seed of the bootstrap.
+    #[arg(long, value_name = "SEED", default_value_t = 1, requires = "bootstrap")]
+    seed: u64,
+    /// Exit with code 1 if |m| or |c| exceeds a limit, such as `m=2e-3@3sigma`: by three standard errors. May be given
+    /// several times.
+    #[arg(long, value_name = "LIMIT")]
+    fail_above: Vec<Limit>,
+    /// Also write the checks of --fail-above to this file as JUnit XML.
+    #[arg(long, value_name = "FILE", requires = "fail_above")]
+    junit: Option<PathBuf>,
+    /// Write the sums of the catalogues to this file, for --merge.
+    #[arg(long, value_name = "FILE", conflicts_with = "merge")]
+    sums: Option<PathBuf>,
+    /// Read only shard K of N of the catalogues.
+    #[arg(long, value_name = "K/N", requires = "sums", conflicts_with = "merge")]
+    shard: Option<Shard>,
+    /// Merge files that --sums wrote for shards of one list of catalogues.
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    merge: Vec<PathBuf>,
+    /// Plot m and c to this file, PNG or SVG by its ending.
+    #[arg(long, value_name = "FILE")]
+    plot: Option<PathBuf>,
+    #[command(flatten)]
+    printing: Printing,
+    #[command(flatten)]
+    report: ReportFile,
+}
+
+/// Type of ellipticities on the command line.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum TypeArgument {
+    /// (1 − q)/(1 + q) for an axis ratio q.
+    Shear,
+    /// (1 − q²)/(1 + q²) for an axis ratio q.
+    Distortion,
+}
+
+/// Designs on the command line.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum DesignArgument {
+    /// One true shear.
+    Single,
+    /// +γ and −γ of the same galaxies.
+    Pairs,
+    /// Several pairs, such as ±g1 and ±g2.
+    Arms,
+    /// One true shear per catalogue.
+    Fields,
+    /// Shears that vary within catalogues.
+    Galaxies,
+    /// Galaxies rotated by 90 degrees, in neighbouring rows or catalogues.
+    Rotated,
+}
+
+impl From<DesignArgument> for Design {
+    fn from(design: DesignArgument) -> Self {
+        match design {
+            DesignArgument::Single => Design::Single,
+            DesignArgument::Pairs => Design::Pairs,
+            DesignArgument::Arms => Design::Arms,
+            DesignArgument::Fields => Design::Fields,
+            DesignArgument::Galaxies => Design::Galaxies,
+            DesignArgument::Rotated => Design::Rotated,
+        }
+    }
+}
+
+/// Parses `EXPRESSION:N` or `EXPRESSION:EDGE,EDGE,...`.
+fn parse_bins(text: &str) -> Result<Binning, String> {
+    let expected = "expected EXPRESSION:N, or EXPRESSION:EDGE,EDGE,... with increasing edges";
+    let (of, bins) = text.rsplit_once(':').ok_or(expected)?;
+    let of = Expression::parse(of)?;
+    let most = format!("expected 2 to {MOST_BINS} bins");
+    if let Ok(count) = bins.trim().parse::<usize>() {
+        let edges = Edges::Equal(count);
+        return match (2..=MOST_BINS).contains(&count) {
+            true => Ok(Binning { of, edges }),
+            false => Err(most),
+        };
+    }
+    let edges: Option<Vec<f64>> = bins
+        .split(',')
+        .map(|edge| {
+            edge.trim()
+                .parse()
+                .ok()
+                .filter(|edge: &f64| edge.is_finite())
+        })
+        .collect();
+    let edges = edges.filter(|edges| edges.len() > 1).ok_or(expected)?;
+    if edges.len() > MOST_BINS + 1 {
+        return Err(most);
+    }
+    match edges.windows(2).all(|pair| pair[0] < pair[1]) {
+        true => Ok(Binning {
+            of,
+            edges: Edges::Given(edges),
+        }),
+        false => Err(expected.into()),
+    }
+}
+
+/// Most bytes of a file of sums.
+const MOST_BYTES: u64 = 1 << 31;
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    if let Some(plot) = &arguments.plot {
+        PictureFormat::of(plot)?;
+    }
+    let summed = match arguments.merge.as_slice() {
+        [] => of_catalogues(arguments)?,
+        files => merged(files)?,
+    };
+    if let Some(path) = &arguments.sums {
+        atomic::write(path, &serde_json::to_vec(&summed)?)?;
+    }
+    let errors = arguments
+        .bootstrap
+        .map_or(Errors::Jackknife, |draws| Errors::Bootstrap {
+            draws,
+            seed: arguments.seed,
+        });
+    let result = match summed.result(errors) {
+        Err(error) if arguments.shard.is_some() => {
+            tell(format_args!(
+                "note: no estimate of this shard alone: {error}"
+            ));
+            return Ok(());
+        }
+        result => result?,
+    };
+    let table = bias_table(&result);
+    arguments.printing.check(&table)?;
+    if let Some(plot) = &arguments.plot {
+        bias_plot(&result).save(plot)?;
+    }
+    let checks = check(result.all()?, &arguments.fail_above);
+    if let Some(path) = &arguments.junit {
+        atomic::write(path, junit(&checks).as_bytes())?;
+    }
+    arguments.printing.print(&table)?;
+    let sections = || Ok(vec![section(&result, table)?]);
+    arguments
+        .report
+        .save("Shear bias", sections, || Ok(made_by(arguments)))?;
+    let failed: Vec<_> = checks.iter().filter(|check| check.failed).collect();
+    for check in &failed {
+        tell(format_args!("error: {}", check.text));
+    }
+    match failed.is_empty() {
+        true => Ok(()),
+        false => Err(Findings.into()),
+    }
+}
+
+/// Inputs and options, for reports.
+fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
+    let paths = |paths: &[PathBuf]| {
+        let shown: Vec<String> = paths
+            .iter()
+            .map(|path| path.display().to_string())
+            .collect();
+        shown.join("\n")
+    };
+    let mut made_by = vec![
+        ("Catalogues".to_owned(), paths(&arguments.catalogues)),
+        ("Sums".to_owned(), paths(&arguments.merge)),
+        ("Columns".to_owned(), arguments.columns.join(", ")),
+    ];
+    if let Some(truth) = &arguments.truth {
+        made_by.push(("True shear".into(), truth.display().to_string()));
+    }
+    if let Some((g1, g2)) = arguments.g1.zip(arguments.g2) {
+        made_by.push(("True shear".into(), format!("{g1}, {g2}")));
+    }
+    if let Some(select) = &arguments.select {
+        made_by.push(("Selection".into(), select.text().to_owned()));
+    }
+    if let Some(draws) = arguments.bootstrap {
+        let seed = arguments.seed;
+        made_by.push(("Bootstrap".into(), format!("{draws} draws, seed {seed}")));
+    }
+    made_by.retain(|(_, value)| !value.is_empty());
+    made_by
+}
+
+fn of_catalogues(arguments: &Arguments) -> anyhow::Result<Summed> {
+    let mut names = Names::default();
+    for text in &arguments.columns {
+        names.add(text).map_err(anyhow::Error::msg)?;
+    }
+    let truth = match (&arguments.truth, arguments.g1.zip(arguments.g2)) {
+        (Some(path), _) => Truth::read(path)?,
+        (None, Some((g1, g2))) => {
+            anyhow::ensure!(
+                g1.hypot(g2) < 1.0,
+                "--g1, --g2: this is no shear (found {g1} and {g2}, expected a modulus below 1)"
+            );
+            Truth::Constant([g1, g2])
+        }
+        (None, None) => Truth::Columns,
+    };
+    let types = arguments.ellipticity.map(|given| match given {
+        TypeArgument::Shear => EllipticityType::Shear,
+        TypeArgument::Distortion => EllipticityType::Distortion,
+    });
+    let shard = arguments.shard.unwrap_or(Shard::WHOLE);
+    if let (Some(_), Some(Edges::Equal(_))) = (
+        arguments.shard,
+        arguments.bins.as_ref().map(|bins| &bins.edges),
+    ) {
+        anyhow::bail!(
+            "--shard: all shards need the same bins (found a number of bins, expected edges). Try: --bins 'snr:5,10,20'"
+        );
+    }
+    let request = Request {
+        catalogues: arguments.catalogues.clone(),
+        names,
+        truth,
+        distortion: types.map(|given| given == EllipticityType::Distortion),
+        flip_g2: arguments.flip_g2,
+        bins: arguments.bins.clone(),
+        select: arguments.select.clone(),
+        design: arguments.design.map(Design::from),
+        units: match arguments.units.as_deref() {
+            None => Units::Recognised,
+            Some("rows") => Units::Rows,
+            Some("catalogues") => Units::Catalogues,
+            Some(column) => Units::Column(column.to_owned()),
+        },
+        drop_missing: arguments.drop_missing,
+        step: arguments.step,
+    };
+    let own = |number: usize| Shard::holding(number, shard.of()) == shard;
+    Ok(sum(&request, &own)?)
+}
+
+/// Merges files of sums.
+fn merged(files: &[PathBuf]) -> anyhow::Result<Summed> {
+    let read = |path: &Path| -> anyhow::Result<Summed> {
+        let bytes = open::read(path, MOST_BYTES)
+            .with_context(|| format!("{}: cannot read the sums", path.display()))?;
+        let what = || format!("{}: these are no sums that --sums wrote", path.display());
+        let summed: Summed = serde_json::from_slice(&bytes).with_context(what)?;
+        summed.checked().with_context(what)
+    };
+    let mut all = read(&files[0])?;
+    for path in &files[1..] {
+        let more = read(path)?;
+        all.merge(more)
+            .with_context(|| path.display().to_string())?;
+    }
+    let absent = all.absent();
+    anyhow::ensure!(
+        absent.is_empty(),
+        "the sums do not contain all catalogues (absent: {}). Try: --merge with the sums of all shards",
+        shearq_files::names_of(&absent)
+    );
+    Ok(all)
+}

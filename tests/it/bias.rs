@@ -1,0 +1,486 @@
+//! `shearq bias` on catalogues with known m and c.
+
+use std::fmt::Write;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use serde_json::Value;
+use shearq_files::frames::frame;
+use shearq_files::frames::polars::Column;
+use shearq_files::table::{self, FileFormat};
+
+use crate::support::{fail, shearq, succeed};
+
+const M: [f64; 2] = [0.02, -0.03];
+const C: [f64; 2] = [1e-3, -2e-3];
+const GALAXIES: usize = 2000;
+
+/// Columns of a catalogue, by name.
+type Columns = Vec<(&'static str, Vec<f64>)>;
+
+/// The same galaxies under a shear, with a response of 0.8 on average.
+fn galaxies(seed: u64, g: [f64; 2]) -> Columns {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut rows: Vec<[f64; 7]> = Vec::new();
+    for id in 0..GALAXIES {
+        let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+        let e = [0, 1].map(|k| 0.2 * normal() + 0.8 * ((1.0 + M[k]) * g[k] + C[k]));
+        let response = [0; 2].map(|_| 0.8 + 0.2 * normal());
+        let weight = rng.random_range(0.5..1.5);
+        let snr = rng.random_range(5.0..50.0);
+        rows.push([id as f64, e[0], e[1], weight, response[0], response[1], snr]);
+    }
+    let names = ["id", "e1", "e2", "w", "R11", "R22", "snr"];
+    let column = |k: usize| rows.iter().map(|row| row[k]).collect();
+    (0..7).map(|k| (names[k], column(k))).collect()
+}
+
+/// With true shears, and a flag on every hundredth row, whose ellipticities are missing.
+fn complete(mut columns: Columns, g: [f64; 2]) -> Columns {
+    let flags: Vec<f64> = (0..GALAXIES).map(|id| f64::from(id % 100 == 0)).collect();
+    for (_, values) in &mut columns[1..3] {
+        values.iter_mut().step_by(100).for_each(|e| *e = f64::NAN);
+    }
+    columns.push(("flag", flags));
+    columns.push(("g1", vec![g[0]; GALAXIES]));
+    columns.push(("g2", vec![g[1]; GALAXIES]));
+    columns
+}
+
+fn csv(path: &Path, columns: &Columns) {
+    let names: Vec<&str> = columns.iter().map(|(name, _)| *name).collect();
+    let mut text = names.join(",") + "\n";
+    for row in 0..columns[0].1.len() {
+        let fields: Vec<String> = columns.iter().map(|(_, v)| v[row].to_string()).collect();
+        writeln!(text, "{}", fields.join(",")).unwrap();
+    }
+    fs::write(path, text).unwrap();
+}
+
+/// Two catalogues of the same galaxies under ±0.02 in both components.
+fn pair(folder: &Path) -> [PathBuf; 2] {
+    [("plus", 0.02), ("minus", -0.02)].map(|(name, g)| {
+        let path = folder.join(format!("{name}.csv"));
+        csv(&path, &complete(galaxies(1, [g; 2]), [g; 2]));
+        path
+    })
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// The rows of the JSON table.
+fn rows(arguments: &[&str]) -> Vec<Value> {
+    let output = succeed(&[&["bias", "--format", "json"], arguments].concat());
+    let json: Value = serde_json::from_str(&output).unwrap();
+    json["rows"].as_array().unwrap().clone()
+}
+
+fn number(row: &Value, key: &str) -> f64 {
+    row[key].as_f64().unwrap_or_else(|| panic!("{key}: {row}"))
+}
+
+/// The row has the known m and c within four of its errors, which are below the limits.
+fn check(row: &Value, [m_error, c_error]: [f64; 2]) {
+    for k in 0..2 {
+        for (of, truth, most) in [("m", M[k], m_error), ("c", C[k], c_error)] {
+            let key = format!("{of}{}", k + 1);
+            let (value, error) = (number(row, &key), number(row, &format!("{key}_error")));
+            assert!(
+                (value - truth).abs() < 4.0 * error,
+                "{key}: {value} ± {error}"
+            );
+            assert!(error > 0.0 && error < most, "{key}: {error}");
+        }
+    }
+}
+
+#[test]
+fn pairs_without_options_give_m_and_c_and_bins_add_rows() {
+    let folder = tempfile::tempdir().unwrap();
+    let [plus, minus] = pair(folder.path());
+    let files = [text(&plus), text(&minus)];
+    // Shapes cancel in m: 0.2/0.8 of 1980 galaxies over √2 is 0.0040 from the scatter of the responses alone. Without
+    // the pairs it would be 0.2.
+    let whole = rows(&files);
+    assert_eq!(whole.len(), 1);
+    check(&whole[0], [0.02, 0.01]);
+    assert_eq!(number(&whole[0], "n"), 2.0 * 1980.0);
+    let binned = rows(&[&files[..], &["--bins", "snr:5"]].concat());
+    assert_eq!(binned.len(), 6);
+    for row in &binned {
+        check(row, [0.04, 0.03]);
+    }
+    let counts: f64 = binned[1..].iter().map(|row| number(row, "n")).sum();
+    assert_eq!(counts, 2.0 * 1980.0);
+    for row in &binned[1..] {
+        assert!((number(row, "n") - 792.0).abs() < 4.0, "{row}");
+    }
+    // The response of a bin is its own: expressions and edges select it.
+    let edges = rows(&[&files[..], &["--bins", "10*R11:-10,8,40"]].concat());
+    assert!(number(&edges[1], "r1") < 0.75 && number(&edges[2], "r1") > 0.85);
+    let printed = succeed(&["bias", files[0], files[1]]);
+    for part in [
+        "Design: pairs",
+        "galaxies with the same identifier",
+        "100 rows",
+    ] {
+        let expected = part.replace("100 rows", "40 rows with a flag");
+        assert!(printed.contains(&expected), "{expected}: {printed}");
+    }
+}
+
+#[test]
+fn formats_and_ways_to_state_the_truth_agree() {
+    let folder = tempfile::tempdir().unwrap();
+    let [plus, minus] = pair(folder.path());
+    let expected = rows(&[text(&plus), text(&minus)]);
+    for format in [FileFormat::Fits, FileFormat::Parquet] {
+        let files = [("plus", 0.02), ("minus", -0.02)].map(|(name, g)| {
+            let path = folder.path().join(format!("{name}.{}", format.extension()));
+            let columns = complete(galaxies(1, [g; 2]), [g; 2]);
+            let columns = columns.into_iter().map(|(n, v)| Column::new(n.into(), v));
+            let table = frame(columns.collect()).unwrap();
+            table::write(&path, format, &table, &Default::default()).unwrap();
+            path
+        });
+        assert_eq!(rows(&[text(&files[0]), text(&files[1])]), expected);
+    }
+    let bare: Vec<PathBuf> = [("a", 0.02), ("b", -0.02)]
+        .into_iter()
+        .map(|(name, g)| {
+            let path = folder.path().join(format!("{name}.csv"));
+            let columns = complete(galaxies(1, [g; 2]), [g; 2]);
+            csv(
+                &path,
+                &columns
+                    .into_iter()
+                    .filter(|(n, _)| !n.starts_with('g'))
+                    .collect(),
+            );
+            path
+        })
+        .collect();
+    let truth = folder.path().join("truth.csv");
+    fs::write(
+        &truth,
+        "catalogue,g1,g2\na.csv,0.02,0.02\nb.csv,-0.02,-0.02\n",
+    )
+    .unwrap();
+    let files = [text(&bare[0]), text(&bare[1])];
+    assert_eq!(
+        rows(&[&files[..], &["--truth", text(&truth)]].concat()),
+        expected
+    );
+    // One shear: m only.
+    let single = rows(&[files[0], "--g1", "0.02", "--g2", "0"]);
+    assert!(single[0]["c1"].is_null() && single[0]["m2"].is_null());
+    assert!(
+        (number(&single[0], "m1") - M[0] - C[0] / 0.02).abs()
+            < 4.0 * number(&single[0], "m1_error")
+    );
+    // A shear per galaxy, joined by identifier in another order.
+    let ids = folder.path().join("ids.csv");
+    let line = |id: usize| format!("0.02,{id},0.02\n");
+    let lines: String = (0..GALAXIES).rev().map(line).collect();
+    fs::write(&ids, format!("g1,id,g2\n{lines}")).unwrap();
+    let joined = rows(&[files[0], "--truth", text(&ids)]);
+    let constant = rows(&[files[0], "--g1", "0.02", "--g2", "0.02"]);
+    assert_eq!(joined, constant);
+}
+
+#[test]
+fn shards_merge_to_the_estimate_of_all_catalogues() {
+    let folder = tempfile::tempdir().unwrap();
+    let [plus, minus] = pair(folder.path());
+    let sums = ["1", "2"].map(|shard| folder.path().join(shard));
+    for (path, shard) in sums.iter().zip(["1/2", "2/2"]) {
+        let files = [text(&plus), text(&minus)];
+        succeed(&[
+            "bias",
+            files[0],
+            files[1],
+            "--shard",
+            shard,
+            "--sums",
+            text(path),
+        ]);
+    }
+    let merged = rows(&["--merge", text(&sums[0]), text(&sums[1])]);
+    check(&merged[0], [0.02, 0.01]);
+    let whole = rows(&[text(&plus), text(&minus)]);
+    for key in ["m1", "m2", "c1", "c2"] {
+        // Sums in another order differ by rounding.
+        assert!((number(&merged[0], key) - number(&whole[0], key)).abs() < 1e-9);
+    }
+    let one = fail(&["bias", "--merge", text(&sums[0])]);
+    assert!(
+        one.contains("absent: ") && one.contains("minus.csv"),
+        "{one}"
+    );
+    let twice = fail(&["bias", "--merge", text(&sums[0]), text(&sums[0])]);
+    assert!(twice.contains("in two files of sums"), "{twice}");
+}
+
+#[test]
+fn limits_set_the_exit_code_and_junit() {
+    let folder = tempfile::tempdir().unwrap();
+    let [plus, minus] = pair(folder.path());
+    let junit = folder.path().join("bias.xml");
+    let run = |limit: &str| {
+        let (plus, minus) = (text(&plus), text(&minus));
+        shearq(&[
+            "bias",
+            plus,
+            minus,
+            "--fail-above",
+            limit,
+            "--junit",
+            text(&junit),
+        ])
+    };
+    assert!(run("m=0.2@3sigma").status.success());
+    assert!(
+        fs::read_to_string(&junit)
+            .unwrap()
+            .contains("failures=\"0\"")
+    );
+    let failed = run("m2=0.001");
+    assert_eq!(failed.status.code(), Some(1));
+    let message = String::from_utf8(failed.stderr).unwrap();
+    assert!(
+        message.contains("error: |m2| exceeds its limit"),
+        "{message}"
+    );
+    assert!(
+        fs::read_to_string(&junit)
+            .unwrap()
+            .contains("failures=\"1\"")
+    );
+}
+
+#[test]
+fn versions_of_metadetect_give_the_response() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut files = Vec::new();
+    for (name, g) in [("plus", 0.02), ("minus", -0.02)] {
+        let base = galaxies(1, [g; 2]);
+        let (mut versions, mut e1, mut e2, mut ids) =
+            (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        for (version, shear) in [
+            ("noshear", [0.0, 0.0]),
+            ("1p", [0.01, 0.0]),
+            ("1m", [-0.01, 0.0]),
+            ("2p", [0.0, 0.01]),
+            ("2m", [0.0, -0.01]),
+        ] {
+            versions.extend(vec![version; GALAXIES]);
+            ids.extend(base[0].1.iter().copied());
+            e1.extend(base[1].1.iter().map(|e| e + 0.8 * shear[0]));
+            e2.extend(base[2].1.iter().map(|e| e + 0.8 * shear[1]));
+        }
+        let path = folder.path().join(format!("{name}.parquet"));
+        let table = frame(vec![
+            Column::new("id".into(), ids),
+            Column::new("mdet_step".into(), versions),
+            Column::new("wmom_g_1".into(), e1),
+            Column::new("wmom_g_2".into(), e2),
+            Column::new("g1".into(), vec![g; 5 * GALAXIES]),
+            Column::new("g2".into(), vec![g; 5 * GALAXIES]),
+        ])
+        .unwrap();
+        table::write(&path, FileFormat::Parquet, &table, &Default::default()).unwrap();
+        files.push(path);
+    }
+    let found = &rows(&[text(&files[0]), text(&files[1])])[0];
+    assert!((number(found, "r1") - 0.8).abs() < 1e-9, "{found}");
+    // Only rounding is left of shapes and responses.
+    assert!((number(found, "m1") - M[0]).abs() < 1e-9, "{found}");
+    assert_eq!(number(found, "n"), 2.0 * GALAXIES as f64);
+    let printed = succeed(&["bias", text(&files[0]), text(&files[1])]);
+    assert!(printed.contains("Columns: metadetect."), "{printed}");
+}
+
+#[test]
+fn plots_and_reports_are_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let [plus, minus] = pair(folder.path());
+    let [plot, report] = ["m.svg", "r.html"].map(|name| folder.path().join(name));
+    let (plus, minus) = (text(&plus), text(&minus));
+    succeed(&[
+        "bias",
+        plus,
+        minus,
+        "--bins",
+        "snr:3",
+        "--plot",
+        text(&plot),
+        "--report",
+        text(&report),
+    ]);
+    assert!(
+        fs::read_to_string(plot)
+            .unwrap()
+            .contains("Multiplicative bias")
+    );
+    let page = fs::read_to_string(report).unwrap();
+    assert!(page.contains("Mandelbaum et al. 2014") && page.contains("plus.csv"));
+    let wrong = fail(&["bias", plus, minus, "--plot", "m.pdf"]);
+    assert!(wrong.contains("expected the extension"), "{wrong}");
+}
+
+/// A pair with columns changed in the first catalogue.
+fn changed(folder: &Path, change: impl Fn(&mut Columns)) -> [PathBuf; 2] {
+    let files = pair(folder);
+    let mut columns = complete(galaxies(1, [0.02; 2]), [0.02; 2]);
+    change(&mut columns);
+    csv(&files[0], &columns);
+    files
+}
+
+#[test]
+fn bad_catalogues_give_one_clear_error() {
+    let set = |name: &'static str, value: fn(usize, f64) -> f64| {
+        move |columns: &mut Columns| {
+            for (_, values) in columns.iter_mut().filter(|(own, _)| *own == name) {
+                for (row, own) in values.iter_mut().enumerate() {
+                    *own = value(row, *own);
+                }
+            }
+        }
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |change: &dyn Fn(&mut Columns), more: &[&str], both: bool, expected: &str| {
+        let [plus, minus] = changed(folder.path(), change);
+        let files = if both {
+            vec![text(&plus), text(&minus)]
+        } else {
+            vec![text(&plus)]
+        };
+        let error = fail(&[&["bias"], &files[..], more].concat());
+        assert!(error.contains(expected), "{expected}: {error}");
+        assert_eq!(error.lines().count(), 1, "{error}");
+    };
+    let nothing = |_: &mut Columns| {};
+    refused(&set("e1", |_, _| 0.1), &[], false, "e1 is 0.1 in all");
+    refused(
+        &set("w", |_, _| 0.0),
+        &[],
+        false,
+        "2000 rows: 20 with a flag, 1980 with a weight of zero or less",
+    );
+    refused(&set("w", |_, _| -1.0), &[], false, "no galaxy can be used");
+    refused(
+        &set("flag", |_, _| 1.0),
+        &[],
+        false,
+        "no galaxy can be used (found 2000 rows: 2000 with a flag",
+    );
+    refused(
+        &set("flag", |row, _| f64::from(row != 7)),
+        &[],
+        false,
+        "found 1, expected 2",
+    );
+    refused(
+        &set("e2", |row, e| if row == 41 { f64::NAN } else { e }),
+        &[],
+        true,
+        "row 42: e2 is NaN",
+    );
+    refused(
+        &set("R11", |_, r| r - 0.8),
+        &[],
+        false,
+        "mean response R11 is too close to zero",
+    );
+    refused(
+        &set("g1", |_, _| 2.0),
+        &[],
+        true,
+        "row 2: this is no shear (found g1 2",
+    );
+    refused(
+        &nothing,
+        &["--bins", "flux/snr:3"],
+        true,
+        "there is no column `flux`",
+    );
+    refused(
+        &nothing,
+        &["--select", "sn > 3"],
+        true,
+        "there is no column `sn`",
+    );
+    refused(
+        &nothing,
+        &["--columns", "w=weight"],
+        true,
+        "there is no column `weight`",
+    );
+    refused(
+        &nothing,
+        &["--flip-g2"],
+        true,
+        "e2 follows minus the true g2",
+    );
+    // Ellipticities of other galaxies: the truth does not fit.
+    let ids = folder.path().join("ids.csv");
+    fs::write(&ids, "id,g1,g2\n1,0.02,0\n2,-0.02,0\n").unwrap();
+    refused(
+        &nothing,
+        &["--truth", text(&ids)],
+        false,
+        "does not contain the identifier 3",
+    );
+    let other = folder.path().join("other.csv");
+    fs::write(&other, "catalogue,g1,g2\nother.csv,0.02,0\n").unwrap();
+    refused(
+        &nothing,
+        &["--truth", text(&other)],
+        false,
+        "does not contain this catalogue (found other.csv)",
+    );
+}
+
+#[test]
+fn missing_numbers_can_be_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let [plus, minus] = changed(folder.path(), |columns| columns[1].1[41] = f64::NAN);
+    let found = &rows(&[text(&plus), text(&minus), "--drop-missing"])[0];
+    assert_eq!(number(found, "n"), 2.0 * 1980.0 - 1.0);
+    check(found, [0.02, 0.01]);
+}
+
+#[test]
+fn distortions_are_noticed_and_converted() {
+    let folder = tempfile::tempdir().unwrap();
+    let files = [("plus", 0.05), ("minus", -0.05)].map(|(name, g)| {
+        let path = folder.path().join(format!("{name}.csv"));
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let mut text = String::from("id,e1,e2,g1,g2\n");
+        for id in 0..GALAXIES {
+            let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+            let shape = shearq_quantities::Shear::new(0.1 * normal(), 0.1 * normal());
+            let e = shape
+                .sheared_by(shearq_quantities::Shear::new(g, g))
+                .to_distortion();
+            writeln!(text, "{id},{},{},{g},{g}", e.e1, e.e2).unwrap();
+        }
+        fs::write(&path, text).unwrap();
+        path
+    });
+    let (plus, minus) = (text(&files[0]), text(&files[1]));
+    let error = fail(&["bias", plus, minus]);
+    assert!(error.contains("look like distortions"), "{error}");
+    let kept = &rows(&[plus, minus, "--ellipticity", "shear"])[0];
+    assert!((0.9..1.0).contains(&number(kept, "m1")), "{kept}");
+    let converted = &rows(&[plus, minus, "--ellipticity", "distortion"])[0];
+    // The mean of sheared ellipticities is the shear for any intrinsic distribution, up to noise of the pairs.
+    let (m, error) = (number(converted, "m1"), number(converted, "m1_error"));
+    assert!(m.abs() < 4.0 * error && error < 2e-3, "{m} ± {error}");
+}
