@@ -7,7 +7,7 @@ use crate::Cli;
 /// The ways to use each command, and the options that each way uses. Two options without a common way must be
 /// refused.
 const WAYS: [(&str, &[&str]); 31] = [
-    ("quickstart", &["out threads"]),
+    ("quickstart", &["out threads wide"]),
     (
         "simulate",
         &["sets images grid seed amplitude tilt out shard threads"],

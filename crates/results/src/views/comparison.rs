@@ -177,6 +177,44 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     }
 }
 
+/// The metrics that decide between variants: Q, calibrated Q, m and noise, as means over their common sets.
+pub fn compact(variants: &[Variant]) -> Table {
+    const METRICS: [&str; 4] = ["q", "q_calibrated", "m_cross", "galaxy_noise"];
+    let records: Vec<Vec<SetRecord>> = variants.iter().map(Variant::records).collect();
+    let common = common_sets(&records);
+    let mut headings = vec![Heading::new("submission", "Configuration")];
+    headings.extend(METRICS.map(metric_heading));
+    let rows = variants.iter().zip(&records).map(|(variant, records)| {
+        let sets: Vec<&SetRecord> = records
+            .iter()
+            .filter(|set| common.contains(&set.set))
+            .collect();
+        let mut row = vec![Cell::text(&variant.name)];
+        row.extend(METRICS.map(|name| mean_cell(&sets, name)));
+        row
+    });
+    let list: Vec<String> = common.iter().map(u32::to_string).collect();
+    let images: usize = records
+        .first()
+        .into_iter()
+        .flatten()
+        .map(|set| set.images.len())
+        .sum();
+    Table {
+        title: "Comparison of configurations".into(),
+        headings,
+        rows: rows.collect(),
+        notes: vec![
+            format!(
+                "Means over the simulated sets {}; {images} images. ± is a standard error.",
+                list.join(", ")
+            ),
+            "Q: the challenge's score. Q cal.: Q after division by the response.".into(),
+            "m: multiplicative bias. noise: scatter per galaxy and component.".into(),
+        ],
+    }
+}
+
 /// Runs side by side: means over sets or groups of sets, and the difference in Q from the first row, or the first row
 /// of the group, on the same images.
 pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<Grouping>) -> Table {
