@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
@@ -148,16 +148,17 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
             parts = list(args[0])
             if parts and all(isinstance(part, Catalogue) and part.dtype.names for part in parts):
                 return concatenate(parts)
-        return super().__array_function__(func, types, args, kwargs)  # type: ignore[arg-type]
+        return super().__array_function__(func, types, args, kwargs)
 
-    @overload  # type: ignore[override]
-    def __getitem__(self, key: _Whole) -> NDArray[np.int32]: ...
+    # numpy's own overloads know no columns, and a name of whole numbers is a name.
+    @overload  # type: ignore[override, unused-ignore]
+    def __getitem__(self, key: _Whole) -> NDArray[np.int32]: ...  # type: ignore[overload-overlap]
     @overload
     def __getitem__(self, key: str) -> NDArray[np.float64]: ...
     @overload
     def __getitem__(self, key: int | np.integer[Any]) -> np.void: ...
     @overload
-    def __getitem__(self, key: slice | Sequence[str] | Sequence[int] | NDArray[Any]) -> Catalogue: ...
+    def __getitem__(self, key: slice | list[str] | list[int] | NDArray[Any]) -> Catalogue: ...
     def __getitem__(self, key: Any) -> Any:
         found = super().__getitem__(key)
         if isinstance(found, Catalogue) and found.dtype.names is None:
@@ -178,6 +179,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
             return super().__repr__()
         flagged = f", {int((self['flags'] != 0).sum())} flagged" if "flags" in names else ""
         return f"<shearq.Catalogue of {len(self)} galaxies{flagged}: {', '.join(names)}>"
+
+    __str__ = __repr__
 
     def _repr_html_(self) -> str:
         from ._display import html
@@ -235,7 +238,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         if names == "anacal":
             return {"e1": e1, "de1_dg1": r11, "e2": e2, "de2_dg2": r22, "flags": self["flags"]}
         if names == "ngmix":
-            cross = {name: self[name] for name in ("R12", "R21") if name in (self.dtype.names or ())}
+            cross: dict[str, NDArray[Any]] = {name: self[name] for name in ("R12", "R21") if name in (self.dtype.names or ())}
             return {"g": np.stack([e1, e2], axis=-1), "R11": r11, "R22": r22, **cross, "flags": self["flags"]}
         raise ValueError(f"names: found {names!r}; expected 'shearq', 'anacal' or 'ngmix'")
 
@@ -397,18 +400,21 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
     ValueError
         As :meth:`Catalogue.mean_shear`; or if there is no catalogue.
     """
-    parts: list[tuple[list[NDArray[np.float64]], list[NDArray[np.float64]], NDArray[np.bool_], bool]] = []
+    parts: list[list[NDArray[np.float64]]] = []
+    goods: list[NDArray[np.bool_]] = []
+    calibrated = False
     for rows in [catalogues] if isinstance(catalogues, Catalogue) else catalogues:
         missing = [name for name in _schema.NEEDED if name not in (rows.dtype.names or ())]
         if missing:
             raise ValueError(f"catalogue: no columns {', '.join(missing)}; expected {', '.join(_schema.NEEDED)}")
         rows = np.atleast_1d(rows).view(Catalogue)
         e, responses = raw(rows)
-        parts.append((e, responses, rows.good, bool(np.isfinite(rows["divisor1"]).any())))
+        parts.append([*e, *responses])
+        goods.append(rows.good)
+        calibrated = calibrated or bool(np.isfinite(rows["divisor1"]).any())
     if not parts:
         raise ValueError("catalogues: found none; expected one or more")
-    columns = [np.concatenate([part[which][k] for part in parts]) for which in (0, 1) for k in (0, 1)]
-    good = np.concatenate([part[2] for part in parts])
+    good = np.concatenate(goods)
     weight = _weights(weights, len(good))
     counted = good & (weight > 0)
     if len(good) == 0:
@@ -417,12 +423,12 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         name = "catalogue" if weights is None else "weights"
         reason = "has a flag" if weights is None else "has a flag or a weight of zero"
         raise ValueError(f"{name}: each of the {len(good)} galaxies {reason}; expected one without")
-    chosen = [column[counted] for column in columns]
-    if not all(np.isfinite(column).all() for column in chosen):
+    e1, e2, r11, r22 = (np.concatenate([part[k] for part in parts])[counted] for k in range(4))
+    if not all(np.isfinite(column).all() for column in (e1, e2, r11, r22)):
         raise ValueError("catalogue: an ellipticity or response without a flag is not finite; expected flags")
     # A common factor changes nothing, but squares of weights could overflow.
     factor = weight[counted] / weight[counted].max()
-    (g1, g2), (first, second), response, galaxies = _shearq.mean_shear(*chosen, factor)
+    (g1, g2), (first, second), response, galaxies = _shearq.mean_shear(e1, e2, r11, r22, factor)
     errors = [float(np.sqrt(value)) for value in (first[0], second[1])]
     return MeanShear(
         g1,
@@ -430,7 +436,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         errors[0],
         errors[1],
         ((first[0], first[1]), (second[0], second[1])),
-        (response[0], response[1]) if any(part[3] for part in parts) else None,
+        (response[0], response[1]) if calibrated else None,
         galaxies,
         int((weight[~good] > 0).sum()),
     )

@@ -49,7 +49,7 @@ def read(path: str | os.PathLike[str]) -> Catalogue:
     if format == "npy":
         return _tables.from_table(np.load(file))
     if format == "ecsv":
-        from astropy.table import Table
+        from astropy.table import Table  # type: ignore[import-untyped, unused-ignore]
 
         return _tables.from_table(Table.read(file, format="ascii.ecsv"))
     keys = [*_schema.KEYS, *_schema.OTHER_KEYS]

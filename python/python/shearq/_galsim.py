@@ -47,7 +47,7 @@ def _many(value: Any, kind: Any) -> list[Any] | None:
 def square_pixels(name: str, jacobian: tuple[float, float, float, float], remedy: str) -> float:
     """The scale of pixels with (du/dx, du/dy, dv/dx, dv/dy), which must be square and along the axes."""
     xx, xy, yx, yy = jacobian
-    scale = abs(xx * yy - xy * yx) ** 0.5
+    scale: float = abs(xx * yy - xy * yx) ** 0.5
     if xx > 0 and max(abs(xy), abs(yx), abs(yy - xx)) <= SAME * scale:
         return scale
     if xx * yy - xy * yx <= 0:

@@ -9,7 +9,7 @@ from typing import Any
 WHOLE = ("flags", "iterations", "stop", "updated")
 # What the mean shear follows from.
 NEEDED = ("e1", "e2", "flags", "R11", "R22", "divisor1", "divisor2")
-REAL = ("x", "y", "e1", "e2", "first_energy", "energy", "noise", "flux", "radius", "size", "R11", "R22", "R12", "R21")
+REAL: tuple[str, ...] = ("x", "y", "e1", "e2", "first_energy", "energy", "noise", "flux", "radius", "size", "R11", "R22", "R12", "R21")
 REAL += ("divisor1", "divisor2")
 UNITS = {"x": "pix", "y": "pix", "radius": "pix", "size": "pix2"}
 

@@ -311,10 +311,10 @@ def compare(
     for name, scored in scores.items():
         paired: dict[str, float] = {}
         for metric, sigma in (("q", "sigma"), ("q_calibrated", "q_calibrated_sigma")):
-            difference, error = _difference(metric, first, scored)
+            difference, uncertainty = _difference(metric, first, scored)
             paired[f"{metric}_difference"] = difference
-            paired[f"{metric}_difference_error"] = error
-            paired[sigma] = difference / error if error else math.nan
+            paired[f"{metric}_difference_error"] = uncertainty
+            paired[sigma] = difference / uncertainty if uncertainty else math.nan
         metrics = {f"{key}_published": value for key, value in (published.get(name) or {}).items()}
         missing = {f"{key}_published": math.nan for key in ("q", "m_half", "sqrt_a")}
         rows.append(

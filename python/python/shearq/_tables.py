@@ -36,7 +36,7 @@ def to_pandas(catalogue: Catalogue) -> pandas.DataFrame:
     import pandas
 
     frame = pandas.DataFrame(_columns(catalogue))
-    frame.attrs = dict(catalogue.attrs)
+    frame.attrs.update(catalogue.attrs)
     return frame
 
 
