@@ -10,6 +10,7 @@ mod score;
 mod simulate;
 mod stamps;
 mod submissions;
+mod tables;
 mod work;
 
 use pyo3::prelude::*;
@@ -26,6 +27,8 @@ mod _shearq {
     use super::simulate::simulate;
     #[pymodule_export]
     use super::submissions::{Configuration, names};
+    #[pymodule_export]
+    use super::tables::{read_table, write_table};
 
     /// Version of shearq.
     #[pymodule_export]

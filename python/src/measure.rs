@@ -94,20 +94,15 @@ struct Request<'a> {
     noise: Noise<'a>,
 }
 
-/// The catalogue, the mean response, the warnings, and an error if all galaxies are flagged.
-type Measured<'py> = (
-    Bound<'py, PyDict>,
-    Option<[f64; 2]>,
-    Vec<String>,
-    Option<String>,
-);
+/// The catalogue, the warnings, and an error if all galaxies are flagged.
+type Measured<'py> = (Bound<'py, PyDict>, Vec<String>, Option<String>);
 
 /// Measures stamps `(n, ny, nx)`.
 ///
 /// PSFs are one star stamp for all, star stamps one per galaxy, or formulas (FWHM, e1, e2 and β, which is NaN for
 /// Kolmogorov), one for all or one per galaxy. The noise is one level for all or one per stamp. Without any, the
-/// configuration measures it on the stamps. Returns the columns of the catalogue, the mean response in
-/// the divisor, the warnings, and an error if all galaxies are flagged.
+/// configuration measures it on the stamps. Returns the columns of the catalogue, the warnings, and an error if all
+/// galaxies are flagged.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
 pub(crate) fn measure<'py>(
@@ -147,7 +142,7 @@ pub(crate) fn measure<'py>(
     }
     let galaxies = request.measure(py, &psfs, threads(threads_asked), progress)?;
     let mut galaxies = [galaxies];
-    let response = calibrate(configuration, &mut galaxies);
+    calibrate(configuration, &mut galaxies);
     let warnings = request.warnings(&psfs, &galaxies)?;
     let [galaxies] = galaxies;
     let flagged = galaxies.iter().filter(|g| !g.flags.is_empty()).count();
@@ -156,7 +151,7 @@ pub(crate) fn measure<'py>(
         .flatten()
         .map(|warning| format!("stamps: no galaxy could be measured: {warning}"));
     let warnings = warnings.iter().map(Warning::to_string).collect();
-    Ok((catalogue(py, &galaxies)?, response, warnings, all_flagged))
+    Ok((catalogue(py, &galaxies)?, warnings, all_flagged))
 }
 
 impl<'s> Request<'s> {

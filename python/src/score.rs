@@ -12,7 +12,8 @@ use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
 use shearq_scoring::{
     BINS, Bins, Choice, Convention, Definition, Fault, FieldSum, Grid, ImageFaults, Metrics, Noise,
-    Options, Row, RowCounts, SCORED, SetImages, SetScorer, TrueShear, TruthSign, sign_by_modes,
+    Options, Row, RowCounts, SCORED, SetImages, SetScorer, TrueShear, TruthSign,
+    sign_by_correlation, sign_by_modes,
 };
 
 use crate::errors::of_scoring;
@@ -136,7 +137,7 @@ pub(crate) fn score<'py>(
     stamp: f64,
     field_degrees: f64,
     truth: Pair<'py>,
-    challenge_sign: bool,
+    challenge_sign: Option<bool>,
     e: Pair<'py>,
     positions: Option<Pair<'py>>,
     lengths: Vec<usize>,
@@ -152,17 +153,18 @@ pub(crate) fn score<'py>(
     };
     let (g1, g2) = (truth.0.as_array(), truth.1.as_array());
     let catalogue = Rows::new(&e, positions.as_ref(), lengths);
-    let (scored, mut warnings) = py.detach(|| {
+    let (scored, mut warnings, challenge) = py.detach(|| {
         let truth = g1.iter().zip(&g2).take(grid.cells() + 1).enumerate();
         let truth = truth.map(|(k, (&e1, &e2))| {
             let (x, y) = grid.centre(k % n, k / n);
             Row { x, y, e1, e2 }
         });
-        let sign = match challenge_sign {
+        let given = challenge_sign.map(|challenge| match challenge {
             true => TruthSign::Challenge,
             false => TruthSign::Standard,
-        };
-        let truth = TrueShear::from_rows(&grid, sign, truth).map_err(of_scoring)?;
+        });
+        let sign = given.unwrap_or(TruthSign::Standard);
+        let mut truth = TrueShear::from_rows(&grid, sign, truth).map_err(of_scoring)?;
         let (images, counts, faults) = catalogue.sum(&grid)?;
         if counts.used == 0 {
             return Err(PyValueError::new_err(format!(
@@ -174,8 +176,19 @@ pub(crate) fn score<'py>(
             return Err(PyValueError::new_err(format!("e1, e2: {fault}")));
         }
         let mut warnings = rows::oddities(&counts, "e1, e2");
-        if sign_by_modes(&grid, &truth).map_err(of_scoring)? == Some(TruthSign::Challenge) {
-            let other = if challenge_sign { "standard" } else { "challenge" };
+        let by_modes = sign_by_modes(&grid, &truth).map_err(of_scoring)?;
+        let mut challenge = sign == TruthSign::Challenge;
+        if given.is_none() {
+            let found = match by_modes {
+                Some(sign) => Some(sign),
+                None => sign_by_correlation(&truth, images.total()).map_err(of_scoring)?,
+            };
+            if found == Some(TruthSign::Challenge) {
+                truth = truth.flipped();
+                challenge = true;
+            }
+        } else if by_modes == Some(TruthSign::Challenge) {
+            let other = if challenge { "standard" } else { "challenge" };
             warnings.push(format!(
                 "warning: truth_g2 seems to have the other sign: with it the shear is an E-mode field. Try: truth_sign=\"{other}\""
             ));
@@ -196,7 +209,7 @@ pub(crate) fn score<'py>(
                 warnings.push(format!("warning: {}.", diagnosis::words(&fault)));
             }
         }
-        PyResult::Ok((scored, warnings))
+        PyResult::Ok((scored, warnings, challenge))
     })?;
     if scored.constant.is_some() {
         warnings.push("note: the true shear is the same everywhere, so that only `mean`, c1 and c2 are known; other metrics are NaN.".into());
@@ -243,6 +256,10 @@ pub(crate) fn score<'py>(
     let leaderboard = &scored.conventions[scored.best.index()];
     found.set_item("q_leaderboard", leaderboard.quality.q)?;
     found.set_item("correlation", spectra.correlation)?;
+    found.set_item(
+        "truth_sign",
+        if challenge { "challenge" } else { "standard" },
+    )?;
     found.set_item("warnings", warnings)?;
     found.set_item(
         "constant",

@@ -15,7 +15,6 @@ def observation(stamp, psf, noise, jacobian=(0.2, 0.0, 0.0, 0.2)):
     names = ("get_dudcol", "get_dudrow", "get_dvdcol", "get_dvdrow")
     ways = {name: (lambda value=value: value) for name, value in zip(names, jacobian)}
     weight = np.full(stamp.shape, noise**-2.0)
-    weight[0, :5] = 0
     star = SimpleNamespace(image=psf)
     return SimpleNamespace(image=stamp, weight=weight, psf=star, jacobian=SimpleNamespace(**ways))
 
@@ -25,6 +24,15 @@ def test_observations_of_ngmix_are_measured_as_their_arrays(image):
     found = shearq.measure(**adapters.from_ngmix(observations))
     assert same_bits(found, shearq.measure(image.stamps, image.psf, noise=image.noise))
     assert adapters.from_ngmix(observations[0])["stamps"].shape == (1, 48, 48)
+    # Weights of zero and bits of bmask are missing pixels.
+    mask = np.zeros(image.stamps.shape, bool)
+    for k, one in enumerate(observations):
+        one.weight[0, :5] = 0
+        one.bmask = np.zeros((48, 48), "i4")
+        one.bmask[40, k % 48] = 2
+        mask[k, 0, :5] = mask[k, 40, k % 48] = True
+    masked = shearq.measure(image.stamps, image.psf, noise=np.full(len(mask), image.noise), mask=mask)
+    assert same_bits(shearq.measure(**adapters.from_ngmix(observations)), masked)
 
 
 def test_an_observation_of_ngmix_itself_is_taken(image):
@@ -38,7 +46,7 @@ def test_an_observation_of_ngmix_itself_is_taken(image):
 
 @pytest.mark.parametrize("jacobian", [(0.2, 0.1, -0.1, 0.2), (-0.2, 0, 0, 0.2), (0.2, 0, 0, 0.3), (0, 0.2, 0.2, 0)])
 def test_pixels_that_are_turned_or_no_squares_are_refused(image, jacobian):
-    with pytest.raises(ValueError, match="observations: the jacobian of observation 0"):
+    with pytest.raises(ValueError, match="observations: observation 0 has (flipped|rotated|sheared) pixels"):
         adapters.from_ngmix(observation(image.stamps[0], image.psf, 1.0, jacobian))
 
 
@@ -62,15 +70,15 @@ def test_tables_of_astropy_keep_columns_and_attributes(image, tmp_path):
     table = pytest.importorskip("astropy.table", reason="tables of astropy need it")
     found = shearq.measure(image.stamps, image.psf, noise=image.noise)
     made = adapters.to_astropy(found)
-    assert made.colnames == list(found.dtype.names) and made.meta["submission"] == "48/linear/star"
+    assert made.colnames == list(found.dtype.names) and made.meta["submiss"] == "48/linear/star"
     back = adapters.from_astropy(made)
     assert back.attrs == found.attrs and same_bits(back, found)
     assert back.mean_shear() == found.mean_shear()
     made.write(tmp_path / "c.ecsv")
     read = adapters.from_astropy(table.Table.read(tmp_path / "c.ecsv"))
     assert read.mean_shear().g1 == pytest.approx(found.mean_shear().g1)
-    with pytest.raises(ValueError, match="table: no columns R11, R22, flags"):
-        adapters.from_astropy(table.Table({"e1": [0.0], "e2": [0.0]}))
+    with pytest.raises(ValueError, match="table: no columns e2"):
+        adapters.from_astropy(table.Table({"e1": [0.0], "x": [0.0]}))
 
 
 def test_frames_are_made_of_a_catalogue_as_of_any_structured_array(image):

@@ -83,6 +83,57 @@ def test_ellipticities_correlate_with_hsm(psf, star):
         assert 0.3 < (hsm * ours).sum() / (hsm**2).sum() < 0.9
 
 
-def test_a_single_image_is_an_error(star):
+def test_a_single_image_is_one_stamp_and_a_single_array_is_an_error(star):
+    with pytest.warns(shearq.DataWarning):
+        assert len(shearq.measure(star, star, noise=1.0)) == 1
     with pytest.raises(ValueError, match=r"stamps: found an array of shape \(48, 48\); expected \(n, ny, nx\)"):
-        shearq.measure(star, star, noise=1.0)
+        shearq.measure(star.array, star, noise=1.0)
+
+
+def _wcs(dudx, dudy, dvdx, dvdy):
+    return galsim.JacobianWCS(dudx, dudy, dvdx, dvdy)
+
+
+def _images(galaxy, wcs, count=3):
+    return [galaxy.drawImage(nx=STAMP, ny=STAMP, wcs=wcs, dtype=np.float32) for _ in range(count)]
+
+
+@pytest.mark.parametrize(
+    "jacobian, kind",
+    [((-0.2, 0, 0, 0.2), "flipped"), ((0, 0.2, -0.2, 0), "rotated"), ((0.2, 0.01, 0.01, 0.2), "sheared"), ((0.2, 0, 0, 0.21), "sheared")],
+)
+def test_pixels_that_would_change_shears_are_refused(psf, star, jacobian, kind):
+    images = _images(psf.dilate(0.4), _wcs(*jacobian))
+    with pytest.raises(ValueError, match=f"stamps: image 0 has {kind} pixels.*wcs='ignore'"):
+        shearq.measure(images, star.array)
+    assert shearq.from_galsim(images, star.array, wcs="ignore")["stamps"].shape == (3, STAMP, STAMP)
+
+
+def test_profiles_are_drawn_on_the_pixels_of_the_stamps():
+    profile = galsim.Moffat(beta=3.0, fwhm=0.68).shear(g1=0.03, g2=-0.02)
+    wcs = galsim.PixelScale(0.2)
+    images = _images(galsim.Convolve(galsim.Exponential(half_light_radius=0.6, flux=100.0), profile), wcs)
+    drawn = profile.drawImage(nx=STAMP, ny=STAMP, scale=0.2, dtype=np.float64)
+    stamps = np.stack([image.array for image in images])
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0, 0.01, stamps.shape).astype(np.float32)
+    for image, more in zip(images, noise):
+        image.array[:] += more
+    expected = shearq.measure(stamps + noise, drawn.array, noise=0.01)
+    for given in (profile, drawn, [profile] * 3, [drawn] * 3):
+        found = shearq.measure(images, given, noise=0.01)
+        assert np.allclose(found["e1"], expected["e1"], rtol=1e-6)
+    # Of a WCS that bends, every profile has the pixels of its own stamp.
+    for image in images:
+        image.wcs = galsim.OffsetWCS(0.2)
+    assert len(shearq.from_galsim(images, [profile] * 3)["psf"]) == 3
+    coarse = profile.drawImage(nx=STAMP, ny=STAMP, scale=0.3)
+    with pytest.raises(ValueError, match="psf: found a pixel scale of 0.3 and stamps of 0.2"):
+        shearq.measure(images, coarse)
+    images[1].wcs = galsim.PixelScale(0.25)
+    with pytest.raises(ValueError, match="stamps: found pixel scales from 0.2 to 0.25"):
+        shearq.measure(images, profile)
+    with pytest.raises(TypeError, match="psf: found a profile of GalSim with stamps that have no WCS.*drawImage"):
+        shearq.measure(stamps, profile)
+    with pytest.raises(TypeError, match="images: found ndarray"):
+        shearq.from_galsim(stamps, profile)

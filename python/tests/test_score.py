@@ -99,7 +99,10 @@ def test_axes_and_signs_are_those_told(wave):
     g1, g2 = wave
     diagonal = np.random.default_rng(3).normal(0, 0.01, (16, 16))
     with pytest.warns(UserWarning, match=r"match the truth in convention 6 \(e2 flipped\)"):
-        shearq.score(*_field(), *_field(sign=-1))
+        shearq.score(*_field(), *_field(sign=-1), truth_sign="standard")
+    found = shearq.score(*_field(), *_field(sign=-1))
+    assert (found.truth_sign, found.convention, found.notes) == ("challenge", 5, [])
+    assert shearq.score(*_field(), *_field()).truth_sign == "standard"
     assert shearq.score(g1, diagonal, g1, diagonal)["m_cross"] == pytest.approx(0, abs=1e-12)
 
 
@@ -143,6 +146,7 @@ WRONG = [
     (dict(positions=(FIELD, FIELD)), "stamp: not given; expected the pixels a side"),
     (dict(positions=(FIELD, FIELD[0]), stamp=48), r"positions: found arrays of shapes \(16, 16\) and \(16,\)"),
     (dict(positions=FIELD, stamp=48), "positions: found ndarray; expected two arrays"),
+    (dict(positions=(FIELD, FIELD), stamp=48), "images: not given; expected the number of images"),
     (dict(e1=FIELD - 99), "256 rows have a whole number as ellipticity"),
     (dict(definition="mine"), 'definition: "mine"; expected "leaderboard" or "corrected"'),
     (dict(convention=9), 'convention: "9"; expected "matched", "best" or a number'),
@@ -239,7 +243,7 @@ def test_probable_faults_are_warned_of():
         with pytest.warns(UserWarning, match=expected):
             shearq.score(*faulty, g1, g2)
     with pytest.warns(UserWarning, match='Try: truth_sign="challenge"'):
-        shearq.score(e1, e2, g1, -g2)
+        shearq.score(e1, e2, g1, -g2, truth_sign="standard")
 
 
 def test_nothing_to_score_is_an_error_and_a_constant_truth_is_noted():

@@ -78,6 +78,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
         let measurer = Measurer::new(&submission, source.head().mosaic.stamp)?;
+        if measurer.configuration() != &submission {
+            // Stamps of the other parity require other pixels of the PSFs.
+            source = ImageSource::open(&data, image, measurer.configuration())?;
+        }
         source.survey(&data, &measurer)?;
         let Mosaic {
             columns,

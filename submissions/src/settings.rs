@@ -509,12 +509,19 @@ pub struct PsfCut {
     pub size: usize,
     /// Pixels a side of the smallest stamp that will do, of which all are taken; of the parity of `size`.
     pub least: usize,
+    /// Whether the middle of the PSF must be the middle of these pixels: stars on stamps of the other parity are shifted
+    /// by half a pixel. The network does not need it, as an autocorrelation does not change with a shift.
+    pub centred: bool,
 }
 
 impl From<usize> for PsfCut {
     /// So many pixels a side, of any PSF.
     fn from(size: usize) -> Self {
-        PsfCut { size, least: size }
+        PsfCut {
+            size,
+            least: size,
+            centred: false,
+        }
     }
 }
 
@@ -529,6 +536,7 @@ impl Configuration {
         PsfCut {
             size,
             least: least - (size - least) % 2,
+            centred: true,
         }
     }
 

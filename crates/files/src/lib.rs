@@ -5,6 +5,7 @@
 //! [`frames`] are polars' data frames with text metadata.
 
 pub mod atomic;
+mod attributes;
 mod error;
 pub mod fits;
 pub mod frames;

@@ -21,7 +21,7 @@ use crate::error::FileError;
 use crate::open::{is_there, open};
 
 pub use crate::limits::MAX_ROWS;
-use crate::{fits, parquet, text};
+use crate::{attributes, fits, parquet, text};
 
 /// A column of numbers of the table of `path`; missing ones are NaN.
 ///
@@ -382,13 +382,12 @@ pub fn stated(path: &Path, key: &str) -> Result<Option<String>, FileError> {
     Ok(found.remove(key).map(|value| value.trim().to_owned()))
 }
 
-/// The part of `metadata` that a table in this `format` can contain: everything in Parquet; in FITS keys of at most eight
-/// characters with values of at most 68.
+/// The part of `metadata` that a table written as `format` contains: all in Parquet, and keys of at most eight
+/// characters in FITS.
 pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
-    let fits = |key: &str, value: &str| key.len() <= 8 && value.len() <= 68;
     metadata
         .iter()
-        .filter(|(key, value)| format == FileFormat::Parquet || fits(key, value))
+        .filter(|(key, _)| format == FileFormat::Parquet || key.len() <= 8)
         .map(|(key, value)| (key.clone(), value.clone()))
         .collect()
 }
@@ -407,8 +406,42 @@ pub fn read_metadata<'a>(
             let mut all = parquet::metadata(path)?;
             Ok(keys.filter_map(|key| all.remove_entry(key)).collect())
         }
-        FileFormat::Fits => fits::read_table_keys(path, keys),
+        FileFormat::Fits => {
+            let found = fits::read_table_keys(path, keys)?;
+            let whole = found.into_iter();
+            Ok(whole.map(|(key, value)| (key, unescaped(&value))).collect())
+        }
     }
+}
+
+/// A text in the characters that a FITS header may have: ASCII, with `\n`, `\\` and `\u{…}` for others.
+fn escaped(text: &str) -> String {
+    text.chars()
+        .map(|c| match c {
+            '\\' => "\\\\".to_owned(),
+            ' '..='~' => c.to_string(),
+            _ => c.escape_default().to_string(),
+        })
+        .collect()
+}
+
+/// The text that [`escaped`] made this of. Other texts stay as they are.
+fn unescaped(text: &str) -> String {
+    let (mut plain, mut rest) = (String::with_capacity(text.len()), text);
+    while let Some((before, after)) = rest.split_once('\\') {
+        plain.push_str(before);
+        let code = || {
+            let (code, after) = after.strip_prefix("u{")?.split_once('}')?;
+            Some((char::from_u32(u32::from_str_radix(code, 16).ok()?)?, after))
+        };
+        let simple = [('n', '\n'), ('r', '\r'), ('t', '\t'), ('\\', '\\')];
+        let simple = simple.into_iter();
+        let known = simple.filter_map(|(name, c)| Some((c, after.strip_prefix(name)?)));
+        let (c, after) = known.chain(code()).next().unwrap_or(('\\', after));
+        plain.push(c);
+        rest = after;
+    }
+    plain + rest
 }
 
 /// Writes `table` in this `format`, with the part of `metadata` that is [`kept`].
@@ -422,11 +455,11 @@ pub fn write(
     metadata: &Metadata,
 ) -> Result<(), FileError> {
     match format {
-        FileFormat::Parquet => parquet::write(path, table, metadata),
+        FileFormat::Parquet => parquet::write(path, table, &attributes::with(metadata, table)),
         FileFormat::Fits => {
             let keys: Vec<(String, fits::Value)> = kept(metadata, format)
                 .into_iter()
-                .map(|(key, value)| (key.to_ascii_uppercase(), fits::Value::Text(value)))
+                .map(|(key, value)| (key.to_ascii_uppercase(), fits::Value::Text(escaped(&value))))
                 .collect();
             let header: Vec<(&str, fits::Value)> =
                 keys.iter().map(|(k, v)| (k.as_str(), v.clone())).collect();
@@ -437,37 +470,46 @@ pub fn write(
 
 #[cfg(test)]
 mod tests {
-    use crate::frames::frame;
-    use crate::frames::polars::Column;
-
     use super::*;
 
     #[test]
-    fn parts_join_to_the_whole_table() {
+    fn any_text_survives_a_fits_header() {
+        let texts = [
+            "plain",
+            "a\n\n\tb = \"c\" # \\n\r",
+            "σ·γ \u{1F30C}",
+            "\\u{",
+            "\\",
+            "'it''s'",
+        ];
+        for text in texts {
+            let header = escaped(text);
+            assert!(
+                header.bytes().all(|b| (b' '..=b'~').contains(&b)),
+                "{header}"
+            );
+            assert_eq!(unescaped(&header), text);
+        }
+        // Of other programs.
+        assert_eq!(unescaped("C:\\data"), "C:\\data");
+        assert_eq!(unescaped("\\u{zz}"), "\\u{zz}");
+    }
+
+    #[test]
+    fn long_metadata_are_the_same_in_both_formats() {
         let folder = tempfile::tempdir().unwrap();
-        // More rows than a part, and not a multiple.
-        let values: Vec<f64> = (0..PART + 7).map(|k| k as f64).collect();
-        let table = frame(vec![
-            Column::new("a".into(), values.clone()),
-            Column::new("b".into(), values.iter().map(|v| -v).collect::<Vec<_>>()),
-        ])
-        .unwrap();
-        for format in [FileFormat::Fits, FileFormat::Parquet] {
-            let path = folder.path().join(format!("t.{}", format.extension()));
-            write(&path, format, &table, &Metadata::new()).unwrap();
-            let mut found = Vec::new();
-            read_parts(&Place::of(&path), &["b"], |part| {
-                found.extend(numbers(&part, "b", &path)?.iter().map(|v| -v));
-                Ok(())
-            })
-            .unwrap();
-            assert_eq!(found, values);
-            let stopped = read_parts(&Place::of(&path), &["b"], |_| {
-                Err(FileError::new(&path, "enough"))
-            });
-            assert!(stopped.unwrap_err().to_string().ends_with("enough"));
-            let missing = read_parts(&Place::of(&path), &["c"], |_| Ok(())).unwrap_err();
-            assert!(missing.no_column, "{missing}");
+        let column = crate::frames::polars::Column::new("x".into(), [1.0, 2.0]);
+        let table = crate::frames::frame(vec![column]).unwrap();
+        let long = "key = \"it's\"\n".repeat(300);
+        let metadata = Metadata::from([("settings".into(), long), ("creator".into(), "σ".into())]);
+        for format in [FileFormat::Parquet, FileFormat::Fits] {
+            let path = folder
+                .path()
+                .join("table")
+                .with_extension(format.extension());
+            write(&path, format, &table, &metadata).unwrap();
+            let found = read_metadata(&path, format, metadata.keys()).unwrap();
+            assert_eq!(found, metadata, "{format:?}");
         }
     }
 }

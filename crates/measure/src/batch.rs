@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use ndarray::{ArrayView2, ArrayView3, Axis};
-use shearq_submissions::{Configuration, Method, NoiseSource};
+use shearq_submissions::{Configuration, NoiseSource};
 
 use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
@@ -48,7 +48,7 @@ impl Measurer {
         psf: ArrayView2<'_, P>,
         noise: Option<f64>,
     ) -> Result<Measurement, MeasureError> {
-        check(self.configuration(), stamp.dim(), Some(psf.dim()), noise)?;
+        check(self.configuration(), noise)?;
         if noise.is_none() && self.noise_plan().is_some() {
             return Err(MeasureError::Noise("not given".into()));
         }
@@ -85,13 +85,7 @@ impl Measurer {
         psfs: &Psfs<'_>,
         noise: Option<f64>,
     ) -> Result<Batch, MeasureError> {
-        let (_, rows, columns) = stamps.dim();
-        check(
-            self.configuration(),
-            (rows, columns),
-            psfs.star_size(),
-            noise,
-        )?;
+        check(self.configuration(), noise)?;
         let survey = match noise {
             None => self.survey(stamps)?,
             Some(_) => None,
@@ -178,13 +172,8 @@ pub(crate) fn shape_error(count: usize, side: usize, error: &ndarray::ShapeError
     }
 }
 
-/// Checks what a measurement of single stamps, or of star stamps, asks for beyond that they are large enough.
-fn check(
-    configuration: &Configuration,
-    stamp: (usize, usize),
-    star: Option<(usize, usize)>,
-    noise: Option<f64>,
-) -> Result<(), MeasureError> {
+/// Checks the noise level that is given, or whether there must be one.
+fn check(configuration: &Configuration, noise: Option<f64>) -> Result<(), MeasureError> {
     let given = match (noise, configuration.noise) {
         (Some(sigma), _) => (!is_level(sigma)).then(|| sigma.to_string()),
         (None, NoiseSource::Header) => Some("not given".to_owned()),
@@ -192,25 +181,6 @@ fn check(
     };
     if let Some(found) = given {
         return Err(MeasureError::Noise(found));
-    }
-    // The linear method's window is fixed at the middle of the stamp, where the PSF has to leave the galaxy.
-    if matches!(configuration.method, Method::Linear(_)) {
-        let sides = [
-            ("stamps", Some(stamp), configuration.stamp.size),
-            ("a PSF stamp", star, configuration.psf.size),
-        ];
-        for (what, found, size) in sides {
-            if let Some((rows, columns)) = found
-                && (rows % 2 != size % 2 || columns % 2 != size % 2)
-            {
-                let parity = if size % 2 == 0 { "an even" } else { "an odd" };
-                let expected = format!(
-                    "{parity} number a side, as the {size} that submission {} cuts around the centre",
-                    configuration.name
-                );
-                return Err(MeasureError::square(what, (rows, columns), expected));
-            }
-        }
     }
     Ok(())
 }
@@ -398,16 +368,6 @@ mod tests {
         message(
             measurer.stamp(one, small, noise),
             "a PSF stamp of 30 × 32 pixels; expected at least 32 × 32",
-        );
-        message(
-            measurer.stamp(one, moffat(0.0).stamp(33).view(), noise),
-            "a PSF stamp of 33 × 33 pixels; expected an even number a side, as the 48",
-        );
-        let odd = Measurer::named("48/linear/star", 49).unwrap();
-        let stamp = stamps(1, 49);
-        message(
-            odd.stamp(stamp.slice(s![0, .., ..]), star.view(), noise),
-            "stamps of 49 × 49 pixels; expected an even number a side, as the 48",
         );
         let stars = Array3::<f32>::zeros((3, 32, 32));
         message(

@@ -43,6 +43,7 @@ where
         if usable {
             galaxy.e1 /= means[0];
             galaxy.e2 /= means[1];
+            galaxy.divisor = Some(means);
         } else {
             (galaxy.e1, galaxy.e2) = (f64::NAN, f64::NAN);
             galaxy.flags.add(Flag::NoResponse);
@@ -87,6 +88,7 @@ mod tests {
         let mean = calibrate(&calibrated, &mut rows).unwrap();
         assert!((mean[0] - 0.5).abs() < 1e-12 && mean[0] == mean[1]);
         assert!((rows[0][0].e1 - 0.2).abs() < 1e-12);
+        assert!(rows.iter().flatten().all(|g| g.divisor == Some(mean)));
         assert!((rows[1][0].e2 + 0.4).abs() < 1e-12);
         // 0.1 ± 0.1 and, of others, 0.1 ± 0.03.
         let unsure = [0.3, -0.1, 0.25, -0.05];

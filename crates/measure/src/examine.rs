@@ -202,7 +202,15 @@ impl Examination {
         ];
         let [a, b, c, d] = corners.map(|corner| corner.mean);
         let apart = 2.0 * edge as f64;
-        let noise = |one: Block, other: Block| (0.5 * (one.variance + other.variance)).sqrt();
+        let noise = |one: Block, other: Block| {
+            // A variance is NaN if pixels of the corner are missing.
+            let mean = match [one.variance, other.variance] {
+                [a, b] if b.is_nan() => a,
+                [a, b] if a.is_nan() => b,
+                [a, b] => 0.5 * (a + b),
+            };
+            mean.max(0.0).sqrt()
+        };
         let mut pairs = [0.0; 3];
         for corner in corners {
             for (sum, more) in pairs.iter_mut().zip(corner.pairs) {
@@ -485,7 +493,8 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
     let plane = sum * sum / count + (along * along + across * across) / spread;
     Block {
         mean: sum / count,
-        variance: ((square - plane) / (count - 3.0)).max(0.0),
+        // NaN if pixels are missing.
+        variance: ((square - plane) / (count - 3.0)).clamp(0.0, f64::MAX),
         pairs,
     }
 }

@@ -39,6 +39,9 @@ impl fmt::Debug for Measurer {
 impl Measurer {
     /// Plans for full stamps of `full` pixels a side.
     ///
+    /// The linear method takes a pixel more of stamps and PSFs than the configuration states if that is even and the
+    /// stamps are odd, or the reverse, so that galaxies stay in the middle of its window.
+    ///
     /// # Errors
     /// If a setting is out of its range, or the stamps are smaller than the configuration needs.
     pub fn new(configuration: &Configuration, full: usize) -> Result<Self, MeasureError> {
@@ -51,6 +54,13 @@ impl Measurer {
             );
             return Err(MeasureError::square("stamps", (full, full), expected));
         }
+        let mut configuration = configuration.clone();
+        if configuration.linear().is_some() && full % 2 != n % 2 {
+            configuration.stamp.size += 1;
+            configuration.psf.size += 1;
+            configuration.validate().map_err(ConfigurationError::from)?;
+        }
+        let (configuration, n) = (&configuration, configuration.stamp.size);
         let plan = Plan {
             full,
             n,

@@ -20,6 +20,8 @@ pub struct Measurement {
     /// could not be measured. Only means over many galaxies are unbiased: the mean contribution of sheared noise is
     /// subtracted from one galaxy in four, for all.
     pub response: Option<ResponseMatrix>,
+    /// Mean responses of the galaxies calibrated together, by which e1 and e2 were divided; `None` before calibration.
+    pub divisor: Option<[f64; 2]>,
     /// Iterations of the network; `None` if it did not run.
     pub descent: Option<Descent>,
     /// Standard deviation of the noise that was used, in image units; NaN if unknown.
@@ -46,6 +48,7 @@ impl Measurement {
             e2: f64::NAN,
             flags: flag.into(),
             response: None,
+            divisor: None,
             descent: None,
             noise: f64::NAN,
             flux: f64::NAN,

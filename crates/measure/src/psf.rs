@@ -3,6 +3,7 @@
 mod average;
 pub(crate) mod breadth;
 pub(crate) mod examine;
+mod halfway;
 mod star;
 
 pub use average::average_stars;

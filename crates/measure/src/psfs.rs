@@ -128,18 +128,6 @@ impl<'a> Psfs<'a> {
         }
     }
 
-    /// Rows and columns of the star stamps, if there are any.
-    pub(crate) fn star_size(&self) -> Option<(usize, usize)> {
-        match self {
-            Psfs::Star(stamp) => Some(stamp.dim()),
-            Psfs::Stars(stamps) => {
-                let (_, rows, columns) = stamps.dim();
-                Some((rows, columns))
-            }
-            Psfs::Prepared(_) | Psfs::Functional(_) => None,
-        }
-    }
-
     /// The PSF of galaxy `k` as it is deconvolved, for galaxies on stamps of `full` pixels a side: cut, of sum one, and
     /// with the offset by which a star was moved to the centre.
     ///

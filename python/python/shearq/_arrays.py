@@ -1,4 +1,4 @@
-"""Arguments into arrays of known types and shapes. What does not fit is told by the argument's name."""
+"""Arguments into arrays of known types and shapes. Errors name the argument."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import operator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 MAX_THREADS = 1024
 
@@ -15,19 +16,13 @@ def shown(shape: tuple[int, ...]) -> str:
     return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
 
 
-def numeric(name: str, value: Any) -> np.ndarray:
+def numeric(name: str, value: Any) -> NDArray[Any]:
     """An array of real numbers: ``value`` itself where it is one, of whatever strides and order of bytes."""
-    array = getattr(value, "array", None)
-    if isinstance(array, np.ndarray) and hasattr(value, "bounds"):
-        # A GalSim image.
-        value = array
     if isinstance(value, np.ma.MaskedArray):
         if np.ma.is_masked(value):
-            raise ValueError(f"{name}: an array with masked values; expected one without, as from .filled()")
+            raise ValueError(f"{name}: found masked values; expected none. Only stamps may have masked pixels")
         value = value.data
     if not isinstance(value, np.ndarray):
-        if isinstance(value, (list, tuple)):
-            value = [v.array if hasattr(v, "bounds") and hasattr(v, "array") else v for v in value]
         try:
             value = np.asarray(value)
         except (TypeError, ValueError, OverflowError) as error:
@@ -40,7 +35,30 @@ def numeric(name: str, value: Any) -> np.ndarray:
     return np.asarray(value)
 
 
-def shaped(name: str, value: Any, expected: str, *, axes: int) -> np.ndarray:
+def with_missing(name: str, value: Any, mask: Any) -> Any:
+    """``value`` with NaN for its masked pixels and for those that ``mask`` marks; itself if there are none."""
+    if isinstance(value, (list, tuple)) and any(isinstance(one, np.ma.MaskedArray) for one in value):
+        value = np.ma.stack(value)
+    missing = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value) else None
+    if isinstance(value, np.ma.MaskedArray):
+        value = value.data
+    if mask is not None:
+        given = np.asarray(mask)
+        if given.dtype != bool:
+            raise TypeError(f"mask: found values of type {given.dtype}; expected booleans, True for missing pixels")
+        value = numeric(name, value)
+        if given.shape not in (value.shape, value.shape[1:]):
+            raise ValueError(f"mask: found an array of shape {shown(given.shape)}; expected {shown(value.shape)}, as the stamps have")
+        missing = given if missing is None else missing | given
+    if missing is None:
+        return value
+    single = value.dtype.itemsize < 4 or value.dtype.kind == "f" and value.dtype.itemsize == 4
+    filled = value.astype(np.float32 if single else np.float64)
+    filled[np.broadcast_to(missing, filled.shape)] = np.nan
+    return filled
+
+
+def shaped(name: str, value: Any, expected: str, *, axes: int) -> NDArray[Any]:
     """The same with so many axes, which ``expected`` describes."""
     array = numeric(name, value)
     if array.ndim != axes:
@@ -48,12 +66,12 @@ def shaped(name: str, value: Any, expected: str, *, axes: int) -> np.ndarray:
     return array
 
 
-def double(name: str, value: Any) -> np.ndarray:
+def double(name: str, value: Any) -> NDArray[np.float64]:
     """A copy in double precision where it is not, in C order."""
     return np.ascontiguousarray(numeric(name, value), dtype=np.float64)
 
 
-def flat(name: str, value: Any) -> np.ndarray:
+def flat(name: str, value: Any) -> NDArray[np.float64]:
     """The same without its shape."""
     return double(name, value).reshape(-1)
 
@@ -85,11 +103,6 @@ def whole(name: str, value: Any, least: int, most: int) -> int:
     if not least <= number <= most:
         raise ValueError(f"{name}: found {number}; expected a whole number from {least} to {most}")
     return number
-
-
-def thread_count(value: int | None) -> int | None:
-    """A number of threads, or none asked for."""
-    return None if value is None else whole("threads", value, 1, MAX_THREADS)
 
 
 def callback(value: Any) -> Any:

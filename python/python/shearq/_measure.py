@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import enum
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Union
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from . import _shearq
-from ._arrays import callback, double, numeric, real, shaped, shown, thread_count
-from ._submissions import SubmissionLike, submission as resolve
+from . import _galsim, _schema, _shearq
+from ._arrays import callback, double, numeric, real, shaped, shown, whole, with_missing
+from ._catalogue import Catalogue
+from ._galsim import GalSimImage, GalSimProfile
+from ._submissions import Configuration, SubmissionLike, submission as resolve
+from ._threads import thread_count
+from ._warn import warn
 
-Flag = enum.IntFlag("Flag", {name: bit for name, bit, _ in _shearq.flags()}, module=__name__)
-Flag.__doc__ = "Why a galaxy could not be measured: the bits of a catalogue's ``flags``.\n\n" + "\n".join(
-    f"* ``{name}``: {meaning}." for name, _, meaning in _shearq.flags()
-)
-
-# Names of columns in AnaCal.
-_ANACAL = {"e1": "e1", "e2": "e2", "R11": "de1_dg1", "R22": "de2_dg2"}
+StampsLike = Union[ArrayLike, GalSimImage, Sequence[GalSimImage]]
+"""Stamps: an array, a sequence of arrays, or one or more GalSim images."""
+PsfLike = Union[ArrayLike, "FunctionalPsf", GalSimImage, GalSimProfile, Sequence[GalSimImage], Sequence[GalSimProfile]]
+"""PSFs: arrays, formulas, or images or profiles of GalSim."""
 
 
 class DataWarning(UserWarning):
@@ -42,6 +40,8 @@ class FunctionalPsf:
     """
 
     __slots__ = ("_rows",)
+
+    _rows: NDArray[np.float64]
 
     def __init__(
         self,
@@ -70,15 +70,34 @@ class FunctionalPsf:
         self._rows = np.ascontiguousarray(np.atleast_2d(np.stack(columns, axis=-1)))
 
     @classmethod
-    def _of_rows(cls, rows: np.ndarray) -> FunctionalPsf:
+    def _of_rows(cls, rows: NDArray[np.float64]) -> FunctionalPsf:
         psf = cls.__new__(cls)
         psf._rows = rows
         return psf
 
-    fwhm = property(lambda self: self._rows[:, 0])
-    e1 = property(lambda self: self._rows[:, 1])
-    e2 = property(lambda self: self._rows[:, 2])
-    beta = property(lambda self: self._rows[:, 3], doc="Not a number for Kolmogorov profiles.")
+    @property
+    def fwhm(self) -> NDArray[np.float64]:
+        """Full widths at half maximum in pixels."""
+        return self._rows[:, 0]
+
+    @property
+    def e1(self) -> NDArray[np.float64]:
+        """First components of the shear-type ellipticity."""
+        return self._rows[:, 1]
+
+    @property
+    def e2(self) -> NDArray[np.float64]:
+        """Second components."""
+        return self._rows[:, 2]
+
+    @property
+    def beta(self) -> NDArray[np.float64]:
+        """Exponents of Moffat profiles; NaN for Kolmogorov profiles."""
+        return self._rows[:, 3]
+
+    def _part(self, start: int, end: int) -> FunctionalPsf:
+        """The PSFs of galaxies from ``start`` to before ``end``; one for all stays one."""
+        return self if len(self) == 1 else FunctionalPsf._of_rows(self._rows[start:end])
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -87,176 +106,15 @@ class FunctionalPsf:
         return f"<shearq.FunctionalPsf of {len(self)}>"
 
 
-@dataclass(frozen=True)
-class MeanShear:
-    """The mean shear of galaxies.
-
-    Attributes
-    ----------
-    g1, g2 : float
-        Components of the mean shear; g1 > 0 along +x, g2 > 0 along x = y.
-    g1_error, g2_error : float
-        Standard errors. They include the errors of the mean responses.
-    covariance : tuple of tuple of float
-        Covariance of g1 and g2.
-    response : tuple of float or None
-        Mean responses R11 and R22 by which the ellipticities were divided; None if the configuration measures none.
-    galaxies : int
-        Galaxies without a flag and with a positive weight.
-    flagged : int
-        Galaxies with a flag and a positive weight.
-    """
-
-    g1: float
-    g2: float
-    g1_error: float
-    g2_error: float
-    covariance: tuple[tuple[float, float], tuple[float, float]]
-    response: tuple[float, float] | None
-    galaxies: int
-    flagged: int
-
-    def __iter__(self):
-        return iter((self.g1, self.g2))
-
-
-class Catalogue(np.ndarray):
-    """A structured array with one row per galaxy, as :func:`measure` returns it.
-
-    Fields
-    ------
-    e1, e2 : float64
-        Ellipticity, divided by the mean response of all galaxies that were measured together; NaN if flagged.
-    flags : int32
-        Reasons why the galaxy could not be measured, bits of :class:`Flag`; 0 for a good galaxy.
-    iterations, stop, updated : int32
-        Iterations of the network, why it stopped (0 stable, 1 energy rise, 2 most iterations, -1 not run), and neurons
-        above their threshold at the end.
-    first_energy, energy : float64
-        Energy of the network at its start and end, in squared image units.
-    noise : float64
-        Noise level used: standard deviation per pixel, in image units.
-    flux : float64
-        Sum of the deconvolved stamp in image units; for the linear method, sum of the stamp.
-    radius, size : float64
-        Radius of the autocorrelation that is used in pixels, and its Qxx + Qyy in px².
-    R11, R22, R12, R21 : float64
-        Response of the galaxy to shear before that division: R12 is the response of e1 to the second component. Only
-        means over many galaxies are unbiased.
-
-    Attributes
-    ----------
-    attrs : dict
-        ``response``: mean responses by which e1 and e2 were divided, or None; ``submission``: name of the configuration;
-        ``settings``: all settings as TOML; ``ellipticity``: 'shear' or 'distortion'; ``version``: of shearq.
-
-    Notes
-    -----
-    The index of a field gives a plain array. Slices and masks of rows give a catalogue. pandas, polars and astropy
-    make tables from it as from any structured array; :func:`shearq.adapters.to_astropy` keeps ``attrs``.
-    """
-
-    attrs: dict[str, Any]
-
-    def __array_finalize__(self, parent: Any) -> None:
-        self.attrs = dict(getattr(parent, "attrs", {}))
-
-    def __getitem__(self, key: Any) -> Any:
-        found = super().__getitem__(key)
-        if isinstance(found, Catalogue) and found.dtype.names is None:
-            return found.view(np.ndarray)
-        return found
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        make, arguments, state = super().__reduce__()
-        return make, arguments, (state, self.attrs)
-
-    def __setstate__(self, state: Any) -> None:
-        plain, self.attrs = state
-        super().__setstate__(plain)
-
-    @property
-    def good(self) -> np.ndarray:
-        """Rows without a flag: booleans of shape (n,)."""
-        return self["flags"] == 0
-
-    def mean_shear(self, weights: ArrayLike | None = None) -> MeanShear:
-        """The mean shear of the good galaxies: Σwe/ΣwR, with the ellipticities e before calibration.
-
-        The error is the error of this ratio to first order, √(Σw²(e − gR)² n/(n − 1)) / ΣwR. It assumes independent
-        galaxies.
-
-        Parameters
-        ----------
-        weights : array of shape (n,), optional
-            Weight of each row, not negative, or a mask of rows. Weights must not depend on the measured shape, which
-            biases the mean; take them from the flux or the noise. Equal weights by default.
-
-        Returns
-        -------
-        MeanShear
-
-        Raises
-        ------
-        ValueError
-            If weights have another shape, no good galaxy has a positive weight, or a mean response is not positive.
-        """
-        rows = np.atleast_1d(self)
-        if weights is None:
-            weight = np.ones(len(rows))
-        else:
-            chosen = np.asarray(weights).dtype == bool
-            weight = np.asarray(weights, dtype=np.float64) if chosen else double("weights", weights)
-        if weight.shape != rows.shape:
-            raise ValueError(f"weights: found an array of shape {shown(weight.shape)}; expected {shown(rows.shape)}, one for each row")
-        if not (np.isfinite(weight).all() and (weight >= 0).all()):
-            raise ValueError("weights: found one that is negative or not finite; expected finite ones, not negative")
-        flagged = int((weight[~rows.good] > 0).sum())
-        rows, weight = rows[rows.good], weight[rows.good]
-        # A common factor changes nothing, but squares of weights could overflow.
-        weight = weight / weight.max(initial=np.finfo(float).tiny)
-        divided = self.attrs.get("response")
-        if divided is None:
-            columns = [rows["e1"], rows["e2"], np.ones(len(rows)), np.ones(len(rows))]
-        else:
-            # Before calibration.
-            columns = [rows["e1"] * divided[0], rows["e2"] * divided[1], rows["R11"], rows["R22"]]
-        columns = [np.ascontiguousarray(column, dtype=np.float64) for column in columns]
-        (g1, g2), covariance, response, galaxies = _shearq.mean_shear(*columns, weight)
-        covariance = tuple(map(tuple, covariance))
-        errors = [float(np.sqrt(covariance[k][k])) for k in (0, 1)]
-        response = None if divided is None else tuple(response)
-        return MeanShear(g1, g2, *errors, covariance, response, galaxies, flagged)
-
-    def columns(self, names: str = "shearq") -> dict[str, np.ndarray]:
-        """Ellipticities, responses and flags by the names that a program uses.
-
-        Parameters
-        ----------
-        names : {'shearq', 'anacal'}
-            ``'anacal'``: ``e1``, ``de1_dg1``, ``e2``, ``de2_dg2`` and ``flags``, with e1 and e2 before calibration.
-            The sum of ellipticities over the sum of responses is the shear. ``'shearq'``: all fields.
-
-        Returns
-        -------
-        dict of str to array of shape (n,)
-        """
-        if names == "shearq":
-            return {name: self[name] for name in self.dtype.names}
-        if names != "anacal":
-            raise ValueError(f"names: found {names!r}; expected 'shearq' or 'anacal'")
-        found = {anacal: self[own] for own, anacal in _ANACAL.items()}
-        for k, name in enumerate(("e1", "e2")):
-            if self.attrs.get("response") is not None:
-                found[name] = found[name] * self.attrs["response"][k]
-        return {**found, "flags": self["flags"]}
-
-
 def measure(
-    stamps: ArrayLike,
-    psf: ArrayLike | FunctionalPsf,
+    stamps: StampsLike,
+    psf: PsfLike,
     *,
     noise: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    x: ArrayLike | None = None,
+    y: ArrayLike | None = None,
+    ids: ArrayLike | None = None,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -266,21 +124,29 @@ def measure(
     Parameters
     ----------
     stamps : array of shape (n, ny, nx)
-        Square postage stamps in any unit, at least as large as the configuration requires. Each has its galaxy near
-        the middle. The sky must be subtracted. float32 and float64 are read without a copy, memory maps included;
-        other types are converted in pieces. Lists of 2-D arrays or GalSim images are accepted. Pixels that are not
-        finite are missing: the network flags such a galaxy, the linear method flags it if many are missing.
-    psf : array of shape (py, px) or (n, py, px), or FunctionalPsf
-        One PSF for all galaxies or one per galaxy, centred like the stamps, and at least as large as the configuration
-        requires. It is cut and normalised.
+        Square postage stamps in any unit, of even or odd size, at least as large as the configuration requires (48
+        pixels by default). Each has its galaxy near the middle. The sky must be subtracted. float32 and float64 are
+        read without a copy, memory maps included; other types are converted in pieces. Lists of 2-D arrays or GalSim
+        images are accepted. Pixels that are masked or not finite are missing: the network flags such a galaxy, the
+        linear method flags it if many are missing.
+    psf : array of shape (py, px) or (n, py, px), FunctionalPsf, or GalSim image or profile
+        One PSF for all galaxies or one per galaxy, centred like the stamps, of even or odd size, and at least as large
+        as the configuration requires (32 pixels by default). It is cut and normalised. Profiles of GalSim are drawn
+        on the pixels of GalSim stamps.
     noise : float or array of shape (n,), optional
         Standard deviation of white noise per pixel in the unit of the stamps, for all or per stamp. By default it is
         measured. A linear configuration assumes one image, and measures noise, its correlation and the galaxy size on
         all stamps together. A network measures the noise on the border of each stamp.
+    mask : array of shape (n, ny, nx) or (ny, nx), optional
+        True for missing pixels, as in masked arrays of numpy. With a mask, the stamps are copied.
+    x, y : array of shape (n,), optional
+        Positions in pixels, which become columns.
+    ids : array of shape (n,), optional
+        Whole numbers or words, which become the column ``id``.
     submission : str, path, mapping or Configuration
-        The configuration: see :func:`shearq.submission`.
+        The configuration: see :func:`submission`.
     threads : int, optional
-        Worker threads; one per core by default. Results do not depend on it.
+        Worker threads; see :func:`set_threads` for the default. Results do not depend on it.
     progress : callable, optional
         Called from the calling thread with the number of galaxies done since the last call:
         ``tqdm(total=len(stamps)).update``. An exception ends the measurement.
@@ -307,22 +173,123 @@ def measure(
     Notes
     -----
     e1 and e2 are divided by the mean response of the good galaxies of this call. Its error is about a per cent for
-    some thousand galaxies. Combine several calls by :meth:`Catalogue.mean_shear` of each, or by ``columns("anacal")``.
+    some thousand galaxies. Combine several calls by :func:`mean_shear` or :func:`concatenate`.
 
     Other Python threads run meanwhile; they must not change the arrays.
 
     Examples
     --------
-    >>> cat = shearq.measure(stamps, psf)
-    >>> cat["e1"][cat.good].mean()
-    >>> shear = cat.mean_shear()
-    >>> print(f"g1 = {shear.g1:+.4f} ± {shear.g1_error:.4f}")
+    >>> import shearq
+    >>> image = shearq.simulate(set=8, grid=20)[0]
+    >>> cat = shearq.measure(image.stamps, image.psf)
+    >>> cat
+    <shearq.Catalogue of 400 galaxies, 0 flagged: e1, e2, ...>
+    >>> print(cat.mean_shear())
+    g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged)
+    >>> cat.write("shapes.parquet", overwrite=True)
     """
-    settings = resolve(submission)
+    stamps, psf = _galsim.unpacked(stamps, psf)
+    return _measure(stamps, psf, noise, mask, (ids, x, y), resolve(submission), thread_count(threads), callback(progress))
+
+
+def measure_blocks(
+    stamps: Any,
+    psf: PsfLike,
+    *,
+    block: int = 10_000,
+    noise: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    x: ArrayLike | None = None,
+    y: ArrayLike | None = None,
+    ids: ArrayLike | None = None,
+    submission: SubmissionLike = "48/linear/star",
+    threads: int | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> Iterator[Catalogue]:
+    """Measure stamps block by block, each like one image, in the memory of one block.
+
+    Parameters
+    ----------
+    stamps : array, or anything with a shape (n, ny, nx) and slices
+        Memory maps, and arrays of h5py, zarr or dask: each block is read when it is measured.
+    psf, noise, mask, x, y, ids, submission, threads, progress
+        As for :func:`measure`.
+    block : int
+        Most stamps of a block. Blocks are as equal as possible. A block needs enough galaxies for its mean response:
+        1000 or more.
+
+    Yields
+    ------
+    Catalogue
+        Of the next block.
+
+    Raises
+    ------
+    ValueError, TypeError, KeyError
+        As :func:`measure`, when the block is measured.
+
+    Examples
+    --------
+    >>> import shearq
+    >>> image = shearq.simulate(set=8, grid=20)[0]
+    >>> blocks = shearq.measure_blocks(image.stamps, image.psf, block=200)
+    >>> print(shearq.mean_shear(blocks))
+    g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged)
+    """
+    stamps, psf = _galsim.unpacked(stamps, psf)
+    most = whole("block", block, 1, 1 << 40)
+    if isinstance(stamps, (list, tuple)):
+        stamps = numeric("stamps", stamps)
+    shape = tuple(getattr(stamps, "shape", ()))
+    if len(shape) != 3:
+        raise ValueError(f"stamps: found an array of shape {shown(shape)}; expected (n, ny, nx)")
+    each: dict[str, Any] = {"psf": psf, "noise": noise, "mask": mask, "ids": ids, "x": x, "y": y}
+    per_galaxy = {"psf": 3, "noise": 1, "mask": 3, "ids": 1, "x": 1, "y": 1}
+    for name, value in each.items():
+        if value is not None and not isinstance(value, FunctionalPsf) and not hasattr(value, "shape"):
+            each[name] = np.asarray(value)
+        if np.ndim(each[name]) == per_galaxy[name] and len(each[name]) != shape[0]:
+            raise ValueError(f"{name}: found {len(each[name])} rows; expected {shape[0]}, one for each stamp")
+    settings, count, done = resolve(submission), thread_count(threads), callback(progress)
+    blocks = -(-shape[0] // most)
+
+    def part(name: str, start: int, end: int) -> Any:
+        value = each[name]
+        if isinstance(value, FunctionalPsf):
+            return value._part(start, end)
+        return value[start:end] if value is not None and np.ndim(value) == per_galaxy[name] else value
+
+    def measured() -> Iterator[Catalogue]:
+        for k in range(blocks):
+            start, end = k * shape[0] // blocks, (k + 1) * shape[0] // blocks
+            one, level, missing, *columns = (part(name, start, end) for name in each)
+            pixels = stamps[start:end]
+            pixels = pixels if isinstance(pixels, np.ndarray) else np.asarray(pixels)
+            try:
+                yield _measure(pixels, one, level, missing, tuple(columns), settings, count, done)
+            except ValueError as error:
+                raise ValueError(f"{error} (stamps {start} to {end - 1})") from None
+
+    return measured()
+
+
+def _measure(
+    stamps: Any,
+    psf: Any,
+    noise: ArrayLike | None,
+    mask: ArrayLike | None,
+    columns: tuple[Any, ...],
+    settings: Configuration,
+    threads: int,
+    progress: Callable[[int], object] | None,
+) -> Catalogue:
+    """Measure arrays."""
+    stamps = with_missing("stamps", stamps, mask)
     stamps = shaped("stamps", stamps, "(n, ny, nx), of one stamp stamps[np.newaxis]", axes=3)
-    count, rows, columns = stamps.shape
-    if rows != columns:
+    count, rows, sides = stamps.shape
+    if rows != sides:
         raise ValueError(f"stamps: found an array of shape {shown(stamps.shape)}; expected squares, ny = nx")
+    own = _own_columns(columns, count)
     star = stars = formulas = None
     if isinstance(psf, FunctionalPsf):
         formulas = psf._rows
@@ -345,29 +312,39 @@ def measure(
             raise ValueError(
                 f"noise: found an array of shape {shown(sigmas.shape)}; expected one number, or ({count},), one for each stamp"
             )
-    found, response, doubts, failure = _shearq.measure(
-        stamps,
-        star,
-        stars,
-        formulas,
-        sigma,
-        sigmas,
-        settings._resolved,
-        thread_count(threads),
-        callback(progress),
+    found, doubts, failure = _shearq.measure(
+        stamps, star, stars, formulas, sigma, sigmas, settings._resolved, threads, progress
     )
     for doubt in doubts:
-        warnings.warn(doubt, DataWarning, stacklevel=2)
+        warn(doubt, DataWarning)
     if failure is not None:
         raise ValueError(failure)
+    found = {**own, **found}
     catalogue = np.empty(count, dtype=[(name, column.dtype) for name, column in found.items()]).view(Catalogue)
     for name, column in found.items():
         catalogue[name] = column
     catalogue.attrs = {
-        "response": None if response is None else tuple(response),
         "submission": settings.name,
-        "settings": settings.toml,
         "ellipticity": settings.ellipticity,
+        "settings": settings.toml,
         "version": _shearq.__version__,
     }
     return catalogue
+
+
+def _own_columns(columns: tuple[Any, ...], count: int) -> dict[str, NDArray[Any]]:
+    """The columns id, x and y that are given."""
+    found: dict[str, NDArray[Any]] = {}
+    for name, argument, value in zip(("id", "x", "y"), ("ids", "x", "y"), columns):
+        if value is None:
+            continue
+        array = np.asarray(value) if name == "id" else double(argument, value)
+        if array.shape != (count,):
+            raise ValueError(f"{argument}: found an array of shape {shown(array.shape)}; expected ({count},), one for each stamp")
+        if name == "id":
+            if array.dtype.kind in "iu":
+                array = array.astype(np.int64)
+            elif array.dtype.kind != "U":
+                raise TypeError(f"ids: found values of type {array.dtype}; expected whole numbers or words")
+        found[name] = array
+    return found

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import importlib
 import math
-import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from . import _shearq
 from ._arrays import degrees, double, flat, real, shown, whole
 from ._submissions import submissions
+from ._warn import warn
 
 # Pixels a side of a cell where no positions tell otherwise; it then changes no metric.
 _CELL = 48.0
 
 METRICS: dict[str, str] = {name: meaning for name, _, meaning in _shearq.metrics()}
+
+
+Definition = Literal["leaderboard", "corrected"]
+Frame = Literal["pandas", "polars", "list"] | None
 
 
 class Score:
@@ -46,6 +50,8 @@ class Score:
         The one of the challenge's eight that the metrics are in; 5 is e1 along +x, e2 along x = y.
     q_leaderboard : float
         The highest Q of all eight, as the challenge's leaderboard took it.
+    truth_sign : {'standard', 'challenge'}
+        The sign of truth_g2 that was used.
     correlation : float
         Of the E modes with the true ones over the scored bins.
     mean : dict or None
@@ -59,16 +65,17 @@ class Score:
     def __init__(self, found: dict[str, Any]) -> None:
         self.metrics: dict[str, float] = found["metrics"]
         self.errors: dict[str, float] = found["errors"]
-        self.spectrum = _table(found["spectrum"])
+        self.spectrum: NDArray[np.void] = _table(found["spectrum"])
         self.images: int = found["images"]
         self.noise_variance: float | None = found["noise_variance"]
         self.convention: int = found["convention"]
         self.q_leaderboard: float = found["q_leaderboard"]
         self.correlation: float = found["correlation"]
-        self.replicates: np.ndarray = found["replicates"]
+        self.replicates: NDArray[np.float64] = found["replicates"]
         self.notes: list[str] = list(found["warnings"])
         constant = found["constant"]
-        self.mean = None if constant is None else dict(zip(("e", "error", "truth"), map(tuple, constant)))
+        self.truth_sign: Literal["standard", "challenge"] = found["truth_sign"]
+        self.mean: dict[str, tuple[float, float]] | None = None if constant is None else dict(zip(("e", "error", "truth"), map(tuple, constant)))
         matched, meaning = found["matched"]
         if found["matched_clearly"] and matched != self.convention:
             self.notes.append(
@@ -87,6 +94,41 @@ class Score:
         errors = {f"{name}_error": error for name, error in self.errors.items()}
         return {**self.metrics, **errors}
 
+    def to_frame(self, frame: Frame = None) -> Any:
+        """A table of the metrics.
+
+        Parameters
+        ----------
+        frame : {'pandas', 'polars', 'list'}, optional
+            What to return. By default pandas, or polars if only that is installed, or else a list of dict.
+
+        Returns
+        -------
+        pandas.DataFrame, polars.DataFrame or list of dict
+            A row per metric: ``metric``, ``value``, ``error`` and ``meaning``.
+        """
+        rows = [
+            {"metric": name, "value": value, "error": self.errors[name], "meaning": METRICS[name]}
+            for name, value in self.metrics.items()
+        ]
+        return _frame(frame)(rows)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Plot the EE and BB bandpowers and the true ones with matplotlib.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Where to plot; a new figure by default.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+        """
+        from ._display import plot_score
+
+        return plot_score(self, ax)
+
     def __repr__(self) -> str:
         shown = ", ".join(f"{name} = {self[name]:.4g} ± {self.errors[name]:.2g}" for name in ("q", "m_cross"))
         return f"<shearq.Score of {self.images} image{'s' * (self.images != 1)}: {shown}>"
@@ -102,10 +144,10 @@ def score(
     positions: tuple[ArrayLike, ArrayLike] | None = None,
     stamp: float | None = None,
     field_degrees: float = 10.0,
-    definition: str = "leaderboard",
-    convention: int | str = 5,
+    definition: Definition = "leaderboard",
+    convention: int | Literal["matched", "best"] = 5,
     noise_variance: float | None = None,
-    truth_sign: str = "standard",
+    truth_sign: Literal["standard", "challenge"] | None = None,
 ) -> Score:
     """Score ellipticities against the true shear.
 
@@ -120,7 +162,7 @@ def score(
         Number of images that e1 and e2 hold one after the other, or the number of its image for each value.
     positions : tuple of two arrays, optional
         x and y of each galaxy, of the shape of e1: FITS pixels, the first pixel's centre at 1. They fall into cells
-        of `stamp` pixels.
+        of `stamp` pixels. Arrays of two axes require `images`.
     stamp : float, optional
         Pixels a side of a cell, with positions.
     field_degrees : float
@@ -132,9 +174,11 @@ def score(
     noise_variance : float, optional
         Variance of the ellipticities' noise per component, galaxy and image, for q_dn. Measured from the scatter
         between images by default.
-    truth_sign : {'standard', 'challenge'}
+    truth_sign : {'standard', 'challenge'}, optional
         'challenge' if truth_g2 is minus the standard one, as in the challenge's files. The `truth.csv` that
-        `simulate` writes has the standard sign.
+        `simulate` writes has the standard sign. By default it is determined like on the command line: by the sign in
+        which the shear is an E-mode field, or else by the sign with which e2 correlates. If both are unclear, it is
+        the standard sign.
 
     Returns
     -------
@@ -161,15 +205,15 @@ def score(
             raise ValueError(f"{name}: found an array of shape {shown(shape)}; expected (n, n) or (n²,)")
     n = _side("truth_g1", g1.size)
     cell, rows, where, lengths = _rows(e1, e2, n, images, positions, stamp)
-    if truth_sign not in ("standard", "challenge"):
-        raise ValueError(f"truth_sign: found {truth_sign!r}; expected 'standard' or 'challenge'")
+    if truth_sign not in (None, "standard", "challenge"):
+        raise ValueError(f"truth_sign: found {truth_sign!r}; expected 'standard', 'challenge' or None")
     found = Score(
         _shearq.score(
             n,
             cell,
             degrees(field_degrees),
             (g1, g2),
-            truth_sign == "challenge",
+            None if truth_sign is None else truth_sign == "challenge",
             rows,
             where,
             lengths,
@@ -183,7 +227,7 @@ def score(
     for note in found.notes:
         # A constant shear is no fault; the note is kept.
         if found.mean is None or not note.startswith("note: the true shear"):
-            warnings.warn(note, stacklevel=2)
+            warn(note, UserWarning)
     return found
 
 
@@ -196,8 +240,8 @@ def power_spectrum(
     positions: tuple[ArrayLike, ArrayLike] | None = None,
     stamp: float | None = None,
     cells: int | None = None,
-    definition: str = "leaderboard",
-) -> np.ndarray:
+    definition: Definition = "leaderboard",
+) -> NDArray[np.void]:
     """E, B and EB bandpowers of the mean of images.
 
     Parameters
@@ -222,7 +266,7 @@ def compare(
     catalogues: Mapping[str, Any],
     truth: Any,
     *,
-    frame: str | None = None,
+    frame: Frame = None,
     **options: Any,
 ) -> Any:
     """Score several catalogues of the same galaxies, side by side.
@@ -267,10 +311,10 @@ def compare(
     for name, scored in scores.items():
         paired: dict[str, float] = {}
         for metric, sigma in (("q", "sigma"), ("q_calibrated", "q_calibrated_sigma")):
-            difference, error = _difference(metric, first, scored)
+            difference, uncertainty = _difference(metric, first, scored)
             paired[f"{metric}_difference"] = difference
-            paired[f"{metric}_difference_error"] = error
-            paired[sigma] = difference / error if error else math.nan
+            paired[f"{metric}_difference_error"] = uncertainty
+            paired[sigma] = difference / uncertainty if uncertainty else math.nan
         metrics = {f"{key}_published": value for key, value in (published.get(name) or {}).items()}
         missing = {f"{key}_published": math.nan for key in ("q", "m_half", "sqrt_a")}
         rows.append(
@@ -315,7 +359,7 @@ def _frame(name: str | None) -> Any:
     return list
 
 
-def _table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+def _table(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.void]:
     """A structured array of columns."""
     length = len(next(iter(columns.values())))
     table = np.empty(length, dtype=[(name, column.dtype) for name, column in columns.items()])
@@ -357,7 +401,7 @@ def _cells(shape: tuple[int, ...], images: Any, positions: Any) -> int:
     return _side("e1", shape[-1] if shape else 1)
 
 
-_Pair = tuple[np.ndarray, np.ndarray]
+_Pair = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def _rows(
@@ -397,7 +441,12 @@ def _rows(
             raise ValueError(f"images: found {number}; expected a divisor of the {e1.size} values of e1")
         lengths = [e1.size // number] * number
     elif where is not None:
-        lengths = [e1.shape[1]] * e1.shape[0] if e1.ndim == 2 else [e1.size]
+        if e1.ndim != 1:
+            raise ValueError(
+                f"images: not given; expected the number of images in arrays of shape {shown(e1.shape)} with positions:"
+                f" images=1 for one image, images={e1.shape[0] if e1.ndim else 1} for one per row"
+            )
+        lengths = [e1.size]
     elif e1.shape in ((n, n), (cells,)):
         lengths = [cells]
     else:

@@ -46,6 +46,8 @@ class Configuration:
 
 def names() -> list[str]: ...
 def run_command(arguments: Sequence[str]) -> int: ...
+def read_table(path: str, format: str, keys: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]: ...
+def write_table(path: str, format: str, columns: Sequence[tuple[str, Any]], metadata: dict[str, str]) -> None: ...
 def flags() -> list[tuple[str, int, str]]: ...
 def measure(
     stamps: NDArray[Any],
@@ -55,9 +57,9 @@ def measure(
     noise: float | None,
     noises: _Doubles | None,
     submission: Configuration,
-    threads_asked: int | None,
+    threads_asked: int,
     progress: Callable[[int], object] | None,
-) -> tuple[dict[str, NDArray[Any]], list[float] | None, list[str], str | None]: ...
+) -> tuple[dict[str, NDArray[Any]], list[str], str | None]: ...
 def mean_shear(
     e1: _Doubles, e2: _Doubles, r11: _Doubles, r22: _Doubles, weights: _Doubles
 ) -> tuple[list[float], list[list[float]], list[float], int]: ...
@@ -67,7 +69,7 @@ def score(
     stamp: float,
     field_degrees: float,
     truth: tuple[_Doubles, _Doubles],
-    challenge_sign: bool,
+    challenge_sign: bool | None,
     e: tuple[_Doubles, _Doubles],
     positions: tuple[_Doubles, _Doubles] | None,
     lengths: Sequence[int],
@@ -99,6 +101,6 @@ def simulate(
     amplitude: float,
     tilt: float,
     intrinsic_sigma: float | None,
-    threads_asked: int | None,
+    threads_asked: int,
     progress: Callable[[int], object] | None,
 ) -> dict[str, Any]: ...

@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import _shearq
-from ._arrays import callback, real, thread_count, whole
+from ._arrays import callback, real, whole
 from ._measure import FunctionalPsf
+from ._threads import thread_count
 
 _SETS = 24
 _MOST_IMAGES = 999_999
@@ -36,12 +38,12 @@ class SimulatedImage:
     """
 
     number: int
-    stamps: np.ndarray
-    psf: np.ndarray
+    stamps: NDArray[np.float32]
+    psf: NDArray[np.float32]
     functional_psf: FunctionalPsf
     noise: float
-    intrinsic: np.ndarray
-    observed: np.ndarray
+    intrinsic: NDArray[np.float64]
+    observed: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +65,10 @@ class Simulation:
 
     set: int
     kind: str
-    g1: np.ndarray
-    g2: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
+    g1: NDArray[np.float64]
+    g2: NDArray[np.float64]
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
     images: tuple[SimulatedImage, ...]
 
     def __len__(self) -> int:

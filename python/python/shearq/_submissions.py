@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from typing import Any, Union
+from typing import Any, Literal, Union
 
 from . import _shearq
 
@@ -39,25 +39,65 @@ class Configuration:
 
     __slots__ = ("_resolved",)
 
+    _resolved: _shearq.Configuration
+
     def __init__(self, resolved: _shearq.Configuration) -> None:
         self._resolved = resolved
 
-    name = property(lambda self: self._resolved.name)
-    description = property(lambda self: self._resolved.description)
-    extends = property(lambda self: self._resolved.extends)
-    toml = property(lambda self: self._resolved.toml)
-    stamp_size = property(lambda self: self._resolved.sizes[0])
-    psf_size = property(lambda self: self._resolved.sizes[1])
-    psf_form = property(lambda self: "functional" if self._resolved.functional else "star")
-    needs_noise = property(lambda self: self._resolved.needs_noise)
-    ellipticity = property(lambda self: self._resolved.ellipticity)
+    @property
+    def name(self) -> str:
+        """What the configuration is called."""
+        return self._resolved.name
+
+    @property
+    def description(self) -> str:
+        """What it is."""
+        return self._resolved.description
+
+    @property
+    def extends(self) -> str | None:
+        """What it inherits from."""
+        return self._resolved.extends
+
+    @property
+    def toml(self) -> str:
+        """All settings as a settings file for the command line."""
+        return self._resolved.toml
+
+    @property
+    def stamp_size(self) -> int:
+        """Pixels per side of the part of a stamp that is used."""
+        return self._resolved.sizes[0]
+
+    @property
+    def psf_size(self) -> int:
+        """Pixels per side of the part of a PSF stamp that is used."""
+        return self._resolved.sizes[1]
+
+    @property
+    def psf_form(self) -> Literal["star", "functional"]:
+        """The PSFs that the command line uses with it."""
+        return "functional" if self._resolved.functional else "star"
+
+    @property
+    def needs_noise(self) -> bool:
+        """Whether the noise level must be given."""
+        return self._resolved.needs_noise
+
+    @property
+    def ellipticity(self) -> Literal["shear", "distortion"]:
+        """The type of e1 and e2."""
+        return "distortion" if self._resolved.ellipticity == "distortion" else "shear"
 
     @property
     def settings(self) -> dict[str, Any]:
-        return json.loads(self._resolved.settings)
+        """All settings, section by section."""
+        settings: dict[str, Any] = json.loads(self._resolved.settings)
+        return settings
 
     @property
     def published(self) -> dict[str, float] | None:
+        """Published metrics ``q``, ``m_half`` (M/2) and ``sqrt_a`` (√A in 10⁻⁴); None if there are none."""
         metrics = self._resolved.published
         return None if metrics is None else dict(zip(("q", "m_half", "sqrt_a"), metrics))
 

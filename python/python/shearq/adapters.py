@@ -1,98 +1,113 @@
-"""Objects of other programs into what :func:`shearq.measure` takes, and catalogues into theirs.
-
-None of those programs is needed unless its objects are used. A GalSim image, or a list of them, is taken by
-:func:`shearq.measure` as it is.
-"""
+"""Observations of ngmix as arguments of :func:`shearq.measure`, and tables of astropy."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ._measure import Catalogue
+from ._catalogue import Catalogue
+from ._galsim import SAME, from_galsim as from_galsim, square_pixels
 
-# Relative, of pixel scales that should be the same.
-_SAME = 1e-6
+if TYPE_CHECKING:
+    import astropy.table  # type: ignore[import-untyped, unused-ignore]
+
+# Pixels between the centre of an observation and the middle of its stamp.
+_OFF_CENTRE = 1.0
 
 
-def from_ngmix(observations: Any) -> dict[str, Any]:
-    """Arguments of :func:`shearq.measure` for an ngmix ``Observation``, or a sequence of them.
+def _position(jacobian: Any, shape: tuple[int, int], k: int) -> None:
+    """Refuses a centre that is not near the middle of the stamp."""
+    if not hasattr(jacobian, "get_cen"):
+        return
+    row, column = jacobian.get_cen()
+    off = max(abs(row - (shape[0] - 1) / 2), abs(column - (shape[1] - 1) / 2))
+    if off > _OFF_CENTRE:
+        raise ValueError(
+            f"observations: the centre of observation {k} is ({row:.6g}, {column:.6g}) (row, column); expected the middle"
+            f" of its {shape[0]} × {shape[1]} pixels. Try: cut the image around the galaxy"
+        )
 
-    The image and the PSF's are taken as they are; the noise is the inverse root of the median of the weights that are
-    positive. Pixels have to be square and along the axes, with x along columns.
+
+def from_ngmix(observations: Any) -> dict[str, NDArray[Any]]:
+    """Arguments of :func:`measure` for an ngmix ``Observation``, or a sequence of them.
+
+    The noise is the inverse root of the median of the positive weights. Pixels with a weight of zero, or with a bit of
+    ``bmask``, are missing.
 
     Parameters
     ----------
     observations : ngmix.Observation or sequence of them
-        Each with a PSF observation, and centred: ngmix's row and column of the centre are not looked at.
+        One per galaxy, each with a PSF observation, and with its galaxy in the middle of the stamp.
 
     Returns
     -------
     dict
-        ``stamps`` of shape (n, ny, nx), ``psf`` of shape (n, py, px), ``noise`` of shape (n,).
-
-    Examples
-    --------
-    >>> shearq.measure(**shearq.adapters.from_ngmix(observations))
-    """
-    many = list(observations) if isinstance(observations, Sequence) else [observations]
-    if not many:
-        raise ValueError("observations: found none; expected one or more")
-    stamps, psfs, noise = [], [], []
-    for k, observation in enumerate(many):
-        jacobian = observation.jacobian
-        xx, xy = jacobian.get_dudcol(), jacobian.get_dudrow()
-        yx, yy = jacobian.get_dvdcol(), jacobian.get_dvdrow()
-        if not (xx > 0 and max(abs(xy), abs(yx), abs(yy - xx)) <= _SAME * xx):
-            raise ValueError(
-                f"observations: the jacobian of observation {k} is ({xx}, {xy}, {yx}, {yy}) (dudcol, dudrow, dvdcol,"
-                " dvdrow); expected square pixels along the axes, (s, 0, 0, s)"
-            )
-        weight = np.asarray(observation.weight)
-        positive = weight[weight > 0]
-        if positive.size == 0:
-            raise ValueError(f"observations: no weight of observation {k} is positive; expected inverse variances")
-        try:
-            psfs.append(observation.psf.image)
-        except (AttributeError, RuntimeError) as error:
-            raise ValueError(f"observations: observation {k} has no PSF: {error}; expected one") from None
-        stamps.append(observation.image)
-        noise.append(1 / np.sqrt(np.median(positive)))
-    for name, images in (("image", stamps), ("PSF image", psfs)):
-        shapes = {np.shape(image) for image in images}
-        if len(shapes) > 1:
-            raise ValueError(f"observations: {name}s of shapes {sorted(shapes)}; expected one shape")
-    return {"stamps": np.stack(stamps), "psf": np.stack(psfs), "noise": np.array(noise)}
-
-
-def to_astropy(catalogue: Catalogue) -> Any:
-    """An ``astropy.table.Table`` of a catalogue, with its ``attrs`` as ``meta``.
-
-    Raises
-    ------
-    ImportError
-        Where astropy is not installed.
-    """
-    from astropy.table import Table
-
-    return Table(catalogue.view(np.ndarray), meta=dict(catalogue.attrs))
-
-
-def from_astropy(table: Any) -> Catalogue:
-    """The catalogue of an ``astropy.table.Table`` that :func:`to_astropy` made, or read back from a file of it.
+        ``stamps`` of shape (n, ny, nx), ``psf`` of shape (n, py, px), ``noise`` of shape (n,), and ``mask`` of shape
+        (n, ny, nx) if pixels are missing.
 
     Raises
     ------
     ValueError
-        Where columns that a catalogue needs are not there.
+        If pixels are not square and along the axes, or scales or shapes differ; or if weights or a PSF are absent.
+
+    Examples
+    --------
+    ``shearq.measure(**shearq.from_ngmix(observations))``
     """
-    needed = ("e1", "e2", "R11", "R22", "flags")
-    missing = [name for name in needed if name not in table.colnames]
-    if missing:
-        raise ValueError(f"table: no columns {', '.join(missing)}; expected {', '.join(needed)}")
-    catalogue = np.asarray(table.as_array()).view(Catalogue)
-    # FITS files write the keys of their headers in capitals.
-    catalogue.attrs = {key.lower(): value for key, value in table.meta.items()}
-    return catalogue
+    many = list(observations) if isinstance(observations, Sequence) else [observations]
+    if not many:
+        raise ValueError("observations: found none; expected one or more")
+    stamps, psfs, noise, masks = [], [], [], []
+    for k, observation in enumerate(many):
+        if not hasattr(observation, "jacobian"):
+            raise TypeError(
+                f"observations: number {k} is of type {type(observation).__name__}; expected one Observation per galaxy,"
+                " of one band and epoch"
+            )
+        scales = []
+        try:
+            pair = (("observation", observation), ("the PSF of observation", observation.psf))
+        except (AttributeError, RuntimeError) as error:
+            raise ValueError(f"observations: observation {k} has no PSF: {error}; expected one") from None
+        for what, one in pair:
+            jacobian = getattr(one, "jacobian", None)
+            if jacobian is not None:
+                values = [getattr(jacobian, f"get_d{way}")() for way in ("udcol", "udrow", "vdcol", "vdrow")]
+                remedy = "Try: resample the image, or transform the shears of the pixel axes yourself"
+                name = f"observations: {what} {k}"
+                scales.append(square_pixels(name, (values[0], values[1], values[2], values[3]), remedy))
+        if max(scales) - min(scales) > SAME * min(scales):
+            raise ValueError(f"observations: observation {k} has the pixel scales {scales} (image, PSF); expected one scale")
+        image, weight = np.asarray(observation.image), np.asarray(observation.weight)
+        _position(observation.jacobian, (image.shape[0], image.shape[1]), k)
+        positive = weight[weight > 0]
+        if positive.size == 0:
+            raise ValueError(f"observations: no weight of observation {k} is positive; expected inverse variances")
+        missing = weight <= 0
+        if getattr(observation, "bmask", None) is not None:
+            missing |= np.asarray(observation.bmask) != 0
+        stamps.append(image)
+        psfs.append(np.asarray(observation.psf.image))
+        noise.append(1 / np.sqrt(np.median(positive)))
+        masks.append(missing)
+    for name, images in (("image", stamps), ("PSF image", psfs)):
+        shapes = {np.shape(image) for image in images}
+        if len(shapes) > 1:
+            raise ValueError(f"observations: {name}s of shapes {sorted(shapes)}; expected one shape")
+    found = {"stamps": np.stack(stamps), "psf": np.stack(psfs), "noise": np.array(noise)}
+    if any(mask.any() for mask in masks):
+        found["mask"] = np.stack(masks)
+    return found
+
+
+def to_astropy(catalogue: Catalogue) -> astropy.table.Table:
+    """As :meth:`Catalogue.to_astropy`."""
+    return catalogue.to_astropy()
+
+
+def from_astropy(table: astropy.table.Table) -> Catalogue:
+    """As :meth:`Catalogue.from_table`."""
+    return Catalogue.from_table(table)

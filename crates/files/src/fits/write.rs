@@ -186,6 +186,9 @@ fn header_blocks(file: &mut FitsFile) -> fitsio::errors::Result<Vec<u8>> {
     Ok(cards)
 }
 
+/// Longest text on a single card.
+const SHORT: usize = 68;
+
 fn write_header(
     file: &mut FitsFile,
     hdu: &FitsHdu,
@@ -195,10 +198,28 @@ fn write_header(
         match value {
             Value::Int(v) => hdu.write_key(file, key, *v)?,
             Value::Real(v) => write_real(file, key, *v)?,
+            Value::Text(v) if v.len() > SHORT => write_long(file, key, v)?,
             Value::Text(v) => hdu.write_key(file, key, v.as_str())?,
         }
     }
     Ok(())
+}
+
+/// Writes a text to the header in use, on as many CONTINUE cards as it takes.
+fn write_long(file: &mut FitsFile, key: &str, value: &str) -> fitsio::errors::Result<()> {
+    let (name, value) = (CString::new(key)?, CString::new(value)?);
+    let mut status = 0;
+    // SAFETY: the file is open, name and value end in a zero byte, and there is no comment.
+    unsafe {
+        sys::ffpkls(
+            file.as_raw(),
+            name.as_ptr(),
+            value.as_ptr(),
+            ptr::null(),
+            &mut status,
+        );
+    }
+    fitsio::errors::check_status(status)
 }
 
 /// Writes a real number to the header in use with all its digits; [`FitsHdu::write_key`] keeps fifteen.

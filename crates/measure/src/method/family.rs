@@ -136,7 +136,7 @@ impl CutWorker for FamilyWorker {
     }
 
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
-        let PsfCut { size, least } = self.family.cut;
+        let PsfCut { size, least, .. } = self.family.cut;
         let side = psf.nrows();
         if !(least..=size).contains(&side) || side % 2 != size % 2 {
             let parity = if size % 2 == 0 { "an even" } else { "an odd" };

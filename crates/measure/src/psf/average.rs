@@ -83,6 +83,7 @@ mod tests {
         let cut = PsfCut {
             size: 48,
             least: 32,
+            centred: false,
         };
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         for (snr, count, tolerance) in [(f64::INFINITY, 5, 2e-4), (200.0, 64, 4e-3)] {
@@ -117,6 +118,7 @@ mod tests {
         let cut = PsfCut {
             size: 32,
             least: 32,
+            centred: false,
         };
         let (number, error) = average_stars(stars.view(), cut).unwrap_err();
         assert_eq!(number, 2);

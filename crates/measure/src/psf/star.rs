@@ -3,13 +3,14 @@
 //! The centre of a side of N pixels is at (N − 1)/2 counted from 0: between pixels for even N. A cut
 //! of another parity starts half a pixel early, so that its central pixel (odd side) or corner (even
 //! side) is half a pixel before the stamp's centre on both axes. The autocorrelation does not see
-//! such shifts; the window of the linear method would, whose stamp and PSF must have one parity.
+//! such shifts. The window of the linear method requires one parity: see `halfway.rs`.
 
 use ndarray::{Array2, ArrayView2, s};
 use shearq_submissions::PsfCut;
 
 use crate::error::MeasureError;
 use crate::pixel::Pixel;
+use crate::psf::halfway::halfway;
 
 /// Largest centroid offset along an axis of a star that is cut around its stamp's centre. See
 /// docs/constants.md.
@@ -55,7 +56,8 @@ pub fn star_psf<P: Pixel>(
     Ok(star(stamp, cut)?.psf)
 }
 
-/// The same with the offset of the star.
+/// The same with the offset of the star. A star on a stamp of another parity than the cut is shifted by half a pixel
+/// first, if the cut requires a centred PSF.
 ///
 /// # Errors
 /// As [`star_psf`].
@@ -64,6 +66,17 @@ pub fn star<P: Pixel>(
     cut: impl Into<PsfCut>,
 ) -> Result<Star, MeasureError> {
     let cut: PsfCut = cut.into();
+    let (rows, columns) = stamp.dim();
+    let other = |side: usize| side > cut.least && side % 2 != cut.size % 2;
+    if !cut.centred || !other(rows) && !other(columns) {
+        return centred_star(stamp, cut);
+    }
+    brightest(stamp)?;
+    centred_star(halfway(stamp, [other(rows), other(columns)]).view(), cut)
+}
+
+/// The star of a stamp of the parity of the cut.
+fn centred_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<Star, MeasureError> {
     let (rows, columns) = stamp.dim();
     let size = cut.least;
     let (Some(y0), Some(x0)) = (cut_start(rows, size), cut_start(columns, size)) else {
@@ -279,6 +292,7 @@ mod tests {
         let cut = PsfCut {
             size: 48,
             least: 32,
+            centred: false,
         };
         let whole = FunctionalPsf::new(profile, 3.4, Shear::new(0.05, -0.03)).unwrap();
         let stamp = whole.stamp(64);

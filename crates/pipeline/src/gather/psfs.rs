@@ -115,6 +115,7 @@ fn examined_cut(side: usize) -> PsfCut {
         size,
         // So that a star off the centre can be cut around itself.
         least: size - (size / 3).next_multiple_of(2),
+        centred: false,
     }
 }
 

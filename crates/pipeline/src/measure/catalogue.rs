@@ -27,7 +27,7 @@ pub enum Value {
 }
 
 /// The columns of catalogues after the position, in order. The command line and Python use the same.
-pub const COLUMNS: [(&str, Value); 16] = [
+pub const COLUMNS: [(&str, Value); 18] = [
     ("e1", Value::Real(|g| g.e1)),
     ("e2", Value::Real(|g| g.e2)),
     ("flags", Value::Whole(|g| g.flags.bits() as i32)),
@@ -60,7 +60,14 @@ pub const COLUMNS: [(&str, Value); 16] = [
     ("R22", Value::Real(|g| response(g, 1, 1))),
     ("R12", Value::Real(|g| response(g, 0, 1))),
     ("R21", Value::Real(|g| response(g, 1, 0))),
+    ("divisor1", Value::Real(|g| divisor(g)[0])),
+    ("divisor2", Value::Real(|g| divisor(g)[1])),
 ];
+
+/// Mean responses by which the ellipticity was divided; NaN if it was not.
+fn divisor(galaxy: &Measurement) -> [f64; 2] {
+    galaxy.divisor.unwrap_or([f64::NAN; 2])
+}
 
 /// Response of component `i` to component `j` of shear; NaN if there is none.
 fn response(galaxy: &Measurement, i: usize, j: usize) -> f64 {

@@ -1,0 +1,460 @@
+"""Catalogues of galaxies, and mean shears of their rows."""
+
+from __future__ import annotations
+
+import enum
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import _distributed, _schema, _shearq
+from ._arrays import double, shown
+
+if TYPE_CHECKING:
+    import astropy.table  # type: ignore[import-untyped, unused-ignore]
+    import pandas
+    import polars
+
+
+class Flag(enum.IntFlag):
+    """Why a galaxy could not be measured: the bits of a catalogue's ``flags``."""
+
+    NotFinite = 1
+    """Pixels are missing."""
+    BadPsf = 2
+    """The PSF cannot be used."""
+    NoScale = 4
+    """Nothing to scale the brightness by."""
+    NoLight = 8
+    """Nothing left after deconvolution."""
+    NoExtent = 16
+    """Moments without extent."""
+    NoShear = 32
+    """Distortion above 1."""
+    NoResponse = 64
+    """No response to shear to divide by."""
+    Neighbour = 128
+    """A second peak near the galaxy."""
+
+
+@dataclass(frozen=True, repr=False)
+class MeanShear:
+    """The mean shear of galaxies. It prints as ``g1 = +0.0201 ± 0.0009, …``.
+
+    Attributes
+    ----------
+    g1, g2 : float
+        Components of the mean shear; g1 > 0 along +x, g2 > 0 along x = y.
+    g1_error, g2_error : float
+        Standard errors. They include the errors of the mean responses.
+    covariance : tuple of tuple of float
+        Covariance of g1 and g2.
+    response : tuple of float or None
+        Mean responses R11 and R22; None if the configuration is not calibrated by them.
+    galaxies : int
+        Galaxies without a flag and with a positive weight.
+    flagged : int
+        Galaxies with a flag and a positive weight.
+    """
+
+    g1: float
+    g2: float
+    g1_error: float
+    g2_error: float
+    covariance: tuple[tuple[float, float], tuple[float, float]]
+    response: tuple[float, float] | None
+    galaxies: int
+    flagged: int
+
+    def __iter__(self) -> Iterator[float]:
+        return iter((self.g1, self.g2))
+
+    def __str__(self) -> str:
+        pairs = (("g1", self.g1, self.g1_error), ("g2", self.g2, self.g2_error))
+        means = ", ".join(f"{name} = {with_error(value, error)}" for name, value, error in pairs)
+        return f"{means} ({self.galaxies} galaxies, {self.flagged} flagged)"
+
+    def __repr__(self) -> str:
+        return f"<shearq.MeanShear {self}>"
+
+
+def with_error(value: float, error: float) -> str:
+    """A value and its error, to the first digit of the error, or to its second if the first is 1."""
+    if not (np.isfinite(error) and error > 0):
+        return f"{value:+.4g} ± {error:.1g}"
+    first = int(np.floor(np.log10(error)))
+    decimals = max(0, -first + (error < 2 * 10.0**first))
+    return f"{value:+.{decimals}f} ± {error:.{decimals}f}"
+
+
+_Whole = Literal["flags", "iterations", "stop", "updated"]
+
+
+class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
+    """A structured array with one row per galaxy, as :func:`measure` returns it.
+
+    Each row contains its response and what its ellipticity was divided by. So rows of any catalogues can be chosen,
+    sorted, joined, saved and read, and the mean shear of the rows stays correct.
+
+    Fields
+    ------
+    id : int64 or str
+        If given.
+    x, y : float64
+        Position in pixels, if given.
+    e1, e2 : float64
+        Ellipticity, divided by ``divisor1`` and ``divisor2``; NaN if flagged.
+    flags : int32
+        Reasons why the galaxy could not be measured, bits of :class:`Flag`; 0 for a good galaxy.
+    iterations, stop, updated : int32
+        Iterations of the network, why it stopped (0 stable, 1 energy rise, 2 most iterations, -1 not run), and neurons
+        above their threshold at the end.
+    first_energy, energy : float64
+        Energy of the network at its start and end, in squared image units.
+    noise : float64
+        Noise level used: standard deviation per pixel, in image units.
+    flux : float64
+        Sum of the deconvolved stamp in image units; for the linear method, sum of the stamp.
+    radius, size : float64
+        Radius of the autocorrelation that is used in pixels, and its Qxx + Qyy in px².
+    R11, R22, R12, R21 : float64
+        Response of the galaxy to shear before the division: R12 is the response of e1 to the second component. Only
+        means over many galaxies are unbiased.
+    divisor1, divisor2 : float64
+        Mean responses of the galaxies that were measured together, by which e1 and e2 were divided; NaN if they were
+        not. The shear is Σ e1·divisor1 / Σ R11.
+
+    Attributes
+    ----------
+    attrs : dict
+        ``submission``: name of the configuration; ``settings``: all settings as TOML; ``ellipticity``: 'shear' or
+        'distortion'; ``version``: of shearq. Nothing is computed from them.
+    """
+
+    attrs: dict[str, Any]
+
+    def __array_finalize__(self, parent: Any) -> None:
+        self.attrs = dict(getattr(parent, "attrs", {}))
+
+    def __array_function__(
+        self, func: Any, types: Iterable[type], args: Any, kwargs: Any
+    ) -> Any:
+        # numpy would make a plain array of catalogues.
+        if func is np.concatenate and args and not kwargs.keys() - {"axis"}:
+            parts = list(args[0])
+            if parts and all(isinstance(part, Catalogue) and part.dtype.names for part in parts):
+                return concatenate(parts)
+        return super().__array_function__(func, types, args, kwargs)
+
+    # numpy's own overloads know no columns, and a name of whole numbers is a name.
+    @overload  # type: ignore[override, unused-ignore]
+    def __getitem__(self, key: _Whole) -> NDArray[np.int32]: ...  # type: ignore[overload-overlap]
+    @overload
+    def __getitem__(self, key: str) -> NDArray[np.float64]: ...
+    @overload
+    def __getitem__(self, key: int | np.integer[Any]) -> np.void: ...
+    @overload
+    def __getitem__(self, key: slice | list[str] | list[int] | NDArray[Any]) -> Catalogue: ...
+    def __getitem__(self, key: Any) -> Any:
+        found = super().__getitem__(key)
+        if isinstance(found, Catalogue) and found.dtype.names is None:
+            return found.view(np.ndarray)
+        return found
+
+    def __reduce__(self) -> Any:
+        make, arguments, state = cast(Any, super().__reduce__())
+        return make, arguments, (state, self.attrs)
+
+    def __setstate__(self, state: Any) -> None:
+        plain, self.attrs = state
+        super().__setstate__(plain)
+
+    def __repr__(self) -> str:
+        names = self.dtype.names
+        if names is None or self.ndim != 1:
+            return super().__repr__()
+        flagged = f", {int((self['flags'] != 0).sum())} flagged" if "flags" in names else ""
+        return f"<shearq.Catalogue of {len(self)} galaxies{flagged}: {', '.join(names)}>"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        from ._display import html
+
+        return html(self)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self.dtype.names or ())
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """Rows without a flag: booleans of shape (n,)."""
+        return np.asarray(self["flags"] == 0)
+
+    def mean_shear(self, weights: ArrayLike | None = None) -> MeanShear:
+        """The mean shear of the good galaxies: Σwe/ΣwR, with the ellipticities e before calibration.
+
+        The error is the error of this ratio to first order, √(Σw²(e − gR)² n/(n − 1)) / ΣwR. It assumes independent
+        galaxies.
+
+        Parameters
+        ----------
+        weights : array of shape (n,), optional
+            Weight of each row, not negative, or a mask of rows. Weights must not depend on the measured shape, which
+            biases the mean; take them from the flux or the noise. Equal weights by default.
+
+        Returns
+        -------
+        MeanShear
+
+        Raises
+        ------
+        ValueError
+            If weights have another shape, no good galaxy has a positive weight, or a mean response is not positive.
+        """
+        return mean_shear(self, weights)
+
+    def columns(self, names: Literal["shearq", "anacal", "ngmix"] = "shearq") -> dict[str, NDArray[Any]]:
+        """Columns by the names that a program uses.
+
+        Parameters
+        ----------
+        names : {'shearq', 'anacal', 'ngmix'}
+            ``'anacal'``: ``e1``, ``de1_dg1``, ``e2``, ``de2_dg2`` and ``flags``; ``'ngmix'``: ``g`` of shape (n, 2),
+            ``R11``, ``R22``, ``R12``, ``R21`` and ``flags``. In both, ellipticities are those before calibration: the
+            sum of ellipticities over the sum of responses is the shear. ``'shearq'``: all columns of the catalogue.
+
+        Returns
+        -------
+        dict of str to array
+        """
+        if names == "shearq":
+            return {name: self[name] for name in self.dtype.names or ()}
+        (e1, e2), (r11, r22) = raw(self)
+        if names == "anacal":
+            return {"e1": e1, "de1_dg1": r11, "e2": e2, "de2_dg2": r22, "flags": self["flags"]}
+        if names == "ngmix":
+            cross: dict[str, NDArray[Any]] = {name: self[name] for name in ("R12", "R21") if name in (self.dtype.names or ())}
+            return {"g": np.stack([e1, e2], axis=-1), "R11": r11, "R22": r22, **cross, "flags": self["flags"]}
+        raise ValueError(f"names: found {names!r}; expected 'shearq', 'anacal' or 'ngmix'")
+
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write a file that :func:`read` and the command line read.
+
+        Parameters
+        ----------
+        path : str or path
+            The ending is the format: ``.parquet``, ``.fits``, ``.ecsv`` (needs astropy) or ``.npy`` (without
+            ``attrs``).
+        overwrite : bool
+            Whether to replace a file.
+
+        Raises
+        ------
+        FileExistsError
+            If there is a file and ``overwrite`` is false.
+        ValueError
+            If the ending is another.
+        """
+        from ._files import write
+
+        write(self, path, overwrite)
+
+    def to_astropy(self) -> astropy.table.Table:
+        """An ``astropy.table.Table`` with units, and with ``attrs`` as ``meta`` by the keys of files."""
+        from ._tables import to_astropy
+
+        return to_astropy(self)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A ``pandas.DataFrame`` with ``attrs``."""
+        from ._tables import to_pandas
+
+        return to_pandas(self)
+
+    def to_polars(self) -> polars.DataFrame:
+        """A ``polars.DataFrame``. It has no ``attrs``."""
+        from ._tables import to_polars
+
+        return to_polars(self)
+
+    @classmethod
+    def from_table(cls, table: Any, columns: Mapping[str, str] | None = None) -> Catalogue:
+        """The catalogue of a table.
+
+        Parameters
+        ----------
+        table : astropy, pandas or polars table, structured array, or mapping of names to arrays
+            With at least e1 and e2. Without ``flags``, rows whose ellipticity is not finite are flagged. Without
+            ``R11`` and ``R22``, the ellipticities are treated as shears. Other columns are kept.
+        columns : mapping of str to str, optional
+            Names in the table of columns of the catalogue: ``{"e1": "g1_meas"}``.
+
+        Returns
+        -------
+        Catalogue
+
+        Raises
+        ------
+        ValueError
+            If a column is absent, columns have several lengths, or responses are there without divisors.
+        """
+        from ._tables import from_table
+
+        return from_table(table, columns)
+
+    def plot(self, kind: Literal["histogram", "map"] = "histogram", ax: Any = None) -> Any:
+        """Plot the good galaxies with matplotlib.
+
+        Parameters
+        ----------
+        kind : {'histogram', 'map'}
+            Histograms of e1 and e2 with their mean shear, or the mean shear in cells of the field (needs x and y).
+        ax : matplotlib.axes.Axes, optional
+            Where to plot; a new figure by default.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+        """
+        from ._display import plot_catalogue
+
+        return plot_catalogue(self, kind, ax)
+
+
+def concatenate(catalogues: Iterable[Catalogue]) -> Catalogue:
+    """Join catalogues, one after the other. ``np.concatenate`` does the same.
+
+    Parameters
+    ----------
+    catalogues : iterable of Catalogue
+        With the same columns.
+
+    Returns
+    -------
+    Catalogue
+        Its ``attrs`` are those on which all agree.
+
+    Raises
+    ------
+    ValueError
+        If there is none, the columns differ, or one has shears and another one distortions.
+    """
+    parts = list(catalogues)
+    if not parts:
+        raise ValueError("catalogues: found none; expected one or more")
+    for k, part in enumerate(parts):
+        if not isinstance(part, Catalogue):
+            raise TypeError(f"catalogues: number {k} is of type {type(part).__name__}; expected Catalogue")
+        differing = set(part.dtype.names or ()) ^ set(parts[0].dtype.names or ())
+        if differing:
+            raise ValueError(
+                f"catalogues: number 0 and number {k} do not share the columns {', '.join(sorted(differing))};"
+                " expected the same columns. Try: choose them by catalogue[[names]]"
+            )
+    kinds = {part.attrs["ellipticity"] for part in parts if "ellipticity" in part.attrs}
+    if len(kinds) > 1:
+        raise ValueError("catalogues: found shears and distortions; expected ellipticities of one type")
+    names = list(parts[0].dtype.names or ())
+    plain = [np.atleast_1d(part.view(np.ndarray))[names] for part in parts]
+    joined = np.concatenate(plain).view(Catalogue)
+    first = parts[0].attrs
+    joined.attrs = {
+        name: value for name, value in first.items() if all(part.attrs.get(name) == value for part in parts)
+    }
+    return joined
+
+
+def raw(rows: Catalogue) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
+    """Ellipticities before calibration, and their responses; those of rows without calibration are 1."""
+    e, responses = [], []
+    for k in "12":
+        divisor = np.asarray(rows[f"divisor{k}"], dtype=np.float64)
+        plain = np.isnan(divisor)
+        e.append(np.ascontiguousarray(rows[f"e{k}"] * np.where(plain, 1.0, divisor)))
+        response = np.where(plain & (rows["flags"] == 0), 1.0, rows[f"R{k}{k}"])
+        responses.append(np.ascontiguousarray(response, dtype=np.float64))
+    return e, responses
+
+
+def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike | None = None) -> MeanShear:
+    """The mean shear of the good galaxies of one or more catalogues; see :meth:`Catalogue.mean_shear`.
+
+    Parameters
+    ----------
+    catalogues : Catalogue or iterable of Catalogue
+        One by one, so that not all need to be in memory: :func:`measure_blocks` will do.
+    weights : array of shape (n,), optional
+        Weight of each row of all catalogues, one after the other.
+
+    Returns
+    -------
+    MeanShear
+
+    Raises
+    ------
+    ValueError
+        As :meth:`Catalogue.mean_shear`; or if there is no catalogue.
+    """
+    parts: list[list[NDArray[np.float64]]] = []
+    goods: list[NDArray[np.bool_]] = []
+    calibrated = False
+    for rows in [catalogues] if isinstance(catalogues, Catalogue) else catalogues:
+        missing = [name for name in _schema.NEEDED if name not in (rows.dtype.names or ())]
+        if missing:
+            raise ValueError(f"catalogue: no columns {', '.join(missing)}; expected {', '.join(_schema.NEEDED)}")
+        rows = np.atleast_1d(rows).view(Catalogue)
+        e, responses = raw(rows)
+        parts.append([*e, *responses])
+        goods.append(rows.good)
+        calibrated = calibrated or bool(np.isfinite(rows["divisor1"]).any())
+    if not parts:
+        raise ValueError("catalogues: found none; expected one or more")
+    good = np.concatenate(goods)
+    weight = _weights(weights, len(good))
+    counted = good & (weight > 0)
+    if len(good) == 0:
+        raise ValueError("catalogue: found no galaxies; expected one or more")
+    if not counted.any():
+        name = "catalogue" if weights is None else "weights"
+        reason = "has a flag" if weights is None else "has a flag or a weight of zero"
+        raise ValueError(f"{name}: each of the {len(good)} galaxies {reason}; expected one without")
+    e1, e2, r11, r22 = (np.concatenate([part[k] for part in parts])[counted] for k in range(4))
+    if not all(np.isfinite(column).all() for column in (e1, e2, r11, r22)):
+        raise ValueError("catalogue: an ellipticity or response without a flag is not finite; expected flags")
+    # A common factor changes nothing, but squares of weights could overflow.
+    factor = weight[counted] / weight[counted].max()
+    (g1, g2), (first, second), response, galaxies = _shearq.mean_shear(e1, e2, r11, r22, factor)
+    errors = [float(np.sqrt(value)) for value in (first[0], second[1])]
+    return MeanShear(
+        g1,
+        g2,
+        errors[0],
+        errors[1],
+        ((first[0], first[1]), (second[0], second[1])),
+        (response[0], response[1]) if calibrated else None,
+        galaxies,
+        int((weight[~good] > 0).sum()),
+    )
+
+
+def _weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64]:
+    """Weights of the rows."""
+    if weights is None:
+        return np.ones(count)
+    given = np.asarray(weights)
+    weight = given.astype(np.float64) if given.dtype == bool else double("weights", given)
+    if weight.shape != (count,):
+        raise ValueError(
+            f"weights: found an array of shape {shown(weight.shape)}; expected {shown((count,))}, one for each row"
+        )
+    if not (np.isfinite(weight).all() and (weight >= 0).all()):
+        raise ValueError("weights: found one that is negative or not finite; expected finite ones, not negative")
+    return weight
+
+
+_distributed.register(Catalogue)

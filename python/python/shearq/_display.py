@@ -1,0 +1,104 @@
+"""Catalogues and scores in notebooks and plots. Plots need matplotlib."""
+
+from __future__ import annotations
+
+import html as escape
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ._catalogue import Catalogue
+    from ._score import Score
+
+# Rows that are shown.
+_SHOWN = 8
+# Cells per side of a map, and the shear of an arrow of one cell.
+_CELLS = 10
+
+
+def _number(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
+
+
+def html(catalogue: Catalogue) -> str:
+    names = catalogue.dtype.names or ()
+    if catalogue.ndim != 1:
+        return f"<pre>{escape.escape(repr(catalogue))}</pre>"
+    head = "".join(f"<th>{escape.escape(name)}</th>" for name in names)
+    rows = [
+        "<tr>" + "".join(f"<td>{escape.escape(_number(row[name]))}</td>" for name in names) + "</tr>"
+        for row in catalogue[:_SHOWN]
+    ]
+    flagged = int((catalogue["flags"] != 0).sum()) if "flags" in names else 0
+    more = f", the first {_SHOWN} shown" if len(catalogue) > _SHOWN else ""
+    text = f"shearq.Catalogue of {len(catalogue)} galaxies, {flagged} flagged{more}"
+    return f"<table><caption>{text}</caption><tr>{head}</tr>{''.join(rows)}</table>"
+
+
+def _axes(ax: Any) -> Any:
+    if ax is not None:
+        return ax
+    try:
+        from matplotlib import pyplot
+    except ImportError:
+        raise ImportError("plots need matplotlib. Try: pip install matplotlib") from None
+    return pyplot.subplots()[1]
+
+
+def plot_catalogue(catalogue: Catalogue, kind: Literal["histogram", "map"], ax: Any) -> Any:
+    good = catalogue[catalogue.good]
+    if kind == "histogram":
+        ax = _axes(ax)
+        mean = catalogue.mean_shear()
+        for k, colour in ((1, "C0"), (2, "C1")):
+            e = good[f"e{k}"]
+            # The tails of noisy galaxies would leave the rest in one bin.
+            edge = float(np.quantile(np.abs(e), 0.99))
+            ax.hist(e, bins=60, range=(-edge, edge), histtype="step", color=colour, label=f"e{k}")
+            ax.axvline((mean.g1, mean.g2)[k - 1], color=colour, linestyle="--", linewidth=1)
+        ax.set(xlabel="ellipticity", ylabel="galaxies", title=str(mean))
+        ax.title.set_fontsize("small")
+        ax.legend()
+        return ax
+    if kind != "map":
+        raise ValueError(f"kind: found {kind!r}; expected 'histogram' or 'map'")
+    names = catalogue.dtype.names or ()
+    if "x" not in names or "y" not in names:
+        raise ValueError("kind: found 'map' of a catalogue without positions; expected columns x and y. Try: measure(…, x=x, y=y)")
+    ax = _axes(ax)
+    cells = []
+    edges = [np.linspace(good[axis].min(), np.nextafter(good[axis].max(), np.inf), _CELLS + 1) for axis in "xy"]
+    place = [np.clip(np.digitize(good[axis], edge) - 1, 0, _CELLS - 1) for axis, edge in zip("xy", edges)]
+    for j in range(_CELLS):
+        for i in range(_CELLS):
+            here = good[(place[0] == i) & (place[1] == j)]
+            if len(here) > 1:
+                g1, g2 = here.mean_shear()
+                cells.append((here["x"].mean(), here["y"].mean(), g1, g2))
+    if not cells:
+        raise ValueError("catalogue: no cell has two good galaxies; expected more galaxies")
+    x, y, g1, g2 = np.array(cells).T
+    size, angle = np.hypot(g1, g2), 0.5 * np.arctan2(g2, g1)
+    style = dict(headwidth=0, headlength=0, headaxislength=0, pivot="middle", angles="xy")
+    arrows = ax.quiver(x, y, size * np.cos(angle), size * np.sin(angle), **style)
+    typical = float(np.median(size))
+    ax.quiverkey(arrows, 0.85, 1.03, typical, f"shear {typical:.2g}", labelpos="E")
+    ax.set(xlabel="x (px)", ylabel="y (px)", aspect="equal")
+    return ax
+
+
+def plot_score(score: Score, ax: Any) -> Any:
+    ax = _axes(ax)
+    table = score.spectrum
+    chosen = table["modes"] > 0
+    l, error = table["l"][chosen], table["ee_error"][chosen]
+    error = np.where(np.isfinite(error), error, 0.0)
+    ax.errorbar(l, table["ee"][chosen], error, fmt="o", markersize=4, label="EE")
+    ax.plot(l, table["bb"][chosen], "x", markersize=4, label="BB")
+    ax.plot(l, table["true_ee"][chosen], color="black", linewidth=1, label="true EE")
+    ax.set(xscale="log", xlabel="multipole ℓ", ylabel="ℓ²C(ℓ)/2π", title=repr(score).strip("<>"))
+    ax.title.set_fontsize("small")
+    ax.set_yscale("symlog", linthresh=max(float(np.nanmax(np.abs(table["true_ee"]))) * 1e-2, 1e-12))
+    ax.legend()
+    return ax

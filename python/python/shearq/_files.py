@@ -1,0 +1,120 @@
+"""Catalogues in files, the same as those of the command line."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import tempfile
+from typing import Any
+
+import numpy as np
+
+from . import _schema, _shearq, _tables
+from ._catalogue import Catalogue
+
+_FORMATS = {".parquet": "parquet", ".pq": "parquet", ".fits": "fits", ".fit": "fits", ".ecsv": "ecsv", ".npy": "npy"}
+
+
+def _format(path: pathlib.Path) -> str:
+    try:
+        return _FORMATS[path.suffix.lower()]
+    except KeyError:
+        raise ValueError(
+            f"path: found {path.name!r}; expected a name that ends in .parquet, .fits, .ecsv or .npy"
+        ) from None
+
+
+def read(path: str | os.PathLike[str]) -> Catalogue:
+    """Read a catalogue that :meth:`Catalogue.write` or the command line wrote.
+
+    Parameters
+    ----------
+    path : str or path
+        A file that ends in ``.parquet``, ``.fits``, ``.ecsv`` (needs astropy) or ``.npy``. For tables of other
+        programs see :meth:`Catalogue.from_table`.
+
+    Returns
+    -------
+    Catalogue
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no such file, its ending is another, or it lacks a column.
+    """
+    file = pathlib.Path(path)
+    format = _format(file)
+    if not file.exists():
+        raise FileNotFoundError(f"path: there is no file {file}")
+    if format == "npy":
+        return _tables.from_table(np.load(file))
+    if format == "ecsv":
+        from astropy.table import Table  # type: ignore[import-untyped, unused-ignore]
+
+        return _tables.from_table(Table.read(file, format="ascii.ecsv"))
+    keys = [*_schema.KEYS, *_schema.OTHER_KEYS]
+    columns, metadata = _shearq.read_table(str(file), format, keys)
+    found = {name: np.asarray(column) for name, column in columns.items()}
+    try:
+        return _tables.build(found, _schema.to_attrs(metadata))
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def read_all(folder: str | os.PathLike[str], sets: int | list[int] | None = None) -> list[Catalogue]:
+    """Read the catalogues of a results folder of the command line, in the order of their sets and images.
+
+    Parameters
+    ----------
+    folder : str or path
+        What ``shearq measure --out`` wrote: ``set01/catalogue-001.parquet`` and so on.
+    sets : int or list of int, optional
+        Numbers of the sets; all by default.
+
+    Returns
+    -------
+    list of Catalogue
+        ``attrs`` contain the numbers ``set`` and ``image``.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no catalogue.
+    """
+    numbers = None if sets is None else {sets} if isinstance(sets, int) else set(sets)
+    found = []
+    for path in sorted(pathlib.Path(folder).glob("set*/catalogue-*")):
+        number = path.parent.name.removeprefix("set")
+        if path.suffix in (".parquet", ".fits") and number.isdecimal():
+            if numbers is None or int(number) in numbers:
+                found.append(path)
+    if not found:
+        raise FileNotFoundError(f"folder: there is no set*/catalogue-* in {os.fspath(folder)}; expected results of `shearq measure`")
+    return [read(path) for path in found]
+
+
+def write(catalogue: Catalogue, path: str | os.PathLike[str], overwrite: bool) -> None:
+    file = pathlib.Path(path)
+    format = _format(file)
+    if file.exists() and not overwrite:
+        raise FileExistsError(f"path: there is a file {file}. Try: overwrite=True")
+    if format in ("parquet", "fits"):
+        columns: list[tuple[str, Any]] = []
+        for name in catalogue.dtype.names or ():
+            column = catalogue[name]
+            if column.dtype.kind in "iub":
+                columns.append((name, np.ascontiguousarray(column, dtype=np.int64)))
+            elif column.dtype.kind == "f":
+                columns.append((name, np.ascontiguousarray(column, dtype=np.float64)))
+            else:
+                columns.append((name, [str(word) for word in column]))
+        _shearq.write_table(str(file), format, columns, _schema.to_keys(catalogue.attrs))
+        return
+    # Completely or not at all.
+    with tempfile.TemporaryDirectory(dir=file.parent) as folder:
+        part = pathlib.Path(folder) / file.name
+        if format == "npy":
+            np.save(part, catalogue.view(np.ndarray))
+        else:
+            _tables.to_astropy(catalogue).write(part, format="ascii.ecsv")
+        os.replace(part, file)

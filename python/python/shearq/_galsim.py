@@ -1,0 +1,177 @@
+"""Images and profiles of GalSim, on one grid of square pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Shear of pixels, and difference of pixel scales, that is tolerated: shears have this error then.
+SAME = 1e-4
+
+
+class GalSimImage(Protocol):
+    """A ``galsim.Image``."""
+
+    @property
+    def array(self) -> Any: ...
+    @property
+    def bounds(self) -> Any: ...
+
+
+class GalSimProfile(Protocol):
+    """A ``galsim.GSObject``."""
+
+    def drawImage(self, *args: Any, **kwargs: Any) -> Any: ...
+
+
+def _is_image(value: Any) -> bool:
+    return hasattr(value, "bounds") and isinstance(getattr(value, "array", None), np.ndarray)
+
+
+def _is_profile(value: Any) -> bool:
+    return hasattr(value, "drawImage")
+
+
+def _many(value: Any, kind: Any) -> list[Any] | None:
+    """The objects of a kind that ``value`` is or lists; None if it is something else."""
+    if kind(value):
+        return [value]
+    if isinstance(value, (list, tuple)) and value and any(map(kind, value)):
+        return list(value)
+    return None
+
+
+def square_pixels(name: str, jacobian: tuple[float, float, float, float], remedy: str) -> float:
+    """The scale of pixels with (du/dx, du/dy, dv/dx, dv/dy), which must be square and along the axes."""
+    xx, xy, yx, yy = jacobian
+    scale: float = abs(xx * yy - xy * yx) ** 0.5
+    if xx > 0 and max(abs(xy), abs(yx), abs(yy - xx)) <= SAME * scale:
+        return scale
+    if xx * yy - xy * yx <= 0:
+        kind = "flipped"
+    elif abs(xx - yy) <= SAME * scale and abs(xy + yx) <= SAME * scale:
+        kind = "rotated"
+    else:
+        kind = "sheared"
+    raise ValueError(
+        f"{name} has {kind} pixels: (du/dx, du/dy, dv/dx, dv/dy) is ({xx:.6g}, {xy:.6g}, {yx:.6g}, {yy:.6g});"
+        f" expected (s, 0, 0, s). {remedy}"
+    )
+
+
+def _scale(image: Any, name: str) -> float | None:
+    """The pixel scale of an image; None if it has no WCS."""
+    if getattr(image, "wcs", None) is None:
+        return None
+    local = image.wcs.local(image.true_center).jacobian()
+    remedy = "Try: resample the image, or from_galsim(…, wcs='ignore') for shears along the pixel axes"
+    return square_pixels(name, (local.dudx, local.dudy, local.dvdx, local.dvdy), remedy)
+
+
+def _array(name: str, images: list[Any]) -> NDArray[Any]:
+    """The pixels of images of one shape."""
+    for k, image in enumerate(images):
+        if not (_is_image(image) or isinstance(image, np.ndarray)):
+            raise TypeError(f"{name}: number {k} is of type {type(image).__name__}; expected images of GalSim")
+    arrays = [image.array if _is_image(image) else image for image in images]
+    shapes = {array.shape for array in arrays}
+    if len(shapes) > 1:
+        raise ValueError(f"{name}: found images of shapes {sorted(shapes)}; expected one shape")
+    return np.stack(arrays)
+
+
+def _common(name: str, images: list[Any]) -> float | None:
+    """The pixel scale that images share."""
+    scales = [_scale(image, f"{name}: image {k}") for k, image in enumerate(images) if _is_image(image)]
+    known = [scale for scale in scales if scale is not None]
+    if known and max(known) - min(known) > SAME * min(known):
+        raise ValueError(f"{name}: found pixel scales from {min(known):.6g} to {max(known):.6g}; expected one scale")
+    return known[0] if known else None
+
+
+def from_galsim(
+    images: GalSimImage | Sequence[GalSimImage],
+    psf: GalSimImage | GalSimProfile | Sequence[GalSimImage] | Sequence[GalSimProfile],
+    *,
+    wcs: Literal["check", "ignore"] = "check",
+) -> dict[str, NDArray[Any]]:
+    """Arguments of :func:`measure` for stamps and PSFs of GalSim.
+
+    Parameters
+    ----------
+    images : galsim.Image or sequence of them
+        Stamps of one shape.
+    psf : galsim.Image, galsim.GSObject, or sequence of them
+        One for all galaxies or one per galaxy. A profile is drawn on the pixels of the stamps, and convolved with
+        them.
+    wcs : {'check', 'ignore'}
+        ``'check'`` refuses pixels that are flipped, rotated or sheared, and PSF images of another scale. ``'ignore'``
+        measures shears along the pixel axes.
+
+    Returns
+    -------
+    dict
+        ``stamps`` of shape (n, ny, nx), and ``psf`` of shape (py, px) or (n, py, px).
+
+    Raises
+    ------
+    ValueError
+        If pixels are not square and along the axes, or scales or shapes differ.
+    TypeError
+        If an object is another.
+
+    Examples
+    --------
+    ``shearq.measure(**shearq.from_galsim(images, psf))``
+    """
+    if wcs not in ("check", "ignore"):
+        raise ValueError(f"wcs: found {wcs!r}; expected 'check' or 'ignore'")
+    stamps = _many(images, _is_image)
+    if stamps is None:
+        raise TypeError(f"images: found {type(images).__name__}; expected images of GalSim")
+    pixels = _array("stamps", stamps)
+    scale = _common("stamps", stamps) if wcs == "check" else None
+    profiles = _many(psf, _is_profile)
+    if profiles is not None:
+        side = pixels.shape[-1]
+        # Every profile on the pixels of its stamp.
+        places = stamps if len(profiles) == len(stamps) else stamps[:1]
+        drawn = []
+        for k, profile in enumerate(profiles):
+            place = places[k if len(places) > 1 else 0]
+            local = None if place.wcs is None else place.wcs.local(place.true_center)
+            how = {"scale": 1.0} if local is None else {"wcs": local}
+            drawn.append(profile.drawImage(nx=side, ny=side, dtype=np.float64, **how).array)
+        return {"stamps": pixels, "psf": drawn[0] if _is_profile(psf) else np.stack(drawn)}
+    stars = _many(psf, _is_image)
+    if stars is None:
+        return {"stamps": pixels, "psf": np.asarray(psf)}
+    own = _common("psf", stars) if wcs == "check" else None
+    if scale is not None and own is not None and abs(own - scale) > SAME * scale:
+        raise ValueError(f"psf: found a pixel scale of {own:.6g} and stamps of {scale:.6g}; expected one scale")
+    return {"stamps": pixels, "psf": stars[0].array if _is_image(psf) else _array("psf", stars)}
+
+
+def unpacked(stamps: Any, psf: Any) -> tuple[Any, Any]:
+    """Stamps and PSFs, of which GalSim's become arrays."""
+    if _many(stamps, _is_image) is not None:
+        if hasattr(psf, "fwhm") and not _is_profile(psf):
+            # Formulas in pixels.
+            images = _many(stamps, _is_image) or []
+            _common("stamps", images)
+            return _array("stamps", images), psf
+        found = from_galsim(stamps, psf)
+        return found["stamps"], found["psf"]
+    if _many(psf, _is_profile) is not None:
+        raise TypeError(
+            "psf: found a profile of GalSim with stamps that have no WCS; expected pixels."
+            " Try: psf.drawImage(nx=48, ny=48, scale=SCALE), with the pixel scale of the stamps"
+        )
+    stars = _many(psf, _is_image)
+    if stars is not None:
+        _common("psf", stars)
+        psf = stars[0].array if _is_image(psf) else _array("psf", stars)
+    return stamps, psf

@@ -1,0 +1,50 @@
+"""The columns and metadata of catalogues: one schema for arrays, tables and files (docs/files-catalogues.md)."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+# Whole numbers; the other columns of the schema are reals.
+WHOLE = ("flags", "iterations", "stop", "updated")
+# What the mean shear follows from.
+NEEDED = ("e1", "e2", "flags", "R11", "R22", "divisor1", "divisor2")
+REAL: tuple[str, ...] = ("x", "y", "e1", "e2", "first_energy", "energy", "noise", "flux", "radius", "size", "R11", "R22", "R12", "R21")
+REAL += ("divisor1", "divisor2")
+UNITS = {"x": "pix", "y": "pix", "radius": "pix", "size": "pix2"}
+
+# Keys of files, and the names of ``attrs``.
+KEYS = {"submiss": "submission", "elltype": "ellipticity", "settings": "settings", "creator": "version"}
+# Keys of the command line's files that are kept as they are.
+OTHER_KEYS = ("set", "image", "warnings")
+_CREATOR = "shearq "
+_ESCAPED = re.compile(r"\\(?:([nrt\\])|u\{([0-9a-fA-F]{1,6})\})")
+_PLAIN = {"n": "\n", "r": "\r", "t": "\t", "\\": "\\"}
+
+
+def to_keys(attrs: dict[str, Any]) -> dict[str, str]:
+    """``attrs`` by the keys of files."""
+    names = {name: key for key, name in KEYS.items()}
+    found = {names.get(name, name): str(value) for name, value in attrs.items()}
+    if "creator" in found:
+        found["creator"] = _CREATOR + found["creator"]
+    return found
+
+
+def to_attrs(metadata: Any) -> dict[str, Any]:
+    """``attrs`` from metadata by the keys of files, in any case, or by their own names."""
+    found: dict[str, Any] = {}
+    for key, value in dict(metadata).items():
+        name = KEYS.get(str(key).lower(), str(key).lower())
+        if name not in KEYS.values() and name not in OTHER_KEYS:
+            continue
+        if name == "settings" and isinstance(value, str) and "\n" not in value:
+            value = _ESCAPED.sub(lambda m: _PLAIN[m[1]] if m[1] else chr(int(m[2], 16)), value)
+        found[name] = value.removeprefix(_CREATOR) if name == "version" and isinstance(value, str) else value
+    return found
+
+
+def in_header(text: str) -> str:
+    """A text in the characters that a FITS header may have, as the command line writes it."""
+    known = {plain: "\\" + name for name, plain in _PLAIN.items()}
+    return "".join(known.get(c) or (c if " " <= c <= "~" else f"\\u{{{ord(c):x}}}") for c in text)

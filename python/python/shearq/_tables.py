@@ -1,0 +1,119 @@
+"""Catalogues as tables of other packages, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import _schema
+from ._catalogue import Catalogue, Flag
+
+if TYPE_CHECKING:
+    import astropy.table  # type: ignore[import-untyped, unused-ignore]
+    import pandas
+    import polars
+
+
+def _columns(catalogue: Catalogue) -> dict[str, Any]:
+    """Columns by name, each in memory of its own."""
+    return {name: np.ascontiguousarray(catalogue[name]) for name in catalogue.dtype.names or ()}
+
+
+def to_astropy(catalogue: Catalogue) -> astropy.table.Table:
+    from astropy.table import Table
+
+    meta = {key: _schema.in_header(value) for key, value in _schema.to_keys(catalogue.attrs).items()}
+    table = Table(_columns(catalogue), meta=meta)
+    for name, unit in _schema.UNITS.items():
+        if name in table.colnames:
+            table[name].unit = unit
+    return table
+
+
+def to_pandas(catalogue: Catalogue) -> pandas.DataFrame:
+    import pandas
+
+    frame = pandas.DataFrame(_columns(catalogue))
+    frame.attrs.update(catalogue.attrs)
+    return frame
+
+
+def to_polars(catalogue: Catalogue) -> polars.DataFrame:
+    import polars
+
+    return polars.DataFrame(_columns(catalogue))
+
+
+def _plain(name: str, column: Any) -> np.ndarray[Any, Any]:
+    """A column as an array; missing reals are NaN."""
+    if isinstance(column, np.ma.MaskedArray):
+        if not np.ma.is_masked(column):
+            return np.asarray(column.data)
+        if column.dtype.kind != "f":
+            raise ValueError(f"table: values of {name} are missing; expected all")
+        return np.asarray(column.filled(np.nan))
+    array = column.to_numpy() if hasattr(column, "to_numpy") else np.asarray(column)
+    if array.dtype.kind == "O":
+        # Words.
+        array = np.array([str(value) for value in array], dtype=np.str_)
+    return np.asarray(array)
+
+
+def from_table(table: Any, columns: Mapping[str, str] | None = None) -> Catalogue:
+    if isinstance(table, Catalogue) and not columns:
+        return table.copy()
+    if isinstance(table, np.ndarray):
+        if table.dtype.names is None:
+            raise TypeError("table: found an array without fields; expected a structured array")
+        names = list(table.dtype.names)
+    else:
+        names = list(getattr(table, "colnames", None) or getattr(table, "columns", None) or table)
+    metadata = getattr(table, "attrs", None) or getattr(table, "meta", None) or {}
+    absent = [name for name in (columns or {}).values() if name not in names]
+    if absent:
+        raise ValueError(f"columns: no {', '.join(absent)} in the table; expected some of {', '.join(map(str, names))}")
+    # The names of the catalogue for those of the table.
+    given = {found: own for own, found in (columns or {}).items()}
+    taken = set(given)
+    found = {
+        given.get(name, str(name)): _plain(str(name), table[name])
+        for name in names
+        if name in taken or str(name) not in given.values()
+    }
+    return build(found, _schema.to_attrs(metadata))
+
+
+def build(found: dict[str, Any], attrs: dict[str, Any]) -> Catalogue:
+    """The catalogue of columns, of which those of the schema get their types."""
+    missing = [name for name in ("e1", "e2") if name not in found]
+    if missing:
+        raise ValueError(f"table: no columns {', '.join(missing)}; expected e1 and e2. Try: columns={{'e1': NAME}}")
+    shapes = {name: np.shape(column) for name, column in found.items()}
+    rows = shapes["e1"]
+    for name, shape in shapes.items():
+        if len(rows) != 1 or shape != rows:
+            raise ValueError(f"table: {name} has the shape {shape} and e1 {rows}; expected columns of one length")
+    responses, divisors = [[f"{kind}{k}" in found for k in end] for kind, end in (("R", ("11", "22")), ("divisor", "12"))]
+    if any(responses) != any(divisors) or any(responses) != all(responses) or any(divisors) != all(divisors):
+        raise ValueError(
+            "table: found only some of R11, R22, divisor1 and divisor2; expected all or none. Set divisor1 and divisor2"
+            " to the numbers by which e1 and e2 were divided: 1 if they are not calibrated"
+        )
+    if not any(responses):
+        found.update({name: np.full(rows, np.nan) for name in ("R11", "R22", "divisor1", "divisor2")})
+    if "flags" not in found:
+        finite = np.isfinite(np.asarray(found["e1"], np.float64)) & np.isfinite(np.asarray(found["e2"], np.float64))
+        found["flags"] = np.where(finite, 0, int(Flag.NotFinite))
+    types = {name: np.dtype(np.int32) for name in _schema.WHOLE} | {name: np.dtype(np.float64) for name in _schema.REAL}
+    arrays = {name: np.asarray(column) for name, column in found.items()}
+    try:
+        arrays = {name: array.astype(types.get(name, array.dtype.newbyteorder("="))) for name, array in arrays.items()}
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"table: {error}; expected numbers") from None
+    catalogue = np.empty(rows, dtype=[(name, array.dtype) for name, array in arrays.items()]).view(Catalogue)
+    for name, array in arrays.items():
+        catalogue[name] = array
+    catalogue.attrs = attrs
+    return catalogue

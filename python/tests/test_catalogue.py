@@ -1,0 +1,329 @@
+"""Catalogues keep their calibration in any table, file and process."""
+
+import copy
+import json
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import same_bits
+
+import shearq
+
+hypothesis = pytest.importorskip("hypothesis", reason="random sequences of operations need hypothesis")
+strategies = pytest.importorskip("hypothesis.strategies")
+
+FILES = (".parquet", ".fits", ".npy", ".ecsv")
+
+
+def _galaxies(seed, set, first, **options):
+    image = shearq.simulate(set=set, seed=seed, grid=8)[0]
+    count = len(image.stamps)
+    ids = np.arange(first, first + count)
+    x, y = np.random.default_rng(seed).uniform(0, 1000, (2, count))
+    stamps = image.stamps.copy()
+    # One galaxy is flagged.
+    stamps[5] = np.nan
+    return shearq.measure(stamps, image.psf, ids=ids, x=x, y=y, noise=image.noise, **options)
+
+
+@pytest.fixture(scope="module")
+def two():
+    """Catalogues whose mean responses differ by some ten per cent."""
+    return _galaxies(3, 8, 0), _galaxies(4, 5, 1000)
+
+
+def expected(rows):
+    """Σe/ΣR of rows without flags, with e before calibration."""
+    good = rows[rows["flags"] == 0]
+    return [float((good[f"e{k}"] * good[f"divisor{k}"]).sum() / good[f"R{k}{k}"].sum()) for k in (1, 2)]
+
+
+def test_joined_tables_have_the_mean_shear_of_all_rows(two):
+    table = pytest.importorskip("astropy.table", reason="tables of astropy need it")
+    a, b = two
+    assert abs(a["divisor1"][0] / b["divisor1"][0] - 1) > 0.01
+    raw = [sum((c.columns("anacal")[name][c.good]).sum() for c in two) for name in ("e1", "de1_dg1")]
+    stacked = shearq.Catalogue.from_table(table.vstack([a.to_astropy(), b.to_astropy()]))
+    joined = shearq.concatenate([a, b])
+    for both in (stacked, joined, np.concatenate([a, b]), np.hstack([a, b]), np.append(a, b)):
+        assert type(both) is shearq.Catalogue
+        shear = both.mean_shear()
+        assert shear.g1 == pytest.approx(raw[0] / raw[1], rel=1e-12) and shear.galaxies == 126 and shear.flagged == 2
+        columns = both.columns("anacal")
+        assert columns["e1"][both.good].sum() / columns["de1_dg1"][both.good].sum() == pytest.approx(shear.g1, rel=1e-12)
+        ngmix = both.columns("ngmix")
+        assert ngmix["g"][both.good, 1].sum() / ngmix["R22"][both.good].sum() == pytest.approx(shear.g2, rel=1e-12)
+    assert str(shearq.mean_shear(iter(two))) == str(joined.mean_shear())
+    weights = np.arange(128.0)
+    assert shearq.mean_shear(two, weights).g1 == pytest.approx(joined.mean_shear(weights).g1, rel=1e-12)
+    assert joined.attrs["submission"] == "48/linear/star"
+
+
+def test_catalogues_of_other_columns_or_types_are_not_joined(two):
+    a, b = two
+    with pytest.raises(ValueError, match="do not share the columns id, x, y"):
+        shearq.concatenate([a, b[[name for name in b.dtype.names if name not in ("id", "x", "y")]]])
+    other = b.copy()
+    other.attrs["ellipticity"] = "distortion"
+    with pytest.raises(ValueError, match="found shears and distortions"):
+        np.concatenate([a, other])
+    with pytest.raises(ValueError, match="catalogues: found none"):
+        shearq.concatenate([])
+    with pytest.raises(ValueError, match="catalogues: found none"):
+        shearq.mean_shear([])
+    with pytest.raises(TypeError, match="number 1 is of type ndarray"):
+        shearq.concatenate([a, np.zeros(3)])
+
+
+def test_calibrated_rows_and_rows_without_calibration_can_be_joined(two):
+    image = shearq.simulate(set=8, seed=9, grid=8)[0]
+    network = shearq.measure(image.stamps, image.psf, noise=0.0, submission="23/raw/star")
+    plain = two[0][list(network.dtype.names)]
+    both = shearq.concatenate([plain, network])
+    good = plain[plain.good]
+    e = (good["e1"] * good["divisor1"]).sum() + network["e1"][network.good].sum()
+    assert both.mean_shear().g1 == pytest.approx(e / (good["R11"].sum() + network.good.sum()), rel=1e-12)
+
+
+@pytest.mark.parametrize("ending", FILES)
+def test_files_keep_every_bit(two, tmp_path, ending):
+    if ending == ".ecsv":
+        pytest.importorskip("astropy", reason="ECSV files need astropy")
+    path = tmp_path / f"c{ending}"
+    for words in (False, True):
+        rows = two[0]
+        if words:
+            names = np.array([f"galaxy {k}" for k in range(len(rows))])
+            table = {**{name: rows[name] for name in rows.dtype.names}, "id": names}
+            rows = shearq.Catalogue.from_table(table)
+            rows.attrs = dict(two[0].attrs)
+        rows.write(path, overwrite=words)
+        back = shearq.read(path)
+        assert same_bits(back, rows) and back.dtype == rows.dtype
+        assert back.attrs == ({} if ending == ".npy" else rows.attrs)
+        assert back.mean_shear() == rows.mean_shear()
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        rows.write(path)
+
+
+def test_tables_of_other_packages_keep_every_bit(two, tmp_path):
+    a = two[0]
+    for package, make in (("astropy", a.to_astropy), ("pandas", a.to_pandas), ("polars", a.to_polars)):
+        pytest.importorskip(package, reason=f"tables of {package} need it")
+        back = shearq.Catalogue.from_table(make())
+        assert same_bits(back, a) and back.dtype == a.dtype, package
+        assert back.attrs == ({} if package == "polars" else a.attrs)
+    assert a.to_astropy()["x"].unit == "pix" and str(a.to_astropy()["size"].unit) == "pix2"
+    from astropy.table import Table
+
+    for ending in ("fits", "ecsv"):
+        path = tmp_path / f"c.{ending}"
+        a.to_astropy().write(path)
+        for back in (shearq.read(path), shearq.Catalogue.from_table(Table.read(path))):
+            assert same_bits(back, a) and back.attrs == a.attrs, ending
+
+
+def test_files_of_the_command_line_and_of_python_are_the_same(two, command, tmp_path):
+    pandas = pytest.importorskip("pandas", reason="metadata are read by pandas")
+    pytest.importorskip("pyarrow", reason="pandas reads Parquet by pyarrow")
+    from astropy.table import Table
+
+    command("simulate", "--sets", 8, "--images", 2, "--grid", 8, "--seed", 3, "--out", tmp_path / "data")
+    measured = [shearq.measure(image.stamps, image.psf) for image in shearq.simulate(set=8, images=2, grid=8, seed=3)]
+    for format in ("parquet", "fits"):
+        out = tmp_path / format
+        command("measure", "--data", tmp_path / "data", "--out", out, "--catalogue-format", format)
+        for found, own in zip(shearq.read_all(out, sets=8), measured):
+            assert same_bits(found[list(own.dtype.names)], own)
+            for key in ("submission", "settings", "ellipticity", "version"):
+                assert found.attrs[key] == own.attrs[key], (format, key)
+            assert found.mean_shear() == own.mean_shear()
+        path = out / "set08" / f"catalogue-002.{format}"
+        table = Table.read(path)
+        assert {key.lower(): value for key, value in table.meta.items()}["submiss"] == "48/linear/star"
+        assert shearq.Catalogue.from_table(table).attrs["settings"] == own.attrs["settings"]
+    assert pandas.read_parquet(tmp_path / "parquet/set08/catalogue-001.parquet").attrs["image"] == "1"
+    with pytest.raises(FileNotFoundError, match="shearq measure"):
+        shearq.read_all(tmp_path / "data")
+    # The command line scores what Python wrote.
+    truth = tmp_path / "data/set08/truth.csv"
+    positions = np.loadtxt(truth, delimiter=",", skiprows=1)[:, :2]
+    scored = []
+    for k, own in enumerate(measured):
+        table = {"x": positions[:, 0], "y": positions[:, 1], **own.columns()}
+        shearq.Catalogue.from_table(table).write(tmp_path / f"own-{k}.parquet")
+    arguments = [tmp_path / "own-0.parquet", tmp_path / "own-1.parquet", "--truth", truth, "--stamp", 48, "--format", "json"]
+    scored = json.loads(command("score", *arguments))
+    simulation = shearq.simulate(set=8, images=2, grid=8, seed=3)
+    e1, e2 = (np.stack([own[name] for own in measured]) for name in ("e1", "e2"))
+    mine = shearq.score(e1, e2, simulation.g1, simulation.g2)
+    rows = scored if isinstance(scored, list) else scored["rows"]
+    assert rows[0]["q"] == pytest.approx(mine["q"], rel=1e-12)
+
+
+def test_tables_of_other_codes_are_taken_by_their_names():
+    table = {"g1_meas": [0.1, np.nan], "g2_meas": [0.2, 0.3], "redshift": [1.0, 2.0]}
+    found = shearq.Catalogue.from_table(table, columns={"e1": "g1_meas", "e2": "g2_meas"})
+    assert found["flags"].tolist() == [0, shearq.Flag.NotFinite] and found["redshift"].tolist() == [1.0, 2.0]
+    assert tuple(found.mean_shear()) == pytest.approx((0.1, 0.2)) and found.mean_shear().response is None
+    for wrong, message in (
+        ({"e1": [0.1], "x": [1.0]}, "table: no columns e2"),
+        ({"e1": [0.1], "e2": [0.1, 0.2]}, "expected columns of one length"),
+        ({"e1": [0.1], "e2": [0.1], "R11": [1.0], "R22": [1.0]}, "Set divisor1 and divisor2"),
+        ({"e1": ["a"], "e2": [0.1]}, "expected numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            shearq.Catalogue.from_table(wrong)
+    with pytest.raises(ValueError, match="columns: no g in the table"):
+        shearq.Catalogue.from_table(table, columns={"e1": "g"})
+    with pytest.raises(TypeError, match="without fields"):
+        shearq.Catalogue.from_table(np.zeros(3))
+
+
+def test_wrong_files_are_named(two, tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        shearq.read(tmp_path / "none.fits")
+    for call in (shearq.read, two[0].write):
+        with pytest.raises(ValueError, match="ends in .parquet, .fits, .ecsv or .npy"):
+            call(tmp_path / "c.csv")
+    (tmp_path / "bad.parquet").write_bytes(b"PAR1")
+    with pytest.raises(ValueError, match="bad.parquet"):
+        shearq.read(tmp_path / "bad.parquet")
+    with pytest.raises(OSError, match="none"):
+        two[0].write(tmp_path / "none" / "c.fits")
+
+
+OPERATIONS = ("slice", "mask", "sort", "concatenate", "pickle", "copy", "astropy", "pandas", "polars", *FILES)
+
+
+@hypothesis.settings(max_examples=60, deadline=None, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.given(strategies.lists(strategies.sampled_from(OPERATIONS), max_size=6), strategies.integers(0, 2**32))
+def test_no_sequence_of_operations_changes_the_mean_shear_of_its_rows(two, tmp_path, operations, seed):
+    for package in ("astropy", "pandas", "polars"):
+        pytest.importorskip(package, reason=f"a sequence may contain tables of {package}")
+    rng = np.random.default_rng(seed)
+    origin = {int(row["id"]): row for part in two for row in part}
+    rows = two[0]
+    for operation in operations:
+        if operation == "slice":
+            first = int(rng.integers(0, len(rows) // 4 + 1))
+            rows = rows[first : first + len(rows) * 3 // 4 : int(rng.integers(1, 3))]
+        elif operation == "mask":
+            rows = rows[rng.random(len(rows)) < 0.8]
+        elif operation == "sort":
+            rows = rows[np.argsort(rows["flux"])] if seed % 2 else np.sort(rows, order="x")
+        elif operation == "concatenate":
+            rows = np.concatenate([rows, two[1]])
+        elif operation == "pickle":
+            rows = pickle.loads(pickle.dumps(rows, protocol=int(rng.integers(2, 6))))
+        elif operation == "copy":
+            rows = copy.deepcopy(rows)
+        elif operation.startswith("."):
+            rows.write(tmp_path / f"c{operation}", overwrite=True)
+            rows = shearq.read(tmp_path / f"c{operation}")
+        else:
+            rows = shearq.Catalogue.from_table(getattr(rows, f"to_{operation}")())
+        assert type(rows) is shearq.Catalogue
+    # The same rows, from the catalogues as they were measured.
+    same = np.array([origin[int(number)] for number in rows["id"]], dtype=two[0].dtype)
+    assert same_bits(rows, same)
+    if not rows.good.any():
+        return
+    shear = rows.mean_shear()
+    # To the rounding of sums of some hundred numbers.
+    assert list(shear) == pytest.approx(expected(same), rel=1e-12, abs=1e-15)
+
+
+def test_results_are_short_to_read(two):
+    shear = shearq.MeanShear(0.0201234, -0.1, 0.00094, 0.0123, ((1.0, 0.0), (0.0, 1.0)), None, 12, 3)
+    assert str(shear) == "g1 = +0.0201 ± 0.0009, g2 = -0.100 ± 0.012 (12 galaxies, 3 flagged)"
+    assert repr(shear) == f"<shearq.MeanShear {shear}>"
+    assert str(two[0]) == repr(two[0]) == f"<shearq.Catalogue of 64 galaxies, 1 flagged: {', '.join(two[0].dtype.names)}>"
+    page = two[0]._repr_html_()
+    assert page.count("<tr>") == 9 and "1 flagged, the first 8 shown" in page and "<th>R11</th>" in page
+    assert two[0]._ipython_key_completions_() == list(two[0].dtype.names)
+
+
+def test_a_catalogue_without_a_good_row_says_so(two):
+    a = two[0]
+    with pytest.raises(ValueError, match="catalogue: found no galaxies; expected one or more"):
+        a[:0].mean_shear()
+    with pytest.raises(ValueError, match="catalogue: each of the 1 galaxies has a flag; expected one without"):
+        a[~a.good].mean_shear()
+    with pytest.raises(ValueError, match="catalogue: no columns R11"):
+        a[["e1", "e2", "flags"]].mean_shear()
+    wrong = a.copy()
+    wrong["e1"][0] = np.nan
+    with pytest.raises(ValueError, match="without a flag is not finite"):
+        wrong.mean_shear()
+
+
+def test_flags_are_those_of_the_library():
+    from shearq import _shearq
+
+    assert {flag.name: flag.value for flag in shearq.Flag} == {name: bit for name, bit, _ in _shearq.flags()}
+    assert str(shearq.Flag(3)) == "Flag.BadPsf|NotFinite" or "NotFinite" in repr(shearq.Flag(3))
+
+
+def test_blocks_are_measured_like_images(two):
+    image = shearq.simulate(set=8, seed=3, grid=12)[0]
+    seen = []
+    columns = dict(ids=np.arange(144), x=np.arange(144.0), y=np.zeros(144), noise=np.full(144, image.noise))
+
+    class Lazy:
+        """A dataset that is read by slices."""
+
+        shape = image.stamps.shape
+
+        def __getitem__(self, part):
+            seen.append(part)
+            return image.stamps[part]
+
+    blocks = shearq.measure_blocks(Lazy(), image.psf, block=60, **columns)
+    assert seen == []
+    found = list(blocks)
+    assert [len(block) for block in found] == [48, 48, 48] and len(seen) == 3
+    for k, block in enumerate(found):
+        part = slice(48 * k, 48 * (k + 1))
+        own = {name: value[part] for name, value in columns.items()}
+        assert same_bits(block, shearq.measure(image.stamps[part], image.psf, **own))
+    assert shearq.mean_shear(found).galaxies == 144
+    with pytest.raises(ValueError, match="noise: found 3 rows; expected 144"):
+        shearq.measure_blocks(image.stamps, image.psf, noise=np.ones(3))
+    stamps = image.stamps.copy()
+    stamps[72:] = np.nan
+    blocks = shearq.measure_blocks(stamps, image.psf, block=72)
+    next(blocks)
+    with pytest.raises(ValueError, match=r"no galaxy could be measured.* \(stamps 72 to 143\)"):
+        next(blocks)
+
+
+def test_plots_show_what_they_promise(two):
+    matplotlib = pytest.importorskip("matplotlib", reason="plots need matplotlib")
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    axes = two[0].plot()
+    assert axes.get_title() == str(two[0].mean_shear())
+    ax = pyplot.subplots()[1]
+    assert two[0].plot("map", ax=ax) is ax and ax.get_xlabel() == "x (px)"
+    with pytest.raises(ValueError, match="expected columns x and y"):
+        two[0][[name for name in two[0].dtype.names if name != "x"]].plot("map")
+    simulation = shearq.simulate(set=8, images=2, grid=12)
+    e = [np.stack([image.observed[:, k] for image in simulation]) for k in (0, 1)]
+    scored = shearq.score(*e, simulation.g1, simulation.g2)
+    assert scored.plot().get_xlabel().startswith("multipole")
+    frame = scored.to_frame("list")
+    assert [row["metric"] for row in frame] == list(scored.metrics) and frame[0]["value"] == scored["q"]
+
+
+def test_warnings_point_to_the_line_that_called(image):
+    with pytest.warns(shearq.DataWarning) as caught:
+        shearq.measure(image.stamps, image.psf, noise=2 * image.noise)
+    assert caught[0].filename == __file__ and not str(caught[0].message).lower().startswith("warning")
+    script = "import sys, warnings, shearq\nimage = shearq.simulate(grid=8)[0]\nshearq.measure(image.stamps, image.psf, noise=2.0)\n"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert "<string>:3: DataWarning: the given noise disagrees" in done.stderr
