@@ -26,6 +26,7 @@
 //! # }
 //! ```
 
+mod attributes;
 mod error;
 mod frame;
 mod parquet;
