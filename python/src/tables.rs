@@ -31,7 +31,7 @@ fn format(name: &str) -> PyResult<FileFormat> {
     }
 }
 
-/// The columns of a table by name, and those of the metadata `keys` that it has.
+/// The columns of numbers of a table by name, and those of the metadata `keys` that it has.
 #[pyfunction]
 pub(crate) fn read_table<'py>(
     py: Python<'py>,
@@ -56,15 +56,12 @@ pub(crate) fn read_table<'py>(
             columns.set_item(name, values.into_pyarray(py))?;
         } else if let Some(values) = reals(column) {
             columns.set_item(name, values.into_owned().into_pyarray(py))?;
-        } else if let Ok(words) = series.str() {
-            let words: Vec<&str> = words.iter().map(Option::unwrap_or_default).collect();
-            columns.set_item(name, words)?;
         }
     }
     Ok((columns, metadata))
 }
 
-/// Writes columns of reals, whole numbers or words, with text metadata: completely or not at all.
+/// Writes columns of reals or whole numbers with text metadata: completely or not at all.
 #[pyfunction]
 pub(crate) fn write_table(
     py: Python<'_>,
@@ -82,10 +79,7 @@ pub(crate) fn write_table(
         if let Ok(whole) = values.extract::<PyReadonlyArray1<'_, i64>>() {
             return Ok(Column::new(label, whole.as_slice()?));
         }
-        let words: Vec<String> = values
-            .extract()
-            .map_err(|_| PyTypeError::new_err(format!("{name}: expected numbers or words")))?;
-        Ok(Column::new(label, words))
+        Err(PyTypeError::new_err(format!("{name}: expected numbers")))
     });
     let columns: Vec<Column> = columns.collect::<PyResult<_>>()?;
     let table = frame(columns).map_err(|error| PyValueError::new_err(error.to_string()))?;

@@ -80,7 +80,7 @@ def test_catalogues_of_other_columns_or_types_are_not_joined(two):
 
 def test_calibrated_rows_and_rows_without_calibration_can_be_joined(two):
     image = shearq.simulate(set=8, seed=9, grid=8)[0]
-    network = shearq.measure(image.stamps, image.psf, noise=0.0, submission="23/raw/star")
+    network = shearq.measure(image.stamps, image.psf, noise=0.0, submission={"extends": "23/raw/star", "shape": {"ellipticity": "shear"}})
     plain = two[0][list(network.dtype.names)]
     both = shearq.concatenate([plain, network])
     good = plain[plain.good]
@@ -93,14 +93,14 @@ def test_files_keep_every_bit(two, tmp_path, ending):
     if ending == ".ecsv":
         pytest.importorskip("astropy", reason="ECSV files need astropy")
     path = tmp_path / f"c{ending}"
-    for words in (False, True):
+    for words in (False, ending in (".ecsv", ".npy")):
         rows = two[0]
         if words:
             names = np.array([f"galaxy {k}" for k in range(len(rows))])
             table = {**{name: rows[name] for name in rows.dtype.names}, "id": names}
             rows = shearq.Catalogue.from_table(table)
             rows.attrs = dict(two[0].attrs)
-        rows.write(path, overwrite=words)
+        rows.write(path, overwrite=True)
         back = shearq.read(path)
         assert same_bits(back, rows) and back.dtype == rows.dtype
         assert back.attrs == ({} if ending == ".npy" else rows.attrs)
@@ -135,7 +135,7 @@ def test_files_of_the_command_line_and_of_python_are_the_same(two, command, tmp_
     measured = [shearq.measure(image.stamps, image.psf) for image in shearq.simulate(set=8, images=2, grid=8, seed=3)]
     for format in ("parquet", "fits"):
         out = tmp_path / format
-        command("measure", "--data", tmp_path / "data", "--out", out, "--catalogue-format", format)
+        command("measure", "--submission", "48/linear/star", "--data", tmp_path / "data", "--out", out, "--catalogue-format", format)
         for found, own in zip(shearq.read_all(out, sets=8), measured):
             assert same_bits(found[list(own.dtype.names)], own)
             for key in ("submission", "settings", "ellipticity", "version"):
@@ -192,8 +192,18 @@ def test_wrong_files_are_named(two, tmp_path):
     (tmp_path / "bad.parquet").write_bytes(b"PAR1")
     with pytest.raises(ValueError, match="bad.parquet"):
         shearq.read(tmp_path / "bad.parquet")
-    with pytest.raises(OSError, match="none"):
-        two[0].write(tmp_path / "none" / "c.fits")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file: cannot make the folder"):
+        two[0].write(tmp_path / "file" / "c.fits")
+    large = shearq.Catalogue.from_table({"id": [2**60 + 1], "e1": [0.0], "e2": [0.0]})
+    large.write(tmp_path / "large.parquet")
+    assert shearq.read(tmp_path / "large.parquet")["id"].tolist() == [2**60 + 1]
+    large.write(tmp_path / "large.fits")
+    with pytest.raises(ValueError, match="large.fits: table: a number of id is above 2.53"):
+        shearq.read(tmp_path / "large.fits")
+    named = shearq.Catalogue.from_table({"id": ["a", "b"], "e1": [0.0, 0.1], "e2": [0.0, 0.1]})
+    with pytest.raises(ValueError, match="found words in id.*ecsv"):
+        named.write(tmp_path / "named.fits")
 
 
 OPERATIONS = ("slice", "mask", "sort", "concatenate", "pickle", "copy", "astropy", "pandas", "polars", *FILES)

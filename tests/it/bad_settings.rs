@@ -86,7 +86,7 @@ fn submissions_with_mistakes_are_refused_with_file_and_place() {
             "extends = \"papr\"\n",
             &[
                 "`extends`",
-                "no submission or file named `papr`",
+                "no configuration or file named `papr`",
                 "23/den/star",
             ],
         ),
@@ -107,7 +107,7 @@ fn submissions_with_mistakes_are_refused_with_file_and_place() {
     assert!(
         fail(&["submissions", "show", text(&path)]).contains("cannot read the configuration file")
     );
-    assert!(fail(&["submissions", "show", text(folder.path())]).contains("no submission or file"));
+    assert!(fail(&["submissions", "show", text(folder.path())]).contains("no configuration or file"));
 }
 
 #[test]

@@ -668,7 +668,7 @@ fn compressed_cubes_are_read_plane_by_plane() {
     let gather = ["gather", "--stamps", text(&path), "--psf", text(&psf)];
     let message = fail(&[&gather[..], &["--out", text(&out)]].concat());
     assert!(
-        message.contains("its tiles are of 3 planes each; expected one"),
+        message.contains("its tiles have 3 planes each; expected one"),
         "{message}"
     );
 }

@@ -25,6 +25,7 @@
 //! # }
 //! ```
 
+mod attributes;
 mod error;
 mod frame;
 mod parquet;

@@ -5,7 +5,6 @@
 //! [`frames`] are polars' data frames with text metadata.
 
 pub mod atomic;
-mod attributes;
 mod error;
 pub mod fits;
 pub mod frames;

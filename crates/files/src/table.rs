@@ -21,7 +21,7 @@ use crate::error::FileError;
 use crate::open::{is_there, open};
 
 pub use crate::limits::MAX_ROWS;
-use crate::{attributes, fits, parquet, text};
+use crate::{fits, parquet, text};
 
 /// A column of numbers of the table of `path`; missing ones are NaN.
 ///
@@ -455,7 +455,7 @@ pub fn write(
     metadata: &Metadata,
 ) -> Result<(), FileError> {
     match format {
-        FileFormat::Parquet => parquet::write(path, table, &attributes::with(metadata, table)),
+        FileFormat::Parquet => parquet::write(path, table, metadata),
         FileFormat::Fits => {
             let keys: Vec<(String, fits::Value)> = kept(metadata, format)
                 .into_iter()

@@ -357,7 +357,7 @@ mod tests {
         );
         message(
             Measurer::named("48/linear/stra", 48),
-            "no submission or file named",
+            "no configuration or file named",
         );
         let narrow = one.slice(s![.., ..46]);
         message(

@@ -39,8 +39,8 @@ impl fmt::Debug for Measurer {
 impl Measurer {
     /// Plans for full stamps of `full` pixels a side.
     ///
-    /// The linear method takes a pixel more of stamps and PSFs than the configuration states if that is even and the
-    /// stamps are odd, or the reverse, so that galaxies stay in the middle of its window.
+    /// If the stamps are odd and the configuration's stamp size is even, or the reverse, the linear method takes a pixel
+    /// more of the stamps and a pixel less of PSFs. So galaxies stay in the middle of its window.
     ///
     /// # Errors
     /// If a setting is out of its range, or the stamps are smaller than the configuration needs.
@@ -57,7 +57,7 @@ impl Measurer {
         let mut configuration = configuration.clone();
         if configuration.linear().is_some() && full % 2 != n % 2 {
             configuration.stamp.size += 1;
-            configuration.psf.size += 1;
+            configuration.psf.size -= 1;
             configuration.validate().map_err(ConfigurationError::from)?;
         }
         let (configuration, n) = (&configuration, configuration.stamp.size);

@@ -144,7 +144,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         self, func: Any, types: Iterable[type], args: Any, kwargs: Any
     ) -> Any:
         # numpy would make a plain array of catalogues.
-        if func is np.concatenate and args and not kwargs.keys() - {"axis"}:
+        plain = all(name in ("axis", "casting") or value is None for name, value in kwargs.items())
+        if func is np.concatenate and args and plain:
             parts = list(args[0])
             if parts and all(isinstance(part, Catalogue) and part.dtype.names for part in parts):
                 return concatenate(parts)
@@ -249,7 +250,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         ----------
         path : str or path
             The ending is the format: ``.parquet``, ``.fits``, ``.ecsv`` (needs astropy) or ``.npy`` (without
-            ``attrs``).
+            ``attrs``). Columns of words need ``.ecsv`` or ``.npy``.
         overwrite : bool
             Whether to replace a file.
 

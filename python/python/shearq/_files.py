@@ -31,7 +31,7 @@ def read(path: str | os.PathLike[str]) -> Catalogue:
     ----------
     path : str or path
         A file that ends in ``.parquet``, ``.fits``, ``.ecsv`` (needs astropy) or ``.npy``. For tables of other
-        programs see :meth:`Catalogue.from_table`.
+        programs see :meth:`Catalogue.from_table`. Columns of words are read from ``.ecsv`` and ``.npy`` only.
 
     Returns
     -------
@@ -107,7 +107,9 @@ def write(catalogue: Catalogue, path: str | os.PathLike[str], overwrite: bool) -
             elif column.dtype.kind == "f":
                 columns.append((name, np.ascontiguousarray(column, dtype=np.float64)))
             else:
-                columns.append((name, [str(word) for word in column]))
+                raise ValueError(
+                    f"path: {file.suffix} files have columns of numbers (found words in {name}). Try: a name that ends in .ecsv"
+                )
         _shearq.write_table(str(file), format, columns, _schema.to_keys(catalogue.attrs))
         return
     # Completely or not at all.

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     import polars
 
 
+# Largest whole number up to which a double has all of them.
+_EXACT = 2**53
+
+
 def _columns(catalogue: Catalogue) -> dict[str, Any]:
     """Columns by name, each in memory of its own."""
     return {name: np.ascontiguousarray(catalogue[name]) for name in catalogue.dtype.names or ()}
@@ -69,8 +73,9 @@ def from_table(table: Any, columns: Mapping[str, str] | None = None) -> Catalogu
             raise TypeError("table: found an array without fields; expected a structured array")
         names = list(table.dtype.names)
     else:
-        names = list(getattr(table, "colnames", None) or getattr(table, "columns", None) or table)
-    metadata = getattr(table, "attrs", None) or getattr(table, "meta", None) or {}
+        # pandas and polars have `columns`, and astropy has `colnames`.
+        names = list(getattr(table, "colnames", getattr(table, "columns", table)))
+    metadata = getattr(table, "attrs", getattr(table, "meta", {}))
     absent = [name for name in (columns or {}).values() if name not in names]
     if absent:
         raise ValueError(f"columns: no {', '.join(absent)} in the table; expected some of {', '.join(map(str, names))}")
@@ -103,15 +108,20 @@ def build(found: dict[str, Any], attrs: dict[str, Any]) -> Catalogue:
         )
     if not any(responses):
         found.update({name: np.full(rows, np.nan) for name in ("R11", "R22", "divisor1", "divisor2")})
-    if "flags" not in found:
-        finite = np.isfinite(np.asarray(found["e1"], np.float64)) & np.isfinite(np.asarray(found["e2"], np.float64))
-        found["flags"] = np.where(finite, 0, int(Flag.NotFinite))
     types = {name: np.dtype(np.int32) for name in _schema.WHOLE} | {name: np.dtype(np.float64) for name in _schema.REAL}
     arrays = {name: np.asarray(column) for name, column in found.items()}
+    if "id" in arrays and arrays["id"].dtype.kind == "f":
+        # Whole numbers of FITS files are read as reals.
+        if not (np.abs(arrays["id"]) <= _EXACT).all():
+            raise ValueError("table: a number of id is above 2^53 or missing; expected smaller ones. Try: a Parquet file")
+        arrays["id"] = arrays["id"].astype(np.int64)
     try:
         arrays = {name: array.astype(types.get(name, array.dtype.newbyteorder("="))) for name, array in arrays.items()}
     except (TypeError, ValueError) as error:
         raise ValueError(f"table: {error}; expected numbers") from None
+    if "flags" not in arrays:
+        finite = np.isfinite(arrays["e1"]) & np.isfinite(arrays["e2"])
+        arrays["flags"] = np.where(finite, 0, int(Flag.NotFinite)).astype(np.int32)
     catalogue = np.empty(rows, dtype=[(name, array.dtype) for name, array in arrays.items()]).view(Catalogue)
     for name, array in arrays.items():
         catalogue[name] = array

@@ -26,6 +26,7 @@ use polars_parquet::read::{
     BasicDecompressor, ColumnChunkMetadata, PageReader, column_iter_to_arrays,
 };
 
+use super::attributes::arrow_schema;
 use super::frame;
 use super::{Metadata, TableError};
 
@@ -47,7 +48,7 @@ const INFLATION: u64 = 8;
 /// Writes `frame` as a Parquet file with `metadata` into `writer`.
 ///
 /// Equal frames give equal bytes. The metadata becomes the file's key-value metadata, in the order
-/// of the keys. The data are not compressed: measured shears and sizes are noise in most of their
+/// of the keys, and is repeated in the Arrow schema, where pandas and astropy read it. The data are not compressed: measured shears and sizes are noise in most of their
 /// bits, so that compression gains a few per cent of space and costs up to half of the reading
 /// speed. Repeated values still become small, by dictionaries.
 ///
@@ -67,7 +68,12 @@ pub fn write_parquet<W: Write>(
         });
     }
     let pairs = metadata.iter();
-    let pairs = pairs.map(|(key, value)| (key.clone(), value.clone()));
+    let mut pairs: Vec<_> = pairs
+        .map(|(key, value)| (key.clone(), value.clone()))
+        .collect();
+    if !metadata.is_empty() {
+        pairs.push((SCHEMA_KEY.into(), arrow_schema(frame, metadata)));
+    }
     ParquetWriter::new(writer)
         .with_compression(ParquetCompression::Uncompressed)
         // Nothing selects rows by minima and maxima, which cost a pass over the values.
@@ -75,7 +81,7 @@ pub fn write_parquet<W: Write>(
             null_count: true,
             ..StatisticsOptions::empty()
         })
-        .with_key_value_metadata(Some(KeyValueMetadata::from_static(pairs.collect())))
+        .with_key_value_metadata(Some(KeyValueMetadata::from_static(pairs)))
         .set_parallel(false)
         .finish(&mut frame.clone())
         .map(drop)
