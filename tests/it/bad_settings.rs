@@ -107,7 +107,9 @@ fn submissions_with_mistakes_are_refused_with_file_and_place() {
     assert!(
         fail(&["submissions", "show", text(&path)]).contains("cannot read the configuration file")
     );
-    assert!(fail(&["submissions", "show", text(folder.path())]).contains("no configuration or file"));
+    assert!(
+        fail(&["submissions", "show", text(folder.path())]).contains("no configuration or file")
+    );
 }
 
 #[test]
