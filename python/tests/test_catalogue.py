@@ -160,7 +160,7 @@ def test_files_of_the_command_line_and_of_python_are_the_same(two, command, tmp_
     simulation = shearq.simulate(set=8, images=2, grid=8, seed=3)
     e1, e2 = (np.stack([own[name] for own in measured]) for name in ("e1", "e2"))
     mine = shearq.score(e1, e2, simulation.g1, simulation.g2)
-    assert scored["Q"]["Q"] == pytest.approx(mine["q"], rel=1e-12)
+    assert scored["Q"] == pytest.approx(mine["q"], rel=1e-12)
 
 
 def test_tables_of_other_codes_are_taken_by_their_names():
