@@ -13,6 +13,7 @@ use shearq_pipeline::images::Shard;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::bias::columns::Names;
 use shearq_results::bias::expression::Expression;
+use shearq_results::bias::folders;
 use shearq_results::bias::truth::Truth;
 use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, sum};
 use shearq_results::views::bias::{Limit, bias_plot, bias_table, check, junit, section};
@@ -28,7 +29,8 @@ use shearq_submissions::EllipticityType;
 /// within a catalogue. Errors are from a jackknife over independent units. The output names design and units.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Catalogues, all with the same columns; FILE[TABLE] is one table of a FITS file.
+    /// Catalogues, all with the same columns, or folders that `measure` or `run` wrote. FILE[TABLE] is one table of a
+    /// FITS file.
     #[arg(
         value_name = "CATALOGUE",
         required_unless_present = "merge",
@@ -41,7 +43,8 @@ pub(crate) struct Arguments {
     /// True g2 of all catalogues.
     #[arg(long, value_name = "G2", allow_negative_numbers = true, requires = "g1", conflicts_with_all = ["truth", "merge"])]
     g2: Option<f64>,
-    /// Table of true shears: columns catalogue, g1, g2 or id, g1, g2 [default: columns g1 and g2 of the catalogues].
+    /// Table of true shears: columns catalogue, g1, g2 or id, g1, g2 or x, y, g1, g2 (within 1 pixel) [default: columns
+    /// g1 and g2 of the catalogues, or the true shear of the data of a folder].
     #[arg(long, value_name = "FILE", conflicts_with = "merge")]
     truth: Option<PathBuf>,
     /// Names of columns, such as `e1=g_1,e2=g_2,w=weight`; `ROLE=none` ignores a column that would be recognised.
@@ -72,7 +75,7 @@ pub(crate) struct Arguments {
     /// patch; else groups of catalogues if there are 20 or more; else rows].
     #[arg(long, value_name = "UNIT", conflicts_with = "merge")]
     units: Option<String>,
-    /// Leave out rows with missing numbers.
+    /// Leave out rows with missing numbers or without a true shear.
     #[arg(long, conflicts_with = "merge")]
     drop_missing: bool,
     /// Artificial shear of metacalibration.
@@ -296,8 +299,9 @@ fn of_catalogues(arguments: &Arguments) -> anyhow::Result<Summed> {
             "--shard: all shards need the same bins (found a number of bins, expected edges). Try: --bins 'snr:5,10,20'"
         );
     }
+    let (catalogues, truth) = folders::expand(&arguments.catalogues, truth)?;
     let request = Request {
-        catalogues: arguments.catalogues.clone(),
+        catalogues,
         names,
         truth,
         distortion: types.map(|given| given == EllipticityType::Distortion),

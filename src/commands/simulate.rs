@@ -11,6 +11,7 @@ use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_pipeline::images;
 use shearq_pipeline::simulate::{SimulationRecord, simulate_folder};
+use shearq_simulate::set::SimulationSettings;
 
 /// Write simulated GREAT10-like sets: images, PSFs, true shear and intrinsic shapes.
 ///
@@ -20,6 +21,9 @@ use shearq_pipeline::simulate::{SimulationRecord, simulate_folder};
 ///
 /// S/N is √(Σ I²)/σ before lensing and behind a round PSF. Images that the same settings made are kept, so the same
 /// command resumes a stopped simulation.
+///
+/// With --constant-shear all galaxies have one shear. Several shears, --opposite or --rotated make a folder for each
+/// version of the same galaxies, with the same noise: OUT/g1_+0.02_g2_+0 and so on. `bias` recognises the pairs.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Sets, as `1,2,7-9` or `all`.
@@ -30,6 +34,15 @@ pub(crate) struct Arguments {
     images: u32,
     #[command(flatten)]
     simulation: SimulationArguments,
+    /// Shear of all galaxies, instead of a shear field. May be given several times.
+    #[arg(long, value_name = "G1,G2", allow_hyphen_values = true, value_parser = parse_shear, conflicts_with_all = ["amplitude", "tilt"])]
+    constant_shear: Vec<[f64; 2]>,
+    /// Also simulate the galaxies under the opposite shear.
+    #[arg(long, requires = "constant_shear")]
+    opposite: bool,
+    /// Also simulate the galaxies rotated by 90 degrees.
+    #[arg(long, requires = "constant_shear")]
+    rotated: bool,
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -39,29 +52,98 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
+/// Parses `G1,G2`.
+fn parse_shear(text: &str) -> Result<[f64; 2], String> {
+    let expected = || "expected two numbers, as in `0.02,0`".to_owned();
+    let (g1, g2) = text.split_once(',').ok_or_else(expected)?;
+    let number = |text: &str| text.trim().parse::<f64>().map_err(|_| expected());
+    Ok([number(g1)?, number(g2)?])
+}
+
+/// A version of the simulated galaxies, with the folder for it.
+struct Version {
+    settings: SimulationSettings,
+    out: PathBuf,
+}
+
+/// The versions that are asked for.
+fn versions(arguments: &Arguments) -> anyhow::Result<Vec<Version>> {
+    let settings = arguments.simulation.settings()?;
+    let mut shears = Vec::new();
+    for shear in &arguments.constant_shear {
+        shears.push(*shear);
+        if arguments.opposite {
+            // Adding zero makes zero of minus zero.
+            shears.push(shear.map(|g| 0.0 - g));
+        }
+    }
+    for (k, shear) in shears.iter().enumerate() {
+        anyhow::ensure!(
+            !shears[..k].contains(shear),
+            "--constant-shear: the shear {}, {} is asked for twice",
+            shear[0],
+            shear[1]
+        );
+    }
+    let mut versions = Vec::new();
+    for shear in shears {
+        for rotated in [false, true] {
+            if rotated && !arguments.rotated {
+                continue;
+            }
+            let settings = SimulationSettings {
+                constant_shear: Some(shear),
+                rotated,
+                ..settings
+            };
+            settings.validate()?;
+            let [g1, g2] = shear;
+            let ending = if rotated { "_rotated" } else { "" };
+            let out = arguments.out.join(format!("g1_{g1:+}_g2_{g2:+}{ending}"));
+            versions.push(Version { settings, out });
+        }
+    }
+    if let [only] = &mut versions[..] {
+        only.out.clone_from(&arguments.out);
+    }
+    if versions.is_empty() {
+        let out = arguments.out.clone();
+        versions.push(Version { settings, out });
+    }
+    Ok(versions)
+}
+
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     goes_on();
-    let Arguments {
-        sets,
-        images,
-        simulation,
-        out,
-        sharding,
-        threads,
-    } = arguments;
-    let record = SimulationRecord {
-        version: shearq_pipeline::VERSION.into(),
-        settings: simulation.settings()?,
-    };
-    let images = sharding.part(&images::of_simulation(sets.simulated()?, *images));
-    let galaxies = images.len() as u64 * (record.settings.grid as u64).pow(2);
+    let images = images::of_simulation(arguments.sets.simulated()?, arguments.images);
+    let images = arguments.sharding.part(&images);
+    let versions = versions(arguments)?;
+    let grid = versions[0].settings.grid as u64;
+    let galaxies = (versions.len() * images.len()) as u64 * grid * grid;
     let mut bar = Bar::new("simulating", galaxies);
-    let data = DataFolder::new(out);
-    let (made, already) = simulate_folder(&record, &images, &data, threads.number(), &mut bar)?;
+    let (mut made, mut already) = (0, 0);
+    for Version { settings, out } in &versions {
+        let record = SimulationRecord {
+            version: shearq_pipeline::VERSION.into(),
+            settings: *settings,
+        };
+        let data = DataFolder::new(out);
+        let threads = arguments.threads.number();
+        let (new, old) = simulate_folder(&record, &images, &data, threads, &mut bar)?;
+        made += new;
+        already += old;
+    }
     drop(bar);
     tell(format_args!(
         "{made} images simulated, {already} there already, in {}",
-        out.display()
+        arguments.out.display()
     ));
+    if versions.len() > 1 {
+        let shown: Vec<String> = versions
+            .iter()
+            .map(|version| version.out.display().to_string())
+            .collect();
+        tell(format_args!("folders: {}", shown.join(", ")));
+    }
     Ok(())
 }

@@ -484,3 +484,191 @@ fn distortions_are_noticed_and_converted() {
     let (m, error) = (number(converted, "m1"), number(converted, "m1_error"));
     assert!(m.abs() < 4.0 * error && error < 2e-3, "{m} ± {error}");
 }
+
+/// The true shear of galaxies is found by their positions, whatever their order.
+#[test]
+fn the_truth_is_joined_by_position() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let truth = |k: usize| {
+        if k % 2 == 0 {
+            [0.05, -0.02]
+        } else {
+            [-0.03, 0.04]
+        }
+    };
+    let mut catalogue = String::from("x,y,e1,e2\n");
+    let mut places = vec![String::new(); 400];
+    for k in 0..400 {
+        let (x, y, g) = (
+            24.5 + 48.0 * (k % 20) as f64,
+            24.5 + 48.0 * (k / 20) as f64,
+            truth(k),
+        );
+        let noise = 0.001 * ((k * 7919 % 1000) as f64 / 1000.0 - 0.5);
+        // Positions differ by less than a pixel.
+        writeln!(
+            catalogue,
+            "{},{},{},{}",
+            x + 0.4,
+            y - 0.5,
+            1.02 * g[0] + noise,
+            0.97 * g[1] - noise
+        )
+        .unwrap();
+        places[(k * 37) % 400] = format!("{x},{y},{},{}", g[0], g[1]);
+    }
+    fs::write(path("c.csv"), &catalogue).unwrap();
+    let table = |sign: &str, rows: &[String]| format!("x,y,g1,g2\n{sign}{}\n", rows.join("\n"));
+    fs::write(path("truth.csv"), table("", &places)).unwrap();
+    let rows = rows(&[text(&path("c.csv")), "--truth", text(&path("truth.csv"))]);
+    for (key, expected) in [("m1", 0.02), ("m2", -0.03)] {
+        // The noise of 400 galaxies of 0.0003 and shears of 0.03 leaves 0.0005.
+        let found = rows[0][key].as_f64().unwrap();
+        assert!((found - expected).abs() < 2e-3, "{key} {found}");
+    }
+    // The sign that the file states is applied.
+    fs::write(path("signed.csv"), table("# g2sign: challenge\n", &places)).unwrap();
+    let message = fail(&[
+        "bias",
+        text(&path("c.csv")),
+        "--truth",
+        text(&path("signed.csv")),
+    ]);
+    assert!(
+        message.contains("e2 follows minus the true g2"),
+        "{message}"
+    );
+    // A galaxy that the truth does not have.
+    fs::write(path("less.csv"), table("", &places[1..])).unwrap();
+    let (own, part) = (path("c.csv"), path("less.csv"));
+    let less = ["bias", text(&own), "--truth", text(&part)];
+    let message = fail(&less);
+    assert!(message.contains("within 1 pixel of x = "), "{message}");
+    succeed(&[&less[..], &["--drop-missing"]].concat());
+    fs::write(path("nowhere.csv"), catalogue.replacen("x,y", "p,q", 1)).unwrap();
+    let message = fail(&[
+        "bias",
+        text(&path("nowhere.csv")),
+        "--truth",
+        text(&path("truth.csv")),
+    ]);
+    assert!(
+        message.contains("no positions to find the true shear with"),
+        "{message}"
+    );
+}
+
+/// From the simulation of pairs to m and c, without a table of shears.
+#[test]
+fn folders_of_constant_shear_are_recognised_as_pairs() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    let data = path("data");
+    succeed(&[
+        "simulate",
+        "--sets",
+        "8",
+        "--images",
+        "2",
+        "--grid",
+        "10",
+        "--constant-shear=0.03,-0.02",
+        "--opposite",
+        "--out",
+        &data,
+    ]);
+    let mut measured = Vec::new();
+    for version in ["g1_+0.03_g2_-0.02", "g1_-0.03_g2_+0.02"] {
+        let (from, to) = (format!("{data}/{version}"), path(version));
+        succeed(&[
+            "measure",
+            "--submission",
+            "48/linear/star",
+            "--data",
+            &from,
+            "--out",
+            &to,
+        ]);
+        measured.push(to);
+    }
+    let all: Vec<&str> = measured.iter().map(String::as_str).collect();
+    let found = shearq(&[&["bias"][..], &all, &["--format", "json"]].concat());
+    let found: Value = serde_json::from_slice(&found.stdout).unwrap();
+    let row = &found["rows"][0];
+    assert_eq!(row["n"], 400.0);
+    for key in ["m1", "m2"] {
+        // Shape noise cancels in pairs: 200 galaxies at S/N 40 leave 0.05/√200/0.02.
+        let m = row[key].as_f64().unwrap();
+        let error = row[format!("{key}_error")].as_f64().unwrap();
+        assert!(m.abs() < 5.0 * error && error < 0.3, "{row}");
+    }
+    assert!(found["notes"].to_string().contains("pairs"), "{found}");
+    // A rotated version has the same noise, and the opposite shapes.
+    let out = path("turned");
+    succeed(&[
+        "simulate",
+        "--sets",
+        "8",
+        "--images",
+        "1",
+        "--grid",
+        "8",
+        "--constant-shear",
+        "0,0",
+        "--rotated",
+        "--out",
+        &out,
+    ]);
+    let shapes =
+        |name: &str| fs::read_to_string(format!("{out}/{name}/set08/intrinsic-001.csv")).unwrap();
+    let numbers = |text: String| -> Vec<f64> {
+        let fields = text.lines().skip(1).flat_map(|line| {
+            line.split(',')
+                .skip(2)
+                .map(str::to_owned)
+                .collect::<Vec<_>>()
+        });
+        fields.filter_map(|field| field.parse().ok()).collect()
+    };
+    let (plain, turned) = (
+        numbers(shapes("g1_+0_g2_+0")),
+        numbers(shapes("g1_+0_g2_+0_rotated")),
+    );
+    // Ellipticities before and after lensing.
+    assert_eq!(plain.len(), 256);
+    assert!(
+        plain.iter().zip(&turned).all(|(a, b)| *a == -b),
+        "{plain:?} {turned:?}"
+    );
+    let plain_folder = path("g1_+0.03_g2_-0.02");
+    fs::remove_file(format!("{plain_folder}/run.json")).unwrap();
+    let message = fail(&["bias", &plain_folder]);
+    assert!(message.contains("this folder has no run.json"), "{message}");
+    let message = fail(&[
+        "simulate",
+        "--sets",
+        "8",
+        "--images",
+        "1",
+        "--constant-shear",
+        "2,0",
+        "--out",
+        &out,
+    ]);
+    assert!(message.contains("the constant shear is 2, 0"), "{message}");
+    let twice = [
+        "--constant-shear",
+        "0.02,0",
+        "--constant-shear=-0.02,0",
+        "--opposite",
+    ];
+    let message = fail(
+        &[
+            &["simulate", "--sets", "8", "--images", "1", "--out", &out][..],
+            &twice,
+        ]
+        .concat(),
+    );
+    assert!(message.contains("asked for twice"), "{message}");
+}

@@ -50,7 +50,6 @@ pub struct ReadTruth {
 /// # Errors
 /// If the file cannot be read, does not fill a square grid, or states another sign of g2 than `reading`.
 pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileError> {
-    truth_is_there(truth)?;
     let table = table::read_truth(truth, MAX_ROWS)?;
     let rows = truth_rows(truth, &table)?;
     let side = grid::side(truth, rows.len())?;

@@ -5,6 +5,8 @@
 
 pub mod columns;
 pub mod expression;
+pub mod folders;
+pub mod positions;
 mod read;
 pub mod truth;
 

@@ -63,6 +63,12 @@ pub struct SimulationSettings {
     pub spectrum: ShearSpectrum,
     /// Standard deviation of each component of the intrinsic ellipticities (shear-type).
     pub intrinsic_sigma: f64,
+    /// The shear [g1, g2] of all galaxies, instead of a field drawn from `spectrum`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub constant_shear: Option<[f64; 2]>,
+    /// Whether all galaxies are turned by 90 degrees before lensing. Noise and centres stay as they are.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub rotated: bool,
 }
 
 impl Serialize for SimulationSettings {
@@ -101,6 +107,8 @@ impl SimulationSettings {
             grid,
             spectrum: ShearSpectrum::default(),
             intrinsic_sigma: INTRINSIC_SIGMA,
+            constant_shear: None,
+            rotated: false,
         }
     }
 
@@ -114,7 +122,17 @@ impl SimulationSettings {
             grid,
             spectrum: ShearSpectrum { amplitude, tilt },
             intrinsic_sigma,
+            constant_shear,
+            rotated: _,
         } = self;
+        if let Some([g1, g2]) = constant_shear {
+            // Also true for what is not a number.
+            if !(g1.hypot(g2) <= MAX_SHEAR) {
+                return Err(SettingsError(format!(
+                    "the constant shear is {g1}, {g2}; expected a modulus of at most {MAX_SHEAR}"
+                )));
+            }
+        }
         if !SIDES.contains(&grid) {
             let (least, most) = (SIDES.start(), SIDES.end());
             return Err(SettingsError(format!(
@@ -212,10 +230,15 @@ impl SetSimulator {
     ) -> Result<Self, shearq_scoring::ScoringError> {
         let grid = Grid::great10(settings.grid)?;
         let decomposer = Decomposer::new(grid);
-        let mut rng = settings.stream(kind.set, WHOLE_SET, Purpose::Shear);
-        let shear = random_field(&decomposer, &mut rng, Content::EOnly, |l| {
-            settings.spectrum.c_l(l)
-        });
+        let shear = match settings.constant_shear {
+            Some([g1, g2]) => Array2::from_elem((grid.n, grid.n), Complex64::new(g1, g2)),
+            None => {
+                let mut rng = settings.stream(kind.set, WHOLE_SET, Purpose::Shear);
+                random_field(&decomposer, &mut rng, Content::EOnly, |l| {
+                    settings.spectrum.c_l(l)
+                })
+            }
+        };
         let strongest = shear.iter().map(|g| g.norm()).fold(0.0, f64::max);
         // What is not a number is not weak either.
         if strongest > MAX_SHEAR || shear.iter().any(|g| !g.norm().is_finite()) {
@@ -287,11 +310,12 @@ impl SetSimulator {
         });
         intrinsic.mapv_inplace(|e| {
             let modulus = e.norm();
-            if modulus > MAX_INTRINSIC {
+            let e = if modulus > MAX_INTRINSIC {
                 e * (MAX_INTRINSIC / modulus)
             } else {
                 e
-            }
+            };
+            if self.settings.rotated { -e } else { e }
         });
         let mut rng = self
             .settings
@@ -434,6 +458,10 @@ impl SetSimulator {
             ImageType::OffsetBulge => {
                 let dx: f64 = StandardNormal.sample(rng);
                 let dy: f64 = StandardNormal.sample(rng);
+                let (dx, dy) = match self.settings.rotated {
+                    true => (-dy, dx),
+                    false => (dx, dy),
+                };
                 // A shear moves the bulge with the rest of the galaxy.
                 let [[xx, xy], [yx, yy]] = shear.matrix();
                 offset = Some((xx * dx + xy * dy, yx * dx + yy * dy));
@@ -467,6 +495,71 @@ mod tests {
 
     fn settings(seed: u64, grid: usize) -> SimulationSettings {
         SimulationSettings::new(seed, grid)
+    }
+
+    #[test]
+    fn turned_galaxies_are_the_galaxies_on_their_side_and_all_have_the_constant_shear() {
+        // Set 24 has displaced bulges, which turn with their galaxies.
+        let kind = SetKind::of(24).unwrap();
+        let draw = |rotated, shear: [f64; 2]| {
+            let settings = SimulationSettings {
+                constant_shear: Some(shear),
+                rotated,
+                ..settings(3, 8)
+            };
+            let set = SetSimulator::new(kind, settings).unwrap();
+            let mut fields = set.image_fields(1);
+            // A round PSF: only the galaxies turn.
+            let round = FunctionalPsf::new(psf_profile(kind), FWHM, Shear::new(0.0, 0.0)).unwrap();
+            fields.psf = PsfField::One(round);
+            let mut scratch = RenderScratch::new();
+            let version = |e: Complex64| Version {
+                intrinsic: Shear::new(e.re, e.im),
+                shear: set.shear_at(2, 5),
+                noise: 0.0,
+            };
+            let mut out = vec![0.0; STAMP * STAMP];
+            let e = fields.intrinsic[(2, 5)];
+            set.draw_as(&fields, (2, 5), version(e), &mut scratch, &mut out);
+            // Quadrupole and centroid: [xx − yy, xy, x, y], by flux.
+            let mut sums = [0.0; 5];
+            for (at, value) in out.iter().enumerate() {
+                let centre = (STAMP as f64 - 1.0) / 2.0;
+                let x = (at % STAMP) as f64 - centre;
+                let y = (at / STAMP) as f64 - centre;
+                let terms = [x * x - y * y, x * y, x, y, 1.0];
+                for (sum, term) in sums.iter_mut().zip(terms) {
+                    *sum += f64::from(*value) * term;
+                }
+            }
+            (e, [0, 1, 2, 3].map(|k| sums[k] / sums[4]))
+        };
+        let (e, plain) = draw(false, [0.0, 0.0]);
+        let (turned, moments) = draw(true, [0.0, 0.0]);
+        assert_eq!(turned, -e);
+        // The centre of the galaxy is off the centre of the stamp by the same dither, so only what is left of the
+        // second moments after it changes its sign.
+        let central = |m: [f64; 4]| [m[0] - m[2] * m[2] + m[3] * m[3], m[1] - m[2] * m[3]];
+        let (a, b) = (central(plain), central(moments));
+        // Light outside the stamp makes the moments differ by up to 0.1 px².
+        for k in 0..2 {
+            assert!((a[k] + b[k]).abs() < 0.1, "{a:?} {b:?}");
+            assert!(a[k].abs() > 0.3, "{a:?}");
+        }
+        let settings = SimulationSettings {
+            constant_shear: Some([0.03, -0.02]),
+            ..settings(3, 8)
+        };
+        let truth = SetSimulator::new(kind, settings).unwrap().truth();
+        assert!(truth.g1.iter().all(|g| *g == 0.03) && truth.g2.iter().all(|g| *g == -0.02));
+        for (g1, shown) in [(0.6, "0.6, 0"), (f64::NAN, "NaN, 0")] {
+            let settings = SimulationSettings {
+                constant_shear: Some([g1, 0.0]),
+                ..settings
+            };
+            let error = settings.validate().unwrap_err().to_string();
+            assert!(error.contains(shown), "{error}");
+        }
     }
 
     fn simulator(set: u32, seed: u64, grid: usize) -> SetSimulator {

@@ -36,6 +36,10 @@ pub enum Role {
     PsfSize,
     /// Identifier of the galaxy.
     Id,
+    /// Position in pixels.
+    X,
+    /// Position in pixels.
+    Y,
     /// Independent unit.
     Unit,
     /// Name of the version: noshear, 1p, 1m, 2p, 2m.
@@ -51,7 +55,7 @@ pub enum Role {
 }
 
 /// The roles with their names in `--columns`, and names of columns that are recognised in any case, the first first.
-const ROLES: [(Role, &str, &[&str]); 20] = [
+const ROLES: [(Role, &str, &[&str]); 22] = [
     (
         Role::E1,
         "e1",
@@ -232,6 +236,8 @@ const ROLES: [(Role, &str, &[&str]); 20] = [
             "number",
         ],
     ),
+    (Role::X, "x", &["x", "x_image", "xwin_image", "x_pix"]),
+    (Role::Y, "y", &["y", "y_image", "ywin_image", "y_pix"]),
     (Role::Unit, "unit", &["pair", "pair_id", "seed", "patch"]),
     (
         Role::Version,

@@ -12,6 +12,7 @@ use shearq_quantities::Distortion;
 
 use super::columns::{Columns, Names, Preset, Role};
 use super::expression::Expression;
+use super::positions::Positions;
 use super::truth::{self, Truth};
 
 /// How catalogues are read.
@@ -157,6 +158,7 @@ fn source(
     let skipped = |role: &Role| match role {
         Role::G1 | Role::G2 => !matches!(reading.truth, Truth::Columns),
         Role::Unit => true,
+        Role::X | Role::Y => !matches!(reading.truth, Truth::Positions(_) | Truth::Data(_)),
         _ => false,
     };
     let all = columns.all().filter(|(role, _)| !skipped(role));
@@ -228,7 +230,6 @@ pub(super) fn rows(
         name: path.display().to_string(),
         ..Catalogue::default()
     };
-    let constant = reading.truth.of_catalogue(path)?;
     // Rows of each version so far.
     let mut counts = [0u64; COUNT];
     for source in sources {
@@ -239,7 +240,7 @@ pub(super) fn rows(
         let wanted: Vec<&str> = source.wanted.iter().map(String::as_str).collect();
         let mut first = 0;
         table::read_parts(&source.place, &wanted, |frame| {
-            let part = Part::new(source, reading, &frame, constant, divisor)?;
+            let part = Part::new(source, reading, &frame, path, divisor)?;
             for at in 0..part.rows {
                 part.row(at, first + at, &mut counts, &mut about, &mut take)?;
             }
@@ -285,9 +286,56 @@ struct Part<'a> {
     places: Places,
     versions: Option<Vec<Option<usize>>>,
     unit: Option<usize>,
-    constant: Option<[f64; 2]>,
+    truth: OfRows<'a>,
     divisor: [f64; 2],
     distortion: bool,
+}
+
+/// Where the true shears of the rows of a catalogue are.
+#[derive(Clone, Copy)]
+enum OfRows<'a> {
+    /// One shear.
+    Constant([f64; 2]),
+    /// By the identifier in a column.
+    Identifiers(&'a HashMap<u64, [f64; 2]>, usize),
+    /// By the position in two columns.
+    Positions(&'a Positions, [usize; 2]),
+    /// In two columns.
+    Columns([usize; 2]),
+    /// Unknown.
+    Nowhere,
+}
+
+impl<'a> OfRows<'a> {
+    fn new(path: &Path, places: &Places, truth: &'a Truth) -> Result<Self, FileError> {
+        let absent = |what: &str, option: &str| {
+            FileError::new(
+                path,
+                format!(
+                    "the catalogue has no {what} to find the true shear with. Try: --columns {option}"
+                ),
+            )
+        };
+        if let Some(positions) = truth.positions(path)? {
+            let position = places.position;
+            let position = position.ok_or_else(|| absent("positions", "x=NAME,y=NAME"))?;
+            return Ok(OfRows::Positions(positions, position));
+        }
+        if let Truth::Galaxies(galaxies) = truth {
+            let id = places.id.ok_or_else(|| absent("identifier", "id=NAME"))?;
+            return Ok(OfRows::Identifiers(galaxies, id));
+        }
+        Ok(match (truth.of_catalogue(path)?, places.shear) {
+            (Some(shear), _) => OfRows::Constant(shear),
+            (None, Some(columns)) => OfRows::Columns(columns),
+            (None, None) => OfRows::Nowhere,
+        })
+    }
+
+    /// Whether a row may be absent from the truth.
+    fn may_lack_rows(self) -> bool {
+        matches!(self, OfRows::Identifiers(..) | OfRows::Positions(..))
+    }
 }
 
 /// Place of the column of each role.
@@ -299,6 +347,7 @@ struct Places {
     derivative: Option<[usize; 2]>,
     flag: Option<usize>,
     shear: Option<[usize; 2]>,
+    position: Option<[usize; 2]>,
     psf: Option<[usize; 2]>,
     psf_size: Option<usize>,
     id: Option<usize>,
@@ -323,6 +372,7 @@ impl Places {
             derivative: pair(Role::Dw1, Role::Dw2),
             flag: place(Role::Flag),
             shear: pair(Role::G1, Role::G2),
+            position: pair(Role::X, Role::Y),
             psf: pair(Role::Psf1, Role::Psf2),
             psf_size: place(Role::PsfSize),
             id: place(Role::Id),
@@ -336,10 +386,12 @@ impl<'a> Part<'a> {
         source: &'a Source,
         reading: &'a Reading,
         frame: &'a DataFrame,
-        constant: Option<[f64; 2]>,
+        catalogue: &Path,
         divisor: [f64; 2],
     ) -> Result<Self, FileError> {
         let path = &source.place.path;
+        let places = Places::of(source);
+        let truth = OfRows::new(catalogue, &places, &reading.truth)?;
         let version = source.columns.of(Role::Version);
         let mut columns = Vec::new();
         for name in &source.wanted {
@@ -357,10 +409,10 @@ impl<'a> Part<'a> {
             reading,
             rows: frame.height(),
             columns,
-            places: Places::of(source),
+            places,
             versions,
             unit: unit.and_then(|name| source.wanted.iter().position(|own| own == name)),
-            constant,
+            truth,
             divisor,
             distortion: reading.distortion.unwrap_or(source.columns.distortion),
         })
@@ -441,7 +493,13 @@ impl<'a> Part<'a> {
                 "{what} is {value} in a row without a flag (expected a number). Try: --drop-missing"
             )));
         }
-        let mut g = self.truth(at).map_err(&fault)?;
+        let mut g = match self.truth(at) {
+            Err(_) if self.reading.drop_missing && self.truth.may_lack_rows() => {
+                about.missing += u64::from(own);
+                return Ok(());
+            }
+            found => found.map_err(&fault)?,
+        };
         truth::check(g).map_err(&fault)?;
         if self.reading.flip_g2 {
             g[1] = -g[1];
@@ -519,19 +577,18 @@ impl<'a> Part<'a> {
     }
 
     fn truth(&self, at: usize) -> Result<[f64; 2], String> {
-        if let Some(shear) = self.constant {
-            return Ok(shear);
+        match self.truth {
+            OfRows::Constant(shear) => Ok(shear),
+            OfRows::Identifiers(galaxies, column) => {
+                let id = self.value(column, at);
+                galaxies.get(&id.to_bits()).copied().ok_or_else(|| {
+                    format!("the table of true shears does not contain the identifier {id}")
+                })
+            }
+            OfRows::Positions(positions, columns) => positions.at(self.pair(columns, at)),
+            OfRows::Columns(columns) => Ok(self.pair(columns, at)),
+            OfRows::Nowhere => Ok([0.0; 2]),
         }
-        if let Truth::Galaxies(galaxies) = &self.reading.truth {
-            let id = self.places.id.ok_or(
-                "the catalogue has no identifier to find the true shear with. Try: --columns id=NAME",
-            )?;
-            let id = self.value(id, at);
-            return galaxies.get(&id.to_bits()).copied().ok_or_else(|| {
-                format!("the table of true shears does not contain the identifier {id}")
-            });
-        }
-        Ok(self.places.shear.map_or([0.0; 2], |g| self.pair(g, at)))
     }
 
     /// The key of the unit of a row, the `index`-th of its version.

@@ -1,11 +1,15 @@
 //! The true shear of catalogues or galaxies.
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use shearq_files::FileError;
 use shearq_files::open::{SETTINGS, read_to_string};
 use shearq_files::table::{self, MAX_ROWS, Place};
+use shearq_scoring::TruthSign;
+
+use super::positions::Positions;
 
 /// Where the true shear comes from.
 #[derive(Debug, Clone, Default)]
@@ -18,14 +22,19 @@ pub enum Truth {
     /// A shear per catalogue, by its path or file name.
     Catalogues(BTreeMap<String, [f64; 2]>),
     /// A shear per galaxy, by the bits of its identifier.
-    Galaxies(HashMap<u64, [f64; 2]>),
+    Galaxies(Arc<HashMap<u64, [f64; 2]>>),
+    /// A shear per galaxy, by its position.
+    Positions(Arc<Positions>),
+    /// A shear per galaxy of each catalogue, by its position.
+    Data(BTreeMap<PathBuf, Arc<Positions>>),
 }
 
 /// Names of the column of catalogues in a table of true shears.
 const CATALOGUE: [&str; 3] = ["catalogue", "catalog", "file"];
 
 impl Truth {
-    /// Reads a table of true shears: columns `catalogue g1 g2` (text), or `id g1 g2` in any format.
+    /// Reads a table of true shears: columns `catalogue g1 g2` (text), or `id g1 g2` or
+    /// `x y g1 g2` in any format.
     ///
     /// # Errors
     /// If the file cannot be read or has other columns, or names a catalogue or galaxy twice.
@@ -39,12 +48,17 @@ impl Truth {
         if CATALOGUE.iter().any(|name| named(name)) {
             return of_catalogues(path);
         }
-        if !(named("id") && named("g1") && named("g2")) {
+        let shears = named("g1") && named("g2");
+        if shears && !named("id") && named("x") && named("y") {
+            let positions = Positions::read(path, TruthSign::Standard)?;
+            return Ok(Truth::Positions(Arc::new(positions)));
+        }
+        if !(shears && named("id")) {
             let found: Vec<&String> = columns.named.iter().flat_map(|list| &list.names).collect();
             return Err(FileError::new(
                 path,
                 format!(
-                    "this is no table of true shears (found {}, expected the columns id, g1, g2 or catalogue, g1, g2)",
+                    "this is no table of true shears (found {}, expected the columns id, g1, g2 or x, y, g1, g2 or catalogue, g1, g2)",
                     shearq_files::names_of(&found)
                 ),
             ));
@@ -62,7 +76,7 @@ impl Truth {
                 return Err(FileError::new(path, message));
             }
         }
-        Ok(Truth::Galaxies(galaxies))
+        Ok(Truth::Galaxies(Arc::new(galaxies)))
     }
 
     /// The shear of a catalogue; `None` if it depends on the galaxy.
@@ -90,7 +104,25 @@ impl Truth {
                     )
                 })
             }
-            Truth::Columns | Truth::Galaxies(_) => Ok(None),
+            Truth::Columns | Truth::Galaxies(_) | Truth::Positions(_) | Truth::Data(_) => Ok(None),
+        }
+    }
+
+    /// The shears of a catalogue by position, if they are known so.
+    ///
+    /// # Errors
+    /// If they are known of other catalogues only.
+    pub(super) fn positions(&self, path: &Path) -> Result<Option<&Positions>, FileError> {
+        match self {
+            Truth::Positions(positions) => Ok(Some(positions)),
+            Truth::Data(all) => match all.get(path) {
+                Some(positions) => Ok(Some(positions)),
+                None => Err(FileError::new(
+                    path,
+                    "the true shear of this catalogue is not known, but that of the folders is. Try: separate commands, or --truth FILE",
+                )),
+            },
+            _ => Ok(None),
         }
     }
 }

@@ -1,0 +1,77 @@
+//! Folders of catalogues that `measure` or `run` wrote, with the true shear of their data.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use shearq_files::FileError;
+use shearq_files::open::is_there;
+use shearq_pipeline::data::run::{RUN_FILE, Run};
+
+use super::BiasFailure;
+use super::positions::Positions;
+use super::truth::Truth;
+
+/// Replaces folders of results by their catalogues, in the order of sets and images. Unless `truth` states the true
+/// shear, it is that of the data folders, if they have one.
+///
+/// # Errors
+/// If a folder is no folder of results, or only some of the data have a true shear.
+pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<PathBuf>, Truth), BiasFailure> {
+    let (mut catalogues, mut found) = (Vec::new(), BTreeMap::new());
+    let mut without: Option<&Path> = None;
+    for path in paths {
+        if !path.is_dir() {
+            catalogues.push(path.clone());
+            continue;
+        }
+        let Some(run) = Run::read(path)? else {
+            let message = format!(
+                "this folder has no {RUN_FILE} (expected catalogues, or a folder that `measure` or `run` wrote). Try: {}/*",
+                path.display()
+            );
+            return Err(FileError::new(path, message).into());
+        };
+        let files = run.catalogues(path, &[])?;
+        if files.is_empty() {
+            return Err(FileError::new(path, "there is no catalogue in this folder").into());
+        }
+        for set in files.sets() {
+            let own: Vec<PathBuf> = files
+                .of_set(set)
+                .into_iter()
+                .map(|(_, file)| file)
+                .collect();
+            if matches!(truth, Truth::Columns) {
+                match of_data(&run, path, set)? {
+                    None => without = Some(path),
+                    Some(positions) => {
+                        let positions = Arc::new(positions);
+                        found.extend(own.iter().map(|file| (file.clone(), positions.clone())));
+                    }
+                }
+            }
+            catalogues.extend(own);
+        }
+    }
+    if found.is_empty() {
+        return Ok((catalogues, truth));
+    }
+    if let Some(path) = without {
+        let message = "its data have no true shear, but the data of other folders have one. Try: separate commands, or --truth FILE";
+        return Err(FileError::new(path, message).into());
+    }
+    Ok((catalogues, Truth::Data(found)))
+}
+
+/// The true shear of the data of a run; `None` if the data no longer exist, or have none.
+fn of_data(run: &Run, folder: &Path, set: u32) -> Result<Option<Positions>, FileError> {
+    let Ok(data) = run.source.data(folder) else {
+        return Ok(None);
+    };
+    let path = data.truth(set);
+    if !is_there(&path) {
+        return Ok(None);
+    }
+    Positions::read(&path, data.truth_sign(set)?).map(Some)
+}
