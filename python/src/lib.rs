@@ -3,6 +3,7 @@
 //! The package in `python/shearq` checks types and shapes, and names the argument in its errors. Here, arrays become
 //! views and errors become exceptions. Only `shearq_pipeline::engine` starts threads, with the interpreter released.
 
+mod bias;
 mod command;
 mod errors;
 mod measure;
@@ -17,6 +18,8 @@ use pyo3::prelude::*;
 
 #[pymodule]
 mod _shearq {
+    #[pymodule_export]
+    use super::bias::{BiasSums, bias_sums};
     #[pymodule_export]
     use super::command::run_command;
     #[pymodule_export]

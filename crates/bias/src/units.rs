@@ -181,6 +181,17 @@ impl UnitSums {
         Ok(())
     }
 
+    /// Adds the sums of other catalogues, which follow these.
+    ///
+    /// # Errors
+    /// If the sums differ in layout or bins.
+    pub fn append(&mut self, mut other: UnitSums) -> Result<(), BiasError> {
+        let first = self.catalogues as u32;
+        other.renamed(|(catalogue, key)| (catalogue + first, key));
+        other.catalogues += self.catalogues;
+        self.merge(other)
+    }
+
     /// The same sums with a unit for each key, whatever the catalogue: the same row or identifier in all catalogues.
     pub fn by_key(mut self) -> Self {
         self.renamed(|(_, key)| (0, key));

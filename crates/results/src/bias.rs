@@ -17,6 +17,7 @@ use shearq_bias::{
     BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, UnitSums, estimate, group,
 };
 use shearq_files::FileError;
+use shearq_files::frames::polars::DataFrame;
 use thiserror::Error;
 
 use columns::{Names, Preset, Role};
@@ -71,11 +72,26 @@ pub enum Units {
     Column(String),
 }
 
+/// A catalogue: a file, or a table in memory.
+#[derive(Debug, Clone)]
+pub struct Input {
+    /// The file, or the name of the table.
+    pub name: PathBuf,
+    /// The table, if it is in memory.
+    pub frame: Option<DataFrame>,
+}
+
+impl From<PathBuf> for Input {
+    fn from(name: PathBuf) -> Self {
+        Input { name, frame: None }
+    }
+}
+
 /// What is read, and how.
 #[derive(Debug, Clone)]
 pub struct Request {
     /// Catalogues.
-    pub catalogues: Vec<PathBuf>,
+    pub catalogues: Vec<Input>,
     /// Names of columns.
     pub names: Names,
     /// True shear.
@@ -194,16 +210,18 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     read::distinct(&request.catalogues)?;
     let reading = request.reading();
     let mut all: Vec<Vec<Source>> = Vec::new();
-    for path in &request.catalogues {
-        all.push(read::sources(path, &reading)?);
+    for input in &request.catalogues {
+        all.push(read::sources(input, &reading)?);
     }
-    let first = &all[0][0];
+    let Some(first) = all.first().and_then(|sources| sources.first()) else {
+        return Err(BiasFailure::Data("there is no catalogue".into()));
+    };
     let layout = Layout {
         psf: first.has_psf(),
         versions: first.has_version_rows() || first.selects_versions(&reading),
     };
     let (truth, response) = (known(&request.truth, first), has_response(first));
-    for (path, sources) in request.catalogues.iter().zip(&all) {
+    for (input, sources) in request.catalogues.iter().zip(&all) {
         let fits = |source: &Source| {
             known(&request.truth, source) == truth
                 && has_response(source) == response
@@ -213,8 +231,8 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         if !sources.iter().all(fits) {
             return Err(BiasFailure::Data(format!(
                 "{}: its columns are not the columns of {} (expected the same columns for truth, response and PSF in all catalogues). Try: one command per kind of catalogue",
-                path.display(),
-                request.catalogues[0].display()
+                input.name.display(),
+                request.catalogues[0].name.display()
             )));
         }
     }
@@ -229,16 +247,16 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let bins = edges.len().max(1);
     let mut sums = UnitSums::new(layout, bins, request.catalogues.len());
     let mut catalogues = Vec::new();
-    for (number, (path, sources)) in request.catalogues.iter().zip(&all).enumerate() {
+    for (number, (Input { name, .. }, sources)) in request.catalogues.iter().zip(&all).enumerate() {
         if !part(number) {
             catalogues.push(Catalogue {
-                name: path.display().to_string(),
+                name: name.display().to_string(),
                 ..Catalogue::default()
             });
             continue;
         }
         let selects = sources[0].selects_versions(&reading);
-        catalogues.push(read::rows(path, &reading, sources, |item| {
+        catalogues.push(read::rows(name, &reading, sources, |item| {
             let number = number as u32;
             let row = &item.row;
             let scaled = row.e.map(|e| e / (2.0 * request.step));
@@ -285,6 +303,11 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     })
 }
 
+fn unlike(what: &str) -> Result<(), BiasFailure> {
+    let message = format!("the sums do not belong together: they have {what}");
+    Err(BiasFailure::Data(message))
+}
+
 /// Whether the true shear is known.
 fn known(truth: &Truth, source: &Source) -> bool {
     !matches!(truth, Truth::Columns) || source.columns.have(&[Role::G1, Role::G2])
@@ -321,8 +344,8 @@ fn equal_edges(
     count: usize,
 ) -> Result<Vec<f64>, BiasFailure> {
     let (mut values, mut stride, mut number) = (Vec::new(), 1u64, 0u64);
-    for (path, sources) in request.catalogues.iter().zip(all) {
-        read::rows(path, reading, sources, |item| {
+    for (input, sources) in request.catalogues.iter().zip(all) {
+        read::rows(&input.name, reading, sources, |item| {
             if item.version.is_none() && item.binned[0].is_finite() {
                 if number % stride == 0 {
                     values.push(item.binned[0]);
@@ -380,24 +403,12 @@ impl Summed {
     /// # Errors
     /// If the lists, options or columns differ, or a catalogue is in both.
     pub fn merge(&mut self, other: Summed) -> Result<(), BiasFailure> {
-        let unlike = |what: &str| {
-            let message = format!("the sums do not belong together: they have {what}");
-            Err(BiasFailure::Data(message))
-        };
-        if self.version != other.version {
-            return unlike("different versions");
-        }
+        self.check_options(&other)?;
         let names = |all: &[Catalogue]| -> Vec<String> {
             all.iter().map(|catalogue| catalogue.name.clone()).collect()
         };
         if names(&self.catalogues) != names(&other.catalogues) {
             return unlike("different lists of catalogues");
-        }
-        if (&self.binned, &self.edges) != (&other.binned, &other.edges)
-            || (self.truth, self.matched, self.design, self.by_key)
-                != (other.truth, other.matched, other.design, other.by_key)
-        {
-            return unlike("different options");
         }
         for (own, more) in self.catalogues.iter_mut().zip(other.catalogues) {
             match (own.rows, more.rows) {
@@ -414,10 +425,34 @@ impl Summed {
         Ok(self.sums.merge(other.sums)?)
     }
 
+    /// Adds the sums of other catalogues, which follow these.
+    ///
+    /// # Errors
+    /// If options or columns differ.
+    pub fn append(&mut self, other: Summed) -> Result<(), BiasFailure> {
+        self.check_options(&other)?;
+        self.catalogues.extend(other.catalogues);
+        Ok(self.sums.append(other.sums)?)
+    }
+
     /// Catalogues without rows, because their shards are absent.
     pub fn absent(&self) -> Vec<&str> {
         let empty = self.catalogues.iter().filter(|own| own.rows == 0);
         empty.map(|own| own.name.as_str()).collect()
+    }
+
+    /// Refuses sums of other options.
+    fn check_options(&self, other: &Summed) -> Result<(), BiasFailure> {
+        if self.version != other.version {
+            return unlike("different versions");
+        }
+        if (&self.binned, &self.edges) != (&other.binned, &other.edges)
+            || (self.truth, self.matched, self.design, self.by_key)
+                != (other.truth, other.matched, other.design, other.by_key)
+        {
+            return unlike("different options");
+        }
+        Ok(())
     }
 
     /// The estimates.

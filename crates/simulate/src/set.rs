@@ -126,8 +126,8 @@ impl SimulationSettings {
             rotated: _,
         } = self;
         if let Some([g1, g2]) = constant_shear {
-            // Also true for what is not a number.
-            if !(g1.hypot(g2) <= MAX_SHEAR) {
+            let modulus = g1.hypot(g2);
+            if modulus > MAX_SHEAR || modulus.is_nan() {
                 return Err(SettingsError(format!(
                     "the constant shear is {g1}, {g2}; expected a modulus of at most {MAX_SHEAR}"
                 )));

@@ -8,6 +8,7 @@
 Measure    measure, measure_blocks, from_galsim, from_ngmix, FunctionalPsf, DataWarning, set_threads, get_threads
 Catalogues Catalogue, concatenate, mean_shear, MeanShear, Flag, read, read_all
 Score      score, compare, power_spectrum, Score, METRICS
+Validate   bias, bias_sums, Bias, BiasSums
 Simulate   simulate, Simulation, SimulatedImage
 Settings   submission, submissions, Configuration
 
@@ -17,6 +18,7 @@ is a standard deviation per pixel in image units. Results equal those of the com
 
 # No __all__: help(shearq) would print each object in full.
 from . import adapters as adapters
+from ._bias import Bias as Bias, BiasSums as BiasSums, bias as bias, bias_sums as bias_sums
 from ._catalogue import (
     Catalogue as Catalogue,
     Flag as Flag,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 if TYPE_CHECKING:
+    from ._bias import Bias
     from ._catalogue import Catalogue
     from ._score import Score
 
@@ -101,4 +102,45 @@ def plot_score(score: Score, ax: Any) -> Any:
     ax.title.set_fontsize("small")
     ax.set_yscale("symlog", linthresh=max(float(np.nanmax(np.abs(table["true_ee"]))) * 1e-2, 1e-12))
     ax.legend()
+    return ax
+
+
+def bias_html(bias: Bias) -> str:
+    keys = ("m1", "m2", "c1", "c2")
+    head = "".join(f"<th>{key}</th>" for key in ("bin", "galaxies", *keys))
+    rows = []
+    for row in bias.rows:
+        cells = [f"<td>{escape.escape(str(row['bin']))}</td>", f"<td>{row['n']:.0f}</td>"]
+        for key in keys:
+            value, error = row.get(key), row.get(f"{key}_error")
+            cells.append("<td></td>" if value is None or error is None else f"<td>{value:+.4f} ± {error:.4f}</td>")
+        rows.append(f"<tr>{''.join(cells)}</tr>")
+    notes = "".join(f"<li>{escape.escape(note)}</li>" for note in bias.notes)
+    return f"<table><caption>Shear bias</caption><tr>{head}</tr>{''.join(rows)}</table><ul>{notes}</ul>"
+
+
+# GREAT3's tolerances (Mandelbaum et al. 2014, ApJS 212, 5).
+_TOLERANCE = {"m": 2e-3, "c": 2e-4}
+
+
+def plot_bias(bias: Bias, quantity: Literal["m", "c"], limit: float | None, ax: Any) -> Any:
+    if quantity not in _TOLERANCE:
+        raise ValueError(f"quantity: found {quantity!r}; expected 'm' or 'c'")
+    ax = _axes(ax)
+    limit = _TOLERANCE[quantity] if limit is None else limit
+    ax.axhspan(-limit, limit, color="0.85", label=f"|{quantity}| < {limit:g}")
+    ax.axhline(0, color="0.5", linewidth=0.8)
+    places = np.arange(len(bias.rows))
+    for k, colour, marker in ((1, "C0", "o"), (2, "C1", "s")):
+        key = f"{quantity}{k}"
+        value, error = (
+            np.array([np.nan if row.get(name) is None else row[name] for row in bias.rows], dtype=float)
+            for name in (key, f"{key}_error")
+        )
+        ax.errorbar(places + 0.12 * (k - 1.5), value, error, fmt=marker, color=colour, markersize=4, capsize=2, label=key)
+    ax.set_xticks(places, [str(row["bin"]) for row in bias.rows], rotation=25 if len(places) > 3 else 0)
+    ax.set(ylabel=quantity, title=repr(bias).strip("<>"))
+    ax.title.set_fontsize("x-small")
+    ax.margins(x=0.15)
+    ax.legend(fontsize="small")
     return ax

@@ -104,3 +104,24 @@ def simulate(
     threads_asked: int,
     progress: Callable[[int], object] | None,
 ) -> dict[str, Any]: ...
+
+class BiasSums:
+    @staticmethod
+    def from_json(text: str) -> BiasSums: ...
+    def to_json(self) -> str: ...
+    def append(self, other: BiasSums) -> BiasSums: ...
+    def result(self, bootstrap: int | None, seed: int) -> tuple[str, str]: ...
+
+def bias_sums(
+    catalogues: Sequence[str | tuple[str, list[tuple[str, Any]]]],
+    columns: Sequence[str],
+    truth: tuple[float, float] | Sequence[tuple[str, float, float]] | str | None,
+    distortion: bool | None,
+    flip_g2: bool,
+    bins: tuple[str, int | None, Sequence[float]] | None,
+    select: str | None,
+    design: str | None,
+    units: str | None,
+    drop_missing: bool,
+    step: float,
+) -> BiasSums: ...

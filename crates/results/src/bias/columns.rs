@@ -18,6 +18,10 @@ pub enum Role {
     R11,
     /// Response of e2 to g2.
     R22,
+    /// What e1 was divided by.
+    Divisor1,
+    /// What e2 was divided by.
+    Divisor2,
     /// Derivative of the weight with g1.
     Dw1,
     /// Derivative of the weight with g2.
@@ -55,7 +59,7 @@ pub enum Role {
 }
 
 /// The roles with their names in `--columns`, and names of columns that are recognised in any case, the first first.
-const ROLES: [(Role, &str, &[&str]); 22] = [
+const ROLES: [(Role, &str, &[&str]); 24] = [
     (
         Role::E1,
         "e1",
@@ -236,6 +240,8 @@ const ROLES: [(Role, &str, &[&str]); 22] = [
             "number",
         ],
     ),
+    (Role::Divisor1, "divisor1", &["divisor1"]),
+    (Role::Divisor2, "divisor2", &["divisor2"]),
     (Role::X, "x", &["x", "x_image", "xwin_image", "x_pix"]),
     (Role::Y, "y", &["y", "y_image", "ywin_image", "y_pix"]),
     (Role::Unit, "unit", &["pair", "pair_id", "seed", "patch"]),
@@ -251,7 +257,8 @@ const ROLES: [(Role, &str, &[&str]); 22] = [
 ];
 
 /// Pairs of columns that need each other.
-const PAIRS: [(Role, Role); 6] = [
+const PAIRS: [(Role, Role); 7] = [
+    (Role::Divisor1, Role::Divisor2),
     (Role::E1, Role::E2),
     (Role::R11, Role::R22),
     (Role::Dw1, Role::Dw2),
@@ -266,9 +273,6 @@ const DISTORTIONS: [&str; 3] = [
     "corrected_e1",
     "ext_shapehsm_hsmshaperegauss_e1",
 ];
-
-/// A column that only catalogues of shearq have.
-const OWN: &str = "first_energy";
 
 /// Names for roles that were given: a column, or `none`.
 #[derive(Debug, Clone, Default)]
@@ -308,7 +312,7 @@ impl Names {
 pub enum Preset {
     /// No known program.
     Plain,
-    /// `shearq measure`: ellipticities are already divided by the mean response of the catalogue.
+    /// shearq: ellipticities are already divided by the divisors.
     Shearq,
     /// GalSim's or LSST's HSM.
     Hsm,
@@ -394,7 +398,7 @@ impl Columns {
             Preset::Metadetect
         } else if roles.contains_key(&Role::E1p) && roles.contains_key(&Role::E2p) {
             Preset::Metacal
-        } else if found.iter().any(|name| name == OWN) && roles.contains_key(&Role::R11) {
+        } else if roles.contains_key(&Role::Divisor1) && roles.contains_key(&Role::R11) {
             Preset::Shearq
         } else if distortion || e1 == "corrected_g1" {
             Preset::Hsm
@@ -449,7 +453,7 @@ mod tests {
     fn programs_are_recognised_by_their_columns() {
         for (columns, preset) in [
             ("e1 e2 w flag", Preset::Plain),
-            ("x y e1 e2 flags first_energy R11 R22", Preset::Shearq),
+            ("x y e1 e2 flags R11 R22 divisor1 divisor2", Preset::Shearq),
             ("corrected_e1 corrected_e2", Preset::Hsm),
             (
                 "e1_noshear e2_noshear e1_1p e1_1m e2_2p e2_2m",

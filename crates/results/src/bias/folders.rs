@@ -8,21 +8,25 @@ use shearq_files::FileError;
 use shearq_files::open::is_there;
 use shearq_pipeline::data::run::{RUN_FILE, Run};
 
-use super::BiasFailure;
 use super::positions::Positions;
 use super::truth::Truth;
+use super::{BiasFailure, Input};
 
 /// Replaces folders of results by their catalogues, in the order of sets and images. Unless `truth` states the true
 /// shear, it is that of the data folders, if they have one.
 ///
 /// # Errors
 /// If a folder is no folder of results, or only some of the data have a true shear.
-pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<PathBuf>, Truth), BiasFailure> {
-    let (mut catalogues, mut found) = (Vec::new(), BTreeMap::new());
+pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<Input>, Truth), BiasFailure> {
+    let (mut truth, mut catalogues) = (truth, Vec::new());
+    let mut found = match &mut truth {
+        Truth::Data(found) => std::mem::take(found),
+        _ => BTreeMap::new(),
+    };
     let mut without: Option<&Path> = None;
     for path in paths {
         if !path.is_dir() {
-            catalogues.push(path.clone());
+            catalogues.push(path.clone().into());
             continue;
         }
         let Some(run) = Run::read(path)? else {
@@ -42,7 +46,7 @@ pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<PathBuf>, Truth), 
                 .into_iter()
                 .map(|(_, file)| file)
                 .collect();
-            if matches!(truth, Truth::Columns) {
+            if matches!(truth, Truth::Columns | Truth::Data(_)) {
                 match of_data(&run, path, set)? {
                     None => without = Some(path),
                     Some(positions) => {
@@ -51,7 +55,7 @@ pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<PathBuf>, Truth), 
                     }
                 }
             }
-            catalogues.extend(own);
+            catalogues.extend(own.into_iter().map(Input::from));
         }
     }
     if found.is_empty() {

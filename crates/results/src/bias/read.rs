@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use shearq_bias::{Catalogue, Row, VERSIONS};
 use shearq_files::FileError;
@@ -10,6 +10,7 @@ use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, Place};
 use shearq_quantities::Distortion;
 
+use super::Input;
 use super::columns::{Columns, Names, Preset, Role};
 use super::expression::Expression;
 use super::positions::Positions;
@@ -51,6 +52,8 @@ pub(super) struct Item {
 /// A table of a catalogue with its columns.
 pub(super) struct Source {
     place: Place,
+    /// The table, if it is in memory.
+    frame: Option<DataFrame>,
     /// The version of all rows, if a FITS file has one table per version.
     version: Option<Option<usize>>,
     pub(super) columns: Columns,
@@ -81,6 +84,18 @@ impl Source {
         self.columns.have(&[Role::Psf1, Role::Psf2])
     }
 
+    /// Gives the wanted columns to `take`, in parts.
+    fn parts(
+        &self,
+        mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
+    ) -> Result<(), FileError> {
+        let wanted: Vec<&str> = self.wanted.iter().map(String::as_str).collect();
+        match &self.frame {
+            Some(frame) => take(frame.clone()),
+            None => table::read_parts(&self.place, &wanted, take),
+        }
+    }
+
     /// Column that names the unit.
     fn unit<'a>(&'a self, reading: &'a Reading) -> Option<&'a str> {
         match &reading.unit {
@@ -92,7 +107,19 @@ impl Source {
 }
 
 /// Finds the tables of a catalogue and their columns.
-pub(super) fn sources(path: &Path, reading: &Reading) -> Result<Vec<Source>, FileError> {
+pub(super) fn sources(input: &Input, reading: &Reading) -> Result<Vec<Source>, FileError> {
+    let path = input.name.as_path();
+    if let Some(frame) = &input.frame {
+        let place = Place {
+            path: path.to_owned(),
+            table: None,
+        };
+        let names = frame.columns().iter().map(|own| own.name().to_string());
+        let names: Vec<String> = names.collect();
+        let mut source = source(place, None, &names, reading)?;
+        source.frame = Some(frame.clone());
+        return Ok(vec![source]);
+    }
     let place = Place::of(path);
     let found = table::columns(&place)?;
     let version = |name: &str| {
@@ -201,6 +228,7 @@ fn source(
     let (selected, binned) = (places(&reading.select)?, places(&reading.binned)?);
     let mut source = Source {
         place,
+        frame: None,
         version,
         columns,
         wanted: Vec::new(),
@@ -233,14 +261,9 @@ pub(super) fn rows(
     // Rows of each version so far.
     let mut counts = [0u64; COUNT];
     for source in sources {
-        let divisor = match source.columns.preset {
-            Preset::Shearq => mean_response(source)?,
-            _ => [1.0; 2],
-        };
-        let wanted: Vec<&str> = source.wanted.iter().map(String::as_str).collect();
         let mut first = 0;
-        table::read_parts(&source.place, &wanted, |frame| {
-            let part = Part::new(source, reading, &frame, path, divisor)?;
+        source.parts(|frame| {
+            let part = Part::new(source, reading, &frame, path)?;
             for at in 0..part.rows {
                 part.row(at, first + at, &mut counts, &mut about, &mut take)?;
             }
@@ -250,30 +273,6 @@ pub(super) fn rows(
     }
     about.rows = counts[0];
     Ok(about)
-}
-
-/// Mean responses of the good rows of a catalogue by shearq: its ellipticities are divided by them. 1 if there are
-/// none.
-fn mean_response(source: &Source) -> Result<[f64; 2], FileError> {
-    let names = [Role::E1, Role::R11, Role::R22].map(|role| source.columns.of(role).unwrap_or(""));
-    let (mut sums, mut count) = ([0.0; 2], 0.0);
-    table::read_parts(&source.place, &names, |frame| {
-        let column = |name| table::numbers(&frame, name, &source.place.path);
-        let [e1, r11, r22] = [column(names[0])?, column(names[1])?, column(names[2])?];
-        for row in 0..e1.len() {
-            if e1[row].is_finite() {
-                count += 1.0;
-                sums[0] += r11[row];
-                sums[1] += r22[row];
-            }
-        }
-        Ok(())
-    })?;
-    let means = sums.map(|sum| sum / count);
-    Ok(match means.iter().all(|mean| mean.is_finite()) {
-        true => means,
-        false => [f64::NAN; 2],
-    })
 }
 
 /// Columns of some rows.
@@ -287,7 +286,6 @@ struct Part<'a> {
     versions: Option<Vec<Option<usize>>>,
     unit: Option<usize>,
     truth: OfRows<'a>,
-    divisor: [f64; 2],
     distortion: bool,
 }
 
@@ -344,6 +342,7 @@ struct Places {
     e: [usize; 2],
     weight: Option<usize>,
     response: Option<[usize; 2]>,
+    divisor: Option<[usize; 2]>,
     derivative: Option<[usize; 2]>,
     flag: Option<usize>,
     shear: Option<[usize; 2]>,
@@ -369,6 +368,7 @@ impl Places {
             e: pair(Role::E1, Role::E2).unwrap_or_default(),
             weight: place(Role::Weight),
             response: pair(Role::R11, Role::R22),
+            divisor: pair(Role::Divisor1, Role::Divisor2),
             derivative: pair(Role::Dw1, Role::Dw2),
             flag: place(Role::Flag),
             shear: pair(Role::G1, Role::G2),
@@ -387,7 +387,6 @@ impl<'a> Part<'a> {
         reading: &'a Reading,
         frame: &'a DataFrame,
         catalogue: &Path,
-        divisor: [f64; 2],
     ) -> Result<Self, FileError> {
         let path = &source.place.path;
         let places = Places::of(source);
@@ -413,7 +412,6 @@ impl<'a> Part<'a> {
             versions,
             unit: unit.and_then(|name| source.wanted.iter().position(|own| own == name)),
             truth,
-            divisor,
             distortion: reading.distortion.unwrap_or(source.columns.distortion),
         })
     }
@@ -540,9 +538,15 @@ impl<'a> Part<'a> {
         let step = 2.0 * self.reading.step;
         let response = if let Some(sheared) = places.sheared {
             sheared.map(|[plus, minus]| (self.value(plus, at) - self.value(minus, at)) / step)
-        } else if let Some(response) = places.response.filter(|_| !self.divisor[0].is_nan()) {
-            let response = self.pair(response, at);
-            [0, 1].map(|k| response[k] / self.divisor[k])
+        } else if let (Some(response), Some(divisor)) = (places.response, places.divisor) {
+            // Configurations without a response have none, and no divisor.
+            let (response, divisor) = (self.pair(response, at), self.pair(divisor, at));
+            [0, 1].map(|k| match response[k] / divisor[k] {
+                ratio if ratio.is_nan() => 1.0,
+                ratio => ratio,
+            })
+        } else if let Some(response) = places.response {
+            self.pair(response, at)
         } else {
             [1.0; 2]
         };
@@ -646,10 +650,10 @@ fn versions(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<Option<usi
 ///
 /// # Errors
 /// If a catalogue is given twice.
-pub(super) fn distinct(paths: &[PathBuf]) -> Result<(), FileError> {
-    for (k, path) in paths.iter().enumerate() {
-        if paths[..k].contains(path) {
-            return Err(FileError::new(path, "the catalogue is given twice"));
+pub(super) fn distinct(inputs: &[Input]) -> Result<(), FileError> {
+    for (k, input) in inputs.iter().enumerate() {
+        if inputs[..k].iter().any(|other| other.name == input.name) {
+            return Err(FileError::new(&input.name, "the catalogue is given twice"));
         }
     }
     Ok(())

@@ -1,0 +1,319 @@
+"""Multiplicative and additive bias of any shear catalogue."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, Union
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from . import _display, _shearq
+
+if TYPE_CHECKING:
+    import pandas
+
+Design = Literal["single", "pairs", "arms", "fields", "galaxies", "rotated"]
+Bins = tuple[str, Union[int, Sequence[float]]]
+
+
+class Bias:
+    """Multiplicative and additive bias with errors, of all galaxies and of bins.
+
+    Attributes
+    ----------
+    rows : list of dict
+        All galaxies first, then each bin: ``bin``, ``n``, ``m1``, ``m1_error``, ``c1`` and so on, as the command line's
+        JSON has them. None is a quantity that the data do not determine.
+    notes : list of str
+        Design, units of the errors, rows that do not count, and requirements that are met or not.
+
+    ``bias["m1"]`` is the value of all galaxies.
+    """
+
+    __slots__ = ("_text", "notes", "rows")
+
+    def __init__(self, rows: list[dict[str, Any]], notes: list[str], text: str) -> None:
+        self.rows = rows
+        self.notes = notes
+        self._text = text
+
+    def __getitem__(self, key: str) -> float:
+        value = self.rows[0][key]
+        return float("nan") if value is None else float(value)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return [key for key, value in self.rows[0].items() if isinstance(value, (int, float))]
+
+    def __str__(self) -> str:
+        return self._text
+
+    def __repr__(self) -> str:
+        shown = [f"{key} = {self[key]:+.4f} ± {self[key + '_error']:.4f}" for key in ("m1", "m2", "c1", "c2")]
+        return f"<shearq.Bias {', '.join(shown)}, n = {self['n']:.0f}>"
+
+    def _repr_html_(self) -> str:
+        return _display.bias_html(self)
+
+    def to_frame(self) -> pandas.DataFrame:
+        """The rows as a pandas frame."""
+        import pandas
+
+        return pandas.DataFrame(self.rows)
+
+    def plot(self, quantity: Literal["m", "c"] = "m", limit: float | None = None, ax: Any = None) -> Any:
+        """Plots m or c of both components in bins with error bars, and a band of ±limit. Needs matplotlib.
+
+        limit is 0.002 for m and 0.0002 for c unless given (GREAT3).
+        """
+        return _display.plot_bias(self, quantity, limit, ax)
+
+
+class BiasSums:
+    """Sums of catalogues that add up: ``a + b`` has the catalogues of b after those of a.
+
+    Sums are small (megabytes for any number of rows) and can be pickled, so each worker of a cluster may sum its own
+    catalogues.
+    """
+
+    __slots__ = ("_sums",)
+
+    def __init__(self, sums: _shearq.BiasSums) -> None:
+        self._sums = sums
+
+    def __add__(self, other: BiasSums) -> BiasSums:
+        return BiasSums(self._sums.append(other._sums))
+
+    def __radd__(self, other: int) -> BiasSums:
+        # sum() begins with 0.
+        return self if other == 0 else NotImplemented
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return _restored, (self._sums.to_json(),)
+
+    def result(self, *, bootstrap: int | None = None, seed: int = 1) -> Bias:
+        """The bias, with errors from a jackknife or from bootstrap draws of units."""
+        text, shown = self._sums.result(bootstrap, seed)
+        found = json.loads(text)
+        return Bias(found["rows"], found["notes"], shown)
+
+
+def _restored(text: str) -> BiasSums:
+    return BiasSums(_shearq.BiasSums.from_json(text))
+
+
+def bias(
+    catalogues: Any,
+    *,
+    g1: float | Sequence[float] | None = None,
+    g2: float | Sequence[float] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    ellipticity: Literal["shear", "distortion"] | None = None,
+    flip_g2: bool = False,
+    bins: Bins | None = None,
+    select: str | None = None,
+    design: Design | None = None,
+    units: str | None = None,
+    drop_missing: bool = False,
+    step: float = 0.01,
+    bootstrap: int | None = None,
+    seed: int = 1,
+) -> Bias:
+    """Multiplicative and additive bias (m and c) of any program's catalogues, as ``shearq bias`` estimates it.
+
+    Parameters
+    ----------
+    catalogues
+        A table or a list of tables: mappings of columns, structured arrays, ``shearq.Catalogue``, astropy tables, pandas
+        or polars frames, Arrow tables or record batches, or paths of files and of folders that ``measure`` wrote. Columns
+        are ``e1 e2``, optionally ``w R11 R22 flag id snr ...`` and the true shear ``g1 g2``. Columns of GalSim's HSM,
+        ngmix metacal, metadetect and AnaCal are recognised.
+    g1, g2 : float or sequence of float
+        True shear of all catalogues, or of each. By default it is in the columns g1 and g2.
+    truth : path
+        Table of true shears with the columns id, g1, g2 or x, y, g1, g2.
+    columns : mapping
+        Names of columns by role, such as ``{"e1": "g_1", "w": "weight"}``; ``"none"`` ignores a column.
+    ellipticity : {'shear', 'distortion'}
+        Type of e1 and e2; recognised by default.
+    flip_g2 : bool
+        Use minus the true g2.
+    bins : (str, int or sequence of float)
+        Also estimate in bins of a column or expression: ``("snr", 5)`` has five bins with equally many galaxies,
+        ``("flux / flux_error", [5, 10, 20])`` has these edges. The response is that of each bin.
+    select : str
+        Use only rows for which this holds, such as ``"snr > 10 and size < 4"``.
+    design : str
+        How catalogues belong together; recognised from the true shears.
+    units : str
+        Independent units of the errors: ``"rows"``, ``"catalogues"`` or a column.
+    drop_missing : bool
+        Leave out rows with missing numbers or without a true shear.
+    step : float
+        Artificial shear of metacalibration.
+    bootstrap, seed : int
+        Number of bootstrap draws instead of a jackknife, and its seed.
+
+    Raises
+    ------
+    ValueError
+        If a column is absent, a number is missing in a row without a flag, the ellipticities do not follow the true shear,
+        or a mean response has less than five standard errors.
+    """
+    sums = bias_sums(
+        catalogues,
+        g1=g1,
+        g2=g2,
+        truth=truth,
+        columns=columns,
+        ellipticity=ellipticity,
+        flip_g2=flip_g2,
+        bins=bins,
+        select=select,
+        design=design,
+        units=units,
+        drop_missing=drop_missing,
+        step=step,
+    )
+    return sums.result(bootstrap=bootstrap, seed=seed)
+
+
+def bias_sums(
+    catalogues: Any,
+    *,
+    g1: float | Sequence[float] | None = None,
+    g2: float | Sequence[float] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    ellipticity: Literal["shear", "distortion"] | None = None,
+    flip_g2: bool = False,
+    bins: Bins | None = None,
+    select: str | None = None,
+    design: Design | None = None,
+    units: str | None = None,
+    drop_missing: bool = False,
+    step: float = 0.01,
+) -> BiasSums:
+    """Sums of catalogues, to be added to those of other catalogues; the parameters are those of ``bias``.
+
+    Bins need edges, because all sums must have the same bins:
+
+    >>> sums = client.map(lambda path: shearq.bias_sums(path, g1=0.02, g2=0), paths)
+    >>> sum(client.gather(sums)).result()
+    """
+    if ellipticity not in (None, "shear", "distortion"):
+        raise ValueError(f"ellipticity: found {ellipticity!r}; expected 'shear' or 'distortion'")
+    if not (np.isfinite(step) and step > 0):
+        raise ValueError(f"step: found {step!r}; expected a positive number")
+    given = [_catalogue(f"catalogue {number}", table) for number, table in enumerate(_several(catalogues), 1)]
+    if not given:
+        raise ValueError("catalogues: found none; expected at least one")
+    return BiasSums(
+        _shearq.bias_sums(
+            given,
+            [f"{role}={column}" for role, column in (columns or {}).items()],
+            _truth(g1, g2, truth, given),
+            None if ellipticity is None else ellipticity == "distortion",
+            flip_g2,
+            _bins(bins),
+            select,
+            design,
+            units,
+            drop_missing,
+            float(step),
+        )
+    )
+
+
+def _several(catalogues: Any) -> Iterable[Any]:
+    if isinstance(catalogues, (str, os.PathLike, Mapping, np.ndarray)) or hasattr(catalogues, "columns"):
+        return [catalogues]
+    if hasattr(catalogues, "schema") or not isinstance(catalogues, Iterable):
+        # Arrow tables and record batches.
+        return [catalogues]
+    return catalogues
+
+
+def _catalogue(name: str, table: Any) -> str | tuple[str, list[tuple[str, Any]]]:
+    """A path, or a name with columns of float64 or of text."""
+    if isinstance(table, (str, os.PathLike)):
+        return os.fspath(table)
+    if isinstance(table, Mapping):
+        names = list(table)
+    elif isinstance(table, np.ndarray):
+        names = list(table.dtype.names or ())
+    elif hasattr(table, "schema") and hasattr(table.schema, "names") and not hasattr(table, "with_columns"):
+        names = list(table.schema.names)
+        table = {column: table.column(column).to_numpy(zero_copy_only=False) for column in names} if hasattr(
+            table, "num_columns"
+        ) else table
+    else:
+        names = [str(column) for column in getattr(table, "colnames", getattr(table, "columns", ()))]
+    columns = []
+    for column in names:
+        values = _values(table[column])
+        if values is not None:
+            columns.append((str(column), values))
+    if not columns:
+        raise ValueError(f"{name}: found {type(table).__name__} without columns of numbers; expected a table with e1 and e2")
+    return name, columns
+
+
+def _values(column: ArrayLike) -> Any:
+    """A contiguous column of float64, a list of text, or None for anything else."""
+    if isinstance(column, np.ma.MaskedArray):
+        if column.dtype.kind not in "fiub" or column.ndim != 1:
+            return None
+        return np.ascontiguousarray(np.ma.filled(column.astype(np.float64), np.nan))
+    array = np.asarray(column)
+    if array.ndim != 1:
+        return None
+    if array.dtype.kind in "fiub":
+        return np.ascontiguousarray(array, dtype=np.float64)
+    if array.dtype.kind in "US" or (array.dtype.kind == "O" and all(isinstance(value, str) for value in array)):
+        return [value.decode() if isinstance(value, bytes) else str(value) for value in array]
+    if array.dtype.kind == "O":
+        try:
+            return np.ascontiguousarray(array, dtype=np.float64)
+        except (TypeError, ValueError):
+            return None
+    return None
+
+
+def _truth(g1: Any, g2: Any, truth: Any, given: list[Any]) -> Any:
+    if (g1 is None) != (g2 is None):
+        raise ValueError("g1, g2: found only one; expected both or none")
+    if truth is not None:
+        if g1 is not None:
+            raise ValueError("truth: found with g1 and g2; expected one of them")
+        return os.fspath(truth)
+    if g1 is None:
+        return None
+    if np.ndim(g1) == 0 and np.ndim(g2) == 0:
+        if not np.hypot(float(g1), float(g2)) < 1:
+            raise ValueError(f"g1, g2: found {g1!r} and {g2!r}; expected a shear with a modulus below 1")
+        return (float(g1), float(g2))
+    both = [np.broadcast_to(np.asarray(g, dtype=np.float64), (len(given),)) if np.ndim(g) == 0 else np.asarray(g) for g in (g1, g2)]
+    for name, values in zip(("g1", "g2"), both):
+        if values.shape != (len(given),):
+            raise ValueError(
+                f"{name}: found shape {values.shape}; expected a number, or one per catalogue ({len(given)})."
+                " A true shear per galaxy belongs into the columns g1 and g2"
+            )
+    names = [each if isinstance(each, str) else each[0] for each in given]
+    return [(name, float(a), float(b)) for name, a, b in zip(names, *both)]
+
+
+def _bins(bins: Any) -> tuple[str, int | None, list[float]] | None:
+    if bins is None:
+        return None
+    try:
+        of, edges = bins
+    except (TypeError, ValueError):
+        raise ValueError(f"bins: found {bins!r}; expected (expression, number or edges)") from None
+    if isinstance(edges, (int, np.integer)):
+        return str(of), int(edges), []
+    return str(of), None, [float(edge) for edge in edges]

@@ -1,0 +1,226 @@
+//! Multiplicative and additive bias of catalogues.
+
+use std::path::PathBuf;
+
+use numpy::PyReadonlyArray1;
+use pyo3::exceptions::{PyFileNotFoundError, PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use shearq_bias::{Design, Errors};
+use shearq_files::frames::frame;
+use shearq_files::frames::polars::Column;
+use shearq_render::table::TableFormat;
+use shearq_results::bias::columns::Names;
+use shearq_results::bias::expression::Expression;
+use shearq_results::bias::folders::expand;
+use shearq_results::bias::truth::Truth;
+use shearq_results::bias::{
+    BiasFailure, Binning, Edges, Input, MOST_BINS, Request, Summed, Units, sum,
+};
+use shearq_results::views::bias::bias_table;
+
+fn of_bias(error: BiasFailure) -> PyErr {
+    let message = error.to_string();
+    match message.contains("No such file or directory") {
+        true => PyFileNotFoundError::new_err(message),
+        false => PyValueError::new_err(message),
+    }
+}
+
+/// The design of a name of the command line.
+fn design_of(name: &str) -> PyResult<Design> {
+    const ALL: [Design; 6] = [
+        Design::Single,
+        Design::Pairs,
+        Design::Arms,
+        Design::Fields,
+        Design::Galaxies,
+        Design::Rotated,
+    ];
+    let found = ALL.into_iter().find(|design| design.name() == name);
+    found.ok_or_else(|| {
+        let names = ALL.map(Design::name).join(", ");
+        PyValueError::new_err(format!("design: found {name:?}; expected one of {names}"))
+    })
+}
+
+/// A table in memory: numbers or text by name.
+fn table_of(name: &str, columns: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<Input> {
+    let columns = columns.iter().map(|(label, values)| {
+        if let Ok(reals) = values.extract::<PyReadonlyArray1<'_, f64>>() {
+            return Ok(Column::new(label.as_str().into(), reals.as_slice()?));
+        }
+        if let Ok(texts) = values.extract::<Vec<String>>() {
+            return Ok(Column::new(label.as_str().into(), texts));
+        }
+        Err(PyTypeError::new_err(format!(
+            "{name}: {label}: expected numbers or text"
+        )))
+    });
+    let columns: Vec<Column> = columns.collect::<PyResult<_>>()?;
+    let table =
+        frame(columns).map_err(|error| PyValueError::new_err(format!("{name}: {error}")))?;
+    Ok(Input {
+        name: PathBuf::from(name),
+        frame: Some(table),
+    })
+}
+
+/// A catalogue: a path, or the name and the columns of a table.
+#[derive(FromPyObject)]
+pub(crate) enum Given<'py> {
+    Path(PathBuf),
+    Table(String, Vec<(String, Bound<'py, PyAny>)>),
+}
+
+/// The true shear: of all, of each table, or in a file.
+#[derive(FromPyObject)]
+pub(crate) enum GivenTruth {
+    Constant((f64, f64)),
+    Catalogues(Vec<(String, f64, f64)>),
+    File(PathBuf),
+}
+
+/// Sums of catalogues, from which the bias follows.
+#[pyclass(frozen, module = "shearq._shearq")]
+pub(crate) struct BiasSums {
+    summed: Summed,
+}
+
+#[pymethods]
+impl BiasSums {
+    /// From what `to_json` returned.
+    #[staticmethod]
+    fn from_json(text: &str) -> PyResult<Self> {
+        let summed: Summed = serde_json::from_str(text)
+            .map_err(|error| PyValueError::new_err(format!("sums: {error}")))?;
+        let summed = summed.checked().map_err(of_bias)?;
+        Ok(BiasSums { summed })
+    }
+
+    /// All that it consists of.
+    fn to_json(&self) -> PyResult<String> {
+        serde_json::to_string(&self.summed)
+            .map_err(|error| PyValueError::new_err(error.to_string()))
+    }
+
+    /// These and the sums of other catalogues, which follow.
+    fn append(&self, other: &BiasSums) -> PyResult<Self> {
+        let mut summed = self.summed.clone();
+        summed.append(other.summed.clone()).map_err(of_bias)?;
+        Ok(BiasSums { summed })
+    }
+
+    /// The table of estimates as JSON, and as text.
+    #[pyo3(signature = (bootstrap, seed))]
+    fn result(
+        &self,
+        py: Python<'_>,
+        bootstrap: Option<u32>,
+        seed: u64,
+    ) -> PyResult<(String, String)> {
+        let errors = bootstrap.map_or(Errors::Jackknife, |draws| Errors::Bootstrap { draws, seed });
+        py.detach(|| {
+            let table = bias_table(&self.summed.clone().result(errors)?);
+            Ok((
+                table.render(TableFormat::Json),
+                table.narrow().render(TableFormat::Table),
+            ))
+        })
+        .map_err(of_bias)
+    }
+}
+
+/// Sums catalogues.
+#[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "the options of the command")]
+pub(crate) fn bias_sums(
+    py: Python<'_>,
+    catalogues: Vec<Given<'_>>,
+    columns: Vec<String>,
+    truth: Option<GivenTruth>,
+    distortion: Option<bool>,
+    flip_g2: bool,
+    bins: Option<(String, Option<usize>, Vec<f64>)>,
+    select: Option<&str>,
+    design: Option<&str>,
+    units: Option<String>,
+    drop_missing: bool,
+    step: f64,
+) -> PyResult<BiasSums> {
+    let value = |argument: &str| {
+        let argument = argument.to_owned();
+        move |fault: String| PyValueError::new_err(format!("{argument}: {fault}"))
+    };
+    let mut names = Names::default();
+    for text in &columns {
+        names
+            .add(text)
+            .map_err(|fault| PyValueError::new_err(fault.replace("--columns", "columns")))?;
+    }
+    let bins = match bins {
+        None => None,
+        Some((of, count, edges)) => {
+            let of = Expression::parse(&of).map_err(value("bins"))?;
+            let edges = match count {
+                Some(count) if (2..=MOST_BINS).contains(&count) => Edges::Equal(count),
+                None if (2..=MOST_BINS + 1).contains(&edges.len())
+                    && edges.windows(2).all(|pair| pair[0] < pair[1]) =>
+                {
+                    Edges::Given(edges)
+                }
+                _ => {
+                    return Err(PyValueError::new_err(format!(
+                        "bins: expected 2 to {MOST_BINS} bins, or increasing edges"
+                    )));
+                }
+            };
+            Some(Binning { of, edges })
+        }
+    };
+    let truth = match truth {
+        None => Truth::Columns,
+        Some(GivenTruth::Constant((g1, g2))) => Truth::Constant([g1, g2]),
+        Some(GivenTruth::Catalogues(all)) => Truth::Catalogues(
+            all.into_iter()
+                .map(|(name, g1, g2)| (name, [g1, g2]))
+                .collect(),
+        ),
+        Some(GivenTruth::File(path)) => {
+            Truth::read(&path).map_err(|error| of_bias(error.into()))?
+        }
+    };
+    let (mut inputs, mut truth) = (Vec::new(), truth);
+    for given in catalogues {
+        match given {
+            Given::Table(name, columns) => inputs.push(table_of(&name, columns)?),
+            Given::Path(path) => {
+                let (found, known) = expand(&[path], truth).map_err(of_bias)?;
+                inputs.extend(found);
+                truth = known;
+            }
+        }
+    }
+    let request = Request {
+        catalogues: inputs,
+        names,
+        truth,
+        distortion,
+        flip_g2,
+        bins,
+        select: select
+            .map(Expression::parse)
+            .transpose()
+            .map_err(value("select"))?,
+        design: design.map(design_of).transpose()?,
+        units: match units.as_deref() {
+            None => Units::Recognised,
+            Some("rows") => Units::Rows,
+            Some("catalogues") => Units::Catalogues,
+            Some(column) => Units::Column(column.to_owned()),
+        },
+        drop_missing,
+        step,
+    };
+    let summed = py.detach(|| sum(&request, &|_| true)).map_err(of_bias)?;
+    Ok(BiasSums { summed })
+}
