@@ -491,7 +491,7 @@ fn the_truth_is_joined_by_position() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     let truth = |k: usize| {
-        if k % 2 == 0 {
+        if k.is_multiple_of(2) {
             [0.05, -0.02]
         } else {
             [-0.03, 0.04]
