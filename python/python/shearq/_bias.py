@@ -51,7 +51,8 @@ class Bias:
         return self._text
 
     def __repr__(self) -> str:
-        shown = [f"{key} = {self[key]:+.4f} ± {self[key + '_error']:.4f}" for key in ("m1", "m2", "c1", "c2")]
+        known = [key for key in ("m1", "m2", "c1", "c2") if self[key] == self[key]]
+        shown = [f"{key} = {self[key]:+.4f} ± {self[key + '_error']:.4f}" for key in known]
         return f"<shearq.Bias {', '.join(shown)}, n = {self['n']:.0f}>"
 
     def _repr_html_(self) -> str:

@@ -100,7 +100,13 @@ def plot_score(score: Score, ax: Any) -> Any:
     ax.plot(l, table["true_ee"][chosen], color="black", linewidth=1, label="true EE")
     ax.set(xscale="log", xlabel="multipole ℓ", ylabel="ℓ²C(ℓ)/2π", title=repr(score).strip("<>"))
     ax.title.set_fontsize("small")
+    ticks = [tick for power in range(5) for tick in (10**power, 2 * 10**power, 5 * 10**power) if l.min() <= tick <= l.max()]
+    if len(ticks) > 1:
+        ax.set_xticks(ticks, [str(tick) for tick in ticks])
+        ax.set_xticks([], minor=True)
     ax.set_yscale("symlog", linthresh=max(float(np.nanmax(np.abs(table["true_ee"]))) * 1e-2, 1e-12))
+    if min(table["ee"][chosen].min(), table["bb"][chosen].min()) >= 0:
+        ax.set_ylim(bottom=0)
     ax.legend()
     return ax
 
@@ -137,10 +143,14 @@ def plot_bias(bias: Bias, quantity: Literal["m", "c"], limit: float | None, ax: 
             np.array([np.nan if row.get(name) is None else row[name] for row in bias.rows], dtype=float)
             for name in (key, f"{key}_error")
         )
+        if np.isnan(value).all():
+            continue
         ax.errorbar(places + 0.12 * (k - 1.5), value, error, fmt=marker, color=colour, markersize=4, capsize=2, label=key)
-    ax.set_xticks(places, [str(row["bin"]) for row in bias.rows], rotation=25 if len(places) > 3 else 0)
-    ax.set(ylabel=quantity, title=repr(bias).strip("<>"))
-    ax.title.set_fontsize("x-small")
+    many = len(places) > 3
+    labels = [str(row["bin"]) for row in bias.rows]
+    ax.set_xticks(places, labels, rotation=25 if many else 0, ha="right" if many else "center", rotation_mode="anchor")
+    meaning = {"m": "multiplicative bias m", "c": "additive bias c"}[quantity]
+    ax.set(ylabel=meaning, title=f"{bias['n']:.0f} galaxies")
     ax.margins(x=0.15)
     ax.legend(fontsize="small")
     return ax

@@ -1,0 +1,33 @@
+#!/bin/sh
+# Builds wheels for Linux and the source distribution into dist/, and checks them.
+#
+# Usage: python/wheels.sh [TARGET...]     default: x86_64-unknown-linux-gnu
+#
+# Needs `pip install 'maturin[zig]' twine auditwheel`. Zig links against glibc 2.17, so that wheels are manylinux2014; it also
+# compiles cfitsio for other targets, such as aarch64-unknown-linux-gnu (`rustup target add` it first).
+# One wheel per target serves Python 3.10 and later.
+set -eu
+cd "$(dirname "$0")"
+dist=$PWD/../dist
+mkdir -p "$dist"
+for target in "${@:-x86_64-unknown-linux-gnu}"; do
+    maturin build --release --zig --compatibility manylinux2014 --target "$target" --out "$dist"
+done
+maturin sdist --out "$dist"
+twine check "$dist"/*
+for wheel in "$dist"/*.whl; do
+    auditwheel show "$wheel"
+done
+# The wheel of this machine must measure in an empty environment.
+own=$(ls "$dist"/*"$(uname -m)".whl)
+empty=$(mktemp -d)
+trap 'rm -rf "$empty"' EXIT
+python3 -m venv "$empty"
+"$empty/bin/pip" install --quiet "$own"
+cd "$empty"
+"$empty/bin/python" - <<'PYTHON'
+import shearq
+image = shearq.simulate(set=8, seed=1, grid=8)[0]
+print(shearq.__version__, shearq.measure(image.stamps, image.psf).mean_shear())
+PYTHON
+"$empty/bin/shearq" --version
