@@ -17,9 +17,8 @@ use shearq_results::groups::{Group, Grouping, Order};
 use shearq_results::row::RunRecord;
 use shearq_results::store;
 use shearq_results::submit::packed::PackedCatalogues;
-use shearq_results::views::comparison::{compare, compare_runs, q_heat_map};
+use shearq_results::views::comparison::{compare, compare_runs, notes_of_variants, q_heat_map};
 use shearq_results::views::pages;
-use shearq_results::views::scores::notes;
 use shearq_results::views::verdict::verdict;
 
 /// Compare the metrics of several configurations.
@@ -128,12 +127,9 @@ fn folders(arguments: &Arguments, variants: &[Variant]) -> anyhow::Result<Table>
     let groups = Group::of(&runs, arguments.group_by, arguments.sort.as_ref())?;
     let mut table = compare_runs(&runs, &groups, arguments.group_by);
     table.title = "Comparison of configurations".into();
-    for variant in variants {
-        for line in notes(&variant.sets).iter().chain(&variant.unscored) {
-            let line = format!("{}: {line}", variant.name);
-            if !table.notes.contains(&line) {
-                table.notes.push(line);
-            }
+    for line in notes_of_variants(variants) {
+        if !table.notes.contains(&line) {
+            table.notes.push(line);
         }
     }
     table.notes.extend(verdict(&by_name(variants)));

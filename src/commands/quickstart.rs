@@ -13,7 +13,6 @@ use shearq_files::table::FileFormat;
 use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::images;
 use shearq_pipeline::run::run_folder;
-use shearq_render::html::Block;
 use shearq_render::terminal::wrapped;
 use shearq_results::compare::{by_name, score_all};
 use shearq_results::score::{OWN, ScoredSet, score_folder};
@@ -87,7 +86,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         folders.push(folder);
     }
     let way = ScoreSettings::default().way();
-    let variants = score_all(&folders, &[], None, way, threads)?;
+    let mut variants = score_all(&folders, &[], None, way, threads)?;
+    for variant in &mut variants {
+        // Published metrics are for 200 images per set.
+        variant.published = None;
+    }
     let full = compare(&variants, options.definition);
     print("\n")?;
     print_table(&compact(&variants))?;
@@ -95,10 +98,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         print_table(&full)?;
     }
     let records = by_name(&variants);
-    let mut comparison = pages::comparison(full, &q_heat_map(&records))?;
+    let comparison = pages::comparison(full, &q_heat_map(&records))?;
     if let Some(verdict) = verdict(&records) {
         print(&format!("\n{}\n", wrapped(&verdict, Some(80))))?;
-        comparison.blocks.insert(0, Block::Text(verdict));
     }
     sections.insert(0, comparison);
     let report = out.join("report.html");

@@ -310,6 +310,7 @@ impl View<'_> {
             subtitle: format!("{}: leaderboard", kind.title),
             sections,
             settings,
+            ..Report::default()
         })
     }
 

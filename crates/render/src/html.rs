@@ -48,6 +48,9 @@ pub struct Report {
     pub subtitle: String,
     /// What it has to say.
     pub sections: Vec<Section>,
+    /// Meanings of columns by the keys of their headings. Those of columns that the report has are listed, and linked
+    /// from the tables.
+    pub glossary: Vec<(String, String)>,
     /// What made it, by name: version, seed, inputs, resolved settings. Values of several lines are
     /// shown as they are.
     pub settings: Vec<(String, String)>,
@@ -91,6 +94,12 @@ pub enum Block {
     Figure(Picture),
     /// Lines in a typewriter font, as they are.
     Code(String),
+}
+
+impl Block {
+    fn is_figure(&self) -> bool {
+        matches!(self, Block::Figure(_))
+    }
 }
 
 /// A figure as it stands in a report.
@@ -184,6 +193,11 @@ impl Report {
             .zip(&self.sections)
             .map(|(id, section)| (id.as_str(), section.heading.as_str()))
             .collect();
+        let glossary = self.used_glossary();
+        page.glossary.clone_from(&glossary);
+        if !glossary.is_empty() {
+            contents.push(GLOSSARY);
+        }
         if !self.settings.is_empty() {
             contents.push(SETTINGS);
         }
@@ -214,8 +228,17 @@ impl Report {
                     main #main { "\n"
                         @for (id, part) in ids.iter().zip(&self.sections) {
                             (section(id, &part.heading, html! {
-                                @for block in &part.blocks { (page.block(block)) "\n" }
+                                @for blocks in part.blocks.chunk_by(|a, b| a.is_figure() && b.is_figure()) {
+                                    @if blocks.len() > 1 {
+                                        div.figures { @for block in blocks { (page.block(block)) "\n" } } "\n"
+                                    } @else {
+                                        @for block in blocks { (page.block(block)) "\n" }
+                                    }
+                                }
                             }))
+                        }
+                        @if !glossary.is_empty() {
+                            (section(GLOSSARY.0, GLOSSARY.1, meanings(&glossary)))
                         }
                         @if !self.settings.is_empty() {
                             (section(SETTINGS.0, SETTINGS.1, settings(&self.settings)))
@@ -225,6 +248,25 @@ impl Report {
             } "\n"
         };
         markup.into_string()
+    }
+
+    /// The entries of the glossary whose columns are in tables: key, label, meaning.
+    fn used_glossary(&self) -> Vec<Entry> {
+        let blocks = self.sections.iter().flat_map(|section| &section.blocks);
+        let tables = blocks.filter_map(|block| match block {
+            Block::Table(table) | Block::Filtered(table) => Some(table),
+            _ => None,
+        });
+        let headings: Vec<_> = tables.flat_map(|table| &table.headings).collect();
+        let entries = self.glossary.iter().filter_map(|(key, meaning)| {
+            let heading = headings.iter().find(|heading| heading.key == key)?;
+            Some(Entry {
+                key: key.clone(),
+                label: heading.label.clone(),
+                meaning: meaning.clone(),
+            })
+        });
+        entries.collect()
     }
 
     /// Writes the page, whole or not at all.
@@ -238,6 +280,17 @@ impl Report {
 
 /// Name and heading of the section of settings.
 const SETTINGS: (&str, &str) = ("settings", "What made this report");
+
+/// Name and heading of the section of meanings.
+const GLOSSARY: (&str, &str) = ("glossary", "Glossary");
+
+/// The meaning of a column.
+#[derive(Debug, Clone)]
+struct Entry {
+    key: String,
+    label: String,
+    meaning: String,
+}
 
 /// Names that are taken.
 #[derive(Debug)]
@@ -274,6 +327,37 @@ struct Words<'a>(&'a str);
 impl Render for Words<'_> {
     fn render_to(&self, page: &mut String) {
         visible(self.0).as_ref().render_to(page);
+    }
+}
+
+/// Words in which symbols with an index are typeset. Not for attributes.
+struct Typeset<'a>(&'a str);
+
+/// Symbols with an index, as terminals and as pages show them.
+const INDEXED: [(&str, &str); 3] = [
+    ("C_ℓ", "C<sub>ℓ</sub>"),
+    ("Q_dn", "Q<sub>dn</sub>"),
+    ("σ_sys", "σ<sub>sys</sub>"),
+];
+
+impl Render for Typeset<'_> {
+    fn render_to(&self, page: &mut String) {
+        let mut words = Words(self.0).render().into_string();
+        for (plain, typeset) in INDEXED {
+            words = words.replace(plain, typeset);
+        }
+        page.push_str(&words);
+    }
+}
+
+fn meanings(glossary: &[Entry]) -> Markup {
+    html! {
+        dl {
+            @for entry in glossary {
+                dt id={ "glossary-" (entry.key) } { (Typeset(&entry.label)) }
+                dd { (Typeset(&entry.meaning)) } "\n"
+            }
+        } "\n"
     }
 }
 
@@ -336,15 +420,17 @@ struct Page {
     ids: Ids,
     tables: usize,
     figures: usize,
+    glossary: Vec<Entry>,
 }
 
 impl Page {
     fn new() -> Self {
-        let taken = ["main", "theme", SETTINGS.0];
+        let taken = ["main", "theme", GLOSSARY.0, SETTINGS.0];
         Page {
             ids: Ids(taken.map(String::from).into()),
             tables: 0,
             figures: 0,
+            glossary: Vec::new(),
         }
     }
 
@@ -400,10 +486,17 @@ impl Page {
         let number = self.tables;
         let id = self.ids.give(&format!("table-{number}"));
         let title = self.ids.give(&format!("{id}-title"));
+        let csv = BASE64.encode(table.render(TableFormat::Csv));
+        let (table, known) = (&table.without_empty_columns(), &self.glossary);
         let columns: Vec<Column> = (0..table.headings.len())
             .map(|k| Column::of(table, k))
             .collect();
-        let csv = BASE64.encode(table.render(TableFormat::Csv));
+        let meaning = |key: &str| known.iter().find(|entry| entry.key == key);
+        let explained: Vec<_> = table
+            .headings
+            .iter()
+            .filter_map(|heading| meaning(heading.key))
+            .collect();
         // The caption stands outside what scrolls; the table is named by it.
         html! {
             div.table.filtered[filtered] id=(id) {
@@ -413,7 +506,9 @@ impl Page {
                         thead {
                             tr {
                                 @for (heading, column) in table.headings.iter().zip(&columns) {
-                                    th scope="col" class=[column.class(false)] { (Words(&heading.label)) }
+                                    th scope="col" class=[column.class(false)] title=[meaning(heading.key).map(|entry| Words(&entry.meaning))] {
+                                        (Typeset(&heading.label))
+                                    }
                                 }
                             }
                         } "\n"
@@ -430,12 +525,21 @@ impl Page {
                 }
                 @if !table.notes.is_empty() {
                     div.notes {
-                        @for note in &table.notes { p { (Words(note)) } }
+                        @for note in &table.notes { p { (Typeset(note)) } }
                     }
                 }
                 p.tools {
                     a download={ (id) ".csv" } href={ "data:text/csv;charset=utf-8;base64," (csv) }
                         aria-label={ "Table " (number) " as CSV" } { "CSV" }
+                    @if !explained.is_empty() {
+                        span {
+                            "Columns: "
+                            @for (k, entry) in explained.iter().enumerate() {
+                                @if k > 0 { ", " }
+                                a href={ "#glossary-" (entry.key) } { (Typeset(&entry.label)) }
+                            }
+                        }
+                    }
                 }
             }
         }
@@ -608,8 +712,8 @@ fn inline(text: &str) -> Markup {
     html! {
         @for run in runs(text) {
             @match run {
-                Run::Plain(words) => (Words(words)),
-                Run::Bold(words) => b { (Words(words)) },
+                Run::Plain(words) => (Typeset(words)),
+                Run::Bold(words) => b { (Typeset(words)) },
                 Run::Code(words) => code { (Words(words)) },
             }
         }

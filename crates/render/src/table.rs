@@ -196,6 +196,19 @@ pub struct Table {
 }
 
 impl Table {
+    /// The table without columns that have no value in any row.
+    pub(crate) fn without_empty_columns(&self) -> Self {
+        let has_value = |k: usize| {
+            self.rows.iter().any(|row| match row.get(k) {
+                None | Some(Cell::Empty) => false,
+                Some(Cell::Text(words)) => !words.is_empty(),
+                Some(Cell::Number { value, .. }) => !value.is_nan(),
+            })
+        };
+        let places = (0..self.headings.len()).filter(|&k| self.rows.is_empty() || has_value(k));
+        self.picked(&places.collect::<Vec<_>>())
+    }
+
     /// The columns at `places`, in that order.
     fn picked(&self, places: &[usize]) -> Self {
         let row = |row: &Vec<Cell>| {

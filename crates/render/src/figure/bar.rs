@@ -7,6 +7,9 @@ use super::scene::{Anchor, Scene, text_width};
 use super::ticks::{Axis, Direction, Scale, shown};
 use super::{Figure, FigureError, LABEL_SIZE, MARGIN, TICK_SIZE, TITLE_SIZE};
 
+/// Radius of points with error bars.
+const POINT: f64 = 3.2;
+
 /// The bars of one variant, one per category.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct BarGroup {
@@ -197,12 +200,15 @@ impl Figure for BarPlot {
                 let x = start + place as f64 * bar;
                 let inset = 0.04 * bar;
                 let colour = series_colour(place);
-                scene.rectangle((x + inset, up(value)), (x + bar - inset, up(0.0)), colour);
                 let error = group.errors.as_ref().map(|errors| errors[number].abs());
                 if let Some(error) = error.filter(|error| shown(*error, true)) {
+                    // A value with an error is a point, because a column would hide half of the error.
                     let x = x + 0.5 * bar;
                     let (low, high) = ((x, up(value - error)), (x, up(value + error)));
-                    draw_error_bar(&mut scene, frame, low, high, INK);
+                    draw_error_bar(&mut scene, frame, low, high, colour);
+                    scene.disc((x, up(value)), POINT, colour);
+                } else {
+                    scene.rectangle((x + inset, up(value)), (x + bar - inset, up(0.0)), colour);
                 }
             }
         }

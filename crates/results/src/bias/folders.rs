@@ -68,11 +68,14 @@ pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<Input>, Truth), Bi
     Ok((catalogues, Truth::Data(found)))
 }
 
-/// The true shear of the data of a run; `None` if the data no longer exist, or have none.
+/// The true shear of the data of a run; `None` if they have none.
 fn of_data(run: &Run, folder: &Path, set: u32) -> Result<Option<Positions>, FileError> {
-    let Ok(data) = run.source.data(folder) else {
-        return Ok(None);
-    };
+    let data = run.source.data(folder).map_err(|error| {
+        let message = format!(
+            "the data with the true shear are gone ({error}). Try: --truth FILE, or the catalogues themselves without a true shear"
+        );
+        FileError::new(folder, message)
+    })?;
     let path = data.truth(set);
     if !is_there(&path) {
         return Ok(None);

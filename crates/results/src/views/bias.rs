@@ -149,36 +149,108 @@ fn notes(result: &BiasResult) -> Vec<String> {
     notes
 }
 
+/// A quantity compared with the requirements that have one limit.
+struct Compared {
+    /// Surveys and challenges with this limit.
+    names: Vec<&'static str>,
+    sources: Vec<String>,
+    /// `m` or `c`.
+    of: char,
+    limit: f64,
+    key: String,
+    measured: Measured,
+    verdict: Verdict,
+}
+
 /// Estimates against published requirements, at 95 % confidence.
-fn verdicts(all: &Estimate) -> Vec<String> {
-    let mut lines = Vec::new();
+fn compared(all: &Estimate) -> Vec<Compared> {
+    let mut found: Vec<Compared> = Vec::new();
     for requirement in REQUIREMENTS {
-        let mut parts = Vec::new();
         for component in [1, 2] {
             let key = format!("{}{component}", requirement.of);
             let Some(measured) = all.value(&key).filter(|found| found.error.is_finite()) else {
                 continue;
             };
-            let found = verdict(measured, requirement.limit, all.galaxies, all.units);
-            parts.push(match found {
-                Verdict::Met => format!("{key} met"),
-                Verdict::NotMet => format!("{key} not met"),
-                Verdict::Undecided { galaxies } => {
-                    format!("{key} undecided (about {galaxies:.1e} galaxies would decide)")
+            let source = format!("{}: {}", requirement.name, requirement.source);
+            let like = |own: &&mut Compared| own.key == key && own.limit == requirement.limit;
+            match found.iter_mut().find(like) {
+                Some(own) => {
+                    own.names.push(requirement.name);
+                    own.sources.push(source);
                 }
-            });
-        }
-        if !parts.is_empty() {
-            lines.push(format!(
-                "{} requires |{}| below {:e}: {}.",
-                requirement.name,
-                requirement.of,
-                requirement.limit,
-                parts.join(", ")
-            ));
+                None => found.push(Compared {
+                    names: vec![requirement.name],
+                    sources: vec![source],
+                    of: requirement.of,
+                    limit: requirement.limit,
+                    verdict: verdict(measured, requirement.limit, all.galaxies, all.units),
+                    key,
+                    measured,
+                }),
+            }
         }
     }
-    lines
+    found
+}
+
+/// The comparison with requirements in words, a line per limit.
+fn verdicts(all: &Estimate) -> Vec<String> {
+    let found = compared(all);
+    let limits = found.chunk_by(|a, b| (a.of, a.limit) == (b.of, b.limit));
+    let lines = limits.filter_map(|of_limit| {
+        let parts = of_limit.iter().map(|own| match own.verdict {
+            Verdict::Met => format!("{} met", own.key),
+            Verdict::NotMet => format!("{} not met", own.key),
+            Verdict::Undecided { galaxies } => {
+                format!(
+                    "{} undecided (about {galaxies:.1e} galaxies would decide)",
+                    own.key
+                )
+            }
+        });
+        let first = of_limit.first()?;
+        Some(format!(
+            "{}: |{}| below {:e}: {}.",
+            first.names.join(", "),
+            first.of,
+            first.limit,
+            parts.collect::<Vec<_>>().join(", ")
+        ))
+    });
+    lines.collect()
+}
+
+/// The comparison with requirements, a row per quantity and limit.
+fn requirement_table(all: &Estimate) -> Table {
+    let rows = compared(all).into_iter().map(|own| {
+        let Measured { value, error } = own.measured;
+        let (verdict, galaxies) = match own.verdict {
+            Verdict::Met => ("met", f64::NAN),
+            Verdict::NotMet => ("not met", f64::NAN),
+            Verdict::Undecided { galaxies } => ("undecided", galaxies),
+        };
+        vec![
+            Cell::text(&own.key),
+            Cell::with_error(value, Some(error), 6),
+            Cell::text(format!("{:e}", own.limit)),
+            Cell::text(verdict),
+            Cell::number(galaxies, 0),
+            Cell::text(own.sources.join("; ")),
+        ]
+    });
+    Table {
+        title: "Verdict: published requirements at 95 % confidence".into(),
+        rows: rows.collect(),
+        headings: vec![
+            Heading::new("quantity", "Quantity"),
+            Heading::new("value", "Value"),
+            Heading::new("limit", "Largest modulus"),
+            Heading::new("verdict", "Verdict"),
+            Heading::new("deciding", "Galaxies that would decide"),
+            Heading::new("source", "Required by"),
+        ],
+        notes: Vec::new(),
+    }
 }
 
 /// A limit of `--fail-above`.
@@ -299,7 +371,22 @@ pub fn junit(checks: &[Checked]) -> String {
 
 /// Plots of m and c in bins, or of all galaxies, with the tightest published requirements as dashed lines.
 pub fn bias_plot(result: &BiasResult) -> PanelGrid {
-    let plots = ['m', 'c'].map(|of| {
+    let known = |of: char| {
+        let keys = [1, 2].map(|component| format!("{of}{component}"));
+        let mut found = result
+            .bins
+            .iter()
+            .filter_map(|bin| bin.estimate.as_ref().ok());
+        found.any(|found| keys.iter().any(|key| found.value(key).is_some()))
+    };
+    let places = result.bins.iter().filter(|bin| is_shown(result, bin.edges));
+    let (first, last) = places.fold((f64::MAX, f64::MIN), |(first, last), bin| {
+        let at = middle(bin.edges);
+        (first.min(at), last.max(at))
+    });
+    // Points of both components stand side by side.
+    let apart = 0.012 * if last > first { last - first } else { 1.0 };
+    let plots = ['m', 'c'].into_iter().filter(|of| known(*of)).map(|of| {
         let limits = REQUIREMENTS
             .iter()
             .filter(|requirement| requirement.of == of);
@@ -321,7 +408,7 @@ pub fn bias_plot(result: &BiasResult) -> PanelGrid {
                     continue;
                 };
                 (left, right) = (left.min(at), right.max(at));
-                x.push(at);
+                x.push(at + (f64::from(component) - 1.5) * apart);
                 y.push(value);
                 errors.push(error);
             }
@@ -357,7 +444,7 @@ pub fn bias_plot(result: &BiasResult) -> PanelGrid {
     PanelGrid {
         title: "Shear bias".into(),
         columns: 2,
-        plots: plots.into(),
+        plots: plots.collect(),
     }
 }
 
@@ -383,24 +470,17 @@ fn middle(edges: Option<[f64; 2]>) -> f64 {
 pub fn section(result: &BiasResult, table: Table) -> Result<Section, FigureError> {
     let caption = "m and c with standard errors. Dashed: the tightest published requirements.";
     let picture = Picture::draw(&bias_plot(result), PictureFormat::Svg, "bias", caption)?;
-    let meaning = QUANTITIES
-        .iter()
-        .filter(|quantity| table.place(quantity.key).is_some());
-    let meaning: Vec<String> = meaning
-        .map(|quantity| format!("**{}**: {}.", quantity.label, quantity.meaning))
-        .collect();
-    let sources = REQUIREMENTS.map(|requirement| {
-        format!(
-            "{} |{}| < {:e}: {}.",
-            requirement.name, requirement.of, requirement.limit, requirement.source
-        )
-    });
-    let blocks = vec![
-        Block::Figure(picture),
-        Block::Table(table),
-        Block::Text(meaning.join("\n\n")),
-        Block::Text(sources.join("\n\n")),
-    ];
+    let mut blocks = Vec::new();
+    let mut table = table;
+    if let Ok(all) = result.all() {
+        let verdicts = verdicts(all);
+        table.notes.retain(|note| !verdicts.contains(note));
+        let required = requirement_table(all);
+        if !required.rows.is_empty() && result.design != Design::Null {
+            blocks.push(Block::Table(required));
+        }
+    }
+    blocks.extend([Block::Figure(picture), Block::Table(table)]);
     Ok(Section::new("bias", "Shear bias", blocks))
 }
 

@@ -160,14 +160,13 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
             _ => format!("Means over sets {}; {images} images in all.", list.join(", ")),
         },
         definition_note(definition),
-        "ΔQ, ΔQ cal.: difference from the first row on the same images, with a jackknife error if each set has eight images or more. Published: for the challenge's 24 sets of 200 images, not comparable in absolute value.".into(),
+        "ΔQ, ΔQ cal.: difference from the first row on the same images, with a jackknife error if each set has eight images or more.".into(),
     ];
-    lines.extend(unpaired_note(&unpaired));
-    for variant in variants {
-        for line in notes(&variant.sets).iter().chain(&variant.unscored) {
-            lines.push(format!("{}: {line}", variant.name));
-        }
+    if variants.iter().any(|variant| variant.published.is_some()) {
+        lines.push("Published: for the challenge's 24 sets of 200 images, not comparable in absolute value.".into());
     }
+    lines.extend(unpaired_note(&unpaired));
+    lines.extend(notes_of_variants(variants));
     lines.extend(verdict(&by_name(variants)));
     Table {
         title: "Comparison of configurations".into(),
@@ -175,6 +174,25 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
         rows,
         notes: lines,
     }
+}
+
+/// Notes on the sets of each variant. A note on several variants appears once, with their names.
+pub fn notes_of_variants(variants: &[Variant]) -> Vec<String> {
+    let mut found: Vec<(String, Vec<&str>)> = Vec::new();
+    for variant in variants {
+        for line in notes(&variant.sets).iter().chain(&variant.unscored) {
+            match found.iter_mut().find(|(known, _)| known == line) {
+                Some((_, names)) => names.push(&variant.name),
+                None => found.push((line.clone(), vec![&variant.name])),
+            }
+        }
+    }
+    let all = variants.len();
+    let shown = found.into_iter().map(|(line, names)| match names.len() {
+        many if many == all => line,
+        _ => format!("{}: {line}", names.join(", ")),
+    });
+    shown.collect()
 }
 
 /// The metrics that decide between variants: Q, calibrated Q, m and noise, as means over their common sets.

@@ -4,11 +4,14 @@ use std::path::Path;
 
 use crate::score::ScoredSet;
 use crate::views::spectrum;
+use crate::views::verdict::take_verdict;
+use shearq_bias::QUANTITIES;
 use shearq_render::figure::{
     BarGroup, BarPlot, FigureError, HeatMap, LinePlot, PanelGrid, PictureFormat, Series, Style,
 };
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::table::{Cell, Table};
+use shearq_scoring::Metrics;
 
 /// Scores of one configuration with its spectra and the true spectra.
 ///
@@ -37,8 +40,24 @@ pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section,
 ///
 /// # Errors
 /// As [`Picture::draw`].
-pub fn comparison(table: Table, map: &HeatMap) -> Result<Section, FigureError> {
+pub fn comparison(mut table: Table, map: &HeatMap) -> Result<Section, FigureError> {
     let mut blocks = Vec::new();
+    if let Some(verdict) = take_verdict(&mut table.notes) {
+        blocks.push(Block::Text(verdict));
+        if let Some(first) = table.headings.first() {
+            let keys = [
+                first.key,
+                "m_cross",
+                "galaxy_noise",
+                "q_calibrated",
+                "q_calibrated_difference",
+                "q_calibrated_sigma",
+            ];
+            let there = |key: &&str| table.place(key).is_some();
+            let keys: Vec<&str> = keys.into_iter().filter(there).collect();
+            blocks.push(Block::Table(table.part(&keys, "Verdict", &[])));
+        }
+    }
     for (key, caption) in [
         (
             "q_calibrated",
@@ -62,7 +81,7 @@ pub fn comparison(table: Table, map: &HeatMap) -> Result<Section, FigureError> {
         "q-per-set",
         caption,
     )?));
-    blocks.insert(0, Block::Table(table));
+    blocks.push(Block::Table(table));
     Ok(Section::new("comparison", "Comparison", blocks))
 }
 
@@ -85,9 +104,58 @@ pub fn save(
         title: title.into(),
         subtitle: String::new(),
         sections,
+        glossary: glossary(),
         settings: made_by,
     }
     .save(path)
+}
+
+/// Meanings of the columns of tables, by their keys.
+fn glossary() -> Vec<(String, String)> {
+    let metrics = Metrics::ALL.map(|metric| (metric.name, metric.meaning));
+    let estimates = QUANTITIES.map(|quantity| (quantity.key, quantity.meaning));
+    let others = [
+        ("configuration", "The settings of a method, by name."),
+        ("submission", "The settings of a method, by name."),
+        ("set", "The number of a set of images."),
+        (
+            "kind",
+            "What distinguishes the galaxies or the PSF of a set.",
+        ),
+        ("images", "Images of a set."),
+        ("galaxies", "Galaxies without a flag."),
+        ("n", "Galaxies without a flag."),
+        (
+            "n_effective",
+            "(Σw)²/Σw²: as many galaxies of equal weight have the same information.",
+        ),
+        (
+            "units",
+            "Independent units, from which errors are determined.",
+        ),
+        ("bin", "Range of the binned quantity."),
+        (
+            "q_difference",
+            "Difference of Q from the first row on the same images.",
+        ),
+        ("sigma", "The same, divided by its error."),
+        (
+            "q_calibrated_difference",
+            "Difference of calibrated Q from the first row on the same images.",
+        ),
+        ("q_calibrated_sigma", "The same, divided by its error."),
+        (
+            "convention",
+            "Convention of signs and axes in which the ellipticities were scored.",
+        ),
+    ];
+    let mut all: Vec<(String, String)> = Vec::new();
+    for (key, meaning) in metrics.into_iter().chain(others).chain(estimates) {
+        if !all.iter().any(|(known, _)| known == key) {
+            all.push((key.to_owned(), meaning.to_owned()));
+        }
+    }
+    all
 }
 
 fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {

@@ -48,7 +48,7 @@ pub fn panel(
     LinePlot {
         title: title.unwrap_or_default(),
         x_label: "ℓ".into(),
-        y_label: "ℓ²C_ℓ/2π".into(),
+        y_label: "ℓ²C(ℓ)/2π".into(),
         x_log: true,
         y_log: true,
         series,

@@ -12,6 +12,15 @@ const CLEAR: f64 = 3.0;
 /// Most sets whose noise is listed set by set.
 const LISTED: usize = 3;
 
+/// Words of every verdict with metrics.
+const NOISE: &str = ", noise per galaxy after calibration ";
+
+/// Takes the verdict out of the notes of a table.
+pub fn take_verdict(notes: &mut Vec<String>) -> Option<String> {
+    let place = notes.iter().position(|note| note.contains(NOISE))?;
+    Some(notes.remove(place))
+}
+
 /// Which configuration to use, with the decisive metrics; for a single configuration, its metrics. `None` for a single
 /// configuration with an unknown response.
 pub fn verdict<R: Borrow<SetRecord>>(configurations: &[(String, Vec<R>)]) -> Option<String> {
@@ -41,19 +50,17 @@ pub fn verdict<R: Borrow<SetRecord>>(configurations: &[(String, Vec<R>)]) -> Opt
             .map(|(_, rival)| rival)
     };
     let behind = |others: &[R]| difference(Paired::Calibrated, others, sets);
-    let others: Vec<String> = rivals()
-        .map(|(other, others)| {
-            let behind = behind(others).map_or(String::new(), |d| {
-                let lower = Cell::with_error(d.difference, Some(d.error), 1);
-                format!(", lower by {}", lower.in_words())
-            });
-            format!(
-                "; {other} has m = {} and Q calibrated = {}{behind}",
-                shown(others, "m_cross", 2),
-                shown(others, "q_calibrated", 1)
-            )
+    let lower: Vec<String> = rivals()
+        .filter_map(|(other, others)| {
+            let behind = behind(others)?;
+            let by = Cell::with_error(behind.difference, Some(behind.error), 1);
+            Some(format!("that of {other} is lower by {}", by.in_words()))
         })
         .collect();
+    let lower = match lower.is_empty() {
+        true => String::new(),
+        false => format!("; {}", lower.join(", ")),
+    };
     // A configuration without a calibrated Q is not distinguished either.
     let equal: Vec<&str> = rivals()
         .filter(|(_, others)| !behind(others).is_some_and(|d| d.sigma() >= CLEAR))
@@ -97,10 +104,9 @@ pub fn verdict<R: Borrow<SetRecord>>(configurations: &[(String, Vec<R>)]) -> Opt
         ),
     };
     Some(format!(
-        "{lead}: m = {}, noise per galaxy after calibration {noise}, and Q calibrated = {}{}.{warning}",
+        "{lead}: m = {}{NOISE}{noise}, and Q calibrated = {}{lower}.{warning}",
         shown(sets, "m_cross", 2),
         shown(sets, "q_calibrated", 1),
-        others.concat()
     ))
 }
 
@@ -149,7 +155,7 @@ mod tests {
         let clear = verdict(&[configuration("a", 12.0, 20.0, common), better.clone()]).unwrap();
         assert!(clear.starts_with("Use b: m = -0.300 ± 0.010"), "{clear}");
         assert!(
-            clear.contains("Q calibrated = 20.0 ± 2.0, lower by 5.00 ± 0.53"),
+            clear.contains("Q calibrated = 25.0 ± 2.0; that of a is lower by 5.00 ± 0.53."),
             "{clear}"
         );
         assert!(
@@ -168,10 +174,9 @@ mod tests {
             unknown.contains("do not distinguish it from a"),
             "{unknown}"
         );
-        assert!(
-            unknown.contains("a has m = -0.300 ± 0.010 and Q calibrated = unknown"),
-            "{unknown}"
-        );
+        let mut notes = vec!["first".to_owned(), clear.clone(), "last".to_owned()];
+        assert_eq!(take_verdict(&mut notes), Some(clear));
+        assert_eq!(notes, ["first", "last"]);
         let blank = || configuration("a", 9.0, f64::NAN, common);
         let none = verdict(&[blank(), blank()]).unwrap();
         assert_eq!(none, "Not enough data to rank the configurations.");
