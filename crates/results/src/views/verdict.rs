@@ -50,17 +50,18 @@ pub fn verdict<R: Borrow<SetRecord>>(configurations: &[(String, Vec<R>)]) -> Opt
             .map(|(_, rival)| rival)
     };
     let behind = |others: &[R]| difference(Paired::Calibrated, others, sets);
-    let lower: Vec<String> = rivals()
+    let lower = rivals()
         .filter_map(|(other, others)| {
             let behind = behind(others)?;
             let by = Cell::with_error(behind.difference, Some(behind.error), 1);
-            Some(format!("that of {other} is lower by {}", by.in_words()))
+            Some((other, by.in_words()))
         })
-        .collect();
-    let lower = match lower.is_empty() {
-        true => String::new(),
-        false => format!("; {}", lower.join(", ")),
-    };
+        .enumerate()
+        .map(|(k, (other, by))| match k {
+            0 => format!("; {other} is lower by {by}"),
+            _ => format!(", {other} by {by}"),
+        });
+    let lower: String = lower.collect();
     // A configuration without a calibrated Q is not distinguished either.
     let equal: Vec<&str> = rivals()
         .filter(|(_, others)| !behind(others).is_some_and(|d| d.sigma() >= CLEAR))
@@ -155,7 +156,7 @@ mod tests {
         let clear = verdict(&[configuration("a", 12.0, 20.0, common), better.clone()]).unwrap();
         assert!(clear.starts_with("Use b: m = -0.300 ± 0.010"), "{clear}");
         assert!(
-            clear.contains("Q calibrated = 25.0 ± 2.0; that of a is lower by 5.00 ± 0.53."),
+            clear.contains("Q calibrated = 25.0 ± 2.0; a is lower by 5.00 ± 0.53."),
             "{clear}"
         );
         assert!(
