@@ -829,8 +829,7 @@ mod tests {
                 ("seed".into(), NASTY.into()),
                 (NASTY.into(), format!("[a]\nb = \"{NASTY}\"\n")),
             ],
-        }
-    }
+        }, ..Report::default() }
 
     /// Elements as (name, attributes), after checking that they nest, that attributes are quoted and
     /// that no bare `<`, `>` or `&` is in the text between.
