@@ -825,11 +825,13 @@ mod tests {
                 Section::new("settings", "", Vec::new()),
                 Section::new("\" onclick=\"", "", Vec::new()),
             ],
+            glossary: vec![("q".into(), NASTY.into()), ("unused".into(), NASTY.into())],
             settings: vec![
                 ("seed".into(), NASTY.into()),
                 (NASTY.into(), format!("[a]\nb = \"{NASTY}\"\n")),
             ],
-        }, ..Report::default() }
+        }
+    }
 
     /// Elements as (name, attributes), after checking that they nest, that attributes are quoted and
     /// that no bare `<`, `>` or `&` is in the text between.
@@ -885,7 +887,7 @@ mod tests {
         let elements = elements(&page);
         let count = |name: &str| elements.iter().filter(|(n, _)| n == name).count();
         assert_eq!((count("script"), count("style"), count("h1")), (1, 1, 1));
-        assert_eq!((count("table"), count("img"), count("section")), (2, 2, 5));
+        assert_eq!((count("table"), count("img"), count("section")), (2, 2, 6));
         let values = |key: &str| -> Vec<&str> {
             elements
                 .iter()
