@@ -10,7 +10,10 @@ const WAYS: [(&str, &[&str]); 31] = [
     ("quickstart", &["out threads wide"]),
     (
         "simulate",
-        &["sets images grid seed amplitude tilt out shard threads"],
+        &[
+            "sets images grid seed amplitude tilt out shard threads",
+            "sets images grid seed constant-shear opposite rotated out shard threads",
+        ],
     ),
     (
         "gather",

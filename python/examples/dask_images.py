@@ -5,6 +5,7 @@ LocalCluster, and read your own images in `measure`. Run: python dask_images.py 
 """
 
 import argparse
+from typing import Any
 
 import distributed
 import numpy as np
@@ -53,10 +54,10 @@ def main() -> None:
     arguments = options.parse_args()
     galaxies = 30 if arguments.quick else 400
 
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
         with distributed.Client(cluster) as client:
-            parts = client.gather(client.map(measure, range(100), galaxies=galaxies))
-    bias = sum(parts).result()
+            parts: Any = client.gather(client.map(measure, range(100), galaxies=galaxies))
+    bias = shearq.BiasSums.merge(parts).result()
     print(bias)
 
     from matplotlib import pyplot

@@ -5,6 +5,7 @@ simulated. Run: python galsim_stamps.py [--quick] [--out plot.png]
 """
 
 import argparse
+from typing import Any
 
 import galsim
 import numpy as np
@@ -15,16 +16,16 @@ STAMP, SCALE = 48, 0.2  # pixels, arcsec per pixel
 SNR = 40
 
 
-def stamps(shear: float, pairs: int, psf: galsim.GSObject, seed: int) -> np.ndarray:
+def stamps(shear: float, pairs: int, psf: Any, seed: int) -> np.ndarray:
     """Noisy stamps of galaxies and of the same galaxies on their side, under a shear g1."""
     random = np.random.default_rng(seed)
     found = np.empty((2 * pairs, STAMP, STAMP), dtype=np.float32)
     for k in range(pairs):
         radius, angle = random.uniform(0.5, 0.8), random.uniform(0, np.pi)
         offset = random.uniform(-0.5, 0.5, 2)
-        galaxy = galsim.Exponential(half_light_radius=radius).shear(g=0.3, beta=angle * galsim.radians)
+        galaxy: Any = galsim.Exponential(half_light_radius=radius).shear(g=0.3, beta=angle * galsim.radians)
         for turned in (False, True):
-            one = galaxy.rotate(90 * galsim.degrees) if turned else galaxy
+            one: Any = galaxy.rotate(90 * galsim.degrees) if turned else galaxy
             one = galsim.Convolve(one.shear(g1=shear), psf)
             image = one.drawImage(nx=STAMP, ny=STAMP, scale=SCALE, offset=offset).array
             sigma = np.sqrt((image**2).sum()) / SNR
@@ -40,7 +41,7 @@ def main() -> None:
     arguments = options.parse_args()
     pairs = 150 if arguments.quick else 2000
 
-    psf = galsim.Moffat(beta=3, fwhm=0.7).shear(g1=0.02)
+    psf: Any = galsim.Moffat(beta=3, fwhm=0.7).shear(g1=0.02)
     star = psf.drawImage(nx=STAMP, ny=STAMP, scale=SCALE).array
 
     true = np.array([-0.04, -0.02, 0.0, 0.02, 0.04])

@@ -74,6 +74,7 @@ def test_sums_add_up_and_travel(pair):
     parts = [shearq.bias_sums(table, g1=s * 0.02, g2=s * 0.01) for table, s in zip(pair, (1, -1))]
     found = sum(pickle.loads(pickle.dumps(part)) for part in parts).result()
     same(found, whole)
+    same(shearq.BiasSums.merge(parts).result(), whole)
     with pytest.raises(ValueError, match="different options"):
         parts[0] + shearq.bias_sums(pair[1], g1=0.02, g2=0, bins=("snr", [5, 50]))
 

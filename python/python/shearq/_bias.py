@@ -5,15 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Union
+from typing import Any, Literal, Union
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import _display, _shearq
-
-if TYPE_CHECKING:
-    import pandas
 
 Design = Literal["single", "pairs", "arms", "fields", "galaxies", "rotated"]
 Bins = tuple[str, Union[int, Sequence[float]]]
@@ -34,6 +31,9 @@ class Bias:
     """
 
     __slots__ = ("_text", "notes", "rows")
+
+    rows: list[dict[str, Any]]
+    notes: list[str]
 
     def __init__(self, rows: list[dict[str, Any]], notes: list[str], text: str) -> None:
         self.rows = rows
@@ -58,7 +58,7 @@ class Bias:
     def _repr_html_(self) -> str:
         return _display.bias_html(self)
 
-    def to_frame(self) -> pandas.DataFrame:
+    def to_frame(self) -> Any:
         """The rows as a pandas frame."""
         import pandas
 
@@ -86,6 +86,14 @@ class BiasSums:
 
     def __add__(self, other: BiasSums) -> BiasSums:
         return BiasSums(self._sums.append(other._sums))
+
+    @staticmethod
+    def merge(parts: Iterable[BiasSums]) -> BiasSums:
+        """The sums of all parts, in their order."""
+        first, *others = parts
+        for part in others:
+            first = first + part
+        return first
 
     def __radd__(self, other: int) -> BiasSums:
         # sum() begins with 0.
@@ -203,7 +211,7 @@ def bias_sums(
     Bins need edges, because all sums must have the same bins:
 
     >>> sums = client.map(lambda path: shearq.bias_sums(path, g1=0.02, g2=0), paths)
-    >>> sum(client.gather(sums)).result()
+    >>> shearq.BiasSums.merge(client.gather(sums)).result()
     """
     if ellipticity not in (None, "shear", "distortion"):
         raise ValueError(f"ellipticity: found {ellipticity!r}; expected 'shear' or 'distortion'")

@@ -13,7 +13,7 @@ use super::truth::Truth;
 use super::{BiasFailure, Input};
 
 /// Replaces folders of results by their catalogues, in the order of sets and images. Unless `truth` states the true
-/// shear, it is that of the data folders, if they have one.
+/// shear, it is read from the data folders, if they have one.
 ///
 /// # Errors
 /// If a folder is no folder of results, or only some of the data have a true shear.

@@ -119,7 +119,7 @@ impl Truth {
                 Some(positions) => Ok(Some(positions)),
                 None => Err(FileError::new(
                     path,
-                    "the true shear of this catalogue is not known, but that of the folders is. Try: separate commands, or --truth FILE",
+                    "this catalogue has no known true shear, but the folders have one. Try: separate commands, or --truth FILE",
                 )),
             },
             _ => Ok(None),
