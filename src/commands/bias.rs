@@ -16,7 +16,9 @@ use shearq_results::bias::expression::Expression;
 use shearq_results::bias::folders;
 use shearq_results::bias::truth::Truth;
 use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, sum};
-use shearq_results::views::bias::{Limit, bias_plot, bias_table, check, junit, section};
+use shearq_results::views::bias::{
+    Limit, bias_plot, bias_table, check, compared_table, junit, section,
+};
 use shearq_submissions::EllipticityType;
 
 /// Multiplicative and additive bias (m and c) of any program's catalogues.
@@ -37,6 +39,10 @@ pub(crate) struct Arguments {
         conflicts_with = "merge"
     )]
     catalogues: Vec<PathBuf>,
+    /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
+    /// difference, with paired errors.
+    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["merge", "sums", "shard", "bootstrap", "seed", "fail_above", "junit", "plot", "path"])]
+    against: Vec<PathBuf>,
     /// True g1 of all catalogues.
     #[arg(long, value_name = "G1", allow_negative_numbers = true, requires = "g2", conflicts_with_all = ["truth", "merge"])]
     g1: Option<f64>,
@@ -194,7 +200,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         PictureFormat::of(plot)?;
     }
     let summed = match arguments.merge.as_slice() {
-        [] => of_catalogues(arguments)?,
+        [] => of_catalogues(arguments, &arguments.catalogues)?,
         files => merged(files)?,
     };
     if let Some(path) = &arguments.sums {
@@ -215,6 +221,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         result => result?,
     };
+    if !arguments.against.is_empty() {
+        let other = of_catalogues(arguments, &arguments.against)?;
+        let difference = summed.difference(&other)?;
+        let table = compared_table(&result, &other.result(errors)?, &difference);
+        return arguments.printing.print(&table);
+    }
     let table = bias_table(&result);
     arguments.printing.check(&table)?;
     if let Some(plot) = &arguments.plot {
@@ -270,7 +282,7 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
     made_by
 }
 
-fn of_catalogues(arguments: &Arguments) -> anyhow::Result<Summed> {
+fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {
     let mut names = Names::default();
     for text in &arguments.columns {
         names.add(text).map_err(anyhow::Error::msg)?;
@@ -299,7 +311,7 @@ fn of_catalogues(arguments: &Arguments) -> anyhow::Result<Summed> {
             "--shard: all shards need the same bins (found a number of bins, expected edges). Try: --bins 'snr:5,10,20'"
         );
     }
-    let (catalogues, truth) = folders::expand(&arguments.catalogues, truth)?;
+    let (catalogues, truth) = folders::expand(catalogues, truth)?;
     let request = Request {
         catalogues,
         names,

@@ -38,10 +38,10 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "G1,G2", allow_hyphen_values = true, value_parser = parse_shear, conflicts_with_all = ["amplitude", "tilt"])]
     constant_shear: Vec<[f64; 2]>,
     /// Also simulate the galaxies under the opposite shear.
-    #[arg(long, requires = "constant_shear")]
+    #[arg(long, requires = "constant_shear", conflicts_with_all = ["amplitude", "tilt"])]
     opposite: bool,
     /// Also simulate the galaxies rotated by 90 degrees.
-    #[arg(long, requires = "constant_shear")]
+    #[arg(long, requires = "constant_shear", conflicts_with_all = ["amplitude", "tilt"])]
     rotated: bool,
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]

@@ -672,3 +672,34 @@ fn folders_of_constant_shear_are_recognised_as_pairs() {
     );
     assert!(message.contains("asked for twice"), "{message}");
 }
+
+/// Two programs that measure the same galaxies with the same intrinsic scatter differ by less than either is uncertain.
+#[test]
+fn differences_of_two_programs_have_paired_errors() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, change: f64| {
+        let mut columns = complete(galaxies(7, [0.03, 0.01]), [0.03, 0.01]);
+        columns[1].1.iter_mut().for_each(|e| *e += change);
+        let path = folder.path().join(name);
+        csv(&path, &columns);
+        path.display().to_string()
+    };
+    let (first, second) = (write("a.csv", 0.0), write("b.csv", 0.008));
+    let found = rows(&[&first, "--against", &second]);
+    let value = |row: usize, key: &str| found[row][key].as_f64().unwrap();
+    assert_eq!(found.len(), 3);
+    assert_eq!(found[2]["of"], "difference");
+    // e1 of the second is higher by 0.008, which is a shear of 0.01 after division by the response of 0.8: a third of
+    // the true shear.
+    let (m, error) = (value(2, "m1"), value(2, "m1_error"));
+    assert!((m + 1.0 / 3.0).abs() < 5.0 * error + 0.01, "{m} {error}");
+    assert!((value(0, "m1") - value(1, "m1") - m).abs() < 1e-12);
+    // The scatter of 0.2 is common; only the response scatters.
+    assert!(error < 0.1 * value(0, "m1_error"), "{error}");
+    assert!(value(2, "m2").abs() < 1e-12 && value(2, "m2_error") < 1e-12);
+    // Edges of equally many galaxies agree for a column that both share.
+    let binned = rows(&[&first, "--against", &second, "--bins", "snr:3"]);
+    assert_eq!(binned.len(), 12);
+    let message = fail(&["bias", &first, "--against", &second, "--bins", "e1:3"]);
+    assert!(message.contains("truth or bins differ"), "{message}");
+}

@@ -154,6 +154,53 @@ pub fn estimate(
     })
 }
 
+/// Differences of the estimates of two programs on the same galaxies: those of `sums` minus those of `other`. The
+/// jackknife leaves out a unit of both, so what both have in common cancels in the errors.
+///
+/// # Errors
+/// As [`estimate`], of either program.
+pub fn difference(
+    sums: &UnitSums,
+    other: &UnitSums,
+    bin: usize,
+    truth: bool,
+) -> Result<Estimate, BiasError> {
+    let first = estimate(sums, bin, truth, Errors::Jackknife)?;
+    let second = estimate(other, bin, truth, Errors::Jackknife)?;
+    let units = sums.pairs_with(other, bin);
+    let plan_of = |place: usize, sums: &UnitSums| {
+        let mut total = vec![0.0; sums.layout().len()];
+        for unit in units.iter().filter_map(|pair| pair[place].as_deref()) {
+            add(&mut total, unit);
+        }
+        (Plan::new(sums.layout(), &total, truth), total)
+    };
+    let both = [plan_of(0, sums), plan_of(1, other)];
+    let without = |pair: Option<&[Option<Vec<f64>>; 2]>| -> Estimates {
+        let [a, b] = [0, 1].map(|place| {
+            let (plan, total) = &both[place];
+            let mut rest = total.clone();
+            if let Some(unit) = pair.and_then(|pair| pair[place].as_ref()) {
+                for (rest, unit) in rest.iter_mut().zip(unit) {
+                    *rest -= unit;
+                }
+            }
+            plan.estimates(&rest)
+        });
+        std::array::from_fn(|k| a[k] - b[k])
+    };
+    let left_out: Vec<Estimates> = units.iter().map(|pair| without(Some(pair))).collect();
+    let n = units.len() as f64;
+    Ok(Estimate {
+        galaxies: first.galaxies.min(second.galaxies),
+        effective: first.effective.min(second.effective),
+        units: units.len(),
+        values: without(None),
+        errors: squares(&left_out).map(|sum| ((n - 1.0) / n * sum).sqrt()),
+        assumes_no_c: [0, 1].map(|k| first.assumes_no_c[k] || second.assumes_no_c[k]),
+    })
+}
+
 /// Standard errors from leaving out each unit: (n − 1)/n Σ (θ − ⟨θ⟩)².
 fn jackknife(plan: &Plan, total: &[f64], units: &[&[f64]]) -> Estimates {
     let mut rest = vec![0.0; total.len()];

@@ -33,7 +33,7 @@ mod verdict;
 
 pub use design::{Catalogue, Design, Grouping, Range, group};
 pub use error::BiasError;
-pub use estimate::{Errors, Estimate, Measured, QUANTITIES, Quantity, estimate};
+pub use estimate::{Errors, Estimate, Measured, QUANTITIES, Quantity, difference, estimate};
 pub use sums::{Layout, Row, VERSIONS, Version};
 pub use units::UnitSums;
 pub use verdict::{REQUIREMENTS, Requirement, Verdict, student_t, verdict};

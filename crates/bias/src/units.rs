@@ -213,6 +213,25 @@ impl UnitSums {
             .collect()
     }
 
+    /// The sums of each unit of a bin in these and other sums, whose units have the same names. `None` if a unit has no
+    /// galaxy.
+    pub(crate) fn pairs_with(&self, other: &UnitSums, bin: usize) -> Vec<[Option<Vec<f64>>; 2]> {
+        let shift = self.shift.max(other.shift);
+        let mut pairs: BTreeMap<(u32, u64), [Option<Vec<f64>>; 2]> = BTreeMap::new();
+        for (place, sums) in [self, other].into_iter().enumerate() {
+            let mut sums = sums.clone();
+            sums.coarsen(shift);
+            let length = sums.layout.len();
+            for (unit, all) in &sums.units {
+                let own = &all[bin * length..(bin + 1) * length];
+                if own.iter().any(|sum| *sum != 0.0) {
+                    pairs.entry(*unit).or_default()[place] = Some(own.to_vec());
+                }
+            }
+        }
+        pairs.into_values().collect()
+    }
+
     /// The same sums with all bins joined to one.
     pub fn all_bins(&self) -> Self {
         let length = self.layout.len();

@@ -14,7 +14,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
-    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, UnitSums, estimate, group,
+    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, UnitSums, difference,
+    estimate, group,
 };
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
@@ -131,6 +132,12 @@ pub struct Summed {
     /// Text of the binned expression.
     binned: String,
     edges: Vec<f64>,
+}
+
+/// Sums whose units are joined.
+struct Grouped {
+    grouping: Grouping,
+    design: Design,
 }
 
 /// Estimates of one bin.
@@ -460,22 +467,14 @@ impl Summed {
     /// # Errors
     /// If no galaxy counts, an ellipticity is constant, the mean response is too close to zero, or the ellipticities do
     /// not follow the true shear.
-    pub fn result(self, errors: Errors) -> Result<BiasResult, BiasFailure> {
-        self.check_values()?;
-        let design = self
-            .design
-            .unwrap_or_else(|| Design::of(&self.catalogues, self.truth));
+    pub fn result(&self, errors: Errors) -> Result<BiasResult, BiasFailure> {
+        let own = self.grouped()?;
         let Grouping {
             sums,
             unit,
             misaligned,
-        } = group(
-            self.sums,
-            &self.catalogues,
-            design,
-            self.by_key,
-            self.matched,
-        );
+        } = own.grouping;
+        let design = own.design;
         let all = estimate(&sums.all_bins(), 0, self.truth, errors)?;
         check_slopes(&all, self.response)?;
         let mut bins = vec![BinResult {
@@ -490,12 +489,72 @@ impl Summed {
         }
         Ok(BiasResult {
             bins,
-            binned: self.binned,
+            binned: self.binned.clone(),
             design,
             unit,
             misaligned,
-            catalogues: self.catalogues,
-            program: self.program,
+            catalogues: self.catalogues.clone(),
+            program: self.program.clone(),
+        })
+    }
+
+    /// Units and design, if the values are usable.
+    fn grouped(&self) -> Result<Grouped, BiasFailure> {
+        self.check_values()?;
+        let design = self
+            .design
+            .unwrap_or_else(|| Design::of(&self.catalogues, self.truth));
+        let grouping = group(
+            self.sums.clone(),
+            &self.catalogues,
+            design,
+            self.by_key,
+            self.matched,
+        );
+        Ok(Grouped { grouping, design })
+    }
+
+    /// Differences of the estimates from `other`, of another program on the same galaxies, with paired errors.
+    ///
+    /// # Errors
+    /// As [`Summed::result`], or if the options or the designs differ.
+    pub fn difference(&self, other: &Summed) -> Result<BiasResult, BiasFailure> {
+        if (&self.binned, &self.edges, self.truth) != (&other.binned, &other.edges, other.truth) {
+            return Err(BiasFailure::Data(
+                "the catalogues cannot be compared: truth or bins differ. Try: bins with edges"
+                    .into(),
+            ));
+        }
+        let (own, theirs) = (self.grouped()?, other.grouped()?);
+        let units = [own.grouping.unit, theirs.grouping.unit];
+        if own.design != theirs.design || units[0] != units[1] {
+            return Err(BiasFailure::Data(format!(
+                "the catalogues cannot be compared (found {} with {} and {} with {}, expected the same design and units). Try: --design and --units",
+                own.design.name(),
+                units[0],
+                theirs.design.name(),
+                units[1]
+            )));
+        }
+        let (a, b) = (&own.grouping.sums, &theirs.grouping.sums);
+        let mut bins = vec![BinResult {
+            edges: None,
+            estimate: Ok(difference(&a.all_bins(), &b.all_bins(), 0, self.truth)?),
+        }];
+        for (bin, edges) in self.edges.windows(2).enumerate() {
+            bins.push(BinResult {
+                edges: Some([edges[0], edges[1]]),
+                estimate: difference(a, b, bin, self.truth),
+            });
+        }
+        Ok(BiasResult {
+            bins,
+            binned: self.binned.clone(),
+            design: own.design,
+            unit: units[0],
+            misaligned: own.grouping.misaligned || theirs.grouping.misaligned,
+            catalogues: self.catalogues.clone(),
+            program: format!("{} minus {}", self.program, other.program),
         })
     }
 

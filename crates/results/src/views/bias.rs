@@ -82,6 +82,47 @@ pub fn bias_table(result: &BiasResult) -> Table {
     }
 }
 
+/// The tables of two programs and of their difference as one table, whose first column names the program.
+pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &BiasResult) -> Table {
+    let parts = [
+        ("catalogues", first),
+        ("against", second),
+        ("difference", difference),
+    ];
+    let tables = parts.map(|(name, result)| (name, bias_table(result)));
+    // The first table may lack columns that another has.
+    let mut headings: Vec<Heading> = vec![Heading::new("of", "Of")];
+    for heading in tables.iter().flat_map(|(_, table)| &table.headings) {
+        if !headings.iter().any(|own| own.key == heading.key) {
+            headings.push(heading.clone());
+        }
+    }
+    let mut rows = Vec::new();
+    for (name, table) in &tables {
+        let places: Vec<Option<usize>> = headings[1..]
+            .iter()
+            .map(|heading| table.place(heading.key))
+            .collect();
+        for row in &table.rows {
+            let cells = places.iter().map(|place| match place {
+                Some(place) => row[*place].clone(),
+                None => Cell::Empty,
+            });
+            rows.push([Cell::text(*name)].into_iter().chain(cells).collect());
+        }
+    }
+    let [(_, mut table), _, _] = tables;
+    table.notes.push(format!(
+        "Difference: {}, with errors from leaving out the same units of both.",
+        difference.program
+    ));
+    Table {
+        headings,
+        rows,
+        ..table
+    }
+}
+
 /// A bin in words.
 fn label(result: &BiasResult, [low, high]: [f64; 2]) -> String {
     // Four significant digits.
