@@ -13,8 +13,8 @@ use shearq_quantities::Distortion;
 use super::Input;
 use super::columns::{Columns, Names, Preset, Role};
 use super::expression::Expression;
-use super::positions::Positions;
-use super::truth::{self, Truth};
+use super::positions::{self, Positions};
+use super::truth::Truth;
 
 /// How catalogues are read.
 #[derive(Debug, Clone)]
@@ -498,7 +498,7 @@ impl<'a> Part<'a> {
             }
             found => found.map_err(&fault)?,
         };
-        truth::check(g).map_err(&fault)?;
+        positions::check(g).map_err(&fault)?;
         if self.reading.flip_g2 {
             g[1] = -g[1];
         }

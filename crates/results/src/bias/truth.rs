@@ -9,7 +9,7 @@ use shearq_files::open::{SETTINGS, read_to_string};
 use shearq_files::table::{self, MAX_ROWS, Place};
 use shearq_scoring::TruthSign;
 
-use super::positions::Positions;
+use super::positions::{Positions, check};
 
 /// Where the true shear comes from.
 #[derive(Debug, Clone, Default)]
@@ -125,17 +125,6 @@ impl Truth {
             _ => Ok(None),
         }
     }
-}
-
-/// Refuses what is no shear.
-pub(crate) fn check([g1, g2]: [f64; 2]) -> Result<(), String> {
-    // Without the square root: this is checked in every row.
-    if g1 * g1 + g2 * g2 < 1.0 {
-        return Ok(());
-    }
-    Err(format!(
-        "this is no shear (found g1 {g1} and g2 {g2}, expected a modulus below 1)"
-    ))
 }
 
 /// A text table of catalogues with their shears.
