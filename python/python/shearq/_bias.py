@@ -208,10 +208,12 @@ def bias_sums(
 ) -> BiasSums:
     """Sums of catalogues, to be added to those of other catalogues; the parameters are those of ``bias``.
 
-    Bins need edges, because all sums must have the same bins:
+    Bins need edges, because all sums must have the same bins. Sums of two catalogues, as two workers would return them:
 
-    >>> sums = client.map(lambda path: shearq.bias_sums(path, g1=0.02, g2=0), paths)
-    >>> shearq.BiasSums.merge(client.gather(sums)).result()
+    >>> plus = shearq.bias_sums({"e1": [0.03, 0.01, 0.02], "e2": [0.01, -0.01, 0.01]}, g1=0.02, g2=0.0)
+    >>> minus = shearq.bias_sums({"e1": [-0.01, -0.03, -0.02], "e2": [0.01, -0.01, 0.01]}, g1=-0.02, g2=0.0)
+    >>> round(abs(shearq.BiasSums.merge([plus, minus]).result()["m1"]), 6)
+    0.0
     """
     if ellipticity not in (None, "shear", "distortion"):
         raise ValueError(f"ellipticity: found {ellipticity!r}; expected 'shear' or 'distortion'")
