@@ -1,6 +1,6 @@
 //! Sums per unit and bin, in bounded memory.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
 use serde::{Deserialize, Serialize};
 
@@ -30,7 +30,7 @@ pub struct UnitSums {
     shift: u32,
     units: Vec<((u32, u64), Vec<f64>)>,
     #[serde(skip)]
-    places: BTreeMap<(u32, u64), usize>,
+    places: HashMap<(u32, u64), usize>,
     #[serde(skip)]
     last: Option<((u32, u64), usize)>,
 }
@@ -44,7 +44,7 @@ impl UnitSums {
             catalogues,
             shift: 0,
             units: Vec::new(),
-            places: BTreeMap::new(),
+            places: HashMap::new(),
             last: None,
         }
     }
