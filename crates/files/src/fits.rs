@@ -1,4 +1,4 @@
-//! FITS images by strips of rows, and FITS binary tables. The only user of cfitsio.
+//! FITS images by strips of rows, and FITS binary tables. The only user of cfitsio, which only reads.
 //!
 //! cfitsio must not be called from several threads at a time, so every call goes through one lock. Images
 //! are read and written row by row in FITS order: the first row of the file is y = 1, row-major.
@@ -7,6 +7,7 @@
 mod cards;
 mod cfitsio;
 mod file;
+mod header;
 mod read;
 mod source;
 mod streams;
@@ -14,5 +15,6 @@ mod tiles;
 mod tiling;
 mod write;
 
+pub use header::Value;
 pub use read::{ImageReader, TableHead, read_table, read_table_keys, read_table_parts, tables};
-pub use write::{ImageWriter, Value, write_table};
+pub use write::{ImageWriter, write_table};

@@ -36,9 +36,9 @@ mod sun;
 mod vector;
 
 pub use descent::{Descent, Stop};
+/// Number types the network runs in: `f32` in a measurement, `f64` to tell rounding from mistakes.
+pub use kernel::Wide;
 pub use network::{Network, NetworkScratch, psf_factor};
 pub use reference::{Matrices, convolve};
 pub use rule::{Rule, Step};
 pub use spectral::{Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
-/// Number types the network runs in: `f32` in a measurement, `f64` to tell rounding from mistakes.
-pub use vector::Wide;

@@ -24,6 +24,7 @@ mod bar;
 mod colour;
 mod heat;
 mod image;
+mod layout;
 mod legend;
 mod line;
 mod scene;

@@ -1,39 +1,18 @@
-//! Writing FITS files. cfitsio makes headers and tables in memory. The standard library writes the bytes to disk, because
-//! it reports every write that fails.
+//! Writing FITS files, without cfitsio: bytes go through the standard library, which reports every write that fails.
 
-use std::ffi::{CStr, CString, c_int};
 use std::fs::File;
 use std::io::Write;
 use std::path::Path;
-use std::ptr;
 
 use crate::frames::polars::{Column, DataFrame};
 use crate::frames::reals;
-use fitsio::FitsFile;
-use fitsio::hdu::FitsHdu;
-use fitsio::images::{ImageDescription, ImageType};
-use fitsio::sys;
-use fitsio::tables::{ColumnDataType, ColumnDescription};
 
-use super::cfitsio::{self, lock};
+use super::header::{BLOCK, Header, Value};
 use crate::atomic::{self, PartFile};
 use crate::error::FileError;
 
-/// Bytes of a block: headers and data each fill whole ones.
-const BLOCK: usize = 2880;
-/// A file of cfitsio's that is not on disk.
-const IN_MEMORY: &str = "mem://";
-
-/// A header value to write.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Value {
-    /// Whole number.
-    Int(i64),
-    /// Real number.
-    Real(f64),
-    /// Text, at most 68 characters.
-    Text(String),
-}
+/// Most columns of a table (FITS standard 4.0, section 7).
+const MOST_COLUMNS: usize = 999;
 
 /// An image being written.
 pub struct ImageWriter {
@@ -142,124 +121,64 @@ impl ImageWriter {
 }
 
 /// The error for a file `path` that cannot be written.
-fn cannot(path: &Path) -> impl Fn(fitsio::errors::Error) -> FileError {
-    move |error| FileError::new(path, format!("cannot write the file: {}", describe(error)))
+fn cannot(path: &Path) -> impl Fn(String) -> FileError {
+    move |error| FileError::new(path, format!("cannot write the file: {error}"))
 }
 
 /// The blocks of the header of an image of `sides` = [columns, rows] 32-bit floats.
-fn image_header(sides: [usize; 2], header: &[(&str, Value)]) -> fitsio::errors::Result<Vec<u8>> {
-    let _guard = lock();
-    let description = ImageDescription {
-        data_type: ImageType::Float,
-        dimensions: &[sides[1], sides[0]],
-    };
-    let mut file = FitsFile::create(IN_MEMORY)
-        .with_custom_primary(&description)
-        .open()?;
-    let hdu = file.primary_hdu()?;
-    write_header(&mut file, &hdu, header)?;
-    header_blocks(&mut file)
-}
-
-/// The blocks of the header in use.
-fn header_blocks(file: &mut FitsFile) -> fitsio::errors::Result<Vec<u8>> {
-    let (mut status, mut keys, mut text) = (0, 0, ptr::null_mut());
-    // SAFETY: the file is open. Flushed, it counts its rows in the header. cfitsio makes the text, which ends in a zero
-    // byte, and frees it on request.
-    let mut cards = unsafe {
-        sys::ffflus(file.as_raw(), &mut status);
-        sys::ffhdr2str(
-            file.as_raw(),
-            0,
-            ptr::null_mut(),
-            0,
-            &mut text,
-            &mut keys,
-            &mut status,
-        );
-        fitsio::errors::check_status(status)?;
-        let cards = CStr::from_ptr(text).to_bytes().to_vec();
-        sys::fffree(text.cast(), &mut status);
-        cards
-    };
-    cards.resize(cards.len().next_multiple_of(BLOCK), b' ');
-    Ok(cards)
-}
-
-/// Longest text on a single card.
-const SHORT: usize = 68;
-
-fn write_header(
-    file: &mut FitsFile,
-    hdu: &FitsHdu,
-    header: &[(&str, Value)],
-) -> fitsio::errors::Result<()> {
-    for (key, value) in header {
-        match value {
-            Value::Int(v) => hdu.write_key(file, key, *v)?,
-            Value::Real(v) => write_real(file, key, *v)?,
-            Value::Text(v) if v.len() > SHORT => write_long(file, key, v)?,
-            Value::Text(v) => hdu.write_key(file, key, v.as_str())?,
-        }
+fn image_header(sides: [usize; 2], keys: &[(&str, Value)]) -> Result<Vec<u8>, String> {
+    let mut header = Header::primary(-32, &sides);
+    header.text("EXTNAME", "_PRIMARY", "")?;
+    for (key, value) in keys {
+        header.add(key, value)?;
     }
-    Ok(())
-}
-
-/// Writes a text to the header in use, on as many CONTINUE cards as it takes.
-fn write_long(file: &mut FitsFile, key: &str, value: &str) -> fitsio::errors::Result<()> {
-    let (name, value) = (CString::new(key)?, CString::new(value)?);
-    let mut status = 0;
-    // SAFETY: the file is open, name and value end in a zero byte, and there is no comment.
-    unsafe {
-        sys::ffpkls(
-            file.as_raw(),
-            name.as_ptr(),
-            value.as_ptr(),
-            ptr::null(),
-            &mut status,
-        );
-    }
-    fitsio::errors::check_status(status)
-}
-
-/// Writes a real number to the header in use with all its digits; [`FitsHdu::write_key`] keeps fifteen.
-fn write_real(file: &mut FitsFile, key: &str, value: f64) -> fitsio::errors::Result<()> {
-    /// Significant digits that distinguish any two numbers; negative if leading zeros do not count.
-    const DIGITS: c_int = -17;
-    let name = CString::new(key)?;
-    let mut status = 0;
-    // SAFETY: the file is open, the name ends in a zero byte, and there is no comment.
-    unsafe {
-        fitsio::sys::ffpkyd(
-            file.as_raw(),
-            name.as_ptr(),
-            value,
-            DIGITS,
-            ptr::null(),
-            &mut status,
-        );
-    }
-    fitsio::errors::check_status(status)
+    Ok(header.blocks())
 }
 
 /// Values of a column in the types that are written.
 enum Values {
     Real(Vec<f64>),
     Whole(Vec<i64>),
-    Text(Vec<String>),
+    Text(Vec<String>, usize),
 }
 
 impl Values {
     fn of(column: &Column) -> Self {
         let series = column.as_materialized_series();
-        if let Ok(whole) = series.i64() {
+        if let Ok(whole) = series.i64()
+            && whole.null_count() == 0
+        {
             return Values::Whole(whole.iter().flatten().collect());
         }
         match reals(column) {
             Some(values) => Values::Real(values.into_owned()),
             None => {
                 let words = series.str().into_iter().flat_map(|words| words.iter());
-                Values::Text(words.map(|word| word.unwrap_or("").to_owned()).collect())
+                let words: Vec<String> = words.map(|word| word.unwrap_or("").to_owned()).collect();
+                let longest = words.iter().map(String::len).max().unwrap_or(0).max(1);
+                Values::Text(words, longest)
+            }
+        }
+    }
+
+    /// Bytes per row, the format's letter with its count, and its name.
+    fn format(&self) -> (usize, String, &'static str) {
+        match self {
+            Values::Real(_) => (size_of::<f64>(), "1D".into(), "8-byte DOUBLE"),
+            Values::Whole(_) => (size_of::<i64>(), "1K".into(), "8-byte INTEGER"),
+            Values::Text(_, longest) => (*longest, format!("{longest}A"), "ASCII Character"),
+        }
+    }
+
+    /// Appends the value of a row as it stands in the file: big-endian numbers, texts with spaces at their end.
+    fn append(&self, row: usize, bytes: &mut Vec<u8>) {
+        match self {
+            Values::Real(values) => bytes.extend(values[row].to_be_bytes()),
+            Values::Whole(values) => bytes.extend(values[row].to_be_bytes()),
+            Values::Text(words, longest) => {
+                let end = bytes.len() + longest;
+                bytes.extend(words[row].as_bytes());
+                bytes.resize(end, b' ');
             }
         }
     }
@@ -279,58 +198,72 @@ pub fn write_table(
     atomic::write(path, &bytes)
 }
 
-fn table_bytes(table: &DataFrame, header: &[(&str, Value)]) -> fitsio::errors::Result<Vec<u8>> {
-    let _guard = lock();
-    let mut file = FitsFile::create(IN_MEMORY).open()?;
-    let mut bytes = header_blocks(&mut file)?;
+fn table_bytes(table: &DataFrame, keys: &[(&str, Value)]) -> Result<Vec<u8>, String> {
+    if table.width() > MOST_COLUMNS {
+        return Err(format!(
+            "the table has {} columns; FITS allows {MOST_COLUMNS}",
+            table.width()
+        ));
+    }
     let columns: Vec<(&str, Values)> = table
         .columns()
         .iter()
         .map(|column| (column.name().as_str(), Values::of(column)))
         .collect();
-    let mut descriptions = Vec::new();
-    let mut width = 0;
-    for (name, values) in &columns {
-        let mut description = ColumnDescription::new(*name);
-        let (kind, each) = match values {
-            Values::Real(_) => (ColumnDataType::Double, size_of::<f64>()),
-            Values::Whole(_) => (ColumnDataType::LongLong, size_of::<i64>()),
-            Values::Text(words) => {
-                let longest = words.iter().map(String::len).max().unwrap_or(0).max(1);
-                description.that_repeats(longest);
-                (ColumnDataType::String, longest)
-            }
-        };
-        width += each;
-        descriptions.push(description.with_type(kind).create()?);
+    let width: usize = columns.iter().map(|(_, values)| values.format().0).sum();
+    let mut bytes = Header::primary(8, &[]).blocks();
+    bytes.extend(table_header(&columns, width, table.height(), keys)?);
+    let start = bytes.len();
+    bytes.reserve(width * table.height() + BLOCK);
+    for row in 0..table.height() {
+        for (_, values) in &columns {
+            values.append(row, &mut bytes);
+        }
     }
-    let hdu = file.create_table("CATALOGUE", &descriptions)?;
-    for (name, values) in &columns {
-        match values {
-            Values::Real(values) => hdu.write_col(&mut file, *name, values),
-            Values::Whole(values) => hdu.write_col(&mut file, *name, values),
-            Values::Text(values) => hdu.write_col(&mut file, *name, values),
-        }?;
-    }
-    write_header(&mut file, &hdu, header)?;
-    bytes.extend(header_blocks(&mut file)?);
-    let mut data = vec![0; width * table.height()];
-    let mut status = 0;
-    // SAFETY: the file is open at the table, of whose rows `data` has room for all bytes.
-    unsafe {
-        sys::ffgtbb(
-            file.as_raw(),
-            1,
-            1,
-            i64::try_from(data.len()).unwrap_or(i64::MAX),
-            data.as_mut_ptr(),
-            &mut status,
-        );
-    }
-    fitsio::errors::check_status(status)?;
-    data.resize(data.len().next_multiple_of(BLOCK), 0);
-    bytes.extend(data);
+    let data = bytes.len() - start;
+    bytes.resize(start + data.next_multiple_of(BLOCK), 0);
     Ok(bytes)
+}
+
+/// The blocks of the header of a binary table with rows of `width` bytes (FITS standard 4.0, section 7.3).
+fn table_header(
+    columns: &[(&str, Values)],
+    width: usize,
+    rows: usize,
+    keys: &[(&str, Value)],
+) -> Result<Vec<u8>, String> {
+    let mut header = Header::default();
+    header.text("XTENSION", "BINTABLE", "binary table extension")?;
+    header.count("BITPIX", 8, "8-bit bytes");
+    header.count("NAXIS", 2, "2-dimensional binary table");
+    header.count("NAXIS1", width, "width of table in bytes");
+    header.count("NAXIS2", rows, "number of rows in table");
+    header.count("PCOUNT", 0, "size of special data area");
+    header.count("GCOUNT", 1, "one data group (required keyword)");
+    header.count("TFIELDS", columns.len(), "number of fields in each row");
+    for (k, (name, values)) in columns.iter().enumerate() {
+        let k = k + 1;
+        let (_, code, kind) = values.format();
+        header.text(
+            &format!("TTYPE{k}"),
+            name,
+            &format!("label for field {k:>3}"),
+        )?;
+        header.text(
+            &format!("TFORM{k}"),
+            &code,
+            &format!("data format of field: {kind}"),
+        )?;
+    }
+    header.text(
+        "EXTNAME",
+        "CATALOGUE",
+        "name of this binary table extension",
+    )?;
+    for (key, value) in keys {
+        header.add(key, value)?;
+    }
+    Ok(header.blocks())
 }
 
 /// Refuses names that cfitsio does not treat as plain: those with `[...]`, `(...)`, a leading `!` or `-`, or a trailing `+n`.
@@ -354,10 +287,69 @@ fn plain_name(path: &Path) -> Result<(), FileError> {
     Ok(())
 }
 
-/// The text of an error of the crate `fitsio`.
-fn describe(error: fitsio::errors::Error) -> String {
-    match error {
-        fitsio::errors::Error::Fits(e) => cfitsio::describe(e.status),
-        other => other.to_string(),
+#[cfg(test)]
+mod tests {
+    use super::super::{read_table, read_table_keys};
+    use super::*;
+    use crate::frames::polars::{NamedFrom, Series};
+
+    #[test]
+    fn a_table_of_all_kinds_of_columns_is_read_back() {
+        let columns = vec![
+            Column::from(Series::new("id".into(), [1_i64, i64::MIN, i64::MAX])),
+            Column::from(Series::new("x".into(), [1.5_f64, f64::NAN, -1e-300])),
+            Column::from(Series::new("bulge".into(), [1.5_f32, 2.0, -1e30])),
+            Column::from(Series::new("missing".into(), [Some(7_i64), None, Some(9)])),
+            Column::from(Series::new("name".into(), ["a", "", "long words"])),
+        ];
+        let table = DataFrame::new(3, columns).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        for rows in [0, 1, 3] {
+            let path = folder.path().join(format!("{rows}.fits"));
+            let table = table.head(Some(rows));
+            let note = "word ".repeat(40);
+            let header = [("NOTE", Value::Text(note.clone()))];
+            write_table(&path, &table, &header).unwrap();
+            assert_eq!(path.metadata().unwrap().len() as usize % BLOCK, 0);
+            let names = ["id", "x", "bulge", "missing"];
+            let read = read_table(&path, Some(&names), None).unwrap();
+            assert_eq!(read.height(), rows);
+            for name in names {
+                let bits = |frame: &DataFrame| -> Vec<u64> {
+                    let column = frame.column(name).unwrap();
+                    reals(column)
+                        .unwrap()
+                        .iter()
+                        .map(|value| value.to_bits())
+                        .collect()
+                };
+                assert_eq!(bits(&read), bits(&table), "{name}");
+            }
+            let keys = ["NOTE".to_owned()];
+            assert_eq!(
+                read_table_keys(&path, keys.iter()).unwrap()["NOTE"].trim_end(),
+                note.trim_end()
+            );
+        }
+    }
+
+    #[test]
+    fn what_fits_does_not_allow_is_refused_and_leaves_no_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("table.fits");
+        let column = |name: String| Column::from(Series::new(name.into(), [1.0_f64]));
+        let many = (0..=MOST_COLUMNS)
+            .map(|k| column(format!("c{k}")))
+            .collect();
+        let many = DataFrame::new(1, many).unwrap();
+        let found = write_table(&path, &many, &[]).unwrap_err().to_string();
+        assert!(found.contains("1000 columns; FITS allows 999"), "{found}");
+        let named = DataFrame::new(1, vec![column("größe".into())]).unwrap();
+        let found = write_table(&path, &named, &[]).unwrap_err().to_string();
+        assert!(
+            found.contains("'ö'") && found.contains("printable ASCII"),
+            "{found}"
+        );
+        assert!(!path.exists());
     }
 }

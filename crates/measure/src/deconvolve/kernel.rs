@@ -12,11 +12,13 @@ use super::operator::Operator;
 use super::real::Real;
 use super::rule::{Rule, Step};
 use super::slide::{BLOCK, LANES, Padded, slide_block};
-use super::vector::{Portable, Vector, Wide};
+#[cfg(target_arch = "x86_64")]
+use super::vector::Sixteen;
+use super::vector::{Portable, Vector};
 
 /// Buffers of one network; the frames of the padded ones stay zero, the rest may hold anything.
 #[derive(Debug, Clone)]
-pub(super) struct Buffers<T> {
+pub struct Buffers<T> {
     /// Accepted state.
     pub(super) state: Padded<T>,
     /// Candidate state.
@@ -285,9 +287,65 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
     descent
 }
 
+/// A number type with its vectors.
+pub trait Wide: Real {
+    /// Vectors of AVX-512.
+    #[cfg(target_arch = "x86_64")]
+    #[doc(hidden)]
+    type Avx512: Vector<Self>;
+    /// Vectors of AVX2 with fused multiply-add.
+    #[cfg(target_arch = "x86_64")]
+    #[doc(hidden)]
+    type Avx2: Vector<Self>;
+
+    /// Runs the network's kernel. Each number type has its own function, so that the kernel is compiled once and not
+    /// again in every crate that uses it.
+    #[doc(hidden)]
+    fn descend(
+        level: Level,
+        operator: &Operator<Self>,
+        rule: &Rule,
+        b: &mut Buffers<Self>,
+    ) -> Descent;
+}
+
+impl Wide for f32 {
+    #[cfg(target_arch = "x86_64")]
+    type Avx512 = Sixteen;
+    #[cfg(target_arch = "x86_64")]
+    type Avx2 = Portable<f32, 8, true>;
+
+    fn descend(
+        level: Level,
+        operator: &Operator<Self>,
+        rule: &Rule,
+        b: &mut Buffers<Self>,
+    ) -> Descent {
+        run_at(level, operator, rule, b)
+    }
+}
+
+// Only tests run in f64.
+#[cfg(test)]
+impl Wide for f64 {
+    #[cfg(target_arch = "x86_64")]
+    type Avx512 = Portable<f64, 4, true>;
+    #[cfg(target_arch = "x86_64")]
+    type Avx2 = Portable<f64, 4, true>;
+
+    fn descend(
+        level: Level,
+        operator: &Operator<Self>,
+        rule: &Rule,
+        b: &mut Buffers<Self>,
+    ) -> Descent {
+        run_at(level, operator, rule, b)
+    }
+}
+
 /// Instruction sets the kernel is compiled for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Level {
+pub enum Level {
     /// 512-bit vectors.
     #[cfg(target_arch = "x86_64")]
     Avx512,
@@ -318,23 +376,23 @@ impl Level {
         wide.map(|(_, level)| level)
             .chain(std::iter::once(Level::Baseline))
     }
+}
 
-    /// Runs the kernel compiled for this level.
-    pub(super) fn run<T: Wide>(
-        self,
-        operator: &Operator<T>,
-        rule: &Rule,
-        b: &mut Buffers<T>,
-    ) -> Descent {
-        match self {
-            // SAFETY: `available` yields these only where the machine has the features.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { run_avx512(operator, rule, b) },
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { run_avx2(operator, rule, b) },
-            Level::Baseline => {
-                run::<T, Portable<T, 4, { cfg!(target_arch = "aarch64") }>>(operator, rule, b)
-            }
+/// Runs the kernel compiled for `level`.
+pub(super) fn run_at<T: Wide>(
+    level: Level,
+    operator: &Operator<T>,
+    rule: &Rule,
+    b: &mut Buffers<T>,
+) -> Descent {
+    match level {
+        // SAFETY: `available` yields these only where the machine has the features.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 => unsafe { run_avx512(operator, rule, b) },
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 => unsafe { run_avx2(operator, rule, b) },
+        Level::Baseline => {
+            run::<T, Portable<T, 4, { cfg!(target_arch = "aarch64") }>>(operator, rule, b)
         }
     }
 }

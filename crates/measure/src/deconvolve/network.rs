@@ -4,11 +4,10 @@ use ndarray::ArrayView2;
 use shearq_submissions::{Kept, PsfScale, Start};
 
 use super::descent::{Descent, Stop};
-use super::kernel::{Buffers, Level};
+use super::kernel::{Buffers, Level, Wide};
 use super::operator::Operator;
 use super::rule::Rule;
 use super::slide::Padded;
-use super::vector::Wide;
 use crate::error::{MeasureError, length};
 
 /// A network for one stamp size, PSF size and λ, holding one PSF at a time.
@@ -99,7 +98,7 @@ impl<T: Wide> Network<T> {
         let n = self.operator.n;
         let b = &mut scratch.buffers;
         Self::start(n, rule, u0, b);
-        let descent = self.level.run(&self.operator, rule, b);
+        let descent = T::descend(self.level, &self.operator, rule, b);
         for (y, row) in out.chunks_exact_mut(n).enumerate() {
             row.copy_from_slice(b.state.row(y));
         }
@@ -132,20 +131,17 @@ impl<T: Wide> Network<T> {
         let image = |padded: &Padded<T>| -> Vec<T> {
             (0..n).flat_map(|y| padded.row(y).iter().copied()).collect()
         };
+        let none = Rule {
+            max_iterations: 0,
+            ..*rule
+        };
         let mut total = Descent {
             iterations: 0,
-            ..self.level.run(
-                &self.operator,
-                &Rule {
-                    max_iterations: 0,
-                    ..*rule
-                },
-                b,
-            )
+            ..T::descend(self.level, &self.operator, &none, b)
         };
         for _ in 0..rule.max_iterations {
             let before = image(&b.state);
-            let descent = self.level.run(&self.operator, &one, b);
+            let descent = T::descend(self.level, &self.operator, &one, b);
             match descent.stop {
                 Stop::Stable => {}
                 Stop::EnergyRise if rule.kept == Kept::Lowest => observe(&before, &image(&b.next)),

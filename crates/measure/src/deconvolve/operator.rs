@@ -11,7 +11,7 @@ use crate::sizes::{check_psf, check_sizes};
 
 /// H, Hᵀ and D of one stamp size and PSF, laid out for the kernel.
 #[derive(Debug, Clone)]
-pub(super) struct Operator<T> {
+pub struct Operator<T> {
     pub(super) n: usize,
     pub(super) p: usize,
     /// λ.

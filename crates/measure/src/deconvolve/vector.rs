@@ -76,33 +76,6 @@ pub trait Vector<T>: Lanes<T> {
     fn sum(sums: Self::Squares) -> f64;
 }
 
-/// A number type with its vectors.
-pub trait Wide: Real {
-    /// Vectors of AVX-512.
-    #[cfg(target_arch = "x86_64")]
-    #[doc(hidden)]
-    type Avx512: Vector<Self>;
-    /// Vectors of AVX2 with fused multiply-add.
-    #[cfg(target_arch = "x86_64")]
-    #[doc(hidden)]
-    type Avx2: Vector<Self>;
-}
-
-impl Wide for f32 {
-    #[cfg(target_arch = "x86_64")]
-    type Avx512 = x86::Sixteen;
-    #[cfg(target_arch = "x86_64")]
-    type Avx2 = Portable<f32, 8, true>;
-}
-
-// Only tests run in f64.
-impl Wide for f64 {
-    #[cfg(target_arch = "x86_64")]
-    type Avx512 = Portable<f64, 4, true>;
-    #[cfg(target_arch = "x86_64")]
-    type Avx2 = Portable<f64, 4, true>;
-}
-
 /// `N` numbers in the hands of the compiler.
 #[derive(Clone, Copy)]
 pub struct Portable<T, const N: usize, const FMA: bool>([T; N]);
@@ -206,6 +179,9 @@ impl<T: Real, const N: usize, const FMA: bool> Vector<T> for Portable<T, N, FMA>
         sums[..width].iter().sum()
     }
 }
+
+#[cfg(target_arch = "x86_64")]
+pub use x86::Sixteen;
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {

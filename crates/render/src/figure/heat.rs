@@ -4,6 +4,7 @@ use ndarray::Array2;
 
 use super::colour::{ColourMap, INK, MASKED, WHITE, text_on};
 use super::image::{Limits, Stretch, draw_colour_bar};
+use super::layout::{draw_label, draw_label_upwards, draw_title, label_room, title_room};
 use super::scene::{Anchor, Scene, text_width};
 use super::ticks::plain;
 use super::{Figure, FigureError, LABEL_SIZE, MARGIN, TICK_SIZE, TITLE_SIZE};
@@ -122,20 +123,9 @@ impl Figure for HeatMap {
         let names_height = if upright { name_width } else { TICK_SIZE };
         let (width, height) = (columns as f64 * cell_width, rows as f64 * cell_height);
 
-        let label_room = |label: &str| {
-            if label.is_empty() {
-                0.0
-            } else {
-                LABEL_SIZE + 6.0
-            }
-        };
         let left =
             MARGIN + label_room(&self.row_label) + widest(&mut self.rows.iter().cloned()) + 8.0;
-        let title_height = if self.title.is_empty() {
-            0.0
-        } else {
-            TITLE_SIZE + 10.0
-        };
+        let title_height = title_room(&self.title);
         let top = MARGIN + title_height + label_room(&self.column_label) + names_height + 8.0;
         let limits = Limits::of(self.values.iter().copied(), None, self.map);
         let bar_top = top + height + 12.0;
@@ -149,18 +139,11 @@ impl Figure for HeatMap {
 
         let middle = left + 0.5 * width;
         let title_middle = middle.max(MARGIN + 0.5 * text_width(&self.title, TITLE_SIZE));
-        let baseline = (title_middle, MARGIN + TITLE_SIZE);
-        scene.text(&self.title, baseline, TITLE_SIZE, INK, Anchor::Middle);
+        draw_title(&mut scene, &self.title, title_middle);
         let baseline = (middle, MARGIN + title_height + LABEL_SIZE);
-        scene.text(
-            &self.column_label,
-            baseline,
-            LABEL_SIZE,
-            INK,
-            Anchor::Middle,
-        );
+        draw_label(&mut scene, &self.column_label, baseline);
         let baseline = (MARGIN + LABEL_SIZE, top + 0.5 * height);
-        scene.text_upwards(&self.row_label, baseline, LABEL_SIZE, INK, Anchor::Middle);
+        draw_label_upwards(&mut scene, &self.row_label, baseline);
         for (column, name) in self.columns.iter().enumerate() {
             let x = left + (column as f64 + 0.5) * cell_width;
             if upright {
@@ -204,7 +187,7 @@ impl Figure for HeatMap {
             Stretch::Linear,
         );
         let baseline = (bar_left + 0.5 * bar_width, bar_top + bar_height);
-        scene.text(&self.value_label, baseline, LABEL_SIZE, INK, Anchor::Middle);
+        draw_label(&mut scene, &self.value_label, baseline);
         Ok(scene)
     }
 }

@@ -1,10 +1,11 @@
 //! Curves and points over a common axis, in one panel or in many.
 
 use super::colour::{GRID, INK, Rgb, series_colour};
+use super::layout::{draw_label, draw_label_upwards, draw_title, label_room, title_room};
 use super::legend::{Entry, Legend, Sample};
 use super::scene::{Anchor, Point, Scene};
 use super::ticks::{Axis, Direction, Scale, TINIEST, shown};
-use super::{Figure, FigureError, LABEL_SIZE, MARGIN, TICK_SIZE, TITLE_SIZE};
+use super::{Figure, FigureError, LABEL_SIZE, MARGIN, TICK_SIZE};
 
 /// How a series is drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -181,6 +182,12 @@ pub(super) struct Frame {
 }
 
 impl Frame {
+    /// Draws the outline.
+    pub(super) fn draw_outline(self, scene: &mut Scene) {
+        let corners = ((self.left, self.top), (self.right, self.bottom));
+        scene.frame(corners.0, corners.1, INK, 1.0);
+    }
+
     pub(super) fn width(&self) -> f64 {
         self.right - self.left
     }
@@ -333,12 +340,7 @@ fn draw_plot(scene: &mut Scene, plot: &LinePlot, frame: Frame) {
             Anchor::Middle,
         );
     }
-    scene.frame(
-        (frame.left, frame.top),
-        (frame.right, frame.bottom),
-        INK,
-        1.0,
-    );
+    frame.draw_outline(scene);
 }
 
 /// An error bar with caps where its ends are inside the frame.
@@ -405,119 +407,159 @@ pub struct PanelGrid {
     pub plots: Vec<LinePlot>,
 }
 
-impl Figure for PanelGrid {
-    #[allow(
-        clippy::too_many_lines,
-        reason = "the elements of a plot in drawing order"
-    )]
-    fn scene(&self) -> Result<Scene, FigureError> {
-        self.plots.iter().try_for_each(LinePlot::check)?;
-        let columns = self.columns.clamp(1, self.plots.len().max(1));
-        let rows = self.plots.len().div_ceil(columns).max(1);
+/// Sizes of a [`PanelGrid`], in points.
+struct Cells {
+    columns: usize,
+    /// Sides of a frame.
+    frame: (f64, f64),
+    /// Space left and right of a frame, for numbers.
+    left: f64,
+    right: f64,
+    /// Space above a frame, for its title, and below it, for numbers.
+    above: f64,
+    below: f64,
+    /// Space of the numbers on the vertical axes.
+    tick_room: f64,
+    /// Whether all plots have the same labels: of x, of y.
+    common: (bool, bool),
+    /// Space of the labels that all plots have in common: beside all and below all.
+    outer: (f64, f64),
+}
+
+impl Cells {
+    fn of(grid: &PanelGrid) -> Self {
+        let plots = &grid.plots;
+        let columns = grid.columns.clamp(1, plots.len().max(1));
         let (width, height) = match columns {
             1 => (600.0, 370.0),
             2 => (380.0, 250.0),
             3 => (280.0, 190.0),
             _ => (205.0, 150.0),
         };
-
         let common = |label: fn(&LinePlot) -> &str| {
-            self.plots
-                .windows(2)
-                .all(|pair| label(&pair[0]) == label(&pair[1]))
+            let mut pairs = plots.windows(2);
+            pairs.all(|pair| label(&pair[0]) == label(&pair[1]))
         };
-        let common_x = common(|plot| &plot.x_label);
-        let common_y = common(|plot| &plot.y_label);
-        let has_x = self.plots.iter().any(|plot| !plot.x_label.is_empty());
-        let has_y = self.plots.iter().any(|plot| !plot.y_label.is_empty());
-        let label_room = |present: bool| if present { LABEL_SIZE + 6.0 } else { 0.0 };
-        let axes: Vec<(Axis, Axis)> = self
-            .plots
-            .iter()
-            .map(|plot| plot.axes(width, height))
-            .collect();
-        let tick_room = axes
-            .iter()
-            .map(|(_, y)| y.label_width(TICK_SIZE))
-            .fold(0.0, f64::max)
-            + 9.0;
+        let common = (common(|plot| &plot.x_label), common(|plot| &plot.y_label));
+        let room = |label: fn(&LinePlot) -> &str| {
+            let rooms = plots.iter().map(|plot| label_room(label(plot)));
+            rooms.fold(0.0, f64::max)
+        };
+        let (x_room, y_room) = (room(|plot| &plot.x_label), room(|plot| &plot.y_label));
+        let axes: Vec<(Axis, Axis)> = plots.iter().map(|plot| plot.axes(width, height)).collect();
+        let numbers = axes.iter().map(|(_, y)| y.label_width(TICK_SIZE));
+        let tick_room = numbers.fold(0.0, f64::max) + 9.0;
         let factor_across = axes.iter().any(|(x, _)| x.factor.is_some());
         let factor_up = axes.iter().any(|(_, y)| y.factor.is_some());
+        let titled = plots.len() != 1 && plots.iter().any(|plot| !plot.title.is_empty());
+        let title = if titled { LABEL_SIZE + 10.0 } else { 6.0 };
+        let factor = if factor_up { TICK_SIZE + 2.0 } else { 0.0 };
+        Cells {
+            columns,
+            frame: (width, height),
+            left: tick_room + if common.1 { 0.0 } else { y_room },
+            right: if factor_across { 42.0 } else { 10.0 },
+            above: title + factor,
+            below: TICK_SIZE + 10.0 + if common.0 { 0.0 } else { x_room },
+            tick_room,
+            common,
+            outer: (
+                if common.1 { y_room } else { 0.0 },
+                if common.0 { x_room } else { 0.0 },
+            ),
+        }
+    }
 
-        // Space around each frame: left for numbers, above for titles, below for numbers.
-        let left = tick_room + if common_y { 0.0 } else { label_room(has_y) };
-        let right = if factor_across { 42.0 } else { 10.0 };
-        let single = self.plots.len() == 1;
-        let panel_title_size = if single { TITLE_SIZE } else { LABEL_SIZE };
-        let titled = self.plots.iter().any(|plot| !plot.title.is_empty());
-        let above = if titled && !single {
-            panel_title_size + 10.0
-        } else {
-            6.0
-        } + if factor_up { TICK_SIZE + 2.0 } else { 0.0 };
-        let below = TICK_SIZE + 10.0 + if common_x { 0.0 } else { label_room(has_x) };
-        let (cell_width, cell_height) = (left + width + right, above + height + below);
+    /// Width and height of a frame with the space around it.
+    fn cell(&self) -> (f64, f64) {
+        let (width, height) = self.frame;
+        (
+            self.left + width + self.right,
+            self.above + height + self.below,
+        )
+    }
 
-        let origin_x = MARGIN + if common_y { label_room(has_y) } else { 0.0 };
-        let total_width = origin_x + columns as f64 * cell_width + 0.5 * MARGIN;
-        let title = match self.plots.as_slice() {
-            [only] if self.title.is_empty() => &only.title,
-            _ => &self.title,
-        };
+    /// The frame of plot `number` of a grid whose corner is `origin`.
+    fn frame(&self, number: usize, origin: Point) -> Frame {
+        let (row, column) = (number / self.columns, number % self.columns);
+        let (cell_width, cell_height) = self.cell();
+        let left = origin.0 + column as f64 * cell_width + self.left;
+        let top = origin.1 + row as f64 * cell_height + self.above;
+        Frame {
+            left,
+            top,
+            right: left + self.frame.0,
+            bottom: top + self.frame.1,
+        }
+    }
+}
+
+impl PanelGrid {
+    fn legend_entries(&self) -> Vec<Entry> {
         let mut entries: Vec<Entry> = Vec::new();
         for entry in self.plots.iter().flat_map(LinePlot::legend_entries) {
             if !entries.contains(&entry) {
                 entries.push(entry);
             }
         }
+        entries
+    }
+
+    /// The title above all plots; a single plot's own title is there too.
+    fn whole_title(&self) -> &str {
+        match self.plots.as_slice() {
+            [only] if self.title.is_empty() => &only.title,
+            _ => &self.title,
+        }
+    }
+
+    /// Draws a plot with its title and labels.
+    fn draw_panel(&self, scene: &mut Scene, number: usize, cells: &Cells, frame: Frame) {
+        let plot = &self.plots[number];
+        draw_plot(scene, plot, frame);
+        let centre = (
+            0.5 * (frame.left + frame.right),
+            0.5 * (frame.top + frame.bottom),
+        );
+        if self.plots.len() != 1 {
+            draw_label(scene, &plot.title, (centre.0, frame.top - 6.0));
+        }
+        // The last plot of each column carries the label, also above a gap in the last row.
+        if !cells.common.0 || number + cells.columns >= self.plots.len() {
+            let baseline = (centre.0, frame.bottom + TICK_SIZE + 10.0 + LABEL_SIZE);
+            draw_label(scene, &plot.x_label, baseline);
+        }
+        if !cells.common.1 || number.is_multiple_of(cells.columns) {
+            let baseline = (frame.left - cells.tick_room - 4.0, centre.1);
+            draw_label_upwards(scene, &plot.y_label, baseline);
+        }
+    }
+}
+
+impl Figure for PanelGrid {
+    fn scene(&self) -> Result<Scene, FigureError> {
+        self.plots.iter().try_for_each(LinePlot::check)?;
+        let cells = Cells::of(self);
+        let rows = self.plots.len().div_ceil(cells.columns).max(1);
+        let (cell_width, cell_height) = cells.cell();
+        let grid_width = cells.columns as f64 * cell_width;
+        let origin_x = MARGIN + cells.outer.0;
+        let total_width = origin_x + grid_width + 0.5 * MARGIN;
+        let entries = self.legend_entries();
         let legend = Legend::new(&entries, total_width - 2.0 * MARGIN);
-        let title_height = if title.is_empty() {
-            0.0
-        } else {
-            TITLE_SIZE + 10.0
-        };
+        let title = self.whole_title();
+        let title_height = title_room(title);
         let origin_y = MARGIN + title_height + legend.height();
-        let bottom_room = if common_x { label_room(has_x) } else { 0.0 } + 0.5 * MARGIN;
+        let bottom_room = cells.outer.1 + 0.5 * MARGIN;
         let total_height = origin_y + rows as f64 * cell_height + bottom_room;
 
         let mut scene = Scene::new(total_width, total_height);
-        let middle = origin_x + 0.5 * (columns as f64 * cell_width + left - right);
-        scene.text(
-            title,
-            (middle, MARGIN + TITLE_SIZE),
-            TITLE_SIZE,
-            INK,
-            Anchor::Middle,
-        );
+        let middle = origin_x + 0.5 * (grid_width + cells.left - cells.right);
+        draw_title(&mut scene, title, middle);
         legend.draw(&mut scene, middle, MARGIN + title_height);
-        for (number, plot) in self.plots.iter().enumerate() {
-            let (row, column) = (number / columns, number % columns);
-            let frame_left = origin_x + column as f64 * cell_width + left;
-            let frame_top = origin_y + row as f64 * cell_height + above;
-            let frame = Frame {
-                left: frame_left,
-                top: frame_top,
-                right: frame_left + width,
-                bottom: frame_top + height,
-            };
-            draw_plot(&mut scene, plot, frame);
-            let centre = (
-                0.5 * (frame.left + frame.right),
-                0.5 * (frame.top + frame.bottom),
-            );
-            if !single {
-                let baseline = (centre.0, frame.top - 6.0);
-                scene.text(&plot.title, baseline, panel_title_size, INK, Anchor::Middle);
-            }
-            // The last plot of each column carries the label, also above a gap in the last row.
-            if !common_x || number + columns >= self.plots.len() {
-                let baseline = (centre.0, frame.bottom + TICK_SIZE + 10.0 + LABEL_SIZE);
-                scene.text(&plot.x_label, baseline, LABEL_SIZE, INK, Anchor::Middle);
-            }
-            if !common_y || column == 0 {
-                let baseline = (frame.left - tick_room - 4.0, centre.1);
-                scene.text_upwards(&plot.y_label, baseline, LABEL_SIZE, INK, Anchor::Middle);
-            }
+        for number in 0..self.plots.len() {
+            let frame = cells.frame(number, (origin_x, origin_y));
+            self.draw_panel(&mut scene, number, &cells, frame);
         }
         Ok(scene)
     }
