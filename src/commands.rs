@@ -17,6 +17,7 @@ pub(crate) mod quickstart;
 pub(crate) mod reproduce;
 pub(crate) mod run;
 pub(crate) mod score;
+pub(crate) mod select;
 pub(crate) mod show;
 pub(crate) mod simulate;
 pub(crate) mod study;

@@ -16,7 +16,8 @@ use clap::{Parser, Subcommand};
 
 use commands::{
     baseline, bench, bias, calibrate, challenge, check, compare, gather, help_files, mean, measure,
-    merge, pack, quickstart, reproduce, run, score, show, simulate, study, submissions, unpack,
+    merge, pack, quickstart, reproduce, run, score, select, show, simulate, study, submissions,
+    unpack,
 };
 use shearq_pipeline::data::listing::Files;
 use shearq_render::escape::visible;
@@ -71,6 +72,10 @@ enum Command {
     Merge(merge::Arguments),
     #[command(after_help = "Example:\n  shearq mean --measured linear")]
     Mean(mean::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq select --measured linear --where 'snr > 10, size > 2.5' --out bright"
+    )]
+    Select(select::Arguments),
     #[command(
         after_help = "Examples:\n  shearq score --measured linear --wide\n  shearq score --truth truth.csv catalogue-1.csv catalogue-2.csv"
     )]
@@ -169,6 +174,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Measure(arguments) => measure::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
         Command::Mean(arguments) => mean::run(&arguments),
+        Command::Select(arguments) => select::run(&arguments),
         Command::Merge(arguments) => merge::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),

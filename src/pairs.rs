@@ -34,7 +34,8 @@ const WAYS: [(&str, &[&str]); 31] = [
         ],
     ),
     ("merge", &["OUT sets images shards discard-damaged threads"]),
-    ("mean", &["measured sets format threads"]),
+    ("mean", &["measured sets where weight format threads"]),
+    ("select", &["measured where weight out"]),
     (
         "score",
         &[

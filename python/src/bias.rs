@@ -10,12 +10,12 @@ use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::Names;
-use shearq_results::bias::expression::Expression;
 use shearq_results::bias::folders::expand;
 use shearq_results::bias::truth::Truth;
 use shearq_results::bias::{
     BiasFailure, Binning, Edges, Input, MOST_BINS, Request, Summed, Units, sum,
 };
+use shearq_results::expression::Expression;
 use shearq_results::views::bias::bias_table;
 
 fn of_bias(error: BiasFailure) -> PyErr {

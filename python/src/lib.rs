@@ -8,6 +8,7 @@ mod command;
 mod errors;
 mod measure;
 mod score;
+mod select;
 mod simulate;
 mod stamps;
 mod submissions;
@@ -26,6 +27,8 @@ mod _shearq {
     use super::measure::{flags, mean_shear, measure};
     #[pymodule_export]
     use super::score::{difference, metrics, score, spectrum};
+    #[pymodule_export]
+    use super::select::select;
     #[pymodule_export]
     use super::simulate::simulate;
     #[pymodule_export]

@@ -13,7 +13,7 @@ use shearq_measure::{
     Warning, Worker, calibrate, examined_rows,
 };
 use shearq_pipeline::engine;
-use shearq_pipeline::measure::{COLUMNS, Value};
+use shearq_pipeline::measure::{COLUMNS, Value, observed};
 use shearq_quantities::Shear;
 
 use crate::errors::{no_memory, of_measuring};
@@ -151,7 +151,8 @@ pub(crate) fn measure<'py>(
         .flatten()
         .map(|warning| format!("stamps: no galaxy could be measured: {warning}"));
     let warnings = warnings.iter().map(Warning::to_string).collect();
-    Ok((catalogue(py, &galaxies)?, warnings, all_flagged))
+    let linear = configuration.linear().is_some();
+    Ok((catalogue(py, &galaxies, linear)?, warnings, all_flagged))
 }
 
 impl<'s> Request<'s> {
@@ -424,7 +425,11 @@ fn formulas(rows: ArrayView2<'_, f64>) -> Result<Vec<FunctionalPsf>, MeasureErro
 }
 
 /// The columns of a catalogue, by name.
-fn catalogue<'py>(py: Python<'py>, galaxies: &[Measurement]) -> PyResult<Bound<'py, PyDict>> {
+fn catalogue<'py>(
+    py: Python<'py>,
+    galaxies: &[Measurement],
+    linear: bool,
+) -> PyResult<Bound<'py, PyDict>> {
     let columns = PyDict::new(py);
     for (name, value) in COLUMNS {
         match value {
@@ -436,6 +441,11 @@ fn catalogue<'py>(py: Python<'py>, galaxies: &[Measurement]) -> PyResult<Bound<'
                 let values: Vec<i32> = galaxies.iter().map(of).collect();
                 columns.set_item(name, values.into_pyarray(py))?;
             }
+        }
+    }
+    if linear {
+        for (name, values) in observed(&galaxies.iter().collect::<Vec<_>>()) {
+            columns.set_item(name, values.into_pyarray(py))?;
         }
     }
     Ok(columns)

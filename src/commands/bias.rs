@@ -12,10 +12,10 @@ use shearq_files::{atomic, open};
 use shearq_pipeline::images::Shard;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::bias::columns::Names;
-use shearq_results::bias::expression::Expression;
 use shearq_results::bias::folders;
 use shearq_results::bias::truth::Truth;
 use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, sum};
+use shearq_results::expression::Expression;
 use shearq_results::views::bias::{
     Limit, bias_plot, bias_table, check, compared_table, junit, section,
 };

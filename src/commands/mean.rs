@@ -10,6 +10,7 @@ use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::inputs;
 use shearq_results::mean::mean_shears;
 use shearq_results::score::without_catalogue;
+use shearq_results::select::selection;
 use shearq_results::views::mean::mean_table;
 
 /// Mean shear of each set, for fields of constant shear.
@@ -17,6 +18,11 @@ use shearq_results::views::mean::mean_table;
 /// The mean shear is the mean ellipticity of all galaxies without a flag, divided by the mean response if the
 /// configuration does so. The error includes the error of the mean response. It assumes independent galaxies: for pairs
 /// that are rotated by 90 degrees it is too large.
+///
+/// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px).
+/// The mean stays calibrated: the response contains how shear and noise change the selection. A cut is a smooth step. The
+/// weight is 1/2 at the threshold; it reaches 0 and 1 at a distance of 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in
+/// `size`, or at the distance after `+-`. Wider steps give smaller errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
@@ -25,6 +31,12 @@ pub(crate) struct Arguments {
     /// Sets [default: all there are].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
+    /// Galaxies to keep, such as "snr > 10, size > 2.5 +- 0.5".
+    #[arg(long = "where", value_name = "CONDITIONS")]
+    cuts: Option<String>,
+    /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
+    #[arg(long, value_name = "FORMULA")]
+    weight: Option<String>,
     #[command(flatten)]
     form: Form,
     #[command(flatten)]
@@ -35,9 +47,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Arguments {
         measured,
         sets,
+        cuts,
+        weight,
         form,
         threads,
     } = arguments;
+    let selection = selection(cuts.as_deref(), weight.as_deref())?;
     let run = Run::require(measured)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
     // The data may have been removed since.
@@ -48,7 +63,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let Some(data) = &data {
         inputs::verify(data, measured, &run, sets, threads.number())?;
     }
-    let means = mean_shears(&run, measured, sets)?;
+    let means = mean_shears(&run, measured, sets, selection.as_ref())?;
     for mean in &means {
         let set = mean.set;
         if let Some(flagged) = mean.mostly_flagged() {
@@ -64,6 +79,14 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let name = measured.display().to_string();
     let mut table = mean_table(&means, &run.configuration, &name);
+    let chosen = [("where", cuts), ("weight", weight)];
+    for (name, text) in chosen {
+        if let Some(text) = text {
+            table
+                .notes
+                .push(format!("Galaxies of --{name} \"{text}\"."));
+        }
+    }
     if let Some(data) = &data {
         let used = means.iter().map(|mean| (mean.set, mean.images.as_slice()));
         table

@@ -50,7 +50,11 @@ fn of_type(kind: EllipticityType, chi: Distortion) -> Option<(f64, f64)> {
 }
 
 /// The response of the ellipticity of type `kind`, from the response of the distortion.
-fn reported(kind: EllipticityType, chi: Distortion, r: ResponseMatrix) -> ResponseMatrix {
+pub(crate) fn reported(
+    kind: EllipticityType,
+    chi: Distortion,
+    r: ResponseMatrix,
+) -> ResponseMatrix {
     match kind {
         EllipticityType::Distortion => r,
         EllipticityType::Shear => {

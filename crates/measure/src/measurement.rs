@@ -2,6 +2,7 @@
 
 use crate::deconvolve::Descent;
 use crate::flag::Flags;
+use crate::observables::Observables;
 
 /// Response ∂e_i/∂γ_j of an ellipticity to shear, as `[i][j]`: R11, R12 and R21, R22.
 pub type ResponseMatrix = [[f64; 2]; 2];
@@ -20,17 +21,19 @@ pub struct Measurement {
     /// could not be measured. Only means over many galaxies are unbiased: the mean contribution of sheared noise is
     /// subtracted from one galaxy in four, for all.
     pub response: Option<ResponseMatrix>,
+    /// Flux and size before the PSF, with their responses; `None` for the network and for galaxies that could not be measured.
+    pub observables: Option<Observables>,
     /// Mean responses of the galaxies calibrated together, by which e1 and e2 were divided; `None` before calibration.
     pub divisor: Option<[f64; 2]>,
     /// Iterations of the network; `None` if it did not run.
     pub descent: Option<Descent>,
     /// Standard deviation of the noise that was used, in image units; NaN if unknown.
     pub noise: f64,
-    /// Sum of the deconvolved stamp in image units. For the linear method, sum of the stamp.
+    /// Sum of the deconvolved stamp in image units. For the linear method, the flux of [`Observables`].
     pub flux: f64,
     /// Radius of the clipped autocorrelation in pixels. For the linear method, radius of the lags that are used.
     pub radius: f64,
-    /// Qxx + Qyy of the clipped, or weighted, autocorrelation in px².
+    /// Qxx + Qyy of the clipped autocorrelation in px². For the linear method, the size of [`Observables`] in px.
     pub size: f64,
 }
 
@@ -48,6 +51,7 @@ impl Measurement {
             e2: f64::NAN,
             flags: flag.into(),
             response: None,
+            observables: None,
             divisor: None,
             descent: None,
             noise: f64::NAN,

@@ -13,7 +13,7 @@ use shearq_submissions::{Configuration, Method};
 
 use self::family::LinearFamily;
 pub use self::found::AdaptedSettings;
-pub(crate) use self::found::{CutWorker, Found, Images, Sheared};
+pub(crate) use self::found::{CutWorker, Found, FoundObservables, Images, Sheared};
 use self::network::NetworkPlan;
 use crate::error::MeasureError;
 

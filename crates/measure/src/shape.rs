@@ -7,10 +7,12 @@
 
 mod acf;
 mod adaptive;
+mod breadth;
 mod clipped;
 mod moments;
 
 pub use acf::{AcfScratch, Autocorrelation};
 pub use adaptive::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
+pub(crate) use breadth::Breadth;
 pub use clipped::{ClippedAcf, ClippedAcfScratch};
 pub use moments::{ClippedMoments, Moments};

@@ -17,6 +17,7 @@ use crate::galaxy::Plan;
 use crate::measurement::Measurement;
 use crate::method::{AdaptedSettings, CutWorker};
 use crate::noise::{StampNoise, Survey};
+use crate::observables::observables;
 use crate::pixel::Pixel;
 use crate::psf::cut_start;
 use crate::psfs::Psfs;
@@ -193,7 +194,17 @@ impl Worker {
             size: found.size,
             ..Measurement::flagged(Flag::NoShear)
         };
-        Ok(match report(plan.configuration.ellipticity(), &found) {
+        let kind = plan.configuration.ellipticity();
+        let observables = found.distortion.ok().and_then(|chi| {
+            let observed = found.observed.as_ref()?;
+            Some(observables(
+                kind,
+                chi,
+                observed,
+                found.sheared_noise.as_ref(),
+            ))
+        });
+        Ok(match report(kind, &found) {
             Err(flag) => Measurement {
                 flags: flag.into(),
                 ..measured
@@ -203,6 +214,7 @@ impl Worker {
                 e2,
                 flags: Flags::NONE,
                 response,
+                observables,
                 ..measured
             },
         })

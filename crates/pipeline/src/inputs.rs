@@ -20,6 +20,8 @@ use shearq_files::table::read_metadata;
 const GALAXIES: &str = "galaxies";
 const PSF: &str = "psf";
 const TRUTH: &str = "truth";
+/// Keys of the fingerprints in the metadata of a catalogue.
+pub const PRINTS: [&str; 3] = [GALAXIES, PSF, TRUTH];
 
 /// The files that a run measures, if they are there. A simulated run has none.
 #[derive(Debug)]

@@ -4,7 +4,6 @@
 //! [`Summed::result`] estimates.
 
 pub mod columns;
-pub mod expression;
 pub mod folders;
 pub mod positions;
 mod read;
@@ -21,8 +20,8 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use thiserror::Error;
 
+use crate::expression::Expression;
 use columns::{Names, Preset, Role};
-use expression::Expression;
 use read::{Reading, Source};
 use truth::Truth;
 

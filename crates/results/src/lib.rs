@@ -2,6 +2,7 @@
 //!
 //! * [`score`] scores catalogues against a true shear field; [`foreign`] reads other programs' catalogues.
 //! * [`bias`] estimates m and c of catalogues of any program.
+//! * [`select`] applies cuts and weights to catalogues without a bias; [`expression`] reads formulas of columns.
 //! * [`mean`] averages catalogues to one shear per set.
 //! * [`row`] is the record of a scored set, and [`store`] keeps records in Parquet files.
 //! * [`conditions`] and [`groups`] choose and group records; [`compare`] compares configurations.
@@ -14,11 +15,13 @@ pub mod baseline;
 pub mod bias;
 pub mod compare;
 pub mod conditions;
+pub mod expression;
 pub mod foreign;
 pub mod groups;
 pub mod mean;
 pub mod row;
 pub mod score;
+pub mod select;
 pub mod store;
 pub mod submit;
 pub mod views;

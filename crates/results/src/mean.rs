@@ -5,10 +5,12 @@ use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
 use shearq_files::table;
-use shearq_measure::{Flag, MeanShear, ShearSum, Warning};
+use shearq_measure::{Flag, MeanShear, Selection, ShearSum, Warning};
 use shearq_pipeline::data::run::Run;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
+
+use crate::select::Weighted;
 
 /// The mean shear of the galaxies of a set.
 #[derive(Debug, Clone, PartialEq)]
@@ -22,6 +24,8 @@ pub struct SetMean {
     pub galaxies: usize,
     /// Galaxies without an ellipticity.
     pub flagged: usize,
+    /// Galaxies with an ellipticity that the selection leaves out.
+    pub cut: usize,
     /// Galaxies with each of [`Flag::ALL`].
     pub flags: [usize; Flag::ALL.len()],
     /// Mean shear, with errors that include the error of the mean response of each image; `None` if all galaxies are
@@ -49,11 +53,17 @@ impl SetMean {
     }
 }
 
-/// The mean shear of the catalogues of each set of the results folder `out` (of `sets`, or of all if empty).
+/// The mean shear of the catalogues of each set of the results folder `out` (of `sets`, or of all if empty), of the
+/// galaxies of a `selection`.
 ///
 /// # Errors
-/// If a catalogue cannot be read, or there is none.
-pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<SetMean>, FileError> {
+/// If a catalogue cannot be read, or there is none; or if a selection needs columns that the catalogues do not have.
+pub fn mean_shears(
+    run: &Run,
+    out: &Path,
+    sets: &[u32],
+    selection: Option<&Selection>,
+) -> Result<Vec<SetMean>, FileError> {
     let files = run.catalogues(out, sets)?;
     let calibrated = run.configuration.calibration() != Calibration::None;
     let mut means = Vec::new();
@@ -63,7 +73,7 @@ pub fn mean_shears(run: &Run, out: &Path, sets: &[u32]) -> Result<Vec<SetMean>, 
             let message = format!("there is no catalogue of set {set}");
             return Err(FileError::new(out, message));
         }
-        means.push(mean_of(set, &catalogues, calibrated)?);
+        means.push(mean_of(set, &catalogues, calibrated, selection)?);
     }
     if means.is_empty() {
         return Err(FileError::new(
@@ -79,11 +89,15 @@ fn mean_of(
     set: u32,
     catalogues: &[(u32, PathBuf)],
     calibrated: bool,
+    selection: Option<&Selection>,
 ) -> Result<SetMean, FileError> {
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
-    let (mut flags, mut flagged) = ([0; Flag::ALL.len()], 0);
+    let (mut flags, mut flagged, mut cut) = ([0; Flag::ALL.len()], 0, 0);
     for (_, path) in catalogues {
-        let rows = Rows::read(path, calibrated)?;
+        let rows = match selection {
+            Some(selection) => Rows::selected(path, selection)?,
+            None => Rows::read(path, calibrated)?,
+        };
         for &bits in &*rows.flags {
             for (count, flag) in flags.iter_mut().zip(Flag::ALL) {
                 *count += usize::from(bits as u32 & flag as u32 != 0);
@@ -93,6 +107,10 @@ fn mean_of(
         for row in 0..rows.flags.len() {
             if !rows.is_good(row) {
                 flagged += 1;
+                continue;
+            }
+            if rows.cut[row] {
+                cut += 1;
                 continue;
             }
             let (e, response) = (rows.e(row), rows.response(row));
@@ -108,6 +126,7 @@ fn mean_of(
         images: catalogues.iter().map(|(image, _)| *image).collect(),
         galaxies: moments[0].count(),
         flagged,
+        cut,
         flags,
         shear: sum.mean().ok(),
         scatter: moments.map(|moment| moment.deviation()),
@@ -120,6 +139,8 @@ struct Rows {
     flags: Vec<f64>,
     /// R11 and R22 of calibrated ellipticities.
     response: Option<[Vec<f64>; 2]>,
+    /// Whether a selection leaves the galaxy out.
+    cut: Vec<bool>,
 }
 
 impl Rows {
@@ -130,14 +151,39 @@ impl Rows {
         }
         let read = table::read(path, Some(&names), table::MAX_ROWS)?;
         let column = |name| table::numbers(&read, name, path).map(Cow::into_owned);
+        let flags = column("flags")?;
         Ok(Rows {
             e: [column("e1")?, column("e2")?],
-            flags: column("flags")?,
+            cut: vec![false; flags.len()],
+            flags,
             response: match calibrated {
                 true => Some([column("R11")?, column("R22")?]),
                 false => None,
             },
         })
+    }
+
+    /// The rows with the weights of a selection.
+    fn selected(path: &Path, selection: &Selection) -> Result<Self, FileError> {
+        let read = table::read(path, None, table::MAX_ROWS)?;
+        let Weighted {
+            mut e,
+            response,
+            weight,
+        } = Weighted::of_table(path, selection, &read)?;
+        let flags = table::numbers(&read, "flags", path)?.into_owned();
+        let mut rows = Rows {
+            cut: weight.iter().map(|weight| *weight == 0.0).collect(),
+            e: [Vec::new(), Vec::new()],
+            flags,
+            response: Some(response),
+        };
+        let mean = rows.mean_of_responses(&e);
+        for (e, mean) in e.iter_mut().zip(mean) {
+            e.iter_mut().for_each(|e| *e /= mean);
+        }
+        rows.e = e;
+        Ok(rows)
     }
 
     fn e(&self, row: usize) -> [f64; 2] {
@@ -154,9 +200,16 @@ impl Rows {
         response.map_or([1.0; 2], |all| [0, 1].map(|k| all[k][row]))
     }
 
-    /// Mean response of the galaxies with an ellipticity.
+    /// Mean response of the galaxies with an ellipticity that are not left out.
     fn mean_response(&self) -> [f64; 2] {
-        let good = || (0..self.flags.len()).filter(|&row| self.is_good(row));
+        self.mean_of_responses(&self.e)
+    }
+
+    fn mean_of_responses(&self, e: &[Vec<f64>; 2]) -> [f64; 2] {
+        let good = || {
+            let rows = 0..self.flags.len();
+            rows.filter(|&row| !self.cut[row] && e.iter().all(|e| e[row].is_finite()))
+        };
         let count = good().count() as f64;
         [0, 1].map(|k| good().map(|row| self.response(row)[k]).sum::<f64>() / count)
     }
@@ -197,14 +250,14 @@ mod tests {
         let path = folder.path().join("catalogue-001.parquet");
         written(&path, [0.1, 0.4], ["flags", "R11", "R22"]);
         let catalogues = [(1, path)];
-        let mean = mean_of(7, &catalogues, true).unwrap();
+        let mean = mean_of(7, &catalogues, true, None).unwrap();
         assert_eq!((mean.galaxies, mean.flagged, mean.flags[2]), (2, 1, 1));
         let shear = mean.shear.unwrap();
         assert!((shear.shear[0] - 0.25).abs() < 1e-15 && (shear.shear[1] + 0.25).abs() < 1e-15);
         // Residuals 0.1 − 0.25 · 0.8 and 0.4 − 0.25 · 1.2 are ∓0.1: √(2 · 0.02)/2.
         assert!((shear.error()[0] - 0.1).abs() < 1e-15, "{shear:?}");
         // Without responses the residuals are ∓0.15.
-        let plain = mean_of(7, &catalogues, false).unwrap().shear.unwrap();
+        let plain = mean_of(7, &catalogues, false, None).unwrap().shear.unwrap();
         assert!((plain.error()[0] - 0.15).abs() < 1e-15, "{plain:?}");
     }
 
@@ -220,7 +273,7 @@ mod tests {
             ),
         ] {
             written(&path, [0.1, 0.4], names);
-            let error = mean_of(7, &[(1, path.clone())], true)
+            let error = mean_of(7, &[(1, path.clone())], true, None)
                 .unwrap_err()
                 .to_string();
             assert!(error.contains(expected), "{error}");

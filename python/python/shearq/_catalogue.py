@@ -118,15 +118,20 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
     noise : float64
         Noise level used: standard deviation per pixel, in image units.
     flux : float64
-        Sum of the deconvolved stamp in image units; for the linear method, sum of the stamp.
+        Sum of the deconvolved stamp in image units. For the linear method, flux in a Gaussian aperture.
     radius, size : float64
-        Radius of the autocorrelation that is used in pixels, and its Qxx + Qyy in px².
+        Radius of the autocorrelation that is used in pixels, and its Qxx + Qyy in px². For the linear method, ``size`` is
+        the standard deviation per axis, in pixels, of a Gaussian galaxy with the same moments.
     R11, R22, R12, R21 : float64
         Response of the galaxy to shear before the division: R12 is the response of e1 to the second component. Only
         means over many galaxies are unbiased.
     divisor1, divisor2 : float64
         Mean responses of the galaxies that were measured together, by which e1 and e2 were divided; NaN if they were
         not. The shear is Σ e1·divisor1 / Σ R11.
+    snr, flux_error : float64
+        Flux over its error, and the error in image units. For linear configurations.
+    flux_g1, …, t_s : float64
+        How flux and size change with shear and noise; :meth:`Catalogue.select` uses them. For linear configurations.
 
     Attributes
     ----------
@@ -196,7 +201,61 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         """Rows without a flag: booleans of shape (n,)."""
         return np.asarray(self["flags"] == 0)
 
-    def mean_shear(self, weights: ArrayLike | None = None) -> MeanShear:
+    def select(self, where: str | None = None, weight: str | None = None) -> Catalogue:
+        """The galaxies of a selection, with ellipticities and responses that keep the mean shear unbiased.
+
+        Ellipticities are multiplied by the weights. Responses contain how shear and noise change the weights. Rows with a
+        flag or without weight are left out. Do not combine the result with rows of other selections.
+
+        Parameters
+        ----------
+        where : str, optional
+            Cuts by ``snr``, ``flux`` (image units) and ``size`` (px), such as ``"snr > 10, size > 2.5 +- 0.5"``. A cut is
+            a smooth step. The number after ``+-`` is the distance from the threshold at which the weight is 0 or 1: 1.5
+            for ``snr``, 1.5 errors for ``flux`` and 0.3 px for ``size`` by default.
+        weight : str, optional
+            Smooth weight as a formula of ``snr``, ``flux`` and ``size``, such as ``"snr^2/(snr^2 + 100)"``.
+
+        Returns
+        -------
+        Catalogue
+
+        Raises
+        ------
+        ValueError
+            If a condition cannot be read, the response of a quantity to shear is not known, the catalogue is not from a
+            linear configuration, or no galaxy is left.
+
+        Examples
+        --------
+        >>> print(cat.select(where="snr > 10").mean_shear())
+        """
+        missing = [name for name in _schema.SELECTED if name not in (self.dtype.names or ())]
+        if missing:
+            raise ValueError(
+                f"catalogue: no columns {', '.join(missing[:4])}; expected the columns of a linear configuration such as 48/linear/star"
+            )
+        rows = np.atleast_1d(self).view(Catalogue)
+        columns = {name: np.ascontiguousarray(rows[name], dtype=np.float64) for name in _schema.SELECTED}
+        e1, e2, r11, r22, weights = _shearq.select(columns, where, weight)
+        kept = weights > 0
+        if not kept.any():
+            raise ValueError(f"where: no galaxy is left of {int(rows.good.sum())} without a flag; expected one or more")
+        chosen = rows[kept].copy()
+        for k, e, response in (("1", e1, r11), ("2", e2, r22)):
+            mean = float(response[kept].mean())
+            if not mean > 0:
+                raise ValueError(f"where: the mean response R{k}{k} of the selection is {mean:.3g}; expected a positive number")
+            chosen[f"e{k}"] = e[kept] / mean
+            chosen[f"R{k}{k}"] = response[kept]
+            chosen[f"divisor{k}"] = mean
+        # A second selection would need responses that the rows do not have.
+        left = [name for name in chosen.dtype.names or () if name not in _schema.OBSERVED]
+        return concatenate([chosen[left]])
+
+    def mean_shear(
+        self, weights: ArrayLike | None = None, *, where: str | None = None, weight: str | None = None
+    ) -> MeanShear:
         """The mean shear of the good galaxies: Σwe/ΣwR, with the ellipticities e before calibration.
 
         The error is the error of this ratio to first order, √(Σw²(e − gR)² n/(n − 1)) / ΣwR. It assumes independent
@@ -206,7 +265,9 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         ----------
         weights : array of shape (n,), optional
             Weight of each row, not negative, or a mask of rows. Weights must not depend on the measured shape, which
-            biases the mean; take them from the flux or the noise. Equal weights by default.
+            biases the mean. Equal weights by default.
+        where, weight : str, optional
+            Cuts and a weight by S/N, flux and size, as for :meth:`select`. The mean stays unbiased.
 
         Returns
         -------
@@ -217,7 +278,11 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         ValueError
             If weights have another shape, no good galaxy has a positive weight, or a mean response is not positive.
         """
-        return mean_shear(self, weights)
+        if where is None and weight is None:
+            return mean_shear(self, weights)
+        if weights is not None:
+            raise ValueError("weights: cannot be combined with where or weight; expected one of them")
+        return mean_shear(self.select(where, weight))
 
     def columns(self, names: Literal["shearq", "anacal", "ngmix"] = "shearq") -> dict[str, NDArray[Any]]:
         """Columns by the names that a program uses.

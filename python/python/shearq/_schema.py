@@ -11,7 +11,14 @@ WHOLE = ("flags", "iterations", "stop", "updated")
 NEEDED = ("e1", "e2", "flags", "R11", "R22", "divisor1", "divisor2")
 REAL: tuple[str, ...] = ("x", "y", "e1", "e2", "first_energy", "energy", "noise", "flux", "radius", "size", "R11", "R22", "R12", "R21")
 REAL += ("divisor1", "divisor2")
-UNITS = {"x": "pix", "y": "pix", "radius": "pix", "size": "pix2"}
+# What linear configurations add: S/N, and how flux and size change with shear and noise (docs/files-catalogues.md).
+OBSERVED: tuple[str, ...] = ("flux_error", "flux_g1", "flux_g2", "size_g1", "size_g2")
+OBSERVED += tuple(f"n{k}_{pair}" for k in "12" for pair in ("ef", "es", "ff", "fs", "ss"))
+OBSERVED += tuple(f"t_{pair}" for pair in ("e1f", "e1s", "e2f", "e2s", "ff", "fs", "ss", "s"))
+REAL += ("snr", *OBSERVED)
+# What a selection reads.
+SELECTED = ("e1", "e2", "flags", "R11", "R22", "R12", "R21", "divisor1", "divisor2", "flux", "size", *OBSERVED)
+UNITS = {"x": "pix", "y": "pix", "radius": "pix"}
 
 # Keys of files, and the names of ``attrs``.
 KEYS = {"submiss": "submission", "elltype": "ellipticity", "settings": "settings", "creator": "version"}

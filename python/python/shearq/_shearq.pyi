@@ -63,6 +63,9 @@ def measure(
 def mean_shear(
     e1: _Doubles, e2: _Doubles, r11: _Doubles, r22: _Doubles, weights: _Doubles
 ) -> tuple[list[float], list[list[float]], list[float], int]: ...
+def select(
+    columns: dict[str, _Doubles], cuts: str | None, weight: str | None
+) -> list[_Doubles]: ...
 def metrics() -> list[tuple[str, str, str]]: ...
 def score(
     n: int,

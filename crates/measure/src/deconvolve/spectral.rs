@@ -29,6 +29,7 @@
 
 mod edges;
 mod plane;
+mod products;
 
 use multiversion::multiversion;
 use ndarray::ArrayView2;
@@ -37,6 +38,8 @@ use shearq_submissions::LinearDeconvolution;
 
 use self::edges::{Edges, EdgesScratch};
 use self::plane::{Plane, PlaneScratch};
+pub(crate) use self::products::Gradients;
+use self::products::Kinds;
 use super::sun::high_pass;
 use crate::error::MeasureError;
 use crate::fft::StampFft;
@@ -85,6 +88,8 @@ pub struct Spectral {
     scale: Vec<f32>,
     /// Phase that moves the centre of a PSF's stamp to the origin.
     centre: Vec<Complex32>,
+    /// Share of the noise under the window that the stamp contains.
+    inside: f32,
 }
 
 /// Noise as the linear network uses it: of level one, and white but for its power.
@@ -116,12 +121,20 @@ pub struct SpectralPsf {
     tilts: Vec<[Complex32; 2]>,
     /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ².
     noise_tilts: Vec<[f32; 2]>,
+    /// Power of noise of σ = 1 in each mode before the window, times its changes with both components of shear, and times
+    /// what it lacks to be that of the PSF turned by 90 degrees.
+    powers: Vec<Kinds>,
 }
 
 impl SpectralPsf {
     /// |p|²/S of each mode of a half spectrum, S being the power of the noise.
     pub fn clarity(&self) -> &[f32] {
         &self.clarity
+    }
+
+    /// Standard deviation of [`Lags::flux`] in noise of σ = 1.
+    pub fn flux_error(&self) -> f32 {
+        self.floor[0].sqrt()
     }
 }
 
@@ -139,6 +152,8 @@ pub struct SpectralScratch {
     /// Where the window is, (x, y) in pixels from the middle of the stamp, and the window along both axes there.
     centre: [f32; 2],
     windows: [Vec<f32>; 2],
+    /// Their transforms.
+    window_modes: [Vec<Complex32>; 2],
     edges: EdgesScratch,
 }
 
@@ -152,6 +167,8 @@ pub struct Lags {
     pub shear1: Vec<f32>,
     /// Its derivative with respect to γ₂.
     pub shear2: Vec<f32>,
+    /// Sum of the windowed result, and its derivatives with respect to γ₁ and γ₂.
+    pub flux: [f32; 3],
 }
 
 impl Spectral {
@@ -216,6 +233,7 @@ impl Spectral {
             edges: Edges::new(n, &plane),
             scale: waves.iter().map(scale).collect(),
             centre: waves.iter().map(centre).collect(),
+            inside: inside * inside,
             leak,
             plane,
         })
@@ -246,7 +264,10 @@ impl Spectral {
     /// Buffers that fit this plan.
     pub fn scratch(&self) -> SpectralScratch {
         let most = self.n.max(self.p);
+        let mut modes = vec![Complex32::ZERO; self.plane.side];
+        products::window_modes(&self.window, &mut modes);
         SpectralScratch {
+            window_modes: [modes.clone(), modes],
             plane: self.plane.scratch(most),
             image: vec![0.0; most * most],
             stamp: self.plane.spectrum(),
@@ -265,8 +286,10 @@ impl Spectral {
                 continue;
             }
             scratch.centre[k] = centre[k];
+            let modes = &mut scratch.window_modes[k];
             if centre[k] == 0.0 {
                 window.copy_from_slice(&self.window);
+                products::window_modes(window, modes);
                 continue;
             }
             let (middle, period) = ((self.n as f32 - 1.0) / 2.0, self.plane.size as f32);
@@ -277,6 +300,7 @@ impl Spectral {
                 let x = (x - period * (x / period).round()) / sigma;
                 *value = (-0.5 * x * x).exp() / side;
             }
+            products::window_modes(window, modes);
         }
     }
 
@@ -292,6 +316,7 @@ impl Spectral {
             clarity: vec![0.0; modes],
             tilts: vec![[Complex32::ZERO; 2]; modes],
             noise_tilts: vec![[0.0; 2]; modes],
+            powers: vec![[0.0; 3]; modes],
         }
     }
 
@@ -331,6 +356,7 @@ impl Spectral {
             acf: lags.clone(),
             shear1: lags.clone(),
             shear2: lags,
+            flux: [0.0; 3],
         }
     }
 
@@ -391,6 +417,12 @@ impl Spectral {
             };
         }
         spread(self.plane.side, &self.leak, tilt, along, &mut out.floor);
+        let area = (self.plane.size * self.plane.size) as f32 * self.inside;
+        for (at, powers) in out.powers.iter_mut().enumerate() {
+            let power = area * tilt[at];
+            let [first, second] = out.field_tilts[at];
+            *powers = [power * first, power * second, power * out.turned[at]];
+        }
         for component in 0..2 {
             let modes = out.field_tilts.iter().zip(&out.field);
             for (value, (tilts, field)) in tilt.iter_mut().zip(modes) {
@@ -435,6 +467,7 @@ impl Spectral {
         let plane = &mut scratch.plane;
         let [u, x, y] = &mut plane.half;
         scratch.stamp.copy_from_slice(u);
+        out.flux = [u[0].re, x[0].re, y[0].re];
         let variance = noise * noise;
         for (at, u) in u.iter_mut().enumerate() {
             let (value, scale) = (*u, self.scale[at]);
@@ -598,6 +631,7 @@ impl Spectral {
             acf,
             shear1,
             shear2,
+            ..
         } = out;
         self.plane.lags(0, self.reach, plane, |at, value| {
             (acf[at], shear1[at]) = (value.re, value.im);

@@ -200,8 +200,12 @@ mod tests {
         FunctionalPsf::new(profile, fwhm, Shear::new(0.03, -0.02)).unwrap()
     }
 
-    /// Of a galaxy as broad as the PSF, elongated along x.
-    fn measured(configuration: &Configuration, fwhms: &[f64], noise: f64) -> Vec<Measurement> {
+    /// Of a galaxy as broad as the PSF, elongated along x, with the σ of the target.
+    fn measured(
+        configuration: &Configuration,
+        fwhms: &[f64],
+        noise: f64,
+    ) -> Vec<(Measurement, f64)> {
         let mut worker = Measurer::new(configuration, 48).unwrap().worker();
         let each = fwhms.iter().map(|&fwhm| {
             let psf = moffat(fwhm).stamp_beside(configuration.psf_cut().size, 48);
@@ -211,7 +215,8 @@ mod tests {
             });
             let mut image = worker.image(ImageNoise::Level(noise));
             let mut worker = image.psf(psf.view()).unwrap();
-            worker.measure(stamp.view()).unwrap()
+            let found = worker.measure(stamp.view()).unwrap();
+            (found, worker.adapted().unwrap().target_sigma)
         });
         each.collect()
     }
@@ -224,15 +229,18 @@ mod tests {
         let plain = measured(&without, &fwhms, 0.5);
         for k in [0, 2] {
             assert_eq!(
-                (found[k].e1, found[k].response),
-                (plain[k].e1, plain[k].response)
+                (found[k].0.e1, found[k].0.response),
+                (plain[k].0.e1, plain[k].0.response)
             );
         }
-        assert!(found[1].size > 1.2 * plain[1].size, "{found:?} {plain:?}");
-        assert!(found[3].size < 0.8 * plain[3].size, "{found:?} {plain:?}");
+        assert!(found[1].1 > 1.2 * plain[1].1, "{found:?} {plain:?}");
+        assert!(found[3].1 < 0.8 * plain[3].1, "{found:?} {plain:?}");
         // Whatever was measured before, and on whichever worker.
         let alone = measured(&with, &[6.0], 0.5);
-        assert_eq!((found[1].e1, found[1].e2), (alone[0].e1, alone[0].e2));
+        assert_eq!(
+            (found[1].0.e1, found[1].0.e2),
+            (alone[0].0.e1, alone[0].0.e2)
+        );
     }
 
     #[test]

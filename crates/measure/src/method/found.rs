@@ -54,9 +54,25 @@ pub(crate) struct Found {
     pub(crate) response: Option<ResponseMatrix>,
     /// Effect of sheared noise, on the galaxies on which it is estimated.
     pub(crate) sheared_noise: Option<Sheared>,
+    /// Flux and size before the PSF, if the method determines them.
+    pub(crate) observed: Option<FoundObservables>,
     pub(crate) flux: f64,
     pub(crate) radius: f64,
     pub(crate) size: f64,
+}
+
+/// Flux and size of a galaxy before the PSF.
+pub(crate) struct FoundObservables {
+    pub(crate) flux: f64,
+    pub(crate) flux_error: f64,
+    pub(crate) flux_response: [f64; 2],
+    /// Response of T, from which the size follows.
+    pub(crate) square_response: [f64; 2],
+    /// The size, and its first and second derivative with T.
+    pub(crate) size: [f64; 3],
+    /// Mean products of changes with noise of χ₁, χ₂, T and the flux, in the order 00, 01, 02, 03, 11, …, for noise changed
+    /// by γ₁, by γ₂, and turned, on the galaxies on which they are determined.
+    pub(crate) products: Option<[[f64; 3]; 10]>,
 }
 
 /// How the response of a galaxy differs with a field of noise added and taken away, to a shear of
@@ -66,6 +82,9 @@ pub(crate) struct Sheared {
     pub(crate) sides: [(Distortion, ResponseMatrix); 2],
     /// Change of the distortion on either side with what that field lacks to be one of a PSF turned by 90 degrees.
     pub(crate) turned: [[f64; 2]; 2],
+    /// Change of the size's T on either side with what γ₁ and γ₂ make of the field, and with what it lacks to be one of a
+    /// turned PSF.
+    pub(crate) breadth: [[f64; 3]; 2],
     /// Factor from the difference of responses to what sheared noise adds to the mean response.
     pub(crate) weight: f64,
 }

@@ -23,13 +23,17 @@ use std::sync::Arc;
 use ndarray::{Array2, ArrayView2};
 use shearq_submissions::LinearMethod;
 
-use super::found::{AdaptedSettings, CutWorker, Found, Images, Sheared, image, whole};
+use super::found::{
+    AdaptedSettings, CutWorker, Found, FoundObservables, Images, Sheared, image, whole,
+};
 use super::softening::Softening;
-use crate::deconvolve::{Descent, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop};
+use crate::deconvolve::{
+    Descent, Gradients, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop,
+};
 use crate::error::MeasureError;
 use crate::measurement::ResponseMatrix;
 use crate::noise::StampNoise;
-use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
+use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Breadth};
 use crate::surroundings::{Surroundings, centre, followed};
 
 /// One galaxy in this many is measured with a field of noise, for the noise term of the response.
@@ -45,6 +49,11 @@ pub(super) struct LinearPlan {
     softening: Softening,
     spectral: Spectral,
     moments: AdaptiveMoments,
+    breadth: Breadth,
+    /// Gradients of P₀ and P₂.
+    broad: [Vec<f32>; 2],
+    /// What corrects the flux for the light beyond the window.
+    aperture: f64,
 }
 
 impl LinearPlan {
@@ -59,6 +68,12 @@ impl LinearPlan {
         let spectral = Spectral::new(n, p, settings)?;
         let scale = method.shape.weight_scale;
         let moments = AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach());
+        let (target, window) = (settings.target_sigma, settings.window_sigma);
+        let breadth = Breadth::new(target, window, spectral.spacing(), spectral.reach());
+        let mut scratch = spectral.scratch();
+        let broad = breadth
+            .gradients()
+            .map(|weights| spectral.spectrum_of(&weights, &mut scratch));
         Ok(LinearPlan {
             lengths: AdaptedSettings {
                 target_sigma: settings.target_sigma,
@@ -66,7 +81,10 @@ impl LinearPlan {
                 weight_scale: scale,
             },
             iterations: u32::try_from(settings.max_iterations).unwrap_or(u32::MAX),
-            softening: Softening::new(method, extent, &spectral, &moments),
+            softening: Softening::new(method, extent, &spectral, &moments, &breadth),
+            aperture: 1.0 + (extent + target * target) / (window * window),
+            breadth,
+            broad,
             moments,
             spectral,
         })
@@ -83,6 +101,9 @@ pub(super) struct LinearWorker {
     psf: SpectralPsf,
     /// What is added to the divisor of the moments, in px⁴ times the unit of the autocorrelation, in noise of level one.
     added: f32,
+    /// What is added to P₀ of the size, in its unit, in noise of level one.
+    faint: f32,
+    gradients: Gradients,
     buffers: SpectralScratch,
     lags: Lags,
     /// What was found on them last.
@@ -101,6 +122,8 @@ impl LinearWorker {
             noise: plan.spectral.noise(&StampNoise::white(1.0)),
             psf: plan.spectral.psf(),
             added: 0.0,
+            faint: 0.0,
+            gradients: plan.spectral.gradients(),
             buffers: plan.spectral.scratch(),
             surroundings: Surroundings::new(plan.spectral.stamp_size()),
             grain: 1.0,
@@ -126,6 +149,42 @@ impl LinearWorker {
         [[first[0], second[0]], [first[1], second[1]]]
     }
 
+    /// Flux and size with their responses, of the galaxy whose `shape` was found last; with the effect of noise on them and
+    /// on the ellipticity if `coupled`.
+    fn observed(&mut self, shape: &AdaptiveShape, noise: f32, coupled: bool) -> FoundObservables {
+        let plan = &*self.plan;
+        let lags = &self.lags;
+        let (soft, typical) = (self.faint * noise * noise, plan.softening.typical);
+        let breadth = plan.breadth.measure(&lags.acf, soft, typical);
+        let response = |change: &[f32]| f64::from(plan.breadth.response(&breadth, change));
+        let flux = lags.flux.map(|flux| plan.aperture * f64::from(flux));
+        let products = coupled.then(|| {
+            plan.moments.gradients(shape, &mut self.gradients.pair);
+            let [zero, two] = &plan.broad;
+            for ((third, zero), two) in self.gradients.third.iter_mut().zip(zero).zip(two) {
+                *third = Breadth::combine(&breadth, [*zero, *two]);
+            }
+            let found = plan
+                .spectral
+                .products(&self.psf, &self.gradients, &mut self.buffers);
+            let unit = f64::from(noise * noise) * SHARE as f64;
+            // The last of four quantities is the flux.
+            let scale = [0, 0, 0, 1, 0, 0, 1, 0, 1, 2];
+            std::array::from_fn(|k| {
+                let unit = unit * plan.aperture.powi(scale[k]);
+                found[k].map(|value| unit * f64::from(value))
+            })
+        });
+        FoundObservables {
+            flux: flux[0],
+            flux_error: plan.aperture * f64::from(noise * self.psf.flux_error()),
+            flux_response: [flux[1], flux[2]],
+            square_response: [response(&lags.shear1), response(&lags.shear2)],
+            size: plan.breadth.size(f64::from(breadth.square)),
+            products,
+        }
+    }
+
     /// The response to sheared noise; `None` if the galaxy cannot be measured with the field.
     fn sheared_noise(&mut self, seed: u64, noise: f32, softening: f32) -> Option<Sheared> {
         let plan = &*self.plan;
@@ -134,6 +193,7 @@ impl LinearWorker {
         plan.spectral
             .turned_field(&self.psf, seed, &mut self.buffers, &mut self.turned);
         let step = FIELD * noise;
+        let soft = self.faint * noise * noise;
         let mut side = |step: f32| {
             let terms = self.lags.acf.iter().zip(&self.field.acf);
             for (out, (acf, change)) in self.shifted.iter_mut().zip(terms) {
@@ -144,12 +204,18 @@ impl LinearWorker {
             let shape = shape.ok()?;
             let response = Self::response(plan, &shape, &self.field, &mut self.values);
             let turned = moments.response(&shape, &self.turned.acf, &mut self.values);
-            Some(((shape.distortion, response), turned))
+            let breadth = plan
+                .breadth
+                .measure(&self.shifted, soft, plan.softening.typical);
+            let changes = [&self.field.shear1, &self.field.shear2, &self.turned.acf];
+            let breadth = changes.map(|change| f64::from(plan.breadth.response(&breadth, change)));
+            Some(((shape.distortion, response), turned, breadth))
         };
         let (plus, minus) = (side(step)?, side(-step)?);
         Some(Sheared {
             sides: [plus.0, minus.0],
             turned: [plus.1, minus.1],
+            breadth: [plus.2, minus.2],
             weight: f64::from(noise * noise / (2.0 * step)) * SHARE as f64,
         })
     }
@@ -165,7 +231,7 @@ impl CutWorker for LinearWorker {
         self.plan
             .spectral
             .set_psf(psf, &self.noise, &mut self.buffers, &mut self.psf)?;
-        self.added = self.plan.softening.behind(&self.psf);
+        [self.added, self.faint] = self.plan.softening.behind(&self.psf);
         Ok(())
     }
 
@@ -197,12 +263,15 @@ impl CutWorker for LinearWorker {
         self.shape = shape.as_ref().ok().copied();
         let mut response = None;
         let mut sheared_noise = None;
+        let mut observed = None;
         if let Ok(shape) = &shape {
             response = Some(Self::response(&plan, shape, lags, &mut self.values));
             let seed = seed_of(whole, sigma);
-            if noise > 0.0 && seed.is_multiple_of(SHARE) {
+            let coupled = noise > 0.0 && seed.is_multiple_of(SHARE);
+            if coupled {
                 sheared_noise = self.sheared_noise(seed, sigma, softening);
             }
+            observed = Some(self.observed(shape, sigma, sheared_noise.is_some()));
         }
         Ok(Some(Found {
             descent: Descent {
@@ -215,9 +284,10 @@ impl CutWorker for LinearWorker {
             distortion: shape.map(|s| s.distortion),
             response,
             sheared_noise,
-            flux: sum(whole),
+            flux: plan.aperture * f64::from(self.lags.flux[0]),
             radius: plan.spectral.reach() as f64 * plan.spectral.spacing(),
-            size: shape.map_or(f64::NAN, |s| s.size),
+            size: observed.as_ref().map_or(f64::NAN, |found| found.size[0]),
+            observed,
         }))
     }
 
@@ -251,19 +321,4 @@ fn seed_of(stamp: &[f32], noise: f32) -> u64 {
         (hash ^ u64::from(step.cast_unsigned())).wrapping_mul(0x0100_0000_01b3)
     });
     hash >> 16
-}
-
-/// Sum of a stamp: rows in f32 side by side, which is where the time would go otherwise.
-fn sum(stamp: &[f32]) -> f64 {
-    /// Numbers that are summed side by side. See docs/constants.md.
-    const LANES: usize = 16;
-    let mut lanes = [0.0f32; LANES];
-    let chunks = stamp.chunks_exact(LANES);
-    let rest: f32 = chunks.remainder().iter().sum();
-    for chunk in chunks {
-        for (lane, value) in lanes.iter_mut().zip(chunk) {
-            *lane += value;
-        }
-    }
-    lanes.iter().map(|&lane| f64::from(lane)).sum::<f64>() + f64::from(rest)
 }

@@ -81,6 +81,7 @@ impl CutWorker for NetworkWorker {
             distortion,
             response: None,
             sheared_noise: None,
+            observed: None,
             flux,
             radius,
             size,

@@ -10,7 +10,10 @@
 use shearq_submissions::{LinearDeconvolution, LinearMethod};
 
 use crate::deconvolve::{Spectral, SpectralPsf};
-use crate::shape::AdaptiveMoments;
+use crate::shape::{AdaptiveMoments, Breadth};
+
+/// S/N at which half of a size is that of a typical galaxy. See docs/constants.md.
+const FAINT_SNR: f32 = 5.0;
 
 /// The added divisor of a plan, for the galaxies that its window is for.
 pub(super) struct Softening {
@@ -19,6 +22,10 @@ pub(super) struct Softening {
     halving: f32,
     /// Its power in each mode, as `Spectral::light` has it.
     galaxy: Vec<f32>,
+    /// P₀ of such a galaxy of flux one, times the square of its S/N, for [`Breadth`].
+    faint: f32,
+    /// Its T.
+    pub(super) typical: f32,
 }
 
 impl Softening {
@@ -29,6 +36,7 @@ impl Softening {
         extent: f64,
         spectral: &Spectral,
         moments: &AdaptiveMoments,
+        breadth: &Breadth,
     ) -> Self {
         let LinearDeconvolution {
             target_sigma,
@@ -48,18 +56,22 @@ impl Softening {
             })
             .collect();
         let halving = moments.halving(&acf);
+        let [zero, two] = breadth.sums(&acf);
         Softening {
             halving: halving * method.shape.half_snr.powi(2) as f32,
             galaxy: spectral.light(extent),
+            faint: zero * FAINT_SNR * FAINT_SNR,
+            typical: two / zero,
         }
     }
 
     /// What is added to the divisor of galaxies behind `psf`, in px⁴ times the unit of the autocorrelation, in noise of level
-    /// one; not finite where the PSF leaves nothing.
-    pub(super) fn behind(&self, psf: &SpectralPsf) -> f32 {
+    /// one, and what is added to P₀ for the size; not finite where the PSF leaves nothing.
+    pub(super) fn behind(&self, psf: &SpectralPsf) -> [f32; 2] {
         // Squared S/N of the galaxy of flux one.
         let seen = self.galaxy.iter().zip(psf.clarity());
-        self.halving / seen.map(|(light, clarity)| light * clarity).sum::<f32>()
+        let seen = seen.map(|(light, clarity)| light * clarity).sum::<f32>();
+        [self.halving / seen, self.faint / seen]
     }
 }
 

@@ -15,6 +15,7 @@
 //! of the autocorrelation.
 
 use multiversion::multiversion;
+use shearq_fourier::Complex32;
 use shearq_quantities::Distortion;
 
 use crate::flag::Flag;
@@ -211,6 +212,33 @@ impl AdaptiveMoments {
         shape
             .inverse
             .map(|row| f64::from(row[0] * moved[0] + row[1] * moved[1]))
+    }
+
+    /// Writes the weights of the lags, each for itself, whose sum with a change of the autocorrelation is the change of χ₁
+    /// (real part) and χ₂ (imaginary part); laid out as `deconvolve::Lags`.
+    pub(crate) fn gradients(&self, shape: &AdaptiveShape, out: &mut [Complex32]) {
+        out.fill(Complex32::ZERO);
+        let scale = self.scale(shape.chi);
+        let [chi1, chi2] = shape.chi;
+        let [[i11, i12], [i21, i22]] = shape.inverse;
+        let [a, b, c] = &self.bases;
+        // Lags of the row y = 0 are stored with both signs, those of others with one.
+        let width = 2 * ((self.lags as f64 / 2.0).sqrt() as usize) + 1;
+        for (k, &at) in self.at.iter().enumerate() {
+            if self.area[k] == 0.0 {
+                continue;
+            }
+            let inverse = 1.0 / (1.0 + scale * (a[k] - chi1 * b[k] - chi2 * c[k]));
+            let at = at as usize;
+            let count = if at == width / 2 { 1.0 } else { 0.5 };
+            let weight = count * self.area[k] * inverse * inverse.sqrt() / shape.trace;
+            let (first, second) = (weight * (b[k] - chi1 * a[k]), weight * (c[k] - chi2 * a[k]));
+            let value = Complex32::new(i11 * first + i12 * second, i21 * first + i22 * second);
+            out[at] = value;
+            if at < width {
+                out[width - 1 - at] = value;
+            }
+        }
     }
 
     /// The weight W at lag (x, y), in pixels, that `shape` was found with.

@@ -111,6 +111,9 @@ pub struct Run {
     pub configuration: Configuration,
     /// File format of the catalogues.
     pub format: FileFormat,
+    /// Cuts and weights that were applied to the catalogues, if any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub selection: Option<String>,
 }
 
 impl Run {
@@ -129,6 +132,7 @@ impl Run {
             source,
             configuration,
             format,
+            selection: None,
         }
     }
 

@@ -7,7 +7,7 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
 use shearq_files::table;
-use shearq_measure::{Flag, Measurement, Warning};
+use shearq_measure::{Flag, Measurement, Observables, Warning};
 use shearq_submissions::EllipticityType;
 
 use super::row::{MeasuredRow, warnings};
@@ -26,7 +26,8 @@ pub enum Value {
     Whole(fn(&Measurement) -> i32),
 }
 
-/// The columns of catalogues after the position, in order. The command line and Python use the same.
+/// The columns of catalogues after the position, in order. The command line and Python use the same. [`observed`] gives the
+/// columns that follow for the linear method.
 pub const COLUMNS: [(&str, Value); 18] = [
     ("e1", Value::Real(|g| g.e1)),
     ("e2", Value::Real(|g| g.e2)),
@@ -64,6 +65,22 @@ pub const COLUMNS: [(&str, Value); 18] = [
     ("divisor2", Value::Real(|g| divisor(g)[1])),
 ];
 
+/// Columns of the catalogues of linear configurations after [`COLUMNS`]: the S/N, and the [`Observables`] that are not among
+/// these. NaN for galaxies that could not be measured.
+pub fn observed(galaxies: &[&Measurement]) -> Vec<(&'static str, Vec<f64>)> {
+    let column = |of: &dyn Fn(&Observables) -> f64| {
+        let values = galaxies.iter().map(|galaxy| galaxy.observables.as_ref());
+        values.map(|found| found.map_or(f64::NAN, of)).collect()
+    };
+    let mut columns = vec![("snr", column(&Observables::snr))];
+    for (at, name) in Observables::COLUMNS.into_iter().enumerate() {
+        if !COLUMNS.iter().any(|(known, _)| *known == name) {
+            columns.push((name, column(&|found: &Observables| found.to_array()[at])));
+        }
+    }
+    columns
+}
+
 /// Mean responses by which the ellipticity was divided; NaN if it was not.
 fn divisor(galaxy: &Measurement) -> [f64; 2] {
     galaxy.divisor.unwrap_or([f64::NAN; 2])
@@ -76,12 +93,16 @@ fn response(galaxy: &Measurement, i: usize, j: usize) -> f64 {
 
 /// Key of the metadata with the warnings of an image.
 const WARNINGS: &str = "warnings";
+/// Keys of the metadata of catalogues, beside fingerprints.
+pub const KEYS: [&str; 7] = [
+    "creator", "submiss", "elltype", "set", "image", "settings", WARNINGS,
+];
 
 /// Catalogue of one image from its rows of stamps, in order.
 ///
 /// # Errors
 /// If polars cannot make the table.
-fn catalogue(rows: &[MeasuredRow]) -> Result<DataFrame, TableError> {
+fn catalogue(rows: &[MeasuredRow], linear: bool) -> Result<DataFrame, TableError> {
     let galaxies = || rows.iter().flat_map(|row| &row.galaxies);
     let positions = rows.iter().flat_map(|row| {
         let mosaic = row.head.mosaic;
@@ -99,6 +120,11 @@ fn catalogue(rows: &[MeasuredRow]) -> Result<DataFrame, TableError> {
             Column::new((*name).into(), values)
         }
     }));
+    if linear {
+        let galaxies: Vec<&Measurement> = galaxies().collect();
+        let observed = observed(&galaxies).into_iter();
+        columns.extend(observed.map(|(name, values)| Column::new(name.into(), values)));
+    }
     frame(columns)
 }
 
@@ -242,7 +268,9 @@ impl<'a> Catalogues<'a> {
         // Writing would make the folder again, without the earlier catalogues.
         self.claim.check()?;
         let path = self.run.catalogue(self.out, set, image);
-        let table = catalogue(rows).map_err(|error| FileError::new(&path, error.to_string()))?;
+        let linear = self.run.configuration.linear().is_some();
+        let table =
+            catalogue(rows, linear).map_err(|error| FileError::new(&path, error.to_string()))?;
         let mut metadata = metadata(self.run, head.id, head.prints.clone())?;
         if !found.is_empty() {
             let lines: Vec<String> = found.iter().map(Warning::to_string).collect();

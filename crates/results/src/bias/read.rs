@@ -10,9 +10,10 @@ use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, Place};
 use shearq_quantities::Distortion;
 
+use crate::expression::Expression;
+
 use super::Input;
 use super::columns::{Columns, Names, Preset, Role};
-use super::expression::Expression;
 use super::positions::{self, Positions};
 use super::truth::Truth;
 

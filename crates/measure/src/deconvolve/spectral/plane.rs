@@ -208,6 +208,53 @@ impl Plane {
         }
     }
 
+    /// The adjoint of [`Plane::lags`]: the real even spectra, as real and imaginary part of `half[which]`, of two even
+    /// functions of the lags that `values` gives as real and imaginary part.
+    pub(super) fn spectra_of_lags(
+        &self,
+        which: usize,
+        reach: usize,
+        scratch: &mut PlaneScratch,
+        values: &[Complex32],
+    ) {
+        let PlaneScratch {
+            half,
+            fine: [columns, rows],
+            fft,
+            ..
+        } = scratch;
+        let (side, lags) = (self.side, self.lags);
+        let width = 2 * reach + 1;
+        let rows = &mut rows[..(reach + 1) * lags];
+        for (line, from) in rows.chunks_exact_mut(lags).zip(values.chunks_exact(width)) {
+            line[..=reach].copy_from_slice(&from[reach..]);
+            line[reach + 1..lags - reach].fill(Complex32::ZERO);
+            line[lags - reach..].copy_from_slice(&from[..reach]);
+        }
+        // The transforms of even functions are the same in both directions.
+        self.fine.process_with_scratch(rows, fft);
+        let columns = &mut columns[..self.columns() * lags];
+        for (column, line) in columns.chunks_exact_mut(lags).enumerate() {
+            line.fill(Complex32::ZERO);
+            let opposite = (lags - column) % lags;
+            for (y, row) in rows.chunks_exact(lags).enumerate() {
+                line[y] = row[column];
+                if y > 0 {
+                    // The function is even: row −y is row y from right to left.
+                    line[lags - y] = row[opposite];
+                }
+            }
+        }
+        self.fine.process_with_scratch(columns, fft);
+        let low = self.modes + 1;
+        let lines = columns.chunks_exact(lags);
+        for (from, to) in lines.zip(half[which].chunks_exact_mut(side)) {
+            to[..low].copy_from_slice(&from[..low]);
+            to[low..side - self.modes].fill(Complex32::ZERO);
+            to[side - self.modes..].copy_from_slice(&from[lags - self.modes..]);
+        }
+    }
+
     /// Images of the real even spectra that are real and imaginary part of `half[which]`, at lags
     /// dy = 0…reach, dx = −reach…reach; a sum over modes, without a scale.
     pub(super) fn lags(

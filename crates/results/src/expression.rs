@@ -6,6 +6,8 @@ pub struct Expression {
     text: String,
     columns: Vec<String>,
     root: Node,
+    /// Whether a comparison, `and`, `or`, `not` or `abs` is used.
+    sharp: bool,
 }
 
 type Function = fn(f64) -> f64;
@@ -73,6 +75,7 @@ impl Expression {
             at: 0,
             depth: 0,
             columns: Vec::new(),
+            sharp: false,
         };
         let root = parser.level(0)?;
         if !parser.rest().is_empty() {
@@ -82,7 +85,13 @@ impl Expression {
             text: text.trim().to_owned(),
             columns: parser.columns,
             root,
+            sharp: parser.sharp,
         })
+    }
+
+    /// Whether the expression has derivatives of all orders where its functions are defined: no comparison and no `abs`.
+    pub fn is_smooth(&self) -> bool {
+        !self.sharp
     }
 
     /// The text that was parsed.
@@ -114,6 +123,7 @@ struct Parser<'a> {
     at: usize,
     depth: usize,
     columns: Vec<String>,
+    sharp: bool,
 }
 
 impl<'a> Parser<'a> {
@@ -154,6 +164,8 @@ impl<'a> Parser<'a> {
         };
         let mut node = self.level(level + 1)?;
         while let Some((_, operator)) = operators.iter().find(|(token, _)| self.take(token)) {
+            // The loosest three levels compare.
+            self.sharp |= level < 3;
             let right = self.level(level + 1)?;
             node = Node::Binary(*operator, Box::new(node), Box::new(right));
         }
@@ -203,6 +215,7 @@ impl<'a> Parser<'a> {
         if let Some((_, function)) = FUNCTIONS.iter().find(|(known, _)| *known == name)
             && self.take("(")
         {
+            self.sharp |= ["abs", "not"].contains(&name);
             return Ok(Node::Unary(*function, Box::new(self.closed()?)));
         }
         let known = self.columns.iter().position(|column| column == name);
@@ -271,6 +284,23 @@ mod tests {
         assert!(value("a > 1", &[f64::NAN]).is_nan());
         let twice = Expression::parse("a*a + b").unwrap();
         assert_eq!(twice.columns(), ["a", "b"]);
+    }
+
+    #[test]
+    fn smooth_expressions_are_known() {
+        for (text, smooth) in [
+            ("snr^2/(snr^2 + 100)", true),
+            ("exp(-size)", true),
+            ("abs(snr)", false),
+            ("size + (snr > 10)", false),
+            ("not(snr)", false),
+        ] {
+            assert_eq!(
+                Expression::parse(text).unwrap().is_smooth(),
+                smooth,
+                "{text}"
+            );
+        }
     }
 
     #[test]

@@ -1,0 +1,427 @@
+//! Selections and weights by S/N, flux and size that keep the shear calibrated.
+//!
+//! With a weight w(F, S) of flux and size, the mean of f = w e responds to a shear of the galaxies by
+//!
+//! ```text
+//! ⟨∂f/∂γ⟩ = ⟨w R + e (w_F F′ + w_S S′)⟩ − ⟨tr(D C f″)⟩,
+//! ```
+//!
+//! where the primes are derivatives with shear of the image with its noise, and the last term takes out that they shear the noise:
+//! for Gaussian noise n of covariance C, changed by D n, Stein's lemma gives ⟨∇f·D n⟩ = ⟨tr(D C f″)⟩, to all orders. Its products
+//! of changes with noise are in [`Coupling`]. In the same way, half of the trace with the difference to noise behind a PSF
+//! turned by 90 degrees takes out of ⟨f⟩ what noise with the shape of the PSF adds to it.
+//!
+//! Both terms need second derivatives of w, so that cuts are smooth steps. A sharp cut would give each of them the
+//! density of galaxies at the edge, with an infinite scatter.
+
+use std::fmt;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use thiserror::Error;
+
+use crate::measurement::ResponseMatrix;
+use crate::observables::{Coupling, Observables};
+
+/// Half width of a step in S/N, if none is given: one and a half times the noise of the S/N. See docs/constants.md.
+const SNR_WIDTH: f64 = 1.5;
+/// Half width of a step in size, in px, if none is given. See docs/constants.md.
+const SIZE_WIDTH: f64 = 0.3;
+
+/// A quantity that galaxies can be selected by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Quantity {
+    /// Flux over its error.
+    Snr,
+    /// [`Observables::flux`].
+    Flux,
+    /// [`Observables::size`].
+    Size,
+}
+
+impl Quantity {
+    /// All, with the names of their columns.
+    pub const ALL: [(&str, Quantity); 3] = [
+        ("snr", Quantity::Snr),
+        ("flux", Quantity::Flux),
+        ("size", Quantity::Size),
+    ];
+}
+
+/// A cut: a smooth step from weight 0 to 1 (above) or 1 to 0 (below).
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct Cut {
+    /// What is cut.
+    pub quantity: Quantity,
+    /// Whether values above the threshold are kept.
+    pub above: bool,
+    /// Where the weight is one half.
+    pub threshold: f64,
+    /// Distance from the threshold at which the weight is 0 or 1. `None`: 1.5 for S/N, 1.5 errors for the flux, 0.3 px for the size.
+    pub half_width: Option<f64>,
+}
+
+/// Why a selection cannot be used.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum SelectionError {
+    /// A condition that cannot be read.
+    #[error(
+        "not a condition on galaxies (found `{0}`, expected snr, flux or size, > or <, and a number, such as `snr > 10` or `size > 2.5 +- 0.5`)"
+    )]
+    Condition(String),
+    /// A column whose response to shear is unknown.
+    #[error(
+        "galaxies cannot be selected by `{0}`: its response to shear is not known, so the mean shear would be biased (expected snr, flux or size)"
+    )]
+    Unknown(String),
+    /// A number that is out of its range.
+    #[error("`{0}`: the threshold must be finite and the half width positive")]
+    Range(String),
+}
+
+/// Cuts and a weight, which are multiplied.
+///
+/// From text: conditions with commas between them, such as `snr > 10, size > 2.5 +- 0.5`. The number after `+-` is the
+/// half width of the step.
+#[derive(Clone, Default)]
+pub struct Selection {
+    cuts: Vec<Cut>,
+    weight: Option<Weight>,
+}
+
+/// A smooth weight of S/N, flux and size.
+type Weight = Arc<dyn Fn(f64, f64, f64) -> f64 + Send + Sync>;
+
+impl fmt::Debug for Selection {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Selection")
+            .field("cuts", &self.cuts)
+            .field("weight", &self.weight.is_some())
+            .finish()
+    }
+}
+
+/// A weighted ellipticity with its response. Means of many divide by each other; weights are in both.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[non_exhaustive]
+pub struct Selected {
+    /// Weighted ellipticity, before calibration.
+    pub e: [f64; 2],
+    /// Diagonal of its response to shear.
+    pub response: [f64; 2],
+    /// The weight; zero for galaxies that are cut.
+    pub weight: f64,
+}
+
+/// A weight and its derivatives with flux and size.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Jet {
+    value: f64,
+    first: [f64; 2],
+    /// Flux and flux, flux and size, size and size.
+    second: [f64; 3],
+}
+
+impl FromStr for Selection {
+    type Err = SelectionError;
+
+    fn from_str(text: &str) -> Result<Self, SelectionError> {
+        let cuts = text
+            .split(',')
+            .map(Cut::from_str)
+            .collect::<Result<_, _>>()?;
+        Ok(Selection { cuts, weight: None })
+    }
+}
+
+impl FromStr for Cut {
+    type Err = SelectionError;
+
+    fn from_str(text: &str) -> Result<Self, SelectionError> {
+        let unread = || SelectionError::Condition(text.trim().to_owned());
+        let at = text.find(['<', '>']).ok_or_else(unread)?;
+        let name = text[..at].trim();
+        let above = text[at..].starts_with('>');
+        let rest = text[at + 1..].trim_start_matches('=');
+        let (threshold, width) = match rest.split_once("+-").or_else(|| rest.split_once('±')) {
+            Some((threshold, width)) => (threshold, Some(width)),
+            None => (rest, None),
+        };
+        let number = |text: &str| text.trim().parse::<f64>().map_err(|_| unread());
+        let (threshold, half_width) = (number(threshold)?, width.map(number).transpose()?);
+        let word = |name: &str| name.chars().all(|c| c.is_alphanumeric() || c == '_');
+        let known = Quantity::ALL.iter().find(|(known, _)| *known == name);
+        let quantity = match known {
+            Some((_, quantity)) => *quantity,
+            None if !name.is_empty() && word(name) => {
+                return Err(SelectionError::Unknown(name.to_owned()));
+            }
+            None => return Err(unread()),
+        };
+        if !threshold.is_finite() || half_width.is_some_and(|width| !(width > 0.0)) {
+            return Err(SelectionError::Range(text.trim().to_owned()));
+        }
+        Ok(Cut {
+            quantity,
+            above,
+            threshold,
+            half_width,
+        })
+    }
+}
+
+impl Selection {
+    /// Adds a weight: a function of S/N, flux and size that is smooth on the scale of their noise. Derivatives are taken
+    /// numerically.
+    #[must_use]
+    pub fn with_weight(
+        mut self,
+        weight: impl Fn(f64, f64, f64) -> f64 + Send + Sync + 'static,
+    ) -> Self {
+        self.weight = Some(Arc::new(weight));
+        self
+    }
+
+    /// The cuts.
+    pub fn cuts(&self) -> &[Cut] {
+        &self.cuts
+    }
+
+    /// The weighted ellipticity and response of a galaxy with the ellipticity `e` and the `response` before calibration.
+    pub fn apply(&self, e: [f64; 2], response: ResponseMatrix, galaxy: &Observables) -> Selected {
+        let w = self.jet(galaxy);
+        if w.value == 0.0 && w.first == [0.0; 2] {
+            return Selected::default();
+        }
+        let Coupling { shear, turned } = galaxy.coupling;
+        let [w_f, w_s] = w.first;
+        // Σ w_ab C_ab, both orders of flux and size.
+        let curved = |ff: f64, fs: f64, ss: f64| {
+            let [w_ff, w_fs, w_ss] = w.second;
+            w_ff * ff + 2.0 * w_fs * fs + w_ss * ss
+        };
+        let [.., t_ff, t_fs, t_ss, t_s] = turned;
+        let mut selected = Selected {
+            weight: w.value,
+            ..Selected::default()
+        };
+        for k in 0..2 {
+            let [e_f, e_s, ff, fs, ss] = shear[k];
+            let [t_ef, t_es] = [turned[2 * k], turned[2 * k + 1]];
+            selected.e[k] = w.value * e[k]
+                + w_f * t_ef
+                + w_s * t_es
+                + 0.5 * e[k] * (curved(t_ff, t_fs, t_ss) + w_s * t_s);
+            selected.response[k] = w.value * response[k][k]
+                + e[k] * (w_f * galaxy.flux_response[k] + w_s * galaxy.size_response[k])
+                - 2.0 * (w_f * e_f + w_s * e_s)
+                - e[k] * curved(ff, fs, ss);
+        }
+        selected
+    }
+
+    fn jet(&self, galaxy: &Observables) -> Jet {
+        let one = Jet {
+            value: 1.0,
+            first: [0.0; 2],
+            second: [0.0; 3],
+        };
+        let cuts = self.cuts.iter().map(|cut| cut.jet(galaxy));
+        let weight = self
+            .weight
+            .iter()
+            .map(|weight| numerical(&**weight, galaxy));
+        cuts.chain(weight).fold(one, Jet::times)
+    }
+}
+
+impl Cut {
+    /// The step u³(10 − 15u + 6u²), u from 0 to 1 between the bounds: two derivatives vanish at either end.
+    fn jet(&self, galaxy: &Observables) -> Jet {
+        // A place along flux or size; S/N is flux in units of its error.
+        let (value, along, unit, usual) = match self.quantity {
+            Quantity::Snr => (galaxy.flux, 0, galaxy.flux_error, SNR_WIDTH),
+            Quantity::Flux => (galaxy.flux, 0, 1.0, SNR_WIDTH * galaxy.flux_error),
+            Quantity::Size => (galaxy.size, 1, 1.0, SIZE_WIDTH),
+        };
+        let half = self.half_width.unwrap_or(usual) * unit;
+        let sign = if self.above { 1.0 } else { -1.0 };
+        let slope = sign / (2.0 * half);
+        let u = 0.5 + (value - self.threshold * unit) * slope;
+        // A galaxy without noise has no S/N: beyond all bounds.
+        let u = if u.is_nan() { 0.0 } else { u.clamp(0.0, 1.0) };
+        let rest = 1.0 - u;
+        let mut jet = Jet {
+            value: u * u * u * (10.0 - 15.0 * u + 6.0 * u * u),
+            first: [0.0; 2],
+            second: [0.0; 3],
+        };
+        if u > 0.0 && u < 1.0 {
+            jet.first[along] = 30.0 * u * u * rest * rest * slope;
+            jet.second[2 * along] = 60.0 * u * rest * (rest - u) * slope * slope;
+        }
+        jet
+    }
+}
+
+impl Jet {
+    fn times(self, other: Self) -> Self {
+        let (a, b) = (self, other);
+        let [[af, a_s], [bf, bs]] = [a.first, b.first];
+        Jet {
+            value: a.value * b.value,
+            first: [0, 1].map(|k| a.first[k] * b.value + a.value * b.first[k]),
+            second: [
+                a.second[0] * b.value + 2.0 * af * bf + a.value * b.second[0],
+                a.second[1] * b.value + af * bs + a_s * bf + a.value * b.second[1],
+                a.second[2] * b.value + 2.0 * a_s * bs + a.value * b.second[2],
+            ],
+        }
+    }
+}
+
+/// A weight and its derivatives by differences.
+fn numerical(weight: &dyn Fn(f64, f64, f64) -> f64, galaxy: &Observables) -> Jet {
+    /// Steps of flux in its errors, and of size in px: the rounding of second differences is 10⁻¹⁰ of the weight. See
+    /// docs/constants.md.
+    const STEP: f64 = 1e-3;
+    let steps = [STEP * galaxy.flux_error, STEP];
+    let at = |i: i32, j: i32| {
+        let (flux, size) = (
+            galaxy.flux + f64::from(i) * steps[0],
+            galaxy.size + f64::from(j) * steps[1],
+        );
+        weight(flux / galaxy.flux_error, flux, size)
+    };
+    let middle = at(0, 0);
+    let [[fp, fm], [sp, sm]] = [[at(1, 0), at(-1, 0)], [at(0, 1), at(0, -1)]];
+    let cross = at(1, 1) - at(1, -1) - at(-1, 1) + at(-1, -1);
+    Jet {
+        value: middle,
+        first: [(fp - fm) / (2.0 * steps[0]), (sp - sm) / (2.0 * steps[1])],
+        second: [
+            (fp - 2.0 * middle + fm) / (steps[0] * steps[0]),
+            cross / (4.0 * steps[0] * steps[1]),
+            (sp - 2.0 * middle + sm) / (steps[1] * steps[1]),
+        ],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn galaxy() -> Observables {
+        Observables {
+            flux: 30.0,
+            flux_error: 2.0,
+            size: 2.5,
+            flux_response: [3.0, -1.0],
+            size_response: [0.2, 0.4],
+            coupling: Coupling {
+                shear: [[0.1, 0.2, 0.3, 0.4, 0.5], [0.6, 0.7, 0.8, 0.9, 1.0]],
+                turned: [0.1, -0.2, 0.3, -0.4, 0.5, 0.6, -0.7, 0.8],
+            },
+        }
+    }
+
+    const RESPONSE: ResponseMatrix = [[0.4, 9.0], [9.0, 0.3]];
+
+    #[test]
+    fn conditions_are_read_or_refused_with_the_reason() {
+        let selection: Selection = "snr > 10, size<=2.5 +- 0.5".parse().unwrap();
+        let [snr, size] = selection.cuts() else {
+            panic!("{selection:?}")
+        };
+        assert_eq!(
+            (snr.quantity, snr.above, snr.threshold),
+            (Quantity::Snr, true, 10.0)
+        );
+        assert_eq!(snr.half_width, None);
+        assert_eq!(
+            (size.quantity, size.above, size.half_width),
+            (Quantity::Size, false, Some(0.5))
+        );
+        for (text, expected) in [
+            ("R11 > 0.3", "galaxies cannot be selected by `R11`"),
+            ("size", "not a condition"),
+            ("size > big", "not a condition"),
+            ("snr > 10 +- 0", "half width positive"),
+            ("snr > nan", "must be finite"),
+            ("", "not a condition"),
+        ] {
+            let error = text.parse::<Selection>().unwrap_err().to_string();
+            assert!(error.contains(expected), "{text}: {error}");
+        }
+    }
+
+    #[test]
+    fn steps_and_their_products_have_the_derivatives_of_differences() {
+        let selection: Selection = "snr > 14.2, size > 2.4 +- 0.4, flux < 31 +- 4"
+            .parse()
+            .unwrap();
+        let jet = selection.jet(&galaxy());
+        let plain = selection.clone();
+        let value = move |_: f64, flux: f64, size: f64| {
+            let moved = Observables {
+                flux,
+                size,
+                ..galaxy()
+            };
+            plain.jet(&moved).value
+        };
+        let expected = numerical(&value, &galaxy());
+        // Truncation of differences of 2·10⁻³ and 10⁻³, and rounding over their squares.
+        let close = |a: f64, b: f64| (a - b).abs() < 1e-5 * (1.0 + b.abs());
+        assert!(close(jet.value, expected.value) && jet.value > 0.1 && jet.value < 0.9);
+        for k in 0..2 {
+            assert!(
+                close(jet.first[k], expected.first[k]),
+                "{jet:?} {expected:?}"
+            );
+        }
+        for k in 0..3 {
+            assert!(
+                close(jet.second[k], expected.second[k]),
+                "{jet:?} {expected:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn galaxies_away_from_the_step_keep_their_ellipticity_or_vanish() {
+        let e = [0.1, -0.2];
+        let all: Selection = "snr > 5".parse().unwrap();
+        let kept = all.apply(e, RESPONSE, &galaxy());
+        assert_eq!((kept.e, kept.response, kept.weight), (e, [0.4, 0.3], 1.0));
+        let none: Selection = "snr < 5".parse().unwrap();
+        assert_eq!(none.apply(e, RESPONSE, &galaxy()), Selected::default());
+    }
+
+    #[test]
+    fn terms_of_a_weight_follow_the_equation_of_the_module() {
+        // w = F S²/100: w_F = S²/100, w_S = F S/50, w_FF = 0, w_FS = S/50, w_SS = F/50.
+        let weighted = Selection::default().with_weight(|_, flux, size| flux * size * size / 100.0);
+        let e = [0.1, -0.2];
+        let found = weighted.apply(e, RESPONSE, &galaxy());
+        let (w, w_f, w_s, w_fs, w_ss) = (1.875, 0.0625, 1.5, 0.05, 0.6);
+        let first = w * 0.4 + 0.1 * (w_f * 3.0 + w_s * 0.2)
+            - 2.0 * (w_f * 0.1 + w_s * 0.2)
+            - 0.1 * (2.0 * w_fs * 0.4 + w_ss * 0.5);
+        let second = w * 0.3 - 0.2 * (-w_f + w_s * 0.4) - 2.0 * (w_f * 0.6 + w_s * 0.7)
+            + 0.2 * (2.0 * w_fs * 0.9 + w_ss * 1.0);
+        let curved = 2.0 * w_fs * 0.6 - w_ss * 0.7 + w_s * 0.8;
+        let e1 = w * 0.1 + w_f * 0.1 - w_s * 0.2 + 0.5 * 0.1 * curved;
+        let e2 = -w * 0.2 + w_f * 0.3 - w_s * 0.4 - 0.5 * 0.2 * curved;
+        // Rounding of second differences.
+        let close = |a: f64, b: f64| (a - b).abs() < 1e-6;
+        assert!(
+            close(found.response[0], first) && close(found.response[1], second),
+            "{found:?}"
+        );
+        assert!(close(found.e[0], e1) && close(found.e[1], e2), "{found:?}");
+    }
+}

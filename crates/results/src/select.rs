@@ -1,0 +1,268 @@
+//! Cuts and weights on catalogues of linear configurations, with the response of the selection to shear.
+
+use std::path::Path;
+
+use shearq_files::frames::frame;
+use shearq_files::frames::polars::{Column, DataFrame};
+use shearq_files::{FileError, atomic, table};
+use shearq_measure::{Observables, Selection};
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::data::run::{RUN_FILE, Run, Source, claim};
+use shearq_pipeline::inputs::PRINTS;
+use shearq_pipeline::measure::KEYS;
+
+use crate::expression::Expression;
+
+/// Columns that a selection replaces or reads, beside those of [`Observables`].
+const READ: [&str; 9] = [
+    "e1", "e2", "flags", "R11", "R22", "R12", "R21", "divisor1", "divisor2",
+];
+
+/// The selection of `--where` and `--weight`; `None` without either.
+///
+/// # Errors
+/// If one of the texts cannot be used, with the reason.
+pub fn selection(
+    cuts: Option<&str>,
+    weight: Option<&str>,
+) -> Result<Option<Selection>, PipelineError> {
+    if cuts.is_none() && weight.is_none() {
+        return Ok(None);
+    }
+    let fault = |message: String| PipelineError::Request(message);
+    let mut selection = match cuts {
+        Some(text) => text
+            .parse::<Selection>()
+            .map_err(|error| fault(error.to_string()))?,
+        None => Selection::default(),
+    };
+    if let Some(text) = weight {
+        let expression = Expression::parse(text).map_err(fault)?;
+        let known = |name: &String| ["snr", "flux", "size"].contains(&name.as_str());
+        if let Some(other) = expression.columns().iter().find(|name| !known(name)) {
+            return Err(fault(format!(
+                "a weight cannot depend on `{other}`, whose response to shear is not known (expected snr, flux or size)"
+            )));
+        }
+        if !expression.is_smooth() {
+            return Err(fault(format!(
+                "the weight `{text}` is not smooth (found a comparison, `abs` or `not`). Try: --where for cuts"
+            )));
+        }
+        selection = selection.with_weight(move |snr, flux, size| {
+            expression.value(&|column| match expression.columns()[column].as_str() {
+                "snr" => snr,
+                "flux" => flux,
+                _ => size,
+            })
+        });
+    }
+    Ok(Some(selection))
+}
+
+/// Name of the column with the weights.
+const WEIGHT: &str = "selection";
+
+/// Writes the catalogues of the folder `from` with the weights of a `selection`, described by `text`, to the folder `to`:
+/// ellipticities are multiplied by the weights and divided by the mean response of their image, so that all that uses catalogues
+/// uses the selection. Galaxies that are left out have an ellipticity and a response of zero. Returns the number of
+/// galaxies that are kept, and of those without a flag.
+///
+/// # Errors
+/// If `from` contains a selection already, a catalogue cannot be used, no galaxy of an image is left, or `to` has other results.
+pub fn write_selected(
+    run: &Run,
+    from: &Path,
+    to: &Path,
+    selection: &Selection,
+    text: &str,
+) -> Result<(usize, usize), FileError> {
+    if let Some(earlier) = &run.selection {
+        return Err(FileError::new(
+            from,
+            format!(
+                "these catalogues have the selection `{earlier}` already. Try: the folder that they were selected from"
+            ),
+        ));
+    }
+    let files = run.catalogues(from, &[])?;
+    let record = Run {
+        source: run.source.moved(from, to)?,
+        selection: Some(text.to_owned()),
+        ..run.clone()
+    };
+    let claim = claim(&to.join(RUN_FILE), &record)?;
+    let keys: Vec<String> = KEYS
+        .iter()
+        .chain(&PRINTS)
+        .map(|key| (*key).to_owned())
+        .collect();
+    let (mut kept, mut good) = (0, 0);
+    for set in files.wanted(&[]) {
+        if let Source::Simulated(_) = run.source {
+            // The truth of a simulated run lies beside the catalogues.
+            let truth = run.source.data(from)?.truth(set);
+            if let (Ok(within), Ok(bytes)) = (truth.strip_prefix(from), std::fs::read(&truth)) {
+                atomic::write(to.join(within), &bytes)?;
+            }
+        }
+        for (image, path) in files.of_set(set) {
+            let read = table::read(&path, None, table::MAX_ROWS)?;
+            let weighted = Weighted::of_table(&path, selection, &read)?;
+            kept += weighted
+                .weight
+                .iter()
+                .filter(|weight| **weight > 0.0)
+                .count();
+            good += weighted.e[0].iter().filter(|e| e.is_finite()).count();
+            let changed = weighted.table(&path, &read)?;
+            let mut metadata = table::read_metadata(&path, run.format, keys.iter())?;
+            metadata.insert("select".into(), text.to_owned());
+            let out = record.catalogue(to, set, image);
+            claim.check()?;
+            table::write(&out, run.format, &changed, &metadata)?;
+        }
+    }
+    Ok((kept, good))
+}
+
+/// Rows of a catalogue after a selection.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub struct Weighted {
+    /// Weighted ellipticities before calibration; NaN in rows with a flag.
+    pub e: [Vec<f64>; 2],
+    /// Their responses; NaN in rows with a flag.
+    pub response: [Vec<f64>; 2],
+    /// Weights; zero in rows with a flag.
+    pub weight: Vec<f64>,
+}
+
+impl Weighted {
+    /// Applies `selection` to the rows of the catalogue `path`. `column` gives a column of it by name.
+    ///
+    /// # Errors
+    /// If a column is missing, or a weight is not a number from 0 on.
+    pub fn of<'a>(
+        path: &Path,
+        selection: &Selection,
+        column: impl Fn(&str) -> Result<std::borrow::Cow<'a, [f64]>, FileError>,
+    ) -> Result<Self, FileError> {
+        let all: Vec<_> = Observables::COLUMNS
+            .iter()
+            .map(|name| column(name))
+            .collect::<Result<_, _>>()?;
+        let [e1, e2, flags, r11, r22, r12, r21, d1, d2] = {
+            let read: Vec<_> = READ
+                .iter()
+                .map(|name| column(name))
+                .collect::<Result<_, _>>()?;
+            <[_; READ.len()]>::try_from(read)
+                .map_err(|_| FileError::new(path, "columns are missing"))?
+        };
+        let count = flags.len();
+        let nothing = || vec![f64::NAN; count];
+        let mut weighted = Weighted {
+            e: [nothing(), nothing()],
+            response: [nothing(), nothing()],
+            weight: vec![0.0; count],
+        };
+        for row in 0..count {
+            if flags[row] != 0.0 {
+                continue;
+            }
+            let observables = Observables::from_array(&std::array::from_fn(|k| all[k][row]));
+            let e = [e1[row] * d1[row], e2[row] * d2[row]];
+            let response = [[r11[row], r12[row]], [r21[row], r22[row]]];
+            let selected = selection.apply(e, response, &observables);
+            if !(selected.weight >= 0.0 && selected.weight.is_finite()) {
+                let found = selected.weight;
+                return Err(FileError::new(
+                    path,
+                    format!(
+                        "row {}: the weight is {found} (expected a number from 0 on)",
+                        row + 1
+                    ),
+                ));
+            }
+            for k in 0..2 {
+                weighted.e[k][row] = selected.e[k];
+                weighted.response[k][row] = selected.response[k];
+            }
+            weighted.weight[row] = selected.weight;
+        }
+        Ok(weighted)
+    }
+
+    /// The same for a table in memory.
+    ///
+    /// # Errors
+    /// As [`Weighted::of`].
+    pub fn of_table(
+        path: &Path,
+        selection: &Selection,
+        read: &DataFrame,
+    ) -> Result<Self, FileError> {
+        let known = read
+            .get_column_names()
+            .iter()
+            .any(|own| own.as_str() == Observables::COLUMNS[2]);
+        if !known {
+            return Err(FileError::new(
+                path,
+                "the catalogue has no responses of flux and size, so a selection cannot be corrected (expected a catalogue of a linear configuration such as 48/linear/star)",
+            ));
+        }
+        Weighted::of(path, selection, |name| table::numbers(read, name, path))
+    }
+
+    /// The catalogue `read` with weighted and calibrated ellipticities.
+    fn table(&self, path: &Path, read: &DataFrame) -> Result<DataFrame, FileError> {
+        let mean = self.mean_response();
+        if !mean.iter().all(|mean| *mean > 0.0) {
+            return Err(FileError::new(
+                path,
+                format!(
+                    "the selection leaves no galaxies with a response to shear (found mean responses of {} and {}, expected positive numbers)",
+                    mean[0], mean[1]
+                ),
+            ));
+        }
+        let e = |k: usize| self.e[k].iter().map(|e| e / mean[k]).collect::<Vec<f64>>();
+        let divisor = |k: usize| {
+            let rows = self.e[k].iter();
+            rows.map(|e| if e.is_finite() { mean[k] } else { f64::NAN })
+                .collect()
+        };
+        let new = |name: &str| match name {
+            "e1" => Some(e(0)),
+            "e2" => Some(e(1)),
+            "R11" => Some(self.response[0].clone()),
+            "R22" => Some(self.response[1].clone()),
+            "divisor1" => Some(divisor(0)),
+            "divisor2" => Some(divisor(1)),
+            _ => None,
+        };
+        let mut columns: Vec<Column> = read
+            .columns()
+            .iter()
+            .map(|own| match new(own.name()) {
+                Some(values) => Column::new(own.name().clone(), values),
+                None => own.clone(),
+            })
+            .collect();
+        columns.push(Column::new(WEIGHT.into(), self.weight.clone()));
+        frame(columns).map_err(|error| FileError::new(path, error.to_string()))
+    }
+
+    /// Mean responses of all rows without a flag, by which means are calibrated.
+    pub fn mean_response(&self) -> [f64; 2] {
+        [0, 1].map(|k| {
+            let good = self.response[k]
+                .iter()
+                .filter(|response| response.is_finite());
+            let (count, sum) = good.fold((0.0, 0.0), |(n, sum), r| (n + 1.0, sum + r));
+            sum / count
+        })
+    }
+}

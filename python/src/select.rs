@@ -1,0 +1,45 @@
+//! Cuts and weights on the columns of a catalogue.
+
+use std::borrow::Cow;
+use std::collections::HashMap;
+use std::path::Path;
+
+use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use shearq_files::FileError;
+use shearq_results::select::{Weighted, selection};
+
+/// Columns of a catalogue after a selection: e1, e2, R11 and R22 before calibration, and the weight.
+type Selected<'py> = [Bound<'py, PyArray1<f64>>; 5];
+
+/// Applies cuts and a weight to the columns of a catalogue.
+#[pyfunction]
+pub(crate) fn select<'py>(
+    py: Python<'py>,
+    columns: HashMap<String, PyReadonlyArray1<'py, f64>>,
+    cuts: Option<&str>,
+    weight: Option<&str>,
+) -> PyResult<Selected<'py>> {
+    let fault = |error: &dyn std::fmt::Display| PyValueError::new_err(error.to_string());
+    let selection = selection(cuts, weight).map_err(|error| fault(&error))?;
+    let path = Path::new("catalogue");
+    let column = |name: &str| {
+        let found = columns.get(name).and_then(|values| values.as_slice().ok());
+        let lacks = || {
+            FileError::new(
+                path,
+                format!("no column {name} (expected the columns of a linear configuration)"),
+            )
+        };
+        found.map(Cow::Borrowed).ok_or_else(lacks)
+    };
+    let weighted = Weighted::of(path, &selection.unwrap_or_default(), column);
+    let Weighted {
+        e: [e1, e2],
+        response: [r11, r22],
+        weight,
+        ..
+    } = weighted.map_err(|error| fault(&error))?;
+    Ok([e1, e2, r11, r22, weight].map(|values| values.into_pyarray(py)))
+}

@@ -1,0 +1,62 @@
+//! `shearq select`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use crate::tell;
+use shearq_pipeline::data::run::Run;
+use shearq_results::select::{selection, write_selected};
+
+/// Write catalogues with cuts and weights that keep the shear calibrated.
+///
+/// Galaxies of linear configurations are selected and weighted by `snr`, `flux` (image units) and `size` (px). Ellipticities
+/// are multiplied by the weights and divided by the mean response of their image, which contains how shear and noise change
+/// the selection. `score`, `mean`, `bias`, `compare` and `pack` then use the selection. Rows of galaxies that are left out
+/// stay, with ellipticity and response zero; the column `selection` has the weights.
+///
+/// A cut is a smooth step. The weight is 1/2 at the threshold; it reaches 0 and 1 at a distance of 1.5 in `snr`, 1.5 errors in
+/// `flux` and 0.3 px in `size`, or at the distance after `+-`. Wider steps give smaller errors.
+#[derive(Debug, Args)]
+pub(crate) struct Arguments {
+    /// Folder of catalogues that `measure` or `run` wrote.
+    #[arg(long, value_name = "DIR")]
+    measured: PathBuf,
+    /// Galaxies to keep, such as "snr > 10, size > 2.5 +- 0.5".
+    #[arg(
+        long = "where",
+        value_name = "CONDITIONS",
+        required_unless_present = "weight"
+    )]
+    cuts: Option<String>,
+    /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
+    #[arg(long, value_name = "FORMULA")]
+    weight: Option<String>,
+    /// Folder to write to.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let Arguments {
+        measured,
+        cuts,
+        weight,
+        out,
+    } = arguments;
+    let run = Run::require(measured)?;
+    let Some(selection) = selection(cuts.as_deref(), weight.as_deref())? else {
+        return Ok(());
+    };
+    let parts = [("where", cuts), ("weight", weight)];
+    let parts = parts
+        .iter()
+        .filter_map(|(name, text)| Some(format!("{name}: {}", text.as_ref()?)));
+    let text = parts.collect::<Vec<_>>().join("; ");
+    let (kept, good) = write_selected(&run, measured, out, &selection, &text)?;
+    tell(format_args!(
+        "{}: {kept} of {good} galaxies without a flag have a weight above zero",
+        out.display()
+    ));
+    Ok(())
+}
