@@ -22,7 +22,7 @@ pub use registry::{Entry, Registry};
 pub use settings::{
     AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Configuration,
     Denoise, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method,
-    NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf,
+    NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf, SkySource,
     Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
 };
 pub use template::Template;

@@ -13,6 +13,7 @@ use crate::pixel::Pixel;
 use crate::psf::Star;
 use crate::psf::examine::{self, PsfLook};
 use crate::psfs::Psfs;
+use crate::sky::{Cells, Subtraction};
 use crate::surroundings::centre;
 use crate::warning::Warning;
 use crate::worker::highest;
@@ -22,7 +23,7 @@ const BLOCK: usize = 8;
 /// A corner block has at most one such part of the stamp's side. See docs/constants.md.
 const BLOCK_SHARE: usize = 4;
 /// Radius within which a galaxy's light is summed. See docs/constants.md.
-const INNER: f64 = 8.0;
+pub(crate) const INNER: f64 = 8.0;
 /// Distances of pixel pairs that show correlations longer than the survey covers. See
 /// docs/constants.md.
 const LONG: [usize; 2] = [4, 5];
@@ -64,9 +65,9 @@ const LONG_CORRELATION: f64 = 0.03;
 pub(crate) const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
 /// Standard deviation of Gaussian numbers in units of the median of their moduli. See
 /// docs/constants.md.
-const FROM_MODULI: f64 = 1.482_602_2;
+pub(crate) const FROM_MODULI: f64 = 1.482_602_2;
 /// Standard error of a median in units of the standard error of the mean. See docs/constants.md.
-const OF_MEDIAN: f64 = 1.253_314;
+pub(crate) const OF_MEDIAN: f64 = 1.253_314;
 
 /// Which of `rows` rows of `columns` stamps are examined: enough for a thousand stamps, or all. They are spread
 /// evenly but not regularly, so that they do not miss what differs from row to row.
@@ -119,6 +120,8 @@ pub struct Examination {
     psfs: Vec<PsfLook>,
     /// Whether each PSF is that of one galaxy.
     each: bool,
+    cells: Cells,
+    subtraction: Subtraction,
 }
 
 /// A block's mean, variance about its plane, and sums over pairs.
@@ -140,6 +143,17 @@ impl Examination {
             blank: 0,
             psfs: Vec::new(),
             each: false,
+            cells: Cells::new(full),
+            subtraction: Subtraction::Nothing,
+        }
+    }
+
+    /// The same for stamps from which this is subtracted before they are measured.
+    #[must_use]
+    pub fn without(self, subtraction: Subtraction) -> Self {
+        Examination {
+            subtraction,
+            ..self
         }
     }
 
@@ -190,6 +204,9 @@ impl Examination {
         if self.pixels.iter().all(|v| *v == self.pixels[0]) {
             self.blank += 1;
             return Ok(());
+        }
+        if self.subtraction != Subtraction::Nothing {
+            self.subtraction.apply(&mut self.pixels, &mut self.cells);
         }
         let (edge, middle) = (n - self.block, (n - self.block) / 2);
         let at = |y, x| block(&self.pixels, n, self.block, (y, x));
@@ -292,6 +309,7 @@ impl Examination {
         if sky.is_none() && gradient.is_none() {
             found.extend(self.long_correlation(noise));
         }
+        found.extend(self.subtracted(noise, flux));
         found.extend(sky);
         found.extend(gradient);
         if lit && flux > 0.0 {
@@ -355,7 +373,29 @@ impl Examination {
             error,
             noise,
             share,
+            subtracted: false,
         })
+    }
+
+    /// What was found and subtracted.
+    fn subtracted(&self, noise: f64, flux: f64) -> Vec<Warning> {
+        let Subtraction::Plane(sky) = self.subtraction else {
+            return Vec::new();
+        };
+        let level = (sky.level != 0.0).then(|| Warning::Sky {
+            level: sky.level,
+            error: sky.level_error,
+            noise,
+            share: sky.level * disc() / flux.abs(),
+            subtracted: true,
+        });
+        let gradient = (sky.slope != [0.0; 2]).then_some(Warning::Gradient {
+            slope: sky.slope,
+            error: sky.slope_error,
+            noise,
+            subtracted: true,
+        });
+        level.into_iter().chain(gradient).collect()
     }
 
     fn gradient(&self, noise: f64, flux: f64) -> Option<Warning> {
@@ -370,6 +410,7 @@ impl Examination {
             slope,
             error,
             noise,
+            subtracted: false,
         })
     }
 
@@ -500,12 +541,12 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
 }
 
 /// Pixels within `INNER` of the middle.
-fn disc() -> f64 {
+pub(crate) fn disc() -> f64 {
     std::f64::consts::PI * INNER * INNER
 }
 
 /// Light within `INNER` of the middle.
-fn inner(pixels: &[f32], n: usize) -> f64 {
+pub(crate) fn inner(pixels: &[f32], n: usize) -> f64 {
     let middle = (n as f64 - 1.0) / 2.0;
     let mut sum = 0.0;
     for (y, row) in pixels.chunks_exact(n).enumerate() {
@@ -544,7 +585,7 @@ fn middle_of(values: &mut [f64; 4]) -> f64 {
 }
 
 /// The lower median; reorders the values.
-fn median(values: &mut [f64]) -> Option<f64> {
+pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
     let middle = values.len().checked_sub(1)? / 2;
     Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
