@@ -462,16 +462,26 @@ impl NoiseSurvey {
         let most: Vec<f32> = medians.iter().map(|m| contrast + m - least).collect();
         let lost = self.lost(&most)?;
         let middle = |first: usize| first as f64 + (BLOCK as f64 - self.plan.full as f64) / 2.0;
-        let blocks: Vec<[f64; 2]> = self.plan.blocks.iter().map(|&(y, x)| [middle(x), middle(y)]).collect();
+        let blocks: Vec<[f64; 2]> = self
+            .plan
+            .blocks
+            .iter()
+            .map(|&(y, x)| [middle(x), middle(y)])
+            .collect();
         let nearest: Vec<usize> = self
             .cells
             .places()
             .map(|[x, y]| {
-                let square = |&at: &usize| (blocks[at][0] - x).powi(2) + (blocks[at][1] - y).powi(2);
-                (0..ring).min_by(|a, b| square(a).total_cmp(&square(b))).unwrap_or(0)
+                let square =
+                    |&at: &usize| (blocks[at][0] - x).powi(2) + (blocks[at][1] - y).powi(2);
+                (0..ring)
+                    .min_by(|a, b| square(a).total_cmp(&square(b)))
+                    .unwrap_or(0)
             })
             .collect();
-        levels.sky(&self.cells, |stamp, cell| lost[stamp * ring + nearest[cell]])
+        levels.sky(&self.cells, |stamp, cell| {
+            lost[stamp * ring + nearest[cell]]
+        })
     }
 
     /// How much brighter than its opposite a place may be.

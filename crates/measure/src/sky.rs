@@ -299,7 +299,9 @@ impl Levels {
             let mean = groups.iter().map(|plane| plane[k]).sum::<f64>() / GROUPS as f64;
             let square = groups.iter().map(|plane| (plane[k] - mean).powi(2));
             let freedom = GROUPS * (GROUPS - 1);
-            (square.sum::<f64>() / freedom as f64).sqrt().max(best.errors[k])
+            (square.sum::<f64>() / freedom as f64)
+                .sqrt()
+                .max(best.errors[k])
         };
         let errors = [error(0), error(1).max(error(2))];
         let [level, slope @ ..] = best.plane;
@@ -307,8 +309,7 @@ impl Levels {
         let flux = median(&mut fluxes)?.abs();
         let steep = slope[0].hypot(slope[1]);
         let is_level = best.least > CLEAR * errors[0] && level.abs() * disc() > LEVEL_SHARE * flux;
-        let is_steep =
-            steep > CLEAR * errors[1] && steep * INNER * disc() > SLOPE_SHARE * flux;
+        let is_steep = steep > CLEAR * errors[1] && steep * INNER * disc() > SLOPE_SHARE * flux;
         (is_level || is_steep).then_some(Sky {
             level: if is_level { level } else { 0.0 },
             level_error: errors[0],
@@ -431,7 +432,11 @@ fn fit(data: &[Datum], full: usize, wing: Option<Wing>) -> Option<Fit> {
     }
     let values = sums.solve(count)?;
     let square = data.iter().map(|datum| {
-        let model: f64 = basis(datum.place).iter().zip(&values).map(|(b, v)| b * v).sum();
+        let model: f64 = basis(datum.place)
+            .iter()
+            .zip(&values)
+            .map(|(b, v)| b * v)
+            .sum();
         datum.weight * (datum.level - model).powi(2)
     });
     let square = square.sum();
@@ -516,5 +521,247 @@ impl<const N: usize> Normal<N> {
             *value *= scale;
         }
         Some(out)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array2;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::noise::{NoisePlan, Survey};
+
+    const N: usize = 48;
+    const COUNT: usize = 400;
+
+    /// A profile of flux one on a stamp, (x, y) off its middle.
+    fn profile(of: impl Fn(f64) -> f64, [x0, y0]: [f64; 2]) -> Array2<f64> {
+        let stamp = Array2::from_shape_fn((N, N), |(y, x)| {
+            let (x, y) = (x as f64 - 23.5 - x0, y as f64 - 23.5 - y0);
+            of(x.hypot(y))
+        });
+        &stamp / stamp.sum()
+    }
+
+    /// An exponential of scale 2.5 px.
+    fn small(place: [f64; 2]) -> Array2<f64> {
+        profile(|r| (-r / 2.5).exp(), place)
+    }
+
+    /// What a survey finds on stamps of unit noise with galaxies of this flux, on this plane, after `spoil`.
+    fn survey(
+        galaxy: impl Fn(&mut ChaCha8Rng) -> Array2<f64>,
+        flux: f64,
+        plane: [f64; 3],
+        mut spoil: impl FnMut(usize, &mut Array2<f32>, &mut ChaCha8Rng),
+    ) -> Survey {
+        let mut rng = ChaCha8Rng::seed_from_u64(11);
+        let stamps: Vec<Array2<f32>> = (0..COUNT)
+            .map(|k| {
+                let galaxy = galaxy(&mut rng);
+                let half = 3f64.sqrt();
+                let mut stamp = Array2::from_shape_fn((N, N), |(y, x)| {
+                    let sky =
+                        plane[0] + plane[1] * (x as f64 - 23.5) + plane[2] * (y as f64 - 23.5);
+                    (flux * galaxy[(y, x)] + sky + rng.random_range(-half..half)) as f32
+                });
+                spoil(k, &mut stamp, &mut rng);
+                stamp
+            })
+            .collect();
+        let plan = NoisePlan::new(N, 1).unwrap().with_sky(SkySource::Image);
+        let look = |mut survey: crate::NoiseSurvey| {
+            stamps
+                .iter()
+                .for_each(|stamp| survey.add(stamp.view()).unwrap());
+            survey
+        };
+        let first = look(plan.survey());
+        first.without_sky().map_or(first, look).found().unwrap()
+    }
+
+    /// Somewhere within half a pixel of the middle.
+    fn anywhere(rng: &mut ChaCha8Rng) -> [f64; 2] {
+        [(); 2].map(|()| rng.random_range(-0.5..0.5))
+    }
+
+    fn assert_plane(found: Option<Sky>, plane: [f64; 3]) {
+        let sky = found.unwrap();
+        // 400 stamps of 1,856 px away from the galaxy, by medians and with a wing: 0.003 and 0.0002 at most.
+        assert!(sky.level_error < 4e-3 && sky.slope_error < 3e-4, "{sky:?}");
+        let near = |found: f64, expected: f64, error: f64| (found - expected).abs() < 4.0 * error;
+        assert!(
+            near(sky.level, plane[0], sky.level_error),
+            "{sky:?} {plane:?}"
+        );
+        for (found, expected) in sky.slope.iter().zip(&plane[1..]) {
+            assert!(
+                near(*found, *expected, sky.slope_error),
+                "{sky:?} {plane:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn the_plane_under_the_stamps_is_found_with_its_sign_and_axes() {
+        let galaxy = |rng: &mut ChaCha8Rng| small(anywhere(rng));
+        for plane in [
+            [0.5, 0.0, 0.0],
+            [-0.5, 0.0, 0.0],
+            [10.0, 0.02, 0.0],
+            [0.3, 0.01, -0.03],
+        ] {
+            let found = survey(galaxy, 300.0, plane, |_, _, _| {});
+            assert_plane(found.sky, plane);
+        }
+        // A level that is too small to matter is not subtracted with a gradient.
+        let sky = survey(galaxy, 300.0, [0.0, 0.0, 0.02], |_, _, _| {}).sky;
+        assert!(sky.is_some_and(|sky| sky.level == 0.0), "{sky:?}");
+        assert_plane(sky, [0.0, 0.0, 0.02]);
+        assert_eq!(survey(galaxy, 300.0, [0.0; 3], |_, _, _| {}).sky, None);
+    }
+
+    #[test]
+    fn galaxies_are_as_broad_as_they_are_without_the_sky() {
+        let galaxy = |rng: &mut ChaCha8Rng| small(anywhere(rng));
+        let dark = survey(galaxy, 300.0, [0.0; 3], |_, _, _| {})
+            .extent
+            .unwrap();
+        for plane in [[3.0, 0.0, 0.0], [10.0, 0.05, -0.05]] {
+            let found = survey(galaxy, 300.0, plane, |_, _, _| {}).extent.unwrap();
+            // The error of the plane is a hundredth of the light.
+            assert!((found / dark - 1.0).abs() < 0.01, "{found} {dark}");
+        }
+    }
+
+    #[test]
+    fn wings_are_no_sky() {
+        /// A profile of a galaxy, or of what a PSF adds to it.
+        type Profile = fn(f64) -> f64;
+        let profiles: [(&str, Profile); 4] = [
+            // Half-light radii of 8 px; blurred by 1.5 px in the middle.
+            ("exponential", |r| (-1.678 * r.hypot(1.5) / 8.0).exp()),
+            ("de Vaucouleurs", |r| {
+                (-7.669 * (r.hypot(1.5) / 8.0).powf(0.25)).exp()
+            }),
+            ("Moffat of β = 2", |r| (1.0 + (r / 3.0).powi(2)).powi(-2)),
+            ("aureole", |r| {
+                (-r / 3.0).exp() + 5e-3 / (1.0 + (r / 4.0).powi(2))
+            }),
+        ];
+        for (name, of) in profiles {
+            for flux in [300.0, 3000.0] {
+                let galaxy = |rng: &mut ChaCha8Rng| profile(of, anywhere(rng));
+                let found = survey(galaxy, flux, [0.0; 3], |_, _, _| {});
+                assert_eq!(found.sky, None, "{name} {flux}");
+                // Off the middle they have no gradient either.
+                let galaxy = |_: &mut ChaCha8Rng| profile(of, [0.8, -0.6]);
+                let found = survey(galaxy, flux, [0.0; 3], |_, _, _| {});
+                assert_eq!(found.sky, None, "{name} {flux}, off the middle");
+            }
+            let galaxy = |rng: &mut ChaCha8Rng| profile(of, anywhere(rng));
+            let sky = survey(galaxy, 300.0, [0.5, 0.0, 0.0], |_, _, _| {}).sky;
+            // The wing takes up to a twentieth.
+            assert!(
+                sky.is_some_and(|sky| (sky.level - 0.5).abs() < 0.05),
+                "{name} {sky:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn neighbours_missing_pixels_and_padding_are_no_sky() {
+        let galaxy = |rng: &mut ChaCha8Rng| small(anywhere(rng));
+        let spoil = |k: usize, stamp: &mut Array2<f32>, rng: &mut ChaCha8Rng| {
+            if k.is_multiple_of(3) {
+                let angle = rng.random_range(0.0..std::f64::consts::TAU);
+                let r = rng.random_range(14.0..24.0);
+                let other = small([r * angle.cos(), r * angle.sin()]);
+                stamp.zip_mut_with(&other, |to, light| *to += 600.0 * *light as f32);
+            }
+            for value in stamp
+                .iter_mut()
+                .filter(|_| rng.random_range(0.0..1.0) < 0.01)
+            {
+                *value = f32::NAN;
+            }
+            if k.is_multiple_of(5) {
+                stamp.slice_mut(ndarray::s![.., 43..]).fill(0.0);
+            }
+        };
+        for plane in [[0.5, 0.0, 0.0], [-0.5, 0.01, 0.0], [0.0; 3]] {
+            let sky = survey(galaxy, 300.0, plane, spoil).sky;
+            let Some(sky) = sky else {
+                assert_eq!(plane, [0.0; 3]);
+                continue;
+            };
+            assert!(plane != [0.0; 3], "{sky:?}");
+            // A twelfth of a cell's stamps have the neighbour near, whose wings are below the noise.
+            assert!((sky.level - plane[0]).abs() < 0.02, "{sky:?}");
+            assert!((sky.slope[0] - plane[1]).abs() < 1e-3, "{sky:?}");
+        }
+    }
+
+    #[test]
+    fn a_stamp_of_its_own_loses_its_own_plane() {
+        let mut cells = Cells::new(N);
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut mean = [0.0; 3];
+        let count = 100;
+        for _ in 0..count {
+            let mut stamp: Vec<f32> = (0..N * N)
+                .map(|at| {
+                    let (x, y) = ((at % N) as f32 - 23.5, (at / N) as f32 - 23.5);
+                    let half = 3f32.sqrt();
+                    2.0 + 0.03 * x - 0.01 * y + rng.random_range(-half..half)
+                })
+                .collect();
+            // A neighbour on the border, and a missing pixel.
+            for y in 20..28 {
+                stamp[y * N..y * N + 6].fill(30.0);
+            }
+            stamp[100] = f32::NAN;
+            let sky = cells.plane_of(&stamp).unwrap();
+            let found = [sky.level, sky.slope[0], sky.slope[1]];
+            mean = [0, 1, 2].map(|k| mean[k] + found[k] / f64::from(count));
+            Subtraction::EachStamp.apply(&mut stamp, &mut cells);
+            let again = cells.plane_of(&stamp).unwrap();
+            assert!(
+                again.level.abs() < 1e-4 && again.slope[0].abs() < 1e-5,
+                "{again:?}"
+            );
+        }
+        // 44 cells of 16 px: 0.04 and 0.002 per stamp.
+        for ((found, expected), error) in
+            mean.iter().zip([2.0, 0.03, -0.01]).zip([0.004, 2e-4, 2e-4])
+        {
+            assert!((found - expected).abs() < 4.0 * error, "{mean:?}");
+        }
+    }
+
+    #[test]
+    fn rows_and_columns_of_padding_are_counted_from_each_edge() {
+        let mut stamp: Vec<f32> = (0..N * N).map(|at| at as f32).collect();
+        stamp[..2 * N].fill(1.0);
+        (0..N).for_each(|y| stamp[y * N + N - 3..(y + 1) * N].fill(1.0));
+        assert_eq!(padding(&stamp, N), [2, 0, 0, 3]);
+    }
+
+    #[test]
+    fn a_fit_of_few_numbers_is_that_of_least_squares() {
+        let mut sums = Normal::<3>::default();
+        for k in 0..10 {
+            let x = f64::from(k);
+            sums.add([1.0, x, x * x], 2.0 - 0.5 * x, 1.0 + x);
+        }
+        let found = sums.solve(2).unwrap();
+        for (found, expected) in found.iter().zip([2.0, -0.5, 0.0]) {
+            assert!((found - expected).abs() < 1e-12, "{found}");
+        }
+        // Σ w x² / (Σ w Σ w x² − (Σ w x)²) with w = 1 + x.
+        let variance = sums.variance(0, 2).unwrap();
+        assert!((variance - 2310.0 / (55.0 * 2310.0 - 330.0 * 330.0)).abs() < 1e-12);
     }
 }
