@@ -22,8 +22,8 @@ pub use registry::{Entry, Registry};
 pub use settings::{
     AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Configuration,
     Denoise, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method,
-    NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf, SkySource,
-    Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
+    NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf,
+    SkySource, Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
 };
 pub use template::Template;
 
