@@ -9,8 +9,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_measure::{
     EXAMINED_PSFS, Examination, Flag, FunctionalPsf, ImageNoise, MeanShear, MeanShearError,
-    MeasureError, Measurement, Measurer, NoisePlan, NoiseSurvey, Pixel, PsfProfile, Psfs, ShearSum, Subtraction, Survey,
-    Warning, Worker, calibrate, examined_rows,
+    MeasureError, Measurement, Measurer, NoisePlan, NoiseSurvey, Pixel, PsfProfile, Psfs, ShearSum,
+    Subtraction, Survey, Warning, Worker, calibrate, examined_rows,
 };
 use shearq_pipeline::engine;
 use shearq_pipeline::measure::{COLUMNS, Value};

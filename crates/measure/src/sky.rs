@@ -308,8 +308,10 @@ impl Levels {
         let mut fluxes: Vec<f64> = self.fluxes.iter().map(|f| f - level * disc()).collect();
         let flux = median(&mut fluxes)?.abs();
         let steep = slope[0].hypot(slope[1]);
-        let is_level = best.least > CLEAR * errors[0] && level.abs() * disc() > LEVEL_SHARE * flux;
-        let is_steep = steep > CLEAR * errors[1] && steep * INNER * disc() > SLOPE_SHARE * flux;
+        let is_level =
+            best.least[0] > CLEAR * errors[0] && level.abs() * disc() > LEVEL_SHARE * flux;
+        let is_steep =
+            best.least[1] > CLEAR * errors[1] && steep * INNER * disc() > SLOPE_SHARE * flux;
         (is_level || is_steep).then_some(Sky {
             level: if is_level { level } else { 0.0 },
             level_error: errors[0],
@@ -353,8 +355,9 @@ struct Bounded {
     plane: [f64; PLANE],
     errors: [f64; PLANE],
     wing: Option<Wing>,
-    /// The least modulus of the level with any wing that the profile allows; zero if both signs are allowed.
-    least: f64,
+    /// The least modulus of the level with any wing that the profile allows, zero if both signs are allowed; and that of
+    /// the gradient.
+    least: [f64; 2],
 }
 
 /// A wing of slope p and steepening q.
@@ -394,13 +397,23 @@ impl Bounded {
         let (best, wing) = *fits.iter().min_by(by_square)?;
         let freedom = (data.len().checked_sub(ALL + 2)?).max(1) as f64;
         let most = best.square + ALLOWED * (best.square / freedom).max(1.0);
-        let allowed = fits.iter().filter(|(fit, _)| fit.square <= most);
-        let along = allowed.map(|(fit, _)| fit.values[0] * best.values[0].signum());
+        let allowed = || fits.iter().filter(|(fit, _)| fit.square <= most);
+        let along = |to: [f64; PLANE]| {
+            let along = allowed().map(|(fit, _)| (0..PLANE).map(|k| fit.values[k] * to[k]).sum());
+            along.fold(f64::INFINITY, f64::min).max(0.0)
+        };
+        let [_, x, y, ..] = best.values;
+        let steep = x.hypot(y).max(f64::MIN_POSITIVE);
+        // What no wing explains is part of the errors.
+        let misfit = (best.square / freedom).max(1.0).sqrt();
         Some(Bounded {
             plane: [0, 1, 2].map(|k| best.values[k]),
-            errors: [0, 1, 2].map(|k| best.errors[k]),
+            errors: [0, 1, 2].map(|k| misfit * best.errors[k]),
             wing,
-            least: along.fold(f64::INFINITY, f64::min).max(0.0),
+            least: [
+                along([best.values[0].signum(), 0.0, 0.0]),
+                along([0.0, x / steep, y / steep]),
+            ],
         })
     }
 
