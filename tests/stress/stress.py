@@ -210,10 +210,13 @@ def line(row):
     m = f"{row['m1']:+8.2f} {row['m2']:+8.2f} ± {max(row['m1_error'], row['m2_error']):.2f}"
     c = f"{row['c1']:+7.2f} {row['c2']:+7.2f} ± {max(row['c1_error'], row['c2_error']):.2f}"
     over = f"{row['over_bound']:.3f}" if "over_bound" in row else "–"
+    more = f"; {100 * row['flagged_once']:.1f} % of measurements flagged" if row["flagged_once"] else ""
+    if "images" in row:
+        more += f"; m of images ± {row['images']:.0f} ± {row['images_error']:.0f}"
     return (
         f"{row['case']:12} {m:>26} {c:>24} {row['noise']:.4f} {over:>6} {100 * row['flagged']:6.2f} "
         f"{row['leak']:+6.3f} {row['aim']:4.0f}  {row['verdict']}"
-    ) + (f"; m of images ± {row['images']:.0f} ± {row['images_error']:.0f}" if "images" in row else "")
+    ) + more
 
 
 def lines_of_peers(row):
