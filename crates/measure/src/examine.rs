@@ -13,7 +13,8 @@ use crate::pixel::Pixel;
 use crate::psf::Star;
 use crate::psf::examine::{self, PsfLook};
 use crate::psfs::Psfs;
-use crate::sky::{Cells, Subtraction};
+use crate::robust::{OF_MEDIAN, median, scatter};
+use crate::sky::{Cells, INNER, Subtraction, disc, inner};
 use crate::surroundings::centre;
 use crate::warning::Warning;
 use crate::worker::highest;
@@ -22,8 +23,6 @@ use crate::worker::highest;
 const BLOCK: usize = 8;
 /// A corner block has at most one such part of the stamp's side. See docs/constants.md.
 const BLOCK_SHARE: usize = 4;
-/// Radius within which a galaxy's light is summed. See docs/constants.md.
-pub(crate) const INNER: f64 = 8.0;
 /// Distances of pixel pairs that show correlations longer than the survey covers. See
 /// docs/constants.md.
 const LONG: [usize; 2] = [4, 5];
@@ -63,12 +62,6 @@ const LONG_CORRELATION: f64 = 0.03;
 /// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
 /// away from the smallest and largest numbers there are.
 pub(crate) const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
-/// Standard deviation of Gaussian numbers in units of the median of their moduli. See
-/// docs/constants.md.
-pub(crate) const FROM_MODULI: f64 = 1.482_602_2;
-/// Standard error of a median in units of the standard error of the mean. See docs/constants.md.
-pub(crate) const OF_MEDIAN: f64 = 1.253_314;
-
 /// Which of `rows` rows of `columns` stamps are examined: enough for a thousand stamps, or all. They are spread
 /// evenly but not regularly, so that they do not miss what differs from row to row.
 pub fn examined_rows(columns: usize, rows: usize) -> Vec<usize> {
@@ -540,28 +533,6 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
     }
 }
 
-/// Pixels within `INNER` of the middle.
-pub(crate) fn disc() -> f64 {
-    std::f64::consts::PI * INNER * INNER
-}
-
-/// Light within `INNER` of the middle.
-pub(crate) fn inner(pixels: &[f32], n: usize) -> f64 {
-    let middle = (n as f64 - 1.0) / 2.0;
-    let mut sum = 0.0;
-    for (y, row) in pixels.chunks_exact(n).enumerate() {
-        let dy = y as f64 - middle;
-        let half = (INNER * INNER - dy * dy).max(-1.0).sqrt();
-        if half.is_nan() {
-            continue;
-        }
-        let first = (middle - half).ceil().max(0.0) as usize;
-        let last = ((middle + half).floor() as usize).min(n - 1);
-        sum += row[first..=last].iter().map(|v| f64::from(*v)).sum::<f64>();
-    }
-    sum
-}
-
 /// A number from the bits of the stamp's pixels: Fowler, Noll and Vo's hash.
 fn trace(pixels: &[f32]) -> u64 {
     // Noise makes a fifth of the pixels different for every stamp.
@@ -582,19 +553,6 @@ fn middle_of(values: &mut [f64; 4]) -> f64 {
         0 => f64::NAN,
         _ => 0.5 * (rest[(count - 1) / 2] + rest[count / 2]),
     }
-}
-
-/// The lower median; reorders the values.
-pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
-    let middle = values.len().checked_sub(1)? / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
-}
-
-/// Median and scatter of the values.
-fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
-    let middle = median(values)?;
-    let mut moduli: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
-    Some((middle, FROM_MODULI * median(&mut moduli)?))
 }
 
 #[cfg(test)]

@@ -52,6 +52,7 @@ pub mod parts;
 mod pixel;
 mod psf;
 mod psfs;
+mod robust;
 mod shape;
 mod sizes;
 mod sky;

@@ -24,10 +24,10 @@ use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::SkySource;
 
 use crate::error::MeasureError;
-use crate::examine::{PEAKS, enough, inner};
+use crate::examine::{PEAKS, enough};
 use crate::extent::Light;
 use crate::pixel::Pixel;
-use crate::sky::{Cells, Levels, Sky, Subtraction};
+use crate::sky::{Cells, Levels, Sky, Subtraction, inner};
 use crate::surroundings::{Contrasts, Missing, centre, followed, turn};
 use crate::warning::Warning;
 use crate::worker::highest;

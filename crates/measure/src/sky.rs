@@ -8,8 +8,10 @@
 
 use shearq_submissions::SkySource;
 
-use crate::examine::{FROM_MODULI, INNER, OF_MEDIAN, disc, median};
+use crate::robust::{FROM_MODULI, OF_MEDIAN, median, scatter};
 
+/// Radius within which a galaxy's light is summed. See docs/constants.md.
+pub(crate) const INNER: f64 = 8.0;
 /// Cells along a side of a stamp. See docs/constants.md.
 const CELLS: usize = 12;
 /// Least distance of a cell from the middle, in units of the stamp's side. See docs/constants.md.
@@ -237,6 +239,28 @@ impl Cells {
     }
 }
 
+/// Pixels within `INNER` of the middle.
+pub(crate) fn disc() -> f64 {
+    std::f64::consts::PI * INNER * INNER
+}
+
+/// Light within `INNER` of the middle.
+pub(crate) fn inner(pixels: &[f32], n: usize) -> f64 {
+    let middle = (n as f64 - 1.0) / 2.0;
+    let mut sum = 0.0;
+    for (y, row) in pixels.chunks_exact(n).enumerate() {
+        let dy = y as f64 - middle;
+        let half = (INNER * INNER - dy * dy).max(-1.0).sqrt();
+        if half.is_nan() {
+            continue;
+        }
+        let first = (middle - half).ceil().max(0.0) as usize;
+        let last = ((middle + half).floor() as usize).min(n - 1);
+        sum += row[first..=last].iter().map(|v| f64::from(*v)).sum::<f64>();
+    }
+    sum
+}
+
 /// How many rows of pixels at the lower and upper edge, and columns at the left and right edge, are all equal.
 fn padding(pixels: &[f32], n: usize) -> [usize; 4] {
     [0, 1, 2, 3].map(|edge| {
@@ -336,11 +360,8 @@ impl Datum {
         if values.len() < FEWEST {
             return None;
         }
-        let level = median(values)?;
-        let count = values.len() as f64;
-        values.iter_mut().for_each(|v| *v = (*v - level).abs());
-        let scatter = FROM_MODULI * median(values)?;
-        let weight = count / (OF_MEDIAN * scatter).powi(2);
+        let (level, scatter) = scatter(values)?;
+        let weight = values.len() as f64 / (OF_MEDIAN * scatter).powi(2);
         weight.is_finite().then_some(Datum {
             place,
             level,
