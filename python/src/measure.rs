@@ -9,8 +9,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_measure::{
     EXAMINED_PSFS, Examination, Flag, FunctionalPsf, ImageNoise, MeanShear, MeanShearError,
-    MeasureError, Measurement, Measurer, NoisePlan, Pixel, PsfProfile, Psfs, ShearSum, Survey,
-    Warning, Worker, calibrate, examined_rows,
+    MeasureError, Measurement, Measurer, NoisePlan, NoiseSurvey, Pixel, PsfProfile, Psfs, ShearSum,
+    Subtraction, Survey, Warning, Worker, calibrate, examined_rows,
 };
 use shearq_pipeline::engine;
 use shearq_pipeline::measure::{COLUMNS, Value, observed};
@@ -140,10 +140,11 @@ pub(crate) fn measure<'py>(
     if let Noise::Each(levels) = request.noise {
         one_each("noise", levels.len(), count)?;
     }
-    let galaxies = request.measure(py, &psfs, threads(threads_asked), progress)?;
+    let survey = request.survey()?;
+    let galaxies = request.measure(py, &psfs, survey.as_ref(), threads(threads_asked), progress)?;
     let mut galaxies = [galaxies];
     calibrate(configuration, &mut galaxies);
-    let warnings = request.warnings(&psfs, &galaxies)?;
+    let warnings = request.warnings(&psfs, survey.as_deref(), &galaxies)?;
     let [galaxies] = galaxies;
     let flagged = galaxies.iter().filter(|g| !g.flags.is_empty()).count();
     let all_flagged = (count > 0 && flagged == count)
@@ -225,7 +226,15 @@ impl<'s> Request<'s> {
         let Some(plan) = self.noise_plan() else {
             return Ok(None);
         };
-        let mut survey = plan.survey();
+        let mut survey = self.look(plan, plan.survey())?;
+        if let Some(again) = survey.without_sky() {
+            survey = self.look(plan, again)?;
+        }
+        survey.shared().map_err(of_measuring)
+    }
+
+    /// Adds the stamps that `plan` chooses to a survey.
+    fn look(&self, plan: &NoisePlan, mut survey: NoiseSurvey) -> PyResult<NoiseSurvey> {
         for at in plan.rows(1, self.dim.0) {
             match self.stamps.piece(at, at + 1)? {
                 Piece::Single(one) => survey.add(one.index_axis(Axis(0), 0)),
@@ -234,7 +243,7 @@ impl<'s> Request<'s> {
             }
             .map_err(of_measuring)?;
         }
-        survey.shared().map_err(of_measuring)
+        Ok(survey)
     }
 
     /// Measures all galaxies, without calibration.
@@ -242,11 +251,11 @@ impl<'s> Request<'s> {
         &self,
         py: Python<'_>,
         psfs: &AllPsfs<'_>,
+        survey: Option<&Arc<Survey>>,
         threads: usize,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<Vec<Measurement>> {
         let count = self.dim.0;
-        let survey = self.survey()?;
         let mut galaxies = Vec::new();
         galaxies
             .try_reserve_exact(count)
@@ -266,7 +275,7 @@ impl<'s> Request<'s> {
                     Ok(())
                 },
                 || self.measurer.worker(),
-                |worker, job: Job<'_, '_>| Ok(measure_job(worker, survey.as_ref(), &job)?),
+                |worker, job: Job<'_, '_>| Ok(measure_job(worker, survey, &job)?),
                 |measured: Vec<Measurement>| {
                     watch.advance(measured.len())?;
                     galaxies.extend(measured);
@@ -291,10 +300,11 @@ impl<'s> Request<'s> {
     fn warnings(
         &self,
         psfs: &AllPsfs<'_>,
+        survey: Option<&Survey>,
         galaxies: &[Vec<Measurement>],
     ) -> PyResult<Vec<Warning>> {
         let configuration = self.measurer.configuration();
-        let examination = self.examine(psfs)?;
+        let examination = self.examine(psfs, self.measurer.subtraction(survey))?;
         let mut warnings = examination.warnings();
         warnings.extend(self.given_noise(&examination)?);
         warnings.extend(Warning::of_settings(configuration));
@@ -308,10 +318,10 @@ impl<'s> Request<'s> {
     }
 
     /// Examines some of the stamps and PSFs.
-    fn examine(&self, psfs: &AllPsfs<'_>) -> PyResult<Examination> {
+    fn examine(&self, psfs: &AllPsfs<'_>, subtraction: Subtraction) -> PyResult<Examination> {
         let (count, side, _) = self.dim;
         let chosen = examined_rows(1, count);
-        let mut examination = Examination::new(side, chosen.len());
+        let mut examination = Examination::new(side, chosen.len()).without(subtraction);
         for at in chosen {
             match self.stamps.piece(at, at + 1)? {
                 Piece::Single(one) => examination.add(one.index_axis(Axis(0), 0)),

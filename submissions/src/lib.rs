@@ -23,7 +23,7 @@ pub use settings::{
     AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Configuration,
     Denoise, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method,
     NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf,
-    Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
+    SkySource, Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
 };
 pub use template::Template;
 

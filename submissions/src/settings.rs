@@ -70,7 +70,7 @@ section! {
     }
 }
 
-partial! { PartialNoise { source: Source, border: usize, correlation: usize, } }
+partial! { PartialNoise { source: Source, border: usize, correlation: usize, sky: SkySource, } }
 
 /// Where the noise of a stamp is known from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -87,7 +87,21 @@ pub enum NoiseSource {
     Image {
         /// Largest distance in pixels, along each axis, of pixels that may be correlated; 0 for white noise.
         correlation: usize,
+        /// From where the sky that is subtracted is known.
+        sky: SkySource,
     },
+}
+
+/// What is subtracted from stamps before they are measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SkySource {
+    /// A plane that all stamps of the image have in common, if it is significant and matters.
+    Image,
+    /// A plane per stamp, fitted to the stamp's own border.
+    Stamp,
+    /// Nothing.
+    None,
 }
 
 /// [`NoiseSource`] as a file names it.
@@ -100,6 +114,14 @@ enum Source {
 }
 
 impl NoiseSource {
+    /// From where the sky is known; `None` if the configuration does not measure the noise of images.
+    pub fn sky(&self) -> Option<SkySource> {
+        match self {
+            NoiseSource::Image { sky, .. } => Some(*sky),
+            NoiseSource::Border { .. } | NoiseSource::Header => None,
+        }
+    }
+
     fn of(partial: &PartialNoise) -> Result<Self, &'static str> {
         Ok(match partial.source.ok_or("noise.source")? {
             Source::Border => NoiseSource::Border {
@@ -108,6 +130,7 @@ impl NoiseSource {
             Source::Header => NoiseSource::Header,
             Source::Image => NoiseSource::Image {
                 correlation: partial.correlation.ok_or("noise.correlation")?,
+                sky: partial.sky.unwrap_or(SkySource::Image),
             },
         })
     }

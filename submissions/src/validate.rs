@@ -78,7 +78,7 @@ impl Configuration {
             let good = (1..=16).contains(border);
             need(good, "noise.border", border, "1 to 16 pixels")?;
         }
-        if let NoiseSource::Image { correlation } = noise {
+        if let NoiseSource::Image { correlation, .. } = noise {
             let good = *correlation <= 4;
             need(good, "noise.correlation", correlation, "0 to 4 pixels")?;
         }

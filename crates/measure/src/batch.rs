@@ -11,10 +11,11 @@ use crate::examine::{EXAMINED_PSFS, Examination, examined_rows};
 use crate::flag::Flag;
 use crate::galaxy::Measurer;
 use crate::measurement::Measurement;
-use crate::noise::Survey;
+use crate::noise::{NoiseSurvey, Survey};
 use crate::pixel::Pixel;
 use crate::psf::star_psf;
 use crate::psfs::Psfs;
+use crate::sky::Subtraction;
 use crate::warning::Warning;
 use crate::worker::{ImageNoise, is_level};
 
@@ -94,7 +95,7 @@ impl Measurer {
         let mut image = worker.image(ImageNoise::of(survey.as_ref(), noise));
         let mut galaxies = [image.measure_each(stamps, psfs)?];
         let response = calibrate(self.configuration(), &mut galaxies);
-        let mut examination = examine(stamps)?;
+        let mut examination = examine(stamps, self.subtraction(survey.as_deref()))?;
         examination.add_psfs(psfs, self.configuration().psf_cut(), EXAMINED_PSFS);
         let mut warnings = examination.warnings();
         warnings.extend(noise.and_then(|noise| examination.given_noise(noise)));
@@ -128,19 +129,28 @@ impl Measurer {
         if count == 0 {
             return Err(MeasureError::Noise("not given".into()));
         }
-        let mut survey = plan.survey();
-        for at in plan.rows(1, count) {
-            survey.add(stamps.index_axis(Axis(0), at))?;
+        let look = |mut survey: NoiseSurvey| {
+            for at in plan.rows(1, count) {
+                survey.add(stamps.index_axis(Axis(0), at))?;
+            }
+            Ok::<_, MeasureError>(survey)
+        };
+        let mut survey = look(plan.survey())?;
+        if let Some(again) = survey.without_sky() {
+            survey = look(again)?;
         }
         survey.shared()
     }
 }
 
 /// Examines as many of the stamps, one each along the first axis, as are enough.
-fn examine<T: Pixel>(stamps: ArrayView3<'_, T>) -> Result<Examination, MeasureError> {
+fn examine<T: Pixel>(
+    stamps: ArrayView3<'_, T>,
+    subtraction: Subtraction,
+) -> Result<Examination, MeasureError> {
     let (count, side, _) = stamps.dim();
     let rows = examined_rows(1, count);
-    let mut examination = Examination::new(side, rows.len());
+    let mut examination = Examination::new(side, rows.len()).without(subtraction);
     for at in rows {
         examination.add(stamps.index_axis(Axis(0), at))?;
     }

@@ -13,6 +13,8 @@ use crate::pixel::Pixel;
 use crate::psf::Star;
 use crate::psf::examine::{self, PsfLook};
 use crate::psfs::Psfs;
+use crate::robust::{OF_MEDIAN, median, scatter};
+use crate::sky::{Cells, INNER, Subtraction, disc, inner};
 use crate::surroundings::centre;
 use crate::warning::Warning;
 use crate::worker::highest;
@@ -21,8 +23,6 @@ use crate::worker::highest;
 const BLOCK: usize = 8;
 /// A corner block has at most one such part of the stamp's side. See docs/constants.md.
 const BLOCK_SHARE: usize = 4;
-/// Radius within which a galaxy's light is summed. See docs/constants.md.
-const INNER: f64 = 8.0;
 /// Distances of pixel pairs that show correlations longer than the survey covers. See
 /// docs/constants.md.
 const LONG: [usize; 2] = [4, 5];
@@ -62,12 +62,6 @@ const LONG_CORRELATION: f64 = 0.03;
 /// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
 /// away from the smallest and largest numbers there are.
 pub(crate) const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
-/// Standard deviation of Gaussian numbers in units of the median of their moduli. See
-/// docs/constants.md.
-const FROM_MODULI: f64 = 1.482_602_2;
-/// Standard error of a median in units of the standard error of the mean. See docs/constants.md.
-const OF_MEDIAN: f64 = 1.253_314;
-
 /// Which of `rows` rows of `columns` stamps are examined: enough for a thousand stamps, or all. They are spread
 /// evenly but not regularly, so that they do not miss what differs from row to row.
 pub fn examined_rows(columns: usize, rows: usize) -> Vec<usize> {
@@ -119,6 +113,8 @@ pub struct Examination {
     psfs: Vec<PsfLook>,
     /// Whether each PSF is that of one galaxy.
     each: bool,
+    cells: Cells,
+    subtraction: Subtraction,
 }
 
 /// A block's mean, variance about its plane, and sums over pairs.
@@ -140,6 +136,17 @@ impl Examination {
             blank: 0,
             psfs: Vec::new(),
             each: false,
+            cells: Cells::new(full),
+            subtraction: Subtraction::Nothing,
+        }
+    }
+
+    /// The same for stamps from which this is subtracted before they are measured.
+    #[must_use]
+    pub fn without(self, subtraction: Subtraction) -> Self {
+        Examination {
+            subtraction,
+            ..self
         }
     }
 
@@ -190,6 +197,9 @@ impl Examination {
         if self.pixels.iter().all(|v| *v == self.pixels[0]) {
             self.blank += 1;
             return Ok(());
+        }
+        if self.subtraction != Subtraction::Nothing {
+            self.subtraction.apply(&mut self.pixels, &mut self.cells);
         }
         let (edge, middle) = (n - self.block, (n - self.block) / 2);
         let at = |y, x| block(&self.pixels, n, self.block, (y, x));
@@ -292,6 +302,7 @@ impl Examination {
         if sky.is_none() && gradient.is_none() {
             found.extend(self.long_correlation(noise));
         }
+        found.extend(self.subtracted(noise, flux));
         found.extend(sky);
         found.extend(gradient);
         if lit && flux > 0.0 {
@@ -355,7 +366,29 @@ impl Examination {
             error,
             noise,
             share,
+            subtracted: false,
         })
+    }
+
+    /// What was found and subtracted.
+    fn subtracted(&self, noise: f64, flux: f64) -> Vec<Warning> {
+        let Subtraction::Plane(sky) = self.subtraction else {
+            return Vec::new();
+        };
+        let level = (sky.level != 0.0).then(|| Warning::Sky {
+            level: sky.level,
+            error: sky.level_error,
+            noise,
+            share: sky.level * disc() / flux.abs(),
+            subtracted: true,
+        });
+        let gradient = (sky.slope != [0.0; 2]).then_some(Warning::Gradient {
+            slope: sky.slope,
+            error: sky.slope_error,
+            noise,
+            subtracted: true,
+        });
+        level.into_iter().chain(gradient).collect()
     }
 
     fn gradient(&self, noise: f64, flux: f64) -> Option<Warning> {
@@ -370,6 +403,7 @@ impl Examination {
             slope,
             error,
             noise,
+            subtracted: false,
         })
     }
 
@@ -499,28 +533,6 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
     }
 }
 
-/// Pixels within `INNER` of the middle.
-fn disc() -> f64 {
-    std::f64::consts::PI * INNER * INNER
-}
-
-/// Light within `INNER` of the middle.
-fn inner(pixels: &[f32], n: usize) -> f64 {
-    let middle = (n as f64 - 1.0) / 2.0;
-    let mut sum = 0.0;
-    for (y, row) in pixels.chunks_exact(n).enumerate() {
-        let dy = y as f64 - middle;
-        let half = (INNER * INNER - dy * dy).max(-1.0).sqrt();
-        if half.is_nan() {
-            continue;
-        }
-        let first = (middle - half).ceil().max(0.0) as usize;
-        let last = ((middle + half).floor() as usize).min(n - 1);
-        sum += row[first..=last].iter().map(|v| f64::from(*v)).sum::<f64>();
-    }
-    sum
-}
-
 /// A number from the bits of the stamp's pixels: Fowler, Noll and Vo's hash.
 fn trace(pixels: &[f32]) -> u64 {
     // Noise makes a fifth of the pixels different for every stamp.
@@ -541,19 +553,6 @@ fn middle_of(values: &mut [f64; 4]) -> f64 {
         0 => f64::NAN,
         _ => 0.5 * (rest[(count - 1) / 2] + rest[count / 2]),
     }
-}
-
-/// The lower median; reorders the values.
-fn median(values: &mut [f64]) -> Option<f64> {
-    let middle = values.len().checked_sub(1)? / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
-}
-
-/// Median and scatter of the values.
-fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
-    let middle = median(values)?;
-    let mut moduli: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
-    Some((middle, FROM_MODULI * median(&mut moduli)?))
 }
 
 #[cfg(test)]

@@ -8,7 +8,8 @@ use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registr
 use crate::denoise::WaveletWiener;
 use crate::error::MeasureError;
 use crate::method::MethodPlan;
-use crate::noise::NoisePlan;
+use crate::noise::{NoisePlan, Survey};
+use crate::sky::Subtraction;
 use crate::worker::Worker;
 
 /// The plan of a measurement, for one configuration and one size of stamps. Measuring does not change it, so it serves
@@ -25,6 +26,14 @@ pub(crate) struct Plan {
     pub(crate) denoise: Option<WaveletWiener>,
     pub(crate) method: MethodPlan,
     noise: Option<NoisePlan>,
+}
+
+impl Plan {
+    /// What is subtracted from stamps of an image with this survey.
+    pub(crate) fn subtraction(&self, survey: Option<&Survey>) -> Subtraction {
+        let sky = survey.and_then(|survey| survey.sky);
+        Subtraction::of(self.configuration.noise.sky(), sky)
+    }
 }
 
 impl fmt::Debug for Measurer {
@@ -69,7 +78,9 @@ impl Measurer {
                 .map(|settings| WaveletWiener::new(full, settings)),
             method: MethodPlan::new(configuration, n)?,
             noise: match configuration.noise {
-                NoiseSource::Image { correlation } => Some(NoisePlan::new(full, correlation)?),
+                NoiseSource::Image { correlation, sky } => {
+                    Some(NoisePlan::new(full, correlation)?.with_sky(sky))
+                }
                 NoiseSource::Header | NoiseSource::Border { .. } => None,
             },
             configuration: configuration.clone(),
@@ -98,6 +109,11 @@ impl Measurer {
     /// The plan for measuring the noise of an image on its stamps, if the configuration requires that.
     pub fn noise_plan(&self) -> Option<&NoisePlan> {
         self.plan.noise.as_ref()
+    }
+
+    /// What is subtracted from stamps of an image with this survey.
+    pub fn subtraction(&self, survey: Option<&Survey>) -> Subtraction {
+        self.plan.subtraction(survey)
     }
 
     /// Pixels a side of the full stamps.

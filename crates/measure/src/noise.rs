@@ -21,11 +21,13 @@ use std::sync::Arc;
 use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2};
 use shearq_quantities::statistics::{SCATTER, median};
+use shearq_submissions::SkySource;
 
 use crate::error::MeasureError;
 use crate::examine::{PEAKS, enough};
 use crate::extent::Light;
 use crate::pixel::Pixel;
+use crate::sky::{Cells, Levels, Sky, Subtraction, inner};
 use crate::surroundings::{Contrasts, Missing, centre, followed, turn};
 use crate::warning::Warning;
 use crate::worker::highest;
@@ -137,6 +139,8 @@ pub struct Survey {
     /// How broad its galaxies are seen through the PSF: the mean square of their radii per axis in px², were they
     /// Gaussians. `None` of a few galaxies.
     pub extent: Option<f64>,
+    /// The sky that is to be subtracted from its stamps; `None` if there is none that matters.
+    pub sky: Option<Sky>,
 }
 
 /// Plan for measuring the noise of images with stamps of one size.
@@ -144,6 +148,8 @@ pub struct Survey {
 pub struct NoisePlan {
     full: usize,
     reach: usize,
+    /// What is done about the sky; `None` if it is not looked at.
+    sky: Option<SkySource>,
     /// First pixels of the blocks, around the frame.
     blocks: Arc<[(usize, usize)]>,
     lags: Arc<[(i32, i32)]>,
@@ -175,11 +181,21 @@ impl NoisePlan {
         Ok(NoisePlan {
             full,
             reach,
+            sky: None,
             blocks: frame(full).into(),
             lags: lags(reach).into(),
             matrix: Arc::new(matrix(reach, &polynomials)),
             polynomials: Arc::new(polynomials),
         })
+    }
+
+    /// The same with the sky of images, as a configuration treats it.
+    #[must_use]
+    pub fn with_sky(self, sky: SkySource) -> Self {
+        NoisePlan {
+            sky: Some(sky),
+            ..self
+        }
     }
 
     /// Which of `rows` rows of `columns` stamps are looked at, evenly spread: enough for a thousand stamps,
@@ -204,6 +220,9 @@ impl NoisePlan {
             brightest: Vec::new(),
             typical: Vec::new(),
             light: Light::default(),
+            cells: Cells::new(self.full),
+            levels: (self.sky == Some(SkySource::Image)).then(Levels::default),
+            subtraction: Subtraction::of(self.sky, None),
             peak: 0.0,
             counts: [0; 3],
         }
@@ -228,6 +247,11 @@ pub struct NoiseSurvey {
     /// Of each frame, the median over all places.
     typical: Vec<f32>,
     light: Light,
+    cells: Cells,
+    /// Levels of the cells, until the sky is found.
+    levels: Option<Levels>,
+    /// What is taken from the stamps for all but noise.
+    subtraction: Subtraction,
     /// The brightest pixel.
     peak: f32,
     /// Number of stamps looked at, of those with missing pixels, and of those that were left out.
@@ -250,16 +274,29 @@ impl NoiseSurvey {
             *to = value.to_f32();
         }
         let whole = self.pixels.iter().all(|value| value.is_finite());
+        let padded = padded(&self.pixels, full);
         let flat = self.pixels.iter().all(|value| *value == self.pixels[0]);
         self.peak = self.peak.max(highest(&self.pixels));
         self.counts[0] += 1;
         self.counts[1] += usize::from(!whole);
-        if flat || !(whole || self.missing.mend(&mut self.pixels, full)) {
+        if flat {
             self.counts[2] += 1;
             return Ok(());
         }
+        if self.levels.is_some() {
+            self.cells.look(&self.pixels);
+        }
+        if self.subtraction != Subtraction::Nothing {
+            self.subtraction.apply(&mut self.pixels, &mut self.cells);
+        }
+        if !(whole || self.missing.mend(&mut self.pixels, full)) {
+            self.counts[2] += 1;
+            return Ok(());
+        }
+        if let Some(levels) = &mut self.levels {
+            levels.add(&self.cells, inner(&self.pixels, full));
+        }
         let blocks = Arc::clone(&self.plan.blocks);
-        let padded = padded(&self.pixels, full);
         for &(y0, x0) in &*blocks {
             for (at, value) in self.block.iter_mut().enumerate() {
                 let (y, x) = (y0 + at / BLOCK, x0 + at % BLOCK);
@@ -305,6 +342,9 @@ impl NoiseSurvey {
         self.brightest.extend_from_slice(&other.brightest);
         self.typical.extend_from_slice(&other.typical);
         self.light.join(&other.light);
+        if let (Some(levels), Some(more)) = (&mut self.levels, &other.levels) {
+            levels.join(more);
+        }
         self.peak = self.peak.max(other.peak);
         for (count, more) in self.counts.iter_mut().zip(other.counts) {
             *count += more;
@@ -368,6 +408,10 @@ impl NoiseSurvey {
         Some(Survey {
             noise: self.noise()?,
             extent: self.light.extent(),
+            sky: match self.subtraction {
+                Subtraction::Plane(sky) => Some(sky),
+                Subtraction::Nothing | Subtraction::EachStamp => None,
+            },
         })
     }
 
@@ -391,8 +435,63 @@ impl NoiseSurvey {
         }
     }
 
-    /// The noise of the stamps looked at; `None` where less than a few frames are left that hold noise alone.
-    pub fn noise(&self) -> Option<StampNoise> {
+    /// A survey of the same stamps without the sky that was found on them, if there is any: galaxies are found and compared
+    /// better without sky.
+    pub fn without_sky(&self) -> Option<NoiseSurvey> {
+        let sky = self.sky()?;
+        Some(NoiseSurvey {
+            levels: None,
+            subtraction: Subtraction::of(self.plan.sky, Some(sky)),
+            ..self.plan.survey()
+        })
+    }
+
+    /// The sky under the stamps looked at, away from other galaxies.
+    fn sky(&self) -> Option<Sky> {
+        let levels = self.levels.as_ref()?;
+        let ring = self.plan.blocks.len();
+        // A gradient makes one side of all stamps brighter than the other.
+        let medians: Vec<f32> = (0..ring)
+            .map(|at| {
+                let of = self.brightest.iter().skip(at).step_by(ring);
+                median(&mut of.copied().collect::<Vec<_>>())
+            })
+            .collect::<Option<_>>()?;
+        let least = medians.iter().copied().fold(f32::INFINITY, f32::min);
+        let contrast = self.contrast()?;
+        let most: Vec<f32> = medians.iter().map(|m| contrast + m - least).collect();
+        let lost = self.lost(&most)?;
+        let middle = |first: usize| first as f64 + (BLOCK as f64 - self.plan.full as f64) / 2.0;
+        let blocks: Vec<[f64; 2]> = self
+            .plan
+            .blocks
+            .iter()
+            .map(|&(y, x)| [middle(x), middle(y)])
+            .collect();
+        let nearest: Vec<usize> = self
+            .cells
+            .places()
+            .map(|[x, y]| {
+                let square =
+                    |&at: &usize| (blocks[at][0] - x).powi(2) + (blocks[at][1] - y).powi(2);
+                (0..ring)
+                    .min_by(|a, b| square(a).total_cmp(&square(b)))
+                    .unwrap_or(0)
+            })
+            .collect();
+        levels.sky(&self.cells, |stamp, cell| {
+            lost[stamp * ring + nearest[cell]]
+        })
+    }
+
+    /// How much brighter than its opposite a place may be.
+    fn contrast(&self) -> Option<f32> {
+        Some(CONTRAST * SCATTER * median(&mut self.typical.clone())?)
+    }
+
+    /// Of each block, frame by frame, whether it is left out: it or those beside it are brighter than noise, pixels are
+    /// missing, or a place near it is brighter than its opposite by more than `most`, block by block around the frame.
+    fn lost(&self, most: &[f32]) -> Option<Vec<bool>> {
         let lags = self.plan.lags.len();
         let powers: Vec<f64> = self
             .products
@@ -400,28 +499,33 @@ impl NoiseSurvey {
             .map(|products| f64::from(products[0]))
             .collect();
         let bright = brightest(&powers)?;
-        let contrast = CONTRAST * SCATTER * median(&mut self.typical.clone())?;
         let ring = self.plan.blocks.len();
-        let mut sums = vec![0.0; lags];
-        let mut count = 0;
-        let frames = self.products.chunks_exact(ring * lags);
+        let frames = powers.chunks_exact(ring);
         let places = self.brightest.chunks_exact(ring);
-        for ((products, powers), places) in frames.zip(powers.chunks_exact(ring)).zip(places) {
-            let lost = |at: usize| {
+        let lost = frames.zip(places).flat_map(|(powers, places)| {
+            (0..ring).map(move |at| {
                 let beside = (ring - BESIDE..=ring + BESIDE).any(|by| {
                     let power = powers[(at + by) % ring];
                     power > bright || power == 0.0
                 });
-                beside || powers[at].is_nan() || places[at] > contrast
-            };
-            for (at, products) in products.chunks_exact(lags).enumerate() {
-                if lost(at) {
-                    continue;
-                }
-                count += 1;
-                for (sum, product) in sums.iter_mut().zip(products) {
-                    *sum += f64::from(*product);
-                }
+                beside || powers[at].is_nan() || places[at] > most[at]
+            })
+        });
+        Some(lost.collect())
+    }
+
+    /// The noise of the stamps looked at; `None` where less than a few frames are left that hold noise alone.
+    pub fn noise(&self) -> Option<StampNoise> {
+        let lags = self.plan.lags.len();
+        let ring = self.plan.blocks.len();
+        let lost = self.lost(&vec![self.contrast()?; ring])?;
+        let mut sums = vec![0.0; lags];
+        let mut count = 0;
+        let blocks = self.products.chunks_exact(lags).zip(lost);
+        for (products, _) in blocks.filter(|(_, lost)| !lost) {
+            count += 1;
+            for (sum, product) in sums.iter_mut().zip(products) {
+                *sum += f64::from(*product);
             }
         }
         if count < 2 * ring {

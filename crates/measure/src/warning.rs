@@ -24,6 +24,8 @@ pub enum Warning {
         noise: f64,
         /// Light of this sky within 8 px of a galaxy, in units of the galaxy's.
         share: f64,
+        /// Whether it was subtracted from the stamps before they were measured.
+        subtracted: bool,
     },
     /// The level of the stamps' corners changes along x or y.
     Gradient {
@@ -33,6 +35,8 @@ pub enum Warning {
         error: f64,
         /// Noise of a pixel in image units.
         noise: f64,
+        /// Whether it was subtracted from the stamps before they were measured.
+        subtracted: bool,
     },
     /// The galaxies are not in the middle of their stamps.
     OffCentre {
@@ -319,7 +323,21 @@ impl fmt::Display for Warning {
                 level,
                 error,
                 noise,
+                subtracted: true,
+                ..
+            } => write!(
+                f,
+                "the stamps contain sky (found {} ± {}, or {:.3} of the noise; expected 0). It was subtracted from all stamps",
+                Shown(*level),
+                Shown(*error),
+                *level / *noise
+            ),
+            Warning::Sky {
+                level,
+                error,
+                noise,
                 share,
+                subtracted: false,
             } => write!(
                 f,
                 "the stamps contain sky (found {} ± {} in their corners, or {:.2} of the noise; expected 0). Its light within 8 px of a galaxy is {:.0} % of the galaxy's, which biases shears. Try: subtract the sky",
@@ -332,12 +350,18 @@ impl fmt::Display for Warning {
                 slope,
                 error,
                 noise,
+                subtracted,
             } => write!(
                 f,
-                "the sky has a gradient (found {:+.4} along x and {:+.4} along y, ± {:.4}, in units of the noise per pixel; expected 0), which biases shears. Try: subtract the sky",
+                "the sky has a gradient (found {:+.4} along x and {:+.4} along y, ± {:.4}, in units of the noise per pixel; expected 0){}",
                 slope[0] / noise,
                 slope[1] / noise,
-                error / noise
+                error / noise,
+                if *subtracted {
+                    ". It was subtracted from all stamps"
+                } else {
+                    ", which biases shears. Try: subtract the sky"
+                }
             ),
             Warning::OffCentre { offset, error } => write!(
                 f,

@@ -21,6 +21,7 @@ use crate::observables::observables;
 use crate::pixel::Pixel;
 use crate::psf::cut_start;
 use crate::psfs::Psfs;
+use crate::sky::{Cells, Subtraction};
 use crate::surroundings::Missing;
 
 /// Noise levels other than zero, in image units, whose squares keep single precision beside those of [`PEAKS`].
@@ -80,6 +81,8 @@ pub struct Worker {
     pub(crate) cut: Vec<f32>,
     border: Vec<f32>,
     missing: Missing,
+    cells: Cells,
+    subtraction: Subtraction,
     /// The survey that the method was set to.
     survey: Option<Arc<Survey>>,
 }
@@ -106,6 +109,8 @@ impl Worker {
             cut: vec![0.0; n * n],
             border: Vec::with_capacity(full * full),
             missing: Missing::new(n),
+            cells: Cells::new(full),
+            subtraction: Subtraction::Nothing,
             survey: None,
             plan,
         }
@@ -116,12 +121,18 @@ impl Worker {
         &self.plan.configuration
     }
 
+    /// What is subtracted from stamps of the image that the worker was prepared for.
+    pub fn subtraction(&self) -> Subtraction {
+        self.subtraction
+    }
+
     /// Prepares for the galaxies of an image with this noise.
     ///
     /// Noise of a survey is treated as white if its correlation is not significant. Without a survey, noise is white, and
     /// the window is the configuration's own. The same survey as before costs nothing.
     pub fn image(&mut self, noise: ImageNoise<'_>) -> ImageWorker<'_> {
         let survey = noise.survey();
+        self.subtraction = self.plan.subtraction(survey.map(Arc::as_ref));
         if self.survey.as_ref() != survey {
             self.survey = survey.cloned();
             self.method
@@ -157,6 +168,9 @@ impl Worker {
         }
         if self.full.iter().all(|v| *v == self.full[0]) {
             return Ok(Measurement::flagged(Flag::NoScale));
+        }
+        if self.subtraction != Subtraction::Nothing {
+            self.subtraction.apply(&mut self.full, &mut self.cells);
         }
         let noise = match plan.configuration.noise {
             NoiseSource::Header | NoiseSource::Image { .. } => level,

@@ -253,6 +253,7 @@ mod tests {
             let survey = Survey {
                 noise: StampNoise::white(0.1),
                 extent,
+                sky: None,
             };
             let survey = Arc::new(survey);
             let mut image = worker.image(ImageNoise::Survey(&survey));

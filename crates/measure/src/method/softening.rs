@@ -140,6 +140,7 @@ mod tests {
                 let survey = Arc::new(Survey {
                     noise: StampNoise::white(light.sqrt() / snr),
                     extent: Some(seen),
+                    sky: None,
                 });
                 let [soft, hard] = workers.each_mut().map(|worker| {
                     let mut image = worker.image(ImageNoise::Survey(&survey));

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
-use shearq_measure::{MeasureError, Measurer, NoisePlan, Survey, Warning, strip};
+use shearq_measure::{MeasureError, Measurer, NoisePlan, NoiseSurvey, Survey, Warning, strip};
 use shearq_submissions::NoiseSource;
 
 use super::head::ImageHead;
@@ -31,18 +31,24 @@ pub(super) fn survey(
     plan: &NoisePlan,
 ) -> Result<Option<Arc<Survey>>, PipelineError> {
     let Mosaic { columns, stamp, .. } = mosaic;
-    let mut survey = plan.survey();
-    let mut next = 0;
-    for row in plan.rows(columns, mosaic.rows()) {
-        image.skip_rows((row - next) * stamp);
-        next = row + 1;
-        let pixels = image.read_rows(stamp)?;
-        let stamps = strip(&pixels, columns, stamp)?;
-        for stamp in stamps.outer_iter().take(mosaic.of_row(row)) {
-            survey.add(stamp)?;
+    let mut look = |mut survey: NoiseSurvey| {
+        let mut next = 0;
+        for row in plan.rows(columns, mosaic.rows()) {
+            image.skip_rows((row - next) * stamp);
+            next = row + 1;
+            let pixels = image.read_rows(stamp)?;
+            let stamps = strip(&pixels, columns, stamp)?;
+            for stamp in stamps.outer_iter().take(mosaic.of_row(row)) {
+                survey.add(stamp)?;
+            }
         }
+        image.rewind();
+        Ok::<_, PipelineError>(survey)
+    };
+    let mut survey = look(plan.survey())?;
+    if let Some(again) = survey.without_sky() {
+        survey = look(again)?;
     }
-    image.rewind();
     let found = survey.shared().map_err(|error| {
         if let MeasureError::Data(warning) = error {
             return FileError::new(path, warning);
@@ -72,7 +78,7 @@ pub(super) fn correlation(
 ) -> Result<Option<Warning>, PipelineError> {
     let configuration = measurer.configuration();
     let white = match configuration.noise {
-        NoiseSource::Image { correlation } => correlation == 0,
+        NoiseSource::Image { correlation, .. } => correlation == 0,
         NoiseSource::Header | NoiseSource::Border { .. } => true,
     };
     if configuration.linear().is_none() || !white {

@@ -65,7 +65,8 @@ fn examine(
     if !rows.contains(&row.iy) {
         return Ok(None);
     }
-    let mut examination = Examination::new(mosaic.stamp, mosaic.columns);
+    let mut examination =
+        Examination::new(mosaic.stamp, mosaic.columns).without(worker.subtraction());
     for stamp in stamps.outer_iter() {
         examination.add(stamp)?;
     }
