@@ -4,6 +4,8 @@ mod average;
 pub(crate) mod breadth;
 pub(crate) mod examine;
 mod halfway;
+mod moffat;
+pub(crate) mod shrink;
 mod star;
 
 pub use average::average_stars;

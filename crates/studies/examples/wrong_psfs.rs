@@ -1,8 +1,8 @@
 //! m and c of simulated galaxies that are measured with a PSF image with errors: noise, a background, another pixel
 //! scale, an offset, a small stamp.
 //!
-//! `cargo run --release -p shearq-studies --example wrong_psfs -- CASES SETS GRID STARS`, where CASES is `noise`,
-//! `background`, `sampling`, `centre`, `size` or `narrow`, SETS a set or several with commas, GRID the galaxies a side and
+//! `cargo run --release -p shearq-studies --example wrong_psfs -- CASES SETS GRID STARS`, where CASES is `noise`, `stars`
+//! (a noisy star per galaxy), `background`, `sampling`, `centre`, `size` or `narrow`, SETS a set or several with commas, GRID the galaxies a side and
 //! STARS the realizations of a star's noise. Prints one row per case: means over galaxies under shears of both signs,
 //! with both signs of their intrinsic ellipticities, so that shape noise cancels.
 #![expect(clippy::print_stdout, reason = "an example shows what it finds")]
@@ -67,11 +67,20 @@ fn measured(
     star: &Array2<f64>,
 ) -> Result<[f64; 5], Box<dyn Error>> {
     let psf = star_psf(star.view(), measurer.configuration().psf_cut())?;
+    measured_with(measurer, galaxies, &Psfs::prepared(psf.view()))
+}
+
+/// The same with any PSFs.
+fn measured_with(
+    measurer: &Measurer,
+    galaxies: &Galaxies,
+    psfs: &Psfs<'_>,
+) -> Result<[f64; 5], Box<dyn Error>> {
     let side = |stamps: ArrayView3<'_, f32>| -> Result<_, Box<dyn Error>> {
         let mut worker = measurer.worker();
         let survey = measurer.survey(stamps)?;
         let mut image = worker.image(ImageNoise::of(survey.as_ref(), Some(NOISE_SIGMA)));
-        Ok(image.measure_each(stamps, &Psfs::prepared(psf.view()))?)
+        Ok(image.measure_each(stamps, psfs)?)
     };
     let mut sides = [
         side(galaxies.sides[0].view())?,
@@ -182,6 +191,28 @@ fn main() -> Result<(), Box<dyn Error>> {
                     print(&format!("S/N {snr}: scatter"), scatter);
                 }
             }
+            "stars" => {
+                for snr in [50.0, 100.0, 200.0, 1000.0] {
+                    let (mut sums, mut squares) = ([0.0; 5], [0.0; 5]);
+                    for seed in 0..stars {
+                        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+                        // One for all versions of a galaxy.
+                        let mut own = Array3::zeros((4 * grid * grid, STAMP, STAMP));
+                        for mut versions in own.axis_chunks_iter_mut(Axis(0), 4) {
+                            versions.assign(&noisy(&middle, snr, &mut rng));
+                        }
+                        let found = measured_with(&measurer, &galaxies, &Psfs::stars(own.view()))?;
+                        for k in 0..5 {
+                            sums[k] += found[k] / stars as f64;
+                            squares[k] += found[k] * found[k] / stars as f64;
+                        }
+                    }
+                    print(&format!("S/N {snr}, one each: mean of {stars}"), sums);
+                    let scatter =
+                        [0, 1, 2, 3, 4].map(|k| (squares[k] - sums[k] * sums[k]).max(0.0).sqrt());
+                    print(&format!("S/N {snr}, one each: scatter"), scatter);
+                }
+            }
             "background" => {
                 for share in [-0.01, -0.001, 0.0003, 0.001, 0.003, 0.01, 0.05, 0.2] {
                     one(
@@ -243,7 +274,8 @@ fn main() -> Result<(), Box<dyn Error>> {
             }
             _ => {
                 return Err(
-                    "CASES: expected noise, background, sampling, centre, narrow or size".into(),
+                    "CASES: expected noise, stars, background, sampling, centre, narrow or size"
+                        .into(),
                 );
             }
         }

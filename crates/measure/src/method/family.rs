@@ -17,6 +17,7 @@ use crate::error::MeasureError;
 use crate::extent::Moments;
 use crate::noise::StampNoise;
 use crate::psf::breadth;
+use crate::psf::shrink::Shrinker;
 
 /// What one submission and stamp size need.
 pub(crate) struct LinearFamily {
@@ -107,6 +108,7 @@ pub(super) fn worker(family: Arc<LinearFamily>) -> Box<dyn CutWorker> {
         at: 0,
         extent: None,
         moments: Moments::default(),
+        shrinker: Shrinker::default(),
         noise: StampNoise::white(1.0),
         family,
     })
@@ -121,6 +123,7 @@ struct FamilyWorker {
     noise: StampNoise,
     extent: Option<f64>,
     moments: Moments,
+    shrinker: Shrinker,
 }
 
 impl CutWorker for FamilyWorker {
@@ -143,6 +146,7 @@ impl CutWorker for FamilyWorker {
             let expected = format!("{parity} number a side, {least} to {size}");
             return Err(MeasureError::square("a PSF stamp", psf.dim(), expected));
         }
+        let psf = self.shrinker.shrunk(psf);
         let kind = self.family.kind(psf, self.extent, &mut self.moments);
         let known = self.members.iter().position(|(of, _)| *of == kind);
         self.at = if let Some(at) = known {
