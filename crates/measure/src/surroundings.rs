@@ -12,7 +12,6 @@ mod missing;
 mod profile;
 
 pub(crate) use self::centre::{centre, followed};
-use self::contrast::opposite;
 pub(crate) use self::contrast::{Contrasts, turn};
 pub(crate) use self::missing::Missing;
 use self::profile::Profile;
@@ -20,15 +19,13 @@ use crate::flag::Flag;
 
 /// Least difference of opposite blocks that is a neighbour, in units of its noise. See
 /// docs/constants.md.
-const SIGNIFICANT: f32 = 5.0;
+const SIGNIFICANT: f32 = 4.0;
 /// Least difference of opposite blocks that is a neighbour, in units of the galaxy's light. See
 /// docs/constants.md.
 const BRIGHT: f32 = 0.03;
 /// Share of a neighbour's distance from the centre at which the fit of its profile begins. See
 /// docs/constants.md.
 const FITTED_FROM: f32 = 0.3;
-/// Share of a neighbour's distance from the centre at which filling begins. See docs/constants.md.
-const FILLED_FROM: f32 = 0.5;
 /// Distance below which a neighbour cannot be removed. See docs/constants.md.
 const TOO_NEAR: f32 = 12.0;
 /// Light of a neighbour, in units of the galaxy's light within 8 px, above which it cannot be
@@ -41,8 +38,6 @@ pub(crate) struct Surroundings {
     pub(crate) filled: Vec<f32>,
     contrasts: Contrasts,
     profile: Profile,
-    /// Directions of neighbours, and how far away filling begins.
-    sides: Vec<([f32; 2], f32)>,
 }
 
 impl Surroundings {
@@ -52,7 +47,6 @@ impl Surroundings {
             filled: vec![0.0; n * n],
             contrasts: Contrasts::new(n),
             profile: Profile::new(n),
-            sides: Vec::with_capacity(n),
         }
     }
 
@@ -69,7 +63,7 @@ impl Surroundings {
     ) -> Result<bool, Flag> {
         // Pixel p is opposite to `turn − p`.
         let turn = turn(centre, self.n);
-        self.contrasts.compare(stamp, turn);
+        self.contrasts.compare_smoothed(stamp, turn);
         let least = BRIGHT * self.contrasts.light;
         let hits = &mut self.contrasts.blocks;
         hits.retain(|hit| hit.excess > least.max(SIGNIFICANT * noise * hit.pixels.sqrt()));
@@ -78,7 +72,6 @@ impl Surroundings {
         }
         hits.sort_unstable_by(|a, b| b.excess.total_cmp(&a.excess));
         self.filled.copy_from_slice(stamp);
-        self.sides.clear();
         let mut most = 0.0f32;
         while let Some(&brightest) = hits.first() {
             let [x, y] = self.profile.place(&self.filled, turn, brightest.place);
@@ -94,29 +87,11 @@ impl Surroundings {
             // The brightest one is done wherever its light was found.
             hits.remove(0);
             hits.retain(|hit| along(hit.place) <= from);
-            self.sides.push((side, FILLED_FROM * distance));
         }
         if most > TOO_BRIGHT * self.contrasts.inner(&self.filled, turn) {
             return Err(Flag::Neighbour);
         }
-        for at in 0..self.sides.len() {
-            let (side, from) = self.sides[at];
-            self.fill(turn, side, from);
-        }
         Ok(true)
-    }
-
-    /// Gives the pixels further than `from` in direction (x, y) those of the opposite side.
-    fn fill(&mut self, turn: [i32; 2], [x, y]: [f32; 2], from: f32) {
-        for row in 0..self.n {
-            let across = (row as f32 - turn[1] as f32 / 2.0) * y;
-            for column in 0..self.n {
-                if (column as f32 - turn[0] as f32 / 2.0) * x + across > from {
-                    let light = opposite(&self.filled, self.n, turn, [column, row]);
-                    self.filled[row * self.n + column] = light.unwrap_or(0.0);
-                }
-            }
-        }
     }
 }
 
