@@ -9,12 +9,14 @@
 mod centre;
 mod contrast;
 mod missing;
+mod near;
 mod profile;
 
 pub(crate) use self::centre::{centre, followed};
 pub(crate) use self::contrast::{Contrasts, turn};
 pub(crate) use self::missing::Missing;
-use self::profile::Profile;
+use self::near::Near;
+use self::profile::{Known, Profile};
 use crate::flag::Flag;
 
 /// Least difference of opposite blocks that is a neighbour, in units of its noise. See
@@ -23,6 +25,10 @@ const SIGNIFICANT: f32 = 4.0;
 /// Least difference of opposite blocks that is a neighbour, in units of the galaxy's light. See
 /// docs/constants.md.
 const BRIGHT: f32 = 0.03;
+/// Least light of a neighbour that overlaps the galaxy, in units of its noise. See docs/constants.md.
+const OVERLAPPING: f32 = 4.2;
+/// Least light of a neighbour that overlaps the galaxy, in units of the galaxy's. See docs/constants.md.
+const BLENDED: f32 = 0.1;
 /// Share of a neighbour's distance from the centre at which the fit of its profile begins. See
 /// docs/constants.md.
 const FITTED_FROM: f32 = 0.3;
@@ -37,6 +43,7 @@ pub(crate) struct Surroundings {
     n: usize,
     pub(crate) filled: Vec<f32>,
     contrasts: Contrasts,
+    near: Near,
     profile: Profile,
 }
 
@@ -46,6 +53,7 @@ impl Surroundings {
             n,
             filled: vec![0.0; n * n],
             contrasts: Contrasts::new(n),
+            near: Near::new(n),
             profile: Profile::new(n),
         }
     }
@@ -68,20 +76,23 @@ impl Surroundings {
         let hits = &mut self.contrasts.blocks;
         hits.retain(|hit| hit.excess > least.max(SIGNIFICANT * noise * hit.pixels.sqrt()));
         if hits.is_empty() {
-            return Ok(false);
+            return self.blended(stamp, turn, noise).map(|()| false);
         }
         hits.sort_unstable_by(|a, b| b.excess.total_cmp(&a.excess));
         self.filled.copy_from_slice(stamp);
         let mut most = 0.0f32;
         while let Some(&brightest) = hits.first() {
-            let [x, y] = self.profile.place(&self.filled, turn, brightest.place);
+            let ([x, y], peak) = self.profile.place(&self.filled, turn, brightest.place);
             let distance = x.hypot(y);
             if distance < TOO_NEAR {
                 return Err(Flag::Neighbour);
             }
             let side = [x / distance, y / distance];
             let from = FITTED_FROM * distance;
-            let light = self.profile.subtract(&mut self.filled, turn, [x, y], from);
+            let known = Known { peak, noise };
+            let light = self
+                .profile
+                .subtract(&mut self.filled, turn, [x, y], from, known);
             most = most.max(light);
             let along = |place: [f32; 2]| place[0] * side[0] + place[1] * side[1];
             // The brightest one is done wherever its light was found.
@@ -91,7 +102,18 @@ impl Surroundings {
         if most > TOO_BRIGHT * self.contrasts.inner(&self.filled, turn) {
             return Err(Flag::Neighbour);
         }
-        Ok(true)
+        self.blended(&self.filled, turn, noise).map(|()| true)
+    }
+
+    /// # Errors
+    /// Where another galaxy overlaps this one.
+    fn blended(&self, stamp: &[f32], turn: [i32; 2], noise: f32) -> Result<(), Flag> {
+        let least = BLENDED * self.contrasts.light;
+        let suspect = self.near.suspect(stamp, turn, noise, least);
+        match suspect {
+            Some(suspect) if suspect.significance > OVERLAPPING => Err(Flag::Neighbour),
+            _ => Ok(()),
+        }
     }
 }
 

@@ -18,6 +18,9 @@ const ELONGATED: [usize; 2] = [1, 2];
 const CORES: [f32; 2] = [2.2, 4.0];
 /// Terms of a neighbour: round ones, two of a displacement, and of elongations.
 const TERMS: usize = COUNT + 2 + 2 * ELONGATED.len();
+/// Usual amplitudes of a neighbour's terms in units of its peak: round ones, of a displacement, and of elongations. The
+/// fit prefers them where noise hides the true ones. See docs/constants.md.
+const USUAL: [f32; TERMS] = [1.0, 1.0, 0.3, 0.03, 0.3, 0.3, 0.3, 0.3, 0.03, 0.03];
 /// Terms of the galaxy's displacement.
 const MOVED: usize = 2 * CORES.len();
 /// Terms of the fit.
@@ -34,6 +37,13 @@ const AROUND: f32 = 9.0;
 const STEPS: usize = 4;
 /// Longest step to a neighbour's position. See docs/constants.md.
 const MAX_STEP: f32 = 2.0;
+
+/// What is known of a neighbour before the fit: its peak, and the noise.
+#[derive(Clone, Copy)]
+pub(super) struct Known {
+    pub(super) peak: f32,
+    pub(super) noise: f32,
+}
 
 /// Room for the Gaussians along the axes of a stamp.
 pub(super) struct Profile {
@@ -59,7 +69,9 @@ impl Profile {
 
     /// Place of a neighbour from the galaxy's centre, (x, y) in pixels, near `start`: that of a Gaussian which fits best.
     /// (A centroid would be drawn inwards where the stamp ends beside the neighbour.)
-    pub(super) fn place(&self, stamp: &[f32], turn: [i32; 2], start: [f32; 2]) -> [f32; 2] {
+    /// Also returns the peak of the Gaussian.
+    pub(super) fn place(&self, stamp: &[f32], turn: [i32; 2], start: [f32; 2]) -> ([f32; 2], f32) {
+        let mut peak = 0.0;
         let centre = turn.map(|turn| turn as f32 / 2.0);
         let [mut x, mut y] = start;
         for _ in 0..STEPS {
@@ -84,8 +96,9 @@ impl Profile {
             }
             let [light, along_x, along_y] = solved(matrix, right);
             if light <= 0.0 {
-                return start;
+                return (start, peak);
             }
+            peak = light as f32;
             let step = |along: f64| {
                 let step = PLACED_BY * PLACED_BY * (along / light) as f32;
                 step.clamp(-MAX_STEP, MAX_STEP)
@@ -94,9 +107,9 @@ impl Profile {
         }
         // Farther away it is something else.
         if (x - start[0]).hypot(y - start[1]) < AROUND {
-            [x, y]
+            ([x, y], peak)
         } else {
-            start
+            (start, peak)
         }
     }
 
@@ -115,6 +128,7 @@ impl Profile {
         turn: [i32; 2],
         place: [f32; 2],
         from: f32,
+        known: Known,
     ) -> f32 {
         for axis in 0..2 {
             let centre = turn[axis] as f32 / 2.0;
@@ -125,7 +139,7 @@ impl Profile {
                 self.galaxy[axis][at] = Core::of(x);
             }
         }
-        let amplitudes = self.fit(stamp, turn, place, from);
+        let amplitudes = self.fit(stamp, turn, place, from, known);
         for (row, line) in stamp.chunks_exact_mut(self.n).enumerate() {
             let y = &self.here[1][row];
             for (pixel, x) in line.iter_mut().zip(&self.here[0]) {
@@ -140,11 +154,24 @@ impl Profile {
     }
 
     /// Amplitudes of the neighbour's terms, and of those of the galaxy's displacement.
-    fn fit(&self, stamp: &[f32], turn: [i32; 2], place: [f32; 2], from: f32) -> [f64; ALL] {
+    fn fit(
+        &self,
+        stamp: &[f32],
+        turn: [i32; 2],
+        place: [f32; 2],
+        from: f32,
+        known: Known,
+    ) -> [f64; ALL] {
         let distance = place[0].hypot(place[1]);
         let side = place.map(|p| p / distance);
         let mut matrix = [[0.0; ALL]; ALL];
         let mut right = [0.0; ALL];
+        if known.peak > 0.0 {
+            for (k, usual) in USUAL.into_iter().enumerate() {
+                let ratio = f64::from(known.noise / (usual * known.peak));
+                matrix[k][k] = ratio * ratio;
+            }
+        }
         for row in 0..self.n {
             let across = (row as f32 - turn[1] as f32 / 2.0) * side[1];
             for column in 0..self.n {
@@ -309,7 +336,11 @@ mod tests {
         ] {
             let light = neighbour(place);
             let mut stamp: Vec<f32> = (0..N * N).map(|p| galaxy(p) + light[p]).collect();
-            profile.subtract(&mut stamp, [47, 47], place, 5.0);
+            let known = Known {
+                peak: 1.5,
+                noise: 0.0,
+            };
+            profile.subtract(&mut stamp, [47, 47], place, 5.0, known);
             // f32 holds light of 20 to 2e-6, and the equations lose three to four digits.
             let worst = (0..N * N).map(|p| (stamp[p] - galaxy(p)).abs());
             assert!(worst.fold(0.0, f32::max) < 5e-3, "{place:?}");
@@ -329,7 +360,8 @@ mod tests {
                     (-(x * x + y * y) / 18.0).exp()
                 })
                 .collect();
-            let [x, y] = profile.place(&stamp, [47, 47], [place[0] - 2.0, place[1] + 2.5]);
+            let ([x, y], peak) = profile.place(&stamp, [47, 47], [place[0] - 2.0, place[1] + 2.5]);
+            assert!((peak - 1.0).abs() < 0.01, "{peak}");
             // Steps go the whole way for a Gaussian of that width, and converge quadratically.
             assert!(
                 (x - place[0]).hypot(y - place[1]) < 0.01,
