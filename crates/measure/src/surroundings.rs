@@ -9,26 +9,29 @@
 mod centre;
 mod contrast;
 mod missing;
+mod near;
 mod profile;
 
 pub(crate) use self::centre::{centre, followed};
-use self::contrast::opposite;
 pub(crate) use self::contrast::{Contrasts, turn};
 pub(crate) use self::missing::Missing;
-use self::profile::Profile;
+use self::near::Near;
+use self::profile::{Known, Profile};
 use crate::flag::Flag;
 
 /// Least difference of opposite blocks that is a neighbour, in units of its noise. See
 /// docs/constants.md.
-const SIGNIFICANT: f32 = 5.0;
+const SIGNIFICANT: f32 = 4.0;
 /// Least difference of opposite blocks that is a neighbour, in units of the galaxy's light. See
 /// docs/constants.md.
 const BRIGHT: f32 = 0.03;
+/// Least light of a neighbour that overlaps the galaxy, in units of its noise. See docs/constants.md.
+const OVERLAPPING: f32 = 4.2;
+/// Least light of a neighbour that overlaps the galaxy, in units of the galaxy's. See docs/constants.md.
+const BLENDED: f32 = 0.1;
 /// Share of a neighbour's distance from the centre at which the fit of its profile begins. See
 /// docs/constants.md.
 const FITTED_FROM: f32 = 0.3;
-/// Share of a neighbour's distance from the centre at which filling begins. See docs/constants.md.
-const FILLED_FROM: f32 = 0.5;
 /// Distance below which a neighbour cannot be removed. See docs/constants.md.
 const TOO_NEAR: f32 = 12.0;
 /// Light of a neighbour, in units of the galaxy's light within 8 px, above which it cannot be
@@ -40,9 +43,8 @@ pub(crate) struct Surroundings {
     n: usize,
     pub(crate) filled: Vec<f32>,
     contrasts: Contrasts,
+    near: Near,
     profile: Profile,
-    /// Directions of neighbours, and how far away filling begins.
-    sides: Vec<([f32; 2], f32)>,
 }
 
 impl Surroundings {
@@ -51,8 +53,8 @@ impl Surroundings {
             n,
             filled: vec![0.0; n * n],
             contrasts: Contrasts::new(n),
+            near: Near::new(n),
             profile: Profile::new(n),
-            sides: Vec::with_capacity(n),
         }
     }
 
@@ -69,53 +71,48 @@ impl Surroundings {
     ) -> Result<bool, Flag> {
         // Pixel p is opposite to `turn − p`.
         let turn = turn(centre, self.n);
-        self.contrasts.compare(stamp, turn);
+        self.contrasts.compare_smoothed(stamp, turn);
         let least = BRIGHT * self.contrasts.light;
         let hits = &mut self.contrasts.blocks;
         hits.retain(|hit| hit.excess > least.max(SIGNIFICANT * noise * hit.pixels.sqrt()));
         if hits.is_empty() {
-            return Ok(false);
+            return self.blended(stamp, turn, noise).map(|()| false);
         }
         hits.sort_unstable_by(|a, b| b.excess.total_cmp(&a.excess));
         self.filled.copy_from_slice(stamp);
-        self.sides.clear();
         let mut most = 0.0f32;
         while let Some(&brightest) = hits.first() {
-            let [x, y] = self.profile.place(&self.filled, turn, brightest.place);
+            let ([x, y], peak) = self.profile.place(&self.filled, turn, brightest.place);
             let distance = x.hypot(y);
             if distance < TOO_NEAR {
                 return Err(Flag::Neighbour);
             }
             let side = [x / distance, y / distance];
             let from = FITTED_FROM * distance;
-            let light = self.profile.subtract(&mut self.filled, turn, [x, y], from);
+            let known = Known { peak, noise };
+            let light = self
+                .profile
+                .subtract(&mut self.filled, turn, [x, y], from, known);
             most = most.max(light);
             let along = |place: [f32; 2]| place[0] * side[0] + place[1] * side[1];
             // The brightest one is done wherever its light was found.
             hits.remove(0);
             hits.retain(|hit| along(hit.place) <= from);
-            self.sides.push((side, FILLED_FROM * distance));
         }
         if most > TOO_BRIGHT * self.contrasts.inner(&self.filled, turn) {
             return Err(Flag::Neighbour);
         }
-        for at in 0..self.sides.len() {
-            let (side, from) = self.sides[at];
-            self.fill(turn, side, from);
-        }
-        Ok(true)
+        self.blended(&self.filled, turn, noise).map(|()| true)
     }
 
-    /// Gives the pixels further than `from` in direction (x, y) those of the opposite side.
-    fn fill(&mut self, turn: [i32; 2], [x, y]: [f32; 2], from: f32) {
-        for row in 0..self.n {
-            let across = (row as f32 - turn[1] as f32 / 2.0) * y;
-            for column in 0..self.n {
-                if (column as f32 - turn[0] as f32 / 2.0) * x + across > from {
-                    let light = opposite(&self.filled, self.n, turn, [column, row]);
-                    self.filled[row * self.n + column] = light.unwrap_or(0.0);
-                }
-            }
+    /// # Errors
+    /// Where another galaxy overlaps this one.
+    fn blended(&self, stamp: &[f32], turn: [i32; 2], noise: f32) -> Result<(), Flag> {
+        let least = BLENDED * self.contrasts.light;
+        let suspect = self.near.suspect(stamp, turn, noise, least);
+        match suspect {
+            Some(suspect) if suspect.significance > OVERLAPPING => Err(Flag::Neighbour),
+            _ => Ok(()),
         }
     }
 }

@@ -8,6 +8,9 @@ const LEAST_DISTANCE: f32 = 9.0;
 /// Half the side of the square whose sum is the galaxy's light. See docs/constants.md.
 const INNER: i32 = 8;
 
+/// Weights of a cell and those beside it along an axis.
+const SMOOTHED: [f32; 3] = [0.5, 1.0, 0.5];
+
 /// Blocks of 6 × 6 pixels away from a galaxy, against their opposites.
 #[derive(Debug, Clone)]
 pub(crate) struct Contrasts {
@@ -68,24 +71,8 @@ impl Contrasts {
 
     /// Compares all blocks. Pixel p is opposite to `turn − p`.
     pub(crate) fn compare(&mut self, stamp: &[f32], turn: [i32; 2]) {
-        self.blocks.clear();
-        self.cells.clear();
-        let most = (self.n / 2 + CELL - 1) / CELL;
+        let most = self.compare_cells(stamp, turn);
         let [x0, y0] = beyond(turn);
-        self.light = self.inner(stamp, turn);
-        // One row of cells from the other half, for blocks on the line between both.
-        for j in -1..most {
-            for i in -most..most {
-                let (x, y) = (x0 + i * CELL, y0 + j * CELL);
-                let opposite = (turn[0] - x - CELL + 1, turn[1] - y - CELL + 1);
-                let (here, own) = self.sum(stamp, (x, y), CELL);
-                let (there, other) = self.sum(stamp, opposite, CELL);
-                self.cells.push(Cell {
-                    excess: here - there,
-                    pixels: own + other,
-                });
-            }
-        }
         let row = 2 * most as usize;
         for (at, pair) in self.cells.windows(row + 2).enumerate() {
             let (i, j) = ((at % row) as i32 - most, (at / row) as i32 - 1);
@@ -113,6 +100,66 @@ impl Contrasts {
                 place: [side * x, side * y],
             });
         }
+    }
+
+    /// Compares places under a weight as wide as a galaxy behind its PSF: a cell has a weight of 1, those beside it 1/2
+    /// and those at its corners 1/4. What is found is in `self.blocks`; a weight w counts as w² pixels.
+    pub(super) fn compare_smoothed(&mut self, stamp: &[f32], turn: [i32; 2]) {
+        let most = self.compare_cells(stamp, turn);
+        let [x0, y0] = beyond(turn);
+        let middle = |first: i32, step: i32, turn: i32| {
+            (first + step * CELL) as f32 + 0.5 * (CELL - 1) as f32 - 0.5 * turn as f32
+        };
+        for j in 0..most {
+            let y = middle(y0, j, turn[1]);
+            for i in -most..most {
+                let x = middle(x0, i, turn[0]);
+                if x * x + y * y < LEAST_DISTANCE * LEAST_DISTANCE {
+                    continue;
+                }
+                let (mut excess, mut pixels) = (0.0, 0.0);
+                for (dj, across) in (-1..=1).zip(SMOOTHED) {
+                    for (di, along) in (-1..=1).zip(SMOOTHED) {
+                        let (i, j) = (i + di, j + dj);
+                        if (-most..most).contains(&i) && j < most {
+                            let cell = self.cells[((j + 1) * 2 * most + i + most) as usize];
+                            let weight = across * along;
+                            excess += weight * cell.excess;
+                            pixels += weight * weight * cell.pixels as f32;
+                        }
+                    }
+                }
+                let side = excess.signum();
+                self.blocks.push(Block {
+                    excess: excess.abs(),
+                    pixels,
+                    place: [side * x, side * y],
+                });
+            }
+        }
+    }
+
+    /// Compares all cells, and takes the galaxy's light. Returns the number of cells from the centre to an edge.
+    fn compare_cells(&mut self, stamp: &[f32], turn: [i32; 2]) -> i32 {
+        self.blocks.clear();
+        self.cells.clear();
+        let most = (self.n / 2 + CELL - 1) / CELL;
+        let [x0, y0] = beyond(turn);
+        self.light = self.inner(stamp, turn);
+        // One row of cells from the other half, for blocks on the line between both.
+        for j in -1..most {
+            for i in -most..most {
+                let (x, y) = (x0 + i * CELL, y0 + j * CELL);
+                let opposite = (turn[0] - x - CELL + 1, turn[1] - y - CELL + 1);
+                let (here, own) = self.sum(stamp, (x, y), CELL);
+                let (there, other) = self.sum(stamp, opposite, CELL);
+                self.cells.push(Cell {
+                    excess: here - there,
+                    pixels: own + other,
+                });
+            }
+        }
+        most
     }
 
     /// The light of 16 × 16 pixels around the centre.

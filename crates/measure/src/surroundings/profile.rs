@@ -12,6 +12,19 @@ use super::contrast::opposite;
 const WIDTHS: [f32; COUNT] = [2.0, 3.5, 6.0, 10.5];
 /// Number of these Gaussians. See docs/constants.md.
 const COUNT: usize = 4;
+/// Which of them may be elongated; the first may be displaced. See docs/constants.md.
+const ELONGATED: [usize; 2] = [1, 2];
+/// σ of the Gaussians whose derivatives are what a displacement of the galaxy changes. See docs/constants.md.
+const CORES: [f32; 2] = [2.2, 4.0];
+/// Terms of a neighbour: round ones, two of a displacement, and of elongations.
+const TERMS: usize = COUNT + 2 + 2 * ELONGATED.len();
+/// Usual amplitudes of a neighbour's terms in units of its peak: round ones, of a displacement, and of elongations. The
+/// fit prefers them where noise hides the true ones. See docs/constants.md.
+const USUAL: [f32; TERMS] = [1.0, 1.0, 0.3, 0.03, 0.3, 0.3, 0.3, 0.3, 0.03, 0.03];
+/// Terms of the galaxy's displacement.
+const MOVED: usize = 2 * CORES.len();
+/// Terms of the fit.
+const ALL: usize = TERMS + MOVED;
 /// Relative addition to the diagonal of the normal equations, which keeps them soluble. See
 /// docs/constants.md.
 const RIDGE: f64 = 1e-6;
@@ -25,27 +38,40 @@ const STEPS: usize = 4;
 /// Longest step to a neighbour's position. See docs/constants.md.
 const MAX_STEP: f32 = 2.0;
 
+/// What is known of a neighbour before the fit: its peak, and the noise.
+#[derive(Clone, Copy)]
+pub(super) struct Known {
+    pub(super) peak: f32,
+    pub(super) noise: f32,
+}
+
 /// Room for the Gaussians along the axes of a stamp.
 pub(super) struct Profile {
     n: usize,
     /// Along x and y, at the pixels and at their opposites, `[pixel][width]`.
-    here: [Vec<[f32; COUNT]>; 2],
-    opposite: [Vec<[f32; COUNT]>; 2],
+    here: [Vec<Along>; 2],
+    opposite: [Vec<Along>; 2],
+    /// Along x and y about the galaxy's centre.
+    galaxy: [Vec<Core>; 2],
 }
 
 impl Profile {
     pub(super) fn new(n: usize) -> Self {
-        let axis = || vec![[0.0; COUNT]; n];
+        let axis = || vec![Along::default(); n];
+        let core = || vec![Core::default(); n];
         Profile {
             n,
             here: [axis(), axis()],
             opposite: [axis(), axis()],
+            galaxy: [core(), core()],
         }
     }
 
     /// Place of a neighbour from the galaxy's centre, (x, y) in pixels, near `start`: that of a Gaussian which fits best.
     /// (A centroid would be drawn inwards where the stamp ends beside the neighbour.)
-    pub(super) fn place(&self, stamp: &[f32], turn: [i32; 2], start: [f32; 2]) -> [f32; 2] {
+    /// Also returns the peak of the Gaussian.
+    pub(super) fn place(&self, stamp: &[f32], turn: [i32; 2], start: [f32; 2]) -> ([f32; 2], f32) {
+        let mut peak = 0.0;
         let centre = turn.map(|turn| turn as f32 / 2.0);
         let [mut x, mut y] = start;
         for _ in 0..STEPS {
@@ -70,8 +96,9 @@ impl Profile {
             }
             let [light, along_x, along_y] = solved(matrix, right);
             if light <= 0.0 {
-                return start;
+                return (start, peak);
             }
+            peak = light as f32;
             let step = |along: f64| {
                 let step = PLACED_BY * PLACED_BY * (along / light) as f32;
                 step.clamp(-MAX_STEP, MAX_STEP)
@@ -80,9 +107,9 @@ impl Profile {
         }
         // Farther away it is something else.
         if (x - start[0]).hypot(y - start[1]) < AROUND {
-            [x, y]
+            ([x, y], peak)
         } else {
-            start
+            (start, peak)
         }
     }
 
@@ -101,22 +128,24 @@ impl Profile {
         turn: [i32; 2],
         place: [f32; 2],
         from: f32,
+        known: Known,
     ) -> f32 {
         for axis in 0..2 {
             let centre = turn[axis] as f32 / 2.0;
             for at in 0..self.n {
                 let x = at as f32 - centre;
-                self.here[axis][at] = gaussians(x - place[axis]);
-                self.opposite[axis][at] = gaussians(-x - place[axis]);
+                self.here[axis][at] = Along::of(x - place[axis]);
+                self.opposite[axis][at] = Along::of(-x - place[axis]);
+                self.galaxy[axis][at] = Core::of(x);
             }
         }
-        let amplitudes = self.fit(stamp, turn, place, from);
+        let amplitudes = self.fit(stamp, turn, place, from, known);
         for (row, line) in stamp.chunks_exact_mut(self.n).enumerate() {
-            let along: [f32; COUNT] =
-                std::array::from_fn(|k| amplitudes[k] as f32 * self.here[1][row][k]);
-            for (pixel, gaussians) in line.iter_mut().zip(&self.here[0]) {
-                let terms = gaussians.iter().zip(&along);
-                *pixel -= terms.map(|(x, y)| x * y).sum::<f32>();
+            let y = &self.here[1][row];
+            for (pixel, x) in line.iter_mut().zip(&self.here[0]) {
+                let terms = x.terms(y);
+                let light = terms.iter().zip(&amplitudes);
+                *pixel -= light.map(|(t, a)| t * *a as f32).sum::<f32>();
             }
         }
         let areas = WIDTHS.map(|width| 2.0 * std::f32::consts::PI * width * width);
@@ -124,28 +153,44 @@ impl Profile {
         lights.map(|(peak, area)| *peak as f32 * area).sum()
     }
 
-    /// Amplitudes of the Gaussians.
-    fn fit(&self, stamp: &[f32], turn: [i32; 2], place: [f32; 2], from: f32) -> [f64; COUNT] {
+    /// Amplitudes of the neighbour's terms, and of those of the galaxy's displacement.
+    fn fit(
+        &self,
+        stamp: &[f32],
+        turn: [i32; 2],
+        place: [f32; 2],
+        from: f32,
+        known: Known,
+    ) -> [f64; ALL] {
         let distance = place[0].hypot(place[1]);
         let side = place.map(|p| p / distance);
-        let mut matrix = [[0.0; COUNT]; COUNT];
-        let mut right = [0.0; COUNT];
+        let mut matrix = [[0.0; ALL]; ALL];
+        let mut right = [0.0; ALL];
+        if known.peak > 0.0 {
+            for (k, usual) in USUAL.into_iter().enumerate() {
+                let ratio = f64::from(known.noise / (usual * known.peak));
+                matrix[k][k] = ratio * ratio;
+            }
+        }
         for row in 0..self.n {
             let across = (row as f32 - turn[1] as f32 / 2.0) * side[1];
             for column in 0..self.n {
                 if (column as f32 - turn[0] as f32 / 2.0) * side[0] + across <= from {
                     continue;
                 }
-                let (x, y) = (&self.here[0][column], &self.here[1][row]);
-                let mut terms: [f32; COUNT] = std::array::from_fn(|k| x[k] * y[k]);
+                let own = self.here[0][column].terms(&self.here[1][row]);
+                let mut terms = [0.0; ALL];
+                terms[..TERMS].copy_from_slice(&own);
                 let mut excess = stamp[row * self.n + column];
                 // In units of the inverse of the noise's variance: a difference has twice that of a pixel.
                 let mut weight = 1.0;
                 if let Some(light) = opposite(stamp, self.n, turn, [column, row]) {
-                    let (x, y) = (&self.opposite[0][column], &self.opposite[1][row]);
-                    for (k, term) in terms.iter_mut().enumerate() {
-                        *term -= x[k] * y[k];
+                    let other = self.opposite[0][column].terms(&self.opposite[1][row]);
+                    for (term, other) in terms.iter_mut().zip(other) {
+                        *term -= other;
                     }
+                    let moved = self.galaxy[0][column].moved(&self.galaxy[1][row]);
+                    terms[TERMS..].copy_from_slice(&moved);
                     excess -= light;
                     weight = 0.5;
                 }
@@ -153,6 +198,65 @@ impl Profile {
             }
         }
         solved(matrix, right)
+    }
+}
+
+/// Factors along one axis of a neighbour's terms.
+#[derive(Clone, Copy, Default)]
+struct Along {
+    /// Distance from the neighbour in units of [`PLACED_BY`].
+    offset: f32,
+    gaussians: [f32; COUNT],
+}
+
+impl Along {
+    fn of(x: f32) -> Self {
+        Along {
+            offset: x / PLACED_BY,
+            gaussians: gaussians(x),
+        }
+    }
+
+    /// All terms at a pixel, of which `self` is along x: round ones, then two of a displacement, and for each of
+    /// [`ELONGATED`] two of an elongation.
+    fn terms(&self, y: &Along) -> [f32; TERMS] {
+        let mut terms = [0.0; TERMS];
+        for (k, term) in terms.iter_mut().take(COUNT).enumerate() {
+            *term = self.gaussians[k] * y.gaussians[k];
+        }
+        let (u, v) = (self.offset, y.offset);
+        let round = terms[ELONGATED[0]];
+        terms[COUNT] = u * round;
+        terms[COUNT + 1] = v * round;
+        for (k, width) in ELONGATED.into_iter().enumerate() {
+            let round = terms[width];
+            terms[COUNT + 2 + 2 * k] = (u * u - v * v) * round;
+            terms[COUNT + 3 + 2 * k] = u * v * round;
+        }
+        terms
+    }
+}
+
+/// Factors along one axis of what a displacement of the galaxy changes.
+#[derive(Clone, Copy, Default)]
+struct Core {
+    x: f32,
+    gaussians: [f32; CORES.len()],
+}
+
+impl Core {
+    fn of(x: f32) -> Self {
+        Core {
+            x,
+            gaussians: CORES.map(|width| (-0.5 * (x / width).powi(2)).exp()),
+        }
+    }
+
+    fn moved(&self, y: &Core) -> [f32; MOVED] {
+        std::array::from_fn(|k| {
+            let round = self.gaussians[k / 2] * y.gaussians[k / 2];
+            round * if k % 2 == 0 { self.x } else { y.x }
+        })
     }
 }
 
@@ -232,7 +336,11 @@ mod tests {
         ] {
             let light = neighbour(place);
             let mut stamp: Vec<f32> = (0..N * N).map(|p| galaxy(p) + light[p]).collect();
-            profile.subtract(&mut stamp, [47, 47], place, 5.0);
+            let known = Known {
+                peak: 1.5,
+                noise: 0.0,
+            };
+            profile.subtract(&mut stamp, [47, 47], place, 5.0, known);
             // f32 holds light of 20 to 2e-6, and the equations lose three to four digits.
             let worst = (0..N * N).map(|p| (stamp[p] - galaxy(p)).abs());
             assert!(worst.fold(0.0, f32::max) < 5e-3, "{place:?}");
@@ -252,7 +360,8 @@ mod tests {
                     (-(x * x + y * y) / 18.0).exp()
                 })
                 .collect();
-            let [x, y] = profile.place(&stamp, [47, 47], [place[0] - 2.0, place[1] + 2.5]);
+            let ([x, y], peak) = profile.place(&stamp, [47, 47], [place[0] - 2.0, place[1] + 2.5]);
+            assert!((peak - 1.0).abs() < 0.01, "{peak}");
             // Steps go the whole way for a Gaussian of that width, and converge quadratically.
             assert!(
                 (x - place[0]).hypot(y - place[1]) < 0.01,

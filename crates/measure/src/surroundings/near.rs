@@ -1,0 +1,262 @@
+//! Neighbours so near that their light overlaps the galaxy's: a pair is not the same turned by 180 degrees.
+//!
+//! The difference between the stamp and itself turned is compared with that of a Gaussian neighbour at places around
+//! the galaxy. The galaxy's centre is known to half a pixel only. What a displacement of the galaxy changes is projected
+//! out of the templates, so that it is not mistaken for a neighbour.
+
+use super::contrast::opposite;
+
+/// Pixels on a side of a cell. See docs/constants.md.
+const CELL: usize = 2;
+/// Cells along an axis. See docs/constants.md.
+const ALONG: usize = 12;
+/// Cells.
+const CELLS: usize = ALONG * ALONG;
+/// σ of the Gaussian neighbour. See docs/constants.md.
+const WIDTH: f32 = 3.0;
+/// σ of the Gaussians whose derivatives are what a displacement of the galaxy changes. See docs/constants.md.
+const CORES: [f32; 3] = [1.8, 2.8, 4.5];
+/// Distances of a neighbour from the galaxy: the least and the largest. See docs/constants.md.
+const DISTANCES: [f32; 2] = [4.0, 10.0];
+/// Distance between places of a neighbour along an axis. See docs/constants.md.
+const STEP: f32 = 2.0;
+
+/// What neighbours at all places look like.
+pub(super) struct Near {
+    n: usize,
+    /// For a turn that is even or not along x and y.
+    templates: [[Vec<Template>; 2]; 2],
+}
+
+/// What a neighbour of flux 1 at one place adds to the differences, without what a displacement of the galaxy may
+/// explain.
+struct Template {
+    cells: [f32; CELLS],
+    squares: f32,
+}
+
+/// The neighbour that noise would explain the least.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Suspect {
+    /// Its light.
+    pub(super) light: f32,
+    /// In units of the noise.
+    pub(super) significance: f32,
+}
+
+impl Near {
+    pub(super) fn new(n: usize) -> Self {
+        let templates = |odd_x| [false, true].map(|odd_y| templates([odd_x, odd_y]));
+        Near {
+            n,
+            templates: [templates(false), templates(true)],
+        }
+    }
+
+    /// The most significant neighbour whose light is at least `least`, in noise of level `noise`. Pixel p is opposite to
+    /// `turn − p`.
+    pub(super) fn suspect(
+        &self,
+        stamp: &[f32],
+        turn: [i32; 2],
+        noise: f32,
+        least: f32,
+    ) -> Option<Suspect> {
+        let cells = self.cells(stamp, turn);
+        let [odd_x, odd_y] = turn.map(|turn| turn.rem_euclid(2) as usize);
+        let suspects = self.templates[odd_x][odd_y].iter().map(|template| {
+            let products = template.cells.iter().zip(&cells);
+            let product: f32 = lanes(products.map(|(a, b)| a * b));
+            // A difference repeats the noise of its opposite with the other sign: twice the amplitude.
+            let error = 2.0 * CELL as f32 * noise * template.squares.sqrt();
+            Suspect {
+                light: product.abs() / template.squares,
+                significance: product.abs() / error,
+            }
+        });
+        let bright = suspects.filter(|suspect| suspect.light >= least);
+        bright.max_by(|a, b| a.significance.total_cmp(&b.significance))
+    }
+
+    /// Differences between the cells and their opposites.
+    fn cells(&self, stamp: &[f32], turn: [i32; 2]) -> [f32; CELLS] {
+        let n = self.n as i32;
+        let first = turn.map(|turn| turn.div_euclid(2) + 1 - (ALONG * CELL / 2) as i32);
+        let mut cells = [0.0; CELLS];
+        for j in 0..(ALONG * CELL) as i32 {
+            let row = first[1] + j;
+            if !(0..n).contains(&row) {
+                continue;
+            }
+            for i in 0..(ALONG * CELL) as i32 {
+                let column = first[0] + i;
+                if !(0..n).contains(&column) {
+                    continue;
+                }
+                let place = [column as usize, row as usize];
+                if let Some(light) = opposite(stamp, self.n, turn, place) {
+                    let here = stamp[place[1] * self.n + place[0]];
+                    cells[j as usize / CELL * ALONG + i as usize / CELL] += here - light;
+                }
+            }
+        }
+        cells
+    }
+}
+
+/// Sum of products, several side by side.
+fn lanes(products: impl Iterator<Item = f32>) -> f32 {
+    let mut lanes = [0.0; ALONG];
+    for (at, product) in products.enumerate() {
+        lanes[at % ALONG] += product;
+    }
+    lanes.iter().sum()
+}
+
+/// The templates, for a turn that is odd or not along x and y.
+fn templates(odd: [bool; 2]) -> Vec<Template> {
+    // Middle of a cell from the centre: one between pixels is in the middle of the cells.
+    let middle = |k: usize, odd: bool| {
+        (k as f32 - (ALONG as f32 - 1.0) / 2.0) * CELL as f32 + if odd { 0.0 } else { 0.5 }
+    };
+    let field = |light: &dyn Fn(f32, f32) -> f32| -> [f32; CELLS] {
+        std::array::from_fn(|at| {
+            let (x, y) = (middle(at % ALONG, odd[0]), middle(at / ALONG, odd[1]));
+            light(x, y)
+        })
+    };
+    let gaussian = |x: f32, y: f32, width: f32| (-0.5 * (x * x + y * y) / (width * width)).exp();
+    // Orthonormal fields of displacements (Gram and Schmidt).
+    let mut moved: Vec<[f32; CELLS]> = Vec::new();
+    for width in CORES {
+        for axis in 0..2 {
+            let mut new = field(&|x, y| [x, y][axis] * gaussian(x, y, width));
+            project(&mut new, &moved);
+            let size = dot(&new, &new).sqrt();
+            moved.push(new.map(|v| v / size));
+        }
+    }
+    let steps = (DISTANCES[1] / STEP).ceil() as i32;
+    let mut templates = Vec::new();
+    for j in 0..=steps {
+        for i in -steps..=steps {
+            let (x0, y0) = (i as f32 * STEP, j as f32 * STEP);
+            let twice = j == 0 && i < 0;
+            if twice || !(DISTANCES[0]..=DISTANCES[1]).contains(&x0.hypot(y0)) {
+                continue;
+            }
+            let area = (CELL * CELL) as f32 / (2.0 * std::f32::consts::PI * WIDTH * WIDTH);
+            let mut cells = field(&|x, y| {
+                area * (gaussian(x - x0, y - y0, WIDTH) - gaussian(x + x0, y + y0, WIDTH))
+            });
+            project(&mut cells, &moved);
+            let squares = dot(&cells, &cells);
+            templates.push(Template { cells, squares });
+        }
+    }
+    templates
+}
+
+fn dot(a: &[f32; CELLS], b: &[f32; CELLS]) -> f32 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Takes orthonormal fields out of another.
+fn project(field: &mut [f32; CELLS], out: &[[f32; CELLS]]) {
+    for other in out {
+        let share = dot(field, other);
+        for (value, other) in field.iter_mut().zip(other) {
+            *value -= share * other;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const N: usize = 48;
+
+    fn blob(stamp: &mut [f32], [x, y]: [f32; 2], width: f32, flux: f32) {
+        let peak = flux / (2.0 * std::f32::consts::PI * width * width);
+        for (at, value) in stamp.iter_mut().enumerate() {
+            let (dx, dy) = ((at % N) as f32 - 23.5 - x, (at / N) as f32 - 23.5 - y);
+            *value += peak * (-(dx * dx + dy * dy) / (2.0 * width * width)).exp();
+        }
+    }
+
+    #[test]
+    fn a_neighbour_of_the_templates_width_has_its_own_light() {
+        let near = Near::new(N);
+        for (turn, middle) in [
+            ([47, 47], [0.0, 0.0]),
+            ([48, 47], [0.5, 0.0]),
+            ([46, 49], [-0.5, 1.0]),
+        ] {
+            for away in [[6.0, 0.0], [0.0, -8.0], [-4.0, 6.0], [4.0, 4.0]] {
+                let mut stamp = vec![0.0; N * N];
+                blob(&mut stamp, middle, 2.5, 200.0);
+                blob(
+                    &mut stamp,
+                    [middle[0] + away[0], middle[1] + away[1]],
+                    WIDTH,
+                    100.0,
+                );
+                let found = near.suspect(&stamp, turn, 1.0, 0.0).unwrap();
+                // Of pixels and cells, sums replace integrals, and light beyond the cells is lost.
+                assert!(
+                    (found.light - 100.0).abs() < 12.0,
+                    "{found:?} {turn:?} {away:?}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_displaced_galaxy_is_no_neighbour() {
+        let near = Near::new(N);
+        for width in [2.0, 3.0, 4.0] {
+            for middle in [[0.25, 0.0], [-0.2, 0.25]] {
+                let mut stamp = vec![0.0; N * N];
+                blob(&mut stamp, middle, width, 1000.0);
+                let found = near.suspect(&stamp, [47, 47], 1.0, 0.0).unwrap();
+                // The difference itself is 5 to 25 % of the galaxy's light.
+                assert!(found.light < 20.0, "{found:?} {width} {middle:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn significances_of_noise_are_those_of_a_normal_distribution() {
+        let near = Near::new(N);
+        let mut state = 1u32;
+        let mut uniform = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 24) as f32
+        };
+        for turn in [[47, 47], [48, 46]] {
+            let template = &near.templates[turn[0] as usize % 2][turn[1] as usize % 2][7];
+            let (mut squares, count) = (0.0, 1000);
+            for _ in 0..count {
+                // Variance 1.
+                let stamp: Vec<f32> = (0..N * N)
+                    .map(|_| 12.0f32.sqrt() * (uniform() - 0.5))
+                    .collect();
+                let cells = near.cells(&stamp, turn);
+                let product = dot(&template.cells, &cells);
+                squares += (product / (2.0 * CELL as f32)).powi(2) / template.squares;
+            }
+            // A variance of a thousand has an error of 4.5 %; cells of an even turn are not opposite to cells.
+            let variance = squares / count as f32;
+            assert!((variance - 1.0).abs() < 0.2, "{variance} {turn:?}");
+        }
+    }
+
+    #[test]
+    fn a_galaxy_at_the_edge_of_the_stamp_is_compared_as_far_as_there_are_pixels() {
+        let near = Near::new(N);
+        let stamp = vec![1.0; N * N];
+        let found = near.suspect(&stamp, [5, 90], 1.0, 0.0).unwrap();
+        assert_eq!(found.light, 0.0);
+    }
+}

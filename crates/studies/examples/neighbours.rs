@@ -1,0 +1,356 @@
+//! The bias m of galaxies at S/N 20 that have one neighbour, by its distance and flux.
+//!
+//! `cargo run --release -p shearq-studies --example neighbours -- SCENES SEED [SVG]` prints a table in Markdown, and draws
+//! the plot if you name a file. Galaxies and neighbours are a bulge and a disc with half-light radii of 2.5 to 5 px, behind
+//! a Moffat PSF with a FWHM of 3.4 px. The shear is (γ, γ) and (−γ, −γ) with γ = 0.02. Each scene is measured in eight
+//! versions: both shears, turned by 90 degrees or not, and both signs of the noise. Only the galaxy is sheared, or the
+//! whole scene about the galaxy.
+#![expect(clippy::print_stdout, reason = "an example shows what it finds")]
+
+use std::error::Error;
+use std::f64::consts::{PI, TAU};
+
+use ndarray::{Array2, Array3, ArrayView2, s};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use shearq_measure::{ImageNoise, Measurement, Measurer, PsfWorker};
+use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Shear, TransformedPsf};
+use shearq_simulate::galaxy::Galaxy;
+use shearq_simulate::render::{RenderScratch, Renderer};
+
+/// Pixels on a side of a stamp.
+const SIDE: usize = 48;
+/// Shear of each component, of either sign.
+const SHEAR: f64 = 0.02;
+/// S/N of the galaxy, in noise of level 1.
+const SNR: f64 = 20.0;
+/// Distances of the neighbour in pixels.
+const DISTANCES: [[f64; 2]; 6] = [
+    [5.0, 7.0],
+    [7.0, 10.0],
+    [10.0, 13.0],
+    [13.0, 16.0],
+    [16.0, 20.0],
+    [20.0, 24.0],
+];
+/// Fluxes of the neighbour in units of the galaxy's.
+const RATIOS: [[f64; 2]; 2] = [[0.3, 1.0], [1.0, 3.0]];
+/// Groups of scenes that the errors come from.
+const GROUPS: usize = 20;
+
+/// A profile of the population.
+#[derive(Clone, Copy)]
+struct Profile {
+    shape: Shear,
+    radius: f64,
+    bulge: f64,
+}
+
+impl Profile {
+    fn drawn(rng: &mut ChaCha8Rng) -> Self {
+        let modulus: f64 = 0.14 * (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
+        let angle = rng.random_range(0.0..TAU);
+        let modulus = modulus.min(0.6);
+        Profile {
+            shape: Shear::new(modulus * angle.cos(), modulus * angle.sin()),
+            radius: rng.random_range(2.5..5.0),
+            bulge: rng.random_range(0.0..1.0),
+        }
+    }
+
+    /// With a flux of 1, turned by 90 degrees or not, and sheared.
+    fn galaxy(self, turned: bool, shear: f64) -> Result<Galaxy, Box<dyn Error>> {
+        let side = if turned { -1.0 } else { 1.0 };
+        let shape = Shear::new(side * self.shape.e1, side * self.shape.e2);
+        let shape = shape.sheared_by(Shear::new(shear, shear));
+        let radii = [0.6 * self.radius, 1.25 * self.radius];
+        Ok(Galaxy::bulge_and_disc(
+            1.0, self.bulge, radii[0], radii[1], shape,
+        )?)
+    }
+}
+
+/// Draws stamps.
+struct Drawing<'a> {
+    renderer: Renderer,
+    psf: TransformedPsf<'a>,
+    scratch: RenderScratch,
+}
+
+impl Drawing<'_> {
+    fn draw(&mut self, galaxy: &Galaxy, [x, y]: [f64; 2]) -> Array2<f32> {
+        let mut out = vec![0.0; SIDE * SIDE];
+        let middle = (SIDE as f64 - 1.0) / 2.0;
+        let centre = (middle + x, middle + y);
+        self.renderer
+            .render(galaxy, &self.psf, centre, &mut self.scratch, &mut out);
+        Array2::from_shape_vec((SIDE, SIDE), out).expect("as long as a stamp")
+    }
+
+    /// A galaxy of S/N 20 at `place`: `[turned][sign of the shear]`, and its flux.
+    fn central(
+        &mut self,
+        profile: Profile,
+        place: [f64; 2],
+    ) -> Result<(Stamps, f32), Box<dyn Error>> {
+        let mut stamps = self.all(|_, _| place, profile, true)?;
+        let squares: f32 = stamps.iter().flatten().flatten().map(|v| v * v).sum();
+        let flux = SNR as f32 / (squares / 4.0).sqrt();
+        for stamp in stamps.iter_mut().flatten() {
+            *stamp *= flux;
+        }
+        Ok((stamps, flux))
+    }
+
+    /// All versions of a galaxy.
+    fn all(
+        &mut self,
+        place: impl Fn(bool, f64) -> [f64; 2],
+        profile: Profile,
+        sheared: bool,
+    ) -> Result<Stamps, Box<dyn Error>> {
+        let mut one = |turned: bool, sign: f64| -> Result<_, Box<dyn Error>> {
+            let shear = if sheared { sign * SHEAR } else { 0.0 };
+            Ok(self.draw(&profile.galaxy(turned, shear)?, place(turned, shear)))
+        };
+        Ok([
+            [one(false, 1.0)?, one(false, -1.0)?],
+            [one(true, 1.0)?, one(true, -1.0)?],
+        ])
+    }
+}
+
+/// Stamps `[turned][sign of the shear]`.
+type Stamps = [[Array2<f32>; 2]; 2];
+
+/// Where a neighbour is.
+#[derive(Clone, Copy)]
+struct Away {
+    distance: f64,
+    angle: f64,
+}
+
+impl Away {
+    /// Its place if the galaxy is at `galaxy`, turned by 90 degrees or not, under a shear about the galaxy.
+    fn place(self, galaxy: [f64; 2], turned: bool, shear: f64) -> [f64; 2] {
+        let angle = self.angle + if turned { PI / 2.0 } else { 0.0 };
+        let [x, y] = [self.distance * angle.cos(), self.distance * angle.sin()];
+        let [[a, b], [c, d]] = Shear::new(shear, shear).matrix();
+        [galaxy[0] + a * x + b * y, galaxy[1] + c * x + d * y]
+    }
+}
+
+/// What was measured of one kind of scene.
+#[derive(Default, Clone)]
+struct Bin {
+    scenes: Vec<[[Measurement; 4]; 2]>,
+}
+
+/// What is printed of a bin.
+struct Row {
+    /// Of scenes of which all versions can be measured.
+    m: [f64; 2],
+    m_error: [f64; 2],
+    /// Of versions that can be measured.
+    single: [f64; 2],
+    single_error: [f64; 2],
+    /// Scatter that noise makes of one component.
+    noise: f64,
+    /// Share of versions with a flag under the positive and the negative shear.
+    flagged: [f64; 2],
+}
+
+fn bias(scenes: &[[[Measurement; 4]; 2]], k: usize, whole: bool) -> f64 {
+    let e = |g: &Measurement| [g.e1, g.e2][k];
+    let response = |g: &Measurement| g.response.map_or(f64::NAN, |r| r[k][k]);
+    let good = |g: &&Measurement| g.flags.is_empty();
+    let (mut sums, mut counts, mut responses) = ([0.0; 2], [0.0f64; 2], 0.0);
+    for scene in scenes {
+        if whole && !scene.iter().flatten().all(|g| g.flags.is_empty()) {
+            continue;
+        }
+        for side in 0..2 {
+            for galaxy in scene[side].iter().filter(good) {
+                sums[side] += e(galaxy);
+                counts[side] += 1.0;
+                responses += response(galaxy);
+            }
+        }
+    }
+    let response = responses / (counts[0] + counts[1]);
+    (sums[0] / counts[0] - sums[1] / counts[1]) / (2.0 * SHEAR) / response - 1.0
+}
+
+impl Bin {
+    fn row(&self) -> Row {
+        let all = |whole: bool| [0, 1].map(|k| bias(&self.scenes, k, whole));
+        let size = self.scenes.len().div_ceil(GROUPS);
+        let error = |whole: bool| {
+            [0, 1].map(|k| {
+                // Jackknife over groups of scenes.
+                let left_out = |group: usize| {
+                    let mut scenes = self.scenes.clone();
+                    scenes.drain(group * size..((group + 1) * size).min(scenes.len()));
+                    bias(&scenes, k, whole)
+                };
+                let count = self.scenes.len().div_ceil(size);
+                let values: Vec<f64> = (0..count).map(left_out).collect();
+                let mean = values.iter().sum::<f64>() / count as f64;
+                let squares: f64 = values.iter().map(|v| (v - mean) * (v - mean)).sum();
+                (squares * (count as f64 - 1.0) / count as f64).sqrt()
+            })
+        };
+        let good: Vec<_> = self.scenes.iter().flatten().collect();
+        let (mut squares, mut responses, mut count) = (0.0, 0.0, 0.0);
+        for versions in &good {
+            // Versions 2k and 2k + 1 have noise of both signs.
+            for pair in versions.chunks(2) {
+                if let ([a, b], true) = (pair, pair.iter().all(|g| g.flags.is_empty())) {
+                    squares += ((a.e1 - b.e1) / 2.0).powi(2) + ((a.e2 - b.e2) / 2.0).powi(2);
+                    let response = |g: &Measurement| g.response.map_or(f64::NAN, |r| r[0][0]);
+                    responses += (response(a) + response(b)) / 2.0;
+                    count += 1.0;
+                }
+            }
+        }
+        let flagged = [0, 1].map(|side| {
+            let versions = self.scenes.iter().flat_map(|scene| &scene[side]);
+            let bad = versions.filter(|g| !g.flags.is_empty()).count();
+            bad as f64 / (4 * self.scenes.len()) as f64
+        });
+        Row {
+            m: all(true),
+            m_error: error(true),
+            single: all(false),
+            single_error: error(false),
+            noise: (squares / count / 2.0f64).sqrt() / (responses / count),
+            flagged,
+        }
+    }
+}
+
+/// A scene in all versions.
+fn measured(
+    worker: &mut PsfWorker<'_>,
+    galaxy: &Stamps,
+    neighbour: Option<(&Stamps, f32)>,
+    noise: ArrayView2<'_, f32>,
+) -> Result<[[Measurement; 4]; 2], Box<dyn Error>> {
+    let mut one = |sign: usize, version: usize| -> Result<_, Box<dyn Error>> {
+        let turned = version / 2;
+        let side = [1.0f32, -1.0][version % 2];
+        let mut stamp = &galaxy[turned][sign] + &(&noise * side);
+        if let Some((stamps, flux)) = neighbour {
+            stamp.scaled_add(flux, &stamps[turned][sign]);
+        }
+        Ok(worker.measure(stamp.view())?)
+    };
+    let mut side = |sign: usize| -> Result<[Measurement; 4], Box<dyn Error>> {
+        Ok([one(sign, 0)?, one(sign, 1)?, one(sign, 2)?, one(sign, 3)?])
+    };
+    Ok([side(0)?, side(1)?])
+}
+
+fn name(range: [f64; 2]) -> String {
+    format!("{} to {}", range[0], range[1])
+}
+
+fn print(case: &str, row: &Row) {
+    let milli = |m: [f64; 2], error: [f64; 2]| {
+        let [m1, m2] = m.map(|m| 1e3 * m);
+        format!("{m1:+.1}, {m2:+.1} ± {:.1}", 1e3 * error[0].max(error[1]))
+    };
+    println!(
+        "| {case} | {} | {} | {:.3} | {:.2} %, {:.2} % |",
+        milli(row.m, row.m_error),
+        milli(row.single, row.single_error),
+        row.noise,
+        100.0 * row.flagged[0],
+        100.0 * row.flagged[1],
+    );
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [scenes, seed, ..] = arguments.as_slice() else {
+        return Err("expected SCENES SEED [SVG]".into());
+    };
+    let (scenes, seed): (usize, u64) = (scenes.parse()?, seed.parse()?);
+    let profile = PsfProfile::Moffat { beta: 3.0 };
+    let transform = PsfTransform::new(profile)?;
+    let psf = FunctionalPsf::new(profile, 3.4, Shear::new(0.03, -0.02))?;
+    let mut drawing = Drawing {
+        renderer: Renderer::new(SIDE),
+        psf: transform.of(&psf)?,
+        scratch: RenderScratch::new(),
+    };
+    let mut bins = vec![Bin::default(); 1 + 2 * DISTANCES.len() * RATIOS.len()];
+
+    let measurer = Measurer::named("48/linear/star", SIDE)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let noise = |rng: &mut ChaCha8Rng| {
+        Array2::from_shape_simple_fn((SIDE, SIDE), || {
+            let value: f32 = StandardNormal.sample(rng);
+            value
+        })
+    };
+    let place = |rng: &mut ChaCha8Rng| [rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5)];
+    // The size of the population, which the window is adapted to.
+    let mut survey = Array3::<f32>::zeros((200, SIDE, SIDE));
+    for mut stamp in survey.outer_iter_mut() {
+        let at = place(&mut rng);
+        let (stamps, _) = drawing.central(Profile::drawn(&mut rng), at)?;
+        stamp.assign(&(&stamps[0][0] + &noise(&mut rng)));
+    }
+    let survey = measurer.survey(survey.slice(s![.., .., ..]))?;
+    let mut worker = measurer.worker();
+    let mut image = worker.image(ImageNoise::of(survey.as_ref(), Some(1.0)));
+    let star = shearq_measure::star_psf(psf.stamp(SIDE).view(), measurer.configuration().psf_cut())?;
+    let mut worker = image.psf(star.view())?;
+
+    for _ in 0..scenes {
+        let at = place(&mut rng);
+        let (galaxy, flux) = drawing.central(Profile::drawn(&mut rng), at)?;
+        let noise = noise(&mut rng);
+        bins[0]
+            .scenes
+            .push(measured(&mut worker, &galaxy, None, noise.view())?);
+        let mut bin = 1;
+        for range in DISTANCES {
+            let profile = Profile::drawn(&mut rng);
+            let away = Away {
+                distance: rng.random_range(range[0]..range[1]),
+                angle: rng.random_range(0.0..TAU),
+            };
+            let share: f64 = rng.random_range(0.0..1.0);
+            for sheared in [false, true] {
+                let here = |turned: bool, shear: f64| away.place(at, turned, shear);
+                let stamps = drawing.all(here, profile, sheared)?;
+                for ratio in RATIOS {
+                    let light = flux * (ratio[0] * (ratio[1] / ratio[0]).powf(share)) as f32;
+                    let neighbour = Some((&stamps, light));
+                    let found = measured(&mut worker, &galaxy, neighbour, noise.view())?;
+                    bins[bin].scenes.push(found);
+                    bin += 1;
+                }
+            }
+        }
+    }
+
+    println!(
+        "| neighbour at (px) | sheared | flux ratio | m1, m2 (10⁻³) | m1, m2 (10⁻³), versions alone | noise | flagged |"
+    );
+    println!("|---|---|---|---|---|---|---|");
+    print("none | | ", &bins[0].row());
+    let mut rest = bins[1..].iter();
+    for range in DISTANCES {
+        for sheared in ["no", "yes"] {
+            for ratio in RATIOS {
+                let row = rest.next().expect("a bin for each").row();
+                print(&format!("{} | {sheared} | {}", name(range), name(ratio)), &row);
+            }
+        }
+    }
+    Ok(())
+}
