@@ -18,15 +18,15 @@ def bias(apart, response, good):
     return 1e3 * m / mean, 1e3 * error / mean, mean
 
 
-def weighted(case, found, k, good):
+def weighted(case, found, k, good, hard):
     """Component k of what is summed over galaxies: weight times ellipticity, and its derivative with shear.
 
     Both are arrays `[field, ±shear, galaxy]`; the shear of a catalogue is the sum of the first over the sum of the
-    second. Here the weight of a cut is one or zero, each catalogue is cut by its own columns, and the derivative of
-    the weight is left out: it is what a calibrated selection adds.
+    second. With `hard` cuts, the weight is one or zero, each catalogue is cut by its own columns, and the derivative of
+    the weight is left out. Otherwise `shearq select` has made both.
     """
     weight = np.ones(found["flags"].shape)
-    if case.cut:
+    if case.cut and hard:
         column, share = case.cut
         weight = (found[column] > np.quantile(found[column][:, :, good], share)).astype(float)
     return weight * found[f"e{k}"], weight * found[f"R{k}{k}"]

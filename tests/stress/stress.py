@@ -70,10 +70,22 @@ def measured(case, stamps, stars, fields, options):
         if run.returncode:
             sys.exit(f"{case.name}: {run.stderr}")
         names = ["e1", "e2", "R11", "R22", "flags", "flux", "size"]
-        tables = [
-            parquet.read_table(out / "set01" / f"catalogue-{k:03}.parquet", columns=names)
-            for k in range(1, number + 1)
-        ]
+
+        def read(folder):
+            paths = [folder / "set01" / f"catalogue-{k:03}.parquet" for k in range(1, number + 1)]
+            return [parquet.read_table(path, columns=names) for path in paths]
+
+        tables = read(out)
+        if case.cut and not options.hard_cuts:
+            column, share = case.cut
+            values = np.concatenate([table[column].to_numpy()[table["flags"].to_numpy() == 0] for table in tables])
+            selected = Path(folder) / "selected"
+            command = [options.shearq, "select", "--measured", str(out), "--out", str(selected)]
+            command += ["--where", f"{column} > {np.quantile(values, share)}"]
+            run = subprocess.run(command, capture_output=True, text=True)
+            if run.returncode:
+                sys.exit(f"{case.name}: {run.stderr}")
+            tables = read(selected)
     columns = {name: np.array([table[name].to_numpy() for table in tables]) for name in names}
     return {name: values.reshape(-1, 2, count) for name, values in columns.items()}
 
@@ -139,7 +151,7 @@ def measure_case(case, options, others):
             if good.any():
                 # Ellipticities are divided by the mean response of their image: undone, for one mean over all.
                 found[f"e{k}"] = found[f"e{k}"] * np.nanmean(response, 2, keepdims=True)
-                row[k] = weighted(case, found, k, good)
+                row[k] = weighted(case, found, k, good, options.hard_cuts)
         rows.append(row)
     return rows
 
@@ -235,6 +247,9 @@ def main():
     words.add_argument("--seed", type=int, default=20261)
     words.add_argument(
         "--peers", nargs="*", default=[], choices=list(peers.PEERS), help="estimators of others, on the same stamps"
+    )
+    words.add_argument(
+        "--hard-cuts", action="store_true", help="cut the columns as a filter does, without the response of `select`"
     )
     words.add_argument("--threads", type=int, default=1)
     words.add_argument("--json", type=Path, help="the table as JSON")

@@ -306,7 +306,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let survey = measurer.survey(survey.slice(s![.., .., ..]))?;
     let mut worker = measurer.worker();
     let mut image = worker.image(ImageNoise::of(survey.as_ref(), Some(1.0)));
-    let star = shearq_measure::star_psf(psf.stamp(SIDE).view(), measurer.configuration().psf_cut())?;
+    let star =
+        shearq_measure::star_psf(psf.stamp(SIDE).view(), measurer.configuration().psf_cut())?;
     let mut worker = image.psf(star.view())?;
 
     for _ in 0..scenes {
@@ -348,7 +349,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         for sheared in ["no", "yes"] {
             for ratio in RATIOS {
                 let row = rest.next().expect("a bin for each").row();
-                print(&format!("{} | {sheared} | {}", name(range), name(ratio)), &row);
+                print(
+                    &format!("{} | {sheared} | {}", name(range), name(ratio)),
+                    &row,
+                );
             }
         }
     }

@@ -72,12 +72,14 @@ impl Breadth {
 
     /// P₀ and P₂ of an autocorrelation or of its change.
     pub(crate) fn sums(&self, lags: &[f32]) -> [f32; 2] {
+        /// Numbers that are summed side by side. See docs/constants.md.
+        const LANES: usize = 16;
         let [zero, two] = &self.weights;
-        let mut lanes = [[0.0f32; 16]; 2];
-        let chunks = lags.chunks_exact(16);
+        let mut lanes = [[0.0f32; LANES]; 2];
+        let chunks = lags.chunks_exact(LANES);
         let at = lags.len() - chunks.remainder().len();
-        for ((v, a), b) in chunks.zip(zero.chunks_exact(16)).zip(two.chunks_exact(16)) {
-            for l in 0..16 {
+        for ((v, a), b) in chunks.zip(zero.chunks_exact(LANES)).zip(two.chunks_exact(LANES)) {
+            for l in 0..LANES {
                 lanes[0][l] += v[l] * a[l];
                 lanes[1][l] += v[l] * b[l];
             }
@@ -146,5 +148,74 @@ impl Breadth {
             first / (2.0 * r),
             (second - first * first / (2.0 * r * r)) / (2.0 * r),
         ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SPACING: f64 = 4.0 / 3.0;
+    const REACH: usize = 15;
+    const TARGET: f64 = 1.5;
+    const WINDOW: f64 = 8.0;
+
+    /// Autocorrelation of a windowed round Gaussian galaxy of standard deviation `r` and flux one.
+    fn acf(r: f64) -> Vec<f32> {
+        let variance = 1.0 / (1.0 / (r * r + TARGET * TARGET) + 1.0 / (WINDOW * WINDOW));
+        let side = REACH as i32;
+        let mut lags = Vec::new();
+        for y in 0..=side {
+            for x in -side..=side {
+                let square = f64::from(x * x + y * y) * SPACING * SPACING;
+                lags.push((-square / (4.0 * variance)).exp() as f32);
+            }
+        }
+        lags
+    }
+
+    #[test]
+    fn the_size_of_a_gaussian_is_its_standard_deviation() {
+        let breadth = Breadth::new(TARGET, WINDOW, SPACING, REACH);
+        for r in [1.0, 2.0, 3.0, 5.0, 8.0] {
+            let found = breadth.measure(&acf(r), 0.0, 0.0);
+            let [size, first, second] = breadth.size(f64::from(found.square));
+            // The lags end at 20 px, four standard deviations of the weight.
+            assert!((size / r - 1.0).abs() < 0.01, "{r}: {size}");
+            assert!((breadth.square_of(size) / f64::from(found.square) - 1.0).abs() < 1e-9);
+            let step = 1e-4 * f64::from(found.square);
+            let side = |by: f64| breadth.size(f64::from(found.square) + by)[0];
+            let (plus, minus) = (side(step), side(-step));
+            // Truncation and rounding of differences of 10⁻⁴.
+            assert!(((plus - minus) / (2.0 * step) / first - 1.0).abs() < 1e-5);
+            let curved = (plus - 2.0 * size + minus) / (step * step);
+            assert!((curved - second).abs() < 1e-3 * (second.abs() + first), "{r}");
+        }
+        assert_eq!(breadth.size(0.0), [0.15, 0.0, 0.0]);
+        assert_eq!(breadth.size(1e9), [16.0, 0.0, 0.0]);
+        assert_eq!(breadth.size(f64::NAN), [0.15, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn responses_are_differences_and_noise_alone_has_the_typical_size() {
+        let breadth = Breadth::new(TARGET, WINDOW, SPACING, REACH);
+        let (galaxy, other) = (acf(2.0), acf(4.0));
+        let found = breadth.measure(&galaxy, 3.0, 20.0);
+        let step = 1e-3;
+        let moved: Vec<f32> = galaxy.iter().zip(&other).map(|(a, b)| a + step * b).collect();
+        let change = (breadth.measure(&moved, 3.0, 20.0).square - found.square) / step;
+        let response = breadth.response(&found, &other);
+        // Single precision over a step of 10⁻³.
+        assert!((change / response - 1.0).abs() < 0.02, "{change} {response}");
+        let nothing = vec![0.0; galaxy.len()];
+        assert_eq!(breadth.measure(&nothing, 3.0, 20.0).square, 20.0);
+        let [zero, two] = breadth.gradients();
+        let each = |weights: &[f32]| -> f32 {
+            let width = 2 * REACH + 1;
+            let rows = weights.iter().zip(&other).enumerate();
+            rows.map(|(at, (w, v))| w * v * if at < width { 1.0 } else { 2.0 }).sum()
+        };
+        let combined = Breadth::combine(&found, [each(&zero), each(&two)]);
+        assert!((combined / response - 1.0).abs() < 1e-4);
     }
 }

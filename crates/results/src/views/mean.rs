@@ -7,11 +7,13 @@ use shearq_render::table::{Cell, Heading, Table};
 
 /// Mean shears of sets that `configuration` measured, of the catalogues called `name`.
 pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) -> Table {
+    /// Place of the column of galaxies that a selection leaves out.
+    const CUT: usize = 3;
+    let selected = means.iter().any(|mean| mean.cut > 0);
     let headings = [
         ("set", "Set"),
         ("galaxies", "Galaxies"),
         ("flagged", "Flagged"),
-        ("cut", "Cut"),
         ("g1", "g1"),
         ("g2", "g2"),
         ("scatter1", "σ(e1)"),
@@ -22,16 +24,19 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
             Some(found) => Cell::with_error(found.shear[k], Some(found.error()[k]), 5),
             None => Cell::number(f64::NAN, 5),
         };
-        vec![
+        let mut row = vec![
             Cell::number(f64::from(mean.set), 0),
             Cell::number(mean.galaxies as f64, 0),
             Cell::number(mean.flagged as f64, 0),
-            Cell::number(mean.cut as f64, 0),
             shear(0),
             shear(1),
             Cell::number(mean.scatter[0], 4),
             Cell::number(mean.scatter[1], 4),
-        ]
+        ];
+        if selected {
+            row.insert(CUT, Cell::number(mean.cut as f64, 0));
+        }
+        row
     });
     let mut notes = vec![format!(
         "Mean ellipticities of {name} by {}. Positive g2 is a stretch along x = y.",
@@ -45,9 +50,13 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
     } else if configuration.ellipticity() == EllipticityType::Distortion {
         notes.push("The ellipticities are distortions, divided by their response to shear.".into());
     }
+    let mut headings: Vec<Heading> = headings.map(|(key, label)| Heading::new(key, label)).into();
+    if selected {
+        headings.insert(CUT, Heading::new("cut", "Cut"));
+    }
     Table {
         title: "Mean shear".into(),
-        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
+        headings,
         rows: rows.collect(),
         notes,
     }
