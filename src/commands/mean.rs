@@ -66,6 +66,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let means = mean_shears(&run, measured, sets, selection.as_ref())?;
     for mean in &means {
         let set = mean.set;
+        anyhow::ensure!(
+            mean.galaxies > 0 || mean.cut == 0,
+            "set {set:02}: the selection leaves none of {} galaxies (expected some). Try: a lower threshold",
+            mean.cut
+        );
         if let Some(flagged) = mean.mostly_flagged() {
             anyhow::ensure!(mean.galaxies > 0, "set {set:02}: {flagged}");
             tell(format_args!("warning: set {set:02}: {flagged}"));

@@ -39,6 +39,7 @@ mod reference;
 mod refused;
 mod reproduced;
 mod scoring_cases;
+mod selected;
 mod shards;
 mod stored;
 mod submitted;

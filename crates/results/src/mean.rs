@@ -44,7 +44,7 @@ impl SetMean {
                 .find(|(_, other)| *other == flag)
                 .map_or(0, |(count, _)| *count)
         };
-        Warning::of_counts(with, self.flagged, self.flagged + self.galaxies)
+        Warning::of_counts(with, self.flagged, self.flagged + self.galaxies + self.cut)
     }
 
     /// Whether all galaxies have one ellipticity, so that the error is meaningless.
@@ -166,24 +166,23 @@ impl Rows {
     /// The rows with the weights of a selection.
     fn selected(path: &Path, selection: &Selection) -> Result<Self, FileError> {
         let read = table::read(path, None, table::MAX_ROWS)?;
+        let weighted = Weighted::of_table(path, selection, &read)?;
+        let flags = table::numbers(&read, "flags", path)?.into_owned();
+        let mean = weighted.mean_response();
         let Weighted {
             mut e,
             response,
             weight,
-        } = Weighted::of_table(path, selection, &read)?;
-        let flags = table::numbers(&read, "flags", path)?.into_owned();
-        let mut rows = Rows {
-            cut: weight.iter().map(|weight| *weight == 0.0).collect(),
-            e: [Vec::new(), Vec::new()],
-            flags,
-            response: Some(response),
-        };
-        let mean = rows.mean_of_responses(&e);
+        } = weighted;
         for (e, mean) in e.iter_mut().zip(mean) {
             e.iter_mut().for_each(|e| *e /= mean);
         }
-        rows.e = e;
-        Ok(rows)
+        Ok(Rows {
+            e,
+            flags,
+            response: Some(response),
+            cut: weight.iter().map(|weight| *weight == 0.0).collect(),
+        })
     }
 
     fn e(&self, row: usize) -> [f64; 2] {
@@ -200,16 +199,9 @@ impl Rows {
         response.map_or([1.0; 2], |all| [0, 1].map(|k| all[k][row]))
     }
 
-    /// Mean response of the galaxies with an ellipticity that are not left out.
+    /// Mean response of the galaxies with an ellipticity. Galaxies that are left out have a response of zero.
     fn mean_response(&self) -> [f64; 2] {
-        self.mean_of_responses(&self.e)
-    }
-
-    fn mean_of_responses(&self, e: &[Vec<f64>; 2]) -> [f64; 2] {
-        let good = || {
-            let rows = 0..self.flags.len();
-            rows.filter(|&row| !self.cut[row] && e.iter().all(|e| e[row].is_finite()))
-        };
+        let good = || (0..self.flags.len()).filter(|&row| self.is_good(row));
         let count = good().count() as f64;
         [0, 1].map(|k| good().map(|row| self.response(row)[k]).sum::<f64>() / count)
     }

@@ -78,7 +78,10 @@ impl Breadth {
         let mut lanes = [[0.0f32; LANES]; 2];
         let chunks = lags.chunks_exact(LANES);
         let at = lags.len() - chunks.remainder().len();
-        for ((v, a), b) in chunks.zip(zero.chunks_exact(LANES)).zip(two.chunks_exact(LANES)) {
+        for ((v, a), b) in chunks
+            .zip(zero.chunks_exact(LANES))
+            .zip(two.chunks_exact(LANES))
+        {
             for l in 0..LANES {
                 lanes[0][l] += v[l] * a[l];
                 lanes[1][l] += v[l] * b[l];
@@ -189,7 +192,10 @@ mod tests {
             // Truncation and rounding of differences of 10⁻⁴.
             assert!(((plus - minus) / (2.0 * step) / first - 1.0).abs() < 1e-5);
             let curved = (plus - 2.0 * size + minus) / (step * step);
-            assert!((curved - second).abs() < 1e-3 * (second.abs() + first), "{r}");
+            assert!(
+                (curved - second).abs() < 1e-3 * (second.abs() + first),
+                "{r}"
+            );
         }
         assert_eq!(breadth.size(0.0), [0.15, 0.0, 0.0]);
         assert_eq!(breadth.size(1e9), [16.0, 0.0, 0.0]);
@@ -202,18 +208,26 @@ mod tests {
         let (galaxy, other) = (acf(2.0), acf(4.0));
         let found = breadth.measure(&galaxy, 3.0, 20.0);
         let step = 1e-3;
-        let moved: Vec<f32> = galaxy.iter().zip(&other).map(|(a, b)| a + step * b).collect();
+        let moved: Vec<f32> = galaxy
+            .iter()
+            .zip(&other)
+            .map(|(a, b)| a + step * b)
+            .collect();
         let change = (breadth.measure(&moved, 3.0, 20.0).square - found.square) / step;
         let response = breadth.response(&found, &other);
         // Single precision over a step of 10⁻³.
-        assert!((change / response - 1.0).abs() < 0.02, "{change} {response}");
+        assert!(
+            (change / response - 1.0).abs() < 0.02,
+            "{change} {response}"
+        );
         let nothing = vec![0.0; galaxy.len()];
         assert_eq!(breadth.measure(&nothing, 3.0, 20.0).square, 20.0);
         let [zero, two] = breadth.gradients();
         let each = |weights: &[f32]| -> f32 {
             let width = 2 * REACH + 1;
             let rows = weights.iter().zip(&other).enumerate();
-            rows.map(|(at, (w, v))| w * v * if at < width { 1.0 } else { 2.0 }).sum()
+            rows.map(|(at, (w, v))| w * v * if at < width { 1.0 } else { 2.0 })
+                .sum()
         };
         let combined = Breadth::combine(&found, [each(&zero), each(&two)]);
         assert!((combined / response - 1.0).abs() < 1e-4);
