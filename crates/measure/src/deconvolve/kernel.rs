@@ -5,8 +5,6 @@
 //! found out when a network is planned. Instruction sets with fused multiply-add round differently
 //! from those without, so last digits differ between machines, never between threads.
 
-#[cfg(target_arch = "x86_64")]
-use multiversion::{multiversion, target::match_target};
 use shearq_submissions::{Clipping, Kept};
 
 use super::descent::{Descent, Stop};
@@ -14,6 +12,8 @@ use super::operator::Operator;
 use super::real::Real;
 use super::rule::{Rule, Step};
 use super::slide::{BLOCK, LANES, Padded, slide_block};
+#[cfg(target_arch = "x86_64")]
+use super::vector::Sixteen;
 use super::vector::{Portable, Vector};
 
 /// Buffers of one network; the frames of the padded ones stay zero, the rest may hold anything.
@@ -311,7 +311,7 @@ pub trait Wide: Real {
 
 impl Wide for f32 {
     #[cfg(target_arch = "x86_64")]
-    type Avx512 = Portable<f32, 16, true>;
+    type Avx512 = Sixteen;
     #[cfg(target_arch = "x86_64")]
     type Avx2 = Portable<f32, 8, true>;
 
@@ -378,7 +378,7 @@ impl Level {
     }
 }
 
-/// Runs the kernel compiled for `level`, or for less if the machine has less.
+/// Runs the kernel compiled for `level`.
 pub(super) fn run_at<T: Wide>(
     level: Level,
     operator: &Operator<T>,
@@ -386,32 +386,25 @@ pub(super) fn run_at<T: Wide>(
     b: &mut Buffers<T>,
 ) -> Descent {
     match level {
+        // SAFETY: `available` yields these only where the machine has the features.
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => run_avx512(operator, rule, b),
+        Level::Avx512 => unsafe { run_avx512(operator, rule, b) },
         #[cfg(target_arch = "x86_64")]
-        Level::Avx2 => run_avx2(operator, rule, b),
-        Level::Baseline => run_baseline(operator, rule, b),
+        Level::Avx2 => unsafe { run_avx2(operator, rule, b) },
+        Level::Baseline => {
+            run::<T, Portable<T, 4, { cfg!(target_arch = "aarch64") }>>(operator, rule, b)
+        }
     }
 }
 
-fn run_baseline<T: Wide>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Descent {
-    run::<T, Portable<T, 4, { cfg!(target_arch = "aarch64") }>>(operator, rule, b)
-}
-
 #[cfg(target_arch = "x86_64")]
-#[multiversion(targets("x86_64+avx512f+avx2+fma"), dispatcher = "direct")]
+#[target_feature(enable = "avx512f,avx2,fma")]
 fn run_avx512<T: Wide>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Descent {
-    match_target! {
-        "x86_64+avx512f+avx2+fma" => run::<T, T::Avx512>(operator, rule, b),
-        _ => run_avx2(operator, rule, b),
-    }
+    run::<T, T::Avx512>(operator, rule, b)
 }
 
 #[cfg(target_arch = "x86_64")]
-#[multiversion(targets("x86_64+avx2+fma"), dispatcher = "direct")]
+#[target_feature(enable = "avx2,fma")]
 fn run_avx2<T: Wide>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Descent {
-    match_target! {
-        "x86_64+avx2+fma" => run::<T, T::Avx2>(operator, rule, b),
-        _ => run_baseline(operator, rule, b),
-    }
+    run::<T, T::Avx2>(operator, rule, b)
 }

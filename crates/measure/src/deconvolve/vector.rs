@@ -1,13 +1,13 @@
 //! A few neighbouring pixels as one value, for each instruction set.
 //!
-//! They are arrays whose loops the compiler turns into instructions of the function that they are inlined into. A
-//! vector of another length, or fused products without the instruction, would be slow there but not wrong.
+//! The vectors with intrinsics are only made in functions compiled for their instruction set: their
+//! operations are inlined into those, and would be wrong to call anywhere else.
 
 use super::real::Real;
 
 /// `LANES` numbers that are multiplied and added together.
 pub trait Lanes<T>: Copy {
-    /// How many numbers.
+    /// Single-precision lanes of AVX-512. See docs/constants.md.
     const LANES: usize;
 
     /// The same number in all lanes.
@@ -28,6 +28,7 @@ impl<T, V: Lanes<T>> Lanes<T> for Pair<V>
 where
     T: Copy,
 {
+    /// Single-precision lanes of AVX-512. See docs/constants.md.
     const LANES: usize = 2 * V::LANES;
 
     #[inline(always)]
@@ -76,7 +77,7 @@ pub trait Vector<T>: Lanes<T> {
 }
 
 /// `N` numbers in the hands of the compiler.
-#[derive(Debug, Clone, Copy)]
+#[derive(Clone, Copy)]
 pub struct Portable<T, const N: usize, const FMA: bool>([T; N]);
 
 impl<T: Real, const N: usize, const FMA: bool> Portable<T, N, FMA> {
@@ -91,6 +92,7 @@ impl<T: Real, const N: usize, const FMA: bool> Portable<T, N, FMA> {
 }
 
 impl<T: Real, const N: usize, const FMA: bool> Lanes<T> for Portable<T, N, FMA> {
+    /// Single-precision lanes of AVX-512. See docs/constants.md.
     const LANES: usize = N;
 
     #[inline(always)]
@@ -165,24 +167,121 @@ impl<T: Real, const N: usize, const FMA: bool> Vector<T> for Portable<T, N, FMA>
         sums
     }
     #[inline(always)]
-    fn sum(sums: Self::Squares) -> f64 {
-        total(&sums)
+    fn sum(mut sums: Self::Squares) -> f64 {
+        // Eight are added in pairs first, so that AVX2 rounds as its instructions do.
+        let mut width = N;
+        while width > 4 {
+            width /= 2;
+            for k in 0..width {
+                sums[k] += sums[k + width];
+            }
+        }
+        sums[..width].iter().sum()
     }
 }
 
-/// The sum of a vector's sums. As a call that reads memory it keeps them in whole vectors before; inlined, the
-/// compiler divides them into pairs.
-#[inline(never)]
-fn total<const N: usize>(sums: &[f64; N]) -> f64 {
-    // Eight are added in pairs first and sixteen in pairs only, as the instructions of AVX2 and AVX-512 do.
-    let mut sums = *sums;
-    let mut width = N;
-    let last = if N == 16 { 1 } else { 4 };
-    while width > last {
-        width /= 2;
-        for k in 0..width {
-            sums[k] += sums[k + width];
+#[cfg(target_arch = "x86_64")]
+pub use x86::Sixteen;
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use std::arch::x86_64::*;
+
+    use super::{Lanes, Vector};
+
+    /// Sixteen f32 of AVX-512.
+    #[derive(Clone, Copy)]
+    pub struct Sixteen(__m512);
+
+    // SAFETY of the unsafe blocks below: the module's `Level` uses this type only in a function
+    // compiled for AVX-512F, entered where the machine has it; loads and stores are of slices of
+    // sixteen numbers.
+    impl Lanes<f32> for Sixteen {
+        /// Single-precision lanes of AVX-512. See docs/constants.md.
+        const LANES: usize = 16;
+
+        #[inline(always)]
+        fn splat(value: f32) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_set1_ps(value) })
+        }
+        #[inline(always)]
+        fn load(from: &[f32]) -> Self {
+            let from = &from[..16];
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_loadu_ps(from.as_ptr()) })
+        }
+        #[inline(always)]
+        fn store(self, to: &mut [f32]) {
+            let to = &mut to[..16];
+            // SAFETY: see above the implementation.
+            unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        fn add_product(self, a: Self, b: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_fmadd_ps(a.0, b.0, self.0) })
         }
     }
-    sums[..width].iter().sum()
+
+    impl Vector<f32> for Sixteen {
+        type Squares = [__m512d; 2];
+
+        #[inline(always)]
+        fn plus(self, other: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_add_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn minus(self, other: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_sub_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn times(self, other: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_mul_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn modulus(self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe { _mm512_abs_ps(self.0) })
+        }
+        #[inline(always)]
+        fn where_greater(a: Self, b: Self, yes: Self, no: Self) -> Self {
+            // SAFETY: see above the implementation.
+            Sixteen(unsafe {
+                let greater = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(a.0, b.0);
+                _mm512_mask_blend_ps(greater, no.0, yes.0)
+            })
+        }
+        #[inline(always)]
+        fn count_greater(a: Self, b: Self) -> u32 {
+            // SAFETY: see above the implementation.
+            unsafe { _mm512_cmp_ps_mask::<_CMP_GT_OQ>(a.0, b.0) }.count_ones()
+        }
+        #[inline(always)]
+        fn no_squares() -> Self::Squares {
+            // SAFETY: see above the implementation.
+            [unsafe { _mm512_setzero_pd() }; 2]
+        }
+        #[inline(always)]
+        fn add_squares(self, sums: Self::Squares) -> Self::Squares {
+            // SAFETY: see above the implementation.
+            unsafe {
+                let bits = _mm512_castps_pd(self.0);
+                let low = _mm512_cvtps_pd(_mm512_castps512_ps256(self.0));
+                let high = _mm512_cvtps_pd(_mm256_castpd_ps(_mm512_extractf64x4_pd::<1>(bits)));
+                [
+                    _mm512_fmadd_pd(low, low, sums[0]),
+                    _mm512_fmadd_pd(high, high, sums[1]),
+                ]
+            }
+        }
+        #[inline(always)]
+        fn sum(sums: Self::Squares) -> f64 {
+            // SAFETY: see above the implementation.
+            unsafe { _mm512_reduce_add_pd(_mm512_add_pd(sums[0], sums[1])) }
+        }
+    }
 }
