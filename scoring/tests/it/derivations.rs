@@ -11,7 +11,7 @@ use shearq_scoring::{
     SCORED, SetImages, SetScorer, TrueShear, measured_bandpowers,
 };
 
-use crate::common::{Content, Normal, field, rows, truth};
+use crate::common::{Content, Normal, field, rows, sum_of, truth};
 
 /// One mode: its place in FFT order, |ℓ|, and whether it is on a Nyquist row.
 struct Mode {

@@ -1,18 +1,11 @@
 //! Rows, truth and arguments: what is counted, and what is refused.
 
 use shearq_scoring::{
-    Convention, FieldSum, Grid, Noise, Options, Row, RowCounts, RowFault, SetImages, SetScorer,
-    TrueShear, TruthSign,
+    Convention, Grid, Noise, Options, Row, RowCounts, RowFault, SetImages, SetScorer, TrueShear,
+    TruthSign,
 };
 
-use crate::common::{Content, field, rows, truth};
-
-/// One image of rows on the grid.
-fn sum_of(grid: &Grid, rows: &[Row]) -> (FieldSum, RowCounts) {
-    let mut sum = FieldSum::new(grid);
-    let counts = sum.add_image(grid, rows.iter().copied());
-    (sum, counts)
-}
+use crate::common::{Content, field, rows, sum_of, truth};
 
 #[test]
 fn every_row_is_counted_once() {

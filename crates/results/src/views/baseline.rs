@@ -105,8 +105,9 @@ mod tests {
             notes: Vec::new(),
         };
         let text = junit(&[check("a<b", vec![shift]), check("c", Vec::new())]);
-        assert!(text.contains("tests=\"2\" failures=\"1\""), "{text}");
+        let totals = "name=\"small\" tests=\"2\" skipped=\"0\" errors=\"0\" failures=\"1\"";
+        assert!(text.contains(totals), "{text}");
         assert!(text.contains("name=\"a&lt;b\"") && text.contains("+0.50 σ"));
-        assert!(text.contains("name=\"c\"/>"));
+        assert!(text.contains("name=\"c\" classname=\"baseline.small\"/>"));
     }
 }
