@@ -19,6 +19,7 @@ use commands::{
     merge, pack, quickstart, reproduce, run, score, select, show, simulate, study, submissions,
     unpack,
 };
+use shearq_files::frames::panic_is_caught;
 use shearq_pipeline::data::listing::Files;
 use shearq_render::escape::visible;
 use shearq_render::figure::HeatMap;
@@ -141,7 +142,18 @@ const MISUSED: u8 = 2;
 pub fn main() -> ExitCode {
     progress::end_at_interrupt();
     fail_at_size_limits();
+    silence_caught_panics();
     ExitCode::from(run_with(std::env::args_os()))
+}
+
+/// Prints no message for a panic that is caught and becomes an error, as when a damaged file is decoded.
+fn silence_caught_panics() {
+    let others = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        if !panic_is_caught() {
+            others(panic);
+        }
+    }));
 }
 
 /// Turns writing beyond a file size limit (`ulimit -f`) into an ordinary error. By default the signal ends the

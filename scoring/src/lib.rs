@@ -13,6 +13,7 @@
 //! # Score ellipticities
 //!
 //! ```
+#![warn(missing_debug_implementations)]
 #![doc = include_str!("../examples/quality.rs")]
 //! ```
 //!
@@ -57,6 +58,7 @@ pub use grid::{Grid, cell_at, centre_of};
 pub use images::SetImages;
 pub use matching::ConventionMatch;
 pub use metrics::{Metric, Metrics};
+pub use ndarray;
 pub use quality::{Bias, BiasFits, Quality};
 pub use resample::MAX_GROUPS;
 pub use score::{Choice, Noise, Options, SetScorer, measured_bandpowers};

@@ -87,7 +87,8 @@ fn a_changed_digit_and_a_changed_setting_are_seen_and_an_update_keeps_the_reason
     assert_eq!(moved.len(), 1);
     assert_eq!(moved[0]["metric"], "q");
     let xml = fs::read_to_string(&junit).unwrap();
-    assert!(xml.contains("tests=\"2\" failures=\"1\""), "{xml}");
+    let totals = "name=\"mine\" tests=\"2\" skipped=\"0\" errors=\"0\" failures=\"1\"";
+    assert!(xml.contains(totals), "{xml}");
     assert!(xml.contains("deconvolution.lambda: 123.0 ≠"), "{xml}");
     assert!(!xml.contains("constant_step"), "{xml}");
 

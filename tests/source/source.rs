@@ -11,3 +11,4 @@ mod crates;
 mod lengths;
 mod modules;
 mod tree;
+mod unsafe_code;

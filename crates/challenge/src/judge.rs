@@ -108,6 +108,12 @@ pub struct Judge {
     truths: BTreeMap<u32, Truth>,
 }
 
+impl std::fmt::Debug for Judge {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Judge").finish_non_exhaustive()
+    }
+}
+
 /// An entry before it is scored.
 struct Candidate {
     sending: Sending,

@@ -35,5 +35,6 @@ pub use ::polars::prelude as polars;
 pub use error::TableError;
 pub use frame::{Metadata, frame, reals};
 pub use parquet::{
-    parquet_columns, parquet_metadata, read_parquet, read_parquet_groups, write_parquet,
+    panic_is_caught, parquet_columns, parquet_metadata, read_parquet, read_parquet_groups,
+    write_parquet,
 };

@@ -5,6 +5,7 @@
 //! object: its transforms run through a table of functions.
 //!
 //! Forward transforms multiply by exp(−2πi jk/n), inverse transforms by exp(+2πi jk/n). Neither divides by n.
+#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
@@ -25,6 +26,12 @@ pub type Plan64 = Arc<dyn Fft<f64>>;
 pub struct Planner32 {
     complex: FftPlanner<f32>,
     real: RealFftPlanner<f32>,
+}
+
+impl std::fmt::Debug for Planner32 {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Planner32").finish_non_exhaustive()
+    }
 }
 
 impl Planner32 {
@@ -71,6 +78,12 @@ impl Default for Planner32 {
 /// Makes plans in double precision. Plans from one planner share their tables.
 pub struct Planner64 {
     complex: FftPlanner<f64>,
+}
+
+impl std::fmt::Debug for Planner64 {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Planner64").finish_non_exhaustive()
+    }
 }
 
 impl Planner64 {

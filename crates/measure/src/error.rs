@@ -9,6 +9,7 @@ use crate::warning::Warning;
 /// What can be wrong with stamps, PSFs or settings. A galaxy that cannot be measured is no error: it has
 /// [`Flags`](crate::Flags).
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum MeasureError {
     /// Sizes that do not fit.
     #[error("{what} of {found}; expected {expected}")]

@@ -15,6 +15,12 @@ pub struct StampFft {
     column_back: Plan32,
 }
 
+impl std::fmt::Debug for StampFft {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("StampFft").finish_non_exhaustive()
+    }
+}
+
 /// Buffers for one thread. Their content between calls does not matter.
 #[derive(Debug, Clone)]
 pub struct FftScratch {

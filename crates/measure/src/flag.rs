@@ -5,6 +5,7 @@ use std::fmt;
 /// A reason. Its number is a bit of the catalogues' column `flags`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u32)]
+#[non_exhaustive]
 pub enum Flag {
     /// Pixels are not finite numbers: one, or under a linear method more than can be filled from the opposite side.
     NotFinite = 1,

@@ -27,6 +27,12 @@ pub struct Steps {
     pub used: Array2<f64>,
 }
 
+impl std::fmt::Debug for Steps {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Steps").finish_non_exhaustive()
+    }
+}
+
 impl PsfWorker<'_> {
     /// The steps behind the last measurement, `measurement` of `stamp` with `psf`.
     ///

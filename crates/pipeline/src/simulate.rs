@@ -274,7 +274,7 @@ struct OpenImage {
     galaxies: ImageWriter,
     stars: Option<ImageWriter>,
     job: RowJob,
-    intrinsic: String,
+    intrinsic: csv::Writer<Vec<u8>>,
 }
 
 impl OpenImage {
@@ -326,6 +326,9 @@ impl OpenImage {
             }
         };
         write_psf_table(data, job)?;
+        // Writing to memory cannot fail.
+        let mut intrinsic = csv::Writer::from_writer(Vec::new());
+        let _ = intrinsic.write_record(["x", "y", "e1", "e2", "observed_e1", "observed_e2"]);
         Ok(OpenImage {
             galaxies,
             stars,
@@ -334,7 +337,7 @@ impl OpenImage {
                 fields: Arc::clone(&job.fields),
                 iy: 0,
             },
-            intrinsic: String::from("x,y,e1,e2,observed_e1,observed_e2\n"),
+            intrinsic,
         })
     }
 
@@ -347,10 +350,10 @@ impl OpenImage {
         for (ix, observed) in row.observed.iter().enumerate() {
             let (x, y) = self.job.set.grid().centre(ix, iy);
             let e = self.job.fields.intrinsic[(ix, iy)];
-            self.intrinsic.push_str(&format!(
-                "{x},{y},{},{},{},{}\n",
-                e.re, e.im, observed.e1, observed.e2
-            ));
+            let numbers = [x, y, e.re, e.im, observed.e1, observed.e2];
+            let _ = self
+                .intrinsic
+                .write_record(numbers.map(|number| number.to_string()));
         }
         Ok(())
     }
@@ -363,7 +366,7 @@ impl OpenImage {
         }
         atomic::write(
             places.truth.intrinsic(set, image),
-            self.intrinsic.as_bytes(),
+            &self.intrinsic.into_inner().unwrap_or_default(),
         )?;
         self.galaxies.finish()?;
         Ok(())

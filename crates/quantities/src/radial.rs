@@ -98,7 +98,7 @@ impl RadialTable {
 }
 
 /// The single-precision face of a [`RadialTable`].
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy)]
 pub struct SingleTable<'a> {
     per_unit: f32,
     cubics: &'a [[f32; 4]; INTERVALS],

@@ -41,14 +41,9 @@ pub(super) fn markdown(text: &str) -> String {
     safe
 }
 
-/// A cell of CSV, without formulas.
+/// Contents of a cell of CSV, without formulas. The writer of CSV adds quotes.
 pub(super) fn csv(text: &str) -> String {
-    let mark = formula_mark(text);
-    if text.contains([',', '"', '\n', '\r']) {
-        format!("\"{mark}{}\"", text.replace('"', "\"\""))
-    } else {
-        format!("{mark}{text}")
-    }
+    format!("{}{text}", formula_mark(text))
 }
 
 /// Contents of an element of HTML or XML, or a value of an attribute in quotes.

@@ -28,6 +28,7 @@ mod layout;
 mod legend;
 mod line;
 mod scene;
+mod style;
 mod ticks;
 
 use std::path::{Path, PathBuf};
@@ -38,9 +39,10 @@ pub use bar::{BarGroup, BarPlot};
 pub use colour::ColourMap;
 pub use heat::HeatMap;
 pub use image::{ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
-pub use line::{LinePlot, PanelGrid, Series, Style};
+pub use line::{LinePlot, PanelGrid, Series};
 pub(super) use scene::PIXELS_PER_POINT;
 pub use scene::Scene;
+pub use style::Style;
 
 /// The em of a figure's title, in points.
 const TITLE_SIZE: f64 = 15.0;

@@ -4,11 +4,13 @@
 //! * [`figure`]: line plots, bars, heat maps and images, as SVG and PNG.
 //! * [`html`], [`page`]: pages that need no other file.
 //! * [`escape`]: text of unknown origin, made safe for each format.
+#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 pub mod escape;
 pub mod figure;
 mod font;
+mod formats;
 pub mod html;
 pub mod page;
 pub mod table;

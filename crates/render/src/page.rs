@@ -33,6 +33,12 @@ pub struct Page<'a> {
     report: Report,
 }
 
+impl std::fmt::Debug for Page<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Page").finish_non_exhaustive()
+    }
+}
+
 impl<'a> Page<'a> {
     /// An empty report to be written to `out`. `settings` are what made it: shown at its end, and
     /// stored with the data.

@@ -265,6 +265,12 @@ pub struct Catalogues<'a> {
     pub choice: Choice,
 }
 
+impl std::fmt::Debug for Catalogues<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Catalogues").finish_non_exhaustive()
+    }
+}
+
 /// A set to score, and its catalogues of every variant.
 type SetFiles = (u32, Vec<Vec<(u32, PathBuf)>>);
 

@@ -4,6 +4,7 @@ pub mod baseline;
 pub mod bias;
 pub mod comparison;
 pub mod diagnosis;
+mod junit;
 pub mod mean;
 pub mod metrics;
 pub mod pages;

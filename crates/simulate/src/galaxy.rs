@@ -101,6 +101,7 @@ fn de_vaucouleurs_fourier(rule: &[(f64, f64)], k: f64) -> f64 {
 
 /// A component or galaxy that cannot be.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
+#[non_exhaustive]
 pub enum GalaxyError {
     /// The radius is zero, negative or not a number.
     #[error("a half-light radius must be a positive number of pixels, not {0}")]

@@ -43,6 +43,12 @@ pub struct Renderer {
     grids: Vec<Grid>,
 }
 
+impl std::fmt::Debug for Renderer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Renderer").finish_non_exhaustive()
+    }
+}
+
 /// One size of transform.
 struct Grid {
     size: usize,
@@ -69,6 +75,12 @@ pub struct RenderScratch {
     /// Transform of pixels along y times 1/N², for ky from −last to last.
     pixel_y: Vec<f32>,
     phases: [Phases; Galaxy::MAX_COMPONENTS],
+}
+
+impl std::fmt::Debug for RenderScratch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("RenderScratch").finish_non_exhaustive()
+    }
 }
 
 /// e^{−ik·x} of a shift along both axes: kx from 0 to last, ky from −last to last.

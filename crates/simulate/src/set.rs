@@ -198,6 +198,12 @@ pub struct SetSimulator {
     transform: PsfTransform,
 }
 
+impl std::fmt::Debug for SetSimulator {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("SetSimulator").finish_non_exhaustive()
+    }
+}
+
 /// One galaxy as it might have been.
 #[derive(Debug, Clone, Copy)]
 pub struct Version {
@@ -217,6 +223,12 @@ pub struct ImageFields {
     pub intrinsic: Array2<Complex64>,
     /// PSFs.
     pub psf: PsfField,
+}
+
+impl std::fmt::Debug for ImageFields {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("ImageFields").finish_non_exhaustive()
+    }
 }
 
 impl SetSimulator {

@@ -19,6 +19,7 @@ const MANY: usize = 1500;
 const UPDATES: [&str; 2] = ["adaptive", "accelerated"];
 
 /// Energy above the minimum and cost, for both updates and all [`ITERATIONS`].
+#[derive(Debug)]
 pub struct Convergence {
     configuration: String,
     /// Mean over galaxies of (E − E_min)/(E₀ − E_min).

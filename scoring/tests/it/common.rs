@@ -2,7 +2,7 @@
 use ndarray::Array2;
 use shearq_fourier::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
-use shearq_scoring::{Grid, Row, TrueShear};
+use shearq_scoring::{FieldSum, Grid, Row, RowCounts, TrueShear};
 
 /// Standard normal numbers from a linear congruential generator (Box–Muller).
 pub struct Normal(pub u64);
@@ -80,4 +80,11 @@ pub fn truth(field: &Array2<Complex64>) -> TrueShear {
         g1: field.mapv(|g| g.re),
         g2: field.mapv(|g| g.im),
     }
+}
+
+/// One image of rows on the grid.
+pub fn sum_of(grid: &Grid, rows: &[Row]) -> (FieldSum, RowCounts) {
+    let mut sum = FieldSum::new(grid);
+    let counts = sum.add_image(grid, rows.iter().copied());
+    (sum, counts)
 }

@@ -7,10 +7,11 @@
 )]
 
 mod api;
-mod by_hand;
 mod common;
 mod conventions;
 mod coverage;
 mod definitions;
+mod derivations;
 mod edges;
 mod great10_cases;
+mod input;

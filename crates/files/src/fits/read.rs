@@ -36,6 +36,12 @@ pub struct ImageReader {
     pixels: Pixels,
 }
 
+impl std::fmt::Debug for ImageReader {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("ImageReader").finish_non_exhaustive()
+    }
+}
+
 /// How the pixels of an image are stored.
 enum Pixels {
     /// Uncompressed, with this number of bytes per pixel.
@@ -294,6 +300,7 @@ struct Description {
 }
 
 /// A table of a file.
+#[derive(Debug)]
 pub struct TableHead {
     /// Number of its extension, from 1.
     pub number: usize,

@@ -25,6 +25,12 @@ pub struct ImageWriter {
     bytes: Vec<u8>,
 }
 
+impl std::fmt::Debug for ImageWriter {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("ImageWriter").finish_non_exhaustive()
+    }
+}
+
 impl ImageWriter {
     /// Starts an image of 32-bit floats.
     ///

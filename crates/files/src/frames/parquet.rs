@@ -11,9 +11,8 @@ use std::cell::Cell;
 use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{Cursor, Read, Seek, SeekFrom, Write};
-use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
-use std::sync::Once;
 
 use polars::prelude::{
     ArrowDataType, ArrowField, ChunkFillNullValue, ChunkedArray, Column, DataFrame, DataType,
@@ -529,7 +528,7 @@ fn guarded<T>(
     place: &str,
     run: impl FnOnce() -> PolarsResult<T>,
 ) -> Result<T, TableError> {
-    let detail = match silently(run) {
+    let detail = match caught(run) {
         Ok(Ok(value)) => return Ok(value),
         Ok(Err(error)) => error.to_string(),
         Err(_) => "the contents contradict themselves".into(),
@@ -545,20 +544,16 @@ thread_local! {
     static CAUGHT: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Catches a panic of `run` without its message on standard error.
+/// Whether a panic on this thread is caught and reported as an error.
 ///
-/// The hook that prints such messages belongs to the whole process, so it is replaced only once. The new hook is silent
-/// while this thread catches panics; otherwise it calls the hook before it.
-fn silently<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
-    static HOOK: Once = Once::new();
-    HOOK.call_once(|| {
-        let others = take_hook();
-        set_hook(Box::new(move |panic| {
-            if !CAUGHT.get() {
-                others(panic);
-            }
-        }));
-    });
+/// The hook that prints the messages of panics belongs to the whole process, so a program and no library replaces it.
+/// A program whose hook is silent if this is true prints one error for a damaged file and no message of a panic.
+pub fn panic_is_caught() -> bool {
+    CAUGHT.get()
+}
+
+/// Catches a panic of `run`.
+fn caught<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
     let outer = CAUGHT.replace(true);
     let result = catch_unwind(AssertUnwindSafe(run));
     CAUGHT.set(outer);

@@ -125,7 +125,9 @@ pub fn write(path: &Path, rows: &[Placed]) -> Result<(), FileError> {
 
 /// The same table as text.
 pub fn text(rows: &[Placed]) -> String {
-    let mut text = format!("{HEADER}\n");
+    // Writing to memory cannot fail.
+    let mut text = csv::Writer::from_writer(Vec::new());
+    let _ = text.write_record(HEADER.split(','));
     for ((x, y), psf) in rows {
         // A Kolmogorov PSF has no β; the column has any valid number.
         let (profile, beta) = match psf.profile {
@@ -133,7 +135,9 @@ pub fn text(rows: &[Placed]) -> String {
             PsfProfile::Kolmogorov => ("kolmogorov", 3.0),
         };
         let (fwhm, e1, e2) = (psf.fwhm, psf.shape.e1, psf.shape.e2);
-        text.push_str(&format!("{x},{y},{profile},{beta},{fwhm},{e1},{e2}\n"));
+        let numbers = [beta, fwhm, e1, e2].map(|number| number.to_string());
+        let place = [x.to_string(), y.to_string(), profile.to_owned()];
+        let _ = text.write_record(place.iter().chain(&numbers));
     }
-    text
+    String::from_utf8(text.into_inner().unwrap_or_default()).unwrap_or_default()
 }

@@ -1,8 +1,8 @@
 //! Legends: what the colours and line styles mean, in rows above the plot.
 
 use super::colour::{INK, Rgb};
-use super::line::Style;
 use super::scene::{Anchor, Scene, text_width};
+use super::style::Style;
 use super::{LABEL_SIZE, MARGIN};
 
 /// The width of the sample line or box.

@@ -4,20 +4,9 @@ use super::colour::{GRID, INK, Rgb, series_colour};
 use super::layout::{draw_label, draw_label_upwards, draw_title, label_room, title_room};
 use super::legend::{Entry, Legend, Sample};
 use super::scene::{Anchor, Point, Scene};
+use super::style::Style;
 use super::ticks::{Axis, Direction, Scale, TINIEST, shown};
 use super::{Figure, FigureError, LABEL_SIZE, MARGIN, TICK_SIZE};
-
-/// How a series is drawn.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Style {
-    /// A line through the points.
-    #[default]
-    Line,
-    /// A disc at each point, without a line.
-    Points,
-    /// A dashed line through the points.
-    Dashed,
-}
 
 /// One curve or set of points.
 #[derive(Debug, Clone, PartialEq, Default)]

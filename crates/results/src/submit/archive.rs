@@ -40,6 +40,12 @@ pub struct ArchiveWriter {
     part: PartFile,
 }
 
+impl std::fmt::Debug for ArchiveWriter {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("ArchiveWriter").finish_non_exhaustive()
+    }
+}
+
 impl ArchiveWriter {
     /// Starts a new archive.
     ///

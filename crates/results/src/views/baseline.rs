@@ -1,10 +1,9 @@
 //! Checks of baselines as a table and as JUnit.
 
-use std::fmt::Write;
-
-use crate::baseline::Checked;
-use shearq_render::escape::markup as escape;
 use shearq_render::table::{Cell, Heading, Table};
+
+use super::junit::{Case, document};
+use crate::baseline::Checked;
 
 /// The metrics of all checks, or only the moved ones.
 pub fn shift_table(checks: &[Checked], all: bool) -> Table {
@@ -67,38 +66,19 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
 
 /// The checks as JUnit: a suite per baseline, a case per configuration.
 pub fn junit(checks: &[Checked]) -> String {
-    let mut text = String::from("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuites>\n");
-    for suite in checks.chunk_by(|a, b| a.baseline == b.baseline) {
-        let failures = suite.iter().filter(|check| check.failed()).count();
-        let name = escape(&suite[0].baseline);
-        // Writing to a `String` cannot fail.
-        let _ = writeln!(
-            text,
-            "  <testsuite name=\"{name}\" tests=\"{}\" failures=\"{failures}\">",
-            suite.len()
-        );
-        for check in suite {
-            let configuration = escape(&check.configuration);
-            let _ = write!(
-                text,
-                "    <testcase classname=\"baseline.{name}\" name=\"{configuration}\""
-            );
-            if check.failed() {
+    let suites = checks.chunk_by(|a, b| a.baseline == b.baseline);
+    document(suites.map(|suite| {
+        let baseline = suite[0].baseline.as_str();
+        let cases = suite.iter().map(|check| Case {
+            class: format!("baseline.{baseline}"),
+            name: &check.configuration,
+            failure: check.failed().then(|| {
                 let lines = check.moved();
-                let _ = writeln!(
-                    text,
-                    ">\n      <failure message=\"{} moved\">{}</failure>\n    </testcase>",
-                    lines.len(),
-                    escape(&lines.join("\n"))
-                );
-            } else {
-                text.push_str("/>\n");
-            }
-        }
-        text.push_str("  </testsuite>\n");
-    }
-    text.push_str("</testsuites>\n");
-    text
+                (format!("{} moved", lines.len()), Some(lines.join("\n")))
+            }),
+        });
+        (baseline, cases.collect())
+    }))
 }
 
 #[cfg(test)]
@@ -125,8 +105,9 @@ mod tests {
             notes: Vec::new(),
         };
         let text = junit(&[check("a<b", vec![shift]), check("c", Vec::new())]);
-        assert!(text.contains("tests=\"2\" failures=\"1\""), "{text}");
+        let totals = "name=\"small\" tests=\"2\" skipped=\"0\" errors=\"0\" failures=\"1\"";
+        assert!(text.contains(totals), "{text}");
         assert!(text.contains("name=\"a&lt;b\"") && text.contains("+0.50 σ"));
-        assert!(text.contains("name=\"c\"/>"));
+        assert!(text.contains("name=\"c\" classname=\"baseline.small\"/>"));
     }
 }

@@ -1,15 +1,13 @@
 //! Shear bias as tables, plots, verdicts and JUnit.
 
-use std::fmt::Write;
-
 use shearq_bias::{
     Catalogue, Design, Estimate, Measured, QUANTITIES, REQUIREMENTS, Verdict, student_t, verdict,
 };
-use shearq_render::escape::markup as escape;
 use shearq_render::figure::{FigureError, LinePlot, PanelGrid, PictureFormat, Series, Style};
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Heading, Table};
 
+use super::junit::{Case, document};
 use crate::bias::BiasResult;
 
 /// Units above which Student's t differs from a normal distribution by less than 5 %.
@@ -390,24 +388,12 @@ fn unknown(key: &str) -> Checked {
 
 /// Checks as JUnit: one suite, a case per quantity.
 pub fn junit(checks: &[Checked]) -> String {
-    let failures = checks.iter().filter(|check| check.failed).count();
-    let mut text = format!(
-        "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuites>\n  <testsuite name=\"shear bias\" tests=\"{}\" failures=\"{failures}\">\n",
-        checks.len()
-    );
-    for check in checks {
-        let name = escape(&check.key);
-        // Writing to a `String` cannot fail.
-        let _ = write!(text, "    <testcase classname=\"bias\" name=\"{name}\"");
-        match check.failed {
-            true => {
-                let words = escape(&check.text);
-                let _ = writeln!(text, "><failure message=\"{words}\"/></testcase>");
-            }
-            false => text.push_str("/>\n"),
-        }
-    }
-    text + "  </testsuite>\n</testsuites>\n"
+    let cases = checks.iter().map(|check| Case {
+        class: "bias".into(),
+        name: &check.key,
+        failure: check.failed.then(|| (check.text.clone(), None)),
+    });
+    document([("shear bias", cases.collect())])
 }
 
 /// Plots of m and c in bins, or of all galaxies, with the tightest published requirements as dashed lines.
