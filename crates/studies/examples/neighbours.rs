@@ -1,7 +1,7 @@
-//! The bias m of galaxies at S/N 20 that have one neighbour, by its distance and flux.
+//! The bias m of galaxies that have one neighbour, by its distance and flux.
 //!
-//! `cargo run --release -p shearq-studies --example neighbours -- SCENES SEED [SVG]` prints a table in Markdown, and draws
-//! the plot if you name a file. Galaxies and neighbours are a bulge and a disc with half-light radii of 2.5 to 5 px, behind
+//! `cargo run --release -p shearq-studies --example neighbours -- SCENES SEED SNR` prints a table in Markdown. m is less that
+//! of the same galaxies without their neighbours. Galaxies and neighbours are a bulge and a disc with half-light radii of 2.5 to 5 px, behind
 //! a Moffat PSF with a FWHM of 3.4 px. The shear is (γ, γ) and (−γ, −γ) with γ = 0.02. Each scene is measured in eight
 //! versions: both shears, turned by 90 degrees or not, and both signs of the noise. Only the galaxy is sheared, or the
 //! whole scene about the galaxy.
@@ -23,8 +23,6 @@ use shearq_simulate::render::{RenderScratch, Renderer};
 const SIDE: usize = 48;
 /// Shear of each component, of either sign.
 const SHEAR: f64 = 0.02;
-/// S/N of the galaxy, in noise of level 1.
-const SNR: f64 = 20.0;
 /// Distances of the neighbour in pixels.
 const DISTANCES: [[f64; 2]; 6] = [
     [5.0, 7.0],
@@ -76,6 +74,8 @@ struct Drawing<'a> {
     renderer: Renderer,
     psf: TransformedPsf<'a>,
     scratch: RenderScratch,
+    /// S/N of the galaxies, in noise of level 1.
+    snr: f64,
 }
 
 impl Drawing<'_> {
@@ -88,7 +88,7 @@ impl Drawing<'_> {
         Array2::from_shape_vec((SIDE, SIDE), out).expect("as long as a stamp")
     }
 
-    /// A galaxy of S/N 20 at `place`: `[turned][sign of the shear]`, and its flux.
+    /// A galaxy at `place`: `[turned][sign of the shear]`, and its flux.
     fn central(
         &mut self,
         profile: Profile,
@@ -96,7 +96,7 @@ impl Drawing<'_> {
     ) -> Result<(Stamps, f32), Box<dyn Error>> {
         let mut stamps = self.all(|_, _| place, profile, true)?;
         let squares: f32 = stamps.iter().flatten().flatten().map(|v| v * v).sum();
-        let flux = SNR as f32 / (squares / 4.0).sqrt();
+        let flux = self.snr as f32 / (squares / 4.0).sqrt();
         for stamp in stamps.iter_mut().flatten() {
             *stamp *= flux;
         }
@@ -141,18 +141,21 @@ impl Away {
     }
 }
 
+/// A scene's versions `[sign of the shear][version]`.
+type Scene = [[Measurement; 4]; 2];
+
 /// What was measured of one kind of scene.
 #[derive(Default, Clone)]
 struct Bin {
-    scenes: Vec<[[Measurement; 4]; 2]>,
+    scenes: Vec<Scene>,
 }
 
-/// What is printed of a bin.
+/// What is printed of a bin: m less that of the same galaxies without a neighbour, and shares.
 struct Row {
     /// Of scenes of which all versions can be measured.
     m: [f64; 2],
     m_error: [f64; 2],
-    /// Of versions that can be measured.
+    /// Of versions that can be measured, each for itself.
     single: [f64; 2],
     single_error: [f64; 2],
     /// Scatter that noise makes of one component.
@@ -161,46 +164,72 @@ struct Row {
     flagged: [f64; 2],
 }
 
-fn bias(scenes: &[[[Measurement; 4]; 2]], k: usize, whole: bool) -> f64 {
-    let e = |g: &Measurement| [g.e1, g.e2][k];
-    let response = |g: &Measurement| g.response.map_or(f64::NAN, |r| r[k][k]);
-    let good = |g: &&Measurement| g.flags.is_empty();
-    let (mut sums, mut counts, mut responses) = ([0.0; 2], [0.0f64; 2], 0.0);
-    for scene in scenes {
-        if whole && !scene.iter().flatten().all(|g| g.flags.is_empty()) {
-            continue;
-        }
-        for side in 0..2 {
-            for galaxy in scene[side].iter().filter(good) {
-                sums[side] += e(galaxy);
-                counts[side] += 1.0;
-                responses += response(galaxy);
+/// Sums of one component over scenes.
+#[derive(Clone, Copy, Default)]
+struct Sums {
+    e: [f64; 2],
+    count: [f64; 2],
+    response: f64,
+}
+
+impl Sums {
+    fn of(scene: &Scene, k: usize) -> Self {
+        let mut sums = Sums::default();
+        for (side, versions) in scene.iter().enumerate() {
+            for galaxy in versions.iter().filter(|g| g.flags.is_empty()) {
+                sums.e[side] += [galaxy.e1, galaxy.e2][k];
+                sums.count[side] += 1.0;
+                sums.response += galaxy.response.map_or(f64::NAN, |r| r[k][k]);
             }
         }
+        sums
     }
-    let response = responses / (counts[0] + counts[1]);
-    (sums[0] / counts[0] - sums[1] / counts[1]) / (2.0 * SHEAR) / response - 1.0
+
+    fn add(&mut self, other: Sums, sign: f64) {
+        for side in 0..2 {
+            self.e[side] += sign * other.e[side];
+            self.count[side] += sign * other.count[side];
+        }
+        self.response += sign * other.response;
+    }
+
+    fn bias(self) -> f64 {
+        let response = self.response / (self.count[0] + self.count[1]);
+        let means = [0, 1].map(|side| self.e[side] / self.count[side]);
+        (means[0] - means[1]) / (2.0 * SHEAR) / response - 1.0
+    }
+}
+
+/// m of one component less that without a neighbour, and its error: a jackknife over groups of scenes.
+fn bias(bin: &Bin, alone: &Bin, k: usize, whole: bool) -> (f64, f64) {
+    let mut groups = [[Sums::default(); 2]; GROUPS];
+    for (at, (scene, without)) in bin.scenes.iter().zip(&alone.scenes).enumerate() {
+        if !whole || scene.iter().flatten().all(|g| g.flags.is_empty()) {
+            groups[at % GROUPS][0].add(Sums::of(scene, k), 1.0);
+            groups[at % GROUPS][1].add(Sums::of(without, k), 1.0);
+        }
+    }
+    let mut all = [Sums::default(); 2];
+    for group in groups {
+        all[0].add(group[0], 1.0);
+        all[1].add(group[1], 1.0);
+    }
+    let left_out = groups.map(|group| {
+        let mut rest = all;
+        rest[0].add(group[0], -1.0);
+        rest[1].add(group[1], -1.0);
+        rest[0].bias() - rest[1].bias()
+    });
+    let mean = left_out.iter().sum::<f64>() / GROUPS as f64;
+    let squares: f64 = left_out.iter().map(|v| (v - mean) * (v - mean)).sum();
+    let error = (squares * (GROUPS as f64 - 1.0) / GROUPS as f64).sqrt();
+    (all[0].bias() - all[1].bias(), error)
 }
 
 impl Bin {
-    fn row(&self) -> Row {
-        let all = |whole: bool| [0, 1].map(|k| bias(&self.scenes, k, whole));
-        let size = self.scenes.len().div_ceil(GROUPS);
-        let error = |whole: bool| {
-            [0, 1].map(|k| {
-                // Jackknife over groups of scenes.
-                let left_out = |group: usize| {
-                    let mut scenes = self.scenes.clone();
-                    scenes.drain(group * size..((group + 1) * size).min(scenes.len()));
-                    bias(&scenes, k, whole)
-                };
-                let count = self.scenes.len().div_ceil(size);
-                let values: Vec<f64> = (0..count).map(left_out).collect();
-                let mean = values.iter().sum::<f64>() / count as f64;
-                let squares: f64 = values.iter().map(|v| (v - mean) * (v - mean)).sum();
-                (squares * (count as f64 - 1.0) / count as f64).sqrt()
-            })
-        };
+    fn row(&self, alone: &Bin) -> Row {
+        let all = |whole: bool| [0, 1].map(|k| bias(self, alone, k, whole));
+        let (whole, single) = (all(true), all(false));
         let good: Vec<_> = self.scenes.iter().flatten().collect();
         let (mut squares, mut responses, mut count) = (0.0, 0.0, 0.0);
         for versions in &good {
@@ -220,10 +249,10 @@ impl Bin {
             bad as f64 / (4 * self.scenes.len()) as f64
         });
         Row {
-            m: all(true),
-            m_error: error(true),
-            single: all(false),
-            single_error: error(false),
+            m: whole.map(|m| m.0),
+            m_error: whole.map(|m| m.1),
+            single: single.map(|m| m.0),
+            single_error: single.map(|m| m.1),
             noise: (squares / count / 2.0f64).sqrt() / (responses / count),
             flagged,
         }
@@ -236,7 +265,7 @@ fn measured(
     galaxy: &Stamps,
     neighbour: Option<(&Stamps, f32)>,
     noise: ArrayView2<'_, f32>,
-) -> Result<[[Measurement; 4]; 2], Box<dyn Error>> {
+) -> Result<Scene, Box<dyn Error>> {
     let mut one = |sign: usize, version: usize| -> Result<_, Box<dyn Error>> {
         let turned = version / 2;
         let side = [1.0f32, -1.0][version % 2];
@@ -273,8 +302,8 @@ fn print(case: &str, row: &Row) {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [scenes, seed, ..] = arguments.as_slice() else {
-        return Err("expected SCENES SEED [SVG]".into());
+    let [scenes, seed, snr] = arguments.as_slice() else {
+        return Err("expected SCENES SEED SNR".into());
     };
     let (scenes, seed): (usize, u64) = (scenes.parse()?, seed.parse()?);
     let profile = PsfProfile::Moffat { beta: 3.0 };
@@ -284,6 +313,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         renderer: Renderer::new(SIDE),
         psf: transform.of(&psf)?,
         scratch: RenderScratch::new(),
+        snr: snr.parse()?,
     };
     let mut bins = vec![Bin::default(); 1 + 2 * DISTANCES.len() * RATIOS.len()];
 
@@ -343,12 +373,12 @@ fn main() -> Result<(), Box<dyn Error>> {
         "| neighbour at (px) | sheared | flux ratio | m1, m2 (10⁻³) | m1, m2 (10⁻³), versions alone | noise | flagged |"
     );
     println!("|---|---|---|---|---|---|---|");
-    print("none | | ", &bins[0].row());
+    print("none | | ", &bins[0].row(&bins[0]));
     let mut rest = bins[1..].iter();
     for range in DISTANCES {
         for sheared in ["no", "yes"] {
             for ratio in RATIOS {
-                let row = rest.next().expect("a bin for each").row();
+                let row = rest.next().expect("a bin for each").row(&bins[0]);
                 print(
                     &format!("{} | {sheared} | {}", name(range), name(ratio)),
                     &row,

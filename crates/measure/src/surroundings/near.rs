@@ -2,9 +2,11 @@
 //!
 //! The difference between the stamp and itself turned is compared with that of a Gaussian neighbour at places around
 //! the galaxy. The galaxy's centre is known to half a pixel only. What a displacement of the galaxy changes is projected
-//! out of the templates, so that it is not mistaken for a neighbour.
+//! out, so that it is not mistaken for a neighbour: the derivatives of a round profile that is fitted to the sum of the
+//! stamp and itself turned.
 
 use super::contrast::opposite;
+use super::profile::solved;
 
 /// Pixels on a side of a cell. See docs/constants.md.
 const CELL: usize = 2;
@@ -14,10 +16,14 @@ const ALONG: usize = 12;
 const CELLS: usize = ALONG * ALONG;
 /// σ of the Gaussian neighbour. See docs/constants.md.
 const WIDTH: f32 = 3.0;
-/// σ of the Gaussians whose derivatives are what a displacement of the galaxy changes. See docs/constants.md.
-const CORES: [f32; 3] = [1.8, 2.8, 4.5];
+/// σ of the concentric Gaussians of the galaxy's profile. See docs/constants.md.
+const PROFILE: [f32; 3] = [1.8, 2.8, 4.5];
+/// Terms of that profile.
+const TERMS: usize = PROFILE.len();
 /// Distances of a neighbour from the galaxy: the least and the largest. See docs/constants.md.
 const DISTANCES: [f32; 2] = [4.0, 10.0];
+/// Least share of a template's square that a displacement of the galaxy leaves. See docs/constants.md.
+const LEFT: f32 = 0.02;
 /// Distance between places of a neighbour along an axis. See docs/constants.md.
 const STEP: f32 = 2.0;
 
@@ -25,14 +31,26 @@ const STEP: f32 = 2.0;
 pub(super) struct Near {
     n: usize,
     /// For a turn that is even or not along x and y.
-    templates: [[Vec<Template>; 2]; 2],
+    grids: [[Grid; 2]; 2],
 }
 
-/// What a neighbour of flux 1 at one place adds to the differences, without what a displacement of the galaxy may
-/// explain.
+/// Cells about a centre.
+struct Grid {
+    templates: Vec<Template>,
+    /// What the cells of a stamp and its opposite are multiplied by for the amplitudes of the galaxy's profile.
+    amplitudes: [[f32; CELLS]; TERMS],
+    /// The derivatives of the terms along x and y.
+    moved: [[[f32; CELLS]; TERMS]; 2],
+    /// Their products.
+    products: [[[f32; TERMS]; TERMS]; 2],
+}
+
+/// What a neighbour of flux 1 at one place adds to the differences.
 struct Template {
     cells: [f32; CELLS],
     squares: f32,
+    /// Its products with the derivatives of the galaxy's profile.
+    moved: [[f32; TERMS]; 2],
 }
 
 /// The neighbour that noise would explain the least.
@@ -46,10 +64,10 @@ pub(super) struct Suspect {
 
 impl Near {
     pub(super) fn new(n: usize) -> Self {
-        let templates = |odd_x| [false, true].map(|odd_y| templates([odd_x, odd_y]));
+        let grids = |odd_x| [false, true].map(|odd_y| Grid::new([odd_x, odd_y]));
         Near {
             n,
-            templates: [templates(false), templates(true)],
+            grids: [grids(false), grids(true)],
         }
     }
 
@@ -62,15 +80,31 @@ impl Near {
         noise: f32,
         least: f32,
     ) -> Option<Suspect> {
-        let cells = self.cells(stamp, turn);
+        let [differences, sums] = self.cells(stamp, turn);
         let [odd_x, odd_y] = turn.map(|turn| turn.rem_euclid(2) as usize);
-        let suspects = self.templates[odd_x][odd_y].iter().map(|template| {
-            let products = template.cells.iter().zip(&cells);
-            let product: f32 = lanes(products.map(|(a, b)| a * b));
+        let grid = &self.grids[odd_x][odd_y];
+        let profile = std::array::from_fn(|k| dot(&grid.amplitudes[k], &sums));
+        // Of the derivative along each axis: its product with the differences, and its square.
+        let moved = [0, 1].map(|axis| {
+            let products = std::array::from_fn(|k| dot(&grid.moved[axis][k], &differences));
+            let rows = grid.products[axis].map(|row| dot(&row, &profile));
+            (dot(&products, &profile), dot(&rows, &profile))
+        });
+        let suspects = grid.templates.iter().map(|template| {
+            let mut product = dot(&template.cells, &differences);
+            let mut squares = template.squares;
+            for (axis, (with, square)) in moved.into_iter().enumerate() {
+                let shared = dot(&template.moved[axis], &profile);
+                if square > 0.0 {
+                    product -= shared * with / square;
+                    squares -= shared * shared / square;
+                }
+            }
+            let squares = squares.max(LEFT * template.squares);
             // A difference repeats the noise of its opposite with the other sign: twice the amplitude.
-            let error = 2.0 * CELL as f32 * noise * template.squares.sqrt();
+            let error = 2.0 * CELL as f32 * noise * squares.sqrt();
             Suspect {
-                light: product.abs() / template.squares,
+                light: product.abs() / squares,
                 significance: product.abs() / error,
             }
         });
@@ -78,11 +112,11 @@ impl Near {
         bright.max_by(|a, b| a.significance.total_cmp(&b.significance))
     }
 
-    /// Differences between the cells and their opposites.
-    fn cells(&self, stamp: &[f32], turn: [i32; 2]) -> [f32; CELLS] {
+    /// Differences between the cells and their opposites, and their sums.
+    fn cells(&self, stamp: &[f32], turn: [i32; 2]) -> [[f32; CELLS]; 2] {
         let n = self.n as i32;
         let first = turn.map(|turn| turn.div_euclid(2) + 1 - (ALONG * CELL / 2) as i32);
-        let mut cells = [0.0; CELLS];
+        let mut cells = [[0.0; CELLS]; 2];
         for j in 0..(ALONG * CELL) as i32 {
             let row = first[1] + j;
             if !(0..n).contains(&row) {
@@ -96,7 +130,9 @@ impl Near {
                 let place = [column as usize, row as usize];
                 if let Some(light) = opposite(stamp, self.n, turn, place) {
                     let here = stamp[place[1] * self.n + place[0]];
-                    cells[j as usize / CELL * ALONG + i as usize / CELL] += here - light;
+                    let cell = j as usize / CELL * ALONG + i as usize / CELL;
+                    cells[0][cell] += here - light;
+                    cells[1][cell] += here + light;
                 }
             }
         }
@@ -104,71 +140,77 @@ impl Near {
     }
 }
 
+impl Grid {
+    /// For a turn that is odd or not along x and y.
+    fn new(odd: [bool; 2]) -> Self {
+        // Middle of a cell from the centre: one between pixels is in the middle of the cells.
+        let middle = |k: usize, odd: bool| {
+            (k as f32 - (ALONG as f32 - 1.0) / 2.0) * CELL as f32 + if odd { 0.0 } else { 0.5 }
+        };
+        let field = |light: &dyn Fn(f32, f32) -> f32| -> [f32; CELLS] {
+            std::array::from_fn(|at| light(middle(at % ALONG, odd[0]), middle(at / ALONG, odd[1])))
+        };
+        let round = PROFILE.map(|width| field(&|x, y| gaussian(x, y, width)));
+        let moved = [0, 1].map(|axis| {
+            PROFILE
+                .map(|width| field(&|x, y| [x, y][axis] / (width * width) * gaussian(x, y, width)))
+        });
+        let products = |fields: &[[f32; CELLS]; TERMS]| {
+            std::array::from_fn(|i| std::array::from_fn(|j| dot(&fields[i], &fields[j])))
+        };
+        let matrix: [[f32; TERMS]; TERMS] = products(&round);
+        let matrix = matrix.map(|row| row.map(f64::from));
+        let mut amplitudes = [[0.0; CELLS]; TERMS];
+        for at in 0..CELLS {
+            let right = std::array::from_fn(|k| f64::from(round[k][at]));
+            let column: [f64; TERMS] = solved(matrix, right);
+            for (row, value) in amplitudes.iter_mut().zip(column) {
+                row[at] = value as f32;
+            }
+        }
+        let mut grid = Grid {
+            templates: Vec::new(),
+            amplitudes,
+            products: [products(&moved[0]), products(&moved[1])],
+            moved,
+        };
+        let steps = (DISTANCES[1] / STEP).ceil() as i32;
+        for j in 0..=steps {
+            for i in -steps..=steps {
+                let (x0, y0) = (i as f32 * STEP, j as f32 * STEP);
+                let twice = j == 0 && i < 0;
+                if twice || !(DISTANCES[0]..=DISTANCES[1]).contains(&x0.hypot(y0)) {
+                    continue;
+                }
+                let area = (CELL * CELL) as f32 / (2.0 * std::f32::consts::PI * WIDTH * WIDTH);
+                let cells = field(&|x, y| {
+                    area * (gaussian(x - x0, y - y0, WIDTH) - gaussian(x + x0, y + y0, WIDTH))
+                });
+                grid.templates.push(Template {
+                    cells,
+                    squares: dot(&cells, &cells),
+                    moved: [0, 1]
+                        .map(|axis| std::array::from_fn(|k| dot(&cells, &grid.moved[axis][k]))),
+                });
+            }
+        }
+        grid
+    }
+}
+
+fn gaussian(x: f32, y: f32, width: f32) -> f32 {
+    (-0.5 * (x * x + y * y) / (width * width)).exp()
+}
+
 /// Sum of products, several side by side.
-fn lanes(products: impl Iterator<Item = f32>) -> f32 {
+fn dot<const N: usize>(a: &[f32; N], b: &[f32; N]) -> f32 {
     let mut lanes = [0.0; ALONG];
-    for (at, product) in products.enumerate() {
-        lanes[at % ALONG] += product;
+    for (a, b) in a.chunks(ALONG).zip(b.chunks(ALONG)) {
+        for ((lane, a), b) in lanes.iter_mut().zip(a).zip(b) {
+            *lane += a * b;
+        }
     }
     lanes.iter().sum()
-}
-
-/// The templates, for a turn that is odd or not along x and y.
-fn templates(odd: [bool; 2]) -> Vec<Template> {
-    // Middle of a cell from the centre: one between pixels is in the middle of the cells.
-    let middle = |k: usize, odd: bool| {
-        (k as f32 - (ALONG as f32 - 1.0) / 2.0) * CELL as f32 + if odd { 0.0 } else { 0.5 }
-    };
-    let field = |light: &dyn Fn(f32, f32) -> f32| -> [f32; CELLS] {
-        std::array::from_fn(|at| {
-            let (x, y) = (middle(at % ALONG, odd[0]), middle(at / ALONG, odd[1]));
-            light(x, y)
-        })
-    };
-    let gaussian = |x: f32, y: f32, width: f32| (-0.5 * (x * x + y * y) / (width * width)).exp();
-    // Orthonormal fields of displacements (Gram and Schmidt).
-    let mut moved: Vec<[f32; CELLS]> = Vec::new();
-    for width in CORES {
-        for axis in 0..2 {
-            let mut new = field(&|x, y| [x, y][axis] * gaussian(x, y, width));
-            project(&mut new, &moved);
-            let size = dot(&new, &new).sqrt();
-            moved.push(new.map(|v| v / size));
-        }
-    }
-    let steps = (DISTANCES[1] / STEP).ceil() as i32;
-    let mut templates = Vec::new();
-    for j in 0..=steps {
-        for i in -steps..=steps {
-            let (x0, y0) = (i as f32 * STEP, j as f32 * STEP);
-            let twice = j == 0 && i < 0;
-            if twice || !(DISTANCES[0]..=DISTANCES[1]).contains(&x0.hypot(y0)) {
-                continue;
-            }
-            let area = (CELL * CELL) as f32 / (2.0 * std::f32::consts::PI * WIDTH * WIDTH);
-            let mut cells = field(&|x, y| {
-                area * (gaussian(x - x0, y - y0, WIDTH) - gaussian(x + x0, y + y0, WIDTH))
-            });
-            project(&mut cells, &moved);
-            let squares = dot(&cells, &cells);
-            templates.push(Template { cells, squares });
-        }
-    }
-    templates
-}
-
-fn dot(a: &[f32; CELLS], b: &[f32; CELLS]) -> f32 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
-/// Takes orthonormal fields out of another.
-fn project(field: &mut [f32; CELLS], out: &[[f32; CELLS]]) {
-    for other in out {
-        let share = dot(field, other);
-        for (value, other) in field.iter_mut().zip(other) {
-            *value -= share * other;
-        }
-    }
 }
 
 #[cfg(test)]
@@ -235,14 +277,14 @@ mod tests {
             (state >> 8) as f32 / (1 << 24) as f32
         };
         for turn in [[47, 47], [48, 46]] {
-            let template = &near.templates[turn[0] as usize % 2][turn[1] as usize % 2][7];
+            let template = &near.grids[turn[0] as usize % 2][turn[1] as usize % 2].templates[7];
             let (mut squares, count) = (0.0, 1000);
             for _ in 0..count {
                 // Variance 1.
                 let stamp: Vec<f32> = (0..N * N)
                     .map(|_| 12.0f32.sqrt() * (uniform() - 0.5))
                     .collect();
-                let cells = near.cells(&stamp, turn);
+                let [cells, _] = near.cells(&stamp, turn);
                 let product = dot(&template.cells, &cells);
                 squares += (product / (2.0 * CELL as f32)).powi(2) / template.squares;
             }

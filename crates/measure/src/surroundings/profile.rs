@@ -282,7 +282,7 @@ fn add<const N: usize>(
 }
 
 /// Solution of normal equations, of which the lower triangle is given, by Cholesky's decomposition.
-fn solved<const N: usize>(mut matrix: [[f64; N]; N], mut right: [f64; N]) -> [f64; N] {
+pub(super) fn solved<const N: usize>(mut matrix: [[f64; N]; N], mut right: [f64; N]) -> [f64; N] {
     for i in 0..N {
         for j in 0..=i {
             let known: f64 = (0..j).map(|k| matrix[i][k] * matrix[j][k]).sum();
