@@ -6,7 +6,7 @@ use crate::Cli;
 
 /// The ways to use each command, and the options that each way uses. Two options without a common way must be
 /// refused.
-const WAYS: [(&str, &[&str]); 31] = [
+const WAYS: [(&str, &[&str]); 32] = [
     ("quickstart", &["out threads wide"]),
     (
         "simulate",

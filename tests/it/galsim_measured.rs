@@ -58,6 +58,7 @@ fn follow_the_truth(folder: &Path) {
             source: Source::folder(&data, out.path()).unwrap(),
             configuration: registry.get(name).unwrap().configuration,
             format: FileFormat::Fits,
+            selection: None,
         };
         let results = out.path().join(name.replace('/', "-"));
         let images = images::of_folder(&data, &[]).unwrap();
