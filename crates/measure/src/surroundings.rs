@@ -25,7 +25,7 @@ const SIGNIFICANT: f32 = 4.0;
 /// docs/constants.md.
 const BRIGHT: f32 = 0.03;
 /// Least light of a neighbour that overlaps the galaxy, in units of its noise. See docs/constants.md.
-const OVERLAPPING: f32 = 4.1;
+const OVERLAPPING: f32 = 4.3;
 /// Least light of a neighbour that overlaps the galaxy, in units of the galaxy's. See docs/constants.md.
 const BLENDED: f32 = 0.1;
 /// Share of a neighbour's distance from the centre at which the fit of its profile begins. See
