@@ -327,10 +327,20 @@ mod tests {
 
     /// The words of a shell's line, without quotes and redirections.
     fn words(line: &str) -> Vec<String> {
-        let line = line.split(" > ").next().unwrap_or(line);
-        line.split_whitespace()
-            .map(|word| word.trim_matches('\'').to_owned())
-            .collect()
+        // Quoted text is one word; what follows a redirection is none.
+        let mut words = Vec::new();
+        for (part, text) in line.split('\'').enumerate() {
+            if part % 2 == 1 {
+                words.push(text.to_owned());
+                continue;
+            }
+            let plain = text.split(" > ").next().unwrap_or(text);
+            words.extend(plain.split_whitespace().map(str::to_owned));
+            if plain.len() < text.len() {
+                break;
+            }
+        }
+        words
     }
 
     /// The commands in the documents, except those with shell variables. A backslash joins two lines.

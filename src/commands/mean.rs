@@ -21,8 +21,8 @@ use shearq_results::views::mean::mean_table;
 ///
 /// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px).
 /// The mean stays calibrated: the response contains how shear and noise change the selection. A cut is a smooth step. The
-/// weight is 1/2 at the threshold; it reaches 0 and 1 at a distance of 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in
-/// `size`, or at the distance after `+-`. Wider steps give smaller errors.
+/// weight is 1/2 at the threshold; it reaches 0 and 1 at the distance after `+-`.
+/// The default distance is 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in `size`. Wider steps give smaller errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.

@@ -15,8 +15,8 @@ use shearq_results::select::{selection, write_selected};
 /// the selection. `score`, `mean`, `bias`, `compare` and `pack` then use the selection. Rows of galaxies that are left out
 /// stay, with ellipticity and response zero; the column `selection` has the weights.
 ///
-/// A cut is a smooth step. The weight is 1/2 at the threshold; it reaches 0 and 1 at a distance of 1.5 in `snr`, 1.5 errors in
-/// `flux` and 0.3 px in `size`, or at the distance after `+-`. Wider steps give smaller errors.
+/// A cut is a smooth step. The weight is 1/2 at the threshold; it reaches 0 and 1 at the distance after `+-`.
+/// The default distance is 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in `size`. Wider steps give smaller errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.

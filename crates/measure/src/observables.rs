@@ -130,8 +130,7 @@ pub(crate) fn observables(
             let [one, two] = numbers.map(|number| product(number, noise));
             jacobian[i][0] * one + jacobian[i][1] * two
         };
-        const SIZE: [usize; 2] = [2, 5];
-        const FLUX: [usize; 2] = [3, 6];
+        let (with_size, with_flux) = ([2, 5], [3, 6]);
         let squares = |noise: usize| {
             let [size2, cross, flux2] = [7, 8, 9].map(|number| product(number, noise));
             [flux2, first * cross, first * first * size2]
@@ -142,11 +141,17 @@ pub(crate) fn observables(
         };
         for k in 0..2 {
             let [flux2, cross, size2] = squares(k);
-            coupling.shear[k] = [of(k, FLUX, k), first * of(k, SIZE, k), flux2, cross, size2];
+            coupling.shear[k] = [
+                of(k, with_flux, k),
+                first * of(k, with_size, k),
+                flux2,
+                cross,
+                size2,
+            ];
             size_response[k] -= curved(k);
         }
         let [flux2, cross, size2] = squares(2);
-        let [one, two] = [0, 1].map(|i| [of(i, FLUX, 2), first * of(i, SIZE, 2)]);
+        let [one, two] = [0, 1].map(|i| [of(i, with_flux, 2), first * of(i, with_size, 2)]);
         coupling.turned = [
             one[0],
             one[1],

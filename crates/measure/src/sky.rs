@@ -762,9 +762,10 @@ mod tests {
             mean = [0, 1, 2].map(|k| mean[k] + found[k] / f64::from(count));
             Subtraction::EachStamp.apply(&mut stamp, &mut cells);
             let again = cells.plane_of(&stamp).unwrap();
-            // Other cells may be beyond 3σ of a plane than of a level: one or two of 44.
+            // Other cells may be beyond 3σ the second time: a cell with a mean of 0.75σ moves the level of 44 cells by
+            // 0.02 and the slope by 10⁻³. Four of them.
             assert!(
-                again.level.abs() < 0.04 && again.slope[0].abs() < 2e-3,
+                again.level.abs() < 0.08 && again.slope[0].abs() < 4e-3,
                 "{again:?}"
             );
         }

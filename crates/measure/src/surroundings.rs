@@ -20,12 +20,12 @@ use crate::flag::Flag;
 
 /// Least difference of opposite places that is a neighbour, in units of its noise. See
 /// docs/constants.md.
-const SIGNIFICANT: f32 = 4.0;
+const SIGNIFICANT: f32 = 5.0;
 /// Least difference of opposite places that is a neighbour, in units of the galaxy's light. See
 /// docs/constants.md.
 const BRIGHT: f32 = 0.03;
 /// Least light of a neighbour that overlaps the galaxy, in units of its noise. See docs/constants.md.
-const OVERLAPPING: f32 = 4.3;
+const OVERLAPPING: f32 = 6.0;
 /// Least light of a neighbour that overlaps the galaxy, in units of the galaxy's. See docs/constants.md.
 const BLENDED: f32 = 0.1;
 /// Share of a neighbour's distance from the centre at which the fit of its profile begins. See

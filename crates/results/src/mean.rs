@@ -174,7 +174,8 @@ impl Rows {
             response,
             weight,
         } = weighted;
-        for (e, mean) in e.iter_mut().zip(mean) {
+        // A mean of zero has no galaxies, and nothing to divide.
+        for (e, mean) in e.iter_mut().zip(mean).filter(|(_, mean)| *mean != 0.0) {
             e.iter_mut().for_each(|e| *e /= mean);
         }
         Ok(Rows {

@@ -13,7 +13,7 @@ use shearq_pipeline::measure::KEYS;
 
 use crate::expression::Expression;
 
-/// Columns that a selection replaces or reads, beside those of [`Observables`].
+/// Columns that a selection replaces or reads. It also reads the columns of [`Observables`].
 const READ: [&str; 9] = [
     "e1", "e2", "flags", "R11", "R22", "R12", "R21", "divisor1", "divisor2",
 ];
@@ -255,7 +255,7 @@ impl Weighted {
         frame(columns).map_err(|error| FileError::new(path, error.to_string()))
     }
 
-    /// Mean responses of all rows without a flag, by which means are calibrated.
+    /// Mean responses of all rows without a flag. Means are divided by them.
     pub fn mean_response(&self) -> [f64; 2] {
         [0, 1].map(|k| {
             let good = self.response[k]

@@ -317,10 +317,11 @@ mod tests {
     #[test]
     fn noise_falls_and_the_mean_power_of_each_direction_stays() {
         let waves = [[0.5, 0.0], [0.0, 0.5], [0.5, 0.5], [0.5, -0.5], [0.9, 0.0]];
-        for (profile, snr) in [
-            (MOFFAT, 50.0),
-            (MOFFAT, 100.0),
-            (PsfProfile::Kolmogorov, 100.0),
+        // The wing of the fit falls as r⁻³ and misses a Kolmogorov profile's light at 6 to 24 px, which noise hides.
+        for (profile, snr, wings) in [
+            (MOFFAT, 50.0, 0.02),
+            (MOFFAT, 100.0, 0.02),
+            (PsfProfile::Kolmogorov, 100.0, 0.04),
         ] {
             let psf = drawn(profile, 3.4, 48);
             let mut rng = ChaCha8Rng::seed_from_u64(5);
@@ -345,7 +346,7 @@ mod tests {
             for (found, wave) in powers.iter().zip(waves) {
                 let expected = power(psf.view(), wave);
                 // 40 stars whose powers scatter by 4/(S/N), at four standard deviations, and wings that cannot be seen.
-                let tolerance = 4.0 * 4.0 / snr / 40f64.sqrt() + 0.02;
+                let tolerance = 4.0 * 4.0 / snr / 40f64.sqrt() + wings;
                 let off = (found / expected - 1.0).abs();
                 assert!(
                     off < tolerance,

@@ -197,9 +197,9 @@ mod tests {
                 "{r}"
             );
         }
-        assert_eq!(breadth.size(0.0), [0.15, 0.0, 0.0]);
-        assert_eq!(breadth.size(1e9), [16.0, 0.0, 0.0]);
-        assert_eq!(breadth.size(f64::NAN), [0.15, 0.0, 0.0]);
+        assert_eq!(breadth.size(0.0), [SMALLEST * TARGET, 0.0, 0.0]);
+        assert_eq!(breadth.size(1e9), [LARGEST * WINDOW, 0.0, 0.0]);
+        assert_eq!(breadth.size(f64::NAN), [SMALLEST * TARGET, 0.0, 0.0]);
     }
 
     #[test]
