@@ -1,11 +1,12 @@
-//! Ellipticity and response of the reported type, from a distortion and its response.
+//! Ellipticity, response and observables of the reported type, from what a method found.
 
 use shearq_quantities::{Distortion, Shear};
 use shearq_submissions::EllipticityType;
 
 use crate::flag::Flag;
 use crate::measurement::ResponseMatrix;
-use crate::method::{Found, Sheared};
+use crate::method::{Found, FoundObservables, Sheared};
+use crate::observables::{Coupling, Observables};
 
 /// The ellipticity of type `kind` with its response, if the method knows it.
 pub(crate) fn report(
@@ -69,5 +70,66 @@ pub(crate) fn reported(
                 [0, 1].map(|j| own2 * r[1][j] + other * r[0][j]),
             ]
         }
+    }
+}
+
+/// Flux and size with their couplings to an ellipticity of type `kind`, measured as the distortion `chi`.
+pub(crate) fn observables(
+    kind: EllipticityType,
+    chi: Distortion,
+    found: &FoundObservables,
+    sheared: Option<&Sheared>,
+) -> Observables {
+    let [size, first, second] = found.size;
+    let mut size_response = found.square_response.map(|response| first * response);
+    let mut coupling = Coupling::default();
+    if let (Some(sheared), Some(products)) = (sheared, &found.products) {
+        let product = |number: usize, noise: usize| products[number][noise];
+        let jacobian = reported(kind, chi, [[1.0, 0.0], [0.0, 1.0]]);
+        // Numbers of the products of χ₁ and χ₂ with T and with the flux.
+        let of = |i: usize, numbers: [usize; 2], noise: usize| {
+            let [one, two] = numbers.map(|number| product(number, noise));
+            jacobian[i][0] * one + jacobian[i][1] * two
+        };
+        let (with_size, with_flux) = ([2, 5], [3, 6]);
+        let squares = |noise: usize| {
+            let [size2, cross, flux2] = [7, 8, 9].map(|number| product(number, noise));
+            [flux2, first * cross, first * first * size2]
+        };
+        let curved = |noise: usize| {
+            let [plus, minus] = sheared.breadth;
+            first * sheared.weight * (plus[noise] - minus[noise]) + second * product(7, noise)
+        };
+        for (k, response) in size_response.iter_mut().enumerate() {
+            let [flux2, cross, size2] = squares(k);
+            coupling.shear[k] = [
+                of(k, with_flux, k),
+                first * of(k, with_size, k),
+                flux2,
+                cross,
+                size2,
+            ];
+            *response -= curved(k);
+        }
+        let [flux2, cross, size2] = squares(2);
+        let [one, two] = [0, 1].map(|i| [of(i, with_flux, 2), first * of(i, with_size, 2)]);
+        coupling.turned = [
+            one[0],
+            one[1],
+            two[0],
+            two[1],
+            flux2,
+            cross,
+            size2,
+            curved(2),
+        ];
+    }
+    Observables {
+        flux: found.flux,
+        flux_error: found.flux_error,
+        size,
+        flux_response: found.flux_response,
+        size_response,
+        coupling,
     }
 }

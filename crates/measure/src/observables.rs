@@ -1,11 +1,5 @@
 //! Flux and size of a galaxy before the PSF, as catalogues have them: with all that a selection by them requires.
 
-use shearq_quantities::Distortion;
-use shearq_submissions::EllipticityType;
-
-use crate::ellipticity::reported;
-use crate::method::{FoundObservables, Sheared};
-
 /// Flux and size of a galaxy before the PSF.
 ///
 /// Galaxies that are selected or weighted by them are selected by shear and by noise, too. [`Selection`](crate::Selection)
@@ -110,67 +104,6 @@ pub struct Coupling {
     /// For what noise lacks to be noise behind a PSF turned by 90 degrees: e1 and flux, e1 and size, e2 and flux, e2 and size, flux and
     /// flux, flux and size, size and size; and the mean change of the size alone.
     pub turned: [f64; 8],
-}
-
-/// Observables beside an ellipticity of type `kind`, measured as the distortion `chi`.
-pub(crate) fn observables(
-    kind: EllipticityType,
-    chi: Distortion,
-    found: &FoundObservables,
-    sheared: Option<&Sheared>,
-) -> Observables {
-    let [size, first, second] = found.size;
-    let mut size_response = found.square_response.map(|response| first * response);
-    let mut coupling = Coupling::default();
-    if let (Some(sheared), Some(products)) = (sheared, &found.products) {
-        let product = |number: usize, noise: usize| products[number][noise];
-        let jacobian = reported(kind, chi, [[1.0, 0.0], [0.0, 1.0]]);
-        // Numbers of the products of χ₁ and χ₂ with T and with the flux.
-        let of = |i: usize, numbers: [usize; 2], noise: usize| {
-            let [one, two] = numbers.map(|number| product(number, noise));
-            jacobian[i][0] * one + jacobian[i][1] * two
-        };
-        let (with_size, with_flux) = ([2, 5], [3, 6]);
-        let squares = |noise: usize| {
-            let [size2, cross, flux2] = [7, 8, 9].map(|number| product(number, noise));
-            [flux2, first * cross, first * first * size2]
-        };
-        let curved = |noise: usize| {
-            let [plus, minus] = sheared.breadth;
-            first * sheared.weight * (plus[noise] - minus[noise]) + second * product(7, noise)
-        };
-        for k in 0..2 {
-            let [flux2, cross, size2] = squares(k);
-            coupling.shear[k] = [
-                of(k, with_flux, k),
-                first * of(k, with_size, k),
-                flux2,
-                cross,
-                size2,
-            ];
-            size_response[k] -= curved(k);
-        }
-        let [flux2, cross, size2] = squares(2);
-        let [one, two] = [0, 1].map(|i| [of(i, with_flux, 2), first * of(i, with_size, 2)]);
-        coupling.turned = [
-            one[0],
-            one[1],
-            two[0],
-            two[1],
-            flux2,
-            cross,
-            size2,
-            curved(2),
-        ];
-    }
-    Observables {
-        flux: found.flux,
-        flux_error: found.flux_error,
-        size,
-        flux_response: found.flux_response,
-        size_response,
-        coupling,
-    }
 }
 
 #[cfg(test)]

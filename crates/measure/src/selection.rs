@@ -161,7 +161,8 @@ impl FromStr for Cut {
             }
             None => return Err(unread()),
         };
-        if !threshold.is_finite() || half_width.is_some_and(|width| !(width > 0.0)) {
+        if !threshold.is_finite() || half_width.is_some_and(|width| width.is_nan() || width <= 0.0)
+        {
             return Err(SelectionError::Range(text.trim().to_owned()));
         }
         Ok(Cut {

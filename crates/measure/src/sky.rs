@@ -536,7 +536,7 @@ impl<const N: usize> Normal<N> {
                 let rest = self.matrix[i][j] * scale[i] * scale[j] - known;
                 if i == j {
                     // NaN as well.
-                    if !(rest > LEAST_PIVOT) {
+                    if rest.is_nan() || rest <= LEAST_PIVOT {
                         return None;
                     }
                     root[i][i] = rest.sqrt();

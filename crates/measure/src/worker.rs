@@ -9,7 +9,7 @@ use ndarray::{ArrayView2, ArrayView3, Axis};
 use shearq_submissions::{Configuration, Method, NoiseSource};
 
 use crate::denoise::{DenoiseScratch, border_noise};
-use crate::ellipticity::report;
+use crate::ellipticity::{observables, report};
 use crate::error::{MeasureError, length};
 use crate::examine::PEAKS;
 use crate::flag::{Flag, Flags};
@@ -17,7 +17,6 @@ use crate::galaxy::Plan;
 use crate::measurement::Measurement;
 use crate::method::{AdaptedSettings, CutWorker};
 use crate::noise::{StampNoise, Survey};
-use crate::observables::observables;
 use crate::pixel::Pixel;
 use crate::psf::cut_start;
 use crate::psfs::Psfs;

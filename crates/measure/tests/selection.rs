@@ -53,7 +53,9 @@ impl Sums {
 }
 
 fn measured(worker: &mut shearq_measure::PsfWorker<'_>, stamp: &Array2<f64>) -> Measurement {
-    worker.measure(stamp.view()).unwrap()
+    worker
+        .measure(stamp.view())
+        .expect("a stamp of the planned size")
 }
 
 #[test]

@@ -228,7 +228,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
 
         Examples
         --------
-        >>> print(cat.select(where="snr > 10").mean_shear())
+        >>> bright = cat.select(where="snr > 10")
         """
         missing = [name for name in _schema.SELECTED if name not in (self.dtype.names or ())]
         if missing:

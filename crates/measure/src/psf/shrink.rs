@@ -50,12 +50,13 @@ impl Shrinker {
         let power: f64 = psf.iter().map(|value| value * value).sum();
         // Hardly ever below the noise's, and quick.
         let least = power.sqrt() / AS_IT_IS[1];
-        if !(mean_square(psf) > 0.25 * least * least) {
+        let square = mean_square(psf);
+        if square.is_nan() || square <= 0.25 * least * least {
             return psf;
         }
         let sigma = self.noise(psf);
         let snr = (power - psf.len() as f64 * sigma * sigma).max(0.0).sqrt() / sigma;
-        if !(snr < AS_IT_IS[1]) {
+        if snr.is_nan() || snr >= AS_IT_IS[1] {
             return psf;
         }
         let middle = (n as f64 - 1.0) / 2.0;
@@ -125,11 +126,11 @@ impl Shrinker {
             }
         }
         shrink(&mut coefficients, sigma);
-        for ky in 0..=ORDER {
+        for (ky, line) in coefficients.iter().enumerate() {
             let mut row = partial.row_mut(ky);
             row.fill(0.0);
-            for kx in 0..=ORDER - ky {
-                row.scaled_add(coefficients[ky][kx], &across.row(kx));
+            for (kx, coefficient) in line.iter().enumerate().take(ORDER + 1 - ky) {
+                row.scaled_add(*coefficient, &across.row(kx));
             }
         }
         for y in 0..n {

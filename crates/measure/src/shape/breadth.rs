@@ -135,7 +135,7 @@ impl Breadth {
     /// The size r in px of a galaxy of this T, with its first and second derivative; both are zero beyond the bounds.
     pub(crate) fn size(&self, square: f64) -> [f64; 3] {
         let (least, most) = (SMALLEST * self.target, LARGEST * self.window);
-        if !(square > self.square_of(least)) {
+        if square.is_nan() || square <= self.square_of(least) {
             return [least, 0.0, 0.0];
         }
         if square >= self.square_of(most) {

@@ -1,0 +1,58 @@
+"""Selections of galaxies keep the mean shear calibrated, and agree with the command line."""
+
+import json
+
+import numpy as np
+import pytest
+
+import shearq
+
+
+@pytest.fixture(scope="module")
+def galaxies():
+    image = shearq.simulate(set=2, seed=3, grid=12)[0]
+    return shearq.measure(image.stamps, image.psf)
+
+
+def test_a_selection_of_all_changes_nothing_but_rounding(galaxies):
+    plain, all_of_them = galaxies.mean_shear(), galaxies.mean_shear(where="snr > -1e6")
+    assert all_of_them.galaxies == plain.galaxies
+    # Sums of doubles in another order.
+    assert np.allclose([all_of_them.g1, all_of_them.g2], [plain.g1, plain.g2], rtol=0, atol=1e-14)
+
+
+def test_a_selection_has_weights_and_another_response(galaxies):
+    middle = np.median(galaxies["size"])
+    chosen = galaxies.select(where=f"size > {middle}", weight="snr^2/(snr^2 + 100)")
+    assert 0.3 * len(galaxies) < len(chosen) < 0.9 * len(galaxies)
+    sure = galaxies[galaxies["size"] > middle + 0.3]
+    assert set(sure["size"]) <= set(chosen["size"])
+    assert chosen["divisor1"][0] == pytest.approx(chosen["R11"].mean(), rel=1e-12)
+    assert not np.allclose(chosen["R11"], galaxies[np.isin(galaxies["size"], chosen["size"])]["R11"])
+    with pytest.raises(ValueError, match="linear configuration"):
+        chosen.select(where="snr > 3")
+
+
+def test_the_command_line_finds_the_same_shear(galaxies, command, tmp_path):
+    command("simulate", "--sets", "2", "--images", "1", "--grid", "12", "--seed", "3", "--out", tmp_path / "data")
+    command("measure", "--submission", "48/linear/star", "--data", tmp_path / "data", "--out", tmp_path / "out")
+    where = f"size > {np.median(galaxies['size'])}"
+    printed = command("mean", "--measured", tmp_path / "out", "--where", where, "--format", "json")
+    row = json.loads(printed.stdout)["rows"][0]
+    mean = shearq.read(tmp_path / "out/set02/catalogue-001.parquet").mean_shear(where=where)
+    assert (mean.galaxies, mean.g1, mean.g2) == (row["galaxies"], pytest.approx(row["g1"], rel=1e-9), pytest.approx(row["g2"], rel=1e-9))
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"where": "R11 > 0.3"}, "response to shear is not known"),
+        ({"where": "snr"}, "not a condition"),
+        ({"where": "snr > 1e9"}, "no galaxy is left"),
+        ({"weight": "abs(snr)"}, "not smooth"),
+        ({"weight": "e1"}, "cannot depend"),
+    ],
+)
+def test_selections_that_cannot_be_corrected_are_refused(galaxies, options, reason):
+    with pytest.raises(ValueError, match=reason):
+        galaxies.mean_shear(**options)
