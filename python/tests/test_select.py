@@ -38,7 +38,7 @@ def test_the_command_line_finds_the_same_shear(galaxies, command, tmp_path):
     command("measure", "--submission", "48/linear/star", "--data", tmp_path / "data", "--out", tmp_path / "out")
     where = f"size > {np.median(galaxies['size'])}"
     printed = command("mean", "--measured", tmp_path / "out", "--where", where, "--format", "json")
-    row = json.loads(printed.stdout)["rows"][0]
+    row = json.loads(printed)["rows"][0]
     mean = shearq.read(tmp_path / "out/set02/catalogue-001.parquet").mean_shear(where=where)
     assert (mean.galaxies, mean.g1, mean.g2) == (row["galaxies"], pytest.approx(row["g1"], rel=1e-9), pytest.approx(row["g2"], rel=1e-9))
 

@@ -228,7 +228,9 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
 
         Examples
         --------
-        >>> bright = cat.select(where="snr > 10")
+        >>> image = shearq.simulate(set=2, grid=12, seed=1)[0]
+        >>> catalogue = shearq.measure(image.stamps, image.psf)
+        >>> bright = catalogue.select(where="snr > 10").mean_shear()
         """
         missing = [name for name in _schema.SELECTED if name not in (self.dtype.names or ())]
         if missing:
