@@ -28,6 +28,7 @@
 //! ([`edges`]).
 
 mod edges;
+mod modes;
 mod plane;
 mod products;
 
@@ -37,9 +38,9 @@ use shearq_fourier::Complex32;
 use shearq_submissions::LinearDeconvolution;
 
 use self::edges::{Edges, EdgesScratch};
+use self::modes::{correlate, restore, sheared};
 use self::plane::{Plane, PlaneScratch};
 pub(crate) use self::products::Gradients;
-use self::products::Kinds;
 use super::sun::high_pass;
 use crate::error::MeasureError;
 use crate::fft::StampFft;
@@ -121,9 +122,9 @@ pub struct SpectralPsf {
     tilts: Vec<[Complex32; 2]>,
     /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ².
     noise_tilts: Vec<[f32; 2]>,
-    /// Power of noise of σ = 1 in each mode before the window, times its changes with both components of shear, and times
-    /// what it lacks to be that of the PSF turned by 90 degrees.
-    powers: Vec<Kinds>,
+    /// Power of noise of σ = 1 in each mode before the window and in the one it stands for, times its changes with both
+    /// components of shear, and times what it lacks to be that of the PSF turned by 90 degrees.
+    powers: [Vec<f32>; 3],
 }
 
 impl SpectralPsf {
@@ -152,8 +153,8 @@ pub struct SpectralScratch {
     /// Where the window is, (x, y) in pixels from the middle of the stamp, and the window along both axes there.
     centre: [f32; 2],
     windows: [Vec<f32>; 2],
-    /// Their transforms.
-    window_modes: [Vec<Complex32>; 2],
+    /// The half spectrum of the window.
+    window_modes: Vec<Complex32>,
     edges: EdgesScratch,
 }
 
@@ -264,10 +265,8 @@ impl Spectral {
     /// Buffers that fit this plan.
     pub fn scratch(&self) -> SpectralScratch {
         let most = self.n.max(self.p);
-        let mut modes = vec![Complex32::ZERO; self.plane.side];
-        products::window_modes(&self.window, &mut modes);
         SpectralScratch {
-            window_modes: [modes.clone(), modes],
+            window_modes: self.plane.spectrum(),
             plane: self.plane.scratch(most),
             image: vec![0.0; most * most],
             stamp: self.plane.spectrum(),
@@ -286,10 +285,8 @@ impl Spectral {
                 continue;
             }
             scratch.centre[k] = centre[k];
-            let modes = &mut scratch.window_modes[k];
             if centre[k] == 0.0 {
                 window.copy_from_slice(&self.window);
-                products::window_modes(window, modes);
                 continue;
             }
             let (middle, period) = ((self.n as f32 - 1.0) / 2.0, self.plane.size as f32);
@@ -300,7 +297,6 @@ impl Spectral {
                 let x = (x - period * (x / period).round()) / sigma;
                 *value = (-0.5 * x * x).exp() / side;
             }
-            products::window_modes(window, modes);
         }
     }
 
@@ -316,7 +312,7 @@ impl Spectral {
             clarity: vec![0.0; modes],
             tilts: vec![[Complex32::ZERO; 2]; modes],
             noise_tilts: vec![[0.0; 2]; modes],
-            powers: vec![[0.0; 3]; modes],
+            powers: std::array::from_fn(|_| vec![0.0; modes]),
         }
     }
 
@@ -418,10 +414,14 @@ impl Spectral {
         }
         spread(self.plane.side, &self.leak, tilt, along, &mut out.floor);
         let area = (self.plane.size * self.plane.size) as f32 * self.inside;
-        for (at, powers) in out.powers.iter_mut().enumerate() {
-            let power = area * tilt[at];
+        for at in 0..tilt.len() {
+            // Columns with k_x > 0 stand for those with k_x < 0 too.
+            let twice = if at < self.plane.side { 1.0 } else { 2.0 };
+            let power = twice * area * tilt[at];
             let [first, second] = out.field_tilts[at];
-            *powers = [power * first, power * second, power * out.turned[at]];
+            for (powers, kind) in out.powers.iter_mut().zip([first, second, out.turned[at]]) {
+                powers[at] = power * kind;
+            }
         }
         for component in 0..2 {
             let modes = out.field_tilts.iter().zip(&out.field);
@@ -468,18 +468,7 @@ impl Spectral {
         let [u, x, y] = &mut plane.half;
         scratch.stamp.copy_from_slice(u);
         out.flux = [u[0].re, x[0].re, y[0].re];
-        let variance = noise * noise;
-        for (at, u) in u.iter_mut().enumerate() {
-            let (value, scale) = (*u, self.scale[at]);
-            // Re(conj(v̂)·δv̂), less what the noise adds to its mean.
-            let along = |change: Complex32| value.re * change.re + value.im * change.im;
-            let [first, second] = psf.noise_tilts[at];
-            let power = scale * (value.norm_sqr() - variance * psf.floor[at]);
-            let first = 2.0 * scale * (along(x[at]) + variance * first);
-            let second = 2.0 * scale * (along(y[at]) + variance * second);
-            *u = Complex32::new(power, first);
-            x[at] = Complex32::new(second, 0.0);
-        }
+        correlate([u, x, y], &self.scale, psf, noise * noise);
         self.lags_of(plane, out);
     }
 
@@ -494,17 +483,7 @@ impl Spectral {
         } = scratch;
         self.plane.transform(stamp, self.n, plane);
         let [u, x, y] = &mut plane.half;
-        // The changes are v̂/û times p·(k_x ∂_x − k_y ∂_y)(û/p), and the other's.
-        for (at, (x, y)) in x.iter_mut().zip(y).enumerate() {
-            let [first, second] = psf.tilts[at];
-            // About the window's place.
-            let (x0, y0) = (*x - u[at] * centre[0], *y - u[at] * centre[1]);
-            let [plus, cross] = sheared(x0, y0, self.waves[at]);
-            let restore = psf.restore[at];
-            *x = restore * (plus - first * u[at]);
-            *y = restore * (cross - second * u[at]);
-            u[at] *= restore;
-        }
+        restore([u, x, y], *centre, &self.waves, psf);
         if self.sees_edges(*centre) {
             self.edges
                 .take(stamp, *centre, &self.plane, plane, at_edges);
@@ -786,14 +765,6 @@ fn add_scaled(to: &mut [f32], from: &[f32], share: f32) {
     for (to, value) in to.iter_mut().zip(from) {
         *to += share * value;
     }
-}
-
-/// (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y) of a transform whose image times x and y has the
-/// transforms x̂ and ŷ: ∂ of it is −i x̂.
-fn sheared(x: Complex32, y: Complex32, [kx, ky]: [f32; 2]) -> [Complex32; 2] {
-    let gx = Complex32::new(x.im, -x.re);
-    let gy = Complex32::new(y.im, -y.re);
-    [gx * kx - gy * ky, gx * ky + gy * kx]
 }
 
 #[cfg(test)]

@@ -15,6 +15,8 @@
 //!
 //! by which T becomes r for any galaxy.
 
+use multiversion::multiversion;
+
 /// Scale τ of the weight in units of the window's σ. See docs/constants.md.
 const SCALE: f64 = 0.6;
 /// Largest size that is reported, in units of the window's σ. See docs/constants.md.
@@ -72,27 +74,8 @@ impl Breadth {
 
     /// P₀ and P₂ of an autocorrelation or of its change.
     pub(crate) fn sums(&self, lags: &[f32]) -> [f32; 2] {
-        /// Numbers that are summed side by side. See docs/constants.md.
-        const LANES: usize = 16;
         let [zero, two] = &self.weights;
-        let mut lanes = [[0.0f32; LANES]; 2];
-        let chunks = lags.chunks_exact(LANES);
-        let at = lags.len() - chunks.remainder().len();
-        for ((v, a), b) in chunks
-            .zip(zero.chunks_exact(LANES))
-            .zip(two.chunks_exact(LANES))
-        {
-            for l in 0..LANES {
-                lanes[0][l] += v[l] * a[l];
-                lanes[1][l] += v[l] * b[l];
-            }
-        }
-        let mut sums = lanes.map(|lane| lane.iter().sum::<f32>());
-        for k in at..lags.len() {
-            sums[0] += lags[k] * zero[k];
-            sums[1] += lags[k] * two[k];
-        }
-        sums
+        sums(lags, zero, two)
     }
 
     /// T of an autocorrelation, with `softening` and the typical T.
@@ -152,6 +135,31 @@ impl Breadth {
             (second - first * first / (2.0 * r * r)) / (2.0 * r),
         ]
     }
+}
+
+/// Sums of products with both weights.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn sums(lags: &[f32], zero: &[f32], two: &[f32]) -> [f32; 2] {
+    /// Numbers that are summed side by side. See docs/constants.md.
+    const LANES: usize = 16;
+    let mut lanes = [[0.0f32; LANES]; 2];
+    let chunks = lags.chunks_exact(LANES);
+    let at = lags.len() - chunks.remainder().len();
+    for ((v, a), b) in chunks
+        .zip(zero.chunks_exact(LANES))
+        .zip(two.chunks_exact(LANES))
+    {
+        for l in 0..LANES {
+            lanes[0][l] += v[l] * a[l];
+            lanes[1][l] += v[l] * b[l];
+        }
+    }
+    let mut sums = lanes.map(|lane| lane.iter().sum::<f32>());
+    for k in at..lags.len() {
+        sums[0] += lags[k] * zero[k];
+        sums[1] += lags[k] * two[k];
+    }
+    sums
 }
 
 #[cfg(test)]

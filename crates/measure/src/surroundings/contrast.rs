@@ -8,14 +8,17 @@ const LEAST_DISTANCE: f32 = 9.0;
 /// Half the side of the square whose sum is the galaxy's light. See docs/constants.md.
 const INNER: i32 = 8;
 
-/// Weights of a cell and those beside it along an axis.
-const SMOOTHED: [f32; 3] = [0.5, 1.0, 0.5];
+/// Weight of the cells beside a cell along an axis, whose own is 1.
+const BESIDE: f32 = 0.5;
+const SMOOTHED: [f32; 3] = [BESIDE, 1.0, BESIDE];
 
 /// Blocks of 6 × 6 pixels away from a galaxy, against their opposites.
 #[derive(Debug, Clone)]
 pub(crate) struct Contrasts {
     n: i32,
     cells: Vec<Cell>,
+    /// Excess and pixels of a row, with those beside it along y.
+    across: Vec<(f32, f32)>,
     /// What was found last.
     pub(crate) blocks: Vec<Block>,
     /// The galaxy's light.
@@ -51,6 +54,11 @@ fn beyond(turn: [i32; 2]) -> [i32; 2] {
     turn.map(|turn| turn.div_euclid(2) + 1)
 }
 
+/// Cells from the centre of a stamp of `n` pixels a side to an edge.
+fn along(n: i32) -> i32 {
+    (n / 2 + CELL - 1) / CELL
+}
+
 /// The light of the opposite of a pixel (x, y) on a stamp of `n` pixels a side; `None` off the stamp.
 pub(super) fn opposite(stamp: &[f32], n: usize, turn: [i32; 2], [x, y]: [usize; 2]) -> Option<f32> {
     let on_stamp = |at: i32| usize::try_from(at).ok().filter(|&at| at < n);
@@ -64,6 +72,7 @@ impl Contrasts {
         Contrasts {
             n: n as i32,
             cells: Vec::with_capacity(n * n / 8),
+            across: vec![(0.0, 0.0); 2 * along(n as i32) as usize],
             blocks: Vec::with_capacity(n * n / 8),
             light: 0.0,
         }
@@ -110,24 +119,27 @@ impl Contrasts {
         let middle = |first: i32, step: i32, turn: i32| {
             (first + step * CELL) as f32 + 0.5 * (CELL - 1) as f32 - 0.5 * turn as f32
         };
+        let row = 2 * most as usize;
         for j in 0..most {
             let y = middle(y0, j, turn[1]);
-            for i in -most..most {
-                let x = middle(x0, i, turn[0]);
+            let lines = self.cells[j as usize * row..].chunks_exact(row).take(3);
+            self.across.fill((0.0, 0.0));
+            for (line, weight) in lines.zip(SMOOTHED) {
+                for (sum, cell) in self.across.iter_mut().zip(line) {
+                    sum.0 += weight * cell.excess;
+                    sum.1 += weight * weight * cell.pixels as f32;
+                }
+            }
+            for i in 0..row {
+                let x = middle(x0, i as i32 - most, turn[0]);
                 if x * x + y * y < LEAST_DISTANCE * LEAST_DISTANCE {
                     continue;
                 }
-                let (mut excess, mut pixels) = (0.0, 0.0);
-                for (dj, across) in (-1..=1).zip(SMOOTHED) {
-                    for (di, along) in (-1..=1).zip(SMOOTHED) {
-                        let (i, j) = (i + di, j + dj);
-                        if (-most..most).contains(&i) && j < most {
-                            let cell = self.cells[((j + 1) * 2 * most + i + most) as usize];
-                            let weight = across * along;
-                            excess += weight * cell.excess;
-                            pixels += weight * weight * cell.pixels as f32;
-                        }
-                    }
+                let (mut excess, mut pixels) = self.across[i];
+                let beside = [i.wrapping_sub(1), i + 1];
+                for beside in beside.into_iter().filter_map(|at| self.across.get(at)) {
+                    excess += BESIDE * beside.0;
+                    pixels += BESIDE * BESIDE * beside.1;
                 }
                 let side = excess.signum();
                 self.blocks.push(Block {
@@ -143,7 +155,7 @@ impl Contrasts {
     fn compare_cells(&mut self, stamp: &[f32], turn: [i32; 2]) -> i32 {
         self.blocks.clear();
         self.cells.clear();
-        let most = (self.n / 2 + CELL - 1) / CELL;
+        let most = along(self.n);
         let [x0, y0] = beyond(turn);
         self.light = self.inner(stamp, turn);
         // One row of cells from the other half, for blocks on the line between both.

@@ -5,7 +5,10 @@
 //! out, so that it is not mistaken for a neighbour: the derivatives of a round profile that is fitted to the sum of the
 //! stamp and itself turned.
 
-use super::contrast::opposite;
+use std::ops::Range;
+
+use multiversion::multiversion;
+
 use super::profile::solved;
 
 /// Pixels on a side of a cell. See docs/constants.md.
@@ -14,6 +17,8 @@ const CELL: usize = 2;
 const ALONG: usize = 12;
 /// Cells.
 const CELLS: usize = ALONG * ALONG;
+/// Cells that are summed side by side. See docs/constants.md.
+const LANES: usize = 16;
 /// σ of the Gaussian neighbour. See docs/constants.md.
 const WIDTH: f32 = 3.0;
 /// σ of the concentric Gaussians of the galaxy's profile. See docs/constants.md.
@@ -80,64 +85,50 @@ impl Near {
         noise: f32,
         least: f32,
     ) -> Option<Suspect> {
-        let [differences, sums] = self.cells(stamp, turn);
+        let cells = self.cells(stamp, turn);
         let [odd_x, odd_y] = turn.map(|turn| turn.rem_euclid(2) as usize);
-        let grid = &self.grids[odd_x][odd_y];
-        let profile = std::array::from_fn(|k| dot(&grid.amplitudes[k], &sums));
-        // Of the derivative along each axis: its product with the differences, and its square.
-        let moved = [0, 1].map(|axis| {
-            let products = std::array::from_fn(|k| dot(&grid.moved[axis][k], &differences));
-            let rows = grid.products[axis].map(|row| dot(&row, &profile));
-            (dot(&products, &profile), dot(&rows, &profile))
-        });
-        let suspects = grid.templates.iter().map(|template| {
-            let mut product = dot(&template.cells, &differences);
-            let mut squares = template.squares;
-            for (axis, (with, square)) in moved.into_iter().enumerate() {
-                let shared = dot(&template.moved[axis], &profile);
-                if square > 0.0 {
-                    product -= shared * with / square;
-                    squares -= shared * shared / square;
-                }
-            }
-            let squares = squares.max(LEFT * template.squares);
-            // A difference repeats the noise of its opposite with the other sign: twice the amplitude.
-            let error = 2.0 * CELL as f32 * noise * squares.sqrt();
-            Suspect {
-                light: product.abs() / squares,
-                significance: product.abs() / error,
-            }
-        });
-        let bright = suspects.filter(|suspect| suspect.light >= least);
-        bright.max_by(|a, b| a.significance.total_cmp(&b.significance))
+        most_significant(&self.grids[odd_x][odd_y], &cells, noise, least)
     }
 
     /// Differences between the cells and their opposites, and their sums.
     fn cells(&self, stamp: &[f32], turn: [i32; 2]) -> [[f32; CELLS]; 2] {
-        let n = self.n as i32;
         let first = turn.map(|turn| turn.div_euclid(2) + 1 - (ALONG * CELL / 2) as i32);
         let mut cells = [[0.0; CELLS]; 2];
-        for j in 0..(ALONG * CELL) as i32 {
-            let row = first[1] + j;
-            if !(0..n).contains(&row) {
-                continue;
+        let [columns, lines] = [0, 1].map(|axis| compared(self.n, turn[axis], first[axis]));
+        if columns.is_empty() {
+            return cells;
+        }
+        let from = (first[0] + columns.start as i32) as usize;
+        let other = (turn[0] + 1) as usize - from - columns.len();
+        for j in lines {
+            let row = (first[1] + j as i32) as usize;
+            let opposite = turn[1] as usize - row;
+            let here = &stamp[row * self.n + from..][..columns.len()];
+            let there = &stamp[opposite * self.n + other..][..columns.len()];
+            let mut pixels = [[0.0; ALONG * CELL]; 2];
+            for (i, (here, there)) in here.iter().zip(there.iter().rev()).enumerate() {
+                pixels[0][columns.start + i] = here - there;
+                pixels[1][columns.start + i] = here + there;
             }
-            for i in 0..(ALONG * CELL) as i32 {
-                let column = first[0] + i;
-                if !(0..n).contains(&column) {
-                    continue;
-                }
-                let place = [column as usize, row as usize];
-                if let Some(light) = opposite(stamp, self.n, turn, place) {
-                    let here = stamp[place[1] * self.n + place[0]];
-                    let cell = j as usize / CELL * ALONG + i as usize / CELL;
-                    cells[0][cell] += here - light;
-                    cells[1][cell] += here + light;
+            for (cells, pixels) in cells.iter_mut().zip(pixels) {
+                let line = &mut cells[j / CELL * ALONG..][..ALONG];
+                for (cell, pixels) in line.iter_mut().zip(pixels.chunks_exact(CELL)) {
+                    *cell += pixels.iter().sum::<f32>();
                 }
             }
         }
         cells
     }
+}
+
+/// Of the pixels that cells cover along an axis, beginning at pixel `first`, those that are on a stamp of `n` pixels a side
+/// and have their opposite there.
+fn compared(n: usize, turn: i32, first: i32) -> Range<usize> {
+    // Pixel p with 0 ≤ p < n and 0 ≤ turn − p < n.
+    let start = 0.max(turn + 1 - n as i32) - first;
+    let end = (n as i32).min(turn + 1) - first;
+    let on = |at: i32| at.clamp(0, (ALONG * CELL) as i32) as usize;
+    on(start)..on(end).max(on(start))
 }
 
 impl Grid {
@@ -198,19 +189,68 @@ impl Grid {
     }
 }
 
+/// The most significant neighbour whose light is at least `least`, of cells' differences and sums.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn most_significant(
+    grid: &Grid,
+    cells: &[[f32; CELLS]; 2],
+    noise: f32,
+    least: f32,
+) -> Option<Suspect> {
+    let [differences, sums] = cells;
+    let profile = std::array::from_fn(|k| dot(&grid.amplitudes[k], sums));
+    // Of the derivative along each axis: its product with the differences, and its square.
+    let moved = [0, 1].map(|axis| {
+        let products = std::array::from_fn(|k| dot(&grid.moved[axis][k], differences));
+        let rows = grid.products[axis].map(|row| short(&row, &profile));
+        (short(&products, &profile), short(&rows, &profile))
+    });
+    // A difference repeats the noise of its opposite with the other sign: twice the amplitude.
+    let noise = 2.0 * CELL as f32 * noise;
+    let mut most: Option<Suspect> = None;
+    for template in &grid.templates {
+        let mut product = dot(&template.cells, differences);
+        let mut squares = template.squares;
+        for (axis, (with, square)) in moved.into_iter().enumerate() {
+            let shared = short(&template.moved[axis], &profile);
+            if square > 0.0 {
+                product -= shared * with / square;
+                squares -= shared * shared / square;
+            }
+        }
+        let squares = squares.max(LEFT * template.squares);
+        let suspect = Suspect {
+            light: product.abs() / squares,
+            significance: product.abs() / (noise * squares.sqrt()),
+        };
+        let more = most.is_none_or(|most| suspect.significance > most.significance);
+        if suspect.light >= least && more {
+            most = Some(suspect);
+        }
+    }
+    most
+}
+
 fn gaussian(x: f32, y: f32, width: f32) -> f32 {
     (-0.5 * (x * x + y * y) / (width * width)).exp()
 }
 
 /// Sum of products, several side by side.
-fn dot<const N: usize>(a: &[f32; N], b: &[f32; N]) -> f32 {
-    let mut lanes = [0.0; ALONG];
-    for (a, b) in a.chunks(ALONG).zip(b.chunks(ALONG)) {
-        for ((lane, a), b) in lanes.iter_mut().zip(a).zip(b) {
-            *lane += a * b;
+#[inline(always)]
+fn dot(a: &[f32; CELLS], b: &[f32; CELLS]) -> f32 {
+    let mut lanes = [0.0; LANES];
+    for (a, b) in a.chunks_exact(LANES).zip(b.chunks_exact(LANES)) {
+        for l in 0..LANES {
+            lanes[l] += a[l] * b[l];
         }
     }
     lanes.iter().sum()
+}
+
+/// Sum of products over the terms of the profile.
+#[inline(always)]
+fn short(a: &[f32; TERMS], b: &[f32; TERMS]) -> f32 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 #[cfg(test)]

@@ -9,6 +9,7 @@
 //! structure of its own, and sums over places as far apart as its own modes allow would depend on
 //! whether a galaxy lies along the grid or across it.
 
+use multiversion::multiversion;
 use shearq_fourier::{Complex32, Plan32, Planner32};
 
 use crate::fft::transform_size;
@@ -143,12 +144,7 @@ impl Plane {
         let size = self.size;
         let middle = (n as f32 - 1.0) / 2.0;
         let rows = &mut rows[..n * size];
-        for (line, row) in rows.chunks_exact_mut(size).zip(image.chunks_exact(n)) {
-            for (i, (out, &value)) in line.iter_mut().zip(row).enumerate() {
-                *out = Complex32::new(value, value * (i as f32 - middle));
-            }
-            line[n..].fill(Complex32::ZERO);
-        }
+        weigh(image, n, middle, rows, size);
         self.wide.process_with_scratch(rows, fft);
         for column in 0..self.columns() {
             let at = column * size..(column + 1) * size;
@@ -189,22 +185,39 @@ impl Plane {
         let pairs = &mut pairs[..lower * side];
         for half in half {
             self.backward.process_with_scratch(half, fft);
-            for (y, line) in pairs.chunks_exact_mut(side).enumerate() {
-                join(half, side, self.modes, (y, y + lower), line);
-            }
+            join_rows(half, side, self.modes, pairs);
             self.backward.process_with_scratch(pairs, fft);
-            for (y, line) in pairs.chunks_exact_mut(side).enumerate() {
-                let (first, second) = (down[y], down[y + lower]);
-                for (value, x) in line.iter_mut().zip(along) {
-                    *value = Complex32::new(value.re * (first * x), value.im * (second * x));
-                }
-            }
+            multiply(pairs, along, down);
             self.forward.process_with_scratch(pairs, fft);
-            for (column, out) in half.chunks_exact_mut(side).enumerate() {
-                let (first, second) = out.split_at_mut(lower);
-                split(pairs, side, column, first, second);
-            }
+            split_rows(pairs, side, half);
             self.forward.process_with_scratch(half, fft);
+        }
+    }
+
+    /// The half spectrum of the window that is `along` x and `down` y.
+    pub(super) fn window_modes(
+        &self,
+        along: &[f32],
+        down: &[f32],
+        scratch: &mut PlaneScratch,
+        out: &mut [Complex32],
+    ) {
+        let side = self.side;
+        let (both, rest) = scratch.pairs.split_at_mut(side);
+        for (value, (x, y)) in both.iter_mut().zip(along.iter().zip(down)) {
+            *value = Complex32::new(*x, *y);
+        }
+        self.forward.process_with_scratch(both, &mut scratch.fft);
+        let modes = |k: usize| parts(both[k], both[(side - k) % side]);
+        let down = &mut rest[..side];
+        for (k, value) in down.iter_mut().enumerate() {
+            *value = modes(k)[1];
+        }
+        for (column, line) in out.chunks_exact_mut(side).enumerate() {
+            let [along, _] = modes(column);
+            for (value, down) in line.iter_mut().zip(&*down) {
+                *value = along * down;
+            }
         }
     }
 
@@ -303,8 +316,49 @@ impl Plane {
     }
 }
 
+/// Writes rows of `n` pixels, and times their distance from the middle along x as imaginary part, padded to `size`.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn weigh(image: &[f32], n: usize, middle: f32, rows: &mut [Complex32], size: usize) {
+    for (line, row) in rows.chunks_exact_mut(size).zip(image.chunks_exact(n)) {
+        for (i, (out, &value)) in line.iter_mut().zip(row).enumerate() {
+            *out = Complex32::new(value, value * (i as f32 - middle));
+        }
+        line[n..].fill(Complex32::ZERO);
+    }
+}
+
+/// Multiplies two rows of an image in one, of which the second is as far below the first as there are such pairs.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn multiply(pairs: &mut [Complex32], along: &[f32], down: &[f32]) {
+    let (upper, lower) = down.split_at(down.len() / 2);
+    let lines = pairs.chunks_exact_mut(along.len());
+    for (line, (first, second)) in lines.zip(upper.iter().zip(lower)) {
+        for (value, x) in line.iter_mut().zip(along) {
+            *value = Complex32::new(value.re * (first * x), value.im * (second * x));
+        }
+    }
+}
+
+/// The half spectrum along x of an image, from transforms of two of its rows in one.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn split_rows(pairs: &[Complex32], side: usize, half: &mut [Complex32]) {
+    for (column, out) in half.chunks_exact_mut(side).enumerate() {
+        let (first, second) = out.split_at_mut(side / 2);
+        split(pairs, side, column, first, second);
+    }
+}
+
+/// Spectra of two rows of an image in one, from its half spectrum whose columns were transformed back.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn join_rows(half: &[Complex32], side: usize, modes: usize, pairs: &mut [Complex32]) {
+    for (y, line) in pairs.chunks_exact_mut(side).enumerate() {
+        join(half, side, modes, (y, y + side / 2), line);
+    }
+}
+
 /// One column of the transforms of two real images, from rows (of `size`) of the transform of the one
 /// plus i times the other.
+#[inline(always)]
 fn split(
     rows: &[Complex32],
     size: usize,
@@ -321,7 +375,7 @@ fn split(
 
 /// Transforms of two real images at one frequency, from those of the one plus i times the other there and at the opposite
 /// frequency.
-#[inline]
+#[inline(always)]
 pub(super) fn parts(here: Complex32, opposite: Complex32) -> [Complex32; 2] {
     let (a, b) = (here, opposite.conj());
     // (a − b)/2i is the second.
@@ -331,6 +385,7 @@ pub(super) fn parts(here: Complex32, opposite: Complex32) -> [Complex32; 2] {
 
 /// The spectrum of row `first` plus i times row `second` of a real image, whose columns were
 /// transformed back.
+#[inline(always)]
 fn join(
     half: &[Complex32],
     side: usize,

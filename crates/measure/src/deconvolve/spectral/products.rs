@@ -5,9 +5,13 @@
 //! so that the mean of a′(n)·b′(tn), with each mode of the second times t, is Σ_k |n̂|² t conj(h_a)·h_b: no field of noise is
 //! drawn.
 
+use multiversion::multiversion;
 use shearq_fourier::Complex32;
 
 use super::{Spectral, SpectralPsf, SpectralScratch};
+
+/// Numbers that are summed side by side. See docs/constants.md.
+const LANES: usize = 16;
 
 /// Means of a product for three kinds t: the change of noise with γ₁, its change with γ₂, and what noise lacks to be that
 /// of a PSF turned by 90 degrees.
@@ -65,43 +69,43 @@ impl Spectral {
             third[at] = value * (twice * gradients.third[at]);
         }
         self.plane.window(across, down, plane);
-        let side = self.plane.side;
-        let [along, upright] = window_modes;
-        let mut sums = [[0.0f32; 3]; 10];
-        for at in 0..stamp.len() {
-            // Columns with k_x > 0 stand for those with k_x < 0 too.
-            let twice = if at < side { 1.0 } else { 2.0 };
-            let powers = psf.powers[at].map(|power| twice * power);
-            let flux = along[at / side] * upright[at % side];
-            let half = [
-                plane.half[0][at],
-                plane.half[1][at],
-                plane.half[2][at],
-                flux,
-            ];
-            let mut number = 0;
-            for a in 0..4 {
-                for b in a..4 {
-                    let product = half[a].re * half[b].re + half[a].im * half[b].im;
-                    for (sum, power) in sums[number].iter_mut().zip(powers) {
-                        *sum += power * product;
-                    }
-                    number += 1;
-                }
-            }
+        self.plane.window_modes(across, down, plane, window_modes);
+        let [first, second, third] = &plane.half;
+        let half = [first, second, third, window_modes];
+        let mut found = [[0.0; 3]; 10];
+        let pairs = (0..4).flat_map(|a| (a..4).map(move |b| [a, b]));
+        for (found, [a, b]) in found.iter_mut().zip(pairs) {
+            *found = products_of(half[a], half[b], &psf.powers);
         }
-        sums
+        found
     }
 }
 
-/// Writes the transform of a window along an axis of the coarse grid.
-pub(super) fn window_modes(window: &[f32], out: &mut [Complex32]) {
-    let side = window.len();
-    for (mode, out) in out.iter_mut().enumerate() {
-        let terms = window.iter().enumerate().map(|(place, value)| {
-            let phase = std::f32::consts::TAU * ((mode * place) % side) as f32 / side as f32;
-            Complex32::from_polar(*value, -phase)
-        });
-        *out = terms.sum();
+/// Σ t·Re(conj(a)·b) over modes, for three kinds t.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn products_of(a: &[Complex32], b: &[Complex32], kinds: &[Vec<f32>; 3]) -> Kinds {
+    let mut lanes = [[0.0f32; LANES]; 3];
+    let whole = a.len() / LANES * LANES;
+    let [first, second, third] = kinds;
+    let chunks = a.chunks_exact(LANES).zip(b.chunks_exact(LANES));
+    let kinds = first
+        .chunks_exact(LANES)
+        .zip(second.chunks_exact(LANES))
+        .zip(third.chunks_exact(LANES));
+    for ((a, b), ((first, second), third)) in chunks.zip(kinds) {
+        for l in 0..LANES {
+            let product = a[l].re * b[l].re + a[l].im * b[l].im;
+            lanes[0][l] += first[l] * product;
+            lanes[1][l] += second[l] * product;
+            lanes[2][l] += third[l] * product;
+        }
     }
+    let mut sums = lanes.map(|lanes| lanes.iter().sum());
+    for at in whole..a.len() {
+        let product = a[at].re * b[at].re + a[at].im * b[at].im;
+        sums[0] += first[at] * product;
+        sums[1] += second[at] * product;
+        sums[2] += third[at] * product;
+    }
+    sums
 }

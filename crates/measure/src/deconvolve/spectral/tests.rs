@@ -597,3 +597,158 @@ fn unusable_sizes_and_psfs_are_refused() {
         .unwrap_err();
     assert!(error.to_string().contains("pixel (4, 3)"), "{error}");
 }
+
+/// Weights of the lags that are the same at opposite lags.
+fn even(plan: &Spectral, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    let width = 2 * plan.reach + 1;
+    let mut weights: Vec<f32> = (0..(plan.reach + 1) * width)
+        .map(|_| rng.random_range(-1.0..1.0))
+        .collect();
+    for x in 0..plan.reach {
+        weights[x] = weights[width - 1 - x];
+    }
+    weights
+}
+
+/// Sum of products over all lags: a place below the first row stands for two.
+fn over_lags(plan: &Spectral, weights: &[f32], values: &[f32]) -> f64 {
+    let products = weights.iter().zip(values).enumerate();
+    products
+        .map(|(at, (w, v))| {
+            let count = if at > 2 * plan.reach { 2.0 } else { 1.0 };
+            count * f64::from(*w) * f64::from(*v)
+        })
+        .sum()
+}
+
+#[test]
+fn spectra_of_weights_are_the_adjoint_of_lags_of_spectra() {
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let settings = settings(400, 1.5, 6.0, 1e-4);
+    for (n, p) in [(48, 48), (23, 30)] {
+        let plan = Spectral::new(n, p, &settings).unwrap();
+        let side = plan.plane.side;
+        let mut scratch = plan.scratch();
+        let weights = [even(&plan, &mut rng), even(&plan, &mut rng)];
+        let pairs: Vec<Complex32> = weights[0]
+            .iter()
+            .zip(&weights[1])
+            .map(|(a, b)| Complex32::new(*a, *b))
+            .collect();
+        let mut spectrum = plan.plane.spectrum();
+        for (at, value) in spectrum.iter_mut().enumerate() {
+            let y = at % side;
+            if y <= plan.plane.modes || y >= side - plan.plane.modes {
+                let each = [(); 2].map(|()| rng.random_range(-1.0f32..1.0));
+                *value = Complex32::new(each[0], each[1]);
+            }
+        }
+        for y in 1..side / 2 {
+            spectrum[side - y] = spectrum[y];
+        }
+        // What is left in the buffers does not matter.
+        for line in &mut scratch.plane.half {
+            line.fill(Complex32::new(7.0, -3.0));
+        }
+        scratch.plane.half[1].copy_from_slice(&spectrum);
+        let mut images = [(); 2].map(|()| vec![0.0; weights[0].len()]);
+        plan.plane
+            .lags(1, plan.reach, &mut scratch.plane, |at, value| {
+                (images[0][at], images[1][at]) = (value.re, value.im);
+            });
+        plan.plane
+            .spectra_of_lags(0, plan.reach, &mut scratch.plane, &pairs);
+        for (which, weights) in weights.iter().enumerate() {
+            let part = |value: Complex32| [value.re, value.im][which];
+            let modes = spectrum.iter().zip(&scratch.plane.half[0]).enumerate();
+            let by_modes: f64 = modes
+                .map(|(at, (a, b))| {
+                    let twice = if at < side { 1.0 } else { 2.0 };
+                    twice * f64::from(part(*a)) * f64::from(part(*b))
+                })
+                .sum();
+            let by_lags = over_lags(&plan, weights, &images[which]);
+            // Thousands of terms of order 100 in single precision.
+            assert!((by_modes - by_lags).abs() < 0.05, "{by_modes} {by_lags}");
+            assert!(by_lags.abs() > 5.0);
+        }
+    }
+}
+
+#[test]
+fn mean_products_are_sums_over_modes_of_what_each_changes() {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let settings = settings(400, 1.5, 6.0, 1e-4);
+    let h = psf(31);
+    let plan = Spectral::new(32, 31, &settings).unwrap();
+    let (side, modes) = (plan.plane.side, plan.plane.modes);
+    let mut scratch = plan.scratch();
+    let mut psf = plan.psf();
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut psf)
+        .unwrap();
+    for centre in [[0.0, 0.0], [1.5, -2.0]] {
+        plan.place_window(centre, &mut scratch);
+        let stamp = observed(32, &h, 0.0, 0.0);
+        let mut lags = plan.lags();
+        plan.autocorrelate(&psf, &stamp, 0.0, &mut scratch, &mut lags);
+        let weights = [(); 3].map(|()| even(&plan, &mut rng));
+        let mut gradients = plan.gradients();
+        for (at, value) in gradients.pair.iter_mut().enumerate() {
+            *value = Complex32::new(weights[0][at], weights[1][at]);
+        }
+        gradients.third = plan.spectrum_of(&weights[2], &mut scratch);
+        let found = plan.products(&psf, &gradients, &mut scratch);
+
+        // A field of one mode at a time, real and imaginary.
+        let mut expected = [[0.0f64; 3]; 10];
+        let mut sizes = [0.0f64; 10];
+        for at in 0..psf.restore.len() {
+            let (column, y) = (at / side, at % side);
+            let kept = y <= modes || y >= side - modes;
+            if !kept || (column == 0 && y > modes) {
+                continue;
+            }
+            let alone = at == 0;
+            for phase in [Complex32::ONE, Complex32::I] {
+                if alone && phase == Complex32::I {
+                    continue;
+                }
+                for half in &mut scratch.plane.half {
+                    half.fill(Complex32::ZERO);
+                }
+                scratch.plane.half[0][at] = phase;
+                if column == 0 {
+                    scratch.plane.half[0][(side - y) % side] = phase.conj();
+                }
+                let [across, down] = &scratch.windows;
+                plan.plane.window(across, down, &mut scratch.plane);
+                let flux = f64::from(scratch.plane.half[0][0].re);
+                plan.changes(&scratch.stamp, &mut scratch.plane, &mut lags);
+                let [a, b, c] = [0, 1, 2].map(|k| over_lags(&plan, &weights[k], &lags.acf));
+                let changes = [a, b, c, flux];
+                // Half of the power of a mode is that of its real part; but for the mean, which has no other.
+                let share = if alone { 1.0 } else { 0.5 };
+                let stands_for = if column == 0 { 1.0 } else { 2.0 };
+                let mut number = 0;
+                for a in 0..4 {
+                    for b in a..4 {
+                        let product = share * changes[a] * changes[b];
+                        for (kind, sum) in expected[number].iter_mut().enumerate() {
+                            let power = f64::from(psf.powers[kind][at]) / stands_for;
+                            *sum += power * product;
+                            sizes[number] = sizes[number].max(sum.abs());
+                        }
+                        number += 1;
+                    }
+                }
+            }
+        }
+        for ((found, expected), size) in found.iter().zip(expected).zip(sizes) {
+            for (found, expected) in found.iter().zip(expected) {
+                // A thousand terms of both signs in single precision.
+                let difference = (f64::from(*found) - expected).abs();
+                assert!(difference < 1e-4 * size, "{found} {expected} {size}");
+            }
+        }
+    }
+}
