@@ -16,6 +16,7 @@ use shearq_results::bias::folders;
 use shearq_results::bias::truth::Truth;
 use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, sum};
 use shearq_results::expression::Expression;
+use shearq_results::select::selection;
 use shearq_results::views::bias::{
     Limit, bias_plot, bias_table, check, compared_table, junit, section,
 };
@@ -74,6 +75,17 @@ pub(crate) struct Arguments {
     /// Use only rows for which this holds, such as `snr > 10 and size < 4`.
     #[arg(long, value_name = "EXPRESSION", value_parser = Expression::parse, conflicts_with = "merge")]
     select: Option<Expression>,
+    /// Cuts on catalogues of linear configurations, such as `snr > 10, size > 2.5 +- 0.5`. The response contains how shear
+    /// changes the selection; `select` explains the steps.
+    #[arg(
+        long = "where",
+        value_name = "CONDITIONS",
+        conflicts_with_all = ["merge", "against", "ellipticity"]
+    )]
+    cuts: Option<String>,
+    /// Weight of each galaxy, a smooth formula of `snr`, `flux` and `size`, such as `snr^2 / (snr^2 + 50)`.
+    #[arg(long, value_name = "FORMULA", conflicts_with_all = ["merge", "against", "ellipticity"])]
+    weight: Option<String>,
     /// How catalogues belong together [default: recognised from the true shears].
     #[arg(long, value_enum, conflicts_with = "merge")]
     design: Option<DesignArgument>,
@@ -274,6 +286,11 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
     if let Some(select) = &arguments.select {
         made_by.push(("Selection".into(), select.text().to_owned()));
     }
+    for (name, text) in [("Where", &arguments.cuts), ("Weight", &arguments.weight)] {
+        if let Some(text) = text {
+            made_by.push((name.into(), text.clone()));
+        }
+    }
     if let Some(draws) = arguments.bootstrap {
         let seed = arguments.seed;
         made_by.push(("Bootstrap".into(), format!("{draws} draws, seed {seed}")));
@@ -320,6 +337,7 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         flip_g2: arguments.flip_g2,
         bins: arguments.bins.clone(),
         select: arguments.select.clone(),
+        selection: selection(arguments.cuts.as_deref(), arguments.weight.as_deref())?,
         design: arguments.design.map(Design::from),
         units: match arguments.units.as_deref() {
             None => Units::Recognised,
@@ -331,7 +349,13 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         step: arguments.step,
     };
     let own = |number: usize| Shard::holding(number, shard.of()) == shard;
-    Ok(sum(&request, &own)?)
+    let summed = sum(&request, &own)?;
+    if let Some(column) = summed.measured_selection().first() {
+        tell(format_args!(
+            "warning: m contains the effect of shear on a choice by `{column}`, which was measured on the galaxies. Try: --where for cuts by snr, flux or size"
+        ));
+    }
+    Ok(summed)
 }
 
 /// Merges files of sums.

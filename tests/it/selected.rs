@@ -60,6 +60,55 @@ fn selected_folders_have_the_means_of_the_option_and_can_be_scored() {
 }
 
 #[test]
+fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let data = at("data");
+    let shears = ["--constant-shear", "0.02,0.02", "--opposite"];
+    let size = [
+        "--sets", "2", "--images", "1", "--grid", "20", "--seed", "5",
+    ];
+    let simulated = [&["simulate", "--out", text(&data)], &size[..], &shears].concat();
+    succeed(&simulated);
+    let cut = ["--where", "size > 2, snr > 15"];
+    let (mut measured, mut selected) = (Vec::new(), Vec::new());
+    for sign in ["+", "-"] {
+        let data = data.join(format!("g1_{sign}0.02_g2_{sign}0.02"));
+        let (out, chosen) = (at(&format!("out{sign}")), at(&format!("chosen{sign}")));
+        let folders = ["--data", text(&data), "--out", text(&out)];
+        succeed(&[&["measure"], &LINEAR[..], &folders].concat());
+        let folders = ["--measured", text(&out), "--out", text(&chosen)];
+        succeed(&[&["select"], &folders[..], &cut].concat());
+        measured.push(text(&out).to_owned());
+        selected.push(text(&chosen).to_owned());
+    }
+    let m = |folders: &[String], options: &[&str]| {
+        let folders: Vec<&str> = folders.iter().map(String::as_str).collect();
+        let arguments = [&["bias", "--format", "json"], &folders[..], options].concat();
+        let run = shearq(&arguments);
+        let warned = String::from_utf8_lossy(&run.stderr).into_owned();
+        let table: Value = serde_json::from_slice(&run.stdout).unwrap();
+        let row = &table["rows"][0];
+        (["m1", "m2"].map(|m| row[m].as_f64().unwrap()), warned)
+    };
+    let (at_once, silent) = m(&measured, &cut);
+    let (written, _) = m(&selected, &[]);
+    assert_eq!(silent, "");
+    for (a, b) in at_once.iter().zip(written) {
+        // Folders are calibrated image by image: responses of both differ by about a hundredth, and so do the parts of m.
+        assert!((a - b).abs() < 1e-3, "{a} {b}");
+        assert!(a.abs() < 0.1, "{a}");
+    }
+    let (filtered, warned) = m(&measured, &["--select", "size > 2 and snr > 15"]);
+    assert!(warned.contains("Try: --where"), "{warned}");
+    assert!(filtered[0] < -0.1, "{filtered:?}");
+    let path = at("chosen+").join("set02/catalogue-001.parquet");
+    let given = ["bias", text(&path), "--g1", "0.02", "--g2", "0.02"];
+    let refused = fail(&[&given[..], &cut].concat());
+    assert!(refused.contains("has a selection already"), "{refused}");
+}
+
+#[test]
 fn selections_that_cannot_be_corrected_are_refused() {
     let small = Small::new("2");
     small.measure(&LINEAR);

@@ -6,7 +6,7 @@ use shearq_submissions::Configuration;
 
 use crate::flag::Flag;
 use crate::measurement::Measurement;
-use crate::psf::examine::{C_PER_NOISE, M_PER_NOISE};
+use crate::psf::examine::effect_of_noise;
 
 /// Something in the data of an image that biases shears, or is likely a mistake.
 ///
@@ -444,12 +444,13 @@ impl fmt::Display for Warning {
                 100.0 * slope[0],
                 100.0 * slope[1]
             ),
-            Warning::PsfNoise { snr, enough, of } => write!(
-                f,
-                "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). The noise of one star changes m by about {:.3} and c by about {:.3}. Try: average several stars, or fit a model",
-                M_PER_NOISE / snr.max(1.0),
-                C_PER_NOISE / snr.max(1.0)
-            ),
+            Warning::PsfNoise { snr, enough, of } => {
+                let [m, c] = effect_of_noise(*snr);
+                write!(
+                    f,
+                "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). The noise of one star changes m by about {m:.3} and c by about {c:.3}. Try: average several stars, or fit a model"
+                )
+            }
             Warning::PsfNarrow { area, of } => write!(
                 f,
                 "the PSF is narrower than the pixels can show (found light on {area:.1} px{of}; expected 6 px or more, a FWHM of about 1 px). Try: check that the file is a PSF with the pixel scale of the galaxies"

@@ -18,6 +18,7 @@ use shearq_bias::{
 };
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
+use shearq_measure::Selection;
 use thiserror::Error;
 
 use crate::expression::Expression;
@@ -104,6 +105,8 @@ pub struct Request {
     pub bins: Option<Binning>,
     /// Rows that count.
     pub select: Option<Expression>,
+    /// Cuts and weights of catalogues of linear configurations, whose response to shear enters.
+    pub selection: Option<Selection>,
     /// The design; recognised if `None`.
     pub design: Option<Design>,
     /// Units of the errors.
@@ -131,6 +134,8 @@ pub struct Summed {
     /// Text of the binned expression.
     binned: String,
     edges: Vec<f64>,
+    /// Measured columns by which rows were selected or binned.
+    measured: Vec<String>,
 }
 
 /// Sums whose units are joined.
@@ -195,6 +200,7 @@ impl Request {
             distortion: self.distortion,
             flip_g2: self.flip_g2,
             select: self.select.clone(),
+            selection: self.selection.clone(),
             binned: self.bins.as_ref().map(|bins| bins.of.clone()),
             drop_missing: self.drop_missing,
             step: self.step,
@@ -226,6 +232,12 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         psf: first.has_psf(),
         versions: first.has_version_rows() || first.selects_versions(&reading),
     };
+    let expressions = [
+        request.select.as_ref(),
+        request.bins.as_ref().map(|bins| &bins.of),
+    ];
+    let by = expressions.into_iter().flatten();
+    let measured = by.flat_map(|by| first.measured(by)).collect();
     let (truth, response) = (known(&request.truth, first), has_response(first));
     for (input, sources) in request.catalogues.iter().zip(&all) {
         let fits = |source: &Source| {
@@ -306,6 +318,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
             .as_ref()
             .map_or_else(String::new, |bins| bins.of.text().to_owned()),
         edges,
+        measured,
     })
 }
 
@@ -459,6 +472,12 @@ impl Summed {
             return unlike("different options");
         }
         Ok(())
+    }
+
+    /// Columns of `--select` or `--bins` that were measured on the galaxies of shearq's catalogues: m contains how shear
+    /// changes this selection.
+    pub fn measured_selection(&self) -> &[String] {
+        &self.measured
     }
 
     /// The estimates.

@@ -14,7 +14,7 @@ use shearq_pipeline::measure::KEYS;
 use crate::expression::Expression;
 
 /// Columns that a selection replaces or reads. It also reads the columns of [`Observables`].
-const READ: [&str; 9] = [
+pub(crate) const READ: [&str; 9] = [
     "e1", "e2", "flags", "R11", "R22", "R12", "R21", "divisor1", "divisor2",
 ];
 
@@ -61,7 +61,7 @@ pub fn selection(
 }
 
 /// Name of the column with the weights.
-const WEIGHT: &str = "selection";
+pub(crate) const WEIGHT: &str = "selection";
 
 /// Writes the catalogues of the folder `from` with the weights of a `selection`, described by `text`, to the folder `to`:
 /// ellipticities are multiplied by the weights and divided by the mean response of their image, so that all that uses catalogues

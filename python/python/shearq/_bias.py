@@ -124,6 +124,8 @@ def bias(
     flip_g2: bool = False,
     bins: Bins | None = None,
     select: str | None = None,
+    where: str | None = None,
+    weight: str | None = None,
     design: Design | None = None,
     units: str | None = None,
     drop_missing: bool = False,
@@ -155,6 +157,9 @@ def bias(
         ``("flux / flux_error", [5, 10, 20])`` has these edges. The response is that of each bin.
     select : str
         Use only rows for which this holds, such as ``"snr > 10 and size < 4"``.
+    where, weight : str
+        Cuts and a weight by S/N, flux and size of shearq's own catalogues, as for :meth:`Catalogue.select`: m contains no
+        effect of the selection.
     design : str
         How catalogues belong together; recognised from the true shears.
     units : str
@@ -182,6 +187,8 @@ def bias(
         flip_g2=flip_g2,
         bins=bins,
         select=select,
+        where=where,
+        weight=weight,
         design=design,
         units=units,
         drop_missing=drop_missing,
@@ -201,6 +208,8 @@ def bias_sums(
     flip_g2: bool = False,
     bins: Bins | None = None,
     select: str | None = None,
+    where: str | None = None,
+    weight: str | None = None,
     design: Design | None = None,
     units: str | None = None,
     drop_missing: bool = False,
@@ -231,6 +240,7 @@ def bias_sums(
             flip_g2,
             _bins(bins),
             select,
+            [where, weight],
             design,
             units,
             drop_missing,

@@ -123,6 +123,7 @@ def bias_sums(
     flip_g2: bool,
     bins: tuple[str, int | None, Sequence[float]] | None,
     select: str | None,
+    selection: Sequence[str | None],
     design: str | None,
     units: str | None,
     drop_missing: bool,

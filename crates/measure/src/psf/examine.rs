@@ -7,6 +7,7 @@
 
 use ndarray::ArrayView2;
 
+use super::shrink::AS_IT_IS;
 use super::{breadth, star};
 use crate::extent::{Core, core_of_psf};
 use crate::warning::{Of, Warning};
@@ -31,9 +32,9 @@ const ENOUGH_SNR: f64 = 1000.0;
 /// The same limit for a star per galaxy, whose noise averages out. See docs/constants.md.
 const ENOUGH_SNR_EACH: f64 = 100.0;
 /// Scatter of m with a star's noise, times the star's S/N. See docs/constants.md.
-pub(crate) const M_PER_NOISE: f64 = 5.3;
+const M_PER_NOISE: f64 = 2.3;
 /// Scatter of c with a star's noise, times the star's S/N. See docs/constants.md.
-pub(crate) const C_PER_NOISE: f64 = 2.4;
+const C_PER_NOISE: f64 = 1.2;
 /// Noise-equivalent area of the narrowest PSF that pixels can show. See docs/constants.md.
 const LEAST_AREA: f64 = 6.0;
 /// Mean square of the PSF's core in units of the galaxies', above which a warning is due. See
@@ -43,6 +44,12 @@ const AS_BROAD: f64 = 0.83;
 const BROADER: f64 = 1.02;
 /// Share of the PSFs of an image that a warning requires. See docs/constants.md.
 const MANY: f64 = 0.1;
+
+/// How much the noise of one star for an image, of S/N `snr`, changes m and c: one standard deviation. The closer its S/N
+/// is to 1000, the less of its noise is taken away, so that the effect is nearly the same from 500 on.
+pub(crate) fn effect_of_noise(snr: f64) -> [f64; 2] {
+    [M_PER_NOISE, C_PER_NOISE].map(|times| times / snr.clamp(1.0, AS_IT_IS[0]))
+}
 
 /// What one PSF shows.
 #[derive(Debug, Clone, Copy)]

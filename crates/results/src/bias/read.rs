@@ -8,9 +8,11 @@ use shearq_bias::{Catalogue, Row, VERSIONS};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, Place};
+use shearq_measure::{Observables, Selection};
 use shearq_quantities::Distortion;
 
 use crate::expression::Expression;
+use crate::select::{READ, WEIGHT, Weighted};
 
 use super::Input;
 use super::columns::{Columns, Names, Preset, Role};
@@ -25,6 +27,8 @@ pub(super) struct Reading {
     pub(super) distortion: Option<bool>,
     pub(super) flip_g2: bool,
     pub(super) select: Option<Expression>,
+    /// Cuts and weights whose response to shear is known.
+    pub(super) selection: Option<Selection>,
     /// What the bins are bins of.
     pub(super) binned: Option<Expression>,
     pub(super) drop_missing: bool,
@@ -73,6 +77,16 @@ impl Source {
             && (reading.select.is_some() || reading.binned.is_some())
             && all(&self.selected)
             && all(&self.binned)
+    }
+
+    /// Columns of an expression that were measured on galaxies that shear has changed.
+    pub(super) fn measured(&self, expression: &Expression) -> Vec<String> {
+        let own = self.columns.preset == Preset::Shearq;
+        let known = |name: &&String| {
+            Observables::COLUMNS.contains(&name.as_str()) || READ.contains(&name.as_str())
+        };
+        let columns = expression.columns().iter().filter(known);
+        columns.filter(|_| own).cloned().collect()
     }
 
     /// Whether rows belong to versions.
@@ -227,6 +241,22 @@ fn source(
             Ok(all)
         };
     let (selected, binned) = (places(&reading.select)?, places(&reading.binned)?);
+    if reading.selection.is_some() {
+        if names.iter().any(|own| own == WEIGHT) {
+            return Err(FileError::new(
+                &place.path,
+                "this catalogue has a selection already. Try: the catalogue that it was selected from",
+            ));
+        }
+        for name in READ.iter().chain(&Observables::COLUMNS) {
+            place_of(name).ok_or_else(|| {
+                FileError::new(
+                    &place.path,
+                    format!("there is no column `{name}`, so a selection cannot be corrected (expected a catalogue of a linear configuration such as 48/linear/star)"),
+                )
+            })?;
+        }
+    }
     let mut source = Source {
         place,
         frame: None,
@@ -282,6 +312,8 @@ struct Part<'a> {
     reading: &'a Reading,
     rows: usize,
     columns: Vec<Cow<'a, [f64]>>,
+    /// The rows after a selection.
+    weighted: Option<Weighted>,
     /// Places of the columns of roles.
     places: Places,
     versions: Option<Vec<Option<usize>>>,
@@ -404,7 +436,11 @@ impl<'a> Part<'a> {
             .map(|name| versions(frame, name, path))
             .transpose()?;
         let unit = source.unit(reading);
+        let weighted = reading.selection.as_ref().map(|selection| {
+            Weighted::of(path, selection, |name| table::numbers(frame, name, path))
+        });
         Ok(Part {
+            weighted: weighted.transpose()?,
             source,
             reading,
             rows: frame.height(),
@@ -456,6 +492,11 @@ impl<'a> Part<'a> {
             let row = number + 1;
             FileError::new(&self.source.place.path, format!("row {row}: {what}"))
         };
+        let left_out = |weighted: &Weighted| weighted.weight[at] <= 0.0;
+        if self.weighted.as_ref().is_some_and(left_out) {
+            about.unselected += u64::from(own);
+            return Ok(());
+        }
         let binned = self.binned(at);
         if binned[0].is_infinite() {
             about.unselected += u64::from(own);
@@ -463,6 +504,10 @@ impl<'a> Part<'a> {
                 return Ok(());
             }
         }
+        let weight = match &self.weighted {
+            Some(weighted) => weighted.weight[at],
+            None => weight,
+        };
         let Some((e, slope)) = self.shape(at, weight) else {
             // A distortion above 1 has no shear.
             about.flagged += u64::from(own);
@@ -527,6 +572,11 @@ impl<'a> Part<'a> {
     /// The ellipticity, and the derivative of the weighted ellipticity with shear.
     fn shape(&self, at: usize, weight: f64) -> Option<([f64; 2], [f64; 2])> {
         let places = &self.places;
+        if let Some(weighted) = &self.weighted {
+            // Both are of the weighted ellipticity.
+            let e = [0, 1].map(|k| weighted.e[k][at] / weight);
+            return Some((e, [0, 1].map(|k| weighted.response[k][at])));
+        }
         let mut e = self.pair(places.e, at);
         if self.distortion && e.iter().all(|e| e.is_finite()) {
             let shear = Distortion::new(e[0], e[1]).to_shear()?;

@@ -165,7 +165,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
     for (count, what) in [
         (total(|c| c.flagged), "with a flag"),
         (total(|c| c.unweighted), "with a weight of zero or less"),
-        (total(|c| c.unselected), "that --select excludes"),
+        (total(|c| c.unselected), "that --select or --where excludes"),
         (total(|c| c.missing), "with missing numbers"),
     ] {
         if count > 0 {
