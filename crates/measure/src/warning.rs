@@ -6,7 +6,6 @@ use shearq_submissions::Configuration;
 
 use crate::flag::Flag;
 use crate::measurement::Measurement;
-use crate::psf::examine::{C_PER_NOISE, M_PER_NOISE};
 
 /// Something in the data of an image that biases shears, or is likely a mistake.
 ///
@@ -199,6 +198,10 @@ impl fmt::Display for Of {
 /// Side of a PSF stamp below which a linear configuration loses too much of the wings. See
 /// docs/constants.md.
 const LEAST_PSF_SIZE: usize = 32;
+/// Scatter of m with a star's noise, times the star's S/N. See docs/constants.md.
+const M_PER_NOISE: f64 = 5.3;
+/// Scatter of c with a star's noise, times the star's S/N. See docs/constants.md.
+const C_PER_NOISE: f64 = 2.4;
 
 impl Warning {
     /// A warning if the configuration uses too little of the PSF.

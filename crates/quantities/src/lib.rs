@@ -4,6 +4,7 @@
 //! * [`units`]: degrees, radians, pixels and multipoles.
 //! * [`FunctionalPsf`]: a Moffat or Kolmogorov PSF, integrated over pixels, with its transform.
 //! * [`radial`]: tables of radial profiles, elliptical radii and quadrature rules.
+//! * [`linear`]: the solvers of linear equations.
 //! * [`statistics`]: running means and medians.
 //!
 //! # Conventions
@@ -14,6 +15,7 @@
 #![cfg_attr(not(test), forbid(unsafe_code))] // ndarray's slicing in tests allows it
 
 mod ellipticity;
+pub mod linear;
 mod psf;
 pub mod radial;
 pub mod statistics;
