@@ -3,6 +3,7 @@
 //! The types fix the order. A [`Worker`] becomes an [`ImageWorker`] for an image, whose noise is known. That becomes a
 //! [`PsfWorker`] for a PSF, and only this measures galaxies.
 
+use std::fmt;
 use std::sync::Arc;
 
 use ndarray::{ArrayView2, ArrayView3, Axis};
@@ -79,15 +80,28 @@ pub struct Worker {
 }
 
 /// A worker for the galaxies of one image.
+#[derive(Debug)]
 pub struct ImageWorker<'a> {
     worker: &'a mut Worker,
     level: f64,
 }
 
 /// A worker for galaxies of one image and one PSF.
+#[derive(Debug)]
 pub struct PsfWorker<'a> {
     pub(crate) worker: &'a mut Worker,
     level: f64,
+}
+
+impl fmt::Debug for Worker {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Worker")
+            .field("configuration", &self.plan.configuration.name)
+            .field("full", &self.plan.full)
+            .field("subtraction", &self.subtraction)
+            .field("survey", &self.survey)
+            .finish_non_exhaustive()
+    }
 }
 
 impl Worker {

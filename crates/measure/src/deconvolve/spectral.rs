@@ -92,6 +92,16 @@ pub struct Spectral {
     inside: f32,
 }
 
+impl std::fmt::Debug for Spectral {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Spectral")
+            .field("n", &self.n)
+            .field("p", &self.p)
+            .field("window_sigma", &self.window_sigma)
+            .finish_non_exhaustive()
+    }
+}
+
 /// Noise as the linear network uses it: of level one, and white but for its power.
 #[derive(Debug, Clone)]
 pub struct ModeNoise {
