@@ -62,7 +62,7 @@ const LIT: f64 = 0.02;
 const REACH: f64 = 2.5;
 
 /// The linear network for one stamp size.
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 pub struct Spectral {
     n: usize,
     p: usize,
@@ -90,16 +90,6 @@ pub struct Spectral {
     centre: Vec<Complex32>,
     /// Share of the noise under the window that the stamp contains.
     inside: f32,
-}
-
-impl std::fmt::Debug for Spectral {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Spectral")
-            .field("n", &self.n)
-            .field("p", &self.p)
-            .field("window_sigma", &self.window_sigma)
-            .finish_non_exhaustive()
-    }
 }
 
 /// Noise as the linear network uses it: of level one, and white but for its power.
