@@ -147,7 +147,9 @@ pub fn main() -> ExitCode {
 }
 
 /// Prints no message for a panic that is caught and becomes an error, as when a damaged file is decoded.
-fn silence_caught_panics() {
+///
+/// For programs and extension modules, to be called once at their start: it replaces the hook of all their panics.
+pub fn silence_caught_panics() {
     let others = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
         if !panic_is_caught() {

@@ -19,6 +19,8 @@ use pyo3::prelude::*;
 
 #[pymodule]
 mod _shearq {
+    use pyo3::prelude::*;
+
     #[pymodule_export]
     use super::bias::{BiasSums, bias_sums};
     #[pymodule_export]
@@ -40,4 +42,12 @@ mod _shearq {
     #[pymodule_export]
     #[expect(non_upper_case_globals, reason = "its name in Python")]
     const __version__: &str = shearq_pipeline::VERSION;
+
+    /// The hook of panics belongs to this module alone: each extension module contains its own standard library.
+    #[pymodule_init]
+    #[expect(clippy::unnecessary_wraps, reason = "pyo3 requires a result")]
+    fn init(_module: &Bound<'_, PyModule>) -> PyResult<()> {
+        shearq::silence_caught_panics();
+        Ok(())
+    }
 }

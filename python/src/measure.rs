@@ -15,6 +15,7 @@ use shearq_measure::{
 use shearq_pipeline::engine;
 use shearq_pipeline::measure::{COLUMNS, Value, observed};
 use shearq_quantities::Shear;
+use shearq_quantities::statistics::upper_median;
 
 use crate::errors::{no_memory, of_measuring};
 use crate::stamps::{Borrowed, Piece, Stamps};
@@ -357,10 +358,9 @@ impl<'s> Request<'s> {
         };
         let (count, side, _) = self.dim;
         let chosen = examined_rows(1, count);
-        let mut sorted: Vec<f64> = chosen.iter().map(|&at| levels[at]).collect();
-        sorted.retain(|level| *level > 0.0);
-        sorted.sort_by(f64::total_cmp);
-        let Some(&median) = sorted.get(sorted.len() / 2) else {
+        let mut positive: Vec<f64> = chosen.iter().map(|&at| levels[at]).collect();
+        positive.retain(|level| *level > 0.0);
+        let Some(median) = upper_median(&mut positive) else {
             return Ok(None);
         };
         let mut scaled = Examination::new(side, chosen.len());

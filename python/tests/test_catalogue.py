@@ -182,6 +182,25 @@ def test_tables_of_other_codes_are_taken_by_their_names():
         shearq.Catalogue.from_table(np.zeros(3))
 
 
+def test_damaged_files_raise_and_print_nothing(two, tmp_path, capfd):
+    path = tmp_path / "bad.parquet"
+    two[0].write(path)
+    whole = path.read_bytes()
+    raised = 0
+    # Every 7th byte of the first page and of the footer.
+    for at in [*range(4, 400, 7), *range(len(whole) - 2000, len(whole) - 8, 7)]:
+        damaged = bytearray(whole)
+        damaged[at] ^= 0xFF
+        path.write_bytes(damaged)
+        try:
+            shearq.read(path)
+        except ValueError as error:
+            assert "bad.parquet" in str(error)
+            raised += 1
+    assert raised > 50
+    assert capfd.readouterr().err == ""
+
+
 def test_wrong_files_are_named(two, tmp_path):
     with pytest.raises(FileNotFoundError, match="there is no file"):
         shearq.read(tmp_path / "none.fits")

@@ -11,6 +11,7 @@
 use std::ops::Range;
 
 use ndarray::Array2;
+#[cfg(feature = "serde")]
 use serde::{Deserialize, Serialize};
 use shearq_fourier::Complex64;
 
@@ -23,8 +24,9 @@ pub const BINS: usize = 20;
 pub const SCORED: Range<usize> = 1..9;
 
 /// How bandpowers and the quality factor are defined.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "lowercase"))]
 pub enum Definition {
     /// As in the challenge's program.
     #[default]

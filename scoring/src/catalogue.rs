@@ -1,6 +1,7 @@
 //! Ellipticities of the images of a set, summed on the grid.
 
 use ndarray::Array2;
+#[cfg(feature = "serde")]
 use serde::Serialize;
 
 use crate::error::ScoringError;
@@ -25,7 +26,8 @@ pub struct Row {
 const TOO_MANY: usize = 20;
 
 /// How the rows of one or several catalogues were used, and how many are odd.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
 pub struct RowCounts {
     /// Rows added to a cell.
     pub used: usize,
@@ -220,8 +222,9 @@ pub struct TrueShear {
 }
 
 /// Sign of g₂ in a truth file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "lowercase"))]
 pub enum TruthSign {
     /// As in the files of the challenge: minus the standard g₂.
     Challenge,

@@ -1,6 +1,7 @@
 //! The eight sign and axis conventions that the original scoring tries on every catalogue.
 
 use ndarray::Array2;
+#[cfg(feature = "serde")]
 use serde::{Deserialize, Serialize};
 use shearq_fourier::Complex64;
 
@@ -13,12 +14,14 @@ use crate::grid::check_shape;
 /// 1 to 4 and again for 5 to 8. Conventions 1 to 4 index the field `[iy, ix]`, 5 to 8 `[ix, iy]`.
 ///
 /// Convention 5 is the standard one: e₁ > 0 along +x, e₂ > 0 along x = y.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(try_from = "u8", into = "u8")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
+#[cfg_attr(feature = "serde", serde(try_from = "u8", into = "u8"))]
 pub struct Convention(u8);
 
 /// The two classes of conventions. All conventions of a class give the same E-mode spectrum.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
 pub enum ConventionClass {
     /// Conventions 1, 3, 6, 8.
     A,

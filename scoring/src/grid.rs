@@ -3,6 +3,7 @@
 use std::ops::RangeInclusive;
 
 use ndarray::{ArrayBase, Data, Ix2};
+#[cfg(feature = "serde")]
 use serde::{Deserialize, Serialize};
 
 use crate::error::ScoringError;
@@ -49,7 +50,8 @@ pub fn centre_of(index: usize, stamp: Pixels) -> f64 {
 }
 
 /// A square grid of galaxies: `n` × `n` stamps of `stamp` pixels, on a field of `field` degrees per side.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
 pub struct Grid {
     /// Cells per side.
     pub n: usize,

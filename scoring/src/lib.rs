@@ -13,7 +13,6 @@
 //! # Score ellipticities
 //!
 //! ```
-#![warn(missing_debug_implementations)]
 #![doc = include_str!("../examples/quality.rs")]
 //! ```
 //!
@@ -66,3 +65,8 @@ pub use set_score::{
     ConventionScore, MeanShear, SetScore, SpectrumCovariance, SpectrumScore, Unknown,
 };
 pub use shearq_fourier::Complex64;
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -1,7 +1,9 @@
 //! The metrics of a scored set: the only place that declares their names and meanings.
 
+#[cfg(feature = "serde")]
 use std::collections::BTreeMap;
 
+#[cfg(feature = "serde")]
 use serde::{Deserialize, Deserializer, Serialize};
 
 /// Name and meaning of a metric.
@@ -17,7 +19,8 @@ pub struct Metric {
 macro_rules! metrics {
     ($($name:ident: $meaning:literal;)+) => {
         /// Metrics of one set or of a replicate of it, or their errors. Not a number if unknown.
-        #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+        #[derive(Debug, Clone, Copy, PartialEq)]
+        #[cfg_attr(feature = "serde", derive(Serialize))]
         #[non_exhaustive]
         pub struct Metrics {
             $(#[doc = $meaning] pub $name: f64,)+
@@ -76,6 +79,7 @@ impl Metrics {
     }
 }
 
+#[cfg(feature = "serde")]
 /// JSON has no NaN: null and absent metrics are read as NaN.
 impl<'de> Deserialize<'de> for Metrics {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
@@ -106,6 +110,12 @@ mod tests {
             assert_eq!(Metrics::place(name), Some(field as usize));
         }
         assert_eq!(Metrics::place("q_best"), None);
+    }
+
+    #[cfg(feature = "serde")]
+    #[test]
+    fn metrics_that_json_lacks_are_unknown() {
+        let metrics = Metrics::from_values(std::array::from_fn(|k| k as f64));
         let text = serde_json::to_string(&metrics).unwrap();
         assert_eq!(serde_json::from_str::<Metrics>(&text).unwrap(), metrics);
         let unknown = serde_json::to_string(&Metrics::unknown()).unwrap();

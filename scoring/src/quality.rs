@@ -1,5 +1,6 @@
 //! Q, M and A of bandpowers.
 
+#[cfg(feature = "serde")]
 use serde::Serialize;
 
 use crate::bandpower::{BINS, Bins, SCORED};
@@ -8,7 +9,8 @@ use crate::bandpower::{BINS, Bins, SCORED};
 const Q_SCALE: f64 = 5e-3;
 
 /// A quality factor and its σ_sys.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
 #[non_exhaustive]
 pub struct Quality {
     /// Q = 5·10⁻³ / σ_sys; infinite for σ_sys = 0.
@@ -58,7 +60,8 @@ pub fn quality_error(
 
 /// Multiplicative and additive bias of a power spectrum:
 /// C_b − C_b^true = A + M·C_b^true, by unweighted least squares over bins 2 to 9.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
 #[allow(
     non_snake_case,
     reason = "the symbols of the challenge, also in JSON output"
@@ -109,7 +112,8 @@ pub(crate) fn bias_weights(
 
 /// The same fit in four units. The published metrics are `cl`. In ℓ²C_ℓ units M absorbs noise, because the
 /// bandpower of noise rises like the weight of the modes.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
 #[non_exhaustive]
 pub struct BiasFits {
     /// Bandpowers ℓ²C_ℓ/2π.

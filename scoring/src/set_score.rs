@@ -1,5 +1,6 @@
 //! The score of a set, as it is given to users.
 
+#[cfg(feature = "serde")]
 use serde::Serialize;
 
 use crate::bandpower::{BINS, Bins, SCORED};
@@ -10,7 +11,8 @@ use crate::metrics::Metrics;
 use crate::quality::{BiasFits, Quality};
 
 /// One convention's spectra and metrics.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
 #[non_exhaustive]
 pub struct ConventionScore {
     /// The convention.
@@ -42,7 +44,8 @@ pub struct ConventionScore {
 
 /// Mean ellipticity of a set with constant true shear, in the chosen convention. Such a set has no power to
 /// compare; its means are its metrics.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
 #[non_exhaustive]
 pub struct MeanShear {
     /// Mean ellipticity of the galaxies.

@@ -3,7 +3,6 @@
 //! A [`Configuration`] has all settings of its method. The [`Registry`] has the configurations of the paper's Table 1
 //! and the linear ones. A file works wherever a name does, and `extends` a name or another file. An error names file and
 //! place of unknown keys, unused keys, values out of range, unknown names and cycles.
-#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 mod error;

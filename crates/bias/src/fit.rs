@@ -1,5 +1,7 @@
 //! The estimates that follow from sums.
 
+use shearq_quantities::linear::{self, Pivots, substitute};
+
 use crate::sums::{
     COUNT, Component, Layout, MOST, ONE, OTHER, OWN, PSF, PSF_SIZE, SIZE, SQUARE, WEIGHT,
 };
@@ -200,23 +202,12 @@ fn eliminate(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(Solutio
         }
         a[i][n] = of.with_e[s] / scale[i];
     }
-    for i in 0..n {
-        let pivot = a[i];
-        if pivot[i].abs() < SMALLEST {
-            return None;
-        }
-        for row in a.iter_mut().take(n).skip(i + 1) {
-            let factor = row[i] / pivot[i];
-            for (value, above) in row.iter_mut().zip(pivot).take(n + 1) {
-                *value -= factor * above;
-            }
-        }
+    let a = &mut a[..n];
+    if !linear::eliminate(a, Pivots::InOrder, SMALLEST) {
+        return None;
     }
     let mut x = [0.0; MOST];
-    for i in (0..n).rev() {
-        let known: f64 = (i + 1..n).map(|j| a[i][j] * x[j]).sum();
-        x[i] = (a[i][n] - known) / a[i][i];
-    }
+    substitute(a, &mut x);
     let pivot = a[n - 1][n - 1] * scale[n - 1] * scale[n - 1];
     for (x, scale) in x.iter_mut().zip(scale).take(n) {
         *x /= scale;

@@ -21,7 +21,6 @@
 //! * [`UnitSums`]: sums per unit and bin, in bounded memory; they merge.
 //! * [`Design`]: how catalogues belong together, recognised from their true shears.
 //! * [`estimate`]: values with errors; [`Verdict`]: comparison with a requirement.
-#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 mod design;

@@ -6,7 +6,6 @@
 //! * [`shapes`] compares an entry with the public images, without the true shear.
 //! * [`inbox`] finds entries, [`judge`] checks and scores them, and [`ranking`] ranks them.
 //! * [`page`] makes the leaderboard.
-#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 pub mod create;

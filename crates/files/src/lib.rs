@@ -3,7 +3,6 @@
 //! [`fits`] is the only user of cfitsio and serialises its calls. [`open`] is the only place that opens files for
 //! reading. [`atomic`] writes each file under a temporary name and renames it when it is complete.
 //! [`frames`] are polars' data frames with text metadata.
-#![warn(missing_debug_implementations)]
 
 pub mod atomic;
 mod error;
@@ -17,3 +16,8 @@ pub mod table;
 pub mod text;
 
 pub use error::{FileError, names_of};
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -164,7 +164,7 @@ impl Place {
 }
 
 /// Names and fields of a table, before columns are chosen.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Columns {
     /// Lists of names, one to be chosen: a header, comments that may be one, or the tables of a FITS file.
     pub named: Vec<Named>,
@@ -173,7 +173,7 @@ pub struct Columns {
 }
 
 /// Names of columns.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Named {
     /// The columns.
     pub names: Vec<String>,

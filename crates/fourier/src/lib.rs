@@ -5,7 +5,6 @@
 //! object: its transforms run through a table of functions.
 //!
 //! Forward transforms multiply by exp(−2πi jk/n), inverse transforms by exp(+2πi jk/n). Neither divides by n.
-#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;

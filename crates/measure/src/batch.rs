@@ -5,6 +5,7 @@ use std::sync::Arc;
 use ndarray::{ArrayView2, ArrayView3, Axis};
 use shearq_submissions::{Configuration, NoiseSource};
 
+use crate::brightness::is_level;
 use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
 use crate::examine::{EXAMINED_PSFS, Examination, examined_rows};
@@ -17,7 +18,7 @@ use crate::psf::star_psf;
 use crate::psfs::Psfs;
 use crate::sky::Subtraction;
 use crate::warning::Warning;
-use crate::worker::{ImageNoise, is_level};
+use crate::worker::ImageNoise;
 
 /// A batch of galaxies, measured.
 #[derive(Debug, Clone)]
@@ -169,17 +170,8 @@ pub fn strip<T>(
 ) -> Result<ArrayView3<'_, T>, MeasureError> {
     length("a strip of stamps", pixels.len(), count * side * side)?;
     let rows = ArrayView3::from_shape((side, count, side), pixels);
-    let rows = rows.map_err(|error| shape_error(count, side, &error))?;
+    let rows = rows.map_err(|error| MeasureError::strip(count, side, &error))?;
     Ok(rows.permuted_axes([1, 0, 2]))
-}
-
-/// A strip that cannot be an array.
-pub(crate) fn shape_error(count: usize, side: usize, error: &ndarray::ShapeError) -> MeasureError {
-    MeasureError::Shape {
-        what: "a strip of stamps",
-        found: format!("{count} stamps of {side} × {side} pixels"),
-        expected: error.to_string(),
-    }
 }
 
 /// Checks the noise level that is given, or whether there must be one.

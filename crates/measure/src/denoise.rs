@@ -14,9 +14,8 @@
 //! level σ, and k = 1 for the Wiener filter. The smooth remainder is kept as it is.
 
 use multiversion::multiversion;
+use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::Wavelet;
-
-use shearq_quantities::statistics as robust;
 
 /// Filter for one stamp size; serial, allocates nothing per stamp.
 #[derive(Debug, Clone)]
@@ -249,11 +248,11 @@ pub fn border_noise(stamp: &[f32], n: usize, border: usize, buffer: &mut Vec<f32
     if 2 * buffer.len() < all {
         return None;
     }
-    let median = robust::median(buffer)?;
+    let middle = median(buffer)?;
     for value in buffer.iter_mut() {
-        *value = (*value - median).abs();
+        *value = (*value - middle).abs();
     }
-    Some(robust::median(buffer)? * robust::SCATTER)
+    Some(median(buffer)? * SCATTER)
 }
 
 #[cfg(test)]

@@ -77,6 +77,15 @@ impl MeasureError {
             expected: expected.into(),
         }
     }
+
+    /// A strip of `count` stamps of `side` pixels that cannot be an array.
+    pub(crate) fn strip(count: usize, side: usize, error: &ndarray::ShapeError) -> Self {
+        MeasureError::Shape {
+            what: "a strip of stamps",
+            found: format!("{count} stamps of {side} × {side} pixels"),
+            expected: error.to_string(),
+        }
+    }
 }
 
 /// Checks the number of values of a slice that should hold `expected` of them.

@@ -5,19 +5,19 @@
 //! the corners, where a galaxy has least light.
 
 use ndarray::ArrayView2;
+use shearq_quantities::statistics::{OF_MEDIAN, median, scatter};
 use shearq_submissions::PsfCut;
 
+use crate::brightness::{PEAKS, highest};
 use crate::error::MeasureError;
 use crate::extent::{Core, core_sums};
 use crate::pixel::Pixel;
 use crate::psf::Star;
 use crate::psf::examine::{self, PsfLook};
 use crate::psfs::Psfs;
-use crate::robust::{OF_MEDIAN, median, scatter};
 use crate::sky::{Cells, INNER, Subtraction, disc, inner};
 use crate::surroundings::centre;
 use crate::warning::Warning;
-use crate::worker::highest;
 
 /// Largest side of the corner blocks in which the sky is measured. See docs/constants.md.
 const BLOCK: usize = 8;
@@ -59,9 +59,7 @@ const LEAST_NOISE: f64 = 0.02;
 const DEPTHS: f64 = 0.1;
 /// Correlation at long distances above which a warning is due. See docs/constants.md.
 const LONG_CORRELATION: f64 = 0.03;
-/// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
-/// away from the smallest and largest numbers there are.
-pub(crate) const PEAKS: std::ops::RangeInclusive<f32> = 1e-18..=1e17;
+
 /// Which of `rows` rows of `columns` stamps are examined: enough for a thousand stamps, or all. They are spread
 /// evenly but not regularly, so that they do not miss what differs from row to row.
 pub fn examined_rows(columns: usize, rows: usize) -> Vec<usize> {

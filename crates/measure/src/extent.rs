@@ -5,6 +5,7 @@
 //! and of its PSF differ by about the galaxy's own, so that the difference compares images of any seeing.
 
 use ndarray::ArrayView2;
+use shearq_quantities::statistics::upper_median;
 
 use crate::denoise::frame;
 
@@ -166,8 +167,7 @@ impl Light {
         }
         let most = [0, 1].map(|k| {
             let mut moduli: Vec<f64> = self.stamps.iter().map(|sums| sums[k].abs()).collect();
-            let middle = moduli.len() / 2;
-            MOST * *moduli.select_nth_unstable_by(middle, f64::total_cmp).1
+            MOST * upper_median(&mut moduli).unwrap_or(f64::NAN)
         });
         let mut sums = [0.0; 2];
         for stamp in &self.stamps {

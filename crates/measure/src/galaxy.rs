@@ -9,6 +9,7 @@ use crate::denoise::WaveletWiener;
 use crate::error::MeasureError;
 use crate::method::MethodPlan;
 use crate::noise::{NoisePlan, Survey};
+use crate::plan::Plan;
 use crate::sky::Subtraction;
 use crate::worker::Worker;
 
@@ -17,23 +18,6 @@ use crate::worker::Worker;
 #[derive(Clone)]
 pub struct Measurer {
     plan: Arc<Plan>,
-}
-
-pub(crate) struct Plan {
-    pub(crate) configuration: Configuration,
-    pub(crate) full: usize,
-    pub(crate) n: usize,
-    pub(crate) denoise: Option<WaveletWiener>,
-    pub(crate) method: MethodPlan,
-    noise: Option<NoisePlan>,
-}
-
-impl Plan {
-    /// What is subtracted from stamps of an image with this survey.
-    pub(crate) fn subtraction(&self, survey: Option<&Survey>) -> Subtraction {
-        let sky = survey.and_then(|survey| survey.sky);
-        Subtraction::of(self.configuration.noise.sky(), sky)
-    }
 }
 
 impl fmt::Debug for Measurer {

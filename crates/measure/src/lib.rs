@@ -34,6 +34,7 @@
 //! [`Flags`] and no ellipticity.
 
 mod batch;
+mod brightness;
 mod calibrate;
 mod deconvolve;
 mod denoise;
@@ -51,9 +52,9 @@ mod noise;
 mod observables;
 pub mod parts;
 mod pixel;
+mod plan;
 mod psf;
 mod psfs;
-mod robust;
 mod selection;
 mod shape;
 mod sizes;

@@ -9,7 +9,6 @@ use ndarray::{
 use shearq_quantities::FunctionalPsf;
 use shearq_submissions::PsfCut;
 
-use crate::batch::shape_error;
 use crate::error::{MeasureError, length};
 use crate::psf::{Star, star};
 
@@ -97,7 +96,7 @@ impl<'a> Psfs<'a> {
     pub fn strip(pixels: Vec<f32>, count: usize, side: usize) -> Result<Self, MeasureError> {
         length("a strip of stamps", pixels.len(), count * side * side)?;
         let rows = Array3::from_shape_vec((side, count, side), pixels);
-        let rows = rows.map_err(|error| shape_error(count, side, &error))?;
+        let rows = rows.map_err(|error| MeasureError::strip(count, side, &error))?;
         Ok(Psfs::stars(rows.permuted_axes([1, 0, 2])))
     }
 

@@ -6,9 +6,9 @@
 //! galaxy. Powers of r have q = 0, exponentials q = 1 and Gaussians q = 2. All p and q that the profile allows bound the
 //! level; only what is beyond that bound is sky.
 
+use shearq_quantities::linear::cholesky;
+use shearq_quantities::statistics::{FROM_MODULI, OF_MEDIAN, median, scatter};
 use shearq_submissions::SkySource;
-
-use crate::robust::{FROM_MODULI, OF_MEDIAN, median, scatter};
 
 /// Radius within which a galaxy's light is summed. See docs/constants.md.
 pub(crate) const INNER: f64 = 8.0;
@@ -528,29 +528,17 @@ impl<const N: usize> Normal<N> {
         /// Least pivot, relative to the diagonal. See docs/constants.md.
         const LEAST_PIVOT: f64 = 1e-10;
         let scale: [f64; N] = std::array::from_fn(|k| 1.0 / self.matrix[k][k].sqrt());
-        let mut root = [[0.0; N]; N];
+        let mut matrix = [[0.0; N]; N];
         let mut out = [0.0; N];
         for i in 0..count {
             for j in 0..=i {
-                let known: f64 = (0..j).map(|k| root[i][k] * root[j][k]).sum();
-                let rest = self.matrix[i][j] * scale[i] * scale[j] - known;
-                if i == j {
-                    // NaN as well.
-                    if rest.is_nan() || rest <= LEAST_PIVOT {
-                        return None;
-                    }
-                    root[i][i] = rest.sqrt();
-                } else {
-                    root[i][j] = rest / root[j][j];
-                }
+                matrix[i][j] = self.matrix[i][j] * scale[i] * scale[j];
             }
-            let known: f64 = (0..i).map(|k| root[i][k] * out[k]).sum();
-            out[i] = (right[i] * scale[i] - known) / root[i][i];
+            out[i] = right[i] * scale[i];
         }
-        for i in (0..count).rev() {
-            let known: f64 = (i + 1..count).map(|k| root[k][i] * out[k]).sum();
-            out[i] = (out[i] - known) / root[i][i];
-        }
+        // NaN is not larger.
+        let large = |pivot: f64| (pivot > LEAST_PIVOT).then_some(pivot);
+        cholesky(&mut matrix, &mut out, count, large)?;
         for (value, scale) in out.iter_mut().zip(scale).take(count) {
             *value *= scale;
         }

@@ -12,6 +12,7 @@ use crate::sizes::check_psf;
 use crate::worker::PsfWorker;
 
 /// The steps of one measurement as images.
+#[derive(Clone)]
 pub struct Steps {
     /// The stamp as cut from the data, before any denoising.
     pub stamp: Array2<f64>,

@@ -6,7 +6,6 @@ use shearq_submissions::Configuration;
 
 use crate::flag::Flag;
 use crate::measurement::Measurement;
-use crate::psf::examine::effect_of_noise;
 
 /// Something in the data of an image that biases shears, or is likely a mistake.
 ///
@@ -199,6 +198,17 @@ impl fmt::Display for Of {
 /// Side of a PSF stamp below which a linear configuration loses too much of the wings. See
 /// docs/constants.md.
 const LEAST_PSF_SIZE: usize = 32;
+/// Scatter of m with a star's noise, times the star's S/N. See docs/constants.md.
+const M_PER_NOISE: f64 = 2.3;
+/// Scatter of c with a star's noise, times the star's S/N. See docs/constants.md.
+const C_PER_NOISE: f64 = 1.2;
+/// S/N of a star above which less and less of its noise is taken away, so that its effect stays. See docs/constants.md.
+const NOISE_STAYS: f64 = 500.0;
+
+/// How much the noise of one star for an image, of S/N `snr`, changes m and c: one standard deviation.
+fn effect_of_noise(snr: f64) -> [f64; 2] {
+    [M_PER_NOISE, C_PER_NOISE].map(|times| times / snr.clamp(1.0, NOISE_STAYS))
+}
 
 impl Warning {
     /// A warning if the configuration uses too little of the PSF.

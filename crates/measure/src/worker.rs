@@ -3,33 +3,26 @@
 //! The types fix the order. A [`Worker`] becomes an [`ImageWorker`] for an image, whose noise is known. That becomes a
 //! [`PsfWorker`] for a PSF, and only this measures galaxies.
 
+use std::fmt;
 use std::sync::Arc;
 
 use ndarray::{ArrayView2, ArrayView3, Axis};
 use shearq_submissions::{Configuration, Method, NoiseSource};
 
+use crate::brightness::{PEAKS, highest, is_level};
 use crate::denoise::{DenoiseScratch, border_noise};
 use crate::ellipticity::{observables, report};
 use crate::error::{MeasureError, length};
-use crate::examine::PEAKS;
 use crate::flag::{Flag, Flags};
-use crate::galaxy::Plan;
 use crate::measurement::Measurement;
 use crate::method::{AdaptedSettings, CutWorker};
 use crate::noise::{StampNoise, Survey};
 use crate::pixel::Pixel;
+use crate::plan::Plan;
 use crate::psf::cut_start;
 use crate::psfs::Psfs;
 use crate::sky::{Cells, Subtraction};
 use crate::surroundings::Missing;
-
-/// Noise levels other than zero, in image units, whose squares keep single precision beside those of [`PEAKS`].
-const LEVELS: std::ops::RangeInclusive<f64> = 1e-30..=1e18;
-
-/// Whether a noise level can be used.
-pub(crate) fn is_level(sigma: f64) -> bool {
-    sigma == 0.0 || LEVELS.contains(&sigma)
-}
 
 /// What is known about the noise of an image.
 #[derive(Debug, Clone, Copy, Default)]
@@ -87,15 +80,28 @@ pub struct Worker {
 }
 
 /// A worker for the galaxies of one image.
+#[derive(Debug)]
 pub struct ImageWorker<'a> {
     worker: &'a mut Worker,
     level: f64,
 }
 
 /// A worker for galaxies of one image and one PSF.
+#[derive(Debug)]
 pub struct PsfWorker<'a> {
     pub(crate) worker: &'a mut Worker,
     level: f64,
+}
+
+impl fmt::Debug for Worker {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Worker")
+            .field("configuration", &self.plan.configuration.name)
+            .field("full", &self.plan.full)
+            .field("subtraction", &self.subtraction)
+            .field("survey", &self.survey)
+            .finish_non_exhaustive()
+    }
 }
 
 impl Worker {
@@ -380,19 +386,4 @@ fn convert<'a, T: Pixel + 'a>(row: &mut [f32], from: impl Iterator<Item = &'a T>
     for (value, pixel) in row.iter_mut().zip(from) {
         *value = pixel.to_f32();
     }
-}
-
-/// The largest pixel, or zero if none is positive. 16 running maxima let vector instructions take several at a time.
-pub(crate) fn highest(pixels: &[f32]) -> f32 {
-    /// Numbers that are compared side by side. See docs/constants.md.
-    const LANES: usize = 16;
-    let mut lanes = [0.0f32; LANES];
-    let chunks = pixels.chunks_exact(LANES);
-    let rest = chunks.remainder().iter().copied().fold(0.0, f32::max);
-    for chunk in chunks {
-        for (lane, value) in lanes.iter_mut().zip(chunk) {
-            *lane = lane.max(*value);
-        }
-    }
-    lanes.into_iter().fold(rest, f32::max)
 }

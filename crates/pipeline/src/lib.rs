@@ -2,7 +2,6 @@
 //!
 //! Only [`engine`] starts threads. The code below it is serial and uses scratch of the caller. Results come back in
 //! order, so they do not depend on the number of threads.
-#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 pub mod complete;

@@ -92,16 +92,24 @@ pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileErro
 /// # Errors
 /// If the file cannot be written.
 pub fn write_truth(path: &Path, grid: &Grid, truth: &TrueShear) -> Result<(), FileError> {
+    // A comment has one field, and no quotes.
+    let mut text = csv::WriterBuilder::new()
+        .flexible(true)
+        .quote_style(csv::QuoteStyle::Never)
+        .from_writer(Vec::new());
+    // Writing to memory cannot fail.
+    let _ = text.write_record(["x", "y", "g1", "g2"]);
     // The comment follows the header, so that readers that skip one line or a `#` read the columns.
-    let mut text = format!("x,y,g1,g2\n# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)\n");
+    let sign = format!("# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)");
+    let _ = text.write_record([sign]);
     for iy in 0..grid.n {
         for ix in 0..grid.n {
             let (x, y) = grid.centre(ix, iy);
             let (g1, g2) = (truth.g1[(ix, iy)], truth.g2[(ix, iy)]);
-            text.push_str(&format!("{x},{y},{g1},{g2}\n"));
+            let _ = text.write_record([x, y, g1, g2].map(|number| number.to_string()));
         }
     }
-    atomic::write(path, text.as_bytes())
+    atomic::write(path, &text.into_inner().unwrap_or_default())
 }
 
 /// How the truth of a set of a data folder is to be read.

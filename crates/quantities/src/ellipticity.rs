@@ -9,10 +9,12 @@
 //!
 //! Component 1 is positive along +x, component 2 is positive along the diagonal x = y.
 
+#[cfg(feature = "serde")]
 use serde::{Deserialize, Serialize};
 
 /// Shear-type ellipticity ε = (1 − q)/(1 + q) · e^{2iφ}; also a reduced shear g.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
 pub struct Shear {
     /// Positive for elongation along +x.
     pub e1: f64,
@@ -21,7 +23,8 @@ pub struct Shear {
 }
 
 /// Distortion χ = (1 − q²)/(1 + q²) · e^{2iφ}.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
 pub struct Distortion {
     /// Positive for elongation along +x.
     pub e1: f64,

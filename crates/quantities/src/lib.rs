@@ -4,16 +4,17 @@
 //! * [`units`]: degrees, radians, pixels and multipoles.
 //! * [`FunctionalPsf`]: a Moffat or Kolmogorov PSF, integrated over pixels, with its transform.
 //! * [`radial`]: tables of radial profiles, elliptical radii and quadrature rules.
+//! * [`linear`]: the solvers of linear equations.
 //! * [`statistics`]: running means and medians.
 //!
 //! # Conventions
 //!
 //! Positions are in pixels, x along columns and y along rows; arrays are indexed `[y, x]`. e1 > 0 is elongation along
 //! +x, e2 > 0 along x = y. Wavenumbers are in radians per pixel. A transform is F(k) = ∫ I(x) e^(−ik·x) d²x.
-#![warn(missing_debug_implementations)]
 #![cfg_attr(not(test), forbid(unsafe_code))] // ndarray's slicing in tests allows it
 
 mod ellipticity;
+pub mod linear;
 mod psf;
 pub mod radial;
 pub mod statistics;
@@ -21,3 +22,8 @@ pub mod units;
 
 pub use ellipticity::{Distortion, Shear};
 pub use psf::{FunctionalPsf, ProfileError, PsfProfile, PsfTransform, TransformedPsf};
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -39,17 +39,58 @@ impl RunningMean {
     }
 }
 
-/// Scatter of Gaussian numbers in units of the median of their moduli.
-pub const SCATTER: f32 = 1.482_602_2;
+/// Standard deviation of Gaussian numbers in units of the median of their moduli: 1/Φ⁻¹(3/4).
+pub const FROM_MODULI: f64 = 1.482_602_2;
+/// [`FROM_MODULI`] in single precision.
+pub const SCATTER: f32 = FROM_MODULI as f32;
+/// Standard error of a median in units of the standard error of the mean: √(π/2).
+pub const OF_MEDIAN: f64 = 1.253_314;
+
+/// `f32` or `f64`.
+pub trait Number: Copy + private::Sealed {}
+
+impl Number for f32 {}
+impl Number for f64 {}
+
+mod private {
+    use std::cmp::Ordering;
+
+    pub trait Sealed {
+        fn compare(&self, other: &Self) -> Ordering;
+    }
+
+    impl Sealed for f32 {
+        fn compare(&self, other: &Self) -> Ordering {
+            self.total_cmp(other)
+        }
+    }
+
+    impl Sealed for f64 {
+        fn compare(&self, other: &Self) -> Ordering {
+            self.total_cmp(other)
+        }
+    }
+}
 
 /// The lower median of finite values; reorders them. `None` of none.
-pub fn median(values: &mut [f32]) -> Option<f32> {
-    if values.is_empty() {
-        return None;
-    }
-    let middle = (values.len() - 1) / 2;
-    let (_, median, _) = values.select_nth_unstable_by(middle, f32::total_cmp);
-    Some(*median)
+pub fn median<T: Number>(values: &mut [T]) -> Option<T> {
+    let middle = values.len().checked_sub(1)? / 2;
+    Some(*values.select_nth_unstable_by(middle, T::compare).1)
+}
+
+/// The upper median of finite values; reorders them. `None` of none.
+pub fn upper_median<T: Number>(values: &mut [T]) -> Option<T> {
+    let middle = values.len() / 2;
+    let middle = (middle < values.len()).then_some(middle)?;
+    Some(*values.select_nth_unstable_by(middle, T::compare).1)
+}
+
+/// The lower median of finite values, and the standard deviation that follows from the median of the moduli of their
+/// differences from it; reorders the values. `None` of none.
+pub fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
+    let middle = median(values)?;
+    let mut moduli: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
+    Some((middle, FROM_MODULI * median(&mut moduli)?))
 }
 
 #[cfg(test)]
@@ -65,5 +106,24 @@ mod tests {
         }
         assert_eq!((running.count(), running.mean()), (3, 1e9 + 3.0));
         assert_eq!(running.deviation(), 7.0f64.sqrt());
+    }
+
+    #[test]
+    fn medians_are_lower_ones_in_either_precision() {
+        assert_eq!(median(&mut [3.0f32, 1.0, 2.0, 4.0]), Some(2.0));
+        assert_eq!(median(&mut [-3.0f64, 1.0, -2.0]), Some(-2.0));
+        assert_eq!(median::<f64>(&mut []), None);
+        assert_eq!(upper_median(&mut [3.0f32, 1.0, 2.0, 4.0]), Some(3.0));
+        assert_eq!(upper_median(&mut [-3.0f64, 1.0, -2.0]), Some(-2.0));
+        assert_eq!(upper_median::<f64>(&mut []), None);
+        assert_eq!(SCATTER, 1.482_602_2f32);
+    }
+
+    #[test]
+    fn the_scatter_is_that_of_gaussian_numbers_about_their_median() {
+        // Moduli 0, 1, 1, 2, 95, of which 1 is the median.
+        let found = scatter(&mut [5.0, 4.0, 6.0, 7.0, 100.0]);
+        assert_eq!(found, Some((6.0, FROM_MODULI)));
+        assert_eq!(scatter(&mut []), None);
     }
 }

@@ -4,7 +4,6 @@
 //! * [`figure`]: line plots, bars, heat maps and images, as SVG and PNG.
 //! * [`html`], [`page`]: pages that need no other file.
 //! * [`escape`]: text of unknown origin, made safe for each format.
-#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 pub mod escape;
@@ -15,3 +14,8 @@ pub mod html;
 pub mod page;
 pub mod table;
 pub mod terminal;
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

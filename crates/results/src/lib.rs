@@ -9,7 +9,6 @@
 //! * [`baseline`] compares metrics with stored metrics.
 //! * [`submit`] packs and checks a submission to a challenge.
 //! * [`views`] makes tables, plots and pages.
-#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 pub mod baseline;

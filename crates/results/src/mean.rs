@@ -165,9 +165,7 @@ impl Rows {
 
     /// The rows with the weights of a selection.
     fn selected(path: &Path, selection: &Selection) -> Result<Self, FileError> {
-        let read = table::read(path, None, table::MAX_ROWS)?;
-        let weighted = Weighted::of_table(path, selection, &read)?;
-        let flags = table::numbers(&read, "flags", path)?.into_owned();
+        let (weighted, flags) = Weighted::read(path, selection)?;
         let mean = weighted.mean_response();
         let Weighted {
             mut e,

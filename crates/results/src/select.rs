@@ -4,6 +4,7 @@ use std::path::Path;
 
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
+use shearq_files::table::Place;
 use shearq_files::{FileError, atomic, table};
 use shearq_measure::{Observables, Selection};
 use shearq_pipeline::PipelineError;
@@ -126,6 +127,20 @@ pub fn write_selected(
     Ok((kept, good))
 }
 
+/// Checks that a catalogue with columns of these names has what a selection requires.
+fn require_responses<'a>(
+    path: &Path,
+    mut names: impl Iterator<Item = &'a str>,
+) -> Result<(), FileError> {
+    if names.any(|name| name == Observables::COLUMNS[2]) {
+        return Ok(());
+    }
+    Err(FileError::new(
+        path,
+        "the catalogue has no responses of flux and size, so a selection cannot be corrected (expected a catalogue of a linear configuration such as 48/linear/star)",
+    ))
+}
+
 /// Rows of a catalogue after a selection.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
@@ -203,17 +218,23 @@ impl Weighted {
         selection: &Selection,
         read: &DataFrame,
     ) -> Result<Self, FileError> {
-        let known = read
-            .get_column_names()
-            .iter()
-            .any(|own| own.as_str() == Observables::COLUMNS[2]);
-        if !known {
-            return Err(FileError::new(
-                path,
-                "the catalogue has no responses of flux and size, so a selection cannot be corrected (expected a catalogue of a linear configuration such as 48/linear/star)",
-            ));
-        }
+        let names = read.get_column_names();
+        require_responses(path, names.iter().map(|name| name.as_str()))?;
         Weighted::of(path, selection, |name| table::numbers(read, name, path))
+    }
+
+    /// The same for the columns of a file that a selection needs, with the flags of its rows.
+    ///
+    /// # Errors
+    /// If the file cannot be read, or as [`Weighted::of`].
+    pub fn read(path: &Path, selection: &Selection) -> Result<(Self, Vec<f64>), FileError> {
+        let present = table::columns(&Place::of(path))?;
+        let names = present.named.iter().flat_map(|named| &named.names);
+        require_responses(path, names.map(String::as_str))?;
+        let wanted: Vec<&str> = READ.iter().chain(&Observables::COLUMNS).copied().collect();
+        let read = table::read(path, Some(&wanted), table::MAX_ROWS)?;
+        let flags = table::numbers(&read, "flags", path)?.into_owned();
+        Ok((Weighted::of_table(path, selection, &read)?, flags))
     }
 
     /// The catalogue `read` with weighted and calibrated ellipticities.

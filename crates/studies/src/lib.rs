@@ -1,6 +1,5 @@
 //! Studies on simulated data: calibration of λ (Sect. 4 of the paper), seven configurations on 24 sets (Sect. 5),
 //! configurations compared with each other and with the Cramér–Rao bound, convergence, speed.
-#![warn(missing_debug_implementations)]
 #![forbid(unsafe_code)]
 
 pub mod bias;

@@ -300,7 +300,7 @@ struct Description {
 }
 
 /// A table of a file.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct TableHead {
     /// Number of its extension, from 1.
     pub number: usize,

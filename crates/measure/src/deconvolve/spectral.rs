@@ -63,7 +63,7 @@ const LIT: f64 = 0.02;
 const REACH: f64 = 2.5;
 
 /// The linear network for one stamp size.
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 pub struct Spectral {
     n: usize,
     p: usize,

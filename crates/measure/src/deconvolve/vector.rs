@@ -77,7 +77,7 @@ pub trait Vector<T>: Lanes<T> {
 }
 
 /// `N` numbers in the hands of the compiler.
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy)]
 pub struct Portable<T, const N: usize, const FMA: bool>([T; N]);
 
 impl<T: Real, const N: usize, const FMA: bool> Portable<T, N, FMA> {
@@ -190,7 +190,7 @@ mod x86 {
     use super::{Lanes, Vector};
 
     /// Sixteen f32 of AVX-512.
-    #[derive(Clone, Copy)]
+    #[derive(Debug, Clone, Copy)]
     pub struct Sixteen(__m512);
 
     // SAFETY of the unsafe blocks below: the module's `Level` uses this type only in a function

@@ -6,12 +6,11 @@
 //! counts as a background. Noise is measured by second differences along the border, where wings are smooth.
 
 use ndarray::ArrayView2;
+use shearq_quantities::statistics::{SCATTER, median, upper_median};
 
-use super::shrink::AS_IT_IS;
 use super::{breadth, star};
 use crate::extent::{Core, core_of_psf};
 use crate::warning::{Of, Warning};
-use shearq_quantities::statistics::{SCATTER, median};
 
 /// Width of the PSF stamp's border. See docs/constants.md.
 const BORDER: usize = 2;
@@ -31,10 +30,6 @@ const GRADIENT: f64 = 0.3;
 const ENOUGH_SNR: f64 = 1000.0;
 /// The same limit for a star per galaxy, whose noise averages out. See docs/constants.md.
 const ENOUGH_SNR_EACH: f64 = 100.0;
-/// Scatter of m with a star's noise, times the star's S/N. See docs/constants.md.
-const M_PER_NOISE: f64 = 2.3;
-/// Scatter of c with a star's noise, times the star's S/N. See docs/constants.md.
-const C_PER_NOISE: f64 = 1.2;
 /// Noise-equivalent area of the narrowest PSF that pixels can show. See docs/constants.md.
 const LEAST_AREA: f64 = 6.0;
 /// Mean square of the PSF's core in units of the galaxies', above which a warning is due. See
@@ -44,12 +39,6 @@ const AS_BROAD: f64 = 0.83;
 const BROADER: f64 = 1.02;
 /// Share of the PSFs of an image that a warning requires. See docs/constants.md.
 const MANY: f64 = 0.1;
-
-/// How much the noise of one star for an image, of S/N `snr`, changes m and c: one standard deviation. The closer its S/N
-/// is to 1000, the less of its noise is taken away, so that the effect is nearly the same from 500 on.
-pub(crate) fn effect_of_noise(snr: f64) -> [f64; 2] {
-    [M_PER_NOISE, C_PER_NOISE].map(|times| times / snr.clamp(1.0, AS_IT_IS[0]))
-}
 
 /// What one PSF shows.
 #[derive(Debug, Clone, Copy)]
@@ -198,8 +187,7 @@ pub(crate) fn warnings(looks: &[PsfLook], shared: bool, galaxies: Option<Core>) 
     };
     let middle = |those: &[PsfLook], of: &dyn Fn(&PsfLook) -> f64| {
         let mut all: Vec<f64> = those.iter().map(of).collect();
-        all.sort_by(f64::total_cmp);
-        all[all.len() / 2]
+        upper_median(&mut all).unwrap_or(f64::NAN)
     };
     with(&|look| look.moved.is_some(), &|those, of| {
         let off = |k: usize| middle(those, &|look| look.moved.map_or(0.0, |moved| moved[k]));

@@ -5,6 +5,7 @@
 
 use multiversion::multiversion;
 use ndarray::{ArrayView2, ArrayViewMut2};
+use shearq_quantities::linear::cholesky;
 
 /// Parameters: amplitude, place, width, the two ellipticities and κ.
 pub(super) const PARAMETERS: usize = 8;
@@ -286,30 +287,12 @@ fn core(base: f32, inverse: f32) -> (f32, f32) {
 
 /// The step that lowers the sum of squares, by Cholesky's decomposition.
 fn solve(sums: &Sums, damping: f64) -> Option<[f64; PARAMETERS]> {
-    let mut root = [[0.0; PARAMETERS]; PARAMETERS];
-    for i in 0..PARAMETERS {
-        for j in 0..=i {
-            let more = if i == j { 1.0 + damping } else { 1.0 };
-            let known: f64 = (0..j).map(|k| root[i][k] * root[j][k]).sum();
-            let rest = more * sums.curvature[i][j] - known;
-            if i == j {
-                if !(rest > 0.0 && rest.is_finite()) {
-                    return None;
-                }
-                root[i][i] = rest.sqrt();
-            } else {
-                root[i][j] = rest / root[j][j];
-            }
-        }
+    let mut curvature = sums.curvature;
+    for (i, row) in curvature.iter_mut().enumerate() {
+        row[i] *= 1.0 + damping;
     }
     let mut step = sums.gradient;
-    for i in 0..PARAMETERS {
-        let known: f64 = (0..i).map(|k| root[i][k] * step[k]).sum();
-        step[i] = (step[i] - known) / root[i][i];
-    }
-    for i in (0..PARAMETERS).rev() {
-        let known: f64 = (i + 1..PARAMETERS).map(|k| root[k][i] * step[k]).sum();
-        step[i] = (step[i] - known) / root[i][i];
-    }
+    let positive = |pivot: f64| (pivot > 0.0 && pivot.is_finite()).then_some(pivot);
+    cholesky(&mut curvature, &mut step, PARAMETERS, positive)?;
     Some(step)
 }

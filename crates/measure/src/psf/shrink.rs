@@ -12,7 +12,7 @@ use super::star;
 use shearq_quantities::statistics::{SCATTER, median};
 
 /// S/N between which a star is used more and more as it is. See docs/constants.md.
-pub(super) const AS_IT_IS: [f64; 2] = [500.0, 1000.0];
+const AS_IT_IS: [f64; 2] = [500.0, 1000.0];
 /// Highest order of the functions for the difference between a star and its profile. See docs/constants.md.
 const ORDER: usize = 12;
 /// Highest order of those functions that are not round. See docs/constants.md.

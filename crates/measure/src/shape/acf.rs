@@ -10,6 +10,7 @@ use crate::fft::{FftScratch, StampFft};
 ///
 /// Lags are kept for dy = 0…n−1 and dx = −(n−1)…n−1; the other half follows from
 /// A(−dx, −dy) = A(dx, dy).
+#[derive(Debug, Clone)]
 pub struct Autocorrelation {
     n: usize,
     /// At least 2n − 1 a side, so that no lag wraps onto another.

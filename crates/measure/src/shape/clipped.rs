@@ -11,6 +11,7 @@ use crate::flag::Flag;
 const BORDER: usize = 3;
 
 /// Autocorrelation, background and moments of n×n stamps. Allocates nothing per stamp.
+#[derive(Debug, Clone)]
 pub struct ClippedAcf {
     n: usize,
     background: Background,

@@ -5,6 +5,8 @@
 //! concentric Gaussians, whose amplitudes follow by least squares. It is taken from the whole stamp: a neighbour's wings
 //! reach the galaxy's own side, where a fit or a copy of the opposite side alone would leave them.
 
+use shearq_quantities::linear::cholesky;
+
 use super::contrast::opposite;
 
 /// σ of the Gaussians of a neighbour's profile, from a PSF's core to a large galaxy's wings. See
@@ -283,23 +285,12 @@ fn add<const N: usize>(
 
 /// Solution of normal equations, of which the lower triangle is given, by Cholesky's decomposition.
 pub(super) fn solved<const N: usize>(mut matrix: [[f64; N]; N], mut right: [f64; N]) -> [f64; N] {
-    for i in 0..N {
-        for j in 0..=i {
-            let known: f64 = (0..j).map(|k| matrix[i][k] * matrix[j][k]).sum();
-            matrix[i][j] = if i == j {
-                let left = matrix[i][i] * (1.0 + RIDGE) - known;
-                left.max(f64::MIN_POSITIVE).sqrt()
-            } else {
-                (matrix[i][j] - known) / matrix[j][j]
-            };
-        }
-        let known: f64 = (0..i).map(|k| matrix[i][k] * right[k]).sum();
-        right[i] = (right[i] - known) / matrix[i][i];
+    for (i, row) in matrix.iter_mut().enumerate() {
+        row[i] *= 1.0 + RIDGE;
     }
-    for i in (0..N).rev() {
-        let known: f64 = (i + 1..N).map(|k| matrix[k][i] * right[k]).sum();
-        right[i] = (right[i] - known) / matrix[i][i];
-    }
+    let positive = |pivot: f64| Some(pivot.max(f64::MIN_POSITIVE));
+    // No pivot is refused.
+    let _ = cholesky(&mut matrix, &mut right, N, positive);
     right
 }
 

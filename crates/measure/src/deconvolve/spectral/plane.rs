@@ -34,6 +34,16 @@ pub(super) struct Plane {
     fine: Plan32,
 }
 
+impl std::fmt::Debug for Plane {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Plane")
+            .field("size", &self.size)
+            .field("side", &self.side)
+            .field("modes", &self.modes)
+            .finish_non_exhaustive()
+    }
+}
+
 /// Buffers for one thread. Their content between calls does not matter.
 #[derive(Debug, Clone)]
 pub(super) struct PlaneScratch {
