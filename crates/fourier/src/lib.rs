@@ -201,3 +201,8 @@ mod tests {
         }
     }
 }
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

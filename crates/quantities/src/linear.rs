@@ -1,14 +1,13 @@
-//! Linear equations: one solver for symmetric positive matrices, one for any matrix.
+//! Linear equations: Cholesky's decomposition for symmetric positive matrices, Gauss's elimination for all matrices.
 //!
-//! Both work in place. The order of their operations is fixed, so that results are the same bits everywhere.
+//! Both work in place. The order of their operations is fixed, so that equal equations give equal bits.
 
 /// Solves the first `count` of N equations with a symmetric positive matrix by Cholesky's decomposition.
 ///
-/// The lower triangle of `matrix` is read and replaced by that of its root; the upper one is not used. The solution
-/// replaces `right`.
+/// Only the lower triangle of `matrix` is used. The root replaces it, and the solution replaces `right`.
 ///
-/// `pivot` is called with the square of each diagonal element of the root and returns the square to use. If it returns
-/// `None`, the equations are not soluble, and neither is the result.
+/// `pivot` receives the square of each diagonal element of the root and returns the square to use. If it returns `None`,
+/// the equations are not soluble: the result is `None`, and `matrix` and `right` are of no use.
 #[inline]
 pub fn cholesky<const N: usize>(
     matrix: &mut [[f64; N]; N],
@@ -36,17 +35,19 @@ pub fn cholesky<const N: usize>(
     Some(())
 }
 
-/// Which equation of those left eliminates the next unknown.
+/// The equation that eliminates the next unknown, among the equations that are left.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pivots {
-    /// The one with the largest coefficient: for any matrix.
+    /// The equation with the largest coefficient of this unknown: for any matrix.
     Largest,
-    /// The next one: for symmetric matrices, whose pivots are then the weights of the unknowns after those before them.
+    /// The next equation: for symmetric matrices. The last pivot is then the inverse variance of the last unknown.
     InOrder,
 }
 
-/// Eliminates unknown after unknown (Gauss). `rows` are n equations of n coefficients and the right-hand side; they become
-/// triangular. Whether no pivot is smaller than `least`: otherwise the equations are not soluble, and the rest is as it was.
+/// Eliminates one unknown after the other (Gauss), so that the equations become triangular. `rows` are n equations: n
+/// coefficients, then the right-hand side. Further numbers in a row are not used.
+///
+/// Returns whether the equations are soluble. They are not if the modulus of a pivot is smaller than `least`.
 pub fn eliminate<R: AsRef<[f64]> + AsMut<[f64]>>(
     rows: &mut [R],
     pivots: Pivots,

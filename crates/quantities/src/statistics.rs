@@ -85,8 +85,8 @@ pub fn upper_median<T: Number>(values: &mut [T]) -> Option<T> {
     Some(*values.select_nth_unstable_by(middle, T::compare).1)
 }
 
-/// The lower median of finite values, and the standard deviation that follows from the median of the moduli of their
-/// differences from it; reorders the values. `None` of none.
+/// The lower median of finite values and their standard deviation, from the median of their distances to it. Reorders the
+/// values. `None` of none.
 pub fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
     let middle = median(values)?;
     let mut moduli: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();

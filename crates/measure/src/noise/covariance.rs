@@ -6,8 +6,8 @@ use shearq_quantities::linear::{Pivots, eliminate, substitute};
 use super::blocks::{BLOCK, PIXELS, POLYNOMIALS, take_out};
 use super::stamp_noise::StampNoise;
 
-/// The noise behind mean products of `count` blocks, one per lag up to `reach`, with the matrix M of these lags; `None` if
-/// there is none of a positive variance.
+/// The noise that explains the mean products of `count` blocks, one product per lag up to `reach`. M is the `matrix` of
+/// these lags. `None` if the variance is not positive.
 pub(super) fn noise_of(
     matrix: &Array2<f64>,
     reach: usize,
