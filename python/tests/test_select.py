@@ -43,6 +43,25 @@ def test_the_command_line_finds_the_same_shear(galaxies, command, tmp_path):
     assert (mean.galaxies, mean.g1, mean.g2) == (row["galaxies"], pytest.approx(row["g1"], rel=1e-9), pytest.approx(row["g2"], rel=1e-9))
 
 
+def test_bias_selects_as_the_command_line_does(command, tmp_path):
+    shear = ("--constant-shear", "0.02,0.02", "--opposite")
+    size = ("--sets", "2", "--images", "1", "--grid", "16", "--seed", "5")
+    command("simulate", *size, *shear, "--out", tmp_path / "data")
+    folders = []
+    for sign in "+-":
+        data, out = tmp_path / "data" / f"g1_{sign}0.02_g2_{sign}0.02", tmp_path / f"out{sign}"
+        command("measure", "--submission", "48/linear/star", "--data", data, "--out", out)
+        folders.append(out)
+    where = "snr > 12, size > 2"
+    row = json.loads(command("bias", *folders, "--where", where, "--format", "json"))["rows"][0]
+    found = shearq.bias(folders, where=where)
+    assert (found["m1"], found["m2"]) == (pytest.approx(row["m1"], rel=1e-9), pytest.approx(row["m2"], rel=1e-9))
+    # What was measured changes with shear: another m, and a note that says why.
+    other = shearq.bias(folders, select="snr > 12 and size > 2")
+    assert other["m1"] < found["m1"] - 0.05
+    assert any("effect of shear on a choice" in note for note in other.notes)
+
+
 @pytest.mark.parametrize(
     ("options", "reason"),
     [

@@ -18,7 +18,7 @@ use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, su
 use shearq_results::expression::Expression;
 use shearq_results::select::selection;
 use shearq_results::views::bias::{
-    Limit, bias_plot, bias_table, check, compared_table, junit, section,
+    Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, junit, section,
 };
 use shearq_submissions::EllipticityType;
 
@@ -233,6 +233,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         result => result?,
     };
+    if let Some(chosen) = chosen_by_measurement(&result) {
+        tell(format_args!("warning: {chosen}"));
+    }
     if !arguments.against.is_empty() {
         let other = of_catalogues(arguments, &arguments.against)?;
         let difference = summed.difference(&other)?;
@@ -349,13 +352,7 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         step: arguments.step,
     };
     let own = |number: usize| Shard::holding(number, shard.of()) == shard;
-    let summed = sum(&request, &own)?;
-    if let Some(column) = summed.measured_selection().first() {
-        tell(format_args!(
-            "warning: m contains the effect of shear on a choice by `{column}`, which was measured on the galaxies. Try: --where for cuts by snr, flux or size"
-        ));
-    }
-    Ok(summed)
+    Ok(sum(&request, &own)?)
 }
 
 /// Merges files of sums.

@@ -171,6 +171,9 @@ pub struct BiasResult {
     pub catalogues: Vec<Catalogue>,
     /// The program that wrote them.
     pub program: String,
+    /// Columns of `--select` or `--bins` that were measured on the galaxies of shearq's catalogues: m contains how shear
+    /// changes this choice.
+    pub measured: Vec<String>,
 }
 
 impl BiasResult {
@@ -474,12 +477,6 @@ impl Summed {
         Ok(())
     }
 
-    /// Columns of `--select` or `--bins` that were measured on the galaxies of shearq's catalogues: m contains how shear
-    /// changes this selection.
-    pub fn measured_selection(&self) -> &[String] {
-        &self.measured
-    }
-
     /// The estimates.
     ///
     /// # Errors
@@ -513,6 +510,7 @@ impl Summed {
             misaligned,
             catalogues: self.catalogues.clone(),
             program: self.program.clone(),
+            measured: self.measured.clone(),
         })
     }
 
@@ -573,6 +571,7 @@ impl Summed {
             misaligned: own.grouping.misaligned || theirs.grouping.misaligned,
             catalogues: self.catalogues.clone(),
             program: format!("{} minus {}", self.program, other.program),
+            measured: Vec::new(),
         })
     }
 

@@ -135,6 +135,14 @@ fn label(result: &BiasResult, [low, high]: [f64; 2]) -> String {
     }
 }
 
+/// A warning if galaxies were selected or binned by what was measured on them.
+pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
+    let column = result.measured.first()?;
+    Some(format!(
+        "m contains the effect of shear on a choice by `{column}`, which was measured on the galaxies. Try: --where for cuts by snr, flux or size"
+    ))
+}
+
 /// Design, units, rows that do not count, and verdicts.
 fn notes(result: &BiasResult) -> Vec<String> {
     let Ok(all) = result.all() else {
@@ -172,6 +180,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
             notes.push(format!("Left out: {count} rows {what}."));
         }
     }
+    notes.extend(chosen_by_measurement(result));
     for (k, assumes) in (1..).zip(all.assumes_no_c) {
         if assumes {
             notes.push(format!(
