@@ -187,10 +187,10 @@ def test_damaged_files_raise_and_print_nothing(two, tmp_path, capfd):
     two[0].write(path)
     whole = path.read_bytes()
     raised = 0
-    # Every 7th byte of the first page and of the footer.
-    for at in [*range(4, 400, 7), *range(len(whole) - 2000, len(whole) - 8, 7)]:
+    # The header of the first page, where some bytes make polars panic, and every 7th byte of the footer.
+    for at in [*range(4, 100), *range(len(whole) - 2000, len(whole) - 8, 7)]:
         damaged = bytearray(whole)
-        damaged[at] ^= 0xFF
+        damaged[at] ^= 0x7F
         path.write_bytes(damaged)
         try:
             shearq.read(path)

@@ -275,6 +275,7 @@ impl Lister {
 fn kept(attributes: &mut Vec<Attribute>) {
     attributes.retain(|attribute| {
         [
+            "cfg_attr",
             "derive",
             "non_exhaustive",
             "must_use",
