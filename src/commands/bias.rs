@@ -80,11 +80,11 @@ pub(crate) struct Arguments {
     #[arg(
         long = "where",
         value_name = "CONDITIONS",
-        conflicts_with_all = ["merge", "against", "ellipticity"]
+        conflicts_with_all = ["merge", "against", "ellipticity", "step"]
     )]
     cuts: Option<String>,
     /// Weight of each galaxy, a smooth formula of `snr`, `flux` and `size`, such as `snr^2 / (snr^2 + 50)`.
-    #[arg(long, value_name = "FORMULA", conflicts_with_all = ["merge", "against", "ellipticity"])]
+    #[arg(long, value_name = "FORMULA", conflicts_with_all = ["merge", "against", "ellipticity", "step"])]
     weight: Option<String>,
     /// How catalogues belong together [default: recognised from the true shears].
     #[arg(long, value_enum, conflicts_with = "merge")]

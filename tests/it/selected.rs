@@ -66,7 +66,7 @@ fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
     let data = at("data");
     let shears = ["--constant-shear", "0.02,0.02", "--opposite"];
     let size = [
-        "--sets", "2", "--images", "1", "--grid", "20", "--seed", "5",
+        "--sets", "2", "--images", "1", "--grid", "40", "--seed", "5",
     ];
     let simulated = [&["simulate", "--out", text(&data)], &size[..], &shears].concat();
     succeed(&simulated);
@@ -101,7 +101,8 @@ fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
     }
     let (filtered, warned) = m(&measured, &["--select", "size > 2 and snr > 15"]);
     assert!(warned.contains("Try: --where"), "{warned}");
-    assert!(filtered[0] < -0.1, "{filtered:?}");
+    // A cut in size removes sheared galaxies; m of 3200 galaxies without shape noise has an error of 0.03.
+    assert!(filtered[0] + filtered[1] < -0.2, "{filtered:?}");
     let path = at("chosen+").join("set02/catalogue-001.parquet");
     let given = ["bias", text(&path), "--g1", "0.02", "--g2", "0.02"];
     let refused = fail(&[&given[..], &cut].concat());

@@ -134,7 +134,7 @@ pub struct Summed {
     /// Text of the binned expression.
     binned: String,
     edges: Vec<f64>,
-    /// Measured columns by which rows were selected or binned.
+    /// Measured columns in `--select` or `--bins`.
     measured: Vec<String>,
 }
 
