@@ -142,7 +142,7 @@ pub(crate) fn bias_sums(
     flip_g2: bool,
     bins: Option<(String, Option<usize>, Vec<f64>)>,
     select: Option<&str>,
-    selection: [Option<&str>; 2],
+    selection: [Option<String>; 2],
     design: Option<&str>,
     units: Option<String>,
     drop_missing: bool,
@@ -212,8 +212,11 @@ pub(crate) fn bias_sums(
             .map(Expression::parse)
             .transpose()
             .map_err(value("select"))?,
-        selection: shearq_results::select::selection(selection[0], selection[1])
-            .map_err(|fault| PyValueError::new_err(fault.to_string()))?,
+        selection: shearq_results::select::selection(
+            selection[0].as_deref(),
+            selection[1].as_deref(),
+        )
+        .map_err(|fault| PyValueError::new_err(fault.to_string()))?,
         design: design.map(design_of).transpose()?,
         units: match units.as_deref() {
             None => Units::Recognised,

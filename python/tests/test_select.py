@@ -45,19 +45,19 @@ def test_the_command_line_finds_the_same_shear(galaxies, command, tmp_path):
 
 def test_bias_selects_as_the_command_line_does(command, tmp_path):
     shear = ("--constant-shear", "0.02,0.02", "--opposite")
-    size = ("--sets", "2", "--images", "1", "--grid", "32", "--seed", "5")
+    size = ("--sets", "2", "--images", "1", "--grid", "40", "--seed", "5")
     command("simulate", *size, *shear, "--out", tmp_path / "data")
     folders = []
     for sign in "+-":
         data, out = tmp_path / "data" / f"g1_{sign}0.02_g2_{sign}0.02", tmp_path / f"out{sign}"
         command("measure", "--submission", "48/linear/star", "--data", data, "--out", out)
         folders.append(out)
-    where = "snr > 12, size > 2"
+    where = "snr > 15, size > 2"
     row = json.loads(command("bias", *folders, "--where", where, "--format", "json"))["rows"][0]
     found = shearq.bias(folders, where=where)
     assert (found["m1"], found["m2"]) == (pytest.approx(row["m1"], rel=1e-9), pytest.approx(row["m2"], rel=1e-9))
     # What was measured changes with shear: another m, and a note that says why.
-    other = shearq.bias(folders, select="snr > 12 and size > 2")
+    other = shearq.bias(folders, select="snr > 15 and size > 2")
     assert other["m1"] + other["m2"] < found["m1"] + found["m2"] - 0.1
     assert any("effect of shear on a choice" in note for note in other.notes)
 
