@@ -88,7 +88,7 @@ enum Command {
     #[command(
         after_help = "Examples:\n  shearq bias catalogue.fits --bins snr:5\n  shearq bias plus.parquet minus.parquet --truth shears.csv --fail-above m=2e-3@3sigma"
     )]
-    Bias(bias::Arguments),
+    Bias(Box<bias::Arguments>),
     #[command(
         after_help = "Examples:\n  shearq baseline record mine --measured raw den\n  shearq baseline check mine"
     )]
