@@ -8,9 +8,8 @@ const LEAST_DISTANCE: f32 = 9.0;
 /// Half the side of the square whose sum is the galaxy's light. See docs/constants.md.
 const INNER: i32 = 8;
 
-/// Weight of the cells beside a cell along an axis, whose own is 1.
-const BESIDE: f32 = 0.5;
-const SMOOTHED: [f32; 3] = [BESIDE, 1.0, BESIDE];
+/// Weights of a cell and of those beside it, along an axis. See docs/constants.md.
+const SMOOTHED: [f32; 3] = [0.5, 1.0, 0.5];
 
 /// Blocks of 6 × 6 pixels away from a galaxy, against their opposites.
 #[derive(Debug, Clone)]
@@ -138,8 +137,8 @@ impl Contrasts {
                 let (mut excess, mut pixels) = self.across[i];
                 let beside = [i.wrapping_sub(1), i + 1];
                 for beside in beside.into_iter().filter_map(|at| self.across.get(at)) {
-                    excess += BESIDE * beside.0;
-                    pixels += BESIDE * BESIDE * beside.1;
+                    excess += SMOOTHED[0] * beside.0;
+                    pixels += SMOOTHED[0] * SMOOTHED[0] * beside.1;
                 }
                 let side = excess.signum();
                 self.blocks.push(Block {
