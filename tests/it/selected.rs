@@ -57,6 +57,9 @@ fn selected_folders_have_the_means_of_the_option_and_can_be_scored() {
     let arguments = ["select", "--measured", text(&chosen), "--out", text(&twice)];
     let refused = fail(&[&arguments[..], &options].concat());
     assert!(refused.contains("have the selection"), "{refused}");
+    let again = ["mean", "--measured", text(&chosen)];
+    let refused = fail(&[&again[..], &options].concat());
+    assert!(refused.contains("has a selection already"), "{refused}");
 }
 
 #[test]

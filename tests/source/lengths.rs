@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use crate::tree::files;
+use crate::tree::{CODE, files};
 
 /// Most lines of a file before its tests.
 const LONGEST: usize = 800;
@@ -14,14 +14,7 @@ const KNOWN: [&str; 0] = [];
 fn files_have_at_most_800_lines() {
     crate::tree::enter_root();
     let mut long = Vec::new();
-    for path in files(&[
-        "src",
-        "crates",
-        "scoring",
-        "submissions",
-        "python",
-        "benches",
-    ]) {
+    for path in files(&CODE) {
         let name = path.display().to_string();
         if name.contains("/tests") {
             continue;

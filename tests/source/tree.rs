@@ -6,6 +6,16 @@ use std::path::{Path, PathBuf};
 
 use syn::{Attribute, Item, ItemUse, UseTree, Visibility};
 
+/// Folders with code.
+pub const CODE: [&str; 6] = [
+    "src",
+    "crates",
+    "scoring",
+    "submissions",
+    "python",
+    "benches",
+];
+
 /// The crates with a library, by package name, and their folders.
 pub const LIBRARIES: [(&str, &str); 13] = [
     ("shearq-bias", "crates/bias"),

@@ -5,7 +5,7 @@
 
 use std::fs;
 
-use crate::tree::files;
+use crate::tree::{CODE, files};
 
 /// Files, or folders of files, with `unsafe`.
 const KNOWN: [&str; 4] = [
@@ -19,14 +19,7 @@ const KNOWN: [&str; 4] = [
 fn unsafe_code_is_where_it_is_known() {
     crate::tree::enter_root();
     let mut found = [false; KNOWN.len()];
-    for path in files(&[
-        "src",
-        "crates",
-        "scoring",
-        "submissions",
-        "python",
-        "benches",
-    ]) {
+    for path in files(&CODE) {
         let name = path.display().to_string();
         let text = fs::read_to_string(&path).unwrap();
         let code = text.lines().map(|line| line.split("//").next().unwrap());

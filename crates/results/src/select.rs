@@ -62,7 +62,7 @@ pub fn selection(
 }
 
 /// Name of the column with the weights.
-pub(crate) const WEIGHT: &str = "selection";
+const WEIGHT: &str = "selection";
 
 /// Writes the catalogues of the folder `from` with the weights of a `selection`, described by `text`, to the folder `to`:
 /// ellipticities are multiplied by the weights and divided by the mean response of their image, so that all that uses catalogues
@@ -127,11 +127,17 @@ pub fn write_selected(
     Ok((kept, good))
 }
 
-/// Checks that a catalogue with columns of these names has what a selection requires.
-fn require_responses<'a>(
+/// Checks that a catalogue with columns of these names has what a selection requires, and no selection yet.
+pub(crate) fn require_responses<'a>(
     path: &Path,
-    mut names: impl Iterator<Item = &'a str>,
+    mut names: impl Iterator<Item = &'a str> + Clone,
 ) -> Result<(), FileError> {
+    if names.clone().any(|name| name == WEIGHT) {
+        return Err(FileError::new(
+            path,
+            "this catalogue has a selection already. Try: the catalogue that it was selected from",
+        ));
+    }
     if names.any(|name| name == Observables::COLUMNS[2]) {
         return Ok(());
     }

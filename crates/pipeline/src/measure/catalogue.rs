@@ -68,14 +68,16 @@ pub const COLUMNS: [(&str, Value); 18] = [
 /// Columns of the catalogues of linear configurations after [`COLUMNS`]: the S/N, and the [`Observables`] that are not among
 /// these. NaN for galaxies that could not be measured.
 pub fn observed(galaxies: &[&Measurement]) -> Vec<(&'static str, Vec<f64>)> {
-    let column = |of: &dyn Fn(&Observables) -> f64| {
-        let values = galaxies.iter().map(|galaxy| galaxy.observables.as_ref());
-        values.map(|found| found.map_or(f64::NAN, of)).collect()
-    };
-    let mut columns = vec![("snr", column(&Observables::snr))];
+    let found = || galaxies.iter().map(|galaxy| galaxy.observables.as_ref());
+    let snr = found().map(|found| found.map_or(f64::NAN, Observables::snr));
+    let mut columns = vec![("snr", snr.collect())];
+    let nothing = [f64::NAN; Observables::COLUMNS.len()];
+    let rows: Vec<_> = found()
+        .map(|found| found.map_or(nothing, Observables::to_array))
+        .collect();
     for (at, name) in Observables::COLUMNS.into_iter().enumerate() {
         if !COLUMNS.iter().any(|(known, _)| *known == name) {
-            columns.push((name, column(&|found: &Observables| found.to_array()[at])));
+            columns.push((name, rows.iter().map(|row| row[at]).collect()));
         }
     }
     columns

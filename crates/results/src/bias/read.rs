@@ -12,7 +12,7 @@ use shearq_measure::{Observables, Selection};
 use shearq_quantities::Distortion;
 
 use crate::expression::Expression;
-use crate::select::{READ, WEIGHT, Weighted};
+use crate::select::{READ, Weighted, require_responses};
 
 use super::Input;
 use super::columns::{Columns, Names, Preset, Role};
@@ -242,19 +242,9 @@ fn source(
         };
     let (selected, binned) = (places(&reading.select)?, places(&reading.binned)?);
     if reading.selection.is_some() {
-        if names.iter().any(|own| own == WEIGHT) {
-            return Err(FileError::new(
-                &place.path,
-                "this catalogue has a selection already. Try: the catalogue that it was selected from",
-            ));
-        }
+        require_responses(&place.path, names.iter().map(String::as_str))?;
         for name in READ.iter().chain(&Observables::COLUMNS) {
-            place_of(name).ok_or_else(|| {
-                FileError::new(
-                    &place.path,
-                    format!("there is no column `{name}`, so a selection cannot be corrected (expected a catalogue of a linear configuration such as 48/linear/star)"),
-                )
-            })?;
+            place_of(name).ok_or_else(|| FileError::no_column(&place.path, name, names))?;
         }
     }
     let mut source = Source {

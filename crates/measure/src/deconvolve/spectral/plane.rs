@@ -171,12 +171,18 @@ impl Plane {
             self.wide.process_with_scratch(wide, fft);
             let columns = wide.chunks_exact(size);
             for (from, to) in columns.zip(half.chunks_exact_mut(self.side)) {
-                let (low, high) = (self.modes + 1, self.side - self.modes);
-                to[..low].copy_from_slice(&from[..low]);
-                to[low..high].fill(Complex32::ZERO);
-                to[high..].copy_from_slice(&from[size - self.modes..]);
+                self.take_modes(from, to);
             }
         }
+    }
+
+    /// Copies the kept modes of a line of frequencies to a line of another length, whose other modes are zero.
+    #[inline]
+    fn take_modes(&self, from: &[Complex32], to: &mut [Complex32]) {
+        let (low, count) = (self.modes + 1, to.len());
+        to[..low].copy_from_slice(&from[..low]);
+        to[low..count - self.modes].fill(Complex32::ZERO);
+        to[count - self.modes..].copy_from_slice(&from[from.len() - self.modes..]);
     }
 
     /// Transforms lines of `size` pixels in place.
@@ -269,12 +275,9 @@ impl Plane {
             }
         }
         self.fine.process_with_scratch(columns, fft);
-        let low = self.modes + 1;
         let lines = columns.chunks_exact(lags);
         for (from, to) in lines.zip(half[which].chunks_exact_mut(side)) {
-            to[..low].copy_from_slice(&from[..low]);
-            to[low..side - self.modes].fill(Complex32::ZERO);
-            to[side - self.modes..].copy_from_slice(&from[lags - self.modes..]);
+            self.take_modes(from, to);
         }
     }
 
@@ -294,12 +297,9 @@ impl Plane {
             ..
         } = scratch;
         let (side, lags) = (self.side, self.lags);
-        let (low, high) = (self.modes + 1, side - self.modes);
         let lines = half[which].chunks_exact(side);
         for (from, to) in lines.zip(columns.chunks_exact_mut(lags)) {
-            to[..low].copy_from_slice(&from[..low]);
-            to[low..lags - self.modes].fill(Complex32::ZERO);
-            to[lags - self.modes..].copy_from_slice(&from[high..]);
+            self.take_modes(from, to);
         }
         self.fine.process_with_scratch(columns, fft);
         let rows = &mut rows[..(reach + 1) * lags];
@@ -307,7 +307,7 @@ impl Plane {
             // The spectrum is even: what column −kx holds at y, column kx holds at −y.
             let opposite = (lags - y) % lags;
             line[0] = columns[y];
-            line[low..lags - self.modes].fill(Complex32::ZERO);
+            line[self.modes + 1..lags - self.modes].fill(Complex32::ZERO);
             for column in 1..=self.modes {
                 line[column] = columns[column * lags + y];
                 line[lags - column] = columns[column * lags + opposite];
