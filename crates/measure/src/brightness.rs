@@ -2,6 +2,8 @@
 
 use std::ops::RangeInclusive;
 
+use multiversion::multiversion;
+
 /// Brightest pixels, in image units, whose autocorrelation keeps single precision: its squares stay
 /// away from the smallest and largest numbers there are.
 pub(crate) const PEAKS: RangeInclusive<f32> = 1e-18..=1e17;
@@ -14,6 +16,7 @@ pub(crate) fn is_level(sigma: f64) -> bool {
 }
 
 /// The largest pixel, or zero if none is positive. 16 running maxima let vector instructions take several at a time.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(crate) fn highest(pixels: &[f32]) -> f32 {
     /// Numbers that are compared side by side. See docs/constants.md.
     const LANES: usize = 16;

@@ -187,10 +187,14 @@ impl Worker {
         if let (Some(filter), Some(buffers)) = (&plan.denoise, &mut self.denoise) {
             filter.apply(&mut self.full, noise as f32, buffers);
         }
-        let start = cut_start(plan.full, n).unwrap_or(0);
-        for (y, row) in self.cut.chunks_exact_mut(n).enumerate() {
-            let from = (start + y) * plan.full + start;
-            row.copy_from_slice(&self.full[from..from + n]);
+        if n == plan.full {
+            std::mem::swap(&mut self.cut, &mut self.full);
+        } else {
+            let start = cut_start(plan.full, n).unwrap_or(0);
+            for (y, row) in self.cut.chunks_exact_mut(n).enumerate() {
+                let from = (start + y) * plan.full + start;
+                row.copy_from_slice(&self.full[from..from + n]);
+            }
         }
         if !whole && !self.missing.mend(&mut self.cut, n) {
             return Ok(Measurement::flagged(Flag::NotFinite));

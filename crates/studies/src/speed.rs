@@ -12,6 +12,7 @@ use shearq_measure::parts::{
 use shearq_measure::{ImageNoise, Measurer, StampNoise};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
+use shearq_submissions::limits::WINDOWS;
 use shearq_submissions::{
     Clipping, Configuration, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut, Start,
     Update,
@@ -431,12 +432,22 @@ pub fn size_costs(
     let inputs = Inputs::new(settings)?;
     SIZES
         .iter()
-        .map(|&n| {
-            let mut sized = configuration.clone();
-            sized.stamp.size = n;
-            inputs.whole(&sized)
-        })
+        .map(|&n| inputs.whole(&sized(configuration, n)))
         .collect()
+}
+
+/// A configuration for stamps of `n` pixels a side. The linear method's window keeps its share of the stamp, and its PSF
+/// stamps are as large, because both must be odd or even.
+fn sized(configuration: &Configuration, n: usize) -> Configuration {
+    let mut sized = configuration.clone();
+    let share = n as f64 / sized.stamp.size as f64;
+    sized.stamp.size = n;
+    if let Method::Linear(method) = &mut sized.method {
+        sized.psf.size = n;
+        let window = &mut method.deconvolution.window_sigma;
+        *window = (*window * share).max(*WINDOWS.start());
+    }
+    sized
 }
 
 /// Costs against stamp size of several configurations as a table.

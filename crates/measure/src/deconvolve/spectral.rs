@@ -27,32 +27,39 @@
 //! worked out on the whole stamp and windowed then: a shear moves the galaxy and not the window, nor the edges of the stamp
 //! ([`edges`]).
 
+mod correlation;
 mod edges;
+mod field;
 mod modes;
+mod parities;
+mod pixels;
 mod plane;
+mod product;
 mod products;
+mod psf;
+mod smoothing;
 
-use multiversion::multiversion;
 use ndarray::ArrayView2;
-use shearq_fourier::Complex32;
+use shearq_fourier::{Complex32, Complex64};
 use shearq_submissions::LinearDeconvolution;
 
+use self::correlation::{Correlation, CorrelationScratch};
 use self::edges::{Edges, EdgesScratch};
-use self::modes::{correlate, restore, sheared};
-use self::plane::{Plane, PlaneScratch};
+use self::modes::{multiply, recentre, shear, subtract_product};
+use self::parities::{change, power};
+use self::pixels::{Pixels, PixelsScratch};
+use self::plane::{Modes, Plane, Quarters};
 pub(crate) use self::products::Gradients;
+pub use self::psf::{ModeNoise, SpectralPsf};
+use self::smoothing::Smoothing;
 use super::sun::high_pass;
 use crate::error::MeasureError;
 use crate::fft::StampFft;
-use crate::noise::StampNoise;
-use crate::sizes::{check_psf, check_sizes};
+use crate::sizes::check_sizes;
 
 /// Padding around a stamp, so that the deconvolved stamp does not wrap around. See
 /// docs/constants.md.
 const SPREAD: usize = 8;
-/// Least power of the PSF's transform; modes below it are left out as pure noise. See
-/// docs/constants.md.
-const LEAST_POWER: f32 = 1e-7;
 /// Largest wave number of the target Γ, times its σ. Γ is 0.09 there. See docs/constants.md.
 const CUT: f64 = 2.2;
 /// Value of the window at the middle of an edge above which the edge correction is applied. See
@@ -65,97 +72,62 @@ const REACH: f64 = 2.5;
 /// The linear network for one stamp size.
 #[derive(Debug, Clone)]
 pub struct Spectral {
-    n: usize,
-    p: usize,
-    reach: usize,
     step: f32,
     iterations: i32,
     plane: Plane,
-    /// λ d² of each mode of a half spectrum.
+    /// Transforms of stamps, and of PSFs.
+    stamp: Pixels,
+    psf: Pixels,
+    /// λ d² of each mode.
     rough: Vec<f32>,
     /// Γ of each mode.
     target: Vec<f32>,
     /// k_x and k_y of each mode, in radians per pixel.
-    waves: Vec<[f32; 2]>,
-    /// The window along an axis of the coarse grid, over the number of places.
-    window: Vec<f32>,
+    waves: [Vec<f32>; 2],
+    /// For how many modes of the plane each stands.
+    counts: Vec<f32>,
+    /// Place of each mode turned by 90 degrees.
+    turned: Vec<u32>,
     window_sigma: f64,
+    window: Smoothing,
+    /// The window's own spectrum.
+    window_modes: Quarters,
+    /// What windowed noise of a power becomes, in units of σ².
+    leak: Smoothing,
     /// The stamp's.
     edges: Edges,
-    /// Power that windowed white noise brings from a mode to one so many frequencies away along an
-    /// axis, either way; the product of both axes is in units of σ².
-    leak: Vec<f32>,
-    /// Scale of the autocorrelation for modes in the largest circle of those kept, zero outside.
+    correlation: Correlation,
+    reach: usize,
+    /// Scale of the autocorrelation for modes in the largest circle of those kept, zero outside; of a quarter.
     scale: Vec<f32>,
-    /// Phase that moves the centre of a PSF's stamp to the origin.
-    centre: Vec<Complex32>,
     /// Share of the noise under the window that the stamp contains.
     inside: f32,
-}
-
-/// Noise as the linear network uses it: of level one, and white but for its power.
-#[derive(Debug, Clone)]
-pub struct ModeNoise {
-    /// Power S of each mode; one for white noise.
-    power: Vec<f32>,
-    /// ½(k_x ∂_x − k_y ∂_y) ln S and ½(k_y ∂_x + k_x ∂_y) ln S: what a shear adds to a mode of noise, in units
-    /// of it and in the mean.
-    tilts: Vec<[f32; 2]>,
-}
-
-/// A PSF as the linear network uses it.
-#[derive(Debug, Clone)]
-pub struct SpectralPsf {
-    /// v̂/û.
-    restore: Vec<Complex32>,
-    /// What a field of noise of σ = 1 becomes of one that is white: v̂/û times √S.
-    field: Vec<Complex32>,
-    /// Change of a mode of the field with the components of shear, in units of it and in the mean.
-    field_tilts: Vec<[f32; 2]>,
-    /// What the field would be with the PSF turned by 90 degrees, less what it is, in units of it.
-    turned: Vec<f32>,
-    /// Mean power of windowed noise, in units of σ².
-    floor: Vec<f32>,
-    /// |p|²/S of each mode: the square of what a point of flux one is there, in units of the noise.
-    clarity: Vec<f32>,
-    /// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p.
-    tilts: Vec<[Complex32; 2]>,
-    /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ².
-    noise_tilts: Vec<[f32; 2]>,
-    /// Power of noise of σ = 1 in each mode before the window and in the one it stands for, times its changes with both
-    /// components of shear, and times what it lacks to be that of the PSF turned by 90 degrees.
-    powers: [Vec<f32>; 3],
-}
-
-impl SpectralPsf {
-    /// |p|²/S of each mode of a half spectrum, S being the power of the noise.
-    pub fn clarity(&self) -> &[f32] {
-        &self.clarity
-    }
-
-    /// Standard deviation of [`Lags::flux`] in noise of σ = 1.
-    pub fn flux_error(&self) -> f32 {
-        self.floor[0].sqrt()
-    }
 }
 
 /// Buffers for one thread. Their content between calls does not matter, but for the stamp that
 /// [`Spectral::noise_field`] looks at.
 #[derive(Debug, Clone)]
 pub struct SpectralScratch {
-    plane: PlaneScratch,
-    /// A stamp or PSF.
+    /// For stamps, and for PSFs.
+    fft: [PixelsScratch; 2],
+    /// v̂ of a stamp and its changes with the components of shear: before the window, and behind it.
+    changes: [Modes; 3],
+    windowed: [Quarters; 3],
+    /// A PSF.
     image: Vec<f32>,
     /// The windowed stamp's transform.
-    stamp: Vec<Complex32>,
-    /// A real half spectrum on its way through the window.
-    real: [Vec<f32>; 3],
-    /// Where the window is, (x, y) in pixels from the middle of the stamp, and the window along both axes there.
+    stamp: Quarters,
+    /// Real spectra.
+    real: [Vec<f32>; 2],
+    /// A real even spectrum by parity.
+    even: Vec<f32>,
+    /// A quarter on its way through the window.
+    smooth: Vec<f32>,
+    /// Where the window is, (x, y) in pixels from the middle of the stamp, and the phases that move this place to the origin.
     centre: [f32; 2],
-    windows: [Vec<f32>; 2],
-    /// The half spectrum of the window.
-    window_modes: Vec<Complex32>,
+    phases: Modes,
     edges: EdgesScratch,
+    correlation: CorrelationScratch,
 }
 
 /// Autocorrelations on lags dy = 0…R, dx = −R…R, in steps of [`Spectral::spacing`]:
@@ -183,73 +155,64 @@ impl Spectral {
         // Below the stamp's own Nyquist frequency, π.
         let cut = (CUT / sigma).min(3.0);
         let plane = Plane::new((n + SPREAD).max(p), cut);
-        let side = plane.side;
-        let waves: Vec<[f64; 2]> = (0..plane.columns())
-            .flat_map(|x| (0..side).map(move |y| (x, y)))
-            .map(|(x, y)| [plane.wave(x), plane.wave(y)])
-            .collect();
+        let waves = plane.waves();
         let target = waves.iter().map(|&[kx, ky]| {
             let square = kx * kx + ky * ky;
             (taper(square.sqrt() / cut) * (-0.5 * sigma * sigma * square).exp()) as f32
         });
-        let window: Vec<f64> = (0..side)
-            .map(|at| {
-                let period = plane.size as f64;
-                let x = at as f64 * plane.spacing() - (n as f64 - 1.0) / 2.0;
-                let x = x - period * (x / period).round();
-                (-0.5 * (x / settings.window_sigma).powi(2)).exp() / side as f64
-            })
-            .collect();
-        let mut leak = window_power(&window, plane.size);
-        let inside = inside(n, settings.window_sigma) as f32;
-        leak.iter_mut().for_each(|power| *power *= inside);
+        let window = window_modes(settings.window_sigma, &plane);
+        let inside = inside(n, settings.window_sigma);
+        let size = plane.size as f64;
         let reach = (REACH * settings.window_sigma / plane.lag_spacing()) as usize;
-        let least = plane.wave(plane.modes);
+        let reach = reach.clamp(1, plane.lags / 2 - 1);
+        let least = plane.wave(plane.modes) * (1.0 + 1e-12);
         let scale = |&[kx, ky]: &[f64; 2]| {
-            let area = (plane.size * plane.size) as f32;
             if kx.hypot(ky) <= least {
-                1.0 / area
+                1.0 / (size * size) as f32
             } else {
                 0.0
             }
         };
-        let centre = |&[kx, ky]: &[f64; 2]| {
-            let phase = (p as f64 - 1.0) / 2.0 * (kx + ky);
-            Complex32::new(phase.cos() as f32, phase.sin() as f32)
-        };
+        let mut window_quarters = plane.quarters();
+        let [even, ..] = window_quarters.each();
+        for (y, line) in even
+            .chunks_exact_mut(plane.width)
+            .take(plane.modes + 1)
+            .enumerate()
+        {
+            for (x, value) in line.iter_mut().take(plane.modes + 1).enumerate() {
+                *value = (window[x] * window[y]) as f32;
+            }
+        }
         Ok(Spectral {
-            n,
-            p,
-            reach: reach.clamp(1, plane.lags / 2 - 1),
             step: settings.step as f32,
             iterations: i32::try_from(settings.max_iterations).unwrap_or(i32::MAX),
+            stamp: Pixels::new(n, &plane),
+            psf: Pixels::new(p, &plane),
             rough: waves
                 .iter()
                 .map(|&[kx, ky]| (settings.lambda * high_pass(kx, ky).powi(2)) as f32)
                 .collect(),
             target: target.collect(),
-            waves: waves.iter().map(|k| k.map(|k| k as f32)).collect(),
-            window: window.iter().map(|w| *w as f32).collect(),
+            waves: [0, 1].map(|axis| waves.iter().map(|k| k[axis] as f32).collect()),
+            counts: plane.counts(),
+            turned: (0..waves.len()).map(|at| plane.turned(at) as u32).collect(),
             window_sigma: settings.window_sigma,
+            window: Smoothing::new(|distance| window[distance], &plane),
+            window_modes: window_quarters,
+            leak: Smoothing::new(|distance| inside * size * window[distance].powi(2), &plane),
             edges: Edges::new(n, &plane),
-            scale: waves.iter().map(scale).collect(),
-            centre: waves.iter().map(centre).collect(),
-            inside: inside * inside,
-            leak,
+            correlation: Correlation::new(reach, &plane),
+            reach,
+            scale: waves[..plane.quarter()].iter().map(scale).collect(),
+            inside: (inside * inside) as f32,
             plane,
         })
     }
 
     /// Stamp side n.
     pub fn stamp_size(&self) -> usize {
-        self.n
-    }
-
-    /// Period of the plane in pixels, places of the coarse grid along an axis, and largest index of a
-    /// mode.
-    #[cfg(test)]
-    fn grid(&self) -> (usize, usize, usize) {
-        (self.plane.size, self.plane.side, self.plane.modes)
+        self.stamp.side()
     }
 
     /// Largest lag, in steps of [`Spectral::spacing`].
@@ -264,83 +227,57 @@ impl Spectral {
 
     /// Buffers that fit this plan.
     pub fn scratch(&self) -> SpectralScratch {
-        let most = self.n.max(self.p);
+        let p = self.psf.side();
+        let zeros = |quarters: usize| vec![0.0; quarters * self.plane.quarter()];
         SpectralScratch {
-            window_modes: self.plane.spectrum(),
-            plane: self.plane.scratch(most),
-            image: vec![0.0; most * most],
-            stamp: self.plane.spectrum(),
-            real: std::array::from_fn(|_| vec![0.0; self.waves.len()]),
+            fft: [self.stamp.scratch(), self.psf.scratch()],
+            changes: std::array::from_fn(|_| self.plane.spectrum()),
+            windowed: std::array::from_fn(|_| self.plane.quarters()),
+            image: vec![0.0; p * p],
+            stamp: self.plane.quarters(),
+            real: [zeros(2), zeros(2)],
+            even: zeros(2),
+            smooth: zeros(1),
             centre: [0.0; 2],
-            windows: [self.window.clone(), self.window.clone()],
-            edges: self.edges.scratch(&self.plane),
+            phases: self.plane.spectrum(),
+            edges: self.edges.scratch(),
+            correlation: self.correlation.scratch(),
         }
     }
 
     /// Puts the window at `centre`, (x, y) in pixels from the middle of the stamp, for the stamps that follow.
     /// Their shear is about this place: the window is where the galaxy is, sheared or not.
     pub fn place_window(&self, centre: [f32; 2], scratch: &mut SpectralScratch) {
-        for (k, window) in scratch.windows.iter_mut().enumerate() {
-            if scratch.centre[k] == centre[k] {
-                continue;
-            }
-            scratch.centre[k] = centre[k];
-            if centre[k] == 0.0 {
-                window.copy_from_slice(&self.window);
-                continue;
-            }
-            let (middle, period) = ((self.n as f32 - 1.0) / 2.0, self.plane.size as f32);
-            let (spacing, side) = (self.plane.spacing() as f32, self.plane.side as f32);
-            let sigma = self.window_sigma as f32;
-            for (at, value) in window.iter_mut().enumerate() {
-                let x = at as f32 * spacing - middle - centre[k];
-                let x = (x - period * (x / period).round()) / sigma;
-                *value = (-0.5 * x * x).exp() / side;
+        if scratch.centre == centre {
+            return;
+        }
+        scratch.centre = centre;
+        let Modes { re, im } = &mut scratch.phases;
+        let [kx, ky] = &self.waves;
+        let width = self.plane.width;
+        let rows = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
+        for ((re, im), ky) in rows.zip(ky.chunks_exact(width)) {
+            // In double precision: a row has one phase along y, and steps of one phase along x.
+            let mut phase = turn(f64::from(ky[0]) * f64::from(centre[1]));
+            let step = turn(f64::from(kx[1]) * f64::from(centre[0]));
+            for (re, im) in re.iter_mut().zip(im) {
+                (*re, *im) = (phase.re as f32, phase.im as f32);
+                phase *= step;
             }
         }
     }
 
-    /// A PSF of zeros.
-    pub fn psf(&self) -> SpectralPsf {
-        let modes = self.waves.len();
-        SpectralPsf {
-            restore: vec![Complex32::ZERO; modes],
-            field: vec![Complex32::ZERO; modes],
-            field_tilts: vec![[0.0; 2]; modes],
-            turned: vec![0.0; modes],
-            floor: vec![0.0; modes],
-            clarity: vec![0.0; modes],
-            tilts: vec![[Complex32::ZERO; 2]; modes],
-            noise_tilts: vec![[0.0; 2]; modes],
-            powers: std::array::from_fn(|_| vec![0.0; modes]),
-        }
-    }
-
-    /// Noise of level one with the correlation of `noise`.
-    pub fn noise(&self, noise: &StampNoise) -> ModeNoise {
-        let modes = self.waves.iter().map(|k| {
-            let (power, slopes) = noise.power(k.map(f64::from));
-            (
-                power as f32,
-                slopes.map(|slope| (0.5 * slope / power) as f32),
-            )
-        });
-        let (power, tilts) = modes.unzip();
-        ModeNoise { power, tilts }
-    }
-
-    /// |g|² of each mode of a half spectrum over the plane's area in px², of a round Gaussian galaxy of flux one with a
-    /// mean square of `extent` px² per axis; twice where the mode stands for its opposite too. The sum of this times |p|²
-    /// is that of the squared pixels of the galaxy behind p.
+    /// |g|² of each mode over the plane's area in px², of a round Gaussian galaxy of flux one with a mean square of `extent`
+    /// px² per axis, times the number of modes that it stands for. The sum of this times |p|² is that of the squared pixels
+    /// of the galaxy behind p.
     pub fn light(&self, extent: f64) -> Vec<f32> {
         let area = (self.plane.size * self.plane.size) as f64;
-        let modes = self.waves.iter().enumerate();
+        let [kx, ky] = &self.waves;
+        let waves = kx.iter().zip(ky).map(|(x, y)| x * x + y * y);
+        let modes = waves.zip(&self.counts);
         modes
-            .map(|(at, k)| {
-                // Columns with k_x > 0 stand for those with k_x < 0 too.
-                let twice = if at < self.plane.side { 1.0 } else { 2.0 };
-                let square = k.iter().map(|&k| f64::from(k).powi(2)).sum::<f64>();
-                (twice / area * (-square * extent).exp()) as f32
+            .map(|(square, &count)| {
+                (f64::from(count) / area * (-f64::from(square) * extent).exp()) as f32
             })
             .collect()
     }
@@ -356,103 +293,6 @@ impl Spectral {
         }
     }
 
-    /// Takes a PSF, for images with `noise`; it is used as it is, so it should sum to one and be centred on the middle of its
-    /// stamp, (p − 1)/2 on both axes: the window is where the galaxy is left by deconvolution.
-    ///
-    /// # Errors
-    /// Where its size is not the planned one or a pixel is not finite.
-    pub fn set_psf(
-        &self,
-        psf: ArrayView2<'_, f64>,
-        noise: &ModeNoise,
-        scratch: &mut SpectralScratch,
-        out: &mut SpectralPsf,
-    ) -> Result<(), MeasureError> {
-        let side = psf.nrows();
-        // Zero around a smaller one.
-        let fits = side < self.p && (self.p - side).is_multiple_of(2);
-        check_psf(psf, if fits { side } else { self.p })?;
-        let first = (self.p - side) / 2;
-        let SpectralScratch {
-            plane, image, real, ..
-        } = scratch;
-        let image = &mut image[..self.p * self.p];
-        image.fill(0.0);
-        let rows = image.chunks_exact_mut(self.p).skip(first);
-        for (row, from) in rows.zip(psf.rows()) {
-            for (out, value) in row[first..].iter_mut().zip(from) {
-                *out = *value as f32;
-            }
-        }
-        self.plane.transform(image, self.p, plane);
-        let [u, x, y] = &plane.half;
-        for at in 0..self.waves.len() {
-            let power = u[at].norm_sqr();
-            out.clarity[at] = power / noise.power[at];
-            let centred = u[at] * self.centre[at];
-            out.restore[at] = centred.conj() * self.amplitude(at, power);
-            out.tilts[at] = if power < LEAST_POWER {
-                [Complex32::ZERO; 2]
-            } else {
-                sheared(x[at], y[at], self.waves[at]).map(|change| change * u[at].conj() / power)
-            };
-        }
-        let [tilt, along, smooth] = real;
-        for (at, value) in tilt.iter_mut().enumerate() {
-            out.field[at] = out.restore[at] * noise.power[at].sqrt();
-            let tilts = [0, 1].map(|k| noise.tilts[at][k] - out.tilts[at][k].re);
-            out.field_tilts[at] = tilts;
-            *value = out.field[at].norm_sqr();
-        }
-        for (at, value) in out.turned.iter_mut().enumerate() {
-            let power = tilt[at];
-            *value = if power > 0.0 {
-                (tilt[self.plane.turned(at)] / power).sqrt() - 1.0
-            } else {
-                0.0
-            };
-        }
-        spread(self.plane.side, &self.leak, tilt, along, &mut out.floor);
-        let area = (self.plane.size * self.plane.size) as f32 * self.inside;
-        for at in 0..tilt.len() {
-            // Columns with k_x > 0 stand for those with k_x < 0 too.
-            let twice = if at < self.plane.side { 1.0 } else { 2.0 };
-            let power = twice * area * tilt[at];
-            let [first, second] = out.field_tilts[at];
-            for (powers, kind) in out.powers.iter_mut().zip([first, second, out.turned[at]]) {
-                powers[at] = power * kind;
-            }
-        }
-        for component in 0..2 {
-            let modes = out.field_tilts.iter().zip(&out.field);
-            for (value, (tilts, field)) in tilt.iter_mut().zip(modes) {
-                *value = -tilts[component] * field.norm_sqr();
-            }
-            spread(self.plane.side, &self.leak, tilt, along, smooth);
-            for (out, value) in out.noise_tilts.iter_mut().zip(&*smooth) {
-                out[component] = *value;
-            }
-        }
-        Ok(())
-    }
-
-    /// Γ[1 − (1 − c w)^M]/w of a mode with |p|² = `power`; zero where the PSF leaves nothing.
-    fn amplitude(&self, at: usize, power: f32) -> f32 {
-        let w = power + self.rough[at];
-        // Without signal a mode is noise alone, whatever λ makes of it.
-        if power < LEAST_POWER || self.target[at] == 0.0 {
-            return 0.0;
-        }
-        let left = f64::from(1.0 - self.step * w);
-        // A positive one below exp(−40) is nothing in single precision.
-        let left = if left > 0.0 && (1.0 - left) * f64::from(self.iterations) > 40.0 {
-            0.0
-        } else {
-            left.powi(self.iterations)
-        };
-        self.target[at] * (1.0 - left) as f32 / w
-    }
-
     /// Deconvolves a row-major `stamp` with noise of level `noise` and writes the
     /// autocorrelation with its derivatives.
     pub fn autocorrelate(
@@ -464,174 +304,100 @@ impl Spectral {
         out: &mut Lags,
     ) {
         self.deconvolve(psf, stamp, scratch);
-        let plane = &mut scratch.plane;
-        let [u, x, y] = &mut plane.half;
-        scratch.stamp.copy_from_slice(u);
-        out.flux = [u[0].re, x[0].re, y[0].re];
-        correlate([u, x, y], &self.scale, psf, noise * noise);
-        self.lags_of(plane, out);
-    }
-
-    /// v̂ of a stamp and its changes with the components of shear, windowed, to `plane.half`.
-    fn deconvolve(&self, psf: &SpectralPsf, stamp: &[f32], scratch: &mut SpectralScratch) {
         let SpectralScratch {
-            plane,
-            centre,
-            windows: [across, down],
-            edges: at_edges,
+            windowed: [v, first, second],
+            stamp,
+            even,
+            correlation,
             ..
         } = scratch;
-        self.plane.transform(stamp, self.n, plane);
-        let [u, x, y] = &mut plane.half;
-        restore([u, x, y], *centre, &self.waves, psf);
-        if self.sees_edges(*centre) {
-            self.edges
-                .take(stamp, *centre, &self.plane, plane, at_edges);
-            let [_, x, y] = &mut plane.half;
-            self.edges.add(at_edges, &psf.restore, x, y);
+        stamp.copy_from(v);
+        out.flux = [&*v, first, second].map(Quarters::sum);
+        let variance = noise * noise;
+        power(v, &self.scale, &psf.floor, variance, even);
+        self.correlation.lags(even, correlation, &mut out.acf);
+        let sheared = [(first, &mut out.shear1), (second, &mut out.shear2)];
+        for ((changed, out), mean) in sheared.into_iter().zip(&psf.noise_tilts) {
+            change(v, changed, &self.scale, mean, variance, even);
+            self.correlation.lags(even, correlation, out);
         }
-        self.plane.window(across, down, plane);
+    }
+
+    /// v̂ of a stamp and its changes with the components of shear, windowed, to `scratch.windowed`.
+    fn deconvolve(&self, psf: &SpectralPsf, stamp: &[f32], scratch: &mut SpectralScratch) {
+        let SpectralScratch {
+            fft: [fft, _],
+            windowed: quarters,
+            changes: [u, x, y],
+            centre,
+            phases,
+            edges,
+            ..
+        } = scratch;
+        self.stamp.transform(stamp, fft, quarters);
+        for (modes, quarters) in [&mut *u, x, y].into_iter().zip(&*quarters) {
+            modes.take(quarters);
+        }
+        let centre = *centre;
+        let moved = centre != [0.0; 2];
+        if moved {
+            // About the window's place.
+            recentre(x, u, centre[0]);
+            recentre(y, u, centre[1]);
+        }
+        shear(x, y, &self.waves);
+        if self.sees_edges(centre) {
+            let fft = (&self.stamp, fft);
+            self.edges.add(stamp, centre, fft, edges, [x, y]);
+        }
+        // The changes are v̂/û times p·(k_x ∂_x − k_y ∂_y)(û/p), and the other's.
+        subtract_product(x, &psf.tilts[0], u);
+        subtract_product(y, &psf.tilts[1], u);
+        for modes in [u, x, y] {
+            multiply(modes, &psf.restore);
+            if moved {
+                multiply(modes, phases);
+            }
+        }
+        self.look_through_window(3, scratch);
+    }
+
+    /// Multiplies the images of the first `count` spectra of `scratch.changes` by the window, which is at their origin, to
+    /// `scratch.windowed`.
+    fn look_through_window(&self, count: usize, scratch: &mut SpectralScratch) {
+        let SpectralScratch {
+            windowed,
+            changes,
+            smooth,
+            ..
+        } = scratch;
+        for (windowed, modes) in windowed.iter_mut().zip(changes).take(count) {
+            windowed.take(modes);
+            self.window.apply(windowed, smooth);
+        }
     }
 
     /// Whether a window at `centre` sees light at the edges.
     fn sees_edges(&self, centre: [f32; 2]) -> bool {
         let off = centre.into_iter().map(f32::abs).fold(0.0, f32::max);
-        let away = (self.n as f64 / 2.0 - f64::from(off)) / self.window_sigma;
+        let away = (self.stamp_size() as f64 / 2.0 - f64::from(off)) / self.window_sigma;
         (-0.5 * away * away).exp() > LIT
-    }
-
-    /// Writes how the autocorrelation of the stamp last given changes with a field of noise of σ = 1
-    /// that is added to it, and with what a shear makes of that field: in `acf` the one, in `shear1` and
-    /// `shear2` the other.
-    ///
-    /// Of the change of noise under shear only the symmetric part is taken, −Re(tilt) of each mode (and what
-    /// the slope of its own power adds): of
-    /// the rest, which moves pixels about, the mean is zero. Modes have random signs.
-    pub fn noise_field(
-        &self,
-        psf: &SpectralPsf,
-        seed: u64,
-        scratch: &mut SpectralScratch,
-        out: &mut Lags,
-    ) {
-        self.field_of(seed, scratch, out, |at, sign| {
-            let field = sign * psf.field[at];
-            let [first, second] = psf.field_tilts[at];
-            [field, field * first, field * second]
-        });
-    }
-
-    /// Writes to `acf` how the autocorrelation of the stamp last given would change further, were the PSF behind the field
-    /// of noise of [`Spectral::noise_field`] turned by 90 degrees.
-    pub fn turned_field(
-        &self,
-        psf: &SpectralPsf,
-        seed: u64,
-        scratch: &mut SpectralScratch,
-        out: &mut Lags,
-    ) {
-        self.field_of(seed, scratch, out, |at, sign| {
-            let lack = sign * (psf.field[at] * psf.turned[at]);
-            [lack, Complex32::ZERO, Complex32::ZERO]
-        });
-    }
-
-    /// Writes how the autocorrelation of the stamp last given changes with three changes of v̂, before the window: what
-    /// `modes` makes of each mode of a field of noise.
-    fn field_of(
-        &self,
-        seed: u64,
-        scratch: &mut SpectralScratch,
-        out: &mut Lags,
-        modes: impl Fn(usize, Complex32) -> [Complex32; 3],
-    ) {
-        let SpectralScratch {
-            plane,
-            stamp,
-            windows: [across, down],
-            ..
-        } = scratch;
-        self.signs(seed, &mut plane.half[0]);
-        let [u, x, y] = &mut plane.half;
-        for (at, value) in u.iter_mut().enumerate() {
-            [*value, x[at], y[at]] = modes(at, *value);
-        }
-        self.plane.window(across, down, plane);
-        self.changes(stamp, plane, out);
-    }
-
-    /// Writes how the autocorrelation of v̂ changes with each of the three changes of v̂ in `plane.half`.
-    fn changes(&self, v: &[Complex32], plane: &mut PlaneScratch, out: &mut Lags) {
-        let [u, x, y] = &mut plane.half;
-        for (at, u) in u.iter_mut().enumerate() {
-            let (value, scale) = (v[at], self.scale[at]);
-            let along =
-                |change: Complex32| 2.0 * scale * (value.re * change.re + value.im * change.im);
-            *u = Complex32::new(along(*u), along(x[at]));
-            x[at] = Complex32::new(along(y[at]), 0.0);
-        }
-        self.lags_of(plane, out);
-    }
-
-    /// The half spectrum of a real field with the power of white noise of σ = 1 in each mode and random
-    /// signs of real and imaginary parts.
-    fn signs(&self, seed: u64, out: &mut [Complex32]) {
-        let side = self.plane.side;
-        let size = self.plane.size as f32 * std::f32::consts::FRAC_1_SQRT_2;
-        let mut state = seed;
-        for line in out.chunks_exact_mut(side) {
-            // The next number of the SplitMix64 sequence; two bits for each mode.
-            let mut bits = [0u64; 2];
-            for (at, value) in line.iter_mut().enumerate() {
-                if at % 64 == 0 {
-                    bits = [(); 2].map(|()| split_mix(&mut state));
-                }
-                let sign = |bits: u64| {
-                    if bits >> (at % 64) & 1 == 0 {
-                        size
-                    } else {
-                        -size
-                    }
-                };
-                *value = Complex32::new(sign(bits[0]), sign(bits[1]));
-            }
-            line[side / 2] = Complex32::ZERO;
-        }
-        // The column k_x = 0 is that of a real field.
-        for at in 1..side / 2 {
-            out[side - at] = out[at].conj();
-        }
-        out[0] = Complex32::new(out[0].re * std::f32::consts::SQRT_2, 0.0);
-    }
-
-    /// Takes the lags of real even spectra: the first, plus i times the second, and the third.
-    fn lags_of(&self, plane: &mut PlaneScratch, out: &mut Lags) {
-        let Lags {
-            acf,
-            shear1,
-            shear2,
-            ..
-        } = out;
-        self.plane.lags(0, self.reach, plane, |at, value| {
-            (acf[at], shear1[at]) = (value.re, value.im);
-        });
-        self.plane
-            .lags(1, self.reach, plane, |at, value| shear2[at] = value.re);
     }
 
     /// The deconvolved stamp itself, convolved with Γ and windowed, for pictures.
     pub fn deconvolved(&self, psf: ArrayView2<'_, f64>, stamp: &[f32]) -> Vec<f32> {
+        let n = self.stamp_size();
         let plan = StampFft::new(self.plane.size);
         let (mut u, mut h, mut fft) = (plan.spectrum(), plan.spectrum(), plan.scratch());
         let rows = psf.rows().into_iter();
         let rows = rows.map(|row| row.into_iter().map(|&v| v as f32));
         plan.rows(rows, &mut fft, &mut h);
         plan.columns(&mut fft, &mut h);
-        let rows = stamp.chunks_exact(self.n);
+        let rows = stamp.chunks_exact(n);
         plan.rows(rows.map(|row| row.iter().copied()), &mut fft, &mut u);
         plan.columns(&mut fft, &mut u);
         let centre = (psf.nrows() / 2) as f32;
-        let (size, side) = (self.plane.size, self.plane.side);
+        let size = self.plane.size;
         for (at, u) in u.iter_mut().enumerate() {
             let (x, y) = (at / size, at % size);
             let modes = self.plane.modes;
@@ -639,20 +405,20 @@ impl Spectral {
                 *u = Complex32::ZERO;
                 continue;
             }
-            let mode = x * side + if y > modes { y + side - size } else { y };
-            let [kx, ky] = self.waves[mode];
+            let mode = self.plane.place(x, y.min(size - y), y > modes);
+            let [kx, ky] = [self.waves[0][mode], self.waves[1][mode]];
             // The PSF's transform about the pixel that a convolution takes for its centre.
             let p = h[at] * Complex32::from_polar(1.0, centre * (kx + ky));
             *u *= p.conj() * (self.amplitude(mode, p.norm_sqr()) / (size * size) as f32);
         }
         plan.columns_back(&mut fft, &mut u);
         let window = |at: usize| {
-            let x = (at as f64 - (self.n as f64 - 1.0) / 2.0) / self.window_sigma;
+            let x = (at as f64 - (n as f64 - 1.0) / 2.0) / self.window_sigma;
             (-0.5 * x * x).exp() as f32
         };
-        let mut image = Vec::with_capacity(self.n * self.n);
-        for y in 0..self.n {
-            let row = &plan.row_back(&u, y, &mut fft)[..self.n];
+        let mut image = Vec::with_capacity(n * n);
+        for y in 0..n {
+            let row = &plan.row_back(&u, y, &mut fft)[..n];
             image.extend(
                 row.iter()
                     .enumerate()
@@ -686,85 +452,23 @@ fn inside(n: usize, sigma: f64) -> f64 {
     share(0, side) / share(-side, 2 * side)
 }
 
-/// Power of the transform of a window along an axis, times the period, at frequencies 0, 1, …: as many
-/// as hold all but a millionth.
-fn window_power(window: &[f64], period: usize) -> Vec<f32> {
-    let side = window.len();
-    let power = |mode: usize| {
-        let (mut re, mut im) = (0.0, 0.0);
-        for (at, w) in window.iter().enumerate() {
-            let phase = std::f64::consts::TAU * ((mode * at) % side) as f64 / side as f64;
-            re += w * phase.cos();
-            im += w * phase.sin();
-        }
-        (re * re + im * im) * period as f64
+/// Transform of a Gaussian window of `sigma` px along an axis, over the plane's period, at modes 0, 1, … 2·`modes`.
+fn window_modes(sigma: f64, plane: &Plane) -> Vec<f64> {
+    let period = plane.size as f64;
+    let places = (0..plane.size).map(|at| at as f64 - (plane.size / 2) as f64);
+    let window: Vec<[f64; 2]> = places
+        .map(|x| [x, (-0.5 * (x / sigma).powi(2)).exp() / period])
+        .collect();
+    let mode = |j: usize| {
+        let terms = window.iter();
+        terms.map(|[x, w]| w * (plane.wave(j) * x).cos()).sum()
     };
-    let powers: Vec<f64> = (0..side / 2).map(power).collect();
-    let beyond = |count: usize| 2.0 * powers[count..].iter().sum::<f64>();
-    let least = 1e-6 * (powers[0] + beyond(1));
-    let enough = (1..powers.len()).find(|&count| beyond(count) < least);
-    let kept = &powers[..enough.unwrap_or(powers.len())];
-    kept.iter().map(|&power| power as f32).collect()
+    (0..=2 * plane.modes).map(mode).collect()
 }
 
-/// The next number of the SplitMix64 sequence.
-fn split_mix(state: &mut u64) -> u64 {
-    *state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    let mut z = *state;
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
-}
-
-/// What a real even half spectrum becomes when each mode's power leaks into its neighbours, `leak`
-/// frequencies away along each axis of the torus of the coarse grid of `side` places. `along` is room
-/// for as many values.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn spread(side: usize, leak: &[f32], spectrum: &[f32], along: &mut [f32], out: &mut [f32]) {
-    let lines = spectrum.chunks_exact(side);
-    for (line, to) in lines.zip(along.chunks_exact_mut(side)) {
-        scaled(to, line, leak[0]);
-        for (distance, &share) in leak.iter().enumerate().skip(1) {
-            let (head, tail) = line.split_at(distance);
-            add_scaled(&mut to[..side - distance], tail, share);
-            add_scaled(&mut to[side - distance..], head, share);
-            let (head, tail) = line.split_at(side - distance);
-            add_scaled(&mut to[distance..], head, share);
-            add_scaled(&mut to[..distance], tail, share);
-        }
-    }
-    let columns = along.len() / side;
-    for (x, to) in out.chunks_exact_mut(side).enumerate() {
-        scaled(to, &along[x * side..][..side], leak[0]);
-        for (distance, &share) in leak.iter().enumerate().skip(1) {
-            for from in [x + distance, x + side - distance].map(|x| x % side) {
-                if from < columns {
-                    add_scaled(to, &along[from * side..][..side], share);
-                } else if side - from < columns {
-                    // A column of negative k_x: what that of −k_x holds at −k_y.
-                    let line = &along[(side - from) * side..][..side];
-                    to[0] += share * line[0];
-                    for (to, value) in to[1..].iter_mut().zip(line[1..].iter().rev()) {
-                        *to += share * value;
-                    }
-                }
-            }
-        }
-    }
-}
-
-#[inline(always)]
-fn scaled(to: &mut [f32], from: &[f32], share: f32) {
-    for (to, value) in to.iter_mut().zip(from) {
-        *to = share * value;
-    }
-}
-
-#[inline(always)]
-fn add_scaled(to: &mut [f32], from: &[f32], share: f32) {
-    for (to, value) in to.iter_mut().zip(from) {
-        *to += share * value;
-    }
+/// exp(iφ).
+fn turn(phase: f64) -> Complex64 {
+    Complex64::from_polar(1.0, phase)
 }
 
 #[cfg(test)]

@@ -159,7 +159,9 @@ impl LinearWorker {
         let response = |change: &[f32]| f64::from(plan.breadth.response(&breadth, change));
         let flux = lags.flux.map(|flux| plan.aperture * f64::from(flux));
         let products = coupled.then(|| {
-            plan.moments.gradients(shape, &mut self.gradients.pair);
+            let [first, second] = &mut self.gradients.pair;
+            plan.moments
+                .gradients(shape, &mut self.values, [first, second]);
             let [zero, two] = &plan.broad;
             for ((third, zero), two) in self.gradients.third.iter_mut().zip(zero).zip(two) {
                 *third = Breadth::combine(&breadth, [*zero, *two]);

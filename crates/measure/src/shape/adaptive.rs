@@ -15,7 +15,6 @@
 //! of the autocorrelation.
 
 use multiversion::multiversion;
-use shearq_fourier::Complex32;
 use shearq_quantities::Distortion;
 
 use crate::flag::Flag;
@@ -40,8 +39,8 @@ pub struct AdaptiveMoments {
     square: f32,
     /// Number of lags in half the plane.
     lags: usize,
-    /// Places in the autocorrelation, of half the plane; filled up with zero weights.
-    at: Vec<u32>,
+    /// Where the lags within the circle are, row by row: first place and count. Of the first row those from zero on.
+    runs: Vec<(usize, usize)>,
     /// Area in px² that a lag stands for, its opposite's too; zero for filling.
     area: Vec<f32>,
     /// x² + y², x² − y² and 2xy.
@@ -51,7 +50,11 @@ pub struct AdaptiveMoments {
 /// Buffers for one thread. Their content between calls does not matter.
 #[derive(Debug, Clone)]
 pub struct AdaptiveScratch {
+    /// Lags within the circle, filled up.
     values: Vec<f32>,
+    /// Weights W of the lags times their area, for the ellipticity `chi`.
+    weights: Vec<f32>,
+    chi: [f32; 2],
 }
 
 /// What was found on an autocorrelation.
@@ -79,30 +82,29 @@ impl AdaptiveMoments {
         let mut moments = AdaptiveMoments {
             square: (scale * scale) as f32,
             lags: (reach + 1) * (2 * reach + 1),
-            at: Vec::new(),
+            runs: Vec::new(),
             area: Vec::new(),
             bases: Default::default(),
         };
         let unit = (spacing * spacing) as f32;
         for y in 0..=side {
-            for x in -side..=side {
-                if (y == 0 && x < 0) || x * x + y * y > side * side {
-                    continue;
-                }
-                let at = (y * (2 * side + 1) + x + side) as u32;
+            let most = f64::from(side * side - y * y).sqrt() as i32;
+            let least = if y == 0 { 0 } else { -most };
+            let first = (y * (2 * side + 1) + least + side) as usize;
+            moments.runs.push((first, (most - least + 1) as usize));
+            for x in least..=most {
                 let count = if x == 0 && y == 0 { 1.0 } else { 2.0 };
                 let bases = [x * x + y * y, x * x - y * y, 2 * x * y];
-                moments.push(at, count * unit, bases.map(|basis| basis as f32 * unit));
+                moments.push(count * unit, bases.map(|basis| basis as f32 * unit));
             }
         }
-        while !moments.at.len().is_multiple_of(LANES) {
-            moments.push(0, 0.0, [0.0; 3]);
+        while !moments.area.len().is_multiple_of(LANES) {
+            moments.push(0.0, [0.0; 3]);
         }
         moments
     }
 
-    fn push(&mut self, at: u32, area: f32, bases: [f32; 3]) {
-        self.at.push(at);
+    fn push(&mut self, area: f32, bases: [f32; 3]) {
         self.area.push(area);
         for (basis, value) in self.bases.iter_mut().zip(bases) {
             basis.push(value);
@@ -112,7 +114,9 @@ impl AdaptiveMoments {
     /// Buffers that fit.
     pub fn scratch(&self) -> AdaptiveScratch {
         AdaptiveScratch {
-            values: vec![0.0; self.at.len()],
+            values: vec![0.0; self.area.len()],
+            weights: vec![0.0; self.area.len()],
+            chi: [f32::NAN; 2],
         }
     }
 
@@ -135,7 +139,7 @@ impl AdaptiveMoments {
         self.gather(acf, &mut scratch.values);
         let mut chi = [0.0f32; 2];
         for _ in 0..MAX_STEPS {
-            let s = self.sums(&scratch.values, chi);
+            let s = self.sums(scratch, chi);
             let [extent, n1, n2, ..] = s;
             let t = extent + softening;
             if !(t > 0.0 && t.is_finite()) {
@@ -185,9 +189,9 @@ impl AdaptiveMoments {
     /// The weight follows the galaxy: with m = aχ′ + bχ the moments of a galaxy of distortion χ′ under a weight of χ,
     /// χ = aχ′/(1 − b) is aχ′T/((1 − b)T + s) after softening by s.
     pub fn halving(&self, acf: &[f32]) -> f32 {
-        let mut values = self.scratch().values;
-        self.gather(acf, &mut values);
-        let sums = self.sums(&values, [0.0; 2]);
+        let mut scratch = self.scratch();
+        self.gather(acf, &mut scratch.values);
+        let sums = self.sums(&mut scratch, [0.0; 2]);
         let extent = sums[0];
         let [[slope, _], _] = self.derivative(&sums, [0.0; 2], [0.0; 2], extent);
         (1.0 - slope) * extent
@@ -201,7 +205,12 @@ impl AdaptiveMoments {
         scratch: &mut AdaptiveScratch,
     ) -> [f64; 2] {
         self.gather(change, &mut scratch.values);
-        let [t, n1, n2, ..] = self.sums(&scratch.values, shape.chi);
+        if scratch.chi != shape.chi {
+            // Not the shape that was found last.
+            self.sums(scratch, shape.chi);
+        }
+        let [a, b, c] = &self.bases;
+        let [t, n1, n2] = plain_sums(&scratch.values, &scratch.weights, [a, b, c]);
         let moved = [
             (n1 - shape.chi[0] * t) / shape.trace,
             (n2 - shape.chi[1] * t) / shape.trace,
@@ -211,29 +220,47 @@ impl AdaptiveMoments {
             .map(|row| f64::from(row[0] * moved[0] + row[1] * moved[1]))
     }
 
-    /// Writes the weights of the lags, each for itself, whose sum with a change of the autocorrelation is the change of χ₁
-    /// (real part) and χ₂ (imaginary part); laid out as `deconvolve::Lags`.
-    pub(crate) fn gradients(&self, shape: &AdaptiveShape, out: &mut [Complex32]) {
-        out.fill(Complex32::ZERO);
-        let scale = self.scale(shape.chi);
+    /// Writes the weights of the lags, each for itself, whose sum with a change of the autocorrelation is the change of χ₁,
+    /// and those for χ₂; laid out as `deconvolve::Lags`.
+    pub(crate) fn gradients(
+        &self,
+        shape: &AdaptiveShape,
+        scratch: &mut AdaptiveScratch,
+        out: [&mut [f32]; 2],
+    ) {
+        let [out1, out2] = out;
+        out1.fill(0.0);
+        out2.fill(0.0);
+        if scratch.chi != shape.chi {
+            self.sums(scratch, shape.chi);
+        }
         let [chi1, chi2] = shape.chi;
         let [[i11, i12], [i21, i22]] = shape.inverse;
         let [a, b, c] = &self.bases;
         // Lags of the row y = 0 are stored with both signs, those of others with one.
         let width = 2 * ((self.lags as f64 / 2.0).sqrt() as usize) + 1;
-        for (k, &at) in self.at.iter().enumerate() {
-            if self.area[k] == 0.0 {
-                continue;
+        let mut from = 0;
+        for &(first, count) in &self.runs {
+            let lags = from..from + count;
+            let bases = a[lags.clone()]
+                .iter()
+                .zip(&b[lags.clone()])
+                .zip(&c[lags.clone()]);
+            let out = out1[first..].iter_mut().zip(&mut out2[first..]);
+            let weights = scratch.weights[lags].iter().zip(bases);
+            for ((out1, out2), (weight, ((a, b), c))) in out.zip(weights) {
+                let weight = 0.5 * weight / shape.trace;
+                let (along, across) = (weight * (b - chi1 * a), weight * (c - chi2 * a));
+                *out1 = i11 * along + i12 * across;
+                *out2 = i21 * along + i22 * across;
             }
-            let inverse = 1.0 / (1.0 + scale * (a[k] - chi1 * b[k] - chi2 * c[k]));
-            let at = at as usize;
-            let count = if at == width / 2 { 1.0 } else { 0.5 };
-            let weight = count * self.area[k] * inverse * inverse.sqrt() / shape.trace;
-            let (first, second) = (weight * (b[k] - chi1 * a[k]), weight * (c[k] - chi2 * a[k]));
-            let value = Complex32::new(i11 * first + i12 * second, i21 * first + i22 * second);
-            out[at] = value;
-            if at < width {
-                out[width - 1 - at] = value;
+            from += count;
+        }
+        // Zero lag stands for itself alone, and so twice for half of it; but its bases are zero.
+        for out in [out1, out2] {
+            let (left, right) = out[..width].split_at_mut(width / 2);
+            for (left, right) in left.iter_mut().rev().zip(&right[1..]) {
+                *left = *right;
             }
         }
     }
@@ -246,15 +273,26 @@ impl AdaptiveMoments {
         (1.0 + q).powf(-1.5)
     }
 
+    /// Takes the lags within the circle.
     fn gather(&self, acf: &[f32], values: &mut [f32]) {
-        for ((value, &at), &area) in values.iter_mut().zip(&self.at).zip(&self.area) {
-            *value = acf[at as usize] * area;
+        let mut to = 0;
+        for &(first, count) in &self.runs {
+            values[to..to + count].copy_from_slice(&acf[first..first + count]);
+            to += count;
         }
+        values[to..].fill(0.0);
     }
 
-    fn sums(&self, values: &[f32], chi: [f32; 2]) -> WeightedSums {
+    /// Sums over the values that were taken; leaves their weights.
+    fn sums(&self, scratch: &mut AdaptiveScratch, chi: [f32; 2]) -> WeightedSums {
         let [a, b, c] = &self.bases;
-        weighted_sums(values, a, b, c, chi, self.scale(chi))
+        let AdaptiveScratch {
+            values,
+            weights,
+            chi: of,
+        } = scratch;
+        *of = chi;
+        weighted_sums(values, &self.area, [a, b, c], chi, self.scale(chi), weights)
     }
 
     /// 1/(√(1 − |χ|²) r²).
@@ -295,23 +333,22 @@ impl AdaptiveMoments {
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn weighted_sums(
     values: &[f32],
-    a: &[f32],
-    b: &[f32],
-    c: &[f32],
+    area: &[f32],
+    bases: [&[f32]; 3],
     chi: [f32; 2],
     scale: f32,
+    weights: &mut [f32],
 ) -> WeightedSums {
     let mut lanes = [[0.0f32; LANES]; 9];
-    let chunks = values
-        .chunks_exact(LANES)
-        .zip(a.chunks_exact(LANES))
-        .zip(b.chunks_exact(LANES))
-        .zip(c.chunks_exact(LANES));
-    for (((v, a), b), c) in chunks {
+    let [a, b, c] = bases.map(|basis| basis.chunks_exact(LANES));
+    let chunks = values.chunks_exact(LANES).zip(area.chunks_exact(LANES));
+    let chunks = chunks.zip(a).zip(b).zip(c);
+    for (kept, ((((v, area), a), b), c)) in weights.chunks_exact_mut(LANES).zip(chunks) {
         let (mut w, mut bend) = ([0.0f32; LANES], [0.0f32; LANES]);
         for l in 0..LANES {
             let inverse = 1.0 / (1.0 + scale * (a[l] - chi[0] * b[l] - chi[1] * c[l]));
-            w[l] = v[l] * inverse * inverse.sqrt();
+            kept[l] = area[l] * inverse * inverse.sqrt();
+            w[l] = v[l] * kept[l];
             bend[l] = 3.0 * w[l] * inverse;
         }
         for l in 0..LANES {
@@ -325,6 +362,23 @@ fn weighted_sums(
             lanes[6][l] += vb * b[l];
             lanes[7][l] += vb * c[l];
             lanes[8][l] += vc * c[l];
+        }
+    }
+    lanes.map(|lane| lane.iter().sum())
+}
+
+/// The first three of them, with weights that are known.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn plain_sums(values: &[f32], weights: &[f32], bases: [&[f32]; 3]) -> [f32; 3] {
+    let mut lanes = [[0.0f32; LANES]; 3];
+    let [a, b, c] = bases.map(|basis| basis.chunks_exact(LANES));
+    let chunks = values.chunks_exact(LANES).zip(weights.chunks_exact(LANES));
+    for ((((v, w), a), b), c) in chunks.zip(a).zip(b).zip(c) {
+        for l in 0..LANES {
+            let weighted = v[l] * w[l];
+            lanes[0][l] += weighted * a[l];
+            lanes[1][l] += weighted * b[l];
+            lanes[2][l] += weighted * c[l];
         }
     }
     lanes.map(|lane| lane.iter().sum())

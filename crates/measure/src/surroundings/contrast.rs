@@ -1,6 +1,10 @@
 //! A stamp compared with itself turned about the galaxy's centre: galaxies look nearly the same turned by 180 degrees, and
 //! neighbours do not.
 
+use std::ops::Range;
+
+use multiversion::multiversion;
+
 /// Side of the cells that blocks are made of, two along each axis. See docs/constants.md.
 const CELL: i32 = 3;
 /// Least distance of a cell's centre from the galaxy's. See docs/constants.md.
@@ -15,6 +19,9 @@ const SMOOTHED: [f32; 3] = [0.5, 1.0, 0.5];
 #[derive(Debug, Clone)]
 pub(crate) struct Contrasts {
     n: i32,
+    /// Sums of the pixels of [`CELL`] rows, column by column, with room for columns off the stamp: of cells and of their
+    /// opposites.
+    lines: [Vec<f32>; 2],
     cells: Vec<Cell>,
     /// Excess and pixels of a row, with those beside it along y.
     across: Vec<(f32, f32)>,
@@ -70,6 +77,7 @@ impl Contrasts {
     pub(crate) fn new(n: usize) -> Self {
         Contrasts {
             n: n as i32,
+            lines: std::array::from_fn(|_| vec![0.0; 3 * n]),
             cells: Vec::with_capacity(n * n / 8),
             across: vec![(0.0, 0.0); 2 * along(n as i32) as usize],
             blocks: Vec::with_capacity(n * n / 8),
@@ -157,16 +165,26 @@ impl Contrasts {
         let most = along(self.n);
         let [x0, y0] = beyond(turn);
         self.light = self.inner(stamp, turn);
+        let n = self.n as usize;
+        let columns = |x: i32| on_stamp(x, self.n).len() as i32;
         // One row of cells from the other half, for blocks on the line between both.
         for j in -1..most {
+            let y = y0 + j * CELL;
+            let rows = [y, turn[1] - y - CELL + 1].map(|y| on_stamp(y, self.n));
+            for (line, rows) in self.lines.iter_mut().zip(&rows) {
+                add_rows(stamp, rows.clone(), &mut line[n..2 * n]);
+            }
+            let [own, other] = rows.map(|rows| rows.len() as i32);
             for i in -most..most {
-                let (x, y) = (x0 + i * CELL, y0 + j * CELL);
-                let opposite = (turn[0] - x - CELL + 1, turn[1] - y - CELL + 1);
-                let (here, own) = self.sum(stamp, (x, y), CELL);
-                let (there, other) = self.sum(stamp, opposite, CELL);
+                let x = x0 + i * CELL;
+                let opposite = turn[0] - x - CELL + 1;
+                let light = |line: &[f32], x: i32| -> f32 {
+                    line[(self.n + x) as usize..][..CELL as usize].iter().sum()
+                };
+                let [here, there] = &self.lines;
                 self.cells.push(Cell {
-                    excess: here - there,
-                    pixels: own + other,
+                    excess: light(here, x) - light(there, opposite),
+                    pixels: own * columns(x) + other * columns(opposite),
                 });
             }
         }
@@ -176,31 +194,33 @@ impl Contrasts {
     /// The light of 16 × 16 pixels around the centre.
     pub(super) fn inner(&self, stamp: &[f32], turn: [i32; 2]) -> f32 {
         let [x0, y0] = beyond(turn);
-        self.sum(stamp, (x0 - INNER, y0 - INNER), 2 * INNER).0
+        let range = |first: i32| {
+            let on = |at: i32| at.clamp(0, self.n) as usize;
+            on(first - INNER)..on(first + INNER)
+        };
+        let (columns, rows) = (range(x0), range(y0));
+        let lines = stamp.chunks_exact(self.n as usize);
+        let lines = lines.skip(rows.start).take(rows.len());
+        lines
+            .map(|line| line[columns.clone()].iter().sum::<f32>())
+            .sum()
     }
+}
 
-    /// Sum over a square, as far as it is on the stamp, and the number of its pixels there.
-    fn sum(&self, stamp: &[f32], (x, y): (i32, i32), side: i32) -> (f32, i32) {
-        if side == CELL && x >= 0 && y >= 0 && x.max(y) + CELL <= self.n {
-            // Most of them: the same sum, of a length that is known.
-            const SIDE: usize = CELL as usize;
-            let (first, n) = ((y * self.n + x) as usize, self.n as usize);
-            let rows = stamp[first..].chunks(n).take(SIDE);
-            let sum = rows.map(|row| row[..SIDE].iter().sum::<f32>()).sum();
-            return (sum, CELL * CELL);
+/// Of the [`CELL`] pixels from `first` on along an axis, those on a stamp of `n` pixels.
+fn on_stamp(first: i32, n: i32) -> Range<usize> {
+    let on = |at: i32| at.clamp(0, n) as usize;
+    on(first)..on(first + CELL)
+}
+
+/// Writes the sum of rows of a stamp.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add_rows(stamp: &[f32], rows: Range<usize>, line: &mut [f32]) {
+    line.fill(0.0);
+    let n = line.len();
+    for row in rows {
+        for (sum, value) in line.iter_mut().zip(&stamp[row * n..][..n]) {
+            *sum += value;
         }
-        let (left, right) = (x.max(0), (x + side).min(self.n));
-        if left >= right {
-            return (0.0, 0);
-        }
-        let (top, bottom) = (y.max(0), (y + side).min(self.n));
-        let mut sum = 0.0;
-        for row in top..bottom {
-            let line = (row * self.n) as usize;
-            sum += stamp[line + left as usize..line + right as usize]
-                .iter()
-                .sum::<f32>();
-        }
-        (sum, (right - left) * (bottom - top).max(0))
     }
 }

@@ -95,29 +95,60 @@ impl Near {
         let first = turn.map(|turn| turn.div_euclid(2) + 1 - (ALONG * CELL / 2) as i32);
         let mut cells = [[0.0; CELLS]; 2];
         let [columns, lines] = [0, 1].map(|axis| compared(self.n, turn[axis], first[axis]));
-        if columns.is_empty() {
+        if columns.is_empty() || lines.is_empty() {
             return cells;
         }
         let from = (first[0] + columns.start as i32) as usize;
         let other = (turn[0] + 1) as usize - from - columns.len();
-        for j in lines {
-            let row = (first[1] + j as i32) as usize;
-            let opposite = turn[1] as usize - row;
-            let here = &stamp[row * self.n + from..][..columns.len()];
-            let there = &stamp[opposite * self.n + other..][..columns.len()];
-            let mut pixels = [[0.0; ALONG * CELL]; 2];
-            for (i, (here, there)) in here.iter().zip(there.iter().rev()).enumerate() {
-                pixels[0][columns.start + i] = here - there;
-                pixels[1][columns.start + i] = here + there;
-            }
-            for (cells, pixels) in cells.iter_mut().zip(pixels) {
-                let line = &mut cells[j / CELL * ALONG..][..ALONG];
-                for (cell, pixels) in line.iter_mut().zip(pixels.chunks_exact(CELL)) {
-                    *cell += pixels.iter().sum::<f32>();
-                }
+        let row = |j: usize| (first[1] + j as i32) as usize;
+        let pairs = Pairs {
+            stamp,
+            n: self.n,
+            here: [from, row(lines.start)],
+            there: [other, turn[1] as usize - row(lines.start)],
+        };
+        add_pairs(&pairs, columns, lines, &mut cells);
+        cells
+    }
+}
+
+/// Pixels and their opposites.
+struct Pairs<'a> {
+    stamp: &'a [f32],
+    n: usize,
+    /// Column and row of the first pixel, and of the last column and first row of the opposites.
+    here: [usize; 2],
+    there: [usize; 2],
+}
+
+/// Adds differences and sums of pixels and opposites in columns and lines of the cells.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add_pairs(
+    pairs: &Pairs<'_>,
+    columns: Range<usize>,
+    lines: Range<usize>,
+    cells: &mut [[f32; CELLS]; 2],
+) {
+    let count = columns.len();
+    let [differences, sums] = cells;
+    for (step, j) in lines.enumerate() {
+        let here = &pairs.stamp[(pairs.here[1] + step) * pairs.n + pairs.here[0]..][..count];
+        let there = &pairs.stamp[(pairs.there[1] - step) * pairs.n + pairs.there[0]..][..count];
+        let mut pixels = [[0.0; ALONG * CELL]; 2];
+        let [less, more] = pixels.each_mut().map(|pixels| &mut pixels[columns.clone()]);
+        let out = less.iter_mut().zip(more);
+        for ((less, more), (here, there)) in out.zip(here.iter().zip(there.iter().rev())) {
+            (*less, *more) = (here - there, here + there);
+        }
+        let line = j / CELL * ALONG..(j / CELL + 1) * ALONG;
+        for (cells, pixels) in [&mut *differences, sums].into_iter().zip(pixels) {
+            for (cell, pixels) in cells[line.clone()]
+                .iter_mut()
+                .zip(pixels.chunks_exact(CELL))
+            {
+                *cell += pixels.iter().sum::<f32>();
             }
         }
-        cells
     }
 }
 

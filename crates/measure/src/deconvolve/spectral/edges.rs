@@ -12,81 +12,69 @@
 //! sees a large galaxy's light there.
 
 use multiversion::multiversion;
-use shearq_fourier::Complex32;
 
-use super::plane::{Plane, PlaneScratch, parts};
-
-/// Pairs of real lines: the edges, and the edges times the position along them. See
-/// docs/constants.md.
-const PAIRS: usize = 4;
+use super::pixels::{Pixels, PixelsScratch};
+use super::plane::{Modes, Plane};
+use super::product::ROWS;
 
 /// The edges of stamps of one size.
 #[derive(Debug, Clone)]
 pub(super) struct Edges {
     n: usize,
-    /// Phase of each frequency of the coarse grid at the first and the last edge of an axis.
-    phases: Vec<[Complex32; 2]>,
+    rows: usize,
+    /// cos and sin of half a stamp for each frequency along an axis: the phase at the first edge. That at the last is its
+    /// conjugate.
+    phase: [Vec<f32>; 2],
 }
 
 /// Buffers for one thread. Their content between calls does not matter.
 #[derive(Debug, Clone)]
 pub(super) struct EdgesScratch {
     /// Left and right edge, the same times y, lower and upper edge, and the same times x.
-    lines: Vec<Complex32>,
-    /// Of each frequency along an edge, what the pairs add: first edge and last one.
-    terms: [Vec<[Complex32; 2]>; PAIRS],
+    lines: Vec<f32>,
+    /// Of each of them and each frequency along it, real and imaginary part.
+    re: Vec<f32>,
+    im: Vec<f32>,
 }
 
 impl Edges {
     /// Of stamps of n×n pixels.
     pub(super) fn new(n: usize, plane: &Plane) -> Self {
-        let phases = (0..plane.side).map(|at| {
-            let k = plane.wave(at);
-            let at_edge = |x: f64| Complex32::from_polar(1.0, (-k * x) as f32);
-            [at_edge(-0.5), at_edge(n as f64 - 0.5)]
+        let phase = [f64::cos, f64::sin].map(|wave| {
+            let mut table = vec![0.0; plane.width];
+            for (k, value) in table.iter_mut().enumerate().take(plane.modes + 1) {
+                *value = wave(plane.wave(k) * n as f64 / 2.0) as f32;
+            }
+            table
         });
         Edges {
             n,
-            phases: phases.collect(),
+            rows: plane.rows,
+            phase,
         }
     }
 
     /// Buffers that fit.
-    pub(super) fn scratch(&self, plane: &Plane) -> EdgesScratch {
+    pub(super) fn scratch(&self) -> EdgesScratch {
+        let width = self.phase[0].len();
         EdgesScratch {
-            lines: vec![Complex32::ZERO; PAIRS * plane.size],
-            terms: std::array::from_fn(|_| vec![[Complex32::ZERO; 2]; plane.side]),
+            lines: vec![0.0; ROWS * self.n],
+            re: vec![0.0; ROWS * width],
+            im: vec![0.0; ROWS * width],
         }
     }
 
-    /// Writes to `scratch` what edges of `stamp` add to its changes under shears about `centre`, (x, y) in pixels from the middle.
-    pub(super) fn take(
+    /// Adds what edges of `stamp` add to its changes with γ₁ and γ₂ about `centre`, (x, y) in pixels from the middle.
+    pub(super) fn add(
         &self,
         stamp: &[f32],
         [x0, y0]: [f32; 2],
-        plane: &Plane,
-        fft: &mut PlaneScratch,
+        (pixels, fft): (&Pixels, &mut PixelsScratch),
         scratch: &mut EdgesScratch,
+        changes: [&mut Modes; 2],
     ) {
-        let (n, size) = (self.n, plane.size);
+        let n = self.n;
         let middle = (n as f32 - 1.0) / 2.0;
-        let EdgesScratch { lines, terms } = scratch;
-        lines.fill(Complex32::ZERO);
-        for at in 0..n {
-            // Half a pixel outwards, along a straight line.
-            let edge = |first: usize, step: usize| {
-                let beyond = |a: usize, b: usize| 1.5 * stamp[a] - 0.5 * stamp[b];
-                let last = first + (n - 1) * step;
-                Complex32::new(beyond(first, first + step), beyond(last, last - step))
-            };
-            let (side, level) = (edge(at * n, 1), edge(at, n));
-            let place = at as f32 - middle;
-            lines[at] = side;
-            lines[size + at] = side * (place - y0);
-            lines[2 * size + at] = level;
-            lines[3 * size + at] = level * (place - x0);
-        }
-        plane.along(lines, fft);
         // What v·∇T is on either edge, beside the place along it.
         let half = n as f32 / 2.0;
         let factors = [
@@ -95,69 +83,78 @@ impl Edges {
             [half + y0, half - y0],
             [1.0, -1.0],
         ];
-        let pairs = lines.chunks_exact(size).zip(terms).zip(factors);
-        for ((line, terms), [first, last]) in pairs {
-            for (at, out) in terms.iter_mut().enumerate() {
-                let here = if 2 * at > plane.side {
-                    size + at - plane.side
-                } else {
-                    at
-                };
-                let opposite = if here == 0 { 0 } else { size - here };
-                let [one, other] = parts(line[here], line[opposite]);
-                *out = [one * first, other * last];
+        let EdgesScratch { lines, re, im } = scratch;
+        for at in 0..n {
+            // Half a pixel outwards, along a straight line.
+            let edge = |first: usize, step: usize| {
+                let beyond = |a: usize, b: usize| 1.5 * stamp[a] - 0.5 * stamp[b];
+                let last = first + (n - 1) * step;
+                [beyond(first, first + step), beyond(last, last - step)]
+            };
+            let (side, level) = (edge(at * n, 1), edge(at, n));
+            let place = at as f32 - middle;
+            let values = [
+                side,
+                side.map(|value| value * (place - y0)),
+                level,
+                level.map(|value| value * (place - x0)),
+            ];
+            for (line, (values, factors)) in values.iter().zip(factors).enumerate() {
+                for edge in 0..2 {
+                    lines[(2 * line + edge) * n + at] = values[edge] * factors[edge];
+                }
             }
         }
-    }
-
-    /// Adds what was taken, times `restore`, to the half spectra of the changes with γ₁ and γ₂.
-    pub(super) fn add(
-        &self,
-        scratch: &EdgesScratch,
-        restore: &[Complex32],
-        first: &mut [Complex32],
-        second: &mut [Complex32],
-    ) {
-        let side = self.phases.len();
-        let [sides, sides_y, levels, levels_x] = &scratch.terms;
-        let columns = first
-            .chunks_exact_mut(side)
-            .zip(second.chunks_exact_mut(side));
-        for (x, ((first, second), restore)) in columns.zip(restore.chunks_exact(side)).enumerate() {
-            add_column(
-                first,
-                restore,
-                self.phases[x],
-                sides,
-                levels[x],
-                &self.phases,
-            );
-            add_column(
-                second,
-                restore,
-                self.phases[x],
-                sides_y,
-                levels_x[x],
-                &self.phases,
-            );
+        pixels.transform_lines(lines, fft, [re, im]);
+        let width = pixels.columns();
+        let line = |k: usize| [&re[k * width..][..width], &im[k * width..][..width]];
+        for (which, change) in changes.into_iter().enumerate() {
+            let sides = [line(2 * which), line(2 * which + 1)];
+            let levels = [line(2 * which + 4), line(2 * which + 5)];
+            let halves = change.re.len() / 2;
+            for (below, start) in [(false, 0), (true, halves)] {
+                let (re, im) = (&mut change.re[start..], &mut change.im[start..]);
+                let lines = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
+                for (y, (re, im)) in lines.take(self.rows).enumerate() {
+                    // Real lines have conjugate transforms at opposite frequencies.
+                    let sign = if below { -1.0 } else { 1.0 };
+                    let at = |line: [&[f32]; 2]| [line[0][y], sign * line[1][y]];
+                    let phase = [self.phase[0][y], sign * self.phase[1][y]];
+                    let [cos, sin] = &self.phase;
+                    add_line([re, im], sides.map(at), [cos, sin], levels, phase);
+                }
+            }
         }
     }
 }
 
-/// Adds to a column of modes what the left and right edge have of them, and what the lower and upper edge have of the column.
+/// Adds to a row of modes what the first and last edge across have of it, of phases `across`, and what the first and last
+/// edge along it have of each column, of phase `down`: the last edge has the conjugate of the first one's.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn add_column(
-    to: &mut [Complex32],
-    restore: &[Complex32],
-    across: [Complex32; 2],
-    sides: &[[Complex32; 2]],
-    level: [Complex32; 2],
-    down: &[[Complex32; 2]],
+fn add_line(
+    to: [&mut [f32]; 2],
+    sides: [[f32; 2]; 2],
+    across: [&[f32]; 2],
+    levels: [[&[f32]; 2]; 2],
+    down: [f32; 2],
 ) {
-    let edges = sides.iter().zip(down);
-    for ((to, restore), (side, down)) in to.iter_mut().zip(restore).zip(edges) {
-        let sum =
-            side[0] * across[0] + side[1] * across[1] + level[0] * down[0] + level[1] * down[1];
-        *to += restore * sum;
+    let [re, im] = to;
+    let [first, last] = sides;
+    let [[first_re, first_im], [last_re, last_im]] = levels;
+    // a·exp(iφ) + b·exp(−iφ) = (a + b) cos φ + i(a − b) sin φ.
+    let (sum, difference) = (
+        [first[0] + last[0], first[1] + last[1]],
+        [first[0] - last[0], first[1] - last[1]],
+    );
+    for x in 0..re.len() {
+        let (cos, sin) = (across[0][x], across[1][x]);
+        let levels_sum = [first_re[x] + last_re[x], first_im[x] + last_im[x]];
+        let levels_difference = [first_re[x] - last_re[x], first_im[x] - last_im[x]];
+        re[x] += sum[0] * cos - difference[1] * sin + levels_sum[0] * down[0]
+            - levels_difference[1] * down[1];
+        im[x] += sum[1] * cos
+            + difference[0] * sin
+            + levels_sum[1] * down[0]
+            + levels_difference[0] * down[1];
     }
 }

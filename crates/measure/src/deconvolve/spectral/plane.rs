@@ -1,129 +1,63 @@
-//! The transforms behind the linear network: from a stamp to its low modes, from these to images on a
-//! coarse grid and back, and from real even spectra to lags.
+//! The modes that the linear network keeps, and how they are stored.
 //!
-//! The plane is periodic with a period of `size` pixels. Of its modes only those with indices
-//! |j| ≤ `modes` along each axis are kept; images of them are sampled without loss at `side` < `size`
-//! places an axis, `size/side` pixels apart, the first at the stamp's first pixel. Half spectra have
-//! `modes + 1` columns (frequencies along x) of `side` frequencies along y, in the order of the
-//! transform. Lags are [`FINER`] times closer together: an autocorrelation is multiplied by a weight with
-//! structure of its own, and sums over places as far apart as its own modes allow would depend on
-//! whether a galaxy lies along the grid or across it.
+//! The plane is periodic with a period of `size` pixels. Of its modes only those with indices |j| ≤ `modes` along each axis
+//! are kept. Of a real image those with k_x ≥ 0 tell everything. They are stored twice over:
+//!
+//! * mode by mode ([`Modes`]): those with k_y ≥ 0, and then those with k_y ≤ 0, each in rows of one |k_y| with k_x from zero;
+//! * by their parity ([`Quarters`]), in which sums along an axis are sums of real numbers.
+//!
+//! With s = −sin, the transform of an image at (k_x, ±k_y), k_y ≥ 0, is
+//!
+//! ```text
+//! Σ I exp(−i(k_x x ± k_y y)) = (cc ∓ ss) + i(sc ± cs)
+//! ```
+//!
+//! where cc is the sum Σ I cos(k_x x) cos(k_y y), sc = Σ I s(k_x x) cos(k_y y), and so on: the first letter is that of x.
+//! Places are measured from the middle of the image. Rows and columns are filled up with zeros to multiples that
+//! [`super::product`] needs.
 
 use multiversion::multiversion;
-use shearq_fourier::{Complex32, Plan32, Planner32};
 
+use super::product::{LANES, ROWS};
 use crate::fft::transform_size;
 
-/// Least number of lags per pixel of the coarse grid, along an axis. See docs/constants.md.
+/// Least number of lags per pixel of a grid that samples the kept modes, along an axis. See docs/constants.md.
 const FINER: f64 = 1.5;
 
-/// Plans for one size.
-#[derive(Clone)]
+/// The kept modes.
+#[derive(Debug, Clone)]
 pub(super) struct Plane {
     /// Period in pixels.
     pub(super) size: usize,
-    /// Places along an axis of the coarse grid.
-    pub(super) side: usize,
     /// Largest index of a mode.
     pub(super) modes: usize,
-    /// Lags along an axis.
+    /// Lags along an axis in a period.
     pub(super) lags: usize,
-    wide: Plan32,
-    forward: Plan32,
-    backward: Plan32,
-    fine: Plan32,
-}
-
-impl std::fmt::Debug for Plane {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Plane")
-            .field("size", &self.size)
-            .field("side", &self.side)
-            .field("modes", &self.modes)
-            .finish_non_exhaustive()
-    }
-}
-
-/// Buffers for one thread. Their content between calls does not matter.
-#[derive(Debug, Clone)]
-pub(super) struct PlaneScratch {
-    /// Rows of an image, and of it times x.
-    rows: Vec<Complex32>,
-    /// Columns of the transforms of an image, and of it times x and y: the low modes along x and all
-    /// along y.
-    wide: [Vec<Complex32>; 3],
-    /// Half spectra of three images.
-    pub(super) half: [Vec<Complex32>; 3],
-    /// Two rows of an image as real and imaginary part of one.
-    pairs: Vec<Complex32>,
-    /// Columns of an autocorrelation's spectrum, and its rows.
-    fine: [Vec<Complex32>; 2],
-    fft: Vec<Complex32>,
+    /// Rows of a quarter, of which the first `modes + 1` are used.
+    pub(super) rows: usize,
+    /// Columns of a quarter, of which the first `modes + 1` are used.
+    pub(super) width: usize,
 }
 
 impl Plane {
-    /// A plane of at least `least` pixels (a power of two, which transforms fastest) that keeps wave
-    /// numbers up to `cut` radians per pixel.
+    /// A plane of at least `least` pixels that keeps wave numbers up to `cut` radians per pixel.
     pub(super) fn new(least: usize, cut: f64) -> Self {
         let size = least.next_power_of_two();
         let places = cut * size as f64 / std::f64::consts::PI;
         let side = transform_size(places.ceil() as usize + 2).min(size);
-        let lags = transform_size((FINER * side as f64).ceil() as usize);
-        let mut planner = Planner32::new();
+        let modes = side / 2 - 1;
         Plane {
             size,
-            side,
-            modes: side / 2 - 1,
-            lags,
-            wide: planner.forward(size),
-            forward: planner.forward(side),
-            backward: planner.inverse(side),
-            fine: planner.inverse(lags),
+            modes,
+            lags: transform_size((FINER * side as f64).ceil() as usize),
+            rows: (modes + 1).next_multiple_of(ROWS),
+            width: (modes + 1).next_multiple_of(LANES),
         }
     }
 
-    /// Place in a half spectrum of the mode at `at` turned by 90 degrees, or of its opposite.
-    pub(super) fn turned(&self, at: usize) -> usize {
-        let (x, y) = (at / self.side, at % self.side);
-        // (k_x, k_y) becomes (k_y, −k_x).
-        if y <= self.modes {
-            y * self.side + (self.side - x) % self.side
-        } else if y < self.side - self.modes {
-            // No mode is kept here.
-            at
-        } else {
-            (self.side - y) * self.side + x
-        }
-    }
-
-    /// Buffers for images of up to `n` rows.
-    pub(super) fn scratch(&self, n: usize) -> PlaneScratch {
-        let zeros = |count| vec![Complex32::ZERO; count];
-        let plans = [&self.wide, &self.forward, &self.backward, &self.fine];
-        let fft = plans.map(|plan| plan.get_inplace_scratch_len());
-        PlaneScratch {
-            rows: zeros(n * self.size),
-            wide: std::array::from_fn(|_| zeros((self.modes + 1) * self.size)),
-            half: std::array::from_fn(|_| self.spectrum()),
-            pairs: zeros(self.side * self.side),
-            fine: [self.columns(), self.lags].map(|lines| zeros(lines * self.lags)),
-            fft: zeros(fft.into_iter().max().unwrap_or(0)),
-        }
-    }
-
-    /// A half spectrum of zeros.
-    pub(super) fn spectrum(&self) -> Vec<Complex32> {
-        vec![Complex32::ZERO; self.columns() * self.side]
-    }
-
-    /// Frequencies along x.
-    pub(super) fn columns(&self) -> usize {
-        self.modes + 1
-    }
-
-    /// Pixels between places of the coarse grid.
-    pub(super) fn spacing(&self) -> f64 {
-        self.size as f64 / self.side as f64
+    /// Numbers in a quarter.
+    pub(super) fn quarter(&self) -> usize {
+        self.rows * self.width
     }
 
     /// Pixels between lags.
@@ -131,284 +65,168 @@ impl Plane {
         self.size as f64 / self.lags as f64
     }
 
-    /// Wave number of frequency `at` of the coarse grid, in radians per pixel.
-    pub(super) fn wave(&self, at: usize) -> f64 {
-        let signed = if 2 * at > self.side {
-            at as f64 - self.side as f64
-        } else {
-            at as f64
-        };
-        std::f64::consts::TAU * signed / self.size as f64
+    /// Wave number of index `j`, in radians per pixel.
+    pub(super) fn wave(&self, j: usize) -> f64 {
+        std::f64::consts::TAU * j as f64 / self.size as f64
     }
 
-    /// Kept modes of an image of n×n pixels, and of it times x and y from its middle, to
-    /// `scratch.half`.
-    pub(super) fn transform(&self, image: &[f32], n: usize, scratch: &mut PlaneScratch) {
-        let PlaneScratch {
-            rows,
-            wide: [u, x, y],
-            half,
-            fft,
-            ..
-        } = scratch;
-        let size = self.size;
-        let middle = (n as f32 - 1.0) / 2.0;
-        let rows = &mut rows[..n * size];
-        weigh(image, n, middle, rows, size);
-        self.wide.process_with_scratch(rows, fft);
-        for column in 0..self.columns() {
-            let at = column * size..(column + 1) * size;
-            let (u, x, y) = (&mut u[at.clone()], &mut x[at.clone()], &mut y[at]);
-            split(rows, size, column, u, x);
-            for (j, (out, value)) in y[..n].iter_mut().zip(&u[..n]).enumerate() {
-                *out = value * (j as f32 - middle);
-            }
-            for line in [u, x, y] {
-                line[n..].fill(Complex32::ZERO);
-            }
-        }
-        for (wide, half) in [u, x, y].into_iter().zip(half) {
-            self.wide.process_with_scratch(wide, fft);
-            let columns = wide.chunks_exact(size);
-            for (from, to) in columns.zip(half.chunks_exact_mut(self.side)) {
-                self.take_modes(from, to);
-            }
-        }
+    /// Place in [`Modes`] of the mode of indices (`x`, ±`y`), the lower sign if `below`.
+    pub(super) fn place(&self, x: usize, y: usize, below: bool) -> usize {
+        usize::from(below) * self.quarter() + y * self.width + x
     }
 
-    /// Copies the kept modes of a line of frequencies to a line of another length, whose other modes are zero.
-    #[inline]
-    fn take_modes(&self, from: &[Complex32], to: &mut [Complex32]) {
-        let (low, count) = (self.modes + 1, to.len());
-        to[..low].copy_from_slice(&from[..low]);
-        to[low..count - self.modes].fill(Complex32::ZERO);
-        to[count - self.modes..].copy_from_slice(&from[from.len() - self.modes..]);
+    /// Indices (x, ±y) of the mode at place `at` of [`Modes`], and whether the lower sign holds.
+    fn indices(&self, at: usize) -> (usize, usize, bool) {
+        let (half, rest) = (at / self.quarter(), at % self.quarter());
+        (rest % self.width, rest / self.width, half == 1)
     }
 
-    /// Transforms lines of `size` pixels in place.
-    pub(super) fn along(&self, lines: &mut [Complex32], scratch: &mut PlaneScratch) {
-        self.wide.process_with_scratch(lines, &mut scratch.fft);
+    /// Wave vector of each mode.
+    pub(super) fn waves(&self) -> Vec<[f64; 2]> {
+        let places = 0..2 * self.quarter();
+        places
+            .map(|at| {
+                let (x, y, below) = self.indices(at);
+                let sign = if below { -1.0 } else { 1.0 };
+                [self.wave(x), sign * self.wave(y)]
+            })
+            .collect()
     }
 
-    /// Multiplies the images of the half spectra by `along` x and `down` y, and transforms again:
-    /// `side²` times too large.
-    pub(super) fn window(&self, along: &[f32], down: &[f32], scratch: &mut PlaneScratch) {
-        let PlaneScratch {
-            half, pairs, fft, ..
-        } = scratch;
-        let side = self.side;
-        let lower = side / 2;
-        let pairs = &mut pairs[..lower * side];
-        for half in half {
-            self.backward.process_with_scratch(half, fft);
-            join_rows(half, side, self.modes, pairs);
-            self.backward.process_with_scratch(pairs, fft);
-            multiply(pairs, along, down);
-            self.forward.process_with_scratch(pairs, fft);
-            split_rows(pairs, side, half);
-            self.forward.process_with_scratch(half, fft);
-        }
-    }
-
-    /// The half spectrum of the window that is `along` x and `down` y.
-    pub(super) fn window_modes(
-        &self,
-        along: &[f32],
-        down: &[f32],
-        scratch: &mut PlaneScratch,
-        out: &mut [Complex32],
-    ) {
-        let side = self.side;
-        let (both, rest) = scratch.pairs.split_at_mut(side);
-        for (value, (x, y)) in both.iter_mut().zip(along.iter().zip(down)) {
-            *value = Complex32::new(*x, *y);
-        }
-        self.forward.process_with_scratch(both, &mut scratch.fft);
-        let modes = |k: usize| parts(both[k], both[(side - k) % side]);
-        let down = &mut rest[..side];
-        for (k, value) in down.iter_mut().enumerate() {
-            *value = modes(k)[1];
-        }
-        for (column, line) in out.chunks_exact_mut(side).enumerate() {
-            let [along, _] = modes(column);
-            for (value, down) in line.iter_mut().zip(&*down) {
-                *value = along * down;
-            }
-        }
-    }
-
-    /// The adjoint of [`Plane::lags`]: the real even spectra, as real and imaginary part of `half[which]`, of two even
-    /// functions of the lags that `values` gives as real and imaginary part.
-    pub(super) fn spectra_of_lags(
-        &self,
-        which: usize,
-        reach: usize,
-        scratch: &mut PlaneScratch,
-        values: &[Complex32],
-    ) {
-        let PlaneScratch {
-            half,
-            fine: [columns, rows],
-            fft,
-            ..
-        } = scratch;
-        let (side, lags) = (self.side, self.lags);
-        let width = 2 * reach + 1;
-        let rows = &mut rows[..(reach + 1) * lags];
-        for (line, from) in rows.chunks_exact_mut(lags).zip(values.chunks_exact(width)) {
-            line[..=reach].copy_from_slice(&from[reach..]);
-            line[reach + 1..lags - reach].fill(Complex32::ZERO);
-            line[lags - reach..].copy_from_slice(&from[..reach]);
-        }
-        // The transforms of even functions are the same in both directions.
-        self.fine.process_with_scratch(rows, fft);
-        let columns = &mut columns[..self.columns() * lags];
-        for (column, line) in columns.chunks_exact_mut(lags).enumerate() {
-            line.fill(Complex32::ZERO);
-            let opposite = (lags - column) % lags;
-            for (y, row) in rows.chunks_exact(lags).enumerate() {
-                line[y] = row[column];
-                if y > 0 {
-                    // The function is even: row −y is row y from right to left.
-                    line[lags - y] = row[opposite];
+    /// For how many modes of the plane each stands. One without k_y is stored twice, and counts half each time.
+    pub(super) fn counts(&self) -> Vec<f32> {
+        let places = 0..2 * self.quarter();
+        places
+            .map(|at| {
+                let (x, y, _) = self.indices(at);
+                if x > self.modes || y > self.modes {
+                    return 0.0;
                 }
-            }
+                let along = if x == 0 { 1.0 } else { 2.0 };
+                along * if y == 0 { 0.5 } else { 1.0 }
+            })
+            .collect()
+    }
+
+    /// Place of the mode at `at` turned by 90 degrees, or of its opposite; a mode that is not kept stays.
+    pub(super) fn turned(&self, at: usize) -> usize {
+        let (x, y, below) = self.indices(at);
+        if x > self.modes || y > self.modes {
+            return at;
         }
-        self.fine.process_with_scratch(columns, fft);
-        let lines = columns.chunks_exact(lags);
-        for (from, to) in lines.zip(half[which].chunks_exact_mut(side)) {
-            self.take_modes(from, to);
+        // (k_x, k_y) becomes (k_y, −k_x), and (k_x, −k_y) the opposite of (k_y, k_x).
+        self.place(y, x, !below)
+    }
+
+    /// Zeros.
+    pub(super) fn spectrum(&self) -> Modes {
+        Modes {
+            re: vec![0.0; 2 * self.quarter()],
+            im: vec![0.0; 2 * self.quarter()],
         }
     }
 
-    /// Images of the real even spectra that are real and imaginary part of `half[which]`, at lags
-    /// dy = 0…reach, dx = −reach…reach; a sum over modes, without a scale.
-    pub(super) fn lags(
-        &self,
-        which: usize,
-        reach: usize,
-        scratch: &mut PlaneScratch,
-        mut out: impl FnMut(usize, Complex32),
-    ) {
-        let PlaneScratch {
-            half,
-            fine: [columns, rows],
-            fft,
-            ..
-        } = scratch;
-        let (side, lags) = (self.side, self.lags);
-        let lines = half[which].chunks_exact(side);
-        for (from, to) in lines.zip(columns.chunks_exact_mut(lags)) {
-            self.take_modes(from, to);
-        }
-        self.fine.process_with_scratch(columns, fft);
-        let rows = &mut rows[..(reach + 1) * lags];
-        for (y, line) in rows.chunks_exact_mut(lags).enumerate() {
-            // The spectrum is even: what column −kx holds at y, column kx holds at −y.
-            let opposite = (lags - y) % lags;
-            line[0] = columns[y];
-            line[self.modes + 1..lags - self.modes].fill(Complex32::ZERO);
-            for column in 1..=self.modes {
-                line[column] = columns[column * lags + y];
-                line[lags - column] = columns[column * lags + opposite];
-            }
-        }
-        self.fine.process_with_scratch(rows, fft);
-        let width = 2 * reach + 1;
-        for (y, line) in rows.chunks_exact(lags).enumerate() {
-            for (x, value) in line[..=reach].iter().enumerate() {
-                out(y * width + reach + x, *value);
-            }
-            for (x, value) in line[lags - reach..].iter().enumerate() {
-                out(y * width + x, *value);
-            }
-        }
+    /// Zeros.
+    pub(super) fn quarters(&self) -> Quarters {
+        Quarters(vec![0.0; 4 * self.quarter()])
     }
 }
 
-/// Writes rows of `n` pixels, and times their distance from the middle along x as imaginary part, padded to `size`.
+/// The half spectrum of a real image, mode by mode.
+#[derive(Debug, Clone)]
+pub(super) struct Modes {
+    pub(super) re: Vec<f32>,
+    pub(super) im: Vec<f32>,
+}
+
+impl Modes {
+    /// Takes the modes of `quarters`.
+    pub(super) fn take(&mut self, quarters: &Quarters) {
+        modes_of(&quarters.0, &mut self.re, &mut self.im);
+    }
+}
+
+/// The spectrum of a real image by parity: cc, cs, sc and ss.
+#[derive(Debug, Clone)]
+pub(super) struct Quarters(pub(super) Vec<f32>);
+
+impl Quarters {
+    /// Takes the parities of `modes`.
+    pub(super) fn take(&mut self, modes: &Modes) {
+        quarters_of(&modes.re, &modes.im, &mut self.0);
+    }
+
+    /// Takes the numbers of another.
+    pub(super) fn copy_from(&mut self, other: &Self) {
+        self.0.copy_from_slice(&other.0);
+    }
+
+    /// The sum of the image.
+    pub(super) fn sum(&self) -> f32 {
+        self.0[0]
+    }
+
+    /// cc, cs, sc and ss.
+    pub(super) fn each(&mut self) -> [&mut [f32]; 4] {
+        each(&mut self.0)
+    }
+}
+
+/// Four parts of equal length.
+fn each(values: &mut [f32]) -> [&mut [f32]; 4] {
+    let (c, s) = values.split_at_mut(values.len() / 2);
+    let (cc, cs) = c.split_at_mut(c.len() / 2);
+    let (sc, ss) = s.split_at_mut(s.len() / 2);
+    [cc, cs, sc, ss]
+}
+
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn weigh(image: &[f32], n: usize, middle: f32, rows: &mut [Complex32], size: usize) {
-    for (line, row) in rows.chunks_exact_mut(size).zip(image.chunks_exact(n)) {
-        for (i, (out, &value)) in line.iter_mut().zip(row).enumerate() {
-            *out = Complex32::new(value, value * (i as f32 - middle));
-        }
-        line[n..].fill(Complex32::ZERO);
-    }
+fn modes_of(quarters: &[f32], re: &mut [f32], im: &mut [f32]) {
+    let count = quarters.len() / 4;
+    let (c, s) = quarters.split_at(2 * count);
+    let ((cc, cs), (sc, ss)) = (c.split_at(count), s.split_at(count));
+    sum_and_difference(ss, cc, &mut re[..2 * count], true);
+    sum_and_difference(cs, sc, &mut im[..2 * count], false);
 }
 
-/// Multiplies two rows of an image in one, of which the second is as far below the first as there are such pairs.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn multiply(pairs: &mut [Complex32], along: &[f32], down: &[f32]) {
-    let (upper, lower) = down.split_at(down.len() / 2);
-    let lines = pairs.chunks_exact_mut(along.len());
-    for (line, (first, second)) in lines.zip(upper.iter().zip(lower)) {
-        for (value, x) in line.iter_mut().zip(along) {
-            *value = Complex32::new(value.re * (first * x), value.im * (second * x));
-        }
-    }
-}
-
-/// The half spectrum along x of an image, from transforms of two of its rows in one.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn split_rows(pairs: &[Complex32], side: usize, half: &mut [Complex32]) {
-    for (column, out) in half.chunks_exact_mut(side).enumerate() {
-        let (first, second) = out.split_at_mut(side / 2);
-        split(pairs, side, column, first, second);
-    }
-}
-
-/// Spectra of two rows of an image in one, from its half spectrum whose columns were transformed back.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn join_rows(half: &[Complex32], side: usize, modes: usize, pairs: &mut [Complex32]) {
-    for (y, line) in pairs.chunks_exact_mut(side).enumerate() {
-        join(half, side, modes, (y, y + side / 2), line);
-    }
-}
-
-/// One column of the transforms of two real images, from rows (of `size`) of the transform of the one
-/// plus i times the other.
+/// Writes b + a and then b − a, or in the other order if `turned`.
 #[inline(always)]
-fn split(
-    rows: &[Complex32],
-    size: usize,
-    column: usize,
-    first: &mut [Complex32],
-    second: &mut [Complex32],
-) {
-    let opposite = (size - column) % size;
-    let lines = rows.chunks_exact(size);
-    for (line, (first, second)) in lines.zip(first.iter_mut().zip(second)) {
-        [*first, *second] = parts(line[column], line[opposite]);
+fn sum_and_difference(a: &[f32], b: &[f32], out: &mut [f32], turned: bool) {
+    let (mut first, mut second) = out.split_at_mut(a.len());
+    if turned {
+        (first, second) = (second, first);
+    }
+    let out = first.iter_mut().zip(second);
+    for ((sum, difference), (a, b)) in out.zip(a.iter().zip(b)) {
+        *sum = b + a;
+        *difference = b - a;
     }
 }
 
-/// Transforms of two real images at one frequency, from those of the one plus i times the other there and at the opposite
-/// frequency.
-#[inline(always)]
-pub(super) fn parts(here: Complex32, opposite: Complex32) -> [Complex32; 2] {
-    let (a, b) = (here, opposite.conj());
-    // (a − b)/2i is the second.
-    let d = (a - b) * 0.5;
-    [(a + b) * 0.5, Complex32::new(d.im, -d.re)]
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn quarters_of(re: &[f32], im: &[f32], quarters: &mut [f32]) {
+    let [cc, cs, sc, ss] = each(quarters);
+    halves(re, cc, ss, true);
+    halves(im, sc, cs, false);
 }
 
-/// The spectrum of row `first` plus i times row `second` of a real image, whose columns were
-/// transformed back.
+/// Writes half the sum and half the difference of the two halves of `values`; of the second and the first if `turned`.
 #[inline(always)]
-fn join(
-    half: &[Complex32],
-    side: usize,
-    modes: usize,
-    (first, second): (usize, usize),
-    line: &mut [Complex32],
-) {
-    line.fill(Complex32::ZERO);
-    line[0] = Complex32::new(half[first].re, half[second].re);
-    for column in 1..=modes {
-        let (a, b) = (half[column * side + first], half[column * side + second]);
-        line[column] = Complex32::new(a.re - b.im, a.im + b.re);
-        // conj(a) + i·conj(b).
-        line[side - column] = Complex32::new(a.re + b.im, b.re - a.im);
+fn halves(values: &[f32], sum: &mut [f32], difference: &mut [f32], turned: bool) {
+    let (mut first, mut second) = values.split_at(sum.len());
+    if turned {
+        (first, second) = (second, first);
     }
+    let out = sum.iter_mut().zip(difference);
+    for ((sum, difference), (a, b)) in out.zip(first.iter().zip(second)) {
+        *sum = 0.5 * (a + b);
+        *difference = 0.5 * (a - b);
+    }
+}
+
+/// Parities cc and ss of a real even spectrum, from its modes.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+pub(super) fn even_quarters(modes: &[f32], quarters: &mut [f32]) {
+    let (cc, ss) = quarters.split_at_mut(modes.len() / 2);
+    halves(modes, cc, ss, true);
 }

@@ -5,7 +5,9 @@ use shearq_fourier::Complex64;
 use shearq_submissions::{LinearDeconvolution, Registry};
 
 use super::super::reference::convolve;
+use super::plane::even_quarters;
 use super::*;
+use crate::noise::StampNoise;
 
 fn settings(iterations: usize, target: f64, window: f64, lambda: f64) -> LinearDeconvolution {
     let registry = Registry::embedded().unwrap();
@@ -77,7 +79,9 @@ fn plain(
     h: &Array2<f64>,
     stamp: &Array2<f64>,
 ) -> Vec<f64> {
-    let (size, side, modes) = plan.grid();
+    let (size, modes) = (plan.plane.size, plan.plane.modes);
+    // Every pixel of the period.
+    let side = size;
     let (n, p) = (stamp.nrows() as f64, h.nrows() as f64);
     let unit = std::f64::consts::TAU / size as f64;
     let spacing = size as f64 / side as f64;
@@ -108,7 +112,7 @@ fn plain(
             transform(stamp.view(), kx, ky) * h.conj() * (target * (1.0 - rest) / w)
         })
         .collect();
-    // v at the places of the coarse grid, windowed.
+    // v at every pixel, windowed.
     let from_middle = |at: usize| {
         let x = at as f64 * spacing - (n - 1.0) / 2.0;
         x - size as f64 * (x / size as f64).round()
@@ -321,8 +325,8 @@ fn light_by_what_the_psf_leaves_of_it_is_the_squared_signal_in_units_of_the_nois
     noise.power.fill(4.0);
     let less = f64::from(signal(&noise));
     assert!((4.0 * less / squares - 1.0).abs() < 1e-5, "{less}");
-    for (power, k) in noise.power.iter_mut().zip(&plan.waves) {
-        *power = (1.0 + k[0] * k[0]).recip();
+    for (power, kx) in noise.power.iter_mut().zip(&plan.waves[0]) {
+        *power = (1.0 + kx * kx).recip();
     }
     // ∂/∂x of the image, squared, is what k_x² adds; by differences that are exact to k⁶/140, k² being 0.06 here.
     let slopes = image.rows().into_iter().flat_map(|row| {
@@ -513,7 +517,6 @@ fn changed_as_by_noise(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
     };
     let mut lags = plan.lags();
     plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
-    let galaxy = scratch.stamp.clone();
     for seed in 0..6000 {
         let stamp = if own_noise.is_correlated() {
             summed(n, rng)
@@ -521,7 +524,7 @@ fn changed_as_by_noise(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
             noise(n, rng)
         };
         plan.deconvolve(&own, &stamp, &mut scratch);
-        plan.changes(&galaxy, &mut scratch.plane, &mut lags);
+        plan.take_changes(3, &mut scratch, &mut lags);
         add(&mut sums[0], &lags);
         plan.noise_field(&own, seed, &mut scratch, &mut lags);
         add(&mut sums[1], &lags);
@@ -558,7 +561,7 @@ fn the_field_of_a_turned_psf_is_the_field_and_what_it_lacks() {
         plan.noise_field(&own, 7, &mut scratch, &mut lags[0]);
         take(&straight, &mut own, &mut scratch);
         // The same stamp behind both.
-        scratch.stamp.copy_from_slice(&seen);
+        scratch.stamp.copy_from(&seen);
         plan.noise_field(&own, 7, &mut scratch, &mut lags[1]);
         plan.turned_field(&own, 7, &mut scratch, &mut lags[2]);
         let [expected, field, lack] = lags.map(|lags| lags.acf);
@@ -621,56 +624,116 @@ fn over_lags(plan: &Spectral, weights: &[f32], values: &[f32]) -> f64 {
         .sum()
 }
 
+/// Sum of products over the modes of the plane of two real spectra.
+fn over_modes(plan: &Spectral, a: &[f32], b: &[f32]) -> f64 {
+    let modes = a.iter().zip(b).zip(&plan.counts);
+    modes
+        .map(|((a, b), count)| f64::from(*count) * f64::from(*a) * f64::from(*b))
+        .sum()
+}
+
 #[test]
 fn spectra_of_weights_are_the_adjoint_of_lags_of_spectra() {
     let mut rng = ChaCha8Rng::seed_from_u64(6);
     let settings = settings(400, 1.5, 6.0, 1e-4);
     for (n, p) in [(48, 48), (23, 30)] {
         let plan = Spectral::new(n, p, &settings).unwrap();
-        let side = plan.plane.side;
         let mut scratch = plan.scratch();
-        let weights = [even(&plan, &mut rng), even(&plan, &mut rng)];
-        let pairs: Vec<Complex32> = weights[0]
-            .iter()
-            .zip(&weights[1])
-            .map(|(a, b)| Complex32::new(*a, *b))
+        let weights = even(&plan, &mut rng);
+        // Any spectrum of a real even function: modes that are stored twice are the same.
+        let mut spectrum: Vec<f32> = (0..plan.counts.len())
+            .map(|_| rng.random_range(-1.0f32..1.0))
             .collect();
-        let mut spectrum = plan.plane.spectrum();
-        for (at, value) in spectrum.iter_mut().enumerate() {
-            let y = at % side;
-            if y <= plan.plane.modes || y >= side - plan.plane.modes {
-                let each = [(); 2].map(|()| rng.random_range(-1.0f32..1.0));
-                *value = Complex32::new(each[0], each[1]);
+        let mut even = vec![0.0; spectrum.len()];
+        let (width, quarter) = (plan.plane.width, plan.plane.quarter());
+        for at in 0..quarter {
+            if at < width || at.is_multiple_of(width) {
+                spectrum[quarter + at] = spectrum[at];
             }
         }
-        for y in 1..side / 2 {
-            spectrum[side - y] = spectrum[y];
-        }
+        even_quarters(&spectrum, &mut even);
         // What is left in the buffers does not matter.
-        for line in &mut scratch.plane.half {
-            line.fill(Complex32::new(7.0, -3.0));
+        scratch.even.fill(f32::NAN);
+        let mut image = vec![f32::NAN; weights.len()];
+        let correlation = &mut scratch.correlation;
+        plan.correlation.lags(&even, correlation, &mut image);
+        let adjoint = plan.spectrum_of(&weights, &mut scratch);
+        // Its modes: cc ∓ ss.
+        let (cc, ss) = adjoint.split_at(quarter);
+        let modes = [-1.0, 1.0].map(|sign| cc.iter().zip(ss).map(move |(cc, ss)| cc + sign * ss));
+        let adjoint: Vec<f32> = modes.into_iter().flatten().collect();
+        let by_modes = over_modes(&plan, &spectrum, &adjoint);
+        let by_lags = over_lags(&plan, &weights, &image);
+        // Thousands of terms of order 100 in single precision.
+        assert!((by_modes - by_lags).abs() < 0.05, "{by_modes} {by_lags}");
+        assert!(by_lags.abs() > 5.0);
+    }
+}
+
+#[test]
+fn parities_and_modes_are_the_same_spectrum() {
+    let plan = Spectral::new(20, 11, &settings(400, 1.5, 6.0, 0.0)).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(12);
+    let mut numbers =
+        |count: usize| -> Vec<f32> { (0..count).map(|_| rng.random_range(-1.0..1.0)).collect() };
+    let mut quarters = plan.plane.quarters();
+    quarters.0 = numbers(quarters.0.len());
+    let mut modes = plan.plane.spectrum();
+    modes.take(&quarters);
+    let quarter = plan.plane.quarter();
+    for at in 0..quarter {
+        let [cc, cs, sc, ss] = [0, 1, 2, 3].map(|part| quarters.0[part * quarter + at]);
+        assert_eq!((modes.re[at], modes.im[at]), (cc - ss, sc + cs));
+        let below = (modes.re[quarter + at], modes.im[quarter + at]);
+        assert_eq!(below, (cc + ss, sc - cs));
+    }
+    let mut back = plan.plane.quarters();
+    back.take(&modes);
+    let mut even = vec![0.0; 2 * quarter];
+    even_quarters(&modes.re, &mut even);
+    for (at, (found, expected)) in back.0.iter().zip(&quarters.0).enumerate() {
+        // A sum and a difference, each rounded.
+        assert!((found - expected).abs() < 3e-7, "{at}");
+    }
+    assert_eq!(even[..quarter], back.0[..quarter]);
+    assert_eq!(even[quarter..], back.0[3 * quarter..]);
+}
+
+#[test]
+fn transforms_of_pixels_are_plain_sums_about_the_middle() {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    for n in [3, 8, 23, 33, 48] {
+        let plan = Spectral::new(n, 5, &settings(400, 1.5, 6.0, 0.0)).unwrap();
+        let stamp = noise(n, &mut rng);
+        let mut scratch = plan.scratch();
+        for dirty in &mut scratch.fft[0].folded {
+            // Rows that fill up are never used.
+            dirty[0] = 7.0;
         }
-        scratch.plane.half[1].copy_from_slice(&spectrum);
-        let mut images = [(); 2].map(|()| vec![0.0; weights[0].len()]);
-        plan.plane
-            .lags(1, plan.reach, &mut scratch.plane, |at, value| {
-                (images[0][at], images[1][at]) = (value.re, value.im);
+        plan.stamp
+            .transform(&stamp, &mut scratch.fft[0], &mut scratch.windowed);
+        let middle = (n as f64 - 1.0) / 2.0;
+        for (which, quarters) in scratch.windowed.iter().enumerate() {
+            let mut modes = plan.plane.spectrum();
+            modes.take(quarters);
+            let weighted = Array2::from_shape_fn((n, n), |(y, x)| {
+                let factor = [1.0, x as f64 - middle, y as f64 - middle][which];
+                factor * f64::from(stamp[y * n + x])
             });
-        plan.plane
-            .spectra_of_lags(0, plan.reach, &mut scratch.plane, &pairs);
-        for (which, weights) in weights.iter().enumerate() {
-            let part = |value: Complex32| [value.re, value.im][which];
-            let modes = spectrum.iter().zip(&scratch.plane.half[0]).enumerate();
-            let by_modes: f64 = modes
-                .map(|(at, (a, b))| {
-                    let twice = if at < side { 1.0 } else { 2.0 };
-                    twice * f64::from(part(*a)) * f64::from(part(*b))
-                })
-                .sum();
-            let by_lags = over_lags(&plan, weights, &images[which]);
-            // Thousands of terms of order 100 in single precision.
-            assert!((by_modes - by_lags).abs() < 0.05, "{by_modes} {by_lags}");
-            assert!(by_lags.abs() > 5.0);
+            let size = weighted.iter().map(|v| v.abs()).sum::<f64>();
+            let modes_used = plan
+                .counts
+                .iter()
+                .enumerate()
+                .filter(|(_, count)| **count > 0.0);
+            for (at, _) in modes_used {
+                let [kx, ky] = [plan.waves[0][at], plan.waves[1][at]].map(f64::from);
+                let plain = transform(weighted.view(), kx, ky)
+                    * Complex64::from_polar(1.0, middle * (kx + ky));
+                let found = Complex64::new(f64::from(modes.re[at]), f64::from(modes.im[at]));
+                // Two sums of a few tens of terms, and wave numbers in single precision.
+                assert!((found - plain).norm() < 2e-6 * size, "{n} {which} {at}");
+            }
         }
     }
 }
@@ -681,7 +744,7 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
     let settings = settings(400, 1.5, 6.0, 1e-4);
     let h = psf(31);
     let plan = Spectral::new(32, 31, &settings).unwrap();
-    let (side, modes) = (plan.plane.side, plan.plane.modes);
+    let (width, quarter) = (plan.plane.width, plan.plane.quarter());
     let mut scratch = plan.scratch();
     let mut psf = plan.psf();
     plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut psf)
@@ -693,19 +756,17 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
         plan.autocorrelate(&psf, &stamp, 0.0, &mut scratch, &mut lags);
         let weights = [(); 3].map(|()| even(&plan, &mut rng));
         let mut gradients = plan.gradients();
-        for (at, value) in gradients.pair.iter_mut().enumerate() {
-            *value = Complex32::new(weights[0][at], weights[1][at]);
-        }
+        gradients.pair = [weights[0].clone(), weights[1].clone()];
         gradients.third = plan.spectrum_of(&weights[2], &mut scratch);
         let found = plan.products(&psf, &gradients, &mut scratch);
 
         // A field of one mode at a time, real and imaginary.
         let mut expected = [[0.0f64; 3]; 10];
         let mut sizes = [0.0f64; 10];
-        for at in 0..psf.restore.len() {
-            let (column, y) = (at / side, at % side);
-            let kept = y <= modes || y >= side - modes;
-            if !kept || (column == 0 && y > modes) {
+        for at in 0..2 * quarter {
+            let (below, x, y) = (at >= quarter, at % width, at % quarter / width);
+            // Modes that are stored twice are taken once.
+            if plan.counts[at] == 0.0 || (below && (x == 0 || y == 0)) {
                 continue;
             }
             let alone = at == 0;
@@ -713,28 +774,34 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
                 if alone && phase == Complex32::I {
                     continue;
                 }
-                for half in &mut scratch.plane.half {
-                    half.fill(Complex32::ZERO);
+                let field = &mut scratch.changes[0];
+                field.re.fill(0.0);
+                field.im.fill(0.0);
+                (field.re[at], field.im[at]) = (phase.re, phase.im);
+                if x == 0 {
+                    let opposite = plan.plane.place(0, y, true);
+                    (field.re[opposite], field.im[opposite]) = (phase.re, -phase.im);
                 }
-                scratch.plane.half[0][at] = phase;
-                if column == 0 {
-                    scratch.plane.half[0][(side - y) % side] = phase.conj();
+                if y == 0 {
+                    let same = plan.plane.place(x, 0, true);
+                    (field.re[same], field.im[same]) = (phase.re, phase.im);
                 }
-                let [across, down] = &scratch.windows;
-                plan.plane.window(across, down, &mut scratch.plane);
-                let flux = f64::from(scratch.plane.half[0][0].re);
-                plan.changes(&scratch.stamp, &mut scratch.plane, &mut lags);
+                plan.look_through_window(1, &mut scratch);
+                let flux = f64::from(scratch.windowed[0].sum());
+                plan.take_changes(1, &mut scratch, &mut lags);
                 let [a, b, c] = [0, 1, 2].map(|k| over_lags(&plan, &weights[k], &lags.acf));
                 let changes = [a, b, c, flux];
                 // Half of the power of a mode is that of its real part; but for the mean, which has no other.
                 let share = if alone { 1.0 } else { 0.5 };
-                let stands_for = if column == 0 { 1.0 } else { 2.0 };
                 let mut number = 0;
                 for a in 0..4 {
                     for b in a..4 {
                         let product = share * changes[a] * changes[b];
                         for (kind, sum) in expected[number].iter_mut().enumerate() {
-                            let power = f64::from(psf.powers[kind][at]) / stands_for;
+                            let [cc, ss] =
+                                [0, quarter].map(|part| psf.powers[kind][part + at % quarter]);
+                            let power = if below { cc + ss } else { cc - ss };
+                            let power = f64::from(power / plan.counts[at]);
                             *sum += power * product;
                             sizes[number] = sizes[number].max(sum.abs());
                         }

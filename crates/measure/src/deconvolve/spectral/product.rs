@@ -1,0 +1,143 @@
+//! Products of small matrices. So few modes are kept that sums over pixels, modes or lags along an axis take less time as
+//! dense products than as fast transforms.
+
+use multiversion::multiversion;
+
+/// Columns that are summed side by side. See docs/constants.md.
+pub(super) const LANES: usize = 16;
+/// Multiple of the rows of a product. See docs/constants.md.
+pub(super) const ROWS: usize = 8;
+
+/// A matrix in row-major order.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Matrix<'a> {
+    pub(super) values: &'a [f32],
+    /// Numbers from the beginning of a row to that of the next.
+    pub(super) stride: usize,
+}
+
+impl<'a> Matrix<'a> {
+    pub(super) fn new(values: &'a [f32], stride: usize) -> Self {
+        Matrix { values, stride }
+    }
+}
+
+/// Writes `left` times `right`, a sum over `inner` columns of the one and rows of the other, to rows of `width` numbers,
+/// a multiple of [`LANES`]. The number of rows is a multiple of [`ROWS`].
+///
+/// Sums run over `inner` in order, fused where the processor can: results are the same for AVX-512, AVX2 and NEON.
+pub(super) fn multiply(
+    left: Matrix<'_>,
+    right: Matrix<'_>,
+    inner: usize,
+    out: &mut [f32],
+    width: usize,
+) {
+    debug_assert!(width.is_multiple_of(LANES) && out.len().is_multiple_of(ROWS * width));
+    product(left, right, inner, out, width);
+}
+
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn product(left: Matrix<'_>, right: Matrix<'_>, inner: usize, out: &mut [f32], width: usize) {
+    // As many rows at a time as there are registers for.
+    multiversion::target::match_target! {
+        "x86_64+avx512f" => bands::<ROWS, true>(left, right, inner, out, width),
+        "x86_64+fma" => bands::<4, true>(left, right, inner, out, width),
+        "aarch64" => bands::<4, true>(left, right, inner, out, width),
+        _ => bands::<4, false>(left, right, inner, out, width),
+    }
+}
+
+/// The product, `R` rows and [`LANES`] columns at a time.
+#[inline(always)]
+fn bands<const R: usize, const FUSED: bool>(
+    left: Matrix<'_>,
+    right: Matrix<'_>,
+    inner: usize,
+    out: &mut [f32],
+    width: usize,
+) {
+    for (band, out) in out.chunks_exact_mut(R * width).enumerate() {
+        let rows: [&[f32]; R] =
+            std::array::from_fn(|k| &left.values[(band * R + k) * left.stride..][..inner]);
+        for column in (0..width).step_by(LANES) {
+            let mut sums = [[0.0f32; LANES]; R];
+            for i in 0..inner {
+                let line = &right.values[i * right.stride + column..][..LANES];
+                for (sums, row) in sums.iter_mut().zip(&rows) {
+                    let factor = row[i];
+                    for (sum, value) in sums.iter_mut().zip(line) {
+                        *sum = if FUSED {
+                            factor.mul_add(*value, *sum)
+                        } else {
+                            factor * value + *sum
+                        };
+                    }
+                }
+            }
+            for (out, sums) in out.chunks_exact_mut(width).zip(&sums) {
+                out[column..][..LANES].copy_from_slice(sums);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    /// The product as a plain sum, and the sum of moduli.
+    fn plain(left: Matrix<'_>, right: Matrix<'_>, inner: usize, at: [usize; 2]) -> [f64; 2] {
+        let terms = (0..inner).map(|i| {
+            let (a, b) = (
+                left.values[at[0] * left.stride + i],
+                right.values[i * right.stride + at[1]],
+            );
+            f64::from(a) * f64::from(b)
+        });
+        terms.fold([0.0; 2], |[sum, size], term| {
+            [sum + term, size + term.abs()]
+        })
+    }
+
+    #[test]
+    fn products_are_plain_sums_for_all_sizes_and_strides_and_dirty_results() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        for (rows, inner, width, more) in [
+            (8, 1, 16, 0),
+            (16, 24, 16, 16),
+            (48, 24, 32, 3),
+            (8, 0, 16, 1),
+            (24, 17, 48, 5),
+        ] {
+            let mut numbers = |count: usize| -> Vec<f32> {
+                (0..count).map(|_| rng.random_range(-1.0..1.0)).collect()
+            };
+            let (a, b) = (
+                numbers(rows * (inner + more)),
+                numbers(inner * (width + more) + width),
+            );
+            let left = Matrix::new(&a, inner + more);
+            let right = Matrix::new(&b, width + more);
+            let mut all = vec![vec![f32::NAN; rows * width]; 4];
+            multiply(left, right, inner, &mut all[0], width);
+            bands::<ROWS, true>(left, right, inner, &mut all[1], width);
+            bands::<4, true>(left, right, inner, &mut all[2], width);
+            bands::<4, false>(left, right, inner, &mut all[3], width);
+            // The number of rows at a time does not matter.
+            assert_eq!(all[1], all[2]);
+            for (found, at) in all.iter().flat_map(|all| all.iter().zip(0..)) {
+                let [sum, size] = plain(left, right, inner, [at / width, at % width]);
+                // As many roundings as terms, of half a bit of 24 each.
+                let tolerance = (inner as f64 + 1.0) * size * f64::from(f32::EPSILON) / 2.0;
+                assert!(
+                    (f64::from(*found) - sum).abs() <= tolerance,
+                    "{found} {sum}"
+                );
+            }
+        }
+    }
+}
