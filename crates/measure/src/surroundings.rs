@@ -70,10 +70,12 @@ impl Surroundings {
     ) -> Result<bool, Flag> {
         // Pixel p is opposite to `turn − p`.
         let turn = turn(centre, self.n);
-        self.contrasts.compare_smoothed(stamp, turn);
-        let least = BRIGHT * self.contrasts.light;
+        let square = (SIGNIFICANT * noise).powi(2);
+        self.contrasts
+            .compare_smoothed(stamp, turn, |light, excess, pixels| {
+                excess > BRIGHT * light && excess * excess > square * pixels
+            });
         let hits = &mut self.contrasts.blocks;
-        hits.retain(|hit| hit.excess > least.max(SIGNIFICANT * noise * hit.pixels.sqrt()));
         if hits.is_empty() {
             return self.blended(stamp, turn, noise).map(|()| false);
         }

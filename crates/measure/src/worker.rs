@@ -9,7 +9,7 @@ use std::sync::Arc;
 use ndarray::{ArrayView2, ArrayView3, Axis};
 use shearq_submissions::{Configuration, Method, NoiseSource};
 
-use crate::brightness::{PEAKS, highest, is_level};
+use crate::brightness::{PEAKS, all_finite, highest, is_level};
 use crate::denoise::{DenoiseScratch, border_noise};
 use crate::ellipticity::{observables, report};
 use crate::error::{MeasureError, length};
@@ -257,8 +257,7 @@ impl Worker {
                 None => convert(row, from.iter()),
             }
         }
-        // No early exit, so that several pixels are tested at a time.
-        Ok(self.full.iter().fold(true, |all, v| all & v.is_finite()))
+        Ok(all_finite(&self.full))
     }
 }
 

@@ -37,6 +37,7 @@ mod plane;
 mod product;
 mod products;
 mod psf;
+mod restore;
 mod smoothing;
 
 use ndarray::ArrayView2;
@@ -45,12 +46,13 @@ use shearq_submissions::LinearDeconvolution;
 
 use self::correlation::{Correlation, CorrelationScratch};
 use self::edges::{Edges, EdgesScratch};
-use self::modes::{multiply, recentre, shear, subtract_product};
+use self::modes::multiply;
 use self::parities::{change, power};
 use self::pixels::{Pixels, PixelsScratch};
 use self::plane::{Modes, Plane, Quarters};
 pub(crate) use self::products::Gradients;
 pub use self::psf::{ModeNoise, SpectralPsf};
+use self::restore::{Restoration, restore};
 use self::smoothing::Smoothing;
 use super::sun::high_pass;
 use crate::error::MeasureError;
@@ -110,8 +112,9 @@ pub struct Spectral {
 pub struct SpectralScratch {
     /// For stamps, and for PSFs.
     fft: [PixelsScratch; 2],
-    /// v̂ of a stamp and its changes with the components of shear: before the window, and behind it.
+    /// Spectra mode by mode, before the window.
     changes: [Modes; 3],
+    /// v̂ of a stamp and its changes with the components of shear, behind the window; or other changes.
     windowed: [Quarters; 3],
     /// A PSF.
     image: Vec<f32>,
@@ -327,39 +330,38 @@ impl Spectral {
     fn deconvolve(&self, psf: &SpectralPsf, stamp: &[f32], scratch: &mut SpectralScratch) {
         let SpectralScratch {
             fft: [fft, _],
-            windowed: quarters,
-            changes: [u, x, y],
+            changes: [moved, edges1, edges2],
+            windowed,
+            smooth,
             centre,
             phases,
             edges,
             ..
         } = scratch;
-        self.stamp.transform(stamp, fft, quarters);
-        for (modes, quarters) in [&mut *u, x, y].into_iter().zip(&*quarters) {
-            modes.take(quarters);
-        }
+        self.stamp.transform(stamp, fft, windowed);
         let centre = *centre;
-        let moved = centre != [0.0; 2];
-        if moved {
-            // About the window's place.
-            recentre(x, u, centre[0]);
-            recentre(y, u, centre[1]);
-        }
-        shear(x, y, &self.waves);
-        if self.sees_edges(centre) {
+        let at_edges = self.sees_edges(centre);
+        if at_edges {
             let fft = (&self.stamp, fft);
-            self.edges.add(stamp, centre, fft, edges, [x, y]);
+            self.edges.take(stamp, centre, fft, edges, [edges1, edges2]);
         }
-        // The changes are v̂/û times p·(k_x ∂_x − k_y ∂_y)(û/p), and the other's.
-        subtract_product(x, &psf.tilts[0], u);
-        subtract_product(y, &psf.tilts[1], u);
-        for modes in [u, x, y] {
-            multiply(modes, &psf.restore);
-            if moved {
-                multiply(modes, phases);
-            }
+        let off_middle = centre != [0.0; 2];
+        if off_middle {
+            // About the window's place.
+            moved.copy_from(&psf.restore);
+            multiply(moved, phases);
         }
-        self.look_through_window(3, scratch);
+        let with = Restoration {
+            restore: if off_middle { moved } else { &psf.restore },
+            tilts: &psf.tilts,
+            waves: &self.waves,
+            centre,
+            edges: at_edges.then_some([edges1, edges2]),
+        };
+        restore(windowed, &with);
+        for spectrum in windowed {
+            self.window.apply(spectrum, smooth);
+        }
     }
 
     /// Multiplies the images of the first `count` spectra of `scratch.changes` by the window, which is at their origin, to

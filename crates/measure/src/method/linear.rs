@@ -38,7 +38,7 @@ use crate::surroundings::{Surroundings, centre, followed};
 
 /// One galaxy in this many is measured with a field of noise, for the noise term of the response.
 /// See docs/constants.md.
-const SHARE: u64 = 4;
+const SHARE: u64 = 8;
 /// Level of the field of noise in units of the image's noise. See docs/constants.md.
 const FIELD: f32 = 0.25;
 

@@ -22,13 +22,11 @@ pub(crate) fn centre(stamp: &[f32], n: usize) -> [f32; 2] {
     let [mut x, mut y] = [0.0f32; 2];
     for _ in 0..STEPS {
         let (first_x, first_y) = (start(middle + x), start(middle + y));
-        let mut along = [0.0f32; (2 * WEIGHT_REACH) as usize];
-        for (i, weight) in along.iter_mut().enumerate() {
-            *weight = gaussian((first_x + i as i32) as f32 - middle - x);
-        }
+        let along = weights(first_x as f32 - middle - x);
+        let down = weights(first_y as f32 - middle - y);
         let mut sums = [0.0f32; 3];
-        for j in 0..2 * WEIGHT_REACH {
-            let row = first_y + j;
+        for (j, weight) in down.into_iter().enumerate() {
+            let row = first_y + j as i32;
             if !(0..n).contains(&row) {
                 continue;
             }
@@ -42,7 +40,6 @@ pub(crate) fn centre(stamp: &[f32], n: usize) -> [f32; 2] {
                 }
             }
             let dy = row as f32 - middle - y;
-            let weight = gaussian(dy);
             sums[0] += weight * all;
             sums[1] += weight * first;
             sums[2] += weight * all * dy;
@@ -69,6 +66,17 @@ fn start(centre: f32) -> i32 {
     centre.floor() as i32 + 1 - WEIGHT_REACH
 }
 
-fn gaussian(x: f32) -> f32 {
-    (-0.5 * (x / WEIGHT).powi(2)).exp()
+/// The weight at places one pixel apart, of which the first is at `first`.
+fn weights(first: f32) -> [f32; (2 * WEIGHT_REACH) as usize] {
+    // exp(−(x + 1)²/2σ²) is exp(−x²/2σ²) times exp(−(2x + 1)/2σ²), whose ratio from place to place is exp(−1/σ²).
+    let square = WEIGHT * WEIGHT;
+    let mut value = (-0.5 * first * first / square).exp();
+    let mut step = (-(first + 0.5) / square).exp();
+    let ratio = (-1.0 / square).exp();
+    std::array::from_fn(|_| {
+        let here = value;
+        value *= step;
+        step *= ratio;
+        here
+    })
 }

@@ -23,8 +23,8 @@ pub(crate) struct Contrasts {
     /// opposites.
     lines: [Vec<f32>; 2],
     cells: Vec<Cell>,
-    /// Excess and pixels of a row, with those beside it along y.
-    across: Vec<(f32, f32)>,
+    /// Excess and pixels of a row, with those beside it along y, between zeros.
+    across: [Vec<f32>; 2],
     /// What was found last.
     pub(crate) blocks: Vec<Block>,
     /// The galaxy's light.
@@ -79,7 +79,7 @@ impl Contrasts {
             n: n as i32,
             lines: std::array::from_fn(|_| vec![0.0; 3 * n]),
             cells: Vec::with_capacity(n * n / 8),
-            across: vec![(0.0, 0.0); 2 * along(n as i32) as usize],
+            across: std::array::from_fn(|_| vec![0.0; 2 * along(n as i32) as usize + 2]),
             blocks: Vec::with_capacity(n * n / 8),
             light: 0.0,
         }
@@ -119,34 +119,42 @@ impl Contrasts {
     }
 
     /// Compares places under a weight as wide as a galaxy behind its PSF: a cell has a weight of 1, those beside it 1/2
-    /// and those at its corners 1/4. What is found is in `self.blocks`; a weight w counts as w² pixels.
-    pub(super) fn compare_smoothed(&mut self, stamp: &[f32], turn: [i32; 2]) {
+    /// and those at its corners 1/4. A weight w counts as w² pixels. Those of which `is_hit` is true, by the galaxy's light,
+    /// the excess and the number of pixels, are in `self.blocks`.
+    pub(super) fn compare_smoothed(
+        &mut self,
+        stamp: &[f32],
+        turn: [i32; 2],
+        is_hit: impl Fn(f32, f32, f32) -> bool,
+    ) {
         let most = self.compare_cells(stamp, turn);
         let [x0, y0] = beyond(turn);
         let middle = |first: i32, step: i32, turn: i32| {
             (first + step * CELL) as f32 + 0.5 * (CELL - 1) as f32 - 0.5 * turn as f32
         };
         let row = 2 * most as usize;
+        let [excesses, counts] = &mut self.across;
         for j in 0..most {
             let y = middle(y0, j, turn[1]);
+            // Nothing beside the first and the last one.
             let lines = self.cells[j as usize * row..].chunks_exact(row).take(3);
-            self.across.fill((0.0, 0.0));
+            excesses.fill(0.0);
+            counts.fill(0.0);
             for (line, weight) in lines.zip(SMOOTHED) {
-                for (sum, cell) in self.across.iter_mut().zip(line) {
-                    sum.0 += weight * cell.excess;
-                    sum.1 += weight * weight * cell.pixels as f32;
+                let sums = excesses[1..].iter_mut().zip(&mut counts[1..]);
+                for ((excess, pixels), cell) in sums.zip(line) {
+                    *excess += weight * cell.excess;
+                    *pixels += weight * weight * cell.pixels as f32;
                 }
             }
+            let [beside, _, _] = SMOOTHED;
             for i in 0..row {
+                let excess = excesses[i + 1] + beside * (excesses[i] + excesses[i + 2]);
+                let pixels = counts[i + 1] + beside * beside * (counts[i] + counts[i + 2]);
                 let x = middle(x0, i as i32 - most, turn[0]);
-                if x * x + y * y < LEAST_DISTANCE * LEAST_DISTANCE {
+                let near = x * x + y * y < LEAST_DISTANCE * LEAST_DISTANCE;
+                if near || !is_hit(self.light, excess.abs(), pixels) {
                     continue;
-                }
-                let (mut excess, mut pixels) = self.across[i];
-                let beside = [i.wrapping_sub(1), i + 1];
-                for beside in beside.into_iter().filter_map(|at| self.across.get(at)) {
-                    excess += SMOOTHED[0] * beside.0;
-                    pixels += SMOOTHED[0] * SMOOTHED[0] * beside.1;
                 }
                 let side = excess.signum();
                 self.blocks.push(Block {

@@ -17,6 +17,8 @@ const CELL: usize = 2;
 const ALONG: usize = 12;
 /// Cells.
 const CELLS: usize = ALONG * ALONG;
+/// Pixels along an axis.
+const WIDE: usize = ALONG * CELL;
 /// Cells that are summed side by side. See docs/constants.md.
 const LANES: usize = 16;
 /// σ of the Gaussian neighbour. See docs/constants.md.
@@ -130,24 +132,37 @@ fn add_pairs(
     cells: &mut [[f32; CELLS]; 2],
 ) {
     let count = columns.len();
-    let [differences, sums] = cells;
     for (step, j) in lines.enumerate() {
         let here = &pairs.stamp[(pairs.here[1] + step) * pairs.n + pairs.here[0]..][..count];
         let there = &pairs.stamp[(pairs.there[1] - step) * pairs.n + pairs.there[0]..][..count];
-        let mut pixels = [[0.0; ALONG * CELL]; 2];
-        let [less, more] = pixels.each_mut().map(|pixels| &mut pixels[columns.clone()]);
-        let out = less.iter_mut().zip(more);
-        for ((less, more), (here, there)) in out.zip(here.iter().zip(there.iter().rev())) {
-            (*less, *more) = (here - there, here + there);
+        let line = j / CELL * ALONG;
+        if let (Ok(here), Ok(there)) = (here.try_into(), there.try_into()) {
+            // A length that is known.
+            add_line(here, there, line, cells);
+        } else {
+            let mut both = [[0.0; WIDE]; 2];
+            both[0][columns.clone()].copy_from_slice(here);
+            both[1][WIDE - columns.end..WIDE - columns.start].copy_from_slice(there);
+            add_line(&both[0], &both[1], line, cells);
         }
-        let line = j / CELL * ALONG..(j / CELL + 1) * ALONG;
-        for (cells, pixels) in [&mut *differences, sums].into_iter().zip(pixels) {
-            for (cell, pixels) in cells[line.clone()]
-                .iter_mut()
-                .zip(pixels.chunks_exact(CELL))
-            {
-                *cell += pixels.iter().sum::<f32>();
-            }
+    }
+}
+
+/// Adds a line of pixels and of their opposites, which are in the other order, to the cells from `first` on.
+#[inline(always)]
+fn add_line(here: &[f32; WIDE], there: &[f32; WIDE], first: usize, cells: &mut [[f32; CELLS]; 2]) {
+    let mut both = [[0.0; ALONG]; 2];
+    for i in 0..ALONG {
+        let (mut own, mut other) = (0.0, 0.0);
+        for k in CELL * i..CELL * (i + 1) {
+            own += here[k];
+            other += there[WIDE - 1 - k];
+        }
+        (both[0][i], both[1][i]) = (own - other, own + other);
+    }
+    for (cells, both) in cells.iter_mut().zip(both) {
+        for (cell, value) in cells[first..].iter_mut().zip(both) {
+            *cell += value;
         }
     }
 }

@@ -64,8 +64,8 @@ impl Edges {
         }
     }
 
-    /// Adds what edges of `stamp` add to its changes with γ₁ and γ₂ about `centre`, (x, y) in pixels from the middle.
-    pub(super) fn add(
+    /// Writes what edges of `stamp` add to its changes with γ₁ and γ₂ about `centre`, (x, y) in pixels from the middle.
+    pub(super) fn take(
         &self,
         stamp: &[f32],
         [x0, y0]: [f32; 2],
@@ -111,6 +111,8 @@ impl Edges {
         for (which, change) in changes.into_iter().enumerate() {
             let sides = [line(2 * which), line(2 * which + 1)];
             let levels = [line(2 * which + 4), line(2 * which + 5)];
+            change.re.fill(0.0);
+            change.im.fill(0.0);
             let halves = change.re.len() / 2;
             for (below, start) in [(false, 0), (true, halves)] {
                 let (re, im) = (&mut change.re[start..], &mut change.im[start..]);

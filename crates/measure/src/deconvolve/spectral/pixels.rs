@@ -8,6 +8,9 @@ use multiversion::multiversion;
 use super::plane::{Plane, Quarters};
 use super::product::{LANES, Matrix, ROWS, multiply};
 
+/// Places that are folded side by side. See docs/constants.md.
+const SIDE: usize = 8;
+
 /// Tables for images of one size.
 #[derive(Debug, Clone)]
 pub(super) struct Pixels {
@@ -183,35 +186,50 @@ impl Pixels {
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn fold(image: &[f32], n: usize, folded: [&mut [f32]; 4]) {
     let half = n.div_ceil(2);
-    let [
-        sums_sums,
-        sums_differences,
-        differences_sums,
-        differences_differences,
-    ] = folded;
-    let sums = sums_sums
-        .chunks_exact_mut(half)
-        .zip(sums_differences.chunks_exact_mut(half));
-    let differences = differences_sums
-        .chunks_exact_mut(half)
-        .zip(differences_differences.chunks_exact_mut(half));
-    for (y, ((ss, sd), (ds, dd))) in sums.zip(differences).take(half).enumerate() {
-        // Of the middle on, and opposite.
+    let whole = half / SIDE * SIDE;
+    for y in 0..half {
+        // From the middle on, and opposite.
         let upper = &image[(n / 2 + y) * n..][..n];
         let lower = &image[(half - 1 - y) * n..][..n];
-        let (upper_left, upper_right) = (&upper[..half], &upper[n / 2..]);
-        let (lower_left, lower_right) = (&lower[..half], &lower[n / 2..]);
-        for x in 0..half {
-            let right = (upper_right[x], lower_right[x]);
-            let left = (upper_left[half - 1 - x], lower_left[half - 1 - x]);
-            let (right_sum, right_difference) = (right.0 + right.1, right.0 - right.1);
-            let (left_sum, left_difference) = (left.0 + left.1, left.0 - left.1);
-            ss[x] = right_sum + left_sum;
-            sd[x] = right_difference + left_difference;
-            ds[x] = right_sum - left_sum;
-            dd[x] = right_difference - left_difference;
+        for x in (0..whole).step_by(SIDE) {
+            let (right, left) = (n / 2 + x, half - SIDE - x);
+            let (upper_right, lower_right) = (side(upper, right), side(lower, right));
+            let (upper_left, lower_left) = (side(upper, left), side(lower, left));
+            let mut out = [[0.0f32; SIDE]; 4];
+            for k in 0..SIDE {
+                let sums = (
+                    upper_right[k] + lower_right[k],
+                    upper_left[SIDE - 1 - k] + lower_left[SIDE - 1 - k],
+                );
+                let differences = (
+                    upper_right[k] - lower_right[k],
+                    upper_left[SIDE - 1 - k] - lower_left[SIDE - 1 - k],
+                );
+                out[0][k] = sums.0 + sums.1;
+                out[1][k] = differences.0 + differences.1;
+                out[2][k] = sums.0 - sums.1;
+                out[3][k] = differences.0 - differences.1;
+            }
+            for k in 0..4 {
+                folded[k][y * half + x..][..SIDE].copy_from_slice(&out[k]);
+            }
+        }
+        for x in whole..half {
+            let (right, left) = (n / 2 + x, half - 1 - x);
+            let sums = (upper[right] + lower[right], upper[left] + lower[left]);
+            let differences = (upper[right] - lower[right], upper[left] - lower[left]);
+            let at = y * half + x;
+            folded[0][at] = sums.0 + sums.1;
+            folded[1][at] = differences.0 + differences.1;
+            folded[2][at] = sums.0 - sums.1;
+            folded[3][at] = differences.0 - differences.1;
         }
     }
+}
+
+#[inline(always)]
+fn side(line: &[f32], first: usize) -> &[f32; SIDE] {
+    line[first..].first_chunk().expect("pixels of a line")
 }
 
 fn fold_line(line: &[f32], sums: &mut [f32], differences: &mut [f32]) {

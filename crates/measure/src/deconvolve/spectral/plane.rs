@@ -144,6 +144,12 @@ impl Modes {
     pub(super) fn take(&mut self, quarters: &Quarters) {
         modes_of(&quarters.0, &mut self.re, &mut self.im);
     }
+
+    /// Takes the numbers of another.
+    pub(super) fn copy_from(&mut self, other: &Self) {
+        self.re.copy_from_slice(&other.re);
+        self.im.copy_from_slice(&other.im);
+    }
 }
 
 /// The spectrum of a real image by parity: cc, cs, sc and ss.
