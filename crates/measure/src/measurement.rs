@@ -19,7 +19,7 @@ pub struct Measurement {
     pub flags: Flags,
     /// Response of the reported ellipticity to shear, before calibration; `None` for the network and for galaxies that
     /// could not be measured. Only means over many galaxies are unbiased: the mean contribution of sheared noise is
-    /// subtracted from one galaxy in four, for all.
+    /// subtracted from one galaxy in eight, for all.
     pub response: Option<ResponseMatrix>,
     /// Flux and size before the PSF, with their responses; `None` for the network and for galaxies that could not be measured.
     pub observables: Option<Observables>,

@@ -94,7 +94,7 @@ impl Observables {
 
 /// Mean products of the changes that noise makes of ellipticity, flux and size.
 ///
-/// They are determined for one galaxy in four, with four times the weight, and zero for the others.
+/// They are determined for one galaxy in eight, with eight times the weight, and zero for the others.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[non_exhaustive]
 pub struct Coupling {

@@ -48,6 +48,25 @@ impl Sersic {
         }
     }
 
+    /// Replaces squared wavenumbers by the transform there, as [`Sersic::fourier`].
+    #[inline(always)]
+    pub(crate) fn fourier_each(self, values: &mut [f64]) {
+        match self {
+            Sersic::Exponential => {
+                for value in values {
+                    let v = 1.0 + *value / (EXPONENTIAL_HALF_LIGHT * EXPONENTIAL_HALF_LIGHT);
+                    *value = 1.0 / (v * v.sqrt());
+                }
+            }
+            Sersic::DeVaucouleurs => {
+                let table = &*DE_VAUCOULEURS;
+                for value in values {
+                    *value = table.at(*value);
+                }
+            }
+        }
+    }
+
     /// Surface brightness of the round profile of flux 1, per r_e², at `radius` in r_e.
     pub fn brightness(self, radius: f64) -> f64 {
         match self {

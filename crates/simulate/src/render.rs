@@ -74,12 +74,58 @@ pub struct RenderScratch {
     blur: Vec<f32>,
     /// Transform of pixels along y times 1/N², for ky from −last to last.
     pixel_y: Vec<f32>,
+    transfer: Transfer,
     phases: [Phases; Galaxy::MAX_COMPONENTS],
 }
 
 impl std::fmt::Debug for RenderScratch {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("RenderScratch").finish_non_exhaustive()
+    }
+}
+
+/// The transform of the PSF that was used last: galaxies of an image often share it.
+#[derive(Default)]
+struct Transfer {
+    /// The PSF and the size of the grid.
+    of: Option<(FunctionalPsf, usize)>,
+    /// Wavenumbers along an axis up to the largest, with those of column i at ky from −last to last in line i.
+    last: usize,
+    lines: Vec<f32>,
+    /// Reach of the line of each column.
+    reaches: Vec<Option<usize>>,
+}
+
+impl Transfer {
+    /// Forgets the PSF unless it is `psf` on a grid of `size`, up to wavenumber `last`.
+    fn prepare(&mut self, psf: &TransformedPsf<'_>, size: usize, last: usize) {
+        let of = Some((psf.functional(), size));
+        if self.of == of && last <= self.last {
+            return;
+        }
+        self.of = of;
+        self.last = last;
+        self.lines.resize((last + 1) * (2 * last + 1), 0.0);
+        self.reaches.clear();
+        self.reaches.resize(last + 1, None);
+    }
+
+    /// The transform on column `i` from −reach to reach, with a quadratic form of the wavenumbers.
+    fn line(
+        &mut self,
+        table: SingleTable<'_>,
+        form: QuadraticForm,
+        i: usize,
+        reach: usize,
+    ) -> &[f32] {
+        let wide = 2 * self.last + 1;
+        let span = i * wide + self.last - reach..i * wide + self.last + reach + 1;
+        let line = &mut self.lines[span];
+        if self.reaches[i].is_none_or(|known| known < reach) {
+            tabulate(table, form, i, reach, line);
+            self.reaches[i] = Some(reach);
+        }
+        line
     }
 }
 
@@ -202,6 +248,7 @@ impl Grid {
             amplitude,
             blur,
             pixel_y,
+            transfer,
             phases,
             ..
         } = scratch;
@@ -218,16 +265,18 @@ impl Grid {
 
         let psf_argument = argument(psf.shape, psf.fwhm, step);
         let psf_table = psf.transform.table().single();
+        transfer.prepare(psf, n, last);
         let bulge_table = Sersic::de_vaucouleurs_table().single();
         for i in 0..=last {
             let beside = (cut / step).powi(2) - (i * i) as f64;
             let reach = (beside.max(0.0).sqrt() as usize).min(last);
             let span = last - reach..last + reach + 1;
             let blur = &mut blur[span.clone()];
-            for (blur, pixel_y) in blur.iter_mut().zip(&pixel_y[span.clone()]) {
-                *blur = self.pixel[i] * pixel_y;
+            let transfer = transfer.line(psf_table, psf_argument, i, reach);
+            let pixels = pixel_y[span.clone()].iter().zip(transfer);
+            for (blur, (pixel_y, transfer)) in blur.iter_mut().zip(pixels) {
+                *blur = self.pixel[i] * pixel_y * transfer;
             }
-            multiply_tabulated(psf_table, psf_argument, i, reach, blur);
             for (phases, group) in phases.iter().zip(groups(galaxy)) {
                 let amplitude = &mut amplitude[span.clone()];
                 amplitude.fill(0.0);
@@ -357,7 +406,7 @@ fn on_column(form: QuadraticForm, i: usize) -> (f32, f32, f32) {
     )
 }
 
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn add_exponential(form: QuadraticForm, i: usize, reach: usize, flux: f32, out: &mut [f32]) {
     let (constant, linear, square) = on_column(form, i);
     for (index, value) in out.iter_mut().enumerate() {
@@ -367,7 +416,7 @@ fn add_exponential(form: QuadraticForm, i: usize, reach: usize, flux: f32, out: 
     }
 }
 
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn add_tabulated(
     table: SingleTable<'_>,
     form: QuadraticForm,
@@ -384,8 +433,8 @@ fn add_tabulated(
     }
 }
 
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn multiply_tabulated(
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn tabulate(
     table: SingleTable<'_>,
     form: QuadraticForm,
     i: usize,
@@ -396,11 +445,12 @@ fn multiply_tabulated(
     for (index, value) in out.iter_mut().enumerate() {
         let j = index as i32 as f32 - reach as i32 as f32;
         let u = constant + j * (linear + square * j);
-        *value *= table.at(u.max(0.0));
+        *value = table.at(u.max(0.0));
     }
 }
 
 /// Adds a column, or its point reflection, onto wavenumbers modulo the length of `target`.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn add_line(line: &Line<'_>, reach: usize, target: &mut [Complex32], mirrored: bool) {
     let n = target.len();
     let value = |index: usize| {
