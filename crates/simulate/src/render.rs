@@ -273,10 +273,7 @@ impl Grid {
             let span = last - reach..last + reach + 1;
             let blur = &mut blur[span.clone()];
             let transfer = transfer.line(psf_table, psf_argument, i, reach);
-            let pixels = pixel_y[span.clone()].iter().zip(transfer);
-            for (blur, (pixel_y, transfer)) in blur.iter_mut().zip(pixels) {
-                *blur = self.pixel[i] * pixel_y * transfer;
-            }
+            blurred(self.pixel[i], &pixel_y[span.clone()], transfer, blur);
             for (phases, group) in phases.iter().zip(groups(galaxy)) {
                 let amplitude = &mut amplitude[span.clone()];
                 amplitude.fill(0.0);
@@ -293,9 +290,7 @@ impl Grid {
                         }
                     }
                 }
-                for (amplitude, blur) in amplitude.iter_mut().zip(&*blur) {
-                    *amplitude *= blur;
-                }
+                multiply(amplitude, blur);
                 let source = Line {
                     amplitude,
                     re: &phases.y_re[span.clone()],
@@ -434,13 +429,7 @@ fn add_tabulated(
 }
 
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn tabulate(
-    table: SingleTable<'_>,
-    form: QuadraticForm,
-    i: usize,
-    reach: usize,
-    out: &mut [f32],
-) {
+fn tabulate(table: SingleTable<'_>, form: QuadraticForm, i: usize, reach: usize, out: &mut [f32]) {
     let (constant, linear, square) = on_column(form, i);
     for (index, value) in out.iter_mut().enumerate() {
         let j = index as i32 as f32 - reach as i32 as f32;
@@ -449,35 +438,60 @@ fn tabulate(
     }
 }
 
+/// The transform of the PSF and of pixels.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn blurred(pixel_x: f32, pixel_y: &[f32], transfer: &[f32], out: &mut [f32]) {
+    for (out, (pixel_y, transfer)) in out.iter_mut().zip(pixel_y.iter().zip(transfer)) {
+        *out = pixel_x * pixel_y * transfer;
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn multiply(values: &mut [f32], factors: &[f32]) {
+    for (value, factor) in values.iter_mut().zip(factors) {
+        *value *= factor;
+    }
+}
+
 /// Adds a column, or its point reflection, onto wavenumbers modulo the length of `target`.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn add_line(line: &Line<'_>, reach: usize, target: &mut [Complex32], mirrored: bool) {
     let n = target.len();
-    let value = |index: usize| {
-        let a = line.amplitude[index];
-        let (re, im) = (a * line.re[index], a * line.im[index]);
-        let p = line.phase_x;
-        Complex32::new(re * p.re - im * p.im, re * p.im + im * p.re)
-    };
-    if !mirrored && 2 * reach < n {
-        let (negative, positive) = (n - reach, reach + 1);
-        for (index, sum) in target[negative..].iter_mut().enumerate() {
-            *sum += value(index);
-        }
-        for (index, sum) in target[..positive].iter_mut().enumerate() {
-            *sum += value(reach + index);
-        }
-        return;
-    }
-    for index in 0..=2 * reach {
+    let count = 2 * reach + 1;
+    let mut from = 0;
+    // Parts without a jump from the last to the first wavenumber. Where several meet, they are added in order.
+    while from < count {
         // index − reach, or its opposite, made positive before the remainder.
-        let j = if mirrored { 2 * reach - index } else { index };
+        let j = if mirrored { 2 * reach - from } else { from };
         let place = (j + n * reach.div_ceil(n) - reach) % n;
-        target[place] += if mirrored {
-            value(index).conj()
+        let room = if mirrored { place + 1 } else { n - place };
+        let part = from..(from + room).min(count);
+        from = part.end;
+        if mirrored {
+            let first = place + 1 - part.len();
+            let target = target[first..=place].iter_mut().rev();
+            add_values(line, part, target, -1.0);
         } else {
-            value(index)
-        };
+            add_values(line, part, target[place..].iter_mut(), 1.0);
+        }
+    }
+}
+
+/// Adds a part of a column, or its complex conjugate if `sign` is −1.
+#[inline(always)]
+fn add_values<'a>(
+    line: &Line<'_>,
+    part: std::ops::Range<usize>,
+    target: impl Iterator<Item = &'a mut Complex32>,
+    sign: f32,
+) {
+    let phases = line.re[part.clone()].iter().zip(&line.im[part.clone()]);
+    let values = line.amplitude[part].iter().zip(phases);
+    let p = line.phase_x;
+    for (sum, (a, (re, im))) in target.zip(values) {
+        let (re, im) = (a * re, a * im);
+        sum.re += re * p.re - im * p.im;
+        sum.im += sign * (re * p.im + im * p.re);
     }
 }
 
