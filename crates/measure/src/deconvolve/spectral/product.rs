@@ -63,10 +63,13 @@ fn bands<const R: usize, const FUSED: bool>(
         for column in (0..width).step_by(LANES) {
             let mut sums = [[0.0f32; LANES]; R];
             for i in 0..inner {
-                let line = &right.values[i * right.stride + column..][..LANES];
+                // A copy, which stays in a register for all rows.
+                let line: [f32; LANES] = *right.values[i * right.stride + column..]
+                    .first_chunk()
+                    .expect("LANES columns");
                 for (sums, row) in sums.iter_mut().zip(&rows) {
                     let factor = row[i];
-                    for (sum, value) in sums.iter_mut().zip(line) {
+                    for (sum, value) in sums.iter_mut().zip(&line) {
                         *sum = if FUSED {
                             factor.mul_add(*value, *sum)
                         } else {
