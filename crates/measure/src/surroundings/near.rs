@@ -152,13 +152,14 @@ fn add_pairs(
 #[inline(always)]
 fn add_line(here: &[f32; WIDE], there: &[f32; WIDE], first: usize, cells: &mut [[f32; CELLS]; 2]) {
     let mut both = [[0.0; ALONG]; 2];
-    for i in 0..ALONG {
+    let [differences, sums] = &mut both;
+    for (i, (difference, sum)) in differences.iter_mut().zip(sums).enumerate() {
         let (mut own, mut other) = (0.0, 0.0);
         for k in CELL * i..CELL * (i + 1) {
             own += here[k];
             other += there[WIDE - 1 - k];
         }
-        (both[0][i], both[1][i]) = (own - other, own + other);
+        (*difference, *sum) = (own - other, own + other);
     }
     for (cells, both) in cells.iter_mut().zip(both) {
         for (cell, value) in cells[first..].iter_mut().zip(both) {

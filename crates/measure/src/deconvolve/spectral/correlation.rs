@@ -43,7 +43,7 @@ impl Correlation {
             (reach + 1).next_multiple_of(ROWS),
             (reach + 1).next_multiple_of(LANES),
         );
-        // Cosines and sines by two indices, of which the first or the second stands for its opposite.
+        // Cosines and sines by two indices. The first or the second stands for its opposite, too.
         let tables = |used: [usize; 2], stored: [usize; 2], counted: Option<usize>| {
             [f64::cos, f64::sin].map(|wave| {
                 let mut table = vec![0.0; stored[0] * stored[1]];

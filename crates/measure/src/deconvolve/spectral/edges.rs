@@ -130,8 +130,8 @@ impl Edges {
     }
 }
 
-/// Adds to a row of modes what the first and last edge across have of it, of phases `across`, and what the first and last
-/// edge along it have of each column, of phase `down`: the last edge has the conjugate of the first one's.
+/// Adds the edges to a row of modes: the first and the last edge across, of phases `across`, and the first and the last edge
+/// along it, of phase `down`. The last edge has the conjugate phase of the first one.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn add_line(
     to: [&mut [f32]; 2],

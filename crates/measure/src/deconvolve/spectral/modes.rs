@@ -9,7 +9,7 @@ pub(super) fn multiply(modes: &mut Modes, by: &Modes) {
     complex_product(&mut modes.re, &mut modes.im, &by.re, &by.im);
 }
 
-/// (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y) of a transform, from those of its image times x and y: ∂ of it is −i x̂.
+/// (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y) of a transform, from the transforms of its image times x and y: ∂ of it is −i x̂.
 pub(super) fn shear(x: &mut Modes, y: &mut Modes, waves: &[Vec<f32>; 2]) {
     let [kx, ky] = waves;
     // −i(a + ib) = b − ia.

@@ -84,7 +84,8 @@ pub(super) fn twice_scaled(v: &Quarters, real: &[f32], scale: &[f32], out: &mut 
 pub(super) fn sums(a: &Quarters, b: &Quarters, kinds: &[Vec<f32>; 3]) -> [f32; 3] {
     let quarter = a.0.len() / 4;
     let (a, b) = (parts(&a.0, quarter), parts(&b.0, quarter));
-    let mut sums = [[0.0f32; LANES]; 3];
+    let (mut of_first, mut of_second) = ([0.0f32; LANES], [0.0f32; LANES]);
+    let mut of_third = [0.0f32; LANES];
     let [first, second, third] = kinds;
     let kinds = [first, second, third].map(|kind| (&kind[..quarter], &kind[quarter..]));
     for at in (0..quarter).step_by(LANES) {
@@ -93,13 +94,13 @@ pub(super) fn sums(a: &Quarters, b: &Quarters, kinds: &[Vec<f32>; 3]) -> [f32; 3
         let (first, second, third) = (kind(0), kind(1), kind(2));
         for l in 0..LANES {
             let (even, odd) = (even_along(a, b, l), odd_along(a, b, l));
-            sums[0][l] += even * first.0[l] + odd * first.1[l];
-            sums[1][l] += even * second.0[l] + odd * second.1[l];
-            sums[2][l] += even * third.0[l] + odd * third.1[l];
+            of_first[l] += even * first.0[l] + odd * first.1[l];
+            of_second[l] += even * second.0[l] + odd * second.1[l];
+            of_third[l] += even * third.0[l] + odd * third.1[l];
         }
     }
     // Of modes above and below: (e − o)(E − O) + (e + o)(E + O).
-    sums.map(|lanes| 2.0 * lanes.iter().sum::<f32>())
+    [of_first, of_second, of_third].map(|lanes| 2.0 * lanes.iter().sum::<f32>())
 }
 
 /// The part cc of Re(conj(a)·b) of modes.
@@ -124,7 +125,7 @@ pub(super) fn parts(values: &[f32], quarter: usize) -> [&[f32]; 4] {
 
 /// The lanes at a place of four quarters.
 #[inline(always)]
-pub(super) fn four<'a>(parts: [&'a [f32]; 4], at: usize) -> [&'a [f32; LANES]; 4] {
+pub(super) fn four(parts: [&[f32]; 4], at: usize) -> [&[f32; LANES]; 4] {
     let [cc, cs, sc, ss] = parts;
     [lanes(cc, at), lanes(cs, at), lanes(sc, at), lanes(ss, at)]
 }

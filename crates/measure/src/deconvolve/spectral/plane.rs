@@ -1,7 +1,7 @@
 //! The modes that the linear network keeps, and how they are stored.
 //!
 //! The plane is periodic with a period of `size` pixels. Of its modes only those with indices |j| ≤ `modes` along each axis
-//! are kept. Of a real image those with k_x ≥ 0 tell everything. They are stored twice over:
+//! are kept. A real image is determined by the modes with k_x ≥ 0. They are stored in two ways:
 //!
 //! * mode by mode ([`Modes`]): those with k_y ≥ 0, and then those with k_y ≤ 0, each in rows of one |k_y| with k_x from zero;
 //! * by their parity ([`Quarters`]), in which sums along an axis are sums of real numbers.
@@ -12,7 +12,7 @@
 //! Σ I exp(−i(k_x x ± k_y y)) = (cc ∓ ss) + i(sc ± cs)
 //! ```
 //!
-//! where cc is the sum Σ I cos(k_x x) cos(k_y y), sc = Σ I s(k_x x) cos(k_y y), and so on: the first letter is that of x.
+//! where cc is the sum Σ I cos(k_x x) cos(k_y y), sc = Σ I s(k_x x) cos(k_y y), and so on: the first letter stands for x.
 //! Places are measured from the middle of the image. Rows and columns are filled up with zeros to multiples that
 //! [`super::product`] needs.
 
@@ -33,9 +33,9 @@ pub(super) struct Plane {
     pub(super) modes: usize,
     /// Lags along an axis in a period.
     pub(super) lags: usize,
-    /// Rows of a quarter, of which the first `modes + 1` are used.
+    /// Rows of a quarter. The first `modes + 1` are used.
     pub(super) rows: usize,
-    /// Columns of a quarter, of which the first `modes + 1` are used.
+    /// Columns of a quarter. The first `modes + 1` are used.
     pub(super) width: usize,
 }
 

@@ -12,7 +12,7 @@ pub(super) const ROWS: usize = 8;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Matrix<'a> {
     pub(super) values: &'a [f32],
-    /// Numbers from the beginning of a row to that of the next.
+    /// Numbers between the beginnings of two rows.
     pub(super) stride: usize,
 }
 

@@ -43,8 +43,8 @@ pub struct SpectralPsf {
     pub(super) tilts: [Modes; 2],
     /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ², by parity.
     pub(super) noise_tilts: [Vec<f32>; 2],
-    /// Power of noise of σ = 1 in each mode before the window and in those it stands for, times its changes with both
-    /// components of shear, and times what it lacks to be that of the PSF turned by 90 degrees; by parity.
+    /// Power of noise of σ = 1 before the window, of each mode and the modes that it stands for. It is multiplied by the change
+    /// with γ₁, by the change with γ₂, and by the difference to noise behind the PSF turned by 90 degrees; by parity.
     pub(super) powers: [Vec<f32>; 3],
 }
 
