@@ -40,10 +40,7 @@ impl Sersic {
     /// with errors below 1e-6.
     pub fn fourier(self, k_re2: f64) -> f64 {
         match self {
-            Sersic::Exponential => {
-                let v = 1.0 + k_re2 / (EXPONENTIAL_HALF_LIGHT * EXPONENTIAL_HALF_LIGHT);
-                1.0 / (v * v.sqrt())
-            }
+            Sersic::Exponential => exponential_fourier(k_re2),
             Sersic::DeVaucouleurs => DE_VAUCOULEURS.at(k_re2),
         }
     }
@@ -54,8 +51,7 @@ impl Sersic {
         match self {
             Sersic::Exponential => {
                 for value in values {
-                    let v = 1.0 + *value / (EXPONENTIAL_HALF_LIGHT * EXPONENTIAL_HALF_LIGHT);
-                    *value = 1.0 / (v * v.sqrt());
+                    *value = exponential_fourier(*value);
                 }
             }
             Sersic::DeVaucouleurs => {
@@ -185,13 +181,24 @@ impl Component {
         self.flux * self.profile.brightness(radius2.sqrt() / re) / (re * re)
     }
 
+    /// The squared wavenumber in units of the half-light radius.
+    pub(crate) fn form(&self) -> QuadraticForm {
+        let re = self.half_light_radius;
+        QuadraticForm::of_wavenumbers(self.shape).scaled(re * re)
+    }
+
     /// The transform at (`kx`, `ky`) radians per pixel about the component's own centre: real, and
     /// equal to the flux at the origin. The offset is not in it.
     pub fn fourier(&self, kx: f64, ky: f64) -> f64 {
-        let re = self.half_light_radius;
-        let form = QuadraticForm::of_wavenumbers(self.shape).scaled(re * re);
-        self.flux * self.profile.fourier(form.at(kx, ky))
+        self.flux * self.profile.fourier(self.form().at(kx, ky))
     }
+}
+
+/// (1 + (k r_s)²)^(−3/2) of a squared wavenumber in units of the half-light radius.
+#[inline(always)]
+fn exponential_fourier(k_re2: f64) -> f64 {
+    let v = 1.0 + k_re2 / (EXPONENTIAL_HALF_LIGHT * EXPONENTIAL_HALF_LIGHT);
+    1.0 / (v * v.sqrt())
 }
 
 /// A galaxy of one or two components; it lives without heap memory.

@@ -4,8 +4,8 @@ use std::f64::consts::PI;
 use std::sync::LazyLock;
 
 use multiversion::multiversion;
+use shearq_quantities::TransformedPsf;
 use shearq_quantities::radial::{QuadraticForm, composite_rule};
-use shearq_quantities::{Shear, TransformedPsf};
 
 use super::galaxy::{Component, Galaxy};
 use super::render::sinc;
@@ -59,16 +59,14 @@ static RINGS: LazyLock<Vec<Ring>> = LazyLock::new(|| {
 /// By Parseval's theorem, ∫ |F|² d²k / (2π)², to 4·10⁻⁴ for PSFs of 3 px or more and ellipticities up to 0.7.
 pub fn power(galaxy: &Galaxy, psf: &TransformedPsf<'_>) -> f64 {
     let components = galaxy.components();
-    let mut forms = [QuadraticForm::of_wavenumbers(Shear::new(0.0, 0.0)); Galaxy::MAX_COMPONENTS];
-    for (form, component) in forms.iter_mut().zip(components) {
-        let re = component.half_light_radius;
-        *form = QuadraticForm::of_wavenumbers(component.shape).scaled(re * re);
-    }
+    // The forms, once for all rings.
+    let forms: [Option<QuadraticForm>; Galaxy::MAX_COMPONENTS] =
+        std::array::from_fn(|k| components.get(k).map(Component::form));
     RINGS
         .iter()
         .map(|ring| {
             let (mut re, mut im) = ([0.0; DIRECTIONS], [0.0; DIRECTIONS]);
-            for (component, form) in components.iter().zip(&forms) {
+            for (component, form) in components.iter().zip(forms.iter().flatten()) {
                 let mut values = [0.0; DIRECTIONS];
                 on_ring(component, *form, ring.k, &TURNS, &mut values);
                 let (dx, dy) = (component.dx, component.dy);
@@ -116,6 +114,7 @@ mod tests {
     use super::*;
     use crate::render::{RenderScratch, Renderer};
     use shearq_quantities::PsfTransform;
+    use shearq_quantities::Shear;
     use shearq_quantities::{FunctionalPsf, PsfProfile};
 
     const MOFFAT: PsfProfile = PsfProfile::Moffat { beta: 3.0 };

@@ -4,12 +4,12 @@ use std::hint::black_box;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use ndarray::ArrayView2;
+use ndarray::{Array2, ArrayView2};
 use shearq_measure::parts::{
     AdaptiveMoments, ClippedAcf, Matrices, Network, Rule, Spectral, StampFft, Step, WaveletWiener,
     border_noise,
 };
-use shearq_measure::{ImageNoise, Measurer, StampNoise};
+use shearq_measure::{ImageNoise, Measurer, StampNoise, Worker};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::limits::WINDOWS;
@@ -100,17 +100,25 @@ impl Inputs {
         Ok(Inputs { set, stamps })
     }
 
-    pub(super) fn psf(&self, cut: impl Into<PsfCut>) -> ndarray::Array2<f64> {
+    pub(super) fn psf(&self, cut: impl Into<PsfCut>) -> Array2<f64> {
         let fields = self.set.image_fields(1);
         fields.psf.at(0, 0).stamp_beside(cut.into().size, STAMP)
     }
 
-    /// Microseconds of a whole measurement of a galaxy whose PSF is set.
-    fn whole(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
+    /// A worker, and the PSF for it.
+    fn prepared(
+        &self,
+        configuration: &Configuration,
+    ) -> Result<(Worker, Array2<f64>), PipelineError> {
         let measurer = Measurer::new(configuration, STAMP)?;
         // Its sizes may differ by a pixel from those of the configuration.
         let psf = self.psf(measurer.configuration().psf_cut());
-        let mut worker = measurer.worker();
+        Ok((measurer.worker(), psf))
+    }
+
+    /// Microseconds of a whole measurement of a galaxy whose PSF is set.
+    fn whole(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
+        let (mut worker, psf) = self.prepared(configuration)?;
         let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
         let mut worker = image.psf(psf.view())?;
         Ok(time(|k| {
@@ -120,10 +128,7 @@ impl Inputs {
 
     /// Microseconds of setting a PSF.
     fn taking_a_psf(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
-        let measurer = Measurer::new(configuration, STAMP)?;
-        // Its sizes may differ by a pixel from those of the configuration.
-        let psf = self.psf(measurer.configuration().psf_cut());
-        let mut worker = measurer.worker();
+        let (mut worker, psf) = self.prepared(configuration)?;
         let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
         Ok(time(|_| {
             let _ = image.psf(black_box(psf.view()));

@@ -255,6 +255,10 @@ impl Spectral {
             return;
         }
         scratch.centre = centre;
+        if centre == [0.0; 2] {
+            // In the middle phases are not used.
+            return;
+        }
         let Modes { re, im } = &mut scratch.phases;
         let [kx, ky] = &self.waves;
         let width = self.plane.width;

@@ -47,7 +47,7 @@ pub struct AdaptiveMoments {
     bases: [Vec<f32>; 3],
 }
 
-/// Buffers for one thread. Their content between calls does not matter.
+/// Buffers for one thread, for the moments that made them. Their content between calls does not matter.
 #[derive(Debug, Clone)]
 pub struct AdaptiveScratch {
     /// Lags within the circle, filled up.
@@ -205,10 +205,7 @@ impl AdaptiveMoments {
         scratch: &mut AdaptiveScratch,
     ) -> [f64; 2] {
         self.gather(change, &mut scratch.values);
-        if scratch.chi != shape.chi {
-            // Not the shape that was found last.
-            self.sums(scratch, shape.chi);
-        }
+        self.weigh(shape, scratch);
         let [a, b, c] = &self.bases;
         let [t, n1, n2] = plain_sums(&scratch.values, &scratch.weights, [a, b, c]);
         let moved = [
@@ -231,9 +228,7 @@ impl AdaptiveMoments {
         let [out1, out2] = out;
         out1.fill(0.0);
         out2.fill(0.0);
-        if scratch.chi != shape.chi {
-            self.sums(scratch, shape.chi);
-        }
+        self.weigh(shape, scratch);
         let [chi1, chi2] = shape.chi;
         let [[i11, i12], [i21, i22]] = shape.inverse;
         let [a, b, c] = &self.bases;
@@ -281,6 +276,13 @@ impl AdaptiveMoments {
             to += count;
         }
         values[to..].fill(0.0);
+    }
+
+    /// Makes sure that the weights are those that `shape` was found with: it may not be the one that was found last.
+    fn weigh(&self, shape: &AdaptiveShape, scratch: &mut AdaptiveScratch) {
+        if scratch.chi != shape.chi {
+            self.sums(scratch, shape.chi);
+        }
     }
 
     /// Sums over the values that were taken; leaves their weights.

@@ -9,14 +9,19 @@ pub(super) fn multiply(modes: &mut Modes, by: &Modes) {
     complex_product(&mut modes.re, &mut modes.im, &by.re, &by.im);
 }
 
-/// (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y) of a transform, from the transforms of its image times x and y: ∂ of it is −i x̂.
+/// Replaces the transforms of an image times x and y by [`sheared`] of them.
 pub(super) fn shear(x: &mut Modes, y: &mut Modes, waves: &[Vec<f32>; 2]) {
-    let [kx, ky] = waves;
-    // −i(a + ib) = b − ia.
-    sheared(&mut x.re, &mut y.re, kx, ky);
-    sheared(&mut x.im, &mut y.im, kx, ky);
-    turn(&mut x.re, &mut x.im);
-    turn(&mut y.re, &mut y.im);
+    shear_each([&mut x.re, &mut x.im], [&mut y.re, &mut y.im], waves);
+}
+
+/// (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y) of a transform, from the transforms of its image times x and y: ∂ of it is
+/// −i x̂. Numbers are real and imaginary part.
+#[inline(always)]
+pub(super) fn sheared(x: [f32; 2], y: [f32; 2], kx: f32, ky: f32) -> [[f32; 2]; 2] {
+    [
+        [x[1] * kx - y[1] * ky, y[0] * ky - x[0] * kx],
+        [x[1] * ky + y[1] * kx, -(x[0] * ky + y[0] * kx)],
+    ]
 }
 
 /// Writes real numbers times complex ones.
@@ -41,16 +46,10 @@ fn scaled(out: &mut [f32], values: &[f32], factors: &[f32]) {
 }
 
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn sheared(x: &mut [f32], y: &mut [f32], kx: &[f32], ky: &[f32]) {
-    for ((x, y), (kx, ky)) in x.iter_mut().zip(y).zip(kx.iter().zip(ky)) {
-        (*x, *y) = (*x * kx - *y * ky, *x * ky + *y * kx);
-    }
-}
-
-/// Times −i.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn turn(re: &mut [f32], im: &mut [f32]) {
-    for (re, im) in re.iter_mut().zip(im) {
-        (*re, *im) = (*im, -*re);
+fn shear_each(x: [&mut [f32]; 2], y: [&mut [f32]; 2], waves: &[Vec<f32>; 2]) {
+    let ([x_re, x_im], [y_re, y_im]) = (x, y);
+    let images = x_re.iter_mut().zip(x_im).zip(y_re.iter_mut().zip(y_im));
+    for (((x_re, x_im), (y_re, y_im)), (kx, ky)) in images.zip(waves[0].iter().zip(&waves[1])) {
+        [[*x_re, *x_im], [*y_re, *y_im]] = sheared([*x_re, *x_im], [*y_re, *y_im], *kx, *ky);
     }
 }

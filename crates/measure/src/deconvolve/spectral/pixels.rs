@@ -6,7 +6,7 @@
 use multiversion::multiversion;
 
 use super::plane::{Plane, Quarters};
-use super::product::{LANES, Matrix, ROWS, multiply};
+use super::product::{Matrix, ROWS, multiply};
 
 /// Places that are folded side by side. See docs/constants.md.
 const SIDE: usize = 8;
@@ -19,7 +19,6 @@ pub(super) struct Pixels {
     half: usize,
     /// Rows of a folded image, filled up.
     band: usize,
-    rows: usize,
     width: usize,
     /// Of each place along x from the middle: cos and x·s of each mode, for sums of opposite pixels.
     sums: Vec<f32>,
@@ -72,7 +71,6 @@ impl Pixels {
             n,
             half,
             band: half.next_multiple_of(ROWS / 2),
-            rows: plane.rows,
             width,
             sums: across(&cos, &s),
             differences: across(&s, &cos),
@@ -177,7 +175,6 @@ impl Pixels {
 
     /// Columns of what [`Pixels::transform_lines`] writes.
     pub(super) fn columns(&self) -> usize {
-        debug_assert!(self.width.is_multiple_of(LANES) && self.rows <= self.width);
         self.width
     }
 }

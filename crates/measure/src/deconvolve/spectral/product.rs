@@ -26,6 +26,7 @@ impl<'a> Matrix<'a> {
 /// a multiple of [`LANES`]. The number of rows is a multiple of [`ROWS`].
 ///
 /// Sums run over `inner` in order, fused where the processor can: results are the same for AVX-512, AVX2 and NEON.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(super) fn multiply(
     left: Matrix<'_>,
     right: Matrix<'_>,
@@ -34,11 +35,6 @@ pub(super) fn multiply(
     width: usize,
 ) {
     debug_assert!(width.is_multiple_of(LANES) && out.len().is_multiple_of(ROWS * width));
-    product(left, right, inner, out, width);
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn product(left: Matrix<'_>, right: Matrix<'_>, inner: usize, out: &mut [f32], width: usize) {
     // As many rows at a time as there are registers for.
     multiversion::target::match_target! {
         "x86_64+avx512f" => bands::<ROWS, true>(left, right, inner, out, width),

@@ -142,15 +142,8 @@ impl Spectral {
             multiply(change, u);
             scale_into(tilts, change, root);
         }
-        let rule = [self.step, self.iterations as f32];
-        amplitudes(
-            power,
-            &self.rough,
-            &self.target,
-            rule,
-            self.iterations,
-            root,
-        );
+        let modes = [&power[..], &self.rough, &self.target];
+        amplitudes(modes, self.step, self.iterations, root);
         scale_into(&mut out.restore, u, root);
         roots(&noise.power, root);
         scale_into(&mut out.field, &out.restore, root);
@@ -188,23 +181,15 @@ impl Spectral {
     /// Γ[1 − (1 − c w)^M]/w of a mode with |p|² = `power`; zero where the PSF leaves nothing.
     pub(super) fn amplitude(&self, at: usize, power: f32) -> f32 {
         let mut out = [0.0];
-        let rule = [self.step, self.iterations as f32];
-        let (rough, target) = (&self.rough[at..=at], &self.target[at..=at]);
-        amplitudes(&[power], rough, target, rule, self.iterations, &mut out);
+        let modes = [&[power][..], &self.rough[at..=at], &self.target[at..=at]];
+        amplitudes(modes, self.step, self.iterations, &mut out);
         out[0]
     }
 }
 
 /// Γ[1 − (1 − c w)^M]/w of modes with |p|² = `powers`; zero where the PSF leaves nothing.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn amplitudes(
-    powers: &[f32],
-    rough: &[f32],
-    target: &[f32],
-    [step, count]: [f32; 2],
-    iterations: i32,
-    out: &mut [f32],
-) {
+fn amplitudes([powers, rough, target]: [&[f32]; 3], step: f32, iterations: i32, out: &mut [f32]) {
     /// Modes side by side. See docs/constants.md.
     const LANES: usize = 16;
     let modes = powers
@@ -220,7 +205,7 @@ fn amplitudes(
         // (1 − c w)^M by repeated squares. A positive one below exp(−40) is nothing in single precision, and would make
         // denormal numbers on the way.
         for left in &mut left {
-            let nothing = *left > 0.0 && (1.0 - *left) * f64::from(count) > 40.0;
+            let nothing = *left > 0.0 && (1.0 - *left) * f64::from(iterations) > 40.0;
             *left = if nothing { 0.0 } else { *left };
         }
         let mut exponent = iterations;

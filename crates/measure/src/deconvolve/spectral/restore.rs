@@ -2,6 +2,7 @@
 
 use multiversion::multiversion;
 
+use super::modes::sheared;
 use super::parities::{four, lanes, lanes_mut, parts};
 use super::plane::{Modes, Quarters};
 use super::product::LANES;
@@ -81,10 +82,7 @@ fn restore_half(
             y[0][l] + sign * y[3][l] - y0 * ur,
             y[2][l] - sign * y[1][l] - y0 * ui,
         );
-        // ∂û is −i times the transform of the stamp times the place.
-        let (kx, ky) = (kx[l], ky[l]);
-        let (plus_re, plus_im) = (xi * kx - yi * ky, yr * ky - xr * kx);
-        let (cross_re, cross_im) = (xi * ky + yi * kx, -(xr * ky + yr * kx));
+        let [[plus_re, plus_im], [cross_re, cross_im]] = sheared([xr, xi], [yr, yi], kx[l], ky[l]);
         let of_psf = |tilt: [&[f32; LANES]; 2]| {
             let (re, im) = (tilt[0][l], tilt[1][l]);
             (re * ur - im * ui, re * ui + im * ur)
