@@ -11,7 +11,7 @@ use shearq_submissions::PsfCut;
 use crate::brightness::{PEAKS, highest};
 use crate::error::MeasureError;
 use crate::extent::{Core, core_sums};
-use crate::pixel::Pixel;
+use crate::pixel::{self, Pixel};
 use crate::psf::Star;
 use crate::psf::examine::{self, PsfLook};
 use crate::psfs::Psfs;
@@ -189,9 +189,7 @@ impl Examination {
             let expected = format!("{n} × {n}");
             return Err(MeasureError::square("a stamp", stamp.dim(), expected));
         }
-        for (to, value) in self.pixels.iter_mut().zip(stamp) {
-            *to = value.to_f32();
-        }
+        pixel::copy(stamp, &mut self.pixels);
         if self.pixels.iter().all(|v| *v == self.pixels[0]) {
             self.blank += 1;
             return Ok(());

@@ -1,5 +1,7 @@
 //! Pixels of either precision.
 
+use ndarray::ArrayView2;
+
 /// `f32` or `f64`.
 pub trait Pixel: Copy + Into<f64> + private::Sealed {
     /// Rounded to single precision, in which stamps are measured.
@@ -17,6 +19,23 @@ impl Pixel for f64 {
     #[inline(always)]
     fn to_f32(self) -> f32 {
         self as f32
+    }
+}
+
+/// Copies a stamp, row by row.
+pub(crate) fn copy<P: Pixel>(stamp: ArrayView2<'_, P>, to: &mut [f32]) {
+    let columns = stamp.ncols().max(1);
+    for (to, row) in to.chunks_exact_mut(columns).zip(stamp.rows()) {
+        match row.to_slice() {
+            Some(row) => to
+                .iter_mut()
+                .zip(row)
+                .for_each(|(to, value)| *to = value.to_f32()),
+            None => to
+                .iter_mut()
+                .zip(row)
+                .for_each(|(to, value)| *to = value.to_f32()),
+        }
     }
 }
 

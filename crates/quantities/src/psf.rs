@@ -11,23 +11,15 @@ use puruspe::bessel::Jn;
 use puruspe::gamma::{gamma, ln_gamma};
 use thiserror::Error;
 
+mod pixels;
+
+use self::pixels::Pixels;
 use crate::Shear;
-use crate::radial::{QuadraticForm, RadialTable, composite_rule, gauss_legendre};
+use crate::radial::{QuadraticForm, RadialTable, composite_rule};
 
 /// λ/r0 in units of the FWHM, times k0·r0/λ: the wavenumber scale k0 of a Kolmogorov profile in
 /// radians per FWHM. Both factors are those of GalSim's `Kolmogorov`.
 const KOLMOGOROV_K0: f64 = 2.992934 * 0.975_863_429_9;
-
-/// Error of a pixel integral that is aimed at, relative to the brightest pixel. The
-/// estimate behind it is coarse, so it is set below the 1e-6 that is promised.
-const PIXEL_TOLERANCE: f64 = 1e-7;
-
-/// The largest Gauss–Legendre rule used inside a pixel; sharper profiles divide the pixel instead.
-const MAX_NODES: usize = 12;
-const MAX_DIVISIONS: usize = 64;
-
-static RULES: LazyLock<Vec<Vec<(f64, f64)>>> =
-    LazyLock::new(|| (0..=MAX_NODES).map(gauss_legendre).collect());
 
 /// Kolmogorov surface brightness of unit flux against (r/FWHM)², per FWHM².
 static KOLMOGOROV: LazyLock<RadialTable> = LazyLock::new(|| {
@@ -148,9 +140,10 @@ impl FunctionalPsf {
     /// real space by a Gauss–Legendre rule as long as the profile's sharpness there asks for;
     /// errors are below 1e-6 of the brightest pixel (tested for FWHM of 0.3 px and more).
     pub fn draw_into(&self, centre_x: f64, centre_y: f64, out: ArrayViewMut2<f64>) {
+        let centre = (centre_x, centre_y);
         match self.brightness() {
-            Brightness::Moffat(profile) => self.integrate(profile, centre_x, centre_y, out),
-            Brightness::Kolmogorov(profile) => self.integrate(profile, centre_x, centre_y, out),
+            Brightness::Moffat(profile) => self.pixels(profile).integrate(centre, out),
+            Brightness::Kolmogorov(profile) => self.pixels(profile).integrate(centre, out),
         }
     }
 
@@ -184,6 +177,15 @@ impl FunctionalPsf {
         Ok(checked.stamp_beside(size, side))
     }
 
+    fn pixels<P: RoundProfile>(&self, profile: P) -> Pixels<P> {
+        Pixels {
+            form: QuadraticForm::of_positions(self.shape),
+            modulus: self.shape.modulus(),
+            core: self.fwhm * profile.core_in_fwhm(),
+            profile,
+        }
+    }
+
     fn brightness(&self) -> Brightness {
         match self.profile {
             PsfProfile::Moffat { beta } => {
@@ -201,53 +203,6 @@ impl FunctionalPsf {
             }),
         }
     }
-
-    fn integrate(
-        &self,
-        profile: impl RoundProfile,
-        centre_x: f64,
-        centre_y: f64,
-        mut out: ArrayViewMut2<f64>,
-    ) {
-        let form = QuadraticForm::of_positions(self.shape);
-        let modulus = self.shape.modulus();
-        // Half a pixel, in the circular coordinates in which it is widest.
-        let half_pixel = 0.5 * ((1.0 + modulus) / (1.0 - modulus)).sqrt();
-        let plan = RulePlan {
-            half_pixel,
-            core: self.fwhm * profile.core_in_fwhm(),
-            // The brightest pixel of a PSF narrower than a pixel holds a flux near 1.
-            peak: profile.at(0.0).min(1.0),
-        };
-        for (row, mut line) in out.outer_iter_mut().enumerate() {
-            let dy = row as f64 - centre_y;
-            for (column, pixel) in line.iter_mut().enumerate() {
-                let dx = column as f64 - centre_x;
-                let (divisions, nodes) = plan.choose(&profile, form.at(dx, dy).sqrt());
-                let half = 0.5 / divisions as f64;
-                let rule = &RULES[nodes];
-                let mut sum = 0.0;
-                for cell_y in 0..divisions {
-                    let y = dy - 0.5 + half * (2 * cell_y + 1) as f64;
-                    for cell_x in 0..divisions {
-                        let x = dx - 0.5 + half * (2 * cell_x + 1) as f64;
-                        for &(node_y, weight_y) in rule {
-                            let y = y + half * node_y;
-                            let (constant, linear) = (form.yy * y * y, 2.0 * form.xy * y);
-                            let mut line_sum = 0.0;
-                            for &(node_x, weight_x) in rule {
-                                let x = x + half * node_x;
-                                line_sum +=
-                                    weight_x * profile.at(constant + x * (linear + form.xx * x));
-                            }
-                            sum += weight_y * line_sum;
-                        }
-                    }
-                }
-                *pixel = sum * half * half;
-            }
-        }
-    }
 }
 
 fn check_size_and_shape(fwhm: f64, shape: Shear) -> Result<(), ProfileError> {
@@ -263,6 +218,8 @@ fn check_size_and_shape(fwhm: f64, shape: Shear) -> Result<(), ProfileError> {
 /// Surface brightness of flux 1 against the squared circular radius in px².
 trait RoundProfile {
     fn at(&self, radius2: f64) -> f64;
+    /// Replaces squared radii by the brightness there.
+    fn at_each(&self, radii2: &mut [f64]);
     /// Distance of the nearest complex singularity from the centre (or what acts as one), in FWHM.
     fn core_in_fwhm(&self) -> f64;
 }
@@ -291,6 +248,21 @@ impl RoundProfile for MoffatBrightness {
         }
     }
 
+    #[inline(always)]
+    fn at_each(&self, radii2: &mut [f64]) {
+        if self.whole == Some(3) {
+            // The usual exponent, without a decision for each value.
+            for value in radii2 {
+                let base = 1.0 + *value * self.per_scale2;
+                *value = self.centre / (base * base * base);
+            }
+        } else {
+            for value in radii2 {
+                *value = self.at(*value);
+            }
+        }
+    }
+
     fn core_in_fwhm(&self) -> f64 {
         // With β the singularity recedes, but the power of the growth towards it rises: what is
         // left is close to a Gaussian, which half a FWHM describes.
@@ -309,48 +281,15 @@ impl RoundProfile for KolmogorovBrightness {
         self.per_fwhm2 * self.table.at(radius2 * self.per_fwhm2)
     }
 
+    #[inline(always)]
+    fn at_each(&self, radii2: &mut [f64]) {
+        for value in radii2 {
+            *value = self.at(*value);
+        }
+    }
+
     fn core_in_fwhm(&self) -> f64 {
         0.6
-    }
-}
-
-/// Chooses the quadrature inside a pixel.
-struct RulePlan {
-    half_pixel: f64,
-    core: f64,
-    peak: f64,
-}
-
-impl RulePlan {
-    /// Divisions of the pixel on each axis, and nodes on each axis of a division, for a pixel at
-    /// circular radius `radius`.
-    ///
-    /// An n-point rule on an interval of half-width h errs by about B^(−2n), where for a
-    /// singularity at distance d the Bernstein ellipse has B = d/h + sqrt(1 + (d/h)²).
-    #[inline]
-    fn choose(&self, profile: &impl RoundProfile, radius: f64) -> (usize, usize) {
-        let mut divisions = 1;
-        loop {
-            let half = self.half_pixel / divisions as f64;
-            let nearest = (radius - self.half_pixel).max(0.0);
-            let ratio = (nearest * nearest + self.core * self.core).sqrt() / half;
-            let bernstein = ratio + (1.0 + ratio * ratio).sqrt();
-            let excess = 10.0 * profile.at(nearest * nearest) / (self.peak * PIXEL_TOLERANCE);
-            let shrink = bernstein * bernstein;
-            let mut nodes = 1;
-            let mut error = excess / shrink;
-            while error > 1.0 && nodes <= MAX_NODES {
-                error /= shrink;
-                nodes += 1;
-            }
-            if nodes <= MAX_NODES {
-                return (divisions, nodes);
-            }
-            if divisions >= MAX_DIVISIONS {
-                return (divisions, MAX_NODES);
-            }
-            divisions *= 2;
-        }
     }
 }
 

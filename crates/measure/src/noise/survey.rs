@@ -14,7 +14,7 @@ use super::stamp_noise::StampNoise;
 use crate::brightness::{PEAKS, highest};
 use crate::error::MeasureError;
 use crate::extent::Light;
-use crate::pixel::Pixel;
+use crate::pixel::{self, Pixel};
 use crate::sky::{Cells, Levels, Sky, Subtraction, inner};
 use crate::surroundings::{Contrasts, Missing, centre, followed, turn};
 use crate::warning::Warning;
@@ -109,9 +109,7 @@ impl NoiseSurvey {
             let expected = format!("{full} × {full}");
             return Err(MeasureError::square("a stamp", stamp.dim(), expected));
         }
-        for (to, value) in self.pixels.iter_mut().zip(stamp) {
-            *to = value.to_f32();
-        }
+        pixel::copy(stamp, &mut self.pixels);
         let whole = self.pixels.iter().all(|value| value.is_finite());
         let padded = padded(&self.pixels, full);
         let flat = self.pixels.iter().all(|value| *value == self.pixels[0]);
@@ -137,9 +135,10 @@ impl NoiseSurvey {
         }
         let blocks = Arc::clone(&self.plan.blocks);
         for &(y0, x0) in &*blocks {
-            for (at, value) in self.block.iter_mut().enumerate() {
-                let (y, x) = (y0 + at / BLOCK, x0 + at % BLOCK);
-                *value = f64::from(stamp[(y, x)].to_f32());
+            for (y, to) in (y0..).zip(self.block.chunks_exact_mut(BLOCK)) {
+                for (value, from) in to.iter_mut().zip(stamp.row(y).iter().skip(x0)) {
+                    *value = f64::from(from.to_f32());
+                }
             }
             let reaches = [y0 == 0, y0 + BLOCK == full, x0 == 0, x0 + BLOCK == full];
             let of_padding = reaches.iter().zip(padded).any(|(at, is)| *at && is);

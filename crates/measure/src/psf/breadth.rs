@@ -4,6 +4,8 @@ use std::ops::RangeInclusive;
 
 use ndarray::{ArrayView2, s};
 
+use super::sums::sum_of_squares;
+
 /// Steps in which lengths double. See docs/constants.md.
 const OCTAVE: f64 = 4.0;
 /// Steps of lengths: 0.6 to 2.8 times as long.
@@ -17,12 +19,11 @@ const LEAST_SIDE: usize = 12;
 /// Noise-equivalent area in px² of a PSF of sum one: 1/Σp², without what a star's noise adds to the sum, which is told
 /// from its frame.
 pub(super) fn area(psf: ArrayView2<'_, f64>) -> f64 {
-    let square = |value: &f64| value * value;
-    let mut sum = psf.iter().map(square).sum::<f64>();
+    let mut sum = sum_of_squares(psf);
     let n = psf.nrows();
     if n >= LEAST_SIDE {
         let inner = psf.slice(s![BORDER..n - BORDER, BORDER..n - BORDER]);
-        let frame = sum - inner.iter().map(square).sum::<f64>();
+        let frame = sum - sum_of_squares(inner);
         sum -= frame * psf.len() as f64 / (psf.len() - inner.len()) as f64;
     }
     1.0 / sum

@@ -9,6 +9,7 @@ use ndarray::{Array2, ArrayView2};
 use super::breadth;
 use super::moffat::Moffat;
 use super::star;
+use super::sums::sum_of_squares;
 use shearq_quantities::statistics::{SCATTER, median};
 
 /// S/N between which a star is used more and more as it is. See docs/constants.md.
@@ -47,7 +48,7 @@ impl Shrinker {
         if n != psf.ncols() || n < LEAST_SIDE {
             return psf;
         }
-        let power: f64 = psf.iter().map(|value| value * value).sum();
+        let power = sum_of_squares(psf);
         // Hardly ever below the noise's, and quick.
         let least = power.sqrt() / AS_IT_IS[1];
         let square = mean_square(psf);

@@ -11,6 +11,7 @@ use shearq_submissions::PsfCut;
 use crate::error::MeasureError;
 use crate::pixel::Pixel;
 use crate::psf::halfway::halfway;
+use crate::psf::sums::{largest_of_rows, sum};
 
 /// Largest centroid offset along an axis of a star that is cut around its stamp's centre. See
 /// docs/constants.md.
@@ -84,11 +85,8 @@ fn centred_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<Star,
         return Err(MeasureError::square("a PSF stamp", stamp.dim(), expected));
     };
     let brightest = brightest(stamp)?;
-    let inner: f64 = central(stamp, size, (y0, x0))
-        .iter()
-        .map(|&value| -> f64 { value.into() })
-        .sum();
-    let all: f64 = stamp.iter().map(|&value| -> f64 { value.into() }).sum();
+    let inner = sum(central(stamp, size, (y0, x0)));
+    let all = sum(stamp);
     if all <= 0.0 {
         // There is nothing to look for elsewhere.
         light(inner)?;
@@ -119,9 +117,9 @@ fn centred_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<Star,
     let more = room.into_iter().fold((cut.size - size) / 2, usize::min);
     let taken = central(stamp, size + 2 * more, (y0 - more, x0 - more));
     let taken: Array2<f64> = taken.mapv(Into::into);
-    let sum = light(taken.sum())?;
+    let flux = light(sum(taken.view()))?;
     Ok(Star {
-        psf: taken / sum,
+        psf: taken / flux,
         moved,
     })
 }
@@ -146,17 +144,21 @@ fn light(sum: f64) -> Result<f64, MeasureError> {
 /// The brightest pixel (x, y) of a stamp of finite pixels.
 fn brightest<P: Pixel>(stamp: ArrayView2<'_, P>) -> Result<[usize; 2], MeasureError> {
     let mut best = ([0, 0], f64::NEG_INFINITY);
-    for ((y, x), &value) in stamp.indexed_iter() {
-        let value: f64 = value.into();
-        if !value.is_finite() {
+    for (y, largest) in largest_of_rows(stamp).enumerate() {
+        // The place in the row, which few rows need.
+        let place = |is: &dyn Fn(f64) -> bool| {
+            let mut values = stamp.row(y).into_iter().map(|&value| value.into());
+            values.position(is).unwrap_or(0)
+        };
+        let Some(largest) = largest else {
             return Err(MeasureError::NotFinite {
                 what: "PSF stamp",
-                x: x + 1,
+                x: place(&|value| !value.is_finite()) + 1,
                 y: y + 1,
             });
-        }
-        if value > best.1 {
-            best = ([x, y], value);
+        };
+        if largest > best.1 {
+            best = ([place(&|value| value == largest), y], largest);
         }
     }
     Ok(best.0)

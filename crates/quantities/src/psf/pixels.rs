@@ -1,0 +1,432 @@
+//! The light of a round profile under a shear that falls into pixels.
+//!
+//! Each pixel is integrated by a Gauss–Legendre rule that is as long as the profile's sharpness there asks for. Pixels
+//! with the same rule are integrated side by side.
+
+use std::sync::LazyLock;
+
+use multiversion::multiversion;
+use ndarray::{Array2, ArrayViewMut2};
+
+use super::RoundProfile;
+use crate::radial::{QuadraticForm, gauss_legendre};
+
+/// Error of a pixel integral that is aimed at, relative to the brightest pixel. The
+/// estimate behind it is coarse, so it is set below the 1e-6 that is promised.
+const PIXEL_TOLERANCE: f64 = 1e-7;
+
+/// The largest Gauss–Legendre rule used inside a pixel; sharper profiles divide the pixel instead.
+const MAX_NODES: usize = 12;
+/// Sharper profiles have their pixels divided in two up to so many times on each axis.
+const MAX_DIVISIONS: usize = 64;
+/// Rules there can be at most: the numbers of nodes times those of divisions.
+const MAX_RULES: usize = MAX_NODES * (MAX_DIVISIONS.ilog2() as usize + 1);
+
+/// Pixels whose rules are chosen side by side.
+const LANES: usize = 16;
+/// Pixels that are integrated side by side.
+const ROOM: usize = 48;
+
+/// The bound between two rules is known to so many pixels; up to it the longer rule is used.
+const BOUND_ERROR: f64 = 1.0 / 32.0;
+
+static NODES: LazyLock<Vec<Vec<(f64, f64)>>> =
+    LazyLock::new(|| (0..=MAX_NODES).map(gauss_legendre).collect());
+
+/// A profile on pixels.
+pub(super) struct Pixels<P> {
+    pub profile: P,
+    /// The squared circular radius at a position.
+    pub form: QuadraticForm,
+    /// Modulus of the shear that made the profile elliptical.
+    pub modulus: f64,
+    /// Distance within which the profile is not smooth, in pixels.
+    pub core: f64,
+}
+
+/// How a pixel is integrated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Rule {
+    /// Parts of the pixel on each axis.
+    divisions: usize,
+    /// Nodes on each axis of a part.
+    nodes: usize,
+}
+
+/// Rules from the centre outwards, and the squared circular radius up to which each is used.
+struct Rules {
+    count: usize,
+    bounds: [f64; MAX_RULES],
+    rules: [Rule; MAX_RULES],
+}
+
+/// Pixels that wait for others with the same rule.
+#[derive(Clone, Copy)]
+struct Waiting {
+    count: usize,
+    /// Places in the stamp, and distances from the centre.
+    at: [u32; ROOM],
+    dx: [f64; ROOM],
+    dy: [f64; ROOM],
+}
+
+impl Default for Waiting {
+    fn default() -> Self {
+        Waiting {
+            count: 0,
+            at: [0; ROOM],
+            dx: [0.0; ROOM],
+            dy: [0.0; ROOM],
+        }
+    }
+}
+
+impl Waiting {
+    /// Adds neighbours, the first of which is at `at` in the stamp.
+    fn push(&mut self, at: usize, dx: &[f64], dy: &[f64]) {
+        let from = self.count;
+        self.count += dx.len();
+        self.dx[from..self.count].copy_from_slice(dx);
+        self.dy[from..self.count].copy_from_slice(dy);
+        for (place, at) in self.at[from..self.count].iter_mut().zip(at as u32..) {
+            *place = at;
+        }
+    }
+}
+
+impl<P: RoundProfile> Pixels<P> {
+    /// Fills `out` (rows are y) with the light in each pixel, the profile's centre being at `centre` (x, y).
+    pub(super) fn integrate(&self, centre: (f64, f64), mut out: ArrayViewMut2<f64>) {
+        let (rows, columns) = out.dim();
+        match out.as_slice_mut() {
+            Some(pixels) => self.integrate_rows(centre, (rows, columns), pixels),
+            None => {
+                let mut pixels = Array2::zeros((rows, columns));
+                let lines = pixels.as_slice_mut().expect("an array is made in rows");
+                self.integrate_rows(centre, (rows, columns), lines);
+                out.assign(&pixels);
+            }
+        }
+    }
+
+    /// The same for pixels one row after the other.
+    fn integrate_rows(&self, centre: (f64, f64), size: (usize, usize), pixels: &mut [f64]) {
+        if pixels.is_empty() {
+            return;
+        }
+        let rules = self.rules(centre, size);
+        let mut waiting = vec![Waiting::default(); rules.count];
+        for row in 0..size.0 {
+            let dy = [row as f64 - centre.1; LANES];
+            for first in (0..size.1).step_by(LANES) {
+                let dx = std::array::from_fn(|lane| (first + lane) as f64 - centre.0);
+                let chosen = choose_lanes(self.form, rules.bounds(), &dx, &dy);
+                let mut lane = 0;
+                while lane < LANES.min(size.1 - first) {
+                    // Neighbours with the same rule.
+                    let rule = chosen[lane];
+                    let same = chosen[lane..].iter().take_while(|other| **other == rule);
+                    let lanes = lane..LANES.min(lane + same.count()).min(size.1 - first);
+                    lane = lanes.end;
+                    let waiting = &mut waiting[rule as usize];
+                    waiting.push(
+                        row * size.1 + first + lanes.start,
+                        &dx[lanes.clone()],
+                        &dy[lanes],
+                    );
+                    if waiting.count > ROOM - LANES {
+                        self.integrate_waiting(waiting, rules.rules[rule as usize], pixels);
+                    }
+                }
+            }
+        }
+        for (waiting, rule) in waiting.iter_mut().zip(rules.rules) {
+            self.integrate_waiting(waiting, rule, pixels);
+        }
+    }
+
+    fn integrate_waiting(&self, waiting: &mut Waiting, rule: Rule, pixels: &mut [f64]) {
+        // Whole vectors; what is left in the places beyond is finite, and not used.
+        let count = waiting.count.next_multiple_of(8);
+        let mut light = [0.0; ROOM];
+        integrals(
+            self,
+            rule,
+            (&waiting.dx[..count], &waiting.dy[..count]),
+            &mut light[..count],
+        );
+        for (at, light) in waiting.at.iter().zip(light).take(waiting.count) {
+            pixels[*at as usize] = light;
+        }
+        waiting.count = 0;
+    }
+
+    /// The rules of a stamp.
+    fn rules(&self, centre: (f64, f64), (rows, columns): (usize, usize)) -> Rules {
+        let plan = RulePlan {
+            // Half a pixel, in the circular coordinates in which it is widest.
+            half_pixel: 0.5 * ((1.0 + self.modulus) / (1.0 - self.modulus)).sqrt(),
+            core: self.core,
+            // The brightest pixel of a PSF narrower than a pixel holds a flux near 1.
+            peak: self.profile.at(0.0).min(1.0),
+        };
+        let corners = [0.0, columns as f64].map(|x| {
+            let squared = [0.0, rows as f64].map(|y| self.form.at(x - centre.0, y - centre.1));
+            squared[0].max(squared[1])
+        });
+        let farthest = corners[0].max(corners[1]).sqrt();
+        let (first, last) = (
+            plan.choose(&self.profile, 0.0),
+            plan.choose(&self.profile, farthest),
+        );
+        let mut rules = Rules {
+            count: 0,
+            bounds: [0.0; MAX_RULES],
+            rules: [last; MAX_RULES],
+        };
+        self.divide(&plan, (0.0, first), (farthest, last), &mut rules);
+        rules.add(f64::INFINITY, last);
+        rules
+    }
+
+    /// Adds the rules of radii between two, by bisection: rules become shorter outwards.
+    fn divide(&self, plan: &RulePlan, inner: (f64, Rule), outer: (f64, Rule), rules: &mut Rules) {
+        if inner.1 == outer.1 {
+            return;
+        }
+        if outer.0 - inner.0 < BOUND_ERROR {
+            rules.add(outer.0 * outer.0, inner.1);
+            return;
+        }
+        let radius = 0.5 * (inner.0 + outer.0);
+        let middle = (radius, plan.choose(&self.profile, radius));
+        self.divide(plan, inner, middle, rules);
+        self.divide(plan, middle, outer, rules);
+    }
+}
+
+impl Rules {
+    fn add(&mut self, bound: f64, rule: Rule) {
+        self.bounds[self.count] = bound;
+        self.rules[self.count] = rule;
+        self.count += 1;
+    }
+
+    /// The bound of each rule but the last, which has none.
+    fn bounds(&self) -> &[f64] {
+        &self.bounds[..self.count - 1]
+    }
+}
+
+/// The number of bounds within which pixels at (`dx`, `dy`) from the centre are not: the place of their rule.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn choose_lanes(
+    form: QuadraticForm,
+    bounds: &[f64],
+    dx: &[f64; LANES],
+    dy: &[f64; LANES],
+) -> [u64; LANES] {
+    let mut squared = [0.0; LANES];
+    for lane in 0..LANES {
+        squared[lane] = form.at(dx[lane], dy[lane]);
+    }
+    let mut chosen = [0; LANES];
+    for bound in bounds {
+        for lane in 0..LANES {
+            chosen[lane] += u64::from(squared[lane] > *bound);
+        }
+    }
+    chosen
+}
+
+/// The light in pixels at (`dx`, `dy`) from the centre, at most [`ROOM`] of them.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn integrals<P: RoundProfile>(
+    pixels: &Pixels<P>,
+    rule: Rule,
+    (dx, dy): (&[f64], &[f64]),
+    light: &mut [f64],
+) {
+    let QuadraticForm { xx, xy, yy } = pixels.form;
+    let half = 0.5 / rule.divisions as f64;
+    let nodes = &NODES[rule.nodes];
+    let count = light.len();
+    let (mut constant, mut linear) = ([0.0; ROOM], [0.0; ROOM]);
+    let (mut line, mut value) = ([0.0; ROOM], [0.0; ROOM]);
+    let (constant, linear) = (&mut constant[..count], &mut linear[..count]);
+    let (line, value) = (&mut line[..count], &mut value[..count]);
+    light.fill(0.0);
+    for part_y in 0..rule.divisions {
+        let part_y = half * (2 * part_y + 1) as f64 - 0.5;
+        for part_x in 0..rule.divisions {
+            let part_x = half * (2 * part_x + 1) as f64 - 0.5;
+            for &(node_y, weight_y) in nodes {
+                let below = part_y + half * node_y;
+                for ((constant, linear), dy) in constant.iter_mut().zip(&mut *linear).zip(dy) {
+                    let y = dy + below;
+                    *constant = yy * y * y;
+                    *linear = 2.0 * xy * y;
+                }
+                line.fill(0.0);
+                for &(node_x, weight_x) in nodes {
+                    let beside = part_x + half * node_x;
+                    let forms = constant.iter().zip(&*linear);
+                    for ((value, dx), (constant, linear)) in value.iter_mut().zip(dx).zip(forms) {
+                        let x = dx + beside;
+                        *value = constant + x * (linear + xx * x);
+                    }
+                    pixels.profile.at_each(value);
+                    for (line, value) in line.iter_mut().zip(&*value) {
+                        *line += weight_x * value;
+                    }
+                }
+                for (light, line) in light.iter_mut().zip(&*line) {
+                    *light += weight_y * line;
+                }
+            }
+        }
+    }
+    for light in light {
+        *light *= half * half;
+    }
+}
+
+/// Chooses the quadrature inside a pixel.
+struct RulePlan {
+    half_pixel: f64,
+    core: f64,
+    peak: f64,
+}
+
+impl RulePlan {
+    /// The rule of a pixel at circular radius `radius`.
+    ///
+    /// An n-point rule on an interval of half-width h errs by about B^(−2n), where for a
+    /// singularity at distance d the Bernstein ellipse has B = d/h + sqrt(1 + (d/h)²).
+    fn choose(&self, profile: &impl RoundProfile, radius: f64) -> Rule {
+        let nearest = (radius - self.half_pixel).max(0.0);
+        let excess = 10.0 * profile.at(nearest * nearest) / (self.peak * PIXEL_TOLERANCE);
+        let mut divisions = 1;
+        loop {
+            let half = self.half_pixel / divisions as f64;
+            let ratio = (nearest * nearest + self.core * self.core).sqrt() / half;
+            let bernstein = ratio + (1.0 + ratio * ratio).sqrt();
+            let shrink = bernstein * bernstein;
+            let mut nodes = 1;
+            let mut error = excess / shrink;
+            while error > 1.0 && nodes <= MAX_NODES {
+                error /= shrink;
+                nodes += 1;
+            }
+            if nodes <= MAX_NODES {
+                return Rule { divisions, nodes };
+            }
+            if divisions >= MAX_DIVISIONS {
+                return Rule {
+                    divisions,
+                    nodes: MAX_NODES,
+                };
+            }
+            divisions *= 2;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Brightness, MoffatBrightness};
+    use super::*;
+    use crate::{FunctionalPsf, PsfProfile, Shear};
+    use ndarray::Array2;
+
+    fn moffat(psf: &FunctionalPsf) -> MoffatBrightness {
+        match psf.brightness() {
+            Brightness::Moffat(moffat) => moffat,
+            Brightness::Kolmogorov(_) => unreachable!("the PSFs here are Moffats"),
+        }
+    }
+
+    /// The integral of one pixel, by the rule that is chosen for it alone.
+    fn plain(psf: &FunctionalPsf, centre: (f64, f64), (row, column): (usize, usize)) -> f64 {
+        let form = QuadraticForm::of_positions(psf.shape);
+        let (dx, dy) = (column as f64 - centre.0, row as f64 - centre.1);
+        let pixels = psf.pixels(moffat(psf));
+        let rules = pixels.rules(centre, (row + 1, column + 1));
+        let inside = |bound: &f64| form.at(dx, dy) <= *bound;
+        let at = rules.bounds().iter().position(inside);
+        let rule = rules.rules[at.unwrap_or(rules.count - 1)];
+        let half = 0.5 / rule.divisions as f64;
+        let mut sum = 0.0;
+        for part_y in 0..rule.divisions {
+            for part_x in 0..rule.divisions {
+                for (node_y, weight_y) in gauss_legendre(rule.nodes) {
+                    for (node_x, weight_x) in gauss_legendre(rule.nodes) {
+                        let x = dx - 0.5 + half * ((2 * part_x + 1) as f64 + node_x);
+                        let y = dy - 0.5 + half * ((2 * part_y + 1) as f64 + node_y);
+                        sum += weight_x * weight_y * psf.value(x, y);
+                    }
+                }
+            }
+        }
+        sum * half * half
+    }
+
+    #[test]
+    fn lanes_agree_with_one_pixel_at_a_time() {
+        for (fwhm, beta, shape) in [
+            (3.4, 3.0, Shear::new(0.05, -0.02)),
+            (0.4, 2.5, Shear::new(-0.3, 0.4)),
+            (1.2, 4.0, Shear::ZERO),
+        ] {
+            let psf = FunctionalPsf::new(PsfProfile::Moffat { beta }, fwhm, shape).unwrap();
+            // Sides that lanes divide and that they do not, and centres on, between and beside pixels.
+            for (size, centre) in [
+                ((16, 24), (11.5, 7.5)),
+                ((11, 13), (6.3, 4.9)),
+                ((3, 5), (-2.0, 1.0)),
+            ] {
+                let mut out = Array2::from_elem(size, f64::NAN);
+                psf.draw_into(centre.0, centre.1, out.view_mut());
+                let brightest = out.iter().copied().fold(0.0, f64::max);
+                for (place, light) in out.indexed_iter() {
+                    let expected = plain(&psf, centre, place);
+                    // Rules of another farthest pixel differ by a step of the bisection, and so by the
+                    // tolerance of the rules.
+                    let tolerance = PIXEL_TOLERANCE * brightest.min(1.0);
+                    assert!(
+                        (light - expected).abs() < tolerance,
+                        "{psf:?} {size:?} {place:?}: {light} {expected}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn rules_become_shorter_outwards_and_none_is_shorter_than_its_pixel_asks_for() {
+        for fwhm in [0.3, 1.0, 3.4] {
+            let psf =
+                FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, fwhm, Shear::ZERO).unwrap();
+            let pixels = psf.pixels(moffat(&psf));
+            let rules = pixels.rules((23.5, 23.5), (48, 48));
+            assert!(rules.bounds().is_sorted());
+            let plan = RulePlan {
+                half_pixel: 0.5,
+                core: pixels.core,
+                peak: pixels.profile.at(0.0).min(1.0),
+            };
+            for step in 0..3000 {
+                let radius = 0.01 * f64::from(step);
+                let asked = plan.choose(&pixels.profile, radius);
+                let inside = |bound: &f64| radius * radius <= *bound;
+                let at = rules.bounds().iter().position(inside);
+                let rule = &rules.rules[at.unwrap_or(rules.count - 1)];
+                let length = |rule: &Rule| (rule.divisions, rule.nodes);
+                assert!(
+                    length(rule) >= length(&asked),
+                    "{fwhm} {radius}: {rule:?} {asked:?}"
+                );
+            }
+        }
+    }
+}
