@@ -33,7 +33,12 @@ pub struct RowJob {
     pub iy: usize,
     /// What the rows of the image share, one per measurer.
     pub heads: Arc<[Arc<ImageHead>]>,
+    /// The row as it is, if it was drawn for the survey of the image.
+    drawn: Option<DrawnRow>,
 }
+
+/// A row of drawn stamps, and the ellipticities after lensing.
+type DrawnRow = (Vec<f32>, Vec<Shear>);
 
 impl fmt::Debug for RowJob {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -141,7 +146,7 @@ pub fn run_set(
             render: RenderScratch::new(),
             workers: measurers.iter().map(Measurer::worker).collect(),
         },
-        |scratch, job| draw_and_measure(set, scratch, &job),
+        |scratch, job| draw_and_measure(set, scratch, job),
         |measured: MeasuredJob| {
             progress.advance(n as u64);
             let (image, iy) = (measured.rows[0].head.id.image, measured.rows[0].iy);
@@ -179,11 +184,15 @@ pub fn feed(
 ) -> Result<(), PipelineError> {
     for &image in images {
         let fields = Arc::new(set.image_fields(image));
-        let heads = heads(set, &fields, measurers, feeder)?;
+        let (heads, mut drawn) = heads(set, &fields, measurers, feeder)?;
         for iy in 0..set.grid().n {
-            let fields = Arc::clone(&fields);
-            let heads = Arc::clone(&heads);
-            if !feeder.push(RowJob { fields, iy, heads }) {
+            let job = RowJob {
+                fields: Arc::clone(&fields),
+                iy,
+                heads: Arc::clone(&heads),
+                drawn: drawn.remove(&iy),
+            };
+            if !feeder.push(job) {
                 return Ok(());
             }
         }
@@ -191,14 +200,14 @@ pub fn feed(
     Ok(())
 }
 
-/// What the rows of a simulated image share, one per measurer.
+/// What the rows of a simulated image share, one per measurer, and the rows that were drawn to find it.
 fn heads(
     set: &SetSimulator,
     fields: &ImageFields,
     measurers: &[Measurer],
     feeder: &Feeder<'_, RowJob>,
-) -> Result<Arc<[Arc<ImageHead>]>, PipelineError> {
-    let surveys = surveys(set, fields, measurers, feeder)?;
+) -> Result<(Arc<[Arc<ImageHead>]>, BTreeMap<usize, DrawnRow>), PipelineError> {
+    let (surveys, drawn) = surveys(set, fields, measurers, feeder)?;
     let head = |(measurer, survey): (&Measurer, Option<Arc<Survey>>)| {
         let warnings = Warning::of_settings(measurer.configuration());
         Arc::new(ImageHead {
@@ -215,38 +224,43 @@ fn heads(
             prints: BTreeMap::new(),
         })
     };
-    Ok(measurers.iter().zip(surveys).map(head).collect())
+    Ok((measurers.iter().zip(surveys).map(head).collect(), drawn))
 }
 
-/// Noise and galaxy sizes of a simulated image, for each measurer that measures them.
+/// What [`surveys`] finds.
+type Surveys = Vec<Option<Arc<Survey>>>;
+
+/// Noise and galaxy sizes of a simulated image, for each measurer that measures them, and the rows that were drawn.
 fn surveys(
     set: &SetSimulator,
     fields: &ImageFields,
     measurers: &[Measurer],
     feeder: &Feeder<'_, RowJob>,
-) -> Result<Vec<Option<Arc<Survey>>>, PipelineError> {
+) -> Result<(Surveys, BTreeMap<usize, DrawnRow>), PipelineError> {
     let n = set.grid().n;
     let empty = || -> Vec<Option<NoiseSurvey>> {
         let plans = measurers.iter().map(Measurer::noise_plan);
         plans.map(|plan| plan.map(NoisePlan::survey)).collect()
     };
     let Some(plan) = measurers.iter().find_map(Measurer::noise_plan) else {
-        return Ok(measurers.iter().map(|_| None).collect());
+        return Ok((measurers.iter().map(|_| None).collect(), BTreeMap::new()));
     };
     // Plans differ only in their lags.
     let rows = feeder.each(plan.rows(n, n), |iy| {
-        let (pixels, _) = simulate::draw_stamps(set, fields, iy, &mut RenderScratch::new());
+        let drawn = simulate::draw_stamps(set, fields, iy, &mut RenderScratch::new());
         let mut surveys = empty();
-        for stamp in strip(&pixels, n, STAMP)?.outer_iter() {
+        for stamp in strip(&drawn.0, n, STAMP)?.outer_iter() {
             for survey in surveys.iter_mut().flatten() {
                 survey.add(stamp)?;
             }
         }
-        Ok::<_, PipelineError>(surveys)
+        Ok::<_, PipelineError>((surveys, (iy, drawn)))
     });
     let mut surveys = empty();
+    let mut drawn = BTreeMap::new();
     for row in rows {
-        let found = row?;
+        let (found, (iy, row)) = row?;
+        drawn.insert(iy, row);
         for (survey, more) in surveys.iter_mut().flatten().zip(found.iter().flatten()) {
             survey.join(more)?;
         }
@@ -254,16 +268,19 @@ fn surveys(
     let found = surveys
         .iter()
         .map(|survey| survey.as_ref()?.found().map(Arc::new));
-    Ok(found.collect())
+    Ok((found.collect(), drawn))
 }
 
 fn draw_and_measure(
     set: &SetSimulator,
     scratch: &mut Scratch,
-    job: &RowJob,
+    mut job: RowJob,
 ) -> Result<MeasuredJob, PipelineError> {
-    let (pixels, observed) = simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render);
-    let rows = measure_strip(set, job, pixels, &mut scratch.workers)?;
+    let (pixels, observed) = job
+        .drawn
+        .take()
+        .unwrap_or_else(|| simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render));
+    let rows = measure_strip(set, &job, pixels, &mut scratch.workers)?;
     Ok(MeasuredJob { observed, rows })
 }
 
