@@ -34,7 +34,11 @@ pub(crate) fn select<'py>(
         };
         found.map(Cow::Borrowed).ok_or_else(lacks)
     };
-    let weighted = Weighted::of(path, &selection.unwrap_or_default(), column);
+    let weighted = Weighted::of(
+        path,
+        &selection.map(|stated| stated.selection).unwrap_or_default(),
+        column,
+    );
     let Weighted {
         e: [e1, e2],
         response: [r11, r22],

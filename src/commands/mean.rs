@@ -63,7 +63,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let Some(data) = &data {
         inputs::verify(data, measured, &run, sets, threads.number())?;
     }
-    let means = mean_shears(&run, measured, sets, selection.as_ref())?;
+    let means = mean_shears(
+        &run,
+        measured,
+        sets,
+        selection.as_ref().map(|stated| &stated.selection),
+    )?;
     for mean in &means {
         let set = mean.set;
         anyhow::ensure!(

@@ -48,12 +48,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Some(selection) = selection(cuts.as_deref(), weight.as_deref())? else {
         return Ok(());
     };
-    let parts = [("where", cuts), ("weight", weight)];
-    let parts = parts
-        .iter()
-        .filter_map(|(name, text)| Some(format!("{name}: {}", text.as_ref()?)));
-    let text = parts.collect::<Vec<_>>().join("; ");
-    let (kept, good) = write_selected(&run, measured, out, &selection, &text)?;
+    let (kept, good) = write_selected(&run, measured, out, &selection)?;
     tell(format_args!(
         "{}: {kept} of {good} galaxies without a flag have a weight above zero",
         out.display()

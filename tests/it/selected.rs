@@ -106,6 +106,31 @@ fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
     assert!(warned.contains("Try: --where"), "{warned}");
     // A cut in size removes sheared galaxies; m of 3200 galaxies without shape noise has an error of 0.03.
     assert!(filtered[0] + filtered[1] < -0.2, "{filtered:?}");
+    // The table says how the galaxies were chosen, and shards of other choices do not merge.
+    let folders: Vec<&str> = measured.iter().map(String::as_str).collect();
+    let shard = |number: usize, cut: &str| {
+        let sums = at(&format!("{number}.json"));
+        let part = format!("{number}/2");
+        let options = [
+            "--where",
+            cut,
+            "--weight",
+            "snr^2",
+            "--shard",
+            &part,
+            "--sums",
+            text(&sums),
+        ];
+        succeed(&[&["bias"], &folders[..], &options].concat());
+        text(&sums).to_owned()
+    };
+    let (first, second) = (shard(1, "snr > 15"), shard(2, "snr > 15"));
+    let merged = succeed(&["bias", "--merge", &first, &second]);
+    let stated = "Galaxies by where: snr > 15; weight: snr^2.";
+    assert!(merged.contains(stated), "{merged}");
+    let other = shard(2, "snr > 16");
+    let refused = fail(&["bias", "--merge", &first, &other]);
+    assert!(refused.contains("different options"), "{refused}");
     let path = at("chosen+").join("set02/catalogue-001.parquet");
     let given = ["bias", text(&path), "--g1", "0.02", "--g2", "0.02"];
     let refused = fail(&[&given[..], &cut].concat());

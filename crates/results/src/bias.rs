@@ -18,10 +18,10 @@ use shearq_bias::{
 };
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
-use shearq_measure::Selection;
 use thiserror::Error;
 
 use crate::expression::Expression;
+use crate::select::StatedSelection;
 use columns::{Names, Preset, Role};
 use read::{Reading, Source};
 use truth::Truth;
@@ -106,7 +106,7 @@ pub struct Request {
     /// Rows that count.
     pub select: Option<Expression>,
     /// Cuts and weights of catalogues of linear configurations, whose response to shear enters.
-    pub selection: Option<Selection>,
+    pub selection: Option<StatedSelection>,
     /// The design; recognised if `None`.
     pub design: Option<Design>,
     /// Units of the errors.
@@ -136,6 +136,8 @@ pub struct Summed {
     edges: Vec<f64>,
     /// Measured columns in `--select` or `--bins`.
     measured: Vec<String>,
+    /// Which rows count, and their weights, in words of the options.
+    selection: Option<String>,
 }
 
 /// Sums whose units are joined.
@@ -174,6 +176,8 @@ pub struct BiasResult {
     /// Columns of `--select` or `--bins` that were measured on the galaxies of shearq's catalogues: m contains how shear
     /// changes this choice.
     pub measured: Vec<String>,
+    /// The texts of the options that select and weight rows, such as `select: snr > 10`.
+    pub selection: Option<String>,
 }
 
 impl BiasResult {
@@ -196,6 +200,15 @@ const SAMPLE: usize = 1 << 20;
 pub const MOST_BINS: usize = 100;
 
 impl Request {
+    /// The texts of what selects and weights rows.
+    fn stated_selection(&self) -> Option<String> {
+        let select = self.select.as_ref();
+        let select = select.map(|expression| format!("select: {}", expression.text()));
+        let stated = self.selection.as_ref().map(|stated| stated.text.clone());
+        let parts: Vec<String> = select.into_iter().chain(stated).collect();
+        (!parts.is_empty()).then(|| parts.join("; "))
+    }
+
     fn reading(&self) -> Reading {
         Reading {
             names: self.names.clone(),
@@ -203,7 +216,10 @@ impl Request {
             distortion: self.distortion,
             flip_g2: self.flip_g2,
             select: self.select.clone(),
-            selection: self.selection.clone(),
+            selection: self
+                .selection
+                .as_ref()
+                .map(|stated| stated.selection.clone()),
             binned: self.bins.as_ref().map(|bins| bins.of.clone()),
             drop_missing: self.drop_missing,
             step: self.step,
@@ -322,6 +338,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
             .map_or_else(String::new, |bins| bins.of.text().to_owned()),
         edges,
         measured,
+        selection: request.stated_selection(),
     })
 }
 
@@ -468,7 +485,8 @@ impl Summed {
         if self.version != other.version {
             return unlike("different versions");
         }
-        if (&self.binned, &self.edges) != (&other.binned, &other.edges)
+        if (&self.binned, &self.edges, &self.selection)
+            != (&other.binned, &other.edges, &other.selection)
             || (self.truth, self.matched, self.design, self.by_key)
                 != (other.truth, other.matched, other.design, other.by_key)
         {
@@ -511,6 +529,7 @@ impl Summed {
             catalogues: self.catalogues.clone(),
             program: self.program.clone(),
             measured: self.measured.clone(),
+            selection: self.selection.clone(),
         })
     }
 
@@ -572,6 +591,7 @@ impl Summed {
             catalogues: self.catalogues.clone(),
             program: format!("{} minus {}", self.program, other.program),
             measured: Vec::new(),
+            selection: self.selection.clone(),
         })
     }
 

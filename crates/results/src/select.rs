@@ -19,6 +19,16 @@ pub(crate) const READ: [&str; 9] = [
     "e1", "e2", "flags", "R11", "R22", "R12", "R21", "divisor1", "divisor2",
 ];
 
+/// A selection and the texts that it was made from.
+#[derive(Debug, Clone)]
+#[non_exhaustive]
+pub struct StatedSelection {
+    /// The selection.
+    pub selection: Selection,
+    /// The texts, such as `where: snr > 10; weight: snr^2`.
+    pub text: String,
+}
+
 /// The selection of `--where` and `--weight`; `None` without either.
 ///
 /// # Errors
@@ -26,7 +36,7 @@ pub(crate) const READ: [&str; 9] = [
 pub fn selection(
     cuts: Option<&str>,
     weight: Option<&str>,
-) -> Result<Option<Selection>, PipelineError> {
+) -> Result<Option<StatedSelection>, PipelineError> {
     if cuts.is_none() && weight.is_none() {
         return Ok(None);
     }
@@ -58,13 +68,20 @@ pub fn selection(
             })
         });
     }
-    Ok(Some(selection))
+    let parts = [("where", cuts), ("weight", weight)];
+    let parts = parts
+        .iter()
+        .filter_map(|(name, text)| Some(format!("{name}: {}", (*text)?.trim())));
+    Ok(Some(StatedSelection {
+        selection,
+        text: parts.collect::<Vec<_>>().join("; "),
+    }))
 }
 
 /// Name of the column with the weights.
 const WEIGHT: &str = "selection";
 
-/// Writes the catalogues of the folder `from` with the weights of a `selection`, described by `text`, to the folder `to`:
+/// Writes the catalogues of the folder `from` with the weights of a `stated` selection to the folder `to`:
 /// ellipticities are multiplied by the weights and divided by the mean response of their image, so that all that uses catalogues
 /// uses the selection. Galaxies that are left out have an ellipticity and a response of zero. Returns the number of
 /// galaxies that are kept, and of those without a flag.
@@ -75,8 +92,7 @@ pub fn write_selected(
     run: &Run,
     from: &Path,
     to: &Path,
-    selection: &Selection,
-    text: &str,
+    stated: &StatedSelection,
 ) -> Result<(usize, usize), FileError> {
     if let Some(earlier) = &run.selection {
         return Err(FileError::new(
@@ -89,7 +105,7 @@ pub fn write_selected(
     let files = run.catalogues(from, &[])?;
     let record = Run {
         source: run.source.moved(from, to)?,
-        selection: Some(text.to_owned()),
+        selection: Some(stated.text.clone()),
         ..run.clone()
     };
     let claim = claim(&to.join(RUN_FILE), &record)?;
@@ -109,7 +125,7 @@ pub fn write_selected(
         }
         for (image, path) in files.of_set(set) {
             let read = table::read(&path, None, table::MAX_ROWS)?;
-            let weighted = Weighted::of_table(&path, selection, &read)?;
+            let weighted = Weighted::of_table(&path, &stated.selection, &read)?;
             kept += weighted
                 .weight
                 .iter()
@@ -118,7 +134,7 @@ pub fn write_selected(
             good += weighted.e[0].iter().filter(|e| e.is_finite()).count();
             let changed = weighted.table(&path, &read)?;
             let mut metadata = table::read_metadata(&path, run.format, keys.iter())?;
-            metadata.insert("select".into(), text.to_owned());
+            metadata.insert("select".into(), stated.text.clone());
             let out = record.catalogue(to, set, image);
             claim.check()?;
             table::write(&out, run.format, &changed, &metadata)?;

@@ -157,6 +157,9 @@ fn notes(result: &BiasResult) -> Vec<String> {
         ),
         format!("Errors are from {} units: {}.", all.units, result.unit),
     ];
+    if let Some(selection) = &result.selection {
+        notes.push(format!("Galaxies by {selection}."));
+    }
     if all.units < MANY_UNITS {
         notes.push(format!(
             "With {} units, 95 % confidence is {:.2} standard errors (Student's t).",
