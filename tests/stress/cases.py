@@ -15,6 +15,8 @@ class Case:
     galaxy: str = "fiducial"
     stamp: int = 48
     off: float = 0.0
+    #: Whether galaxies are within half a pixel of the middle of the stamp, or else exactly there.
+    dithered: bool = True
     #: Distance of a second galaxy in pixels; of a range, at random in the plane.
     neighbour: float | tuple[float, float] = 0.0
     #: Its flux in units of the galaxy's, at random in the logarithm.

@@ -1,8 +1,8 @@
 """Shapes by estimators that others made, of the stamps that a submission is measured on.
 
-Each takes stamps `[version, galaxy, y, x]`, their PSF, and a function that draws noise like that of a version. The
-versions are the two shears under one field of noise, and the first under another. It returns ellipticities
-`[version, galaxy, component]`, not a number where it failed, and its own response `[galaxy, component]`.
+Each takes stamps `[field, ±shear, galaxy, y, x]` under fields of noise, their PSF, and a function that draws further noise for a
+field. Every second field is the one before with the other sign. It returns ellipticities `[field, ±shear, galaxy, component]`,
+not a number where it failed, and its own response `[galaxy, component]`.
 """
 
 import galsim
@@ -22,27 +22,29 @@ def regauss(stamps, psf, _noise):
     """
     side = stamps.shape[-1]
     image = psf.drawImage(nx=side, ny=side, scale=1, dtype=float)
-    e = np.full((*stamps.shape[:2], 2), np.nan)
-    for version, galaxies in enumerate(stamps):
-        for k, stamp in enumerate(galaxies):
-            found = galsim.hsm.EstimateShear(
-                galsim.Image(np.ascontiguousarray(stamp, dtype=float)), image, sky_var=1.0, strict=False
-            )
-            if not found.error_message:
-                e[version, k] = found.corrected_e1 / 2, found.corrected_e2 / 2
+    e = np.full((*stamps.shape[:3], 2), np.nan)
+    for at in np.ndindex(e.shape[:3]):
+        stamp = galsim.Image(np.ascontiguousarray(stamps[at], dtype=float))
+        found = galsim.hsm.EstimateShear(stamp, image, sky_var=1.0, strict=False)
+        if not found.error_message:
+            e[at] = found.corrected_e1 / 2, found.corrected_e2 / 2
     e[np.hypot(e[..., 0], e[..., 1]) > 1.0] = np.nan
-    e[:, np.isnan(e).any((0, 2))] = np.nan
-    off = e - np.nanmean(e, 1, keepdims=True)
-    return e, 1.0 - 4.0 * off[0] * off[2]
+    e[:, :, np.isnan(e).any((0, 1, 3))] = np.nan
+    off = e - np.nanmean(e, 2, keepdims=True)
+    # Fields 0 and 2 are independent.
+    return e, 1.0 - 4.0 * off[0, 0] * off[2, 0]
 
 
-def fpfs(stamps, psf, noise):
-    """FPFS (Li et al. 2022) of AnaCal at the stamps' middles, without detection, with noise added for its response."""
+def fpfs(stamps, psf, noise, renoise=True):
+    """FPFS (Li et al. 2022) of AnaCal at the stamps' middles, without detection.
+
+    With `renoise`, it adds noise like that of the stamps, which removes the noise bias of its response.
+    """
     try:
         import anacal
     except ImportError:
         raise SystemExit("FPFS needs AnaCal: pip install anacal") from None
-    versions, count, side, _ = stamps.shape
+    count, side = stamps.shape[2:4]
     full = max(SIDE, side)
     grid = int(np.sqrt(count))
     edge = (full - side) // 2
@@ -61,18 +63,27 @@ def fpfs(stamps, psf, noise):
     places = np.empty(count, dtype=[("y", np.int32), ("x", np.int32)])
     y, x = np.mgrid[0:grid, 0:grid] * full + full // 2
     places["y"], places["x"] = y.ravel(), x.ravel()
-    e, responses, offset = [], [], None
-    for version in range(versions):
+    e = np.empty((*stamps.shape[:3], 2))
+    responses, offset = np.zeros((count, 2)), None
+    for field, sign in np.ndindex(e.shape[:2]):
         # It adds this to the image itself.
-        added = mosaic(noise(version))
-        found = task.run(gal_array=mosaic(stamps[version]), psf=drawn, noise_array=added, det=places)
+        added = mosaic(noise(field)) if renoise else None
+        found = task.run(gal_array=mosaic(stamps[field, sign]), psf=drawn, noise_array=added, det=places)
         if offset is None:
             offset = OFFSET * float(np.median(found["data"]["m00"]))
-        shapes = anacal.fpfs.measure_fpfs(C0=offset, x_array=found["data"], y_array=found["noise"])
-        e.append(np.stack([shapes["e1"], shapes["e2"]], 1))
-        responses.append(np.stack([shapes["de1_dg1"], shapes["de2_dg2"]], 1))
-    return np.array(e), np.mean(responses[:2], 0)
+        again = found["noise"] if renoise else None
+        shapes = anacal.fpfs.measure_fpfs(C0=offset, x_array=found["data"], y_array=again)
+        e[field, sign] = np.stack([shapes["e1"], shapes["e2"]], 1)
+        responses += np.stack([shapes["de1_dg1"], shapes["de2_dg2"]], 1)
+    return e, responses / (len(stamps) * 2)
+
+
+def fpfs_plain(stamps, psf, noise):
+    """FPFS without added noise: less noise, and some noise bias at low S/N."""
+    return fpfs(stamps, psf, noise, renoise=False)
 
 
 #: What can be asked for.
-PEERS = {"REGAUSS": regauss, "FPFS": fpfs}
+PEERS = {"REGAUSS": regauss}
+#: Those whose authors use them on galaxies whose middle is known: stamps without dither.
+CENTRED = {"FPFS": fpfs, "FPFS-plain": fpfs_plain}

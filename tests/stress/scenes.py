@@ -130,6 +130,8 @@ def render(case, count, random, folder):
         for turn in range(TURNS):
             at = first + turn
             place = direction(random, case.off) if case.off else random.uniform(-0.5, 0.5, 2)
+            if not case.dithered:
+                place = np.zeros(2)
             turned = galaxy.rotate(180 / TURNS * turn * galsim.degrees)
             for sign in range(2):
                 g = SHEAR * (1 - 2 * sign)

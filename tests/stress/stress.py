@@ -12,6 +12,8 @@ import json
 import subprocess
 import sys
 import tempfile
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,22 +24,20 @@ from cases import CASES
 from estimates import bias, leakage, mean_of, scatter_of_images, weighted
 from scenes import RENDERED, SHEAR, bound, noise_field, render
 
-#: Noise fields a galaxy is measured under: four, each added and taken away.
-FIELDS = 8
 #: Pixels a side of star stamps.
 STAR = 48
 
 
-def stars_of(case, psf, grid, random):
+def stars_of(case, psf, grid, random, fields):
     """Star stamps of each noise field: the PSF, or with noise one for all galaxies or a mosaic of one per galaxy."""
     star = psf.drawImage(nx=STAR, ny=STAR, scale=1).array
     if not case.star:
-        return [star] * FIELDS
+        return [star] * fields
     sigma = np.sqrt((star**2).sum()) / case.star
     if case.star_of == "image":
-        return [star + sigma * random.standard_normal(star.shape) for _ in range(FIELDS)]
+        return [star + sigma * random.standard_normal(star.shape) for _ in range(fields)]
     stars = []
-    for _ in range(FIELDS // 2):
+    for _ in range(fields // 2):
         noise = sigma * random.standard_normal((grid * STAR, grid * STAR))
         stars += [np.tile(star, (grid, grid)) + sign * noise for sign in (1, -1)]
     return stars
@@ -98,17 +98,21 @@ class Peers:
         self.found = {name: [] for name in names if not (case.missing or case.star)}
         self.case, self.seed, self.blocks = case, seed, 0
 
-    def look(self, stamps, psf, fields):
-        if not self.found:
-            return
-        versions = np.stack([stamps[0] + fields[0], stamps[1] + fields[0], stamps[0] + fields[2]]) + self.case.sky
+    def centred(self):
+        """Whether one of them needs galaxies in the middle of their stamps."""
+        return any(name in peers.CENTRED for name in self.found)
 
-        def noise(version):
-            random = np.random.default_rng([self.seed, self.blocks, version // 2])
-            return noise_field(self.case, stamps.shape[1:], random)
+    def look(self, estimators, stamps, psf, fields):
+        versions = np.array([stamps + field for field in fields]) + self.case.sky
+
+        def noise(field):
+            # As that of the fields: each once with the other sign.
+            random = np.random.default_rng([self.seed, self.blocks, field // 2])
+            return (1 - 2 * (field % 2)) * noise_field(self.case, stamps.shape[1:], random)
 
         for name, found in self.found.items():
-            found.append(peers.PEERS[name](versions, psf, noise))
+            if name in estimators:
+                found.append(estimators[name](versions, psf, noise))
         self.blocks += 1
 
     def results(self):
@@ -116,34 +120,39 @@ class Peers:
 
     @staticmethod
     def result(found):
-        e = np.concatenate([e for e, _ in found], 1)
+        e = np.concatenate([e for e, _ in found], 2)
         response = np.concatenate([own for _, own in found])
-        good = np.isfinite(e).all((0, 2))
+        good = np.isfinite(e).all((0, 1, 3))
         result = {"failed": 1.0 - good.mean()}
         noise = []
         for k in (0, 1):
-            apart = (e[0, :, k] - e[1, :, k]) / (2 * SHEAR)
+            apart = (e[:, 0, :, k] - e[:, 1, :, k]).mean(0) / (2 * SHEAR)
             result[f"m{k + 1}"], result[f"m{k + 1}_error"], _ = bias(apart, response[:, k], good)
-            noise.append((e[0] - e[2])[good, k].std() / np.sqrt(2) / apart[good].mean())
+            noise.append((e[0, 0] - e[2, 0])[good, k].std() / np.sqrt(2) / apart[good].mean())
         return result | {"noise": float(np.sqrt(np.mean(np.square(noise))))}
 
 
 def measure_case(case, options, others):
     """Measurements of a case, block by block: flags, sums of its estimate, and those of each image."""
     random = np.random.default_rng([options.seed, sum(case.name.encode())])
-    wanted = max(options.galaxies // FIELDS, 8)
+    wanted = max(options.galaxies // options.fields, 8)
     rows = []
     while sum(len(row["good"]) for row in rows) < wanted:
         left = wanted - sum(len(row["good"]) for row in rows)
         # An even number a side keeps fours together.
         grid = min(case.grid, 2 * int(np.ceil(np.sqrt(left) / 2)))
+        again = deepcopy(random)
         stamps, psf = render(case, grid * grid, random, options.real)
         fields = []
-        for _ in range(FIELDS // 2):
+        for _ in range(options.fields // 2):
             noise = noise_field(case, stamps.shape[1:], random)
             fields += [noise, -noise]
-        others.look(stamps, psf, fields)
-        found = measured(case, stamps, stars_of(case, psf, grid, random), fields, options)
+        if others.centred():
+            middle, _ = render(replace(case, dithered=False), grid * grid, again, options.real)
+            others.look(peers.CENTRED, middle, psf, fields)
+        others.look(peers.PEERS, stamps, psf, fields)
+        stars = stars_of(case, psf, grid, random, options.fields)
+        found = measured(case, stamps, stars, fields, options)
         good = (found["flags"] == 0).all((0, 1))
         row = {"good": good, "flagged": (found["flags"] != 0).mean()}
         for k in (1, 2):
@@ -163,7 +172,7 @@ def examine(case, options):
     good = np.concatenate([row["good"] for row in rows])
     result = {
         "case": case.name,
-        "galaxies": int(len(good)) * FIELDS,
+        "galaxies": int(len(good)) * options.fields,
         "flagged": 1.0 - good.mean(),
         "flagged_once": float(np.mean([row["flagged"] for row in rows])),
         "aim": case.aim,
@@ -186,7 +195,7 @@ def examine(case, options):
         for row in kept:
             e, response = row[k]
             apart = (e[:, 0] - e[:, 1]) / (2 * SHEAR)
-            images += [(apart[j], response[j].mean(0), row["good"]) for j in range(FIELDS)]
+            images += [(apart[j], response[j].mean(0), row["good"]) for j in range(options.fields)]
     result["noise"] = float(np.sqrt((result["noise1"] ** 2 + result["noise2"] ** 2) / 2))
     result["leak"], result["leak_error"] = leakage(result)
     if case.images:
@@ -234,7 +243,15 @@ def line(row):
 def lines_of_peers(row):
     for name, found in row["peers"].items():
         m = f"{found['m1']:+8.2f} {found['m2']:+8.2f} ± {max(found['m1_error'], found['m2_error']):.2f}"
-        yield f"  {name:10} {m:>26} {'':24} {found['noise']:.4f} {'':6} {100 * found['failed']:6.2f}"
+        yield f"  {name:13} {m:>23} {'':24} {found['noise']:.4f} {'':6} {100 * found['failed']:6.2f}"
+
+
+def even(text):
+    """An even number of at least four."""
+    number = int(text)
+    if number < 4 or number % 2:
+        raise argparse.ArgumentTypeError(f"{text} is not an even number of at least 4")
+    return number
 
 
 def main():
@@ -242,11 +259,14 @@ def main():
     words.add_argument("--shearq", default="target/release/shearq", help="the program")
     words.add_argument("--submission", default="48/linear/star", help="a name or a settings file")
     words.add_argument("--galaxies", type=int, default=40_000, help="galaxies a case, each of one noise field")
+    words.add_argument(
+        "--fields", type=even, default=8, help="noise fields each galaxy is measured under, half of them with the other sign"
+    )
     words.add_argument("--cases", help="names with commas; all of them without")
     words.add_argument("--real", type=Path, help="folder with GalSim's example catalogues; without, those cases are left out")
     words.add_argument("--seed", type=int, default=20261)
     words.add_argument(
-        "--peers", nargs="*", default=[], choices=list(peers.PEERS), help="estimators of others, on the same stamps"
+        "--peers", nargs="*", default=[], choices=[*peers.PEERS, *peers.CENTRED], help="estimators of others, on the same stamps"
     )
     words.add_argument(
         "--hard-cuts", action="store_true", help="cut the columns as a filter does, without the response of `select`"
@@ -260,7 +280,7 @@ def main():
         sys.exit(f"no case {unknown[0]}; known: {', '.join(known)}")
     if not options.real:
         names = [name for name in names if known[name].galaxy in RENDERED]
-    print(f"{options.submission}, {options.galaxies} galaxies a case, seed {options.seed}")
+    print(f"{options.submission}, {options.galaxies} galaxies a case, {options.fields} noise fields, seed {options.seed}")
     print(f"{'case':12} {'m1, m2 [1e-3]':>26} {'c1, c2 [1e-4]':>24}  noise /bound flag %   leak  aim", flush=True)
     rows = []
     for name in names:
@@ -268,6 +288,7 @@ def main():
         print(line(rows[-1]), *lines_of_peers(rows[-1]), sep="\n", flush=True)
         if options.json:
             settings = {"submission": options.submission, "galaxies": options.galaxies, "seed": options.seed}
+            settings["fields"] = options.fields
             settings["peers"] = options.peers
             options.json.write_text(json.dumps({"settings": settings, "cases": rows}, indent=1))
     return any(row["verdict"] == "FAILED" for row in rows)
