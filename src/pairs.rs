@@ -100,7 +100,10 @@ const WAYS: [(&str, &[&str]); 32] = [
         "study",
         &["submission sets images pairs grid seed amplitude tilt out format threads"],
     ),
-    ("bench", &["submission catalogues out format threads"]),
+    (
+        "bench",
+        &["submission catalogues galaxies out format threads"],
+    ),
     ("submissions list", &["format"]),
     ("submissions show", &["NAME|FILE"]),
     ("submissions init", &["FILE method"]),

@@ -25,6 +25,9 @@ pub(crate) struct Arguments {
     /// Number of catalogues to score.
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u16).range(2..=2000))]
     catalogues: u16,
+    /// Also time simulating and measuring of up to so many galaxies, such as 1e7 (some minutes), in one image and in many.
+    #[arg(long, value_name = "N", value_parser = galaxies)]
+    galaxies: Option<f64>,
     /// Folder for a report with plots and their data.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -32,6 +35,14 @@ pub(crate) struct Arguments {
     form: Form,
     #[command(flatten)]
     threads: Threads,
+}
+
+/// Parses a number of galaxies.
+fn galaxies(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok();
+    number
+        .filter(|number| (1e3..=1e9).contains(number))
+        .ok_or_else(|| "expected a number from 1000 to 1e9".into())
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -113,6 +124,22 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         show(&mut page, &name, energies.table())?;
         if let Some(page) = &mut page {
             page.figure(&name, &energies.figure(), "Energy above its minimum.")?;
+        }
+    }
+    if let Some(most) = arguments.galaxies {
+        if let Some(page) = &mut page {
+            page.section(
+                "Numbers",
+                "Time against the number of galaxies, in one image and in many.",
+            );
+        }
+        for submission in &submissions {
+            let name = format!("numbers-{}", submission.name.replace('/', "-"));
+            let amounts = speed::amounts(submission, settings, threads, most)?;
+            show(&mut page, &name, amounts.table())?;
+            if let Some(page) = &mut page {
+                page.figure(&name, &amounts.figure(), "Time against number.")?;
+            }
         }
     }
     if let Some(page) = &mut page {

@@ -5,6 +5,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use ndarray::{Array2, ArrayView2};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::parts::{
     AdaptiveMoments, ClippedAcf, Matrices, Network, Rule, Spectral, StampFft, Step, WaveletWiener,
     border_noise,
@@ -12,7 +15,7 @@ use shearq_measure::parts::{
 use shearq_measure::{ImageNoise, Measurer, StampNoise, Worker};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
-use shearq_submissions::limits::WINDOWS;
+use shearq_submissions::limits::{MAX_PSF, WINDOWS};
 use shearq_submissions::{
     Clipping, Configuration, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut, Start,
     Update,
@@ -36,12 +39,16 @@ use shearq_results::score::{COLUMNS, score_files};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, SimulationSettings};
 
+mod amounts;
+
+pub use amounts::{Amounts, amounts};
+
 /// Number of different galaxies per timing, so that branches are not predictable.
 const SAMPLE: usize = 64;
 /// Longest time per timing.
 const BUDGET: Duration = Duration::from_millis(400);
 /// Stamp sizes of the table of costs.
-pub const SIZES: [usize; 8] = [11, 15, 19, 23, 29, 33, 39, 48];
+pub const SIZES: [usize; 10] = [11, 15, 19, 23, 29, 33, 39, 48, 56, 64];
 
 /// Microseconds per call: the fastest of several passes over `SAMPLE` galaxies, after a warm-up.
 pub(super) fn time(mut call: impl FnMut(usize)) -> f64 {
@@ -60,9 +67,10 @@ pub(super) fn time(mut call: impl FnMut(usize)) -> f64 {
     best
 }
 
-/// A full stamp.
+/// A square stamp.
 fn view(stamp: &[f32]) -> ArrayView2<'_, f32> {
-    ArrayView2::from_shape((STAMP, STAMP), stamp).expect("a stamp of the set's size")
+    let side = stamp.len().isqrt();
+    ArrayView2::from_shape((side, side), stamp).expect("a square stamp")
 }
 
 /// Settings of a configuration's network.
@@ -105,12 +113,31 @@ impl Inputs {
         fields.psf.at(0, 0).stamp_beside(cut.into().size, STAMP)
     }
 
+    /// The stamps of at least `side` pixels a side: larger ones have noise around the set's stamps.
+    fn of_side(&self, side: usize) -> Vec<Vec<f32>> {
+        let before = side.saturating_sub(STAMP) / 2;
+        let mut rng = ChaCha8Rng::seed_from_u64(side as u64);
+        let surrounded = |stamp: &Vec<f32>| {
+            if side <= STAMP {
+                return stamp.clone();
+            }
+            let mut large: Vec<f32> = (0..side * side)
+                .map(|_| StandardNormal.sample(&mut rng))
+                .collect();
+            for (y, row) in stamp.chunks_exact(STAMP).enumerate() {
+                large[(before + y) * side + before..][..STAMP].copy_from_slice(row);
+            }
+            large
+        };
+        self.stamps.iter().map(surrounded).collect()
+    }
+
     /// A worker, and the PSF for it.
     fn prepared(
         &self,
         configuration: &Configuration,
     ) -> Result<(Worker, Array2<f64>), PipelineError> {
-        let measurer = Measurer::new(configuration, STAMP)?;
+        let measurer = Measurer::new(configuration, configuration.stamp.size.max(STAMP))?;
         // Its sizes may differ by a pixel from those of the configuration.
         let psf = self.psf(measurer.configuration().psf_cut());
         Ok((measurer.worker(), psf))
@@ -119,10 +146,11 @@ impl Inputs {
     /// Microseconds of a whole measurement of a galaxy whose PSF is set.
     fn whole(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
         let (mut worker, psf) = self.prepared(configuration)?;
+        let stamps = self.of_side(configuration.stamp.size);
         let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
         let mut worker = image.psf(psf.view())?;
         Ok(time(|k| {
-            let _ = black_box(worker.measure(view(&self.stamps[k])));
+            let _ = black_box(worker.measure(view(&stamps[k])));
         }))
     }
 
@@ -446,15 +474,15 @@ pub fn size_costs(
 }
 
 /// A configuration for stamps of `n` pixels a side. The linear method's window keeps its share of the stamp, and its PSF
-/// stamps are as large, because both must be odd or even.
+/// stamps are as large, up to the largest, because both must be odd or even.
 fn sized(configuration: &Configuration, n: usize) -> Configuration {
     let mut sized = configuration.clone();
     let share = n as f64 / sized.stamp.size as f64;
     sized.stamp.size = n;
     if let Method::Linear(method) = &mut sized.method {
-        sized.psf.size = n;
+        sized.psf.size = n.min(MAX_PSF - n % 2);
         let window = &mut method.deconvolution.window_sigma;
-        *window = (*window * share).max(*WINDOWS.start());
+        *window = (*window * share).clamp(*WINDOWS.start(), *WINDOWS.end());
     }
     sized
 }
