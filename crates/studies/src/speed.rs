@@ -13,6 +13,7 @@ use shearq_measure::parts::{
     border_noise,
 };
 use shearq_measure::{ImageNoise, Measurer, StampNoise, Worker};
+use shearq_quantities::statistics::median;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::limits::{MAX_PSF, WINDOWS};
@@ -45,26 +46,43 @@ pub use amounts::{Amounts, amounts};
 
 /// Number of different galaxies per timing, so that branches are not predictable.
 const SAMPLE: usize = 64;
+/// Runs of which a time is the median.
+const RUNS: usize = 5;
 /// Longest time per timing.
 const BUDGET: Duration = Duration::from_millis(400);
 /// Stamp sizes of the table of costs.
 pub const SIZES: [usize; 10] = [11, 15, 19, 23, 29, 33, 39, 48, 56, 64];
 
-/// Microseconds per call: the fastest of several passes over `SAMPLE` galaxies, after a warm-up.
+/// Microseconds per call: the median of passes over `SAMPLE` galaxies, at least [`RUNS`], after a warm-up.
 pub(super) fn time(mut call: impl FnMut(usize)) -> f64 {
     for k in 0..SAMPLE {
         call(k);
     }
     let begin = Instant::now();
-    let mut best = f64::INFINITY;
-    while begin.elapsed() < BUDGET {
+    let mut passes = Vec::new();
+    while passes.len() < RUNS || begin.elapsed() < BUDGET {
         let start = Instant::now();
         for k in 0..SAMPLE {
             call(k);
         }
-        best = best.min(start.elapsed().as_secs_f64() * 1e6 / SAMPLE as f64);
+        passes.push(start.elapsed().as_secs_f64() * 1e6 / SAMPLE as f64);
     }
-    best
+    median(&mut passes).unwrap_or(f64::NAN)
+}
+
+/// Seconds of `run`.
+fn seconds(mut run: impl FnMut() -> Result<(), PipelineError>) -> Result<f64, PipelineError> {
+    let start = Instant::now();
+    run()?;
+    Ok(start.elapsed().as_secs_f64())
+}
+
+/// The same: the median of [`RUNS`].
+fn median_seconds(
+    mut run: impl FnMut() -> Result<(), PipelineError>,
+) -> Result<f64, PipelineError> {
+    let runs: Result<Vec<f64>, _> = (0..RUNS).map(|_| seconds(&mut run)).collect();
+    Ok(median(&mut runs?).unwrap_or(f64::NAN))
 }
 
 /// A square stamp.
@@ -220,7 +238,7 @@ pub fn stages(
     }
     let cut = inputs.cuts(n);
     let mut notes = vec![format!(
-        "One thread; fastest of several passes over {SAMPLE} galaxies."
+        "One thread; median of passes over {SAMPLE} galaxies."
     )];
     let linear = configuration.linear().is_some();
     match &configuration.method {
@@ -544,20 +562,10 @@ pub fn scaling(
     let measurers = measurers(std::slice::from_ref(configuration))?;
     let galaxies = inputs.set.grid().cells() as f64;
     let rate = |threads: usize| -> Result<f64, PipelineError> {
-        let mut best = 0.0f64;
-        for _ in 0..3 {
-            let start = Instant::now();
-            run_set(
-                &inputs.set,
-                &[1],
-                &measurers,
-                threads,
-                &mut Quiet,
-                |_, _| Ok(()),
-            )?;
-            best = best.max(galaxies / start.elapsed().as_secs_f64());
-        }
-        Ok(best)
+        let set = &inputs.set;
+        let seconds =
+            median_seconds(|| run_set(set, &[1], &measurers, threads, &mut Quiet, |_, _| Ok(())))?;
+        Ok(galaxies / seconds)
     };
     let one = rate(1)?;
     let mut rows = vec![vec![
@@ -634,7 +642,7 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
             }
             paths.push(path);
         }
-        let seconds = best_score(&truth, &paths, threads)?;
+        let seconds = score_seconds(&truth, &paths, threads)?;
         rows.push(vec![
             Cell::text(format),
             Cell::number(seconds, 3),
@@ -653,7 +661,7 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
     })
 }
 
-fn best_score(
+fn score_seconds(
     truth: &Path,
     paths: &[std::path::PathBuf],
     threads: usize,
@@ -663,9 +671,7 @@ fn best_score(
         stamp: Pixels(48.0),
         sign: Some(TruthSign::Standard),
     };
-    let mut best = f64::INFINITY;
-    for _ in 0..3 {
-        let start = Instant::now();
+    median_seconds(|| {
         let read = plain_columns(COLUMNS, Screen::default());
         black_box(score_files(
             truth,
@@ -675,7 +681,6 @@ fn best_score(
             Options::default(),
             threads,
         )?);
-        best = best.min(start.elapsed().as_secs_f64());
-    }
-    Ok(best)
+        Ok(())
+    })
 }

@@ -1,7 +1,5 @@
 //! Time against the number of galaxies.
 
-use std::time::Instant;
-
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::run::{measurers, run_set};
@@ -10,6 +8,11 @@ use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_simulate::set::SimulationSettings;
 use shearq_submissions::Configuration;
+
+use super::{median_seconds, seconds};
+
+/// Amounts of fewer galaxies are timed several times.
+const REPEATED: f64 = 1e5;
 
 /// Galaxies per side of small images.
 const SMALL_GRID: usize = 32;
@@ -56,16 +59,14 @@ pub fn amounts(
         let mut amount = Amount {
             grid,
             images,
-            seconds: f64::INFINITY,
+            seconds: 0.0,
         };
         if amount.galaxies() > 1.1 * most {
             continue;
         }
         let set = simulator(2, SimulationSettings { grid, ..settings })?;
         let images: Vec<u32> = (1..=images).collect();
-        // Short times vary.
-        for _ in 0..if amount.galaxies() < 1e5 { 3 } else { 1 } {
-            let start = Instant::now();
+        let run = || {
             run_set(
                 &set,
                 &images,
@@ -73,9 +74,14 @@ pub fn amounts(
                 threads,
                 &mut Quiet,
                 |_, _| Ok(()),
-            )?;
-            amount.seconds = amount.seconds.min(start.elapsed().as_secs_f64());
-        }
+            )
+        };
+        amount.seconds = if amount.galaxies() < REPEATED {
+            median_seconds(run)?
+        } else {
+            // Long enough to be stable.
+            seconds(run)?
+        };
         points.push(amount);
     }
     Ok(Amounts {
