@@ -24,6 +24,9 @@ use crate::fft::transform_size;
 /// Least number of lags per pixel of a grid that samples the kept modes, along an axis. See docs/constants.md.
 const FINER: f64 = 1.5;
 
+/// Pixels of which the period is a multiple. See docs/constants.md.
+const GRAIN: usize = 16;
+
 /// The kept modes.
 #[derive(Debug, Clone)]
 pub(super) struct Plane {
@@ -42,7 +45,7 @@ pub(super) struct Plane {
 impl Plane {
     /// A plane of at least `least` pixels that keeps wave numbers up to `cut` radians per pixel.
     pub(super) fn new(least: usize, cut: f64) -> Self {
-        let size = least.next_power_of_two();
+        let size = least.next_multiple_of(GRAIN);
         let places = cut * size as f64 / std::f64::consts::PI;
         let side = transform_size(places.ceil() as usize + 2).min(size);
         let modes = side / 2 - 1;
