@@ -7,6 +7,7 @@ use shearq_submissions::{Configuration, Registry};
 
 use crate::arguments::{Form, Threads, given_once};
 use crate::print;
+use shearq_render::figure::Figure;
 use shearq_render::page::Page;
 use shearq_render::table::Table;
 use shearq_simulate::set::SimulationSettings;
@@ -41,8 +42,37 @@ pub(crate) struct Arguments {
 fn galaxies(text: &str) -> Result<f64, String> {
     let number = text.parse().ok();
     number
-        .filter(|number| (1e3..=1e9).contains(number))
-        .ok_or_else(|| "expected a number from 1000 to 1e9".into())
+        .filter(|number| (1e3..=1e7).contains(number))
+        .ok_or_else(|| "expected a number from 1000 to 1e7".into())
+}
+
+/// What is printed, and written to a report if there is a folder for it.
+struct Output<'a> {
+    page: Option<Page<'a>>,
+    form: &'a Form,
+}
+
+impl Output<'_> {
+    fn section(&mut self, title: &str, text: &str) {
+        if let Some(page) = &mut self.page {
+            page.section(title, text);
+        }
+    }
+
+    fn table(&mut self, name: &str, table: &Table) -> anyhow::Result<()> {
+        if let Some(page) = &mut self.page {
+            page.table(name, table)?;
+        }
+        self.form.print(table)?;
+        print("\n")
+    }
+
+    fn figure(&mut self, name: &str, figure: &impl Figure, caption: &str) -> anyhow::Result<()> {
+        match &mut self.page {
+            Some(page) => Ok(page.figure(name, figure, caption)?),
+            None => Ok(()),
+        }
+    }
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -55,7 +85,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .collect::<anyhow::Result<Vec<Configuration>>>()?;
     let threads = arguments.threads.number();
     let settings = SimulationSettings::new(1, 50);
-    let mut page = arguments.out.as_deref().map(|out| {
+    let page = arguments.out.as_deref().map(|out| {
         let made_by = vec![
             (
                 "Version".into(),
@@ -66,88 +96,64 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ];
         Page::new(out, "Speed of shearq", "Measured on this machine", made_by)
     });
-    let show = |page: &mut Option<Page<'_>>, name: &str, table: Table| {
-        if let Some(page) = page {
-            page.table(name, &table)?;
-        }
-        arguments.form.print(&table)?;
-        print("\n")
+    let mut output = Output {
+        page,
+        form: &arguments.form,
     };
-    if let Some(page) = &mut page {
-        page.section(
-            "Stages",
-            "Cost of one galaxy on one thread, and rates with several threads.",
-        );
-    }
+    let of = |name: &str, submission: &Configuration| {
+        format!("{name}-{}", submission.name.replace('/', "-"))
+    };
+    output.section(
+        "Stages",
+        "Cost of one galaxy on one thread, and rates with several threads.",
+    );
     for submission in &submissions {
-        let name = submission.name.replace('/', "-");
         let stages = speed::stages(submission, settings)?;
-        show(&mut page, &format!("stages-{name}"), stages)?;
+        output.table(&of("stages", submission), &stages)?;
         let scaling = speed::scaling(submission, settings, threads)?;
-        show(&mut page, &format!("threads-{name}"), scaling)?;
+        output.table(&of("threads", submission), &scaling)?;
     }
-    if let Some(page) = &mut page {
-        page.section(
-            "Sizes",
-            "Cost against the size of the stamp, and forms of the convolution.",
-        );
-    }
+    output.section(
+        "Sizes",
+        "Cost against the size of the stamp, and forms of the convolution.",
+    );
     let costs = submissions
         .iter()
         .map(|s| Ok((s.name.as_str(), speed::size_costs(s, settings)?)))
         .collect::<anyhow::Result<Vec<_>>>()?;
-    show(&mut page, "sizes", speed::sizes_table(&costs))?;
-    if let Some(page) = &mut page {
-        page.figure(
-            "sizes",
-            &speed::sizes_figure(&costs),
-            "Cost against stamp size.",
-        )?;
-    }
-    show(
-        &mut page,
-        "operator-forms",
-        speed::operator_forms(settings)?,
+    output.table("sizes", &speed::sizes_table(&costs))?;
+    output.figure(
+        "sizes",
+        &speed::sizes_figure(&costs),
+        "Cost against stamp size.",
     )?;
-    if let Some(page) = &mut page {
-        page.section(
-            "Convergence",
-            "Energy of the network with and without momentum.",
-        );
-    }
-    for submission in &submissions {
-        if submission.linear().is_some() {
-            continue;
-        }
-        let name = format!("energy-{}", submission.name.replace('/', "-"));
+    output.table("operator-forms", &speed::operator_forms(settings)?)?;
+    output.section(
+        "Convergence",
+        "Energy of the network with and without momentum.",
+    );
+    for submission in submissions.iter().filter(|s| s.linear().is_none()) {
+        let name = of("energy", submission);
         let energies = convergence(submission, settings)?;
-        show(&mut page, &name, energies.table())?;
-        if let Some(page) = &mut page {
-            page.figure(&name, &energies.figure(), "Energy above its minimum.")?;
-        }
+        output.table(&name, &energies.table())?;
+        output.figure(&name, &energies.figure(), "Energy above its minimum.")?;
     }
     if let Some(most) = arguments.galaxies {
-        if let Some(page) = &mut page {
-            page.section(
-                "Numbers",
-                "Time against the number of galaxies, in one image and in many.",
-            );
-        }
+        output.section(
+            "Numbers",
+            "Time against the number of galaxies, in one image and in many.",
+        );
         for submission in &submissions {
-            let name = format!("numbers-{}", submission.name.replace('/', "-"));
+            let name = of("numbers", submission);
             let amounts = speed::amounts(submission, settings, threads, most)?;
-            show(&mut page, &name, amounts.table())?;
-            if let Some(page) = &mut page {
-                page.figure(&name, &amounts.figure(), "Time against number.")?;
-            }
+            output.table(&name, &amounts.table())?;
+            output.figure(&name, &amounts.figure(), "Time against number.")?;
         }
     }
-    if let Some(page) = &mut page {
-        page.section("Scoring", "Catalogues of 10,000 rows, read and scored.");
-    }
+    output.section("Scoring", "Catalogues of 10,000 rows, read and scored.");
     let scoring = speed::scoring(usize::from(arguments.catalogues), threads)?;
-    show(&mut page, "scoring", scoring)?;
-    match page {
+    output.table("scoring", &scoring)?;
+    match output.page {
         Some(page) => Ok(page.save()?),
         None => Ok(()),
     }

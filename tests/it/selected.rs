@@ -126,7 +126,7 @@ fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
     };
     let (first, second) = (shard(1, "snr > 15"), shard(2, "snr > 15"));
     let merged = succeed(&["bias", "--merge", &first, &second]);
-    let stated = "Galaxies by where: snr > 15; weight: snr^2.";
+    let stated = "Selection: where: snr > 15; weight: snr^2.";
     assert!(merged.contains(stated), "{merged}");
     let other = shard(2, "snr > 16");
     let refused = fail(&["bias", "--merge", &first, &other]);

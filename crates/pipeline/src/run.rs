@@ -39,6 +39,7 @@ pub struct RowJob {
 
 /// A row of drawn stamps, and the ellipticities after lensing.
 type DrawnRow = (Vec<f32>, Vec<Shear>);
+type DrawnRows = BTreeMap<usize, DrawnRow>;
 
 impl fmt::Debug for RowJob {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -184,7 +185,8 @@ pub fn feed(
 ) -> Result<(), PipelineError> {
     for &image in images {
         let fields = Arc::new(set.image_fields(image));
-        let (heads, mut drawn) = heads(set, &fields, measurers, feeder)?;
+        let (surveys, mut drawn) = surveys(set, &fields, measurers, feeder)?;
+        let heads = heads(set, image, measurers, surveys);
         for iy in 0..set.grid().n {
             let job = RowJob {
                 fields: Arc::clone(&fields),
@@ -200,20 +202,19 @@ pub fn feed(
     Ok(())
 }
 
-/// What the rows of a simulated image share, one per measurer, and the rows that were drawn to find it.
+/// What the rows of a simulated image share, one per measurer.
 fn heads(
     set: &SetSimulator,
-    fields: &ImageFields,
+    image: u32,
     measurers: &[Measurer],
-    feeder: &Feeder<'_, RowJob>,
-) -> Result<(Arc<[Arc<ImageHead>]>, BTreeMap<usize, DrawnRow>), PipelineError> {
-    let (surveys, drawn) = surveys(set, fields, measurers, feeder)?;
+    surveys: Surveys,
+) -> Arc<[Arc<ImageHead>]> {
     let head = |(measurer, survey): (&Measurer, Option<Arc<Survey>>)| {
         let warnings = Warning::of_settings(measurer.configuration());
         Arc::new(ImageHead {
             id: ImageId {
                 set: set.kind().set,
-                image: fields.image,
+                image,
             },
             mosaic: Mosaic::square(set.grid().n, STAMP),
             noise: Some(NOISE_SIGMA),
@@ -224,19 +225,19 @@ fn heads(
             prints: BTreeMap::new(),
         })
     };
-    Ok((measurers.iter().zip(surveys).map(head).collect(), drawn))
+    measurers.iter().zip(surveys).map(head).collect()
 }
 
-/// What [`surveys`] finds.
+/// Noise and galaxy sizes of an image, for each measurer that measures them.
 type Surveys = Vec<Option<Arc<Survey>>>;
 
-/// Noise and galaxy sizes of a simulated image, for each measurer that measures them, and the rows that were drawn.
+/// The surveys of a simulated image, and the rows that were drawn for them by their place.
 fn surveys(
     set: &SetSimulator,
     fields: &ImageFields,
     measurers: &[Measurer],
     feeder: &Feeder<'_, RowJob>,
-) -> Result<(Surveys, BTreeMap<usize, DrawnRow>), PipelineError> {
+) -> Result<(Surveys, DrawnRows), PipelineError> {
     let n = set.grid().n;
     let empty = || -> Vec<Option<NoiseSurvey>> {
         let plans = measurers.iter().map(Measurer::noise_plan);

@@ -258,21 +258,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let by = expressions.into_iter().flatten();
     let measured = by.flat_map(|by| first.measured(by)).collect();
     let (truth, response) = (known(&request.truth, first), has_response(first));
-    for (input, sources) in request.catalogues.iter().zip(&all) {
-        let fits = |source: &Source| {
-            known(&request.truth, source) == truth
-                && has_response(source) == response
-                && source.has_psf() == layout.psf
-                && source.columns.preset == first.columns.preset
-        };
-        if !sources.iter().all(fits) {
-            return Err(BiasFailure::Data(format!(
-                "{}: its columns are not the columns of {} (expected the same columns for truth, response and PSF in all catalogues). Try: one command per kind of catalogue",
-                input.name.display(),
-                request.catalogues[0].name.display()
-            )));
-        }
-    }
+    check_columns(request, &all)?;
     let edges = match &request.bins {
         None => Vec::new(),
         Some(bins) => match &bins.edges {
@@ -340,6 +326,29 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         measured,
         selection: request.stated_selection(),
     })
+}
+
+/// Refuses catalogues with other columns than the first one.
+fn check_columns(request: &Request, all: &[Vec<Source>]) -> Result<(), BiasFailure> {
+    let kind = |source: &Source| {
+        (
+            known(&request.truth, source),
+            has_response(source),
+            source.has_psf(),
+            source.columns.preset,
+        )
+    };
+    let first = all[0].first().map(kind);
+    for (input, sources) in request.catalogues.iter().zip(all) {
+        if !sources.iter().all(|source| Some(kind(source)) == first) {
+            return Err(BiasFailure::Data(format!(
+                "{}: its columns are not the columns of {} (expected the same columns for truth, response and PSF in all catalogues). Try: one command per kind of catalogue",
+                input.name.display(),
+                request.catalogues[0].name.display()
+            )));
+        }
+    }
+    Ok(())
 }
 
 fn unlike(what: &str) -> Result<(), BiasFailure> {

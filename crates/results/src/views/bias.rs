@@ -158,7 +158,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
         format!("Errors are from {} units: {}.", all.units, result.unit),
     ];
     if let Some(selection) = &result.selection {
-        notes.push(format!("Galaxies by {selection}."));
+        notes.push(format!("Selection: {selection}."));
     }
     if all.units < MANY_UNITS {
         notes.push(format!(
