@@ -337,7 +337,7 @@ mod tests {
     use super::super::{Brightness, MoffatBrightness};
     use super::*;
     use crate::{FunctionalPsf, PsfProfile, Shear};
-    use ndarray::Array2;
+    use ndarray::{Array2, s};
 
     fn moffat(psf: &FunctionalPsf) -> MoffatBrightness {
         match psf.brightness() {
@@ -400,6 +400,18 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn pixels_may_be_anywhere_in_memory() {
+        let profile = PsfProfile::Moffat { beta: 3.0 };
+        let psf = FunctionalPsf::new(profile, 2.5, Shear::new(0.1, 0.2)).unwrap();
+        let mut one = Array2::zeros((9, 11));
+        psf.draw_into(4.3, 5.1, one.view_mut());
+        let mut apart = Array2::zeros((9, 22));
+        psf.draw_into(4.3, 5.1, apart.slice_mut(s![.., ..;2]));
+        assert_eq!(apart.slice(s![.., ..;2]), one);
+        assert!(apart.slice(s![.., 1..;2]).iter().all(|light| *light == 0.0));
     }
 
     #[test]
