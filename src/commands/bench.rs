@@ -46,7 +46,7 @@ fn galaxies(text: &str) -> Result<f64, String> {
         .ok_or_else(|| "expected a number from 1000 to 1e7".into())
 }
 
-/// What is printed, and written to a report if there is a folder for it.
+/// Tables and plots for the terminal, and for a report if there is a folder for it.
 struct Output<'a> {
     page: Option<Page<'a>>,
     form: &'a Form,
