@@ -24,6 +24,8 @@ from cases import CASES
 from estimates import bias, leakage, mean_of, scatter_of_images, weighted
 from scenes import RENDERED, SHEAR, bound, noise_field, render
 
+#: Stamps of one shear that are in memory at a time.
+IN_MEMORY = 20_000
 #: Pixels a side of star stamps.
 STAR = 48
 
@@ -140,7 +142,8 @@ def measure_case(case, options, others):
     while sum(len(row["good"]) for row in rows) < wanted:
         left = wanted - sum(len(row["good"]) for row in rows)
         # An even number a side keeps fours together.
-        grid = min(case.grid, 2 * int(np.ceil(np.sqrt(left) / 2)))
+        most = min(case.grid, 2 * int(np.sqrt(IN_MEMORY / options.fields) / 2))
+        grid = min(most, 2 * int(np.ceil(np.sqrt(left) / 2)))
         again = deepcopy(random)
         stamps, psf = render(case, grid * grid, random, options.real)
         fields = []
