@@ -83,7 +83,7 @@ def fpfs_plain(stamps, psf, noise):
     return fpfs(stamps, psf, noise, renoise=False)
 
 
-#: What can be asked for.
+#: Those that get the stamps as they are.
 PEERS = {"REGAUSS": regauss}
 #: Those whose authors use them on galaxies whose middle is known: stamps without dither.
 CENTRED = {"FPFS": fpfs, "FPFS-plain": fpfs_plain}

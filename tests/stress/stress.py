@@ -100,11 +100,13 @@ class Peers:
         self.found = {name: [] for name in names if not (case.missing or case.star)}
         self.case, self.seed, self.blocks = case, seed, 0
 
-    def centred(self):
-        """Whether one of them needs galaxies in the middle of their stamps."""
-        return any(name in peers.CENTRED for name in self.found)
+    def wants(self, estimators):
+        """Whether one of these estimators was asked for."""
+        return any(name in estimators for name in self.found)
 
     def look(self, estimators, stamps, psf, fields):
+        if not self.wants(estimators):
+            return
         versions = np.array([stamps + field for field in fields]) + self.case.sky
 
         def noise(field):
@@ -150,7 +152,7 @@ def measure_case(case, options, others):
         for _ in range(options.fields // 2):
             noise = noise_field(case, stamps.shape[1:], random)
             fields += [noise, -noise]
-        if others.centred():
+        if others.wants(peers.CENTRED):
             middle, _ = render(replace(case, dithered=False), grid * grid, again, options.real)
             others.look(peers.CENTRED, middle, psf, fields)
         others.look(peers.PEERS, stamps, psf, fields)

@@ -26,16 +26,17 @@ impl Pixel for f64 {
 pub(crate) fn copy<P: Pixel>(stamp: ArrayView2<'_, P>, to: &mut [f32]) {
     let columns = stamp.ncols().max(1);
     for (to, row) in to.chunks_exact_mut(columns).zip(stamp.rows()) {
-        match row.to_slice() {
-            Some(row) => to
-                .iter_mut()
-                .zip(row)
-                .for_each(|(to, value)| *to = value.to_f32()),
-            None => to
-                .iter_mut()
-                .zip(row)
-                .for_each(|(to, value)| *to = value.to_f32()),
+        // Contiguous pixels, as in an image, are converted several at a time.
+        match row.as_slice() {
+            Some(row) => convert(to, row.iter()),
+            None => convert(to, row.iter()),
         }
+    }
+}
+
+fn convert<'a, P: Pixel + 'a>(to: &mut [f32], from: impl Iterator<Item = &'a P>) {
+    for (value, pixel) in to.iter_mut().zip(from) {
+        *value = pixel.to_f32();
     }
 }
 

@@ -7,7 +7,7 @@ mod halfway;
 mod moffat;
 pub(crate) mod shrink;
 mod star;
-pub(crate) mod sums;
+mod sums;
 
 pub use average::average_stars;
 pub(crate) use star::cut_start;

@@ -17,7 +17,7 @@ use crate::flag::{Flag, Flags};
 use crate::measurement::Measurement;
 use crate::method::{AdaptedSettings, CutWorker};
 use crate::noise::{StampNoise, Survey};
-use crate::pixel::Pixel;
+use crate::pixel::{self, Pixel};
 use crate::plan::Plan;
 use crate::psf::cut_start;
 use crate::psfs::Psfs;
@@ -250,13 +250,7 @@ impl Worker {
             let expected = format!("{full} × {full}");
             return Err(MeasureError::square("a stamp", stamp.dim(), expected));
         }
-        for (row, from) in self.full.chunks_exact_mut(full).zip(stamp.rows()) {
-            // Contiguous pixels, as in an image, are converted several at a time.
-            match from.as_slice() {
-                Some(from) => convert(row, from.iter()),
-                None => convert(row, from.iter()),
-            }
-        }
+        pixel::copy(stamp, &mut self.full);
         Ok(all_finite(&self.full))
     }
 }
@@ -382,11 +376,5 @@ impl PsfWorker<'_> {
         level: f64,
     ) -> Result<Measurement, MeasureError> {
         self.worker.measure(stamp, level, true)
-    }
-}
-
-fn convert<'a, T: Pixel + 'a>(row: &mut [f32], from: impl Iterator<Item = &'a T>) {
-    for (value, pixel) in row.iter_mut().zip(from) {
-        *value = pixel.to_f32();
     }
 }

@@ -1,6 +1,8 @@
 //! Sums and maxima over the pixels of a PSF. Their order is the same wherever the pixels are in memory.
 
-use ndarray::ArrayView2;
+use std::borrow::Cow;
+
+use ndarray::{ArrayView1, ArrayView2};
 
 use crate::pixel::Pixel;
 
@@ -8,35 +10,37 @@ use crate::pixel::Pixel;
 const LANES: usize = 16;
 
 /// The sum of all pixels.
-pub(crate) fn sum<P: Pixel>(pixels: ArrayView2<'_, P>) -> f64 {
+pub(super) fn sum<P: Pixel>(pixels: ArrayView2<'_, P>) -> f64 {
     sum_of(pixels, |value| value)
 }
 
 /// The sum of the squares of all pixels.
-pub(crate) fn sum_of_squares<P: Pixel>(pixels: ArrayView2<'_, P>) -> f64 {
+pub(super) fn sum_of_squares<P: Pixel>(pixels: ArrayView2<'_, P>) -> f64 {
     sum_of(pixels, |value| value * value)
 }
 
 #[inline(always)]
 fn sum_of<P: Pixel>(pixels: ArrayView2<'_, P>, of: impl Fn(f64) -> f64) -> f64 {
     let mut sums = [0.0; LANES];
-    for row in pixels.rows() {
-        match row.to_slice() {
-            Some(values) => add(values, &of, &mut sums),
-            None => add(&row.to_vec(), &of, &mut sums),
-        }
+    for row in pixels.into_outer_iter() {
+        add(&contiguous(row), &of, &mut sums);
     }
     sums.iter().sum()
 }
 
 /// The largest pixel of each row, from the first row on; `None` for rows with pixels that are not finite.
-pub(crate) fn largest_of_rows<P: Pixel>(
+pub(super) fn largest_of_rows<P: Pixel>(
     pixels: ArrayView2<'_, P>,
 ) -> impl Iterator<Item = Option<f64>> {
-    pixels.into_outer_iter().map(|row| match row.to_slice() {
-        Some(values) => largest(values),
-        None => largest(&row.to_vec()),
-    })
+    pixels
+        .into_outer_iter()
+        .map(|row| largest(&contiguous(row)))
+}
+
+/// The pixels of a row, copied where they are apart in memory.
+fn contiguous<P: Pixel>(row: ArrayView1<'_, P>) -> Cow<'_, [P]> {
+    row.to_slice()
+        .map_or_else(|| Cow::Owned(row.to_vec()), Cow::Borrowed)
 }
 
 fn largest<P: Pixel>(values: &[P]) -> Option<f64> {

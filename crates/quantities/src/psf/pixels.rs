@@ -121,12 +121,13 @@ impl<P: RoundProfile> Pixels<P> {
             for first in (0..size.1).step_by(LANES) {
                 let dx = std::array::from_fn(|lane| (first + lane) as f64 - centre.0);
                 let chosen = choose_lanes(self.form, rules.bounds(), &dx, &dy);
+                let inside = LANES.min(size.1 - first);
                 let mut lane = 0;
-                while lane < LANES.min(size.1 - first) {
+                while lane < inside {
                     // Neighbours with the same rule.
                     let rule = chosen[lane];
                     let same = chosen[lane..].iter().take_while(|other| **other == rule);
-                    let lanes = lane..LANES.min(lane + same.count()).min(size.1 - first);
+                    let lanes = lane..inside.min(lane + same.count());
                     lane = lanes.end;
                     let waiting = &mut waiting[rule as usize];
                     waiting.push(
