@@ -1,4 +1,4 @@
-//! Where code may be `unsafe`: calls of cfitsio, one of the C library, and intrinsics of the network's kernel.
+//! Where code may be `unsafe`: calls of cfitsio, and one of the C library.
 //!
 //! Crates that use the macro of `multiversion` cannot forbid it, because the macro expands to checked calls of
 //! functions with target features. So their text is searched.
@@ -8,10 +8,8 @@ use std::fs;
 use crate::tree::{CODE, files};
 
 /// Files, or folders of files, with `unsafe`.
-const KNOWN: [&str; 4] = [
+const KNOWN: [&str; 2] = [
     "crates/files/src/fits/",
-    "crates/measure/src/deconvolve/kernel.rs",
-    "crates/measure/src/deconvolve/vector.rs",
     "src/lib.rs",
 ];
 

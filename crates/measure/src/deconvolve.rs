@@ -23,17 +23,18 @@
 //! [`Matrices`] are the reference, and iterate on them; [`Network`] never forms them and is what a
 //! measurement runs.
 
+mod convolution;
 mod descent;
+mod fold;
 mod kernel;
 mod network;
 mod operator;
+mod product;
 mod real;
 mod reference;
 mod rule;
-mod slide;
 mod spectral;
 mod sun;
-mod vector;
 
 pub use descent::{Descent, Stop};
 /// Number types the network runs in: `f32` in a measurement, `f64` to tell rounding from mistakes.

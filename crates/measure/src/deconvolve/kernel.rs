@@ -1,141 +1,192 @@
 //! The arithmetic of one iteration, serial and vectorised, without allocation.
 //!
-//! Called from many threads at once, so nothing here is parallel. The functions are written once,
-//! over [`Vector`], and compiled for each instruction set at the end of the file; which one runs is
-//! found out when a network is planned. Instruction sets with fused multiply-add round differently
+//! Called from many threads at once, so nothing here is parallel. The functions are written once, over plain arrays, and
+//! compiled for each instruction set at the end of the file. Instruction sets with fused multiply-add round differently
 //! from those without, so last digits differ between machines, never between threads.
 
+use multiversion::multiversion;
+use ndarray::ArrayView2;
 use shearq_submissions::{Clipping, Kept};
 
+use super::convolution::Scratch;
 use super::descent::{Descent, Stop};
-use super::operator::Operator;
+use super::operator::{Operator, padded};
+use super::product::{LANES, ROWS};
 use super::real::Real;
 use super::rule::{Rule, Step};
-use super::slide::{BLOCK, LANES, Padded, slide_block};
-#[cfg(target_arch = "x86_64")]
-use super::vector::Sixteen;
-use super::vector::{Portable, Vector};
+use super::sun::roughen;
 
-/// Buffers of one network; the frames of the padded ones stay zero, the rest may hold anything.
+/// Buffers of one network. Images are row-major, with zeros behind them that fill the last lanes; the rest may hold
+/// anything between runs.
 #[derive(Debug, Clone)]
 pub struct Buffers<T> {
     /// Accepted state.
-    pub(super) state: Padded<T>,
+    pub(super) state: Vec<T>,
     /// Candidate state.
-    pub(super) next: Padded<T>,
+    pub(super) next: Vec<T>,
     /// State after an accelerated update, before its momentum.
-    moved: Padded<T>,
+    moved: Vec<T>,
     /// The same one iteration before.
-    last: Padded<T>,
-    /// u₀ − Hv.
-    residual: Padded<T>,
+    last: Vec<T>,
+    /// u₀ − Hv, folded.
+    residual: Vec<T>,
     /// Dv.
-    rough: Padded<T>,
+    rough: Vec<T>,
     /// u₀.
-    pub(super) data: Padded<T>,
-    /// Rows of H's or Hᵀ's product on their way.
-    rows: Vec<T>,
-    /// Rows of D's product.
-    rough_rows: Vec<T>,
+    pub(super) data: Vec<T>,
+    /// The same, folded.
+    folded: Vec<T>,
+    /// Hv, folded.
+    convolved: Vec<T>,
+    /// What squares of a folded image add to the sum of squares of its pixels.
+    weights: Vec<f64>,
+    /// Product of Hᵀ.
+    product: Vec<T>,
+    /// Product of D with Dv.
+    rough_product: Vec<T>,
+    /// Sums along x for D, with a row of zeros before and after.
+    lines: Vec<T>,
+    convolution: Scratch<T>,
 }
 
 impl<T: Real> Buffers<T> {
-    pub(super) fn new(n: usize, p: usize) -> Self {
-        let rows = vec![T::ZERO; BLOCK * n.next_multiple_of(LANES)];
+    pub(super) fn new(operator: &Operator<T>) -> Self {
+        let n = operator.n;
+        let image = vec![T::ZERO; padded(n)];
+        let folded = vec![T::ZERO; operator.convolution.folded_len()];
         Buffers {
-            state: Padded::new(n, p, p),
-            next: Padded::new(n, p, p),
-            moved: Padded::new(n, 0, 0),
-            last: Padded::new(n, 0, 0),
-            residual: Padded::new(n, p, p),
-            rough: Padded::new(n, 1, 1),
-            data: Padded::new(n, 0, 0),
-            rows: rows.clone(),
-            rough_rows: rows,
+            state: image.clone(),
+            next: image.clone(),
+            moved: image.clone(),
+            last: image.clone(),
+            residual: folded.clone(),
+            rough: image.clone(),
+            data: image.clone(),
+            folded: folded.clone(),
+            convolved: folded,
+            weights: operator.convolution.weights(),
+            product: image.clone(),
+            rough_product: image,
+            lines: vec![T::ZERO; n * (n + 2)],
+            convolution: operator.convolution.scratch(),
         }
     }
+}
+
+/// Sums of squares, each place of the lanes for itself.
+#[derive(Clone, Copy)]
+struct Squares([f64; LANES]);
+
+impl Squares {
+    const NONE: Self = Squares([0.0; LANES]);
+
+    #[inline(always)]
+    fn add<T: Real>(&mut self, values: [T; LANES]) {
+        self.add_weighted(values, &[1.0; LANES]);
+    }
+
+    #[inline(always)]
+    fn add_weighted<T: Real>(&mut self, values: [T; LANES], weights: &[f64; LANES]) {
+        for l in 0..LANES {
+            let value = values[l].to_f64();
+            self.0[l] += weights[l] * (value * value);
+        }
+    }
+
+    #[inline(always)]
+    fn sum(self) -> f64 {
+        self.0.iter().sum()
+    }
+}
+
+/// The lanes of an image, and the place of each.
+#[inline(always)]
+fn lanes<T: Copy>(image: &[T]) -> impl Iterator<Item = &[T; LANES]> {
+    image.as_chunks().0.iter()
+}
+
+#[inline(always)]
+fn lanes_mut<T: Copy>(image: &mut [T]) -> impl Iterator<Item = &mut [T; LANES]> {
+    image.as_chunks_mut().0.iter_mut()
 }
 
 /// Residual and roughness of `state`; returns J(v) = ½‖u₀ − Hv‖² + ½λ‖Dv‖² (Eq. 4), which is the
 /// energy E plus the constant ½‖u₀‖² (Eq. 9 of the paper's J) but has no cancellation in it.
 #[inline(always)]
-fn residual<T: Real, V: Vector<T>>(operator: &Operator<T>, b: &mut Buffers<T>) -> f64 {
-    let n = operator.n;
-    let stride = n.next_multiple_of(LANES);
-    let regularised = operator.lambda > T::ZERO;
-    let (mut misfit, mut roughness) = (V::no_squares(), V::no_squares());
-    for first in (0..n).step_by(BLOCK) {
-        slide_block::<T, V>(&b.next, &operator.turned, first, &mut b.rows, stride);
-        if regularised {
-            slide_block::<T, V>(&b.next, &operator.sun, first, &mut b.rough_rows, stride);
+fn residual<T: Real, const R: usize, const FUSED: bool>(
+    operator: &Operator<T>,
+    b: &mut Buffers<T>,
+) -> f64 {
+    let convolution = &operator.convolution;
+    convolution.apply::<R, FUSED>(&b.next, &mut b.convolution, &mut b.convolved);
+    let mut misfit = Squares::NONE;
+    let values = lanes(&b.folded).zip(lanes(&b.convolved));
+    let out = lanes_mut(&mut b.residual).zip(lanes(&b.weights));
+    for ((left, weights), (data, product)) in out.zip(values) {
+        // Results are stored together: the compiler does not know that they are apart from what they are made of.
+        let mut out = [T::ZERO; LANES];
+        for l in 0..LANES {
+            out[l] = data[l].minus(product[l]);
         }
-        for y in first..n.min(first + BLOCK) {
-            let (data, out) = (b.data.wide(y), b.residual.wide_mut(y));
-            let rough = b.rough.wide_mut(y);
-            let row = (y - first) * stride;
-            for x in (0..n).step_by(V::LANES) {
-                let inside = V::load(&operator.inside[x..]);
-                let left = V::load(&data[x..]).minus(V::load(&b.rows[row + x..]));
-                let left = left.times(inside);
-                left.store(&mut out[x..]);
-                misfit = left.add_squares(misfit);
-                if regularised {
-                    let left = V::load(&b.rough_rows[row + x..]).times(inside);
-                    left.store(&mut rough[x..]);
-                    roughness = left.add_squares(roughness);
-                }
-            }
+        misfit.add_weighted(out, weights);
+        *left = out;
+    }
+    let mut roughness = Squares::NONE;
+    if operator.lambda > T::ZERO {
+        roughen::<T, FUSED>(&b.next, operator.n, &mut b.lines, &mut b.rough);
+        for rough in lanes(&b.rough) {
+            roughness.add(*rough);
         }
     }
-    0.5 * V::sum(misfit) + 0.5 * operator.lambda.to_f64() * V::sum(roughness)
+    0.5 * misfit.sum() + 0.5 * operator.lambda.to_f64() * roughness.sum()
 }
 
 /// Takes f = Hᵀ(u₀ − Hv) − λD(Dv) (Eq. 11; D is symmetric), updates every neuron beyond its
 /// threshold (Eq. 6) and clips at zero (Eq. 12) where that comes first; returns how many were beyond.
 #[inline(always)]
-fn update<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> u32 {
-    let n = operator.n;
-    let stride = n.next_multiple_of(LANES);
-    let regularised = operator.lambda > T::ZERO;
-    let zero = V::splat(T::ZERO);
-    let minus_lambda = V::splat(T::ZERO.minus(operator.lambda));
-    let unit = V::splat(T::from_f64(rule.unit));
-    let floor = V::splat(floor::<T>(rule));
-    let (adaptive, step) = match rule.step {
-        Step::Adaptive(c) | Step::Accelerated(c) => (true, V::splat(T::from_f64(c))),
-        Step::Constant(delta) => (false, V::splat(T::from_f64(delta))),
-    };
-    let mut updated = 0;
-    for first in (0..n).step_by(BLOCK) {
-        slide_block::<T, V>(&b.residual, &operator.forward, first, &mut b.rows, stride);
-        if regularised {
-            slide_block::<T, V>(&b.rough, &operator.sun, first, &mut b.rough_rows, stride);
-        }
-        for y in first..n.min(first + BLOCK) {
-            let (from, to) = (b.state.wide(y), b.next.wide_mut(y));
-            let thresholds = &operator.wide_thresholds[y * stride..][..stride];
-            let row = (y - first) * stride;
-            for x in (0..n).step_by(V::LANES) {
-                let mut f = V::load(&b.rows[row + x..]);
-                if regularised {
-                    f = f.add_product(minus_lambda, V::load(&b.rough_rows[row + x..]));
-                }
-                let from = V::load(&from[x..]);
-                // Infinite behind the end of the row, where the state has to stay zero.
-                let threshold = V::load(&thresholds[x..]).times(unit);
-                let moved = if adaptive {
-                    from.add_product(step, f)
-                } else {
-                    V::where_greater(f, zero, from.plus(step), from.minus(step))
-                };
-                let size = f.modulus();
-                let value = V::where_greater(size, threshold, moved, from);
-                V::where_greater(value, floor, value, floor).store(&mut to[x..]);
-                updated += V::count_greater(size, threshold);
-            }
+fn update<T: Real, const R: usize, const FUSED: bool>(
+    operator: &Operator<T>,
+    rule: &Rule,
+    b: &mut Buffers<T>,
+) -> u32 {
+    let convolution = &operator.convolution;
+    convolution.apply_transposed::<R, FUSED>(&b.residual, &mut b.convolution, &mut b.product);
+    if operator.lambda > T::ZERO {
+        let minus_lambda = T::ZERO.minus(operator.lambda);
+        roughen::<T, FUSED>(&b.rough, operator.n, &mut b.lines, &mut b.rough_product);
+        for (f, rough) in b.product.iter_mut().zip(&b.rough_product) {
+            *f = f.add_product::<FUSED>(minus_lambda, *rough);
         }
     }
-    updated
+    let unit = T::from_f64(rule.unit);
+    let floor = floor::<T>(rule);
+    let (adaptive, step) = match rule.step {
+        Step::Adaptive(c) | Step::Accelerated(c) => (true, T::from_f64(c)),
+        Step::Constant(delta) => (false, T::from_f64(delta)),
+    };
+    let mut updated = [0; LANES];
+    let values = lanes(&b.state).zip(lanes(&b.product));
+    let values = values.zip(lanes(&operator.thresholds));
+    for (to, ((from, f), thresholds)) in lanes_mut(&mut b.next).zip(values) {
+        let mut out = [T::ZERO; LANES];
+        for l in 0..LANES {
+            let (from, f) = (from[l], f[l]);
+            // Infinite behind the image, where the state has to stay zero.
+            let beyond = f.modulus() > thresholds[l].times(unit);
+            let moved = if adaptive {
+                from.add_product::<FUSED>(step, f)
+            } else if f > T::ZERO {
+                from.plus(step)
+            } else {
+                from.minus(step)
+            };
+            let value = if beyond { moved } else { from };
+            out[l] = if value > floor { value } else { floor };
+            updated[l] += u32::from(beyond);
+        }
+        *to = out;
+    }
+    updated.iter().sum()
 }
 
 /// What an update clips at.
@@ -149,18 +200,14 @@ fn floor<T: Real>(rule: &Rule) -> T {
 
 /// Sets negative neurons of the candidate to zero (Eq. 12); returns whether there were any.
 #[inline(always)]
-fn clip<T: Real, V: Vector<T>>(n: usize, b: &mut Buffers<T>) -> bool {
-    let zero = V::splat(T::ZERO);
-    let mut negative = 0;
-    for y in 0..n {
-        let row = b.next.wide_mut(y);
-        for x in (0..n).step_by(V::LANES) {
-            let value = V::load(&row[x..]);
-            negative += V::count_greater(zero, value);
-            V::where_greater(value, zero, value, zero).store(&mut row[x..]);
-        }
+fn clip<T: Real>(next: &mut [T]) -> bool {
+    let mut negative = false;
+    for value in next {
+        let below = *value < T::ZERO;
+        negative |= below;
+        *value = if below { T::ZERO } else { *value };
     }
-    negative > 0
+    negative
 }
 
 /// Adds momentum to an update from `b.state` to `b.next`: `b.moved` takes the update and `b.next` goes
@@ -168,28 +215,26 @@ fn clip<T: Real, V: Vector<T>>(n: usize, b: &mut Buffers<T>) -> bool {
 /// where the direction points uphill (O'Donoghue & Candès 2015, gradient scheme). Returns whether
 /// there was any momentum.
 #[inline(always)]
-fn extrapolate<T: Real, V: Vector<T>>(
-    operator: &Operator<T>,
+fn extrapolate<T: Real, const FUSED: bool>(
     rule: &Rule,
     b: &mut Buffers<T>,
     momentum: &mut f64,
 ) -> bool {
-    let n = operator.n;
-    let floor = V::splat(floor::<T>(rule));
+    let floor = floor::<T>(rule);
     // (from − moved)·(moved − last) > 0 by the squares of sum and difference.
-    let (mut sum, mut difference) = (V::no_squares(), V::no_squares());
-    b.moved.copy_from(&b.next);
-    for y in 0..n {
-        let (from, moved, last) = (b.state.wide(y), b.moved.wide(y), b.last.wide(y));
-        for x in (0..n).step_by(V::LANES) {
-            let moved = V::load(&moved[x..]);
-            let back = V::load(&from[x..]).minus(moved);
-            let on = moved.minus(V::load(&last[x..]));
-            sum = back.plus(on).add_squares(sum);
-            difference = back.minus(on).add_squares(difference);
+    let (mut sum, mut difference) = (Squares::NONE, Squares::NONE);
+    b.moved.copy_from_slice(&b.next);
+    let values = lanes(&b.state).zip(lanes(&b.moved)).zip(lanes(&b.last));
+    for ((from, moved), last) in values {
+        let (mut forth, mut apart) = ([T::ZERO; LANES], [T::ZERO; LANES]);
+        for l in 0..LANES {
+            let (back, on) = (from[l].minus(moved[l]), moved[l].minus(last[l]));
+            (forth[l], apart[l]) = (back.plus(on), back.minus(on));
         }
+        sum.add(forth);
+        difference.add(apart);
     }
-    if V::sum(sum) > V::sum(difference) {
+    if sum.sum() > difference.sum() {
         *momentum = 1.0;
     }
     let next = 0.5 * (1.0 + (1.0 + 4.0 * *momentum * *momentum).sqrt());
@@ -198,29 +243,27 @@ fn extrapolate<T: Real, V: Vector<T>>(
     if beta == 0.0 {
         return false;
     }
-    let beta = V::splat(T::from_f64(beta));
-    for y in 0..n {
-        let (moved, last, to) = (b.moved.wide(y), b.last.wide(y), b.next.wide_mut(y));
-        for x in (0..n).step_by(V::LANES) {
-            let moved = V::load(&moved[x..]);
-            let value = moved.add_product(beta, moved.minus(V::load(&last[x..])));
-            V::where_greater(value, floor, value, floor).store(&mut to[x..]);
-        }
+    let beta = T::from_f64(beta);
+    for ((to, moved), last) in b.next.iter_mut().zip(&b.moved).zip(&b.last) {
+        let value = moved.add_product::<FUSED>(beta, moved.minus(*last));
+        *to = if value > floor { value } else { floor };
     }
     true
 }
 
 /// Runs the network from `b.state` on `b.data`; the result is left in `b.state`.
 #[inline(always)]
-fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Descent {
-    let mut constant = V::no_squares();
-    for y in 0..operator.n {
-        let row = b.data.wide(y);
-        for x in (0..operator.n).step_by(V::LANES) {
-            constant = V::load(&row[x..]).add_squares(constant);
-        }
+pub(super) fn run<T: Real, const R: usize, const FUSED: bool>(
+    operator: &Operator<T>,
+    rule: &Rule,
+    b: &mut Buffers<T>,
+) -> Descent {
+    let mut constant = Squares::NONE;
+    for data in lanes(&b.data) {
+        constant.add(*data);
     }
-    let constant = 0.5 * V::sum(constant);
+    let constant = 0.5 * constant.sum();
+    operator.convolution.fold(&b.data, &mut b.folded);
     let mut descent = Descent {
         iterations: 0,
         stop: Stop::MaxIterations,
@@ -230,7 +273,7 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
     };
     let accelerated = matches!(rule.step, Step::Accelerated(_));
     if accelerated {
-        b.last.copy_from(&b.state);
+        b.last.copy_from_slice(&b.state);
     }
     let (mut momentum, mut extrapolated) = (1.0, false);
     let mut cost = None;
@@ -240,14 +283,14 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
     // it is inlined and by far the largest part of the code.
     std::mem::swap(&mut b.state, &mut b.next);
     loop {
-        let next = residual::<T, V>(operator, b);
+        let next = residual::<T, R, FUSED>(operator, b);
         match cost {
             None => {
                 std::mem::swap(&mut b.state, &mut b.next);
                 descent.first_energy = next - constant;
             }
             Some(cost) if clipped || next < cost => {
-                if !clipped && rule.clipping == Clipping::AfterTest && clip::<T, V>(operator.n, b) {
+                if !clipped && rule.clipping == Clipping::AfterTest && clip(&mut b.next) {
                     clipped = true;
                     continue;
                 }
@@ -259,7 +302,7 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
             Some(_) if extrapolated => {
                 // Too far: the update itself is left.
                 (momentum, extrapolated) = (1.0, false);
-                b.next.copy_from(&b.moved);
+                b.next.copy_from_slice(&b.moved);
                 continue;
             }
             Some(_) => {
@@ -277,134 +320,69 @@ fn run<T: Real, V: Vector<T>>(operator: &Operator<T>, rule: &Rule, b: &mut Buffe
         if descent.iterations as usize >= rule.max_iterations {
             break;
         }
-        descent.updated = update::<T, V>(operator, rule, b);
+        descent.updated = update::<T, R, FUSED>(operator, rule, b);
         if descent.updated == 0 {
             descent.stop = Stop::Stable;
             break;
         }
-        extrapolated = accelerated && extrapolate::<T, V>(operator, rule, b, &mut momentum);
+        extrapolated = accelerated && extrapolate::<T, FUSED>(rule, b, &mut momentum);
     }
     descent
 }
 
-/// A number type with its vectors.
+/// A number type that the network runs in.
 pub trait Wide: Real {
-    /// Vectors of AVX-512.
-    #[cfg(target_arch = "x86_64")]
+    /// Runs the network. Each number type has its own function, so that it is compiled once and not again in every crate
+    /// that uses it.
     #[doc(hidden)]
-    type Avx512: Vector<Self>;
-    /// Vectors of AVX2 with fused multiply-add.
-    #[cfg(target_arch = "x86_64")]
-    #[doc(hidden)]
-    type Avx2: Vector<Self>;
+    fn descend(operator: &Operator<Self>, rule: &Rule, b: &mut Buffers<Self>) -> Descent;
 
-    /// Runs the network's kernel. Each number type has its own function, so that the kernel is compiled once and not
-    /// again in every crate that uses it.
+    /// Takes `factor` times a PSF of the planned size.
     #[doc(hidden)]
-    fn descend(
-        level: Level,
-        operator: &Operator<Self>,
-        rule: &Rule,
-        b: &mut Buffers<Self>,
-    ) -> Descent;
+    fn set_psf(operator: &mut Operator<Self>, psf: ArrayView2<'_, f64>, factor: f64);
 }
 
-impl Wide for f32 {
-    #[cfg(target_arch = "x86_64")]
-    type Avx512 = Sixteen;
-    #[cfg(target_arch = "x86_64")]
-    type Avx2 = Portable<f32, 8, true>;
+/// Compiles the network in one number type for each instruction set, with as many rows of a product at a time as there
+/// are registers for.
+macro_rules! wide {
+    ($number:ty, $descend:ident, $set_psf:ident) => {
+        #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+        fn $descend(
+            operator: &Operator<$number>,
+            rule: &Rule,
+            b: &mut Buffers<$number>,
+        ) -> Descent {
+            multiversion::target::match_target! {
+                "x86_64+avx512f" => run::<_, ROWS, true>(operator, rule, b),
+                "x86_64+fma" => run::<_, 4, true>(operator, rule, b),
+                "aarch64" => run::<_, 4, true>(operator, rule, b),
+                _ => run::<_, 4, false>(operator, rule, b),
+            }
+        }
 
-    fn descend(
-        level: Level,
-        operator: &Operator<Self>,
-        rule: &Rule,
-        b: &mut Buffers<Self>,
-    ) -> Descent {
-        run_at(level, operator, rule, b)
-    }
+        #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+        fn $set_psf(operator: &mut Operator<$number>, psf: ArrayView2<'_, f64>, factor: f64) {
+            multiversion::target::match_target! {
+                "x86_64+avx512f" => operator.set_psf::<ROWS, true>(psf, factor),
+                "x86_64+fma" => operator.set_psf::<4, true>(psf, factor),
+                "aarch64" => operator.set_psf::<4, true>(psf, factor),
+                _ => operator.set_psf::<4, false>(psf, factor),
+            }
+        }
+
+        impl Wide for $number {
+            fn descend(operator: &Operator<Self>, rule: &Rule, b: &mut Buffers<Self>) -> Descent {
+                $descend(operator, rule, b)
+            }
+
+            fn set_psf(operator: &mut Operator<Self>, psf: ArrayView2<'_, f64>, factor: f64) {
+                $set_psf(operator, psf, factor);
+            }
+        }
+    };
 }
 
+wide!(f32, descend_f32, set_psf_f32);
 // Only tests run in f64.
 #[cfg(test)]
-impl Wide for f64 {
-    #[cfg(target_arch = "x86_64")]
-    type Avx512 = Portable<f64, 4, true>;
-    #[cfg(target_arch = "x86_64")]
-    type Avx2 = Portable<f64, 4, true>;
-
-    fn descend(
-        level: Level,
-        operator: &Operator<Self>,
-        rule: &Rule,
-        b: &mut Buffers<Self>,
-    ) -> Descent {
-        run_at(level, operator, rule, b)
-    }
-}
-
-/// Instruction sets the kernel is compiled for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Level {
-    /// 512-bit vectors.
-    #[cfg(target_arch = "x86_64")]
-    Avx512,
-    /// 256-bit vectors with fused multiply-add.
-    #[cfg(target_arch = "x86_64")]
-    Avx2,
-    /// Whatever the target always has: NEON with fused multiply-add on aarch64.
-    Baseline,
-}
-
-impl Level {
-    /// The best that this machine has.
-    pub(super) fn detect() -> Self {
-        Self::available().next().unwrap_or(Level::Baseline)
-    }
-
-    /// All that this machine has, the best first.
-    pub(super) fn available() -> impl Iterator<Item = Self> {
-        #[cfg(target_arch = "x86_64")]
-        let wide = {
-            let fused = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
-            let avx512 = fused && is_x86_feature_detected!("avx512f");
-            [(avx512, Level::Avx512), (fused, Level::Avx2)]
-        };
-        #[cfg(not(target_arch = "x86_64"))]
-        let wide: [(bool, Level); 0] = [];
-        let wide = wide.into_iter().filter(|(here, _)| *here);
-        wide.map(|(_, level)| level)
-            .chain(std::iter::once(Level::Baseline))
-    }
-}
-
-/// Runs the kernel compiled for `level`.
-pub(super) fn run_at<T: Wide>(
-    level: Level,
-    operator: &Operator<T>,
-    rule: &Rule,
-    b: &mut Buffers<T>,
-) -> Descent {
-    match level {
-        // SAFETY: `available` yields these only where the machine has the features.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => unsafe { run_avx512(operator, rule, b) },
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx2 => unsafe { run_avx2(operator, rule, b) },
-        Level::Baseline => {
-            run::<T, Portable<T, 4, { cfg!(target_arch = "aarch64") }>>(operator, rule, b)
-        }
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx2,fma")]
-fn run_avx512<T: Wide>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Descent {
-    run::<T, T::Avx512>(operator, rule, b)
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,fma")]
-fn run_avx2<T: Wide>(operator: &Operator<T>, rule: &Rule, b: &mut Buffers<T>) -> Descent {
-    run::<T, T::Avx2>(operator, rule, b)
-}
+wide!(f64, descend_f64, set_psf_f64);

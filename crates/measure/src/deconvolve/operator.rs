@@ -1,76 +1,49 @@
-//! The convolution H, its transpose and D as small kernels, with the thresholds they imply.
+//! The convolution H with its transpose, the regularisation λ, and the thresholds they imply.
 
 use ndarray::ArrayView2;
 use shearq_submissions::limits::MAX_PSF;
 
+use super::convolution::Convolution;
+use super::product::LANES;
 use super::real::Real;
-use super::slide::{Kernel, LANES};
 use super::sun::SUN_KERNEL;
 use crate::error::MeasureError;
-use crate::sizes::{check_psf, check_sizes};
+use crate::sizes::check_sizes;
 
-/// H, Hᵀ and D of one stamp size and PSF, laid out for the kernel.
+/// H, λ and thresholds of one stamp size and PSF.
 #[derive(Debug, Clone)]
 pub struct Operator<T> {
     pub(super) n: usize,
     pub(super) p: usize,
     /// λ.
     pub(super) lambda: T,
-    /// h: what Hᵀ slides over the residual.
-    pub(super) forward: Kernel<T>,
-    /// h turned by 180°: what H slides over the state.
-    pub(super) turned: Kernel<T>,
-    /// d.
-    pub(super) sun: Kernel<T>,
-    /// TH_i for a unit of brightness of one, row-major n×n (Eq. 9).
+    /// H.
+    pub(super) convolution: Convolution<T>,
+    /// TH_i for a unit of brightness of one, row-major n×n (Eq. 9), and infinite behind them.
     pub(super) thresholds: Vec<T>,
-    /// The same in rows of whole vectors, infinite behind their ends.
-    pub(super) wide_thresholds: Vec<T>,
-    /// One for each pixel of a row, zero behind its end.
-    pub(super) inside: Vec<T>,
 }
 
 impl<T: Real> Operator<T> {
     pub(super) fn new(n: usize, p: usize, lambda: f64) -> Result<Self, MeasureError> {
         check_sizes(n, p)?;
-        let wide = n.next_multiple_of(LANES);
-        let mut inside = vec![T::ZERO; wide];
-        inside[..n].fill(T::from_f64(1.0));
-        let mut sun = Kernel::new(3, 1);
-        for (j, row) in SUN_KERNEL.iter().enumerate() {
-            for (i, &value) in row.iter().enumerate() {
-                sun.set(j, i, T::from_f64(value));
-            }
-        }
         Ok(Operator {
             n,
             p,
             lambda: T::from_f64(lambda),
-            // A PSF's centre is its pixel p/2; turned, p − 1 − p/2.
-            forward: Kernel::new(p, p / 2),
-            turned: Kernel::new(p, p - 1 - p / 2),
-            sun,
-            thresholds: vec![T::ZERO; n * n],
-            wide_thresholds: vec![T::from_f64(f64::INFINITY); n * wide],
-            inside,
+            convolution: Convolution::new(n, p),
+            thresholds: vec![T::from_f64(f64::INFINITY); padded(n)],
         })
     }
 
     /// Takes `factor` times a PSF of the planned size. Allocates nothing.
-    pub(super) fn set_psf(
+    #[inline(always)]
+    pub(super) fn set_psf<const R: usize, const FUSED: bool>(
         &mut self,
         psf: ArrayView2<'_, f64>,
         factor: f64,
-    ) -> Result<(), MeasureError> {
-        let p = self.p;
-        check_psf(psf, p)?;
-        for ((y, x), value) in psf.indexed_iter() {
-            let value = T::from_f64(*value * factor);
-            self.forward.set(y, x, value);
-            self.turned.set(p - 1 - y, p - 1 - x, value);
-        }
+    ) {
+        self.convolution.set_psf::<R, FUSED>(psf, factor);
         self.set_thresholds(psf, factor * factor);
-        Ok(())
     }
 
     /// TH_i = ½|W_ii + λG_ii|: W_ii is the sum of h² over the part of the PSF that falls inside the
@@ -107,10 +80,13 @@ impl<T: Real> Operator<T> {
                         g += value * value;
                     }
                 }
-                let threshold = T::from_f64(0.5 * (w + lambda * g).abs());
-                self.thresholds[y * n + x] = threshold;
-                self.wide_thresholds[y * n.next_multiple_of(LANES) + x] = threshold;
+                self.thresholds[y * n + x] = T::from_f64(0.5 * (w + lambda * g).abs());
             }
         }
     }
+}
+
+/// Pixels of a stamp of side `n`, filled up to whole lanes.
+pub(super) fn padded(n: usize) -> usize {
+    (n * n).next_multiple_of(LANES)
 }

@@ -34,7 +34,6 @@ mod modes;
 mod parities;
 mod pixels;
 mod plane;
-mod product;
 mod products;
 mod psf;
 mod restore;

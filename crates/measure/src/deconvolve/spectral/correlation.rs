@@ -5,7 +5,7 @@
 //! would depend on whether a galaxy lies along the grid or across it.
 
 use super::plane::Plane;
-use super::product::{LANES, Matrix, ROWS, multiply};
+use crate::deconvolve::product::{LANES, Matrix, ROWS, multiply};
 
 /// Tables for lags dy = 0…reach, dx = −reach…reach.
 #[derive(Debug, Clone)]
@@ -64,9 +64,9 @@ impl Correlation {
             width: plane.width,
             lag_rows,
             lag_width,
-            down: tables([lags, modes], [lag_rows, modes], Some(1)),
+            down: tables([lags, modes], [lag_rows, plane.width], Some(1)),
             across: tables([modes, lags], [modes, lag_width], Some(0)),
-            down_back: tables([modes, lags], [plane.rows, lags], Some(1)),
+            down_back: tables([modes, lags], [plane.rows, lag_width], Some(1)),
             across_back: tables([lags, modes], [lags, plane.width], None),
         }
     }
@@ -91,7 +91,7 @@ impl Correlation {
         let between = &mut scratch.between[..self.lag_rows * width];
         let quarters = spectrum.chunks_exact(self.rows * width);
         for (parity, (quarter, lags)) in quarters.zip(&mut scratch.lags).enumerate() {
-            let down = Matrix::new(&self.down[parity], self.count);
+            let down = Matrix::new(&self.down[parity], width);
             multiply(
                 down,
                 Matrix::new(quarter, width),
@@ -158,7 +158,7 @@ impl Correlation {
                 between,
                 width,
             );
-            let down = Matrix::new(&self.down_back[parity], lags);
+            let down = Matrix::new(&self.down_back[parity], self.lag_width);
             multiply(down, Matrix::new(between, width), lags, quarter, width);
         }
     }

@@ -3,8 +3,8 @@
 use super::modes::{multiply, scale_into};
 use super::parities::change;
 use super::plane::Modes;
-use super::product::LANES;
 use super::{Lags, Spectral, SpectralPsf, SpectralScratch};
+use crate::deconvolve::product::LANES;
 
 impl Spectral {
     /// Writes how the autocorrelation of the stamp last given changes with a field of noise of σ = 1

@@ -6,10 +6,8 @@
 use multiversion::multiversion;
 
 use super::plane::{Plane, Quarters};
-use super::product::{Matrix, ROWS, multiply};
-
-/// Places that are folded side by side. See docs/constants.md.
-const SIDE: usize = 8;
+use crate::deconvolve::fold::fold;
+use crate::deconvolve::product::{LANES, Matrix, ROWS, multiply};
 
 /// Tables for images of one size.
 #[derive(Debug, Clone)]
@@ -17,6 +15,8 @@ pub(super) struct Pixels {
     n: usize,
     /// Pixels from the middle to the edge; the middle one of an odd number is the first.
     half: usize,
+    /// The same, filled up.
+    places: usize,
     /// Rows of a folded image, filled up.
     band: usize,
     width: usize,
@@ -41,6 +41,7 @@ impl Pixels {
     /// For images of n×n pixels.
     pub(super) fn new(n: usize, plane: &Plane) -> Self {
         let half = n.div_ceil(2);
+        let places = half.next_multiple_of(LANES);
         let middle = if n.is_multiple_of(2) { 0.5 } else { 0.0 };
         let at = |place: usize| place as f64 + middle;
         // The middle pixel is its own opposite: folding doubles it.
@@ -59,9 +60,10 @@ impl Pixels {
             table
         };
         let down = |value: &dyn Fn(usize, usize) -> f64| {
-            let mut table = vec![0.0; plane.rows * half];
-            for (k, line) in table.chunks_exact_mut(half).take(modes + 1).enumerate() {
-                for (place, out) in line.iter_mut().enumerate() {
+            let mut table = vec![0.0; plane.rows * places];
+            let lines = table.chunks_exact_mut(places).take(modes + 1);
+            for (k, line) in lines.enumerate() {
+                for (place, out) in line[..half].iter_mut().enumerate() {
                     *out = value(k, place) as f32;
                 }
             }
@@ -70,6 +72,7 @@ impl Pixels {
         Pixels {
             n,
             half,
+            places,
             band: half.next_multiple_of(ROWS / 2),
             width,
             sums: across(&cos, &s),
@@ -91,7 +94,7 @@ impl Pixels {
     /// Buffers that fit.
     pub(super) fn scratch(&self) -> PixelsScratch {
         PixelsScratch {
-            folded: std::array::from_fn(|_| vec![0.0; 2 * self.band * self.half]),
+            folded: std::array::from_fn(|_| vec![0.0; 2 * self.band * self.places]),
             lines: std::array::from_fn(|_| vec![0.0; 2 * self.band * 2 * self.width]),
         }
     }
@@ -107,18 +110,18 @@ impl Pixels {
             folded: [sums, differences],
             lines: [of_sums, of_differences],
         } = scratch;
-        let below = self.band * self.half;
+        let below = self.band * self.places;
         {
             let (sums, differences) = (sums.split_at_mut(below), differences.split_at_mut(below));
             let folded = [sums.0, sums.1, differences.0, differences.1];
-            fold(image, self.n, folded);
+            fold_image(image, self.n, self.places, folded);
         }
-        let (half, width) = (self.half, 2 * self.width);
+        let (half, places, width) = (self.half, self.places, 2 * self.width);
         for (folded, table, lines) in [
             (&*sums, &self.sums, &mut *of_sums),
             (&*differences, &self.differences, &mut *of_differences),
         ] {
-            let (folded, table) = (Matrix::new(folded, half), Matrix::new(table, width));
+            let (folded, table) = (Matrix::new(folded, places), Matrix::new(table, width));
             multiply(folded, table, half, lines, width);
         }
         let lower = self.band * width;
@@ -126,7 +129,7 @@ impl Pixels {
         // Of sums and of differences along y, the one transformed along x, and times x.
         let take = |lines: &[f32], with: usize, table: &[f32], out: &mut [f32]| {
             let lines = Matrix::new(&lines[with * self.width..], width);
-            multiply(Matrix::new(table, half), lines, half, out, self.width);
+            multiply(Matrix::new(table, places), lines, half, out, self.width);
         };
         let [u, x, y] = out;
         let [cc, cs, sc, ss] = u.each();
@@ -153,24 +156,22 @@ impl Pixels {
         scratch: &mut PixelsScratch,
         [re, im]: [&mut [f32]; 2],
     ) {
-        let (half, width) = (self.half, self.width);
+        let (half, places, width) = (self.half, self.places, self.width);
         let [sums, differences] = &mut scratch.folded;
         // There is room for it: a stamp has at least eight pixels a side.
         let folded = sums
-            .chunks_exact_mut(half)
-            .zip(differences.chunks_exact_mut(half));
+            .chunks_exact_mut(places)
+            .zip(differences.chunks_exact_mut(places));
         for (line, (sums, differences)) in lines.chunks_exact(self.n).zip(folded) {
-            fold_line(line, sums, differences);
+            fold_line(line, &mut sums[..half], &mut differences[..half]);
         }
         let across = |table| Matrix::new(table, 2 * width);
-        multiply(Matrix::new(sums, half), across(&self.sums), half, re, width);
-        multiply(
-            Matrix::new(differences, half),
-            across(&self.differences),
-            half,
-            im,
-            width,
-        );
+        for (lines, table, out) in [
+            (&*sums, &self.sums, re),
+            (&*differences, &self.differences, im),
+        ] {
+            multiply(Matrix::new(lines, places), across(table), half, out, width);
+        }
     }
 
     /// Columns of what [`Pixels::transform_lines`] writes.
@@ -179,54 +180,9 @@ impl Pixels {
     }
 }
 
-/// Sums and differences along x of sums of opposite rows, of differences, and so on: first letter x, second y.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn fold(image: &[f32], n: usize, folded: [&mut [f32]; 4]) {
-    let half = n.div_ceil(2);
-    let whole = half / SIDE * SIDE;
-    for y in 0..half {
-        // From the middle on, and opposite.
-        let upper = &image[(n / 2 + y) * n..][..n];
-        let lower = &image[(half - 1 - y) * n..][..n];
-        for x in (0..whole).step_by(SIDE) {
-            let (right, left) = (n / 2 + x, half - SIDE - x);
-            let (upper_right, lower_right) = (side(upper, right), side(lower, right));
-            let (upper_left, lower_left) = (side(upper, left), side(lower, left));
-            let mut out = [[0.0f32; SIDE]; 4];
-            for k in 0..SIDE {
-                let sums = (
-                    upper_right[k] + lower_right[k],
-                    upper_left[SIDE - 1 - k] + lower_left[SIDE - 1 - k],
-                );
-                let differences = (
-                    upper_right[k] - lower_right[k],
-                    upper_left[SIDE - 1 - k] - lower_left[SIDE - 1 - k],
-                );
-                out[0][k] = sums.0 + sums.1;
-                out[1][k] = differences.0 + differences.1;
-                out[2][k] = sums.0 - sums.1;
-                out[3][k] = differences.0 - differences.1;
-            }
-            for k in 0..4 {
-                folded[k][y * half + x..][..SIDE].copy_from_slice(&out[k]);
-            }
-        }
-        for x in whole..half {
-            let (right, left) = (n / 2 + x, half - 1 - x);
-            let sums = (upper[right] + lower[right], upper[left] + lower[left]);
-            let differences = (upper[right] - lower[right], upper[left] - lower[left]);
-            let at = y * half + x;
-            folded[0][at] = sums.0 + sums.1;
-            folded[1][at] = differences.0 + differences.1;
-            folded[2][at] = sums.0 - sums.1;
-            folded[3][at] = differences.0 - differences.1;
-        }
-    }
-}
-
-#[inline(always)]
-fn side(line: &[f32], first: usize) -> &[f32; SIDE] {
-    line[first..].first_chunk().expect("pixels of a line")
+fn fold_image(image: &[f32], n: usize, stride: usize, folded: [&mut [f32]; 4]) {
+    fold(image, n, stride, folded);
 }
 
 fn fold_line(line: &[f32], sums: &mut [f32], differences: &mut [f32]) {

@@ -14,11 +14,11 @@
 //!
 //! where cc is the sum Σ I cos(k_x x) cos(k_y y), sc = Σ I s(k_x x) cos(k_y y), and so on: the first letter stands for x.
 //! Places are measured from the middle of the image. Rows and columns are filled up with zeros to multiples that
-//! [`super::product`] needs.
+//! [`crate::deconvolve::product`] needs.
 
 use multiversion::multiversion;
 
-use super::product::{LANES, ROWS};
+use crate::deconvolve::product::{LANES, ROWS};
 use crate::fft::transform_size;
 
 /// Least number of lags per pixel of a grid that samples the kept modes, along an axis. See docs/constants.md.

@@ -2,7 +2,7 @@
 //! a convolution along both axes.
 
 use super::plane::{Plane, Quarters};
-use super::product::{Matrix, multiply};
+use crate::deconvolve::product::{Matrix, multiply};
 
 /// A convolution of the kept modes.
 #[derive(Debug, Clone)]
@@ -42,7 +42,7 @@ impl Smoothing {
             count: plane.modes + 1,
             rows,
             width,
-            down: [1.0, -1.0].map(|sign| table(rows, rows, &|k, q| added(k, q, sign))),
+            down: [1.0, -1.0].map(|sign| table(rows, width, &|k, q| added(k, q, sign))),
             across: [1.0, -1.0].map(|sign| table(rows, width, &|q, k| added(k, q, sign))),
         }
     }
@@ -66,7 +66,7 @@ impl Smoothing {
     /// The same for a quarter of cosines (0) or sines (1) along x and y.
     fn quarter(&self, quarter: &mut [f32], [x, y]: [usize; 2], scratch: &mut [f32]) {
         let width = self.width;
-        let down = Matrix::new(&self.down[y], self.rows);
+        let down = Matrix::new(&self.down[y], width);
         multiply(
             down,
             Matrix::new(quarter, width),
