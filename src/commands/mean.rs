@@ -16,8 +16,8 @@ use shearq_results::views::mean::mean_table;
 /// Mean shear of each set, for fields of constant shear.
 ///
 /// The mean shear is the mean ellipticity of all galaxies without a flag, divided by the mean response if the
-/// configuration does so. The error includes the error of the mean response. It assumes independent galaxies: for pairs
-/// that are rotated by 90 degrees it is too large.
+/// configuration does so. The error includes the error of the mean response, and the noise of one star per image. It
+/// assumes independent galaxies: for pairs that are rotated by 90 degrees it is too large.
 ///
 /// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px).
 /// The mean stays calibrated: the response contains how shear and noise change the selection. A cut is a smooth step. The

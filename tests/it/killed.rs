@@ -107,7 +107,8 @@ fn what_killed_commands_leave_is_removed_by_the_next() {
         "--submission",
         "23/raw/star",
     ];
-    let record = [&record[..], &sets, &["--folder"]].concat();
+    let few = ["--sets", "1,7", "--images", "4", "--grid", "16"];
+    let record = [&record[..], &few, &["--folder"]].concat();
     // With what is taken away so that the command can run again.
     for (command, out, made) in [
         (&pack[..], "sent", "sent"),

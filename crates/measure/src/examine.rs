@@ -17,7 +17,7 @@ use crate::psf::examine::{self, PsfLook};
 use crate::psfs::Psfs;
 use crate::sky::{Cells, INNER, Subtraction, disc, inner};
 use crate::surroundings::centre;
-use crate::warning::Warning;
+use crate::warning::{Warning, effect_of_noise};
 
 /// Largest side of the corner blocks in which the sky is measured. See docs/constants.md.
 const BLOCK: usize = 8;
@@ -309,6 +309,15 @@ impl Examination {
         let galaxies = self.core().filter(|_| lit && flux > 0.0);
         found.extend(self.psfs(galaxies));
         found
+    }
+
+    /// How much the noise of the star changes m and c of a linear configuration: one standard deviation, the same for all
+    /// galaxies. `None` if each galaxy has a PSF of its own, or none was added.
+    pub fn psf_noise(&self) -> Option<[f64; 2]> {
+        let [look] = self.psfs.as_slice() else {
+            return None;
+        };
+        (!self.each).then(|| effect_of_noise(look.snr))
     }
 
     /// A warning if `given` is not the noise of the stamps.

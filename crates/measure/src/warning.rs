@@ -205,9 +205,21 @@ const C_PER_NOISE: f64 = 1.2;
 /// S/N of a star above which less and less of its noise is taken away, so that its effect stays. See docs/constants.md.
 const NOISE_STAYS: f64 = 500.0;
 
-/// How much the noise of one star for an image, of S/N `snr`, changes m and c: one standard deviation.
-fn effect_of_noise(snr: f64) -> [f64; 2] {
-    [M_PER_NOISE, C_PER_NOISE].map(|times| times / snr.clamp(1.0, NOISE_STAYS))
+/// Scatter of m with the noise of a star that is used unchanged, times the star's S/N. See docs/constants.md.
+const M_UNCHANGED: f64 = 5.5;
+/// Scatter of c with the noise of a star that is used unchanged, times the star's S/N. See docs/constants.md.
+const C_UNCHANGED: f64 = 2.3;
+
+/// How much the noise of one star for an image, of S/N `snr`, changes m and c of a linear configuration: one standard
+/// deviation.
+pub(crate) fn effect_of_noise(snr: f64) -> [f64; 2] {
+    let effect = |reduced: f64, unchanged: f64| {
+        (reduced / snr.clamp(1.0, NOISE_STAYS)).min(unchanged / snr.max(1.0))
+    };
+    [
+        effect(M_PER_NOISE, M_UNCHANGED),
+        effect(C_PER_NOISE, C_UNCHANGED),
+    ]
 }
 
 impl Warning {

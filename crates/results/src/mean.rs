@@ -4,9 +4,10 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
-use shearq_files::table;
+use shearq_files::table::{self, FileFormat};
 use shearq_measure::{Flag, MeanShear, Selection, ShearSum, Warning};
 use shearq_pipeline::data::run::Run;
+use shearq_pipeline::measure::PSF_NOISE;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
@@ -28,9 +29,11 @@ pub struct SetMean {
     pub cut: usize,
     /// Galaxies with each of [`Flag::ALL`].
     pub flags: [usize; Flag::ALL.len()],
-    /// Mean shear, with errors that include the error of the mean response of each image; `None` if all galaxies are
-    /// flagged.
+    /// Mean shear, with errors that include the error of the mean response of each image and the noise of its star; `None`
+    /// if all galaxies are flagged.
     pub shear: Option<MeanShear>,
+    /// The part of the errors that the noise of the stars makes. Each star counts for all galaxies of its image.
+    pub psf_error: [f64; 2],
     /// Standard deviation of e1 and of e2 of one galaxy.
     pub scatter: [f64; 2],
 }
@@ -73,7 +76,13 @@ pub fn mean_shears(
             let message = format!("there is no catalogue of set {set}");
             return Err(FileError::new(out, message));
         }
-        means.push(mean_of(set, &catalogues, calibrated, selection)?);
+        means.push(mean_of(
+            set,
+            &catalogues,
+            run.format,
+            calibrated,
+            selection,
+        )?);
     }
     if means.is_empty() {
         return Err(FileError::new(
@@ -88,12 +97,16 @@ pub fn mean_shears(
 fn mean_of(
     set: u32,
     catalogues: &[(u32, PathBuf)],
+    format: FileFormat,
     calibrated: bool,
     selection: Option<&Selection>,
 ) -> Result<SetMean, FileError> {
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
     let (mut flags, mut flagged, mut cut) = ([0; Flag::ALL.len()], 0, 0);
+    // Of images with noisy stars: galaxies, and the scatter of m and c.
+    let mut stars = Vec::new();
     for (_, path) in catalogues {
+        let before = moments[0].count();
         let rows = match selection {
             Some(selection) => Rows::selected(path, selection)?,
             None => Rows::read(path, calibrated)?,
@@ -120,6 +133,18 @@ fn mean_of(
                 moment.add(e);
             }
         }
+        if let Some(effect) = psf_noise(path, format)? {
+            stars.push((moments[0].count() - before, effect));
+        }
+    }
+    let mut shear = sum.mean().ok();
+    let psf_error = shear.map_or([0.0; 2], |found| {
+        of_stars(&stars, moments[0].count(), found.shear)
+    });
+    if let Some(found) = &mut shear {
+        for (k, error) in psf_error.into_iter().enumerate() {
+            found.covariance[k][k] += error * error;
+        }
     }
     Ok(SetMean {
         set,
@@ -128,8 +153,39 @@ fn mean_of(
         flagged,
         cut,
         flags,
-        shear: sum.mean().ok(),
+        shear,
+        psf_error,
         scatter: moments.map(|moment| moment.deviation()),
+    })
+}
+
+/// The scatter of m and c by the noise of the star of an image, as its catalogue states it.
+fn psf_noise(path: &Path, format: FileFormat) -> Result<Option<[f64; 2]>, FileError> {
+    let key = PSF_NOISE.to_owned();
+    let metadata = table::read_metadata(path, format, std::iter::once(&key))?;
+    let Some(text) = metadata.get(PSF_NOISE) else {
+        return Ok(None);
+    };
+    let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
+    match numbers.as_deref() {
+        Some(&[m, c]) if m >= 0.0 && c >= 0.0 => Ok(Some([m, c])),
+        _ => Err(FileError::new(
+            path,
+            format!(
+                "the metadata `{PSF_NOISE}` are `{text}`; expected the scatter of m and of c, such as 2.3e-2 1.2e-2"
+            ),
+        )),
+    }
+}
+
+/// Errors of the mean of `galaxies` with the mean `shear` by the noise of independent stars, each for so many galaxies.
+fn of_stars(stars: &[(usize, [f64; 2])], galaxies: usize, shear: [f64; 2]) -> [f64; 2] {
+    shear.map(|g| {
+        let variances = stars.iter().map(|&(count, [m, c])| {
+            let share = count as f64 / galaxies as f64;
+            share * share * (m * m * g * g + c * c)
+        });
+        variances.sum::<f64>().sqrt()
     })
 }
 
@@ -210,12 +266,11 @@ impl Rows {
 mod tests {
     use shearq_files::frames::frame;
     use shearq_files::frames::polars::Column;
-    use shearq_files::table::FileFormat;
 
     use super::*;
 
     /// Writes a catalogue of two good galaxies, of mean response 0.5, and one flagged.
-    fn written(path: &Path, e: [f64; 2], names: [&str; 3]) {
+    fn written(path: &Path, e: [f64; 2], names: [&str; 3], psf_noise: Option<&str>) {
         let column = |name: &str, values: [f64; 3]| Column::new(name.into(), values);
         let e = |sign: f64| [sign * e[0], sign * e[1], f64::NAN];
         let [flags, r11, r22] = names;
@@ -230,7 +285,10 @@ mod tests {
             path,
             FileFormat::Parquet,
             &table.unwrap(),
-            &Default::default(),
+            &psf_noise
+                .map(|text| (PSF_NOISE.to_owned(), text.to_owned()))
+                .into_iter()
+                .collect(),
         )
         .unwrap();
     }
@@ -239,17 +297,51 @@ mod tests {
     fn the_shear_is_the_mean_ellipticity_and_its_error_that_of_a_ratio() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("catalogue-001.parquet");
-        written(&path, [0.1, 0.4], ["flags", "R11", "R22"]);
+        written(&path, [0.1, 0.4], ["flags", "R11", "R22"], None);
         let catalogues = [(1, path)];
-        let mean = mean_of(7, &catalogues, true, None).unwrap();
+        let mean = mean_of(7, &catalogues, FileFormat::Parquet, true, None).unwrap();
         assert_eq!((mean.galaxies, mean.flagged, mean.flags[2]), (2, 1, 1));
         let shear = mean.shear.unwrap();
         assert!((shear.shear[0] - 0.25).abs() < 1e-15 && (shear.shear[1] + 0.25).abs() < 1e-15);
         // Residuals 0.1 − 0.25 · 0.8 and 0.4 − 0.25 · 1.2 are ∓0.1: √(2 · 0.02)/2.
         assert!((shear.error()[0] - 0.1).abs() < 1e-15, "{shear:?}");
         // Without responses the residuals are ∓0.15.
-        let plain = mean_of(7, &catalogues, false, None).unwrap().shear.unwrap();
+        let plain = mean_of(7, &catalogues, FileFormat::Parquet, false, None)
+            .unwrap()
+            .shear
+            .unwrap();
         assert!((plain.error()[0] - 0.15).abs() < 1e-15, "{plain:?}");
+    }
+
+    #[test]
+    fn the_noise_of_stars_is_in_the_error_and_falls_with_their_number() {
+        let folder = tempfile::tempdir().unwrap();
+        let mean = |images: u32, text: Option<&str>| {
+            let catalogues: Vec<_> = (1..=images)
+                .map(|image| (image, folder.path().join(format!("{image}.parquet"))))
+                .collect();
+            for (_, path) in &catalogues {
+                written(path, [0.1, 0.4], ["flags", "R11", "R22"], text);
+            }
+            mean_of(7, &catalogues, FileFormat::Parquet, true, None)
+        };
+        let without = mean(1, None).unwrap();
+        assert_eq!(without.psf_error, [0.0; 2]);
+        for images in [1, 4] {
+            let (with, own) = (
+                mean(images, Some("4.00e-1 1.00e-2")).unwrap(),
+                mean(images, None).unwrap(),
+            );
+            // m times the mean of 0.25, and c.
+            let expected = 0.1f64.hypot(0.01) / f64::from(images).sqrt();
+            let total = own.shear.unwrap().error()[1].hypot(expected);
+            assert!((with.psf_error[1] - expected).abs() < 1e-15, "{with:?}");
+            assert!((with.shear.unwrap().error()[1] - total).abs() < 1e-15);
+        }
+        for text in ["", "0.1", "0.1 x", "-1e-2 1e-2", "NaN 0"] {
+            let error = mean(1, Some(text)).unwrap_err().to_string();
+            assert!(error.contains("psfnoise"), "{error}");
+        }
     }
 
     #[test]
@@ -263,8 +355,8 @@ mod tests {
                 "`response1` is now called `R11`",
             ),
         ] {
-            written(&path, [0.1, 0.4], names);
-            let error = mean_of(7, &[(1, path.clone())], true, None)
+            written(&path, [0.1, 0.4], names, None);
+            let error = mean_of(7, &[(1, path.clone())], FileFormat::Parquet, true, None)
                 .unwrap_err()
                 .to_string();
             assert!(error.contains(expected), "{error}");

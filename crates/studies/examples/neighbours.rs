@@ -1,7 +1,7 @@
 //! The bias m of galaxies that have one neighbour, by its distance and flux.
 //!
-//! `cargo run --release -p shearq-studies --example neighbours -- SCENES SEED SNR` prints a table in Markdown. m is less that
-//! of the same galaxies without their neighbours. Galaxies and neighbours are a bulge and a disc with half-light radii of 2.5 to 5 px, behind
+//! `cargo run --release -p shearq-studies --example neighbours -- SCENES SEED SNR [FIGURE]` prints a table in Markdown, and
+//! draws it to a PNG or SVG file. m is less that of the same galaxies without their neighbours. Galaxies and neighbours are a bulge and a disc with half-light radii of 2.5 to 5 px, behind
 //! a Moffat PSF with a FWHM of 3.4 px. The shear is (γ, γ) and (−γ, −γ) with γ = 0.02. Each scene is measured in eight
 //! versions: both shears, turned by 90 degrees or not, and both signs of the noise. Only the galaxy is sheared, or the
 //! whole scene about the galaxy.
@@ -9,6 +9,7 @@
 
 use std::error::Error;
 use std::f64::consts::{PI, TAU};
+use std::path::Path;
 
 use ndarray::{Array2, Array3, ArrayView2, s};
 use rand::{RngExt, SeedableRng};
@@ -16,6 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::{ImageNoise, Measurement, Measurer, PsfWorker};
 use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Shear, TransformedPsf};
+use shearq_render::figure::{Figure, LinePlot, PanelGrid, PictureFormat, Series, Style};
 use shearq_simulate::galaxy::Galaxy;
 use shearq_simulate::render::{RenderScratch, Renderer};
 
@@ -34,6 +36,10 @@ const DISTANCES: [[f64; 2]; 6] = [
 ];
 /// Fluxes of the neighbour in units of the galaxy's.
 const RATIOS: [[f64; 2]; 2] = [[0.3, 1.0], [1.0, 3.0]];
+/// Ends of the axis of m in the figure, in 10⁻³.
+const SHOWN: (f64, f64) = (-100.0, 40.0);
+/// Largest error of m that the figure shows.
+const MOST_ERROR: f64 = 0.05;
 /// Groups of scenes that the errors come from.
 const GROUPS: usize = 20;
 
@@ -302,9 +308,13 @@ fn print(case: &str, row: &Row) {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [scenes, seed, snr] = arguments.as_slice() else {
-        return Err("expected SCENES SEED SNR".into());
+    let ([scenes, seed, snr], figure) = match arguments.as_slice() {
+        [scenes, seed, snr] => ([scenes, seed, snr], None),
+        [scenes, seed, snr, figure] => ([scenes, seed, snr], Some(Path::new(figure))),
+        _ => return Err("expected SCENES SEED SNR [FIGURE]".into()),
     };
+    // Found out before the work is done.
+    figure.map(PictureFormat::of).transpose()?;
     let (scenes, seed): (usize, u64) = (scenes.parse()?, seed.parse()?);
     let profile = PsfProfile::Moffat { beta: 3.0 };
     let transform = PsfTransform::new(profile)?;
@@ -374,17 +384,69 @@ fn main() -> Result<(), Box<dyn Error>> {
     );
     println!("|---|---|---|---|---|---|---|");
     print("none | | ", &bins[0].row(&bins[0]));
-    let mut rest = bins[1..].iter();
+    let rows: Vec<Row> = bins[1..].iter().map(|bin| bin.row(&bins[0])).collect();
+    let mut rest = rows.iter();
     for range in DISTANCES {
         for sheared in ["no", "yes"] {
             for ratio in RATIOS {
-                let row = rest.next().expect("a bin for each").row(&bins[0]);
+                let row = rest.next().expect("a bin for each");
                 print(
                     &format!("{} | {sheared} | {}", name(range), name(ratio)),
-                    &row,
+                    row,
                 );
             }
         }
     }
+    if let Some(path) = figure {
+        plots(&rows).save(path)?;
+    }
     Ok(())
+}
+
+/// m against distance, for galaxies sheared alone and with the neighbour.
+fn plots(rows: &[Row]) -> PanelGrid {
+    let plot = |sheared: usize, title: &str| {
+        let of_ratio = |ratio: usize| {
+            let (mut x, mut y, mut errors) = (Vec::new(), Vec::new(), Vec::new());
+            for (at, range) in DISTANCES.into_iter().enumerate() {
+                let row = &rows[4 * at + 2 * sheared + ratio];
+                let (m, error) = (
+                    0.5 * (row.m[0] + row.m[1]),
+                    row.m_error[0].max(row.m_error[1]),
+                );
+                // Beside each other, not on top.
+                x.push(0.5 * (range[0] + range[1]) + 0.3 * (ratio as f64 - 0.5));
+                y.push(if error < MOST_ERROR {
+                    1e3 * m
+                } else {
+                    f64::NAN
+                });
+                errors.push(1e3 * error);
+            }
+            let [low, high] = RATIOS[ratio];
+            let label = format!("flux ratio {low} to {high}");
+            Series::new(&label, x, y, Style::Points, ratio).with_errors(errors)
+        };
+        LinePlot {
+            title: title.into(),
+            x_label: "distance [px]".into(),
+            y_label: "m [10⁻³]".into(),
+            y_range: Some(SHOWN),
+            series: vec![
+                Series::new("", vec![9.0, 25.0], vec![0.0; 2], Style::Dashed, 7),
+                of_ratio(0),
+                of_ratio(1),
+            ],
+            x_range: Some((9.0, 25.0)),
+            ..LinePlot::default()
+        }
+    };
+    PanelGrid {
+        title: "Bias by a neighbour, of galaxies without a flag".into(),
+        columns: 2,
+        plots: vec![
+            plot(0, "galaxy sheared alone"),
+            plot(1, "neighbour sheared, too"),
+        ],
+    }
 }

@@ -44,7 +44,7 @@ const MANY: f64 = 0.1;
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PsfLook {
     /// S/N of the star; infinite without noise.
-    snr: f64,
+    pub(crate) snr: f64,
     /// Level of the background in units of the peak, and its light in units of the star's.
     level: f64,
     background: f64,

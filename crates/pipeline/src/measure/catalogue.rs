@@ -10,7 +10,7 @@ use shearq_files::table;
 use shearq_measure::{Flag, Measurement, Observables, Warning};
 use shearq_submissions::EllipticityType;
 
-use super::row::{MeasuredRow, warnings};
+use super::row::{MeasuredRow, examined, warnings};
 use crate::PipelineError;
 use crate::data::run::{Claim, RUN_FILE, Run, claim};
 use crate::engine::Progress;
@@ -95,9 +95,12 @@ fn response(galaxy: &Measurement, i: usize, j: usize) -> f64 {
 
 /// Key of the metadata with the warnings of an image.
 const WARNINGS: &str = "warnings";
+/// Key of the metadata with the effect of the noise of an image's star on its mean shear: the standard deviations of m and c.
+/// A FITS key has eight characters.
+pub const PSF_NOISE: &str = "psfnoise";
 /// Keys of the metadata of catalogues, beside fingerprints.
-pub const KEYS: [&str; 7] = [
-    "creator", "submiss", "elltype", "set", "image", "settings", WARNINGS,
+pub const KEYS: [&str; 8] = [
+    "creator", "submiss", "elltype", "set", "image", "settings", PSF_NOISE, WARNINGS,
 ];
 
 /// Catalogue of one image from its rows of stamps, in order.
@@ -277,6 +280,9 @@ impl<'a> Catalogues<'a> {
         if !found.is_empty() {
             let lines: Vec<String> = found.iter().map(Warning::to_string).collect();
             metadata.insert(WARNINGS.into(), lines.join("\n"));
+        }
+        if linear && let Some([m, c]) = examined(rows).and_then(|all| all.psf_noise()) {
+            metadata.insert(PSF_NOISE.into(), format!("{m:.2e} {c:.2e}"));
         }
         table::write(&path, self.run.format, &table, &metadata)?;
         self.summary.count(rows);

@@ -79,16 +79,21 @@ fn examine(
     Ok(Some(examination))
 }
 
+/// What the examinations of all rows found.
+pub(super) fn examined(rows: &[MeasuredRow]) -> Option<Examination> {
+    let mut examinations = rows.iter().filter_map(|row| row.examination.as_ref());
+    let mut all = examinations.next()?.clone();
+    examinations.for_each(|more| all.join(more));
+    Some(all)
+}
+
 /// The warnings about an image whose rows have been measured and calibrated.
 pub(super) fn warnings(rows: &[MeasuredRow]) -> Vec<Warning> {
     let Some(head) = rows.first().map(|row| &row.head) else {
         return Vec::new();
     };
     let mut found = head.warnings.clone();
-    let mut examinations = rows.iter().filter_map(|row| row.examination.as_ref());
-    if let Some(first) = examinations.next() {
-        let mut all = first.clone();
-        examinations.for_each(|more| all.join(more));
+    if let Some(all) = examined(rows) {
         found.extend(all.warnings());
         let stated = head.stated_noise.and_then(|noise| all.given_noise(noise));
         found.extend(stated.map(of_header));

@@ -50,6 +50,9 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
     } else if configuration.ellipticity() == EllipticityType::Distortion {
         notes.push("The ellipticities are distortions, divided by their response to shear.".into());
     }
+    if means.iter().any(noticed) {
+        notes.push("Errors include the noise of the star of each image.".into());
+    }
     let mut headings: Vec<Heading> = headings.map(|(key, label)| Heading::new(key, label)).into();
     if selected {
         headings.insert(CUT, Heading::new("cut", "Cut"));
@@ -60,4 +63,11 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
         rows: rows.collect(),
         notes,
     }
+}
+
+/// Whether the noise of the stars is at least a tenth of an error.
+fn noticed(mean: &SetMean) -> bool {
+    let errors = mean.shear.iter().flat_map(|shear| shear.error());
+    let mut pairs = errors.zip(mean.psf_error);
+    pairs.any(|(error, psf)| psf > 0.1 * error)
 }
