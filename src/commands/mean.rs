@@ -15,8 +15,8 @@ use shearq_results::views::mean::mean_table;
 
 /// Mean shear of each set, for fields of constant shear.
 ///
-/// The mean shear is the mean ellipticity of all galaxies without a flag, divided by the mean response if the
-/// configuration does so. The error includes the error of the mean response, and the noise of one star per image. It
+/// The mean shear is the mean ellipticity before calibration of all galaxies without a flag, divided by their mean response if
+/// the configuration does so. The error includes the error of the mean response, and the noise of one star per image. It
 /// assumes independent galaxies: for pairs that are rotated by 90 degrees it is too large.
 ///
 /// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px).
@@ -89,6 +89,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let name = measured.display().to_string();
     let mut table = mean_table(&means, &run.configuration, &name);
+    if let Some(text) = &run.selection {
+        table
+            .notes
+            .push(format!("The catalogues have the selection `{text}`."));
+    }
     let chosen = [("where", cuts), ("weight", weight)];
     for (name, text) in chosen {
         if let Some(text) = text {

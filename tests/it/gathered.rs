@@ -187,22 +187,26 @@ fn the_mean_of_a_field_is_that_of_its_catalogue() {
             .zip(r)
             .filter(|(e, _)| e.is_finite())
             .collect();
-        // The ellipticities of an image are divided by its mean response, and so are its responses here.
+        // The ellipticities of an image are divided by its mean response.
         let mean = good.iter().map(|(_, r)| r).sum::<f64>() / good.len() as f64;
-        pairs.extend(good.iter().map(|(e, r)| (*e, r / mean)));
+        pairs.extend(good.iter().map(|(e, r)| (e * mean, *r)));
         all.extend(e);
     }
-    let known: Vec<f64> = all.iter().copied().filter(|e| e.is_finite()).collect();
-    let n = known.len() as f64;
-    let expected = known.iter().sum::<f64>() / n;
-    let square: f64 = known.iter().map(|e| (e - expected).powi(2)).sum();
+    let n = pairs.len() as f64;
+    let [sum, response] = pairs
+        .iter()
+        .fold([0.0; 2], |[e, r], pair| [e + pair.0, r + pair.1]);
+    let expected = sum / response;
     // Sums in another order.
     let near = |found: f64, expected: f64| (found - expected).abs() < 1e-12;
     assert!(near(value("g2"), expected));
     // The error of a ratio of means contains the scatter of the responses.
     let residual: f64 = pairs.iter().map(|(e, r)| (e - expected * r).powi(2)).sum();
-    assert!(near(value("g2_error"), (residual / (n - 1.0) / n).sqrt()));
-    assert!(near(value("scatter2"), (square / (n - 1.0)).sqrt()));
+    let error = (residual * n / (n - 1.0)).sqrt() / response;
+    assert!(near(value("g2_error"), error));
+    let square: f64 = pairs.iter().map(|(e, _)| (e - sum / n).powi(2)).sum();
+    let scatter = (square / (n - 1.0)).sqrt() * n / response;
+    assert!(near(value("scatter2"), scatter));
     assert_eq!(value("galaxies"), n);
     assert_eq!(value("flagged"), all.len() as f64 - n);
 }

@@ -156,6 +156,14 @@ fn selections_that_cannot_be_corrected_are_refused() {
         let message = refused(option, value);
         assert!(message.contains(expected), "{option} {value}: {message}");
     }
+    let (from, to) = (text(&out), small.at("too-few"));
+    let select = ["select", "--measured", from, "--out", text(&to), "--where"];
+    let message = fail(&[&select[..], &["snr > 1e9"]].concat());
+    assert!(
+        message.contains("leaves no galaxies with a response"),
+        "{message}"
+    );
+    assert!(!to.exists());
     small.measure(&["--submission", "23/raw/star"]);
     let message = refused("--where", "snr > 10");
     assert!(

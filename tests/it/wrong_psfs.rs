@@ -4,7 +4,7 @@ use std::fs;
 
 use shearq_files::fits::ImageReader;
 
-use crate::support::{Small, fits_image, floats, pixels_of};
+use crate::support::{Small, fits_image, floats, pixels_of, succeed, text};
 
 const LINEAR: [&str; 2] = ["--submission", "48/linear/star"];
 
@@ -68,6 +68,8 @@ fn wrong_psfs_are_named_and_good_ones_are_not() {
         write(&pixels);
         let said = small.measure(&LINEAR);
         assert!(said.contains(expected), "{name}: {said}");
+        let stated = stars_in_the_error(&small);
+        assert_eq!(stated.is_some(), name == "S/N 100", "{name}: {stated:?}");
     }
     // The star that was moved to the centre: wings beyond 42 px are cut off.
     for (found, expected) in small.measured("02", "e1").iter().zip(&e1) {
@@ -82,6 +84,16 @@ fn wrong_psfs_are_named_and_good_ones_are_not() {
         let message = small.fail_to_measure(&LINEAR);
         assert!(message.contains(expected), "{message}");
     }
+}
+
+/// What `mean` says about the noise of stars in its errors.
+fn stars_in_the_error(small: &Small) -> Option<String> {
+    let said = succeed(&["mean", "--measured", text(&small.at("out"))]);
+    let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
+    let from = said.find("Errors include the noise of the star of")?;
+    let stated = said[from..].to_owned();
+    assert!(stated.contains("each image"), "{stated}");
+    Some(stated)
 }
 
 #[test]

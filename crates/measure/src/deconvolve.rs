@@ -37,7 +37,7 @@ mod spectral;
 mod sun;
 
 pub use descent::{Descent, Stop};
-/// Number types the network runs in: `f32` in a measurement, `f64` to tell rounding from mistakes.
+/// Number types the network runs in: `f32`, and in unit tests `f64`, to tell rounding from mistakes.
 pub use kernel::Wide;
 pub use network::{Network, NetworkScratch, psf_factor};
 pub use reference::{Matrices, convolve};

@@ -17,7 +17,7 @@ use crate::psf::examine::{self, PsfLook};
 use crate::psfs::Psfs;
 use crate::sky::{Cells, INNER, Subtraction, disc, inner};
 use crate::surroundings::centre;
-use crate::warning::{Warning, effect_of_noise};
+use crate::warning::Warning;
 
 /// Largest side of the corner blocks in which the sky is measured. See docs/constants.md.
 const BLOCK: usize = 8;
@@ -312,12 +312,10 @@ impl Examination {
     }
 
     /// How much the noise of the star changes m and c of a linear configuration: one standard deviation, the same for all
-    /// galaxies. `None` if each galaxy has a PSF of its own, or none was added.
+    /// galaxies. `None` if each galaxy has a PSF of its own, or no PSF was examined.
     pub fn psf_noise(&self) -> Option<[f64; 2]> {
-        let [look] = self.psfs.as_slice() else {
-            return None;
-        };
-        (!self.each).then(|| effect_of_noise(look.snr))
+        let look = self.psfs.first().filter(|_| !self.each)?;
+        Some(look.effect_of_noise())
     }
 
     /// A warning if `given` is not the noise of the stamps.
@@ -618,6 +616,28 @@ mod tests {
         first.join(&second);
         assert_eq!(first.warnings(), one.warnings());
         assert!(!one.warnings().is_empty());
+    }
+
+    #[test]
+    fn the_noise_of_a_star_has_one_effect_on_all_galaxies_or_none() {
+        // Checks of ±σ, which second differences see as noise.
+        let star = Array2::from_shape_fn((N, N), |(y, x)| {
+            let noise = if (x / 2 + y / 3) % 2 == 0 {
+                1e-4
+            } else {
+                -1e-4
+            };
+            f64::from(stamp(0.0, [0.0; 2], [0.0; 2])[(y, x)]) / 565.5 + noise
+        });
+        let mut one = Examination::new(N, 1);
+        assert_eq!(one.psf_noise(), None);
+        one.add_psf(star.view(), None);
+        let [m, c] = one.psf_noise().unwrap();
+        assert!(m > 1e-3 && c > 0.3 * m && c < m, "{m} {c}");
+        let stars = ndarray::stack![ndarray::Axis(0), star, star];
+        let mut several = Examination::new(N, 2);
+        several.add_psfs(&Psfs::stars(stars), N.into(), 2);
+        assert_eq!((several.psfs.len(), several.psf_noise()), (2, None));
     }
 
     #[test]

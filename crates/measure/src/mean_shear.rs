@@ -24,10 +24,8 @@ pub struct MeanShear {
     pub covariance: [[f64; 2]; 2],
     /// Weighted mean responses R11 and R22.
     pub response: [f64; 2],
-    /// Galaxies with a positive weight and without a flag.
+    /// Galaxies with a positive weight.
     pub galaxies: usize,
-    /// Galaxies with a positive weight and a flag.
-    pub flagged: usize,
 }
 
 impl MeanShear {
@@ -63,7 +61,6 @@ pub struct ShearSum {
     /// Sums of squared weights times products of (e1, e2, R11, R22).
     products: [[f64; 4]; 4],
     galaxies: usize,
-    flagged: usize,
 }
 
 impl ShearSum {
@@ -88,11 +85,6 @@ impl ShearSum {
                 *sum += weight * weight * a * b;
             }
         }
-    }
-
-    /// Counts a flagged galaxy.
-    pub fn add_flagged(&mut self) {
-        self.flagged += 1;
     }
 
     /// The mean shear of the galaxies that were added.
@@ -131,7 +123,6 @@ impl ShearSum {
             covariance,
             response,
             galaxies: self.galaxies,
-            flagged: self.flagged,
         })
     }
 }
@@ -243,15 +234,14 @@ mod tests {
     }
 
     #[test]
-    fn weights_of_zero_and_flags_do_not_count() {
+    fn weights_of_zero_do_not_count() {
         let mut sum = ShearSum::default();
         assert_eq!(sum.mean(), Err(MeanShearError::NoGalaxies));
         sum.add([f64::MAX; 2], [1.0; 2], 0.0);
-        sum.add_flagged();
         assert_eq!(sum.mean(), Err(MeanShearError::NoGalaxies));
         sum.add([0.1, 0.2], [0.5, 2.0], 3.0);
         let mean = sum.mean().unwrap();
-        assert_eq!((mean.galaxies, mean.flagged), (1, 1));
+        assert_eq!(mean.galaxies, 1);
         assert!((mean.shear[0] - 0.2).abs() < 1e-15 && (mean.shear[1] - 0.1).abs() < 1e-15);
         assert!(mean.error()[0].is_nan());
         sum.add([0.1, 0.2], [-5.0, 2.0], 3.0);

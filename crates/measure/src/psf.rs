@@ -2,6 +2,7 @@
 
 mod average;
 pub(crate) mod breadth;
+mod effect;
 pub(crate) mod examine;
 mod halfway;
 mod moffat;

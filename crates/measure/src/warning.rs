@@ -135,6 +135,8 @@ pub enum Warning {
         snr: f64,
         /// The same that is enough.
         enough: f64,
+        /// Standard deviations of m and c by the noise of one star.
+        effect: [f64; 2],
         /// PSFs.
         of: Of,
     },
@@ -198,30 +200,6 @@ impl fmt::Display for Of {
 /// Side of a PSF stamp below which a linear configuration loses too much of the wings. See
 /// docs/constants.md.
 const LEAST_PSF_SIZE: usize = 32;
-/// Scatter of m with a star's noise, times the star's S/N. See docs/constants.md.
-const M_PER_NOISE: f64 = 2.3;
-/// Scatter of c with a star's noise, times the star's S/N. See docs/constants.md.
-const C_PER_NOISE: f64 = 1.2;
-/// S/N of a star above which less and less of its noise is taken away, so that its effect stays. See docs/constants.md.
-const NOISE_STAYS: f64 = 500.0;
-
-/// Scatter of m with the noise of a star that is used unchanged, times the star's S/N. See docs/constants.md.
-const M_UNCHANGED: f64 = 5.5;
-/// Scatter of c with the noise of a star that is used unchanged, times the star's S/N. See docs/constants.md.
-const C_UNCHANGED: f64 = 2.3;
-
-/// How much the noise of one star for an image, of S/N `snr`, changes m and c of a linear configuration: one standard
-/// deviation.
-pub(crate) fn effect_of_noise(snr: f64) -> [f64; 2] {
-    let effect = |reduced: f64, unchanged: f64| {
-        (reduced / snr.clamp(1.0, NOISE_STAYS)).min(unchanged / snr.max(1.0))
-    };
-    [
-        effect(M_PER_NOISE, M_UNCHANGED),
-        effect(C_PER_NOISE, C_UNCHANGED),
-    ]
-}
-
 impl Warning {
     /// A warning if the configuration uses too little of the PSF.
     pub fn of_settings(configuration: &Configuration) -> Option<Warning> {
@@ -466,8 +444,12 @@ impl fmt::Display for Warning {
                 100.0 * slope[0],
                 100.0 * slope[1]
             ),
-            Warning::PsfNoise { snr, enough, of } => {
-                let [m, c] = effect_of_noise(*snr);
+            Warning::PsfNoise {
+                snr,
+                enough,
+                effect: [m, c],
+                of,
+            } => {
                 write!(
                     f,
                 "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). The noise of one star changes m by about {m:.3} and c by about {c:.3}. Try: average several stars, or fit a model"

@@ -18,7 +18,8 @@ use shearq_files::table::read_metadata;
 
 /// Keys of a catalogue's metadata.
 const GALAXIES: &str = "galaxies";
-const PSF: &str = "psf";
+/// Key of the fingerprint of the PSF of an image.
+pub const PSF: &str = "psf";
 const TRUTH: &str = "truth";
 /// Keys of the fingerprints in the metadata of a catalogue.
 pub const PRINTS: [&str; 3] = [GALAXIES, PSF, TRUTH];

@@ -1,17 +1,22 @@
 //! Mean shears of sets, for fields of constant shear.
 
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
 use shearq_measure::{Flag, MeanShear, Selection, ShearSum, Warning};
 use shearq_pipeline::data::run::Run;
+use shearq_pipeline::inputs::PSF;
 use shearq_pipeline::measure::PSF_NOISE;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
 use crate::select::Weighted;
+
+/// Largest effect on m or c that metadata can state: a star without any signal has 5.5.
+const MOST_PSF_NOISE: f64 = 10.0;
 
 /// The mean shear of the galaxies of a set.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,11 +34,13 @@ pub struct SetMean {
     pub cut: usize,
     /// Galaxies with each of [`Flag::ALL`].
     pub flags: [usize; Flag::ALL.len()],
-    /// Mean shear, with errors that include the error of the mean response of each image and the noise of its star; `None`
-    /// if all galaxies are flagged.
+    /// Mean shear: the sum of ellipticities before calibration over the sum of responses. Errors include the error of the mean
+    /// response and the noise of stars. `None` if all galaxies are flagged, or the mean response is not positive.
     pub shear: Option<MeanShear>,
-    /// The part of the errors that the noise of the stars makes. Each star counts for all galaxies of its image.
+    /// The part of the errors that the noise of the stars makes. Each star counts for all galaxies of its images.
     pub psf_error: [f64; 2],
+    /// Images whose catalogue states the effect of the noise of its star.
+    pub noisy_stars: usize,
     /// Standard deviation of e1 and of e2 of one galaxy.
     pub scatter: [f64; 2],
 }
@@ -103,10 +110,8 @@ fn mean_of(
 ) -> Result<SetMean, FileError> {
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
     let (mut flags, mut flagged, mut cut) = ([0; Flag::ALL.len()], 0, 0);
-    // Of images with noisy stars: galaxies, and the scatter of m and c.
-    let mut stars = Vec::new();
-    for (_, path) in catalogues {
-        let before = moments[0].count();
+    let mut stars = Stars::default();
+    for (image, path) in catalogues {
         let rows = match selection {
             Some(selection) => Rows::selected(path, selection)?,
             None => Rows::read(path, calibrated)?,
@@ -116,7 +121,7 @@ fn mean_of(
                 *count += usize::from(bits as u32 & flag as u32 != 0);
             }
         }
-        let mean = rows.mean_response();
+        let mut share = [0.0; 2];
         for row in 0..rows.flags.len() {
             if !rows.is_good(row) {
                 flagged += 1;
@@ -127,25 +132,23 @@ fn mean_of(
                 continue;
             }
             let (e, response) = (rows.e(row), rows.response(row));
-            // The ellipticities are divided by the mean response of their image.
-            sum.add(e, [0, 1].map(|k| response[k] / mean[k]), 1.0);
-            for (moment, e) in moments.iter_mut().zip(e) {
-                moment.add(e);
+            sum.add(e, response, 1.0);
+            for k in 0..2 {
+                moments[k].add(e[k]);
+                share[k] += response[k];
             }
         }
-        if let Some(effect) = psf_noise(path, format)? {
-            stars.push((moments[0].count() - before, effect));
-        }
+        stars.add(*image, path, format, share)?;
     }
     let mut shear = sum.mean().ok();
-    let psf_error = shear.map_or([0.0; 2], |found| {
-        of_stars(&stars, moments[0].count(), found.shear)
-    });
+    let mut psf_error = [0.0; 2];
     if let Some(found) = &mut shear {
+        psf_error = stars.errors(found.shear);
         for (k, error) in psf_error.into_iter().enumerate() {
             found.covariance[k][k] += error * error;
         }
     }
+    let response = shear.map_or([1.0; 2], |found| found.response);
     Ok(SetMean {
         set,
         images: catalogues.iter().map(|(image, _)| *image).collect(),
@@ -155,45 +158,90 @@ fn mean_of(
         flags,
         shear,
         psf_error,
-        scatter: moments.map(|moment| moment.deviation()),
+        noisy_stars: stars.stated,
+        scatter: [0, 1].map(|k| moments[k].deviation() / response[k]),
     })
 }
 
-/// The scatter of m and c by the noise of the star of an image, as its catalogue states it.
-fn psf_noise(path: &Path, format: FileFormat) -> Result<Option<[f64; 2]>, FileError> {
-    let key = PSF_NOISE.to_owned();
-    let metadata = table::read_metadata(path, format, std::iter::once(&key))?;
-    let Some(text) = metadata.get(PSF_NOISE) else {
-        return Ok(None);
-    };
+/// The noise of the stars of a set. Images with the same star have the same error.
+#[derive(Default)]
+struct Stars {
+    /// By the fingerprint of the star or, without one, the image: sums of responses, which are the shares in the mean, times
+    /// the scatter of m and of c.
+    effects: BTreeMap<Result<String, u32>, [[f64; 2]; 2]>,
+    /// Sum of the responses of all images.
+    responses: [f64; 2],
+    /// Images whose catalogue states the effect of the noise.
+    stated: usize,
+}
+
+impl Stars {
+    /// Adds an image whose galaxies have responses of the sum `share`.
+    fn add(
+        &mut self,
+        image: u32,
+        path: &Path,
+        format: FileFormat,
+        share: [f64; 2],
+    ) -> Result<(), FileError> {
+        for (sum, share) in self.responses.iter_mut().zip(share) {
+            *sum += share;
+        }
+        let keys = [PSF_NOISE, PSF].map(str::to_owned);
+        let mut metadata = table::read_metadata(path, format, keys.iter())?;
+        let Some(text) = metadata.get(PSF_NOISE) else {
+            return Ok(());
+        };
+        let effect = psf_noise(path, text)?;
+        self.stated += 1;
+        let star = metadata.remove(PSF).ok_or(image);
+        let sums = self.effects.entry(star).or_default();
+        for (sums, effect) in sums.iter_mut().zip(effect) {
+            for (sum, share) in sums.iter_mut().zip(share) {
+                *sum += share * effect;
+            }
+        }
+        Ok(())
+    }
+
+    /// Errors of the mean `shear` by the noise.
+    fn errors(&self, shear: [f64; 2]) -> [f64; 2] {
+        [0, 1].map(|k| {
+            let variances = self.effects.values().map(|[m, c]| {
+                let [m, c] = [m[k], c[k]].map(|sum| sum / self.responses[k]);
+                (m * shear[k]).powi(2) + c * c
+            });
+            variances.sum::<f64>().sqrt()
+        })
+    }
+}
+
+/// The scatter of m and c by the noise of a star, as the metadata state it.
+fn psf_noise(path: &Path, text: &str) -> Result<[f64; 2], FileError> {
     let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
     match numbers.as_deref() {
-        Some(&[m, c]) if m >= 0.0 && c >= 0.0 => Ok(Some([m, c])),
+        Some(&[m, c])
+            if [m, c]
+                .iter()
+                .all(|value| (0.0..=MOST_PSF_NOISE).contains(value)) =>
+        {
+            Ok([m, c])
+        }
         _ => Err(FileError::new(
             path,
             format!(
-                "the metadata `{PSF_NOISE}` are `{text}`; expected the scatter of m and of c, such as 2.3e-2 1.2e-2"
+                "the metadata `{PSF_NOISE}` are {text:?} (expected the scatter of m and of c, two numbers from 0 to {MOST_PSF_NOISE} such as 2.3e-2 1.2e-2)"
             ),
         )),
     }
 }
 
-/// Errors of the mean of `galaxies` with the mean `shear` by the noise of independent stars, each for so many galaxies.
-fn of_stars(stars: &[(usize, [f64; 2])], galaxies: usize, shear: [f64; 2]) -> [f64; 2] {
-    shear.map(|g| {
-        let variances = stars.iter().map(|&(count, [m, c])| {
-            let share = count as f64 / galaxies as f64;
-            share * share * (m * m * g * g + c * c)
-        });
-        variances.sum::<f64>().sqrt()
-    })
-}
-
 /// The columns of a catalogue from which a mean shear follows.
 struct Rows {
+    /// Before calibration.
     e: [Vec<f64>; 2],
     flags: Vec<f64>,
-    /// R11 and R22 of calibrated ellipticities.
+    /// R11 and R22 of configurations with a calibration.
     response: Option<[Vec<f64>; 2]>,
     /// Whether a selection leaves the galaxy out.
     cut: Vec<bool>,
@@ -203,40 +251,38 @@ impl Rows {
     fn read(path: &Path, calibrated: bool) -> Result<Self, FileError> {
         let mut names = vec!["e1", "e2", "flags"];
         if calibrated {
-            names.extend(["R11", "R22"]);
+            names.extend(["R11", "R22", "divisor1", "divisor2"]);
         }
         let read = table::read(path, Some(&names), table::MAX_ROWS)?;
         let column = |name| table::numbers(&read, name, path).map(Cow::into_owned);
         let flags = column("flags")?;
+        let mut e = [column("e1")?, column("e2")?];
+        let mut response = None;
+        if calibrated {
+            response = Some([column("R11")?, column("R22")?]);
+            for (e, name) in e.iter_mut().zip(["divisor1", "divisor2"]) {
+                for (e, divisor) in e.iter_mut().zip(column(name)?) {
+                    *e *= divisor;
+                }
+            }
+        }
         Ok(Rows {
-            e: [column("e1")?, column("e2")?],
+            e,
             cut: vec![false; flags.len()],
             flags,
-            response: match calibrated {
-                true => Some([column("R11")?, column("R22")?]),
-                false => None,
-            },
+            response,
         })
     }
 
     /// The rows with the weights of a selection.
     fn selected(path: &Path, selection: &Selection) -> Result<Self, FileError> {
         let (weighted, flags) = Weighted::read(path, selection)?;
-        let mean = weighted.mean_response();
-        let Weighted {
-            mut e,
-            response,
-            weight,
-        } = weighted;
-        // A mean of zero has no galaxies, and nothing to divide.
-        for (e, mean) in e.iter_mut().zip(mean).filter(|(_, mean)| *mean != 0.0) {
-            e.iter_mut().for_each(|e| *e /= mean);
-        }
+        let cut = weighted.weight.iter().map(|weight| *weight == 0.0);
         Ok(Rows {
-            e,
+            cut: cut.collect(),
+            e: weighted.e,
             flags,
-            response: Some(response),
-            cut: weight.iter().map(|weight| *weight == 0.0).collect(),
+            response: Some(weighted.response),
         })
     }
 
@@ -253,13 +299,6 @@ impl Rows {
         let response = self.response.as_ref();
         response.map_or([1.0; 2], |all| [0, 1].map(|k| all[k][row]))
     }
-
-    /// Mean response of the galaxies with an ellipticity. Galaxies that are left out have a response of zero.
-    fn mean_response(&self) -> [f64; 2] {
-        let good = || (0..self.flags.len()).filter(|&row| self.is_good(row));
-        let count = good().count() as f64;
-        [0, 1].map(|k| good().map(|row| self.response(row)[k]).sum::<f64>() / count)
-    }
 }
 
 #[cfg(test)]
@@ -269,77 +308,130 @@ mod tests {
 
     use super::*;
 
-    /// Writes a catalogue of two good galaxies, of mean response 0.5, and one flagged.
-    fn written(path: &Path, e: [f64; 2], names: [&str; 3], psf_noise: Option<&str>) {
+    /// Writes a catalogue of two good galaxies, of mean response 0.5, and one flagged. `e` is before calibration.
+    fn written(path: &Path, e: [f64; 2], names: [&str; 3], metadata: &[(&str, &str)]) {
         let column = |name: &str, values: [f64; 3]| Column::new(name.into(), values);
-        let e = |sign: f64| [sign * e[0], sign * e[1], f64::NAN];
+        let e = |sign: f64| [2.0 * sign * e[0], 2.0 * sign * e[1], f64::NAN];
         let [flags, r11, r22] = names;
         let table = frame(vec![
             column("e1", e(1.0)),
-            column("e2", e(-1.0)),
+            column("e2", e(-0.5)),
             column(flags, [0.0, 0.0, 4.0]),
             column(r11, [0.4, 0.6, f64::NAN]),
             column(r22, [0.4, 0.6, f64::NAN]),
+            column("divisor1", [0.5, 0.5, f64::NAN]),
+            column("divisor2", [0.5, 0.5, f64::NAN]),
         ]);
+        let metadata = metadata
+            .iter()
+            .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
         table::write(
             path,
             FileFormat::Parquet,
             &table.unwrap(),
-            &psf_noise
-                .map(|text| (PSF_NOISE.to_owned(), text.to_owned()))
-                .into_iter()
-                .collect(),
+            &metadata.collect(),
         )
         .unwrap();
     }
 
+    const NAMES: [&str; 3] = ["flags", "R11", "R22"];
+
     #[test]
-    fn the_shear_is_the_mean_ellipticity_and_its_error_that_of_a_ratio() {
+    fn the_shear_is_a_ratio_of_means_and_its_error_that_of_a_ratio() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("catalogue-001.parquet");
-        written(&path, [0.1, 0.4], ["flags", "R11", "R22"], None);
+        written(&path, [0.05, 0.2], NAMES, &[]);
         let catalogues = [(1, path)];
         let mean = mean_of(7, &catalogues, FileFormat::Parquet, true, None).unwrap();
         assert_eq!((mean.galaxies, mean.flagged, mean.flags[2]), (2, 1, 1));
         let shear = mean.shear.unwrap();
-        assert!((shear.shear[0] - 0.25).abs() < 1e-15 && (shear.shear[1] + 0.25).abs() < 1e-15);
-        // Residuals 0.1 − 0.25 · 0.8 and 0.4 − 0.25 · 1.2 are ∓0.1: √(2 · 0.02)/2.
+        assert!((shear.shear[0] - 0.25).abs() < 1e-15 && (shear.shear[1] + 0.125).abs() < 1e-15);
+        // Residuals 0.05 − 0.25 · 0.4 and 0.2 − 0.25 · 0.6 are ∓0.05, over the response: √(2 · 0.01)/2.
         assert!((shear.error()[0] - 0.1).abs() < 1e-15, "{shear:?}");
+        // That of 0.1 and 0.4.
+        let scatter = 0.3 / 2f64.sqrt();
+        assert!((mean.scatter[0] - scatter).abs() < 1e-15, "{mean:?}");
         // Without responses the residuals are ∓0.15.
-        let plain = mean_of(7, &catalogues, FileFormat::Parquet, false, None)
-            .unwrap()
-            .shear
-            .unwrap();
+        let plain = mean_of(7, &catalogues, FileFormat::Parquet, false, None);
+        let plain = plain.unwrap().shear.unwrap();
         assert!((plain.error()[0] - 0.15).abs() < 1e-15, "{plain:?}");
+    }
+
+    #[test]
+    fn images_weigh_by_their_responses() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |image: u32| folder.path().join(format!("{image}.parquet"));
+        written(&path(1), [0.05, 0.2], NAMES, &[]);
+        // Galaxies of the other have hardly any response, and noise.
+        let column = |name: &str, value: f64| Column::new(name.into(), [value; 2]);
+        let table = frame(vec![
+            column("e1", 5.0),
+            column("e2", 5.0),
+            column("flags", 0.0),
+            column("R11", 1e-3),
+            column("R22", 1e-3),
+            column("divisor1", 1e-3),
+            column("divisor2", 1e-3),
+        ]);
+        let none = Default::default();
+        table::write(&path(2), FileFormat::Parquet, &table.unwrap(), &none).unwrap();
+        let catalogues = [1, 2].map(|image| (image, path(image)));
+        let mean = mean_of(7, &catalogues, FileFormat::Parquet, true, None);
+        let found = mean.unwrap().shear.unwrap().shear[0];
+        assert!((found - (0.25 + 0.01) / 1.002).abs() < 1e-15, "{found}");
     }
 
     #[test]
     fn the_noise_of_stars_is_in_the_error_and_falls_with_their_number() {
         let folder = tempfile::tempdir().unwrap();
-        let mean = |images: u32, text: Option<&str>| {
-            let catalogues: Vec<_> = (1..=images)
-                .map(|image| (image, folder.path().join(format!("{image}.parquet"))))
+        let mean = |images: &[&[(&str, &str)]]| {
+            let catalogues: Vec<_> = (1..)
+                .zip(images)
+                .map(|(image, metadata)| {
+                    let path = folder.path().join(format!("{image}.parquet"));
+                    written(&path, [0.05, 0.2], NAMES, metadata);
+                    (image, path)
+                })
                 .collect();
-            for (_, path) in &catalogues {
-                written(path, [0.1, 0.4], ["flags", "R11", "R22"], text);
-            }
             mean_of(7, &catalogues, FileFormat::Parquet, true, None)
         };
-        let without = mean(1, None).unwrap();
-        assert_eq!(without.psf_error, [0.0; 2]);
-        for images in [1, 4] {
-            let (with, own) = (
-                mean(images, Some("4.00e-1 1.00e-2")).unwrap(),
-                mean(images, None).unwrap(),
-            );
-            // m times the mean of 0.25, and c.
-            let expected = 0.1f64.hypot(0.01) / f64::from(images).sqrt();
-            let total = own.shear.unwrap().error()[1].hypot(expected);
-            assert!((with.psf_error[1] - expected).abs() < 1e-15, "{with:?}");
-            assert!((with.shear.unwrap().error()[1] - total).abs() < 1e-15);
+        let own = |images: usize| mean(&vec![&[][..]; images]).unwrap();
+        let noisy = (PSF_NOISE, "4.00e-1 1.00e-2");
+        // m times the mean shears of 0.25 and −0.125, and c.
+        let of_one = [0.1f64.hypot(0.01), 0.05f64.hypot(0.01)];
+        for (images, stated, factor) in [
+            (&[&[][..]][..], 0, 0.0),
+            (&[&[noisy]], 1, 1.0),
+            (&[&[noisy], &[noisy], &[noisy], &[noisy]], 4, 0.5),
+            // The same star, different ones, and an image without noise.
+            (&[&[noisy, (PSF, "a")], &[noisy, (PSF, "a")]], 2, 1.0),
+            (
+                &[&[noisy, (PSF, "a")], &[noisy, (PSF, "b")]],
+                2,
+                0.5f64.sqrt(),
+            ),
+            (&[&[noisy], &[]], 1, 0.5),
+        ] {
+            let (with, own) = (mean(images).unwrap(), own(images.len()));
+            assert_eq!(with.noisy_stars, stated);
+            for (k, of_one) in of_one.into_iter().enumerate() {
+                let expected = factor * of_one;
+                assert!((with.psf_error[k] - expected).abs() < 1e-15, "{with:?}");
+                let total = own.shear.unwrap().error()[k].hypot(expected);
+                assert!((with.shear.unwrap().error()[k] - total).abs() < 1e-15);
+            }
         }
-        for text in ["", "0.1", "0.1 x", "-1e-2 1e-2", "NaN 0"] {
-            let error = mean(1, Some(text)).unwrap_err().to_string();
+        for text in [
+            "",
+            "0.1",
+            "0.1 x",
+            "-1e-2 1e-2",
+            "NaN 0",
+            "inf 0",
+            "0 11",
+            "0  0",
+        ] {
+            let error = mean(&[&[(PSF_NOISE, text)]]).unwrap_err().to_string();
             assert!(error.contains("psfnoise"), "{error}");
         }
     }
@@ -355,7 +447,7 @@ mod tests {
                 "`response1` is now called `R11`",
             ),
         ] {
-            written(&path, [0.1, 0.4], names, None);
+            written(&path, [0.05, 0.2], names, &[]);
             let error = mean_of(7, &[(1, path.clone())], FileFormat::Parquet, true, None)
                 .unwrap_err()
                 .to_string();

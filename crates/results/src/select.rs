@@ -103,6 +103,14 @@ pub fn write_selected(
         ));
     }
     let files = run.catalogues(from, &[])?;
+    // Nothing is written if one of the images has too few galaxies left.
+    for set in files.wanted(&[]) {
+        for (_, path) in files.of_set(set) {
+            Weighted::read(&path, &stated.selection)?
+                .0
+                .divisors(&path)?;
+        }
+    }
     let record = Run {
         source: run.source.moved(from, to)?,
         selection: Some(stated.text.clone()),
@@ -259,18 +267,24 @@ impl Weighted {
         Ok((Weighted::of_table(path, selection, &read)?, flags))
     }
 
-    /// The catalogue `read` with weighted and calibrated ellipticities.
-    fn table(&self, path: &Path, read: &DataFrame) -> Result<DataFrame, FileError> {
+    /// The mean responses, which have to be positive for a calibration.
+    fn divisors(&self, path: &Path) -> Result<[f64; 2], FileError> {
         let mean = self.mean_response();
         if !mean.iter().all(|mean| *mean > 0.0) {
             return Err(FileError::new(
                 path,
                 format!(
-                    "the selection leaves no galaxies with a response to shear (found mean responses of {} and {}, expected positive numbers)",
+                    "the selection leaves no galaxies with a response to shear (found mean responses of {} and {}, expected positive numbers). Try: a lower threshold",
                     mean[0], mean[1]
                 ),
             ));
         }
+        Ok(mean)
+    }
+
+    /// The catalogue `read` with weighted and calibrated ellipticities.
+    fn table(&self, path: &Path, read: &DataFrame) -> Result<DataFrame, FileError> {
+        let mean = self.divisors(path)?;
         let e = |k: usize| self.e[k].iter().map(|e| e / mean[k]).collect::<Vec<f64>>();
         let divisor = |k: usize| {
             let rows = self.e[k].iter();

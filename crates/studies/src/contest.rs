@@ -113,7 +113,7 @@ pub fn contest_table(
                 Cell::Empty,
                 Cell::text(&configuration.name),
             ];
-            row.extend((0..8).map(|_| Cell::Empty));
+            row.extend((0..10).map(|_| Cell::Empty));
             row.push(mean(&|r| (r.score.metrics.q, r.score.errors.q), 1));
             row.push(mean(&spectrum, 0));
             row.push(Cell::number(limit, 0));
@@ -127,6 +127,8 @@ pub fn contest_table(
         ("submission", "Configuration"),
         ("scatter", "scatter"),
         ("scatter_over_bound", "/ bound"),
+        ("total", "total"),
+        ("total_over_bound", "/ bound"),
         ("m1", "m1×10³"),
         ("m2", "m2×10³"),
         ("c1", "c1×10⁴"),
@@ -143,7 +145,7 @@ pub fn contest_table(
         headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
         rows,
         notes: vec![
-            "Scatter of ε per component after division by its response, and its ratio to the Cramér–Rao bound of a sample of the galaxies. Offset bulges have no bound. If S/N differ, galaxies of low S/N count less, and the scatter can be below the bound.".into(),
+            "Scatter of ε per component after division by its response, and its ratio to the Cramér–Rao bound of a sample of the galaxies. Offset bulges have no bound. Total: the scatter with intrinsic shapes, and its ratio to that with noise at the bound. If S/N differ, galaxies of low S/N count less, and the scatter can be below the bound.".into(),
             "m and c: from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign. Leakage: c along the ellipticity of the PSF. Unmeasured: galaxies without ellipticity; they are left out.".into(),
             "Q of the catalogues, and of cross-spectra between groups of images, which noise does not bias; leaderboard definition, standard convention. Expected Q: mean Q of a perfect method with noise at the bound.".into(),
         ],
@@ -159,6 +161,8 @@ pub fn contest_parts(table: &Table) -> [Table; 2] {
         "submission",
         "scatter",
         "scatter_over_bound",
+        "total",
+        "total_over_bound",
         "m1",
         "m2",
         "c1",
@@ -196,12 +200,17 @@ fn row(
     let bound = bias.bound.unwrap_or(f64::NAN);
     let relative = (scatter_error / scatter).hypot(bias.bound_error.unwrap_or(f64::NAN) / bound);
     let (q_spectrum, q_spectrum_error) = spectrum(own);
+    let total = own.response.rms_total();
+    // Of intrinsic shapes, which are the rest of the total, and noise at the bound.
+    let total_bound = (total * total - scatter * scatter + bound * bound).sqrt();
     vec![
         Cell::text(format!("{:02}", result.set)),
         Cell::text(SetKind::of(result.set).map_or("", |kind| kind.image.label())),
         Cell::text(&configuration.name),
         Cell::with_error(scatter, Some(scatter_error), 5),
         Cell::with_error(scatter / bound, Some(scatter / bound * relative), 3),
+        Cell::number(total, 4),
+        Cell::number(total / total_bound, 4),
         scaled(biases.m[0], biases.m_error[0], 1e3),
         scaled(biases.m[1], biases.m_error[1], 1e3),
         scaled(biases.c[0], biases.c_error[0], 1e4),

@@ -8,8 +8,7 @@
 //! ```
 //!
 //! from the middle of the stamp, where the first letter stands for x. Each sum along an axis is a dense product, both to
-//! modes and back. For PSFs of 15 px this takes half of the time of a sum over the pixels of the PSF, and for larger ones
-//! less.
+//! modes and back. These products have fewer terms than sums over the pixels of the PSF.
 
 use ndarray::ArrayView2;
 
@@ -49,7 +48,7 @@ struct Modes<T>([Vec<T>; 4]);
 /// Sizes of the period.
 #[derive(Debug, Clone, Copy)]
 struct Period {
-    /// In pixels; odd, so that no mode is its own opposite.
+    /// In pixels; odd, so that no mode but zero is its own opposite.
     pixels: usize,
     /// Modes along an axis, from zero on.
     modes: usize,
@@ -275,7 +274,7 @@ impl<T: Real> ToPixels<T> {
         for (at, spectrum) in scratch.modes.0.iter().enumerate() {
             let (x, y) = (at / 2, at % 2);
             let down = Matrix::new(&self.down[y], width);
-            // Rows beyond `band` are written again by the second part.
+            // Rows of the first part beyond `band` are written again by the second; those of the second are not used.
             let lines = &mut scratch.lines[x][y * band * width..][..padded * width];
             product::<T, R, FUSED>(down, Matrix::new(spectrum, width), modes, lines, width);
         }

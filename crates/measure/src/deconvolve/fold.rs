@@ -112,7 +112,7 @@ fn fold_four<T: Real>([upper, lower]: [[T; 2]; 2]) -> [T; 4] {
     ]
 }
 
-/// The opposite of [`fold_four`], of which it needs halves.
+/// The opposite of [`fold_four`], of which it needs quarters.
 #[inline(always)]
 fn unfold_four<T: Real>([ee, eo, oe, oo]: [T; 4]) -> [[T; 2]; 2] {
     let (even, odd) = (ee.plus(eo), oe.plus(oo));
@@ -133,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn unfolding_gives_the_image_of_which_the_parts_are_halves() {
+    fn unfolding_gives_the_image_from_a_quarter_of_its_parts() {
         for n in [1usize, 2, 3, 5, 14, 15, 16, 19, 23, 24, 31, 48] {
             let half = n.div_ceil(2);
             let image: Vec<f64> = (0..n * n).map(|at| ((at * at) % 97) as f64).collect();

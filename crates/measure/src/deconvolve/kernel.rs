@@ -16,8 +16,8 @@ use super::real::Real;
 use super::rule::{Rule, Step};
 use super::sun::roughen;
 
-/// Buffers of one network. Images are row-major, with zeros behind them that fill the last lanes; the rest may hold
-/// anything between runs.
+/// Buffers of one network. Images are row-major, with zeros behind them that fill the last lanes. The zeros around
+/// `lines` and behind the parts of folded images stay, too. All else may have any value between runs.
 #[derive(Debug, Clone)]
 pub struct Buffers<T> {
     /// Accepted state.
@@ -99,7 +99,7 @@ impl Squares {
     }
 }
 
-/// The lanes of an image, and the place of each.
+/// The lanes of an image.
 #[inline(always)]
 fn lanes<T: Copy>(image: &[T]) -> impl Iterator<Item = &[T; LANES]> {
     image.as_chunks().0.iter()
@@ -110,8 +110,8 @@ fn lanes_mut<T: Copy>(image: &mut [T]) -> impl Iterator<Item = &mut [T; LANES]> 
     image.as_chunks_mut().0.iter_mut()
 }
 
-/// Residual and roughness of `state`; returns J(v) = ½‖u₀ − Hv‖² + ½λ‖Dv‖² (Eq. 4), which is the
-/// energy E plus the constant ½‖u₀‖² (Eq. 9 of the paper's J) but has no cancellation in it.
+/// Residual and roughness of the candidate; returns J(v) = ½‖u₀ − Hv‖² + ½λ‖Dv‖² (Eq. 4), which is the
+/// energy E plus the constant ½‖u₀‖² but has no cancellation in it.
 #[inline(always)]
 fn residual<T: Real, const R: usize, const FUSED: bool>(
     operator: &Operator<T>,

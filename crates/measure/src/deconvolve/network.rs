@@ -31,7 +31,7 @@ impl<T: Wide> Network<T> {
     /// Plans for n×n stamps and p×p PSFs; the PSF is zero until [`Network::set_psf`].
     ///
     /// # Errors
-    /// Where a size is out of range.
+    /// If a size is out of range.
     pub fn plan(n: usize, p: usize, lambda: f64) -> Result<Self, MeasureError> {
         Ok(Network {
             operator: Operator::new(n, p, lambda)?,
@@ -41,7 +41,7 @@ impl<T: Wide> Network<T> {
     /// Takes a PSF; it is used as it is, so it should sum to one.
     ///
     /// # Errors
-    /// Where its size is not the planned one or a pixel is not finite.
+    /// If its size is not the planned one or a pixel is not finite.
     pub fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
         check_psf(psf, self.operator.p)?;
         T::set_psf(&mut self.operator, psf, 1.0);
@@ -52,7 +52,7 @@ impl<T: Wide> Network<T> {
     /// states to the light of the galaxy.
     ///
     /// # Errors
-    /// As [`Network::set_psf`], and where no pixel is positive.
+    /// As [`Network::set_psf`], and if no pixel is positive.
     pub fn set_scaled_psf(
         &mut self,
         psf: ArrayView2<'_, f64>,
@@ -88,7 +88,7 @@ impl<T: Wide> Network<T> {
     /// Deconvolves the row-major n×n stamp `u0` into `out`.
     ///
     /// # Errors
-    /// Where `u0` or `out` does not have n² pixels, or the scratch is of another network's sizes.
+    /// If `u0` or `out` does not have n² pixels, or the scratch is of another network's sizes.
     pub fn deconvolve(
         &self,
         rule: &Rule,
@@ -202,7 +202,7 @@ impl<T: Wide> Network<T> {
 /// The factor that gives a PSF of sum one the scale `scale`.
 ///
 /// # Errors
-/// Where no pixel is positive.
+/// If no pixel is positive.
 pub fn psf_factor(psf: ArrayView2<'_, f64>, scale: PsfScale) -> Result<f64, MeasureError> {
     match scale {
         PsfScale::Sum => Ok(1.0),
@@ -225,7 +225,7 @@ mod tests {
     use shearq_submissions::{Clipping, Start};
 
     use super::*;
-    use crate::deconvolve::product::ROWS;
+    use crate::deconvolve::product::{ROWS, fuses};
     use crate::deconvolve::reference::Matrices;
     use crate::deconvolve::rule::Step;
 
@@ -273,7 +273,15 @@ mod tests {
         let mut scratch = network.scratch();
         let mut out = vec![T::ZERO; case.n * case.n];
         let data: Vec<T> = u0.iter().map(|&v| T::from_f64(v)).collect();
-        // A first run on other data leaves its traces in the scratch.
+        // First runs on other data, and on none, leave their traces in the scratch.
+        let missing = vec![T::from_f64(f64::NAN); data.len()];
+        let rule = Rule {
+            start: Start::Data,
+            ..case.rule
+        };
+        network
+            .deconvolve(&rule, &missing, &mut scratch, &mut out)
+            .unwrap();
         let dirt: Vec<T> = data
             .iter()
             .rev()
@@ -299,11 +307,14 @@ mod tests {
     fn matches_the_matrices_over_sizes_updates_and_regularisation() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let sizes = [
+            (3, 2),
+            (4, 48),
             (5, 3),
             (5, 4),
             (5, 15),
             (7, 25),
             (11, 5),
+            (14, 6),
             (16, 15),
             (17, 16),
             (19, 15),
@@ -333,6 +344,8 @@ mod tests {
                     Step::Adaptive(0.9),
                     Step::Constant(0.4),
                     Step::Adaptive(3.0),
+                    Step::Accelerated(0.8),
+                    Step::Accelerated(3.0),
                 ]
                 .into_iter()
                 .enumerate()
@@ -494,6 +507,11 @@ mod tests {
                     (b.state.clone(), descent)
                 });
                 assert_eq!(four, eight);
+                if fuses() {
+                    let mut out = vec![f32::NAN; n * n];
+                    let found = network.deconvolve(&rule, &u0, &mut scratch, &mut out);
+                    assert_eq!((&out[..], found.unwrap()), (&four.0[..n * n], four.1));
+                }
                 assert_eq!(plain.1.iterations, four.1.iterations);
                 // Fused and unfused products differ by f32 rounding; a constant step is taken
                 // the other way where that decides on a gradient's sign.
@@ -637,8 +655,17 @@ mod tests {
         assert!(network.set_psf(Array2::zeros((5, 7)).view()).is_err());
         let mut psf = Array2::from_elem((5, 5), 0.04);
         psf[(1, 2)] = f64::NAN;
-        let message = network.set_psf(psf.view()).unwrap_err().to_string();
-        assert!(message.contains("(3, 2)"), "{message}");
+        for scale in [PsfScale::Sum, PsfScale::Peak] {
+            let other = Array2::from_elem((5, 7), 0.04);
+            assert!(network.set_scaled_psf(other.view(), scale).is_err());
+            for found in [
+                network.set_psf(psf.view()),
+                network.set_scaled_psf(psf.view(), scale).map(|_| ()),
+            ] {
+                let message = found.unwrap_err().to_string();
+                assert!(message.contains("(3, 2)"), "{message}");
+            }
+        }
         assert!(Network::<f32>::plan(2, 5, 0.0).is_err());
         assert!(Network::<f32>::plan(15, 49, 0.0).is_err());
     }
@@ -665,5 +692,7 @@ mod tests {
         assert_eq!(run(224, 225, &network), expected);
         assert!(run(225, 226, &network).is_err());
         assert!(run(225, 225, &other).unwrap_err().contains("23 × 23"));
+        let wider = Network::<f32>::plan(15, 7, 0.0).unwrap();
+        assert!(run(225, 225, &wider).unwrap_err().contains("7 × 7"));
     }
 }

@@ -47,8 +47,8 @@ impl<T: Real> Operator<T> {
     }
 
     /// TH_i = ½|W_ii + λG_ii|: W_ii is the sum of h² over the part of the PSF that falls inside the
-    /// stamp when centred on pixel i, times `factor`, and G_ii the same for d.
-    fn set_thresholds(&mut self, psf: ArrayView2<'_, f64>, factor: f64) {
+    /// stamp when centred on pixel i, times `square`, and G_ii the same for d.
+    fn set_thresholds(&mut self, psf: ArrayView2<'_, f64>, square: f64) {
         // Sums over all rectangles from the corner, so that any window costs four look-ups.
         let mut sums = [0.0; (MAX_PSF + 1) * (MAX_PSF + 1)];
         let stride = self.p + 1;
@@ -72,7 +72,7 @@ impl<T: Real> Operator<T> {
             for x in 0..n {
                 let (i0, i1) = window(x, self.p);
                 let at = |j: usize, i: usize| sums[j * stride + i];
-                let w = factor * (at(j1, i1) - at(j0, i1) - at(j1, i0) + at(j0, i0));
+                let w = square * (at(j1, i1) - at(j0, i1) - at(j1, i0) + at(j0, i0));
                 let (di0, di1) = window(x, 3);
                 let mut g = 0.0;
                 for row in &SUN_KERNEL[dj0..dj1] {

@@ -75,6 +75,7 @@ fn bands<T: Real, const R: usize, const S: usize, const FUSED: bool>(
     width: usize,
 ) {
     let stride = if S == 0 { left.stride } else { S };
+    debug_assert!(inner <= stride, "{inner} columns of {stride}");
     // No column is beyond a row, which the compiler does not know otherwise.
     let inner = inner.min(stride);
     // Of places instead of chunks, whose number would be a division.
@@ -112,6 +113,15 @@ fn add<T: Real, const FUSED: bool>(sums: &mut [T; LANES], factor: T, line: &[T; 
     for (sum, value) in sums.iter_mut().zip(line) {
         *sum = sum.add_product::<FUSED>(factor, *value);
     }
+}
+
+/// Whether this processor has fused multiply-adds, so that [`multiply`] has the bits of fused sums.
+#[cfg(test)]
+pub(super) fn fuses() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    return is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+    #[cfg(not(target_arch = "x86_64"))]
+    return cfg!(target_arch = "aarch64");
 }
 
 #[cfg(test)]
@@ -164,6 +174,9 @@ mod tests {
             product::<_, 4, false>(left, right, inner, &mut all[3], width);
             // The number of rows at a time does not matter.
             assert_eq!(all[1], all[2]);
+            if fuses() {
+                assert_eq!(all[0], all[1]);
+            }
             for (found, at) in all.iter().flat_map(|all| all.iter().zip(0..)) {
                 let [sum, size] = plain(left, right, inner, [at / width, at % width]);
                 // As many roundings as terms, of half a bit of 24 each.

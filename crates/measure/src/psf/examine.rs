@@ -8,6 +8,7 @@
 use ndarray::ArrayView2;
 use shearq_quantities::statistics::{SCATTER, median, upper_median};
 
+use super::effect::of_noise;
 use super::{breadth, star};
 use crate::extent::{Core, core_of_psf};
 use crate::warning::{Of, Warning};
@@ -43,8 +44,10 @@ const MANY: f64 = 0.1;
 /// What one PSF shows.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PsfLook {
+    /// Pixels a side.
+    side: usize,
     /// S/N of the star; infinite without noise.
-    pub(crate) snr: f64,
+    snr: f64,
     /// Level of the background in units of the peak, and its light in units of the star's.
     level: f64,
     background: f64,
@@ -61,6 +64,11 @@ impl PsfLook {
     /// S/N of the star; infinite without noise.
     pub(super) fn snr(&self) -> f64 {
         self.snr
+    }
+
+    /// Standard deviations of m and c by the noise of the star, if all galaxies share it.
+    pub(crate) fn effect_of_noise(&self) -> [f64; 2] {
+        of_noise(self.snr, self.side)
     }
 
     /// At a PSF of sum one, which was `moved` by so much to be in the middle; `None` if its sides are too short to tell
@@ -122,6 +130,7 @@ impl PsfLook {
         }
         let bright = (peak - outer.mean()).max(f64::MIN_POSITIVE);
         Some(PsfLook {
+            side: n,
             snr: (power - count * sigma * sigma).max(0.0).sqrt() / sigma,
             level: level / bright,
             background: level * pixels / star,
@@ -213,6 +222,7 @@ pub(crate) fn warnings(looks: &[PsfLook], shared: bool, galaxies: Option<Core>) 
     with(&|look| look.snr < enough, &|those, of| Warning::PsfNoise {
         snr: middle(those, &|look| look.snr),
         enough,
+        effect: [0, 1].map(|k| middle(those, &|look| look.effect_of_noise()[k])),
         of,
     });
     with(&|look| look.area < LEAST_AREA, &|those, of| {

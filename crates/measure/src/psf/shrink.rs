@@ -13,7 +13,7 @@ use super::sums::sum_of_squares;
 use shearq_quantities::statistics::{SCATTER, median};
 
 /// S/N between which a star is used more and more as it is. See docs/constants.md.
-const AS_IT_IS: [f64; 2] = [500.0, 1000.0];
+pub(super) const AS_IT_IS: [f64; 2] = [500.0, 1000.0];
 /// Highest order of the functions for the difference between a star and its profile. See docs/constants.md.
 const ORDER: usize = 12;
 /// Highest order of those functions that are not round. See docs/constants.md.
@@ -25,7 +25,7 @@ const LOW: usize = 2;
 /// Scale of the functions in units of the σ of the profile's core. See docs/constants.md.
 const SCALE: f64 = 1.1;
 /// Side from which on the border is free of the star's light. See docs/constants.md.
-const LEAST_SIDE: usize = 24;
+pub(super) const LEAST_SIDE: usize = 24;
 /// Value of a function below which its pixel is left out.
 const NOTHING: f64 = 1e-4;
 /// Fourth differences 1, −4, 6, −4, 1 of white noise have the variance of so many pixels.

@@ -10,7 +10,7 @@ use shearq_files::table;
 use shearq_measure::{Flag, Measurement, Observables, Warning};
 use shearq_submissions::EllipticityType;
 
-use super::row::{MeasuredRow, examined, warnings};
+use super::row::{MeasuredRow, psf_noise, warnings};
 use crate::PipelineError;
 use crate::data::run::{Claim, RUN_FILE, Run, claim};
 use crate::engine::Progress;
@@ -98,6 +98,8 @@ const WARNINGS: &str = "warnings";
 /// Key of the metadata with the effect of the noise of an image's star on its mean shear: the standard deviations of m and c.
 /// A FITS key has eight characters.
 pub const PSF_NOISE: &str = "psfnoise";
+/// Effect on m below which the noise of a star, or of rounding, is not stated.
+const LEAST_PSF_NOISE: f64 = 1e-5;
 /// Keys of the metadata of catalogues, beside fingerprints.
 pub const KEYS: [&str; 8] = [
     "creator", "submiss", "elltype", "set", "image", "settings", PSF_NOISE, WARNINGS,
@@ -281,7 +283,8 @@ impl<'a> Catalogues<'a> {
             let lines: Vec<String> = found.iter().map(Warning::to_string).collect();
             metadata.insert(WARNINGS.into(), lines.join("\n"));
         }
-        if linear && let Some([m, c]) = examined(rows).and_then(|all| all.psf_noise()) {
+        let noise = psf_noise(rows).filter(|effect| linear && effect[0] > LEAST_PSF_NOISE);
+        if let Some([m, c]) = noise {
             metadata.insert(PSF_NOISE.into(), format!("{m:.2e} {c:.2e}"));
         }
         table::write(&path, self.run.format, &table, &metadata)?;

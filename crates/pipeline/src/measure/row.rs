@@ -79,12 +79,10 @@ fn examine(
     Ok(Some(examination))
 }
 
-/// What the examinations of all rows found.
-pub(super) fn examined(rows: &[MeasuredRow]) -> Option<Examination> {
-    let mut examinations = rows.iter().filter_map(|row| row.examination.as_ref());
-    let mut all = examinations.next()?.clone();
-    examinations.for_each(|more| all.join(more));
-    Some(all)
+/// The effect of the noise of the star of an image on m and c, if all galaxies share it.
+pub(super) fn psf_noise(rows: &[MeasuredRow]) -> Option<[f64; 2]> {
+    let examinations = rows.iter().filter_map(|row| row.examination.as_ref());
+    examinations.filter_map(Examination::psf_noise).next()
 }
 
 /// The warnings about an image whose rows have been measured and calibrated.
@@ -93,7 +91,10 @@ pub(super) fn warnings(rows: &[MeasuredRow]) -> Vec<Warning> {
         return Vec::new();
     };
     let mut found = head.warnings.clone();
-    if let Some(all) = examined(rows) {
+    let mut examinations = rows.iter().filter_map(|row| row.examination.as_ref());
+    if let Some(first) = examinations.next() {
+        let mut all = first.clone();
+        examinations.for_each(|more| all.join(more));
         found.extend(all.warnings());
         let stated = head.stated_noise.and_then(|noise| all.given_noise(noise));
         found.extend(stated.map(of_header));

@@ -254,7 +254,7 @@ fn verdicts(all: &Estimate) -> Vec<String> {
             Verdict::NotMet => format!("{} not met", own.key),
             Verdict::Undecided { galaxies } => {
                 format!(
-                    "{} undecided (about {galaxies:.1e} galaxies would decide)",
+                    "{} undecided (about {galaxies:.1e} galaxies would decide if the value stays)",
                     own.key
                 )
             }

@@ -51,7 +51,14 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
         notes.push("The ellipticities are distortions, divided by their response to shear.".into());
     }
     if means.iter().any(noticed) {
-        notes.push("Errors include the noise of the star of each image.".into());
+        let images = means.iter().map(|mean| mean.images.len()).sum::<usize>();
+        let stated = means.iter().map(|mean| mean.noisy_stars).sum::<usize>();
+        let of = if stated == images {
+            "each image".to_owned()
+        } else {
+            format!("{stated} of {images} images, whose catalogues state it")
+        };
+        notes.push(format!("Errors include the noise of the star of {of}."));
     }
     let mut headings: Vec<Heading> = headings.map(|(key, label)| Heading::new(key, label)).into();
     if selected {

@@ -158,7 +158,7 @@ impl Pixels {
     ) {
         let (half, places, width) = (self.half, self.places, self.width);
         let [sums, differences] = &mut scratch.folded;
-        // There is room for it: a stamp has at least eight pixels a side.
+        // There is room for it: two parts have at least eight rows.
         let folded = sums
             .chunks_exact_mut(places)
             .zip(differences.chunks_exact_mut(places));
