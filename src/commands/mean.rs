@@ -76,6 +76,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             "set {set:02}: the selection leaves none of {} galaxies (expected some). Try: a lower threshold",
             mean.cut
         );
+        anyhow::ensure!(
+            mean.shear.is_some() || mean.galaxies == 0,
+            "set {set:02}: the mean response of {} galaxies is not positive, so there is no mean shear. Try: more galaxies, or a lower threshold",
+            mean.galaxies
+        );
         if let Some(flagged) = mean.mostly_flagged() {
             anyhow::ensure!(mean.galaxies > 0, "set {set:02}: {flagged}");
             tell(format_args!("warning: set {set:02}: {flagged}"));
