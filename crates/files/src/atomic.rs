@@ -384,7 +384,7 @@ pub fn write(target: impl AsRef<Path>, bytes: &[u8]) -> Result<(), FileError> {
     written(target, bytes)?.finish()
 }
 
-/// Like [`write`], but does not replace an existing `target`. Returns whether it was written.
+/// Like [`write()`], but does not replace an existing `target`. Returns whether it was written.
 ///
 /// # Errors
 /// If the file cannot be written.

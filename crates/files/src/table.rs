@@ -394,7 +394,7 @@ pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
         .collect()
 }
 
-/// The values of `keys` that a table written by [`write`] carries, those that it has.
+/// The values of `keys` that a table written by [`write()`] carries, those that it has.
 ///
 /// # Errors
 /// If the file cannot be read.

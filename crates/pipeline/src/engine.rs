@@ -1,6 +1,6 @@
 //! Ordered, bounded, parallel mapping: one thread reads, a pool works, and the calling thread writes.
 //!
-//! Results reach the writer in the order of reading, for any number of threads. At most [`IN_FLIGHT`] items per worker
+//! Results reach the writer in the order of reading, for any number of threads. At most `IN_FLIGHT` items per worker
 //! exist at a time, so memory does not grow with the length of the work.
 
 use std::any::Any;

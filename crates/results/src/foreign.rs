@@ -256,7 +256,7 @@ pub fn sum_foreign(
     }
 }
 
-/// A [`ReadImage`] for other programs' catalogues with the given columns.
+/// A reader of images for other programs' catalogues with the given columns.
 pub fn plain_columns<'a>(
     columns: [&'a str; 4],
     screen: Screen,

@@ -18,7 +18,7 @@ const MANY: usize = 1500;
 /// Names of the two updates.
 const UPDATES: [&str; 2] = ["adaptive", "accelerated"];
 
-/// Energy above the minimum and cost, for both updates and all [`ITERATIONS`].
+/// Energy above the minimum and cost, for both updates and several numbers of iterations.
 #[derive(Debug)]
 pub struct Convergence {
     configuration: String,

@@ -253,7 +253,7 @@ impl NoiseSurvey {
         })
     }
 
-    /// The same for [`Worker::set_survey`](crate::Worker::set_survey); `None` where all stamps are such that their galaxies
+    /// The same for [`Worker::image`](crate::Worker::image); `None` if all stamps are such that their galaxies
     /// will be flagged.
     ///
     /// # Errors
