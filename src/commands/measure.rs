@@ -9,7 +9,7 @@ use shearq_measure::Flag;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::run::{Run, Source, open_data};
 use shearq_pipeline::images::{self, ImageId};
-use shearq_pipeline::measure::{Session, Summary};
+use shearq_pipeline::measure::{Session, Summary, all_flagged};
 use shearq_submissions::Registry;
 
 use crate::arguments::{SetList, Sharding, Threads};
@@ -107,7 +107,7 @@ pub(super) fn measure(
 /// Reports on standard error what was measured and how fast.
 ///
 /// # Errors
-/// If all galaxies are flagged.
+/// If all galaxies that were measured now are flagged; or, if none was, all that were measured before.
 pub(super) fn report(
     run: &Run,
     summary: &Summary,
@@ -142,7 +142,12 @@ pub(super) fn report(
             .collect();
         tell(format_args!("flagged: {}", reasons.join(", ")));
     }
-    match summary.all_flagged() {
+    // What failed fails again if it is continued.
+    let earlier = match summary.images {
+        0 => all_flagged(run, out)?,
+        _ => None,
+    };
+    match summary.all_flagged().or(earlier) {
         Some(warning) => anyhow::bail!("no galaxy could be measured: {warning}"),
         None => Ok(()),
     }

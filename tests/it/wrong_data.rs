@@ -165,16 +165,22 @@ fn results_without_a_galaxy_are_an_error_with_the_likely_cause() {
     let own = at("own.toml");
     let settings = format!("extends = \"{LINEAR}\"\n[noise]\nsky = \"none\"\n");
     fs::write(&own, settings).unwrap();
-    let message = {
+    let measured = || {
         let done = shearq(&[&measure[..], &["--submission", text(&own)]].concat());
         assert_eq!(done.status.code(), Some(1));
         String::from_utf8(done.stderr).unwrap()
     };
+    let message = measured();
     assert!(message.contains("the sky has a gradient"), "{message}");
     let expected = "256 of 256 galaxies are flagged (most frequent reason: a second peak near the galaxy). Try: check sky gradients";
     assert!(
         message.contains(&format!("error: no galaxy could be measured: {expected}")),
         "{message}"
+    );
+    let again = measured();
+    assert!(
+        again.contains("1 there already") && again.contains(expected),
+        "{again}"
     );
     let message = fail(&["mean", "--measured", text(&out)]);
     assert!(

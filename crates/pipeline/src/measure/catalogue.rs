@@ -166,6 +166,27 @@ pub(crate) fn metadata(
     Ok(all)
 }
 
+/// A warning with the most frequent reason if the catalogues of the results folder `out` have galaxies and all are flagged.
+///
+/// # Errors
+/// If a catalogue cannot be read.
+pub fn all_flagged(run: &Run, out: &Path) -> Result<Option<Warning>, FileError> {
+    let files = run.catalogues(out, &[])?;
+    let mut summary = Summary::default();
+    for set in files.wanted(&[]) {
+        for (_, path) in files.of_set(set) {
+            let read = table::read(&path, Some(&["flags"]), table::MAX_ROWS)?;
+            for &bits in &*table::numbers(&read, "flags", &path)? {
+                if bits == 0.0 {
+                    return Ok(None);
+                }
+                summary.add(true, |flag| bits as u32 & flag as u32 != 0);
+            }
+        }
+    }
+    Ok(summary.all_flagged())
+}
+
 /// Counts of a measurement.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Summary {
@@ -200,11 +221,16 @@ impl Summary {
     fn count(&mut self, rows: &[MeasuredRow]) {
         self.images += 1;
         for galaxy in rows.iter().flat_map(|row| &row.galaxies) {
-            self.galaxies += 1;
-            self.flagged += u64::from(!galaxy.flags.is_empty());
-            for (count, flag) in self.flags.iter_mut().zip(Flag::ALL) {
-                *count += u64::from(galaxy.flags.contains(flag));
-            }
+            self.add(!galaxy.flags.is_empty(), |flag| galaxy.flags.contains(flag));
+        }
+    }
+
+    /// Counts a galaxy.
+    fn add(&mut self, flagged: bool, with: impl Fn(Flag) -> bool) {
+        self.galaxies += 1;
+        self.flagged += u64::from(flagged);
+        for (count, flag) in self.flags.iter_mut().zip(Flag::ALL) {
+            *count += u64::from(with(flag));
         }
     }
 }
