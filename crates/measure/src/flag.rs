@@ -85,6 +85,11 @@ impl Flags {
         self.0
     }
 
+    /// The reasons of the bits of the catalogues' column.
+    pub fn from_bits(bits: u32) -> Flags {
+        Flags(bits)
+    }
+
     pub(crate) fn add(&mut self, flag: Flag) {
         self.0 |= flag as u32;
     }

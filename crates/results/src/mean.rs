@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
-use shearq_measure::{Flag, MeanShear, Selection, ShearSum, Warning};
+use shearq_measure::{Flag, Flags, MeanShear, Selection, ShearSum, Warning};
 use shearq_pipeline::data::run::Run;
 use shearq_pipeline::inputs::PSF;
 use shearq_pipeline::measure::PSF_NOISE;
@@ -118,7 +118,7 @@ fn mean_of(
         };
         for &bits in &*rows.flags {
             for (count, flag) in flags.iter_mut().zip(Flag::ALL) {
-                *count += usize::from(bits as u32 & flag as u32 != 0);
+                *count += usize::from(Flags::from_bits(bits as u32).contains(flag));
             }
         }
         let mut share = [0.0; 2];
@@ -348,7 +348,7 @@ mod tests {
         assert!((shear.shear[0] - 0.25).abs() < 1e-15 && (shear.shear[1] + 0.125).abs() < 1e-15);
         // Residuals 0.05 − 0.25 · 0.4 and 0.2 − 0.25 · 0.6 are ∓0.05, over the response: √(2 · 0.01)/2.
         assert!((shear.error()[0] - 0.1).abs() < 1e-15, "{shear:?}");
-        // That of 0.1 and 0.4.
+        // The scatter of 0.1 and 0.4.
         let scatter = 0.3 / 2f64.sqrt();
         assert!((mean.scatter[0] - scatter).abs() < 1e-15, "{mean:?}");
         // Without responses the residuals are ∓0.15.

@@ -54,6 +54,11 @@ pub struct Response {
     pub total: [f64; 2],
 }
 
+/// Root mean square over the components.
+fn rms(values: [f64; 2]) -> f64 {
+    (values.iter().map(|v| v * v).sum::<f64>() / 2.0).sqrt()
+}
+
 fn unknown() -> [f64; 2] {
     [f64::NAN; 2]
 }
@@ -112,12 +117,12 @@ impl Regression {
 impl Response {
     /// Root mean square over the components of the calibrated scatter.
     pub fn rms_scatter(&self) -> f64 {
-        (self.scatter.iter().map(|s| s * s).sum::<f64>() / 2.0).sqrt()
+        rms(self.scatter)
     }
 
     /// Root mean square over the components of the calibrated ellipticity: intrinsic shapes and noise.
     pub fn rms_total(&self) -> f64 {
-        (self.total.iter().map(|s| s * s).sum::<f64>() / 2.0).sqrt()
+        rms(self.total)
     }
 
     /// Standard error of [`Response::rms_scatter`] for Gaussian noise.

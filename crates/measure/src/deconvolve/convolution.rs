@@ -1,6 +1,6 @@
 //! The convolution H with the PSF and its transpose, under a zero boundary, by sums over modes.
 //!
-//! The stamp is continued by zeros to a period in which nothing that wraps around reaches it again. Its few modes are sums
+//! The stamp is continued by zeros to a period that is long enough: light that wraps around does not reach it again. Its few modes are sums
 //! of real numbers by parity, as `spectral::plane` defines them for another method: with s = −sin,
 //!
 //! ```text
@@ -12,7 +12,7 @@
 
 use ndarray::ArrayView2;
 
-use super::fold::{fold, unfold};
+use super::fold::Folding;
 use super::product::{LANES, Matrix, ROWS, product};
 use super::real::Real;
 
@@ -70,96 +70,29 @@ impl Period {
         }
     }
 
-    /// cos and s of mode `k` at the place `place` of a folded image of `n` pixels a side.
-    fn waves(&self, n: usize, k: usize, place: usize) -> [f64; 2] {
-        let middle = if n.is_multiple_of(2) { 0.5 } else { 0.0 };
+    /// cos and s of mode `k` at the place `place` of a folded image.
+    fn waves(&self, folding: &Folding, k: usize, place: usize) -> [f64; 2] {
         let angle = std::f64::consts::TAU * k as f64 / self.pixels as f64;
-        let (sin, cos) = (angle * (place as f64 + middle)).sin_cos();
+        let (sin, cos) = (angle * folding.distance(place)).sin_cos();
         [cos, -sin]
     }
 }
 
-/// How a folded image of n×n pixels lies in memory: four parts, in the order of [`fold`], each in `band` rows of `places`
-/// numbers. What is not used is zero.
-#[derive(Debug, Clone, Copy)]
-struct Folding {
-    n: usize,
-    /// Places along an axis from the middle on.
-    half: usize,
-    places: usize,
-    /// Two parts are a multiple of [`ROWS`].
-    band: usize,
-}
-
-impl Folding {
-    fn new(n: usize) -> Self {
-        let half = n.div_ceil(2);
-        Folding {
-            n,
-            half,
-            places: half.next_multiple_of(LANES),
-            band: half.next_multiple_of(ROWS / 2),
-        }
-    }
-
-    /// Numbers in a part.
-    fn part(&self) -> usize {
-        self.band * self.places
-    }
-
-    #[inline(always)]
-    fn fold<T: Real>(&self, image: &[T], parts: &mut [T]) {
-        let (sums, differences) = parts.split_at_mut(2 * self.part());
-        let (ss, sd) = sums.split_at_mut(self.part());
-        let (ds, dd) = differences.split_at_mut(self.part());
-        fold(image, self.n, self.places, [ss, sd, ds, dd]);
-    }
-
-    /// The image whose parts, even and odd along each axis, are `parts`.
-    #[inline(always)]
-    fn unfold<T: Real>(&self, parts: &[T], image: &mut [T]) {
-        let (even, odd) = parts.split_at(2 * self.part());
-        let (ee, eo) = even.split_at(self.part());
-        let (oe, oo) = odd.split_at(self.part());
-        unfold([ee, eo, oe, oo], self.places, self.n, image);
-    }
-
-    /// What the square of each number adds to the sum of the squares of the pixels.
-    fn weights(&self) -> Vec<f64> {
-        let middle = |place: usize| {
-            let doubled = !self.n.is_multiple_of(2) && place == 0;
-            if doubled { 0.5 } else { 1.0 }
-        };
-        let mut weights = vec![0.0; 4 * self.part()];
-        for part in weights.chunks_exact_mut(self.part()) {
-            for (y, row) in part
-                .chunks_exact_mut(self.places)
-                .take(self.half)
-                .enumerate()
-            {
-                for (x, weight) in row[..self.half].iter_mut().enumerate() {
-                    // Four pixels of a square; each part is four times as large as what it adds to a pixel.
-                    *weight = middle(x) * middle(y) / 4.0;
-                }
-            }
-        }
-        weights
-    }
-}
-
-/// A table of `rows` by `columns`, zero outside of what `value` is asked for.
-fn table<T: Real>(
+/// Tables for cos and for s of `rows` by `columns`, zero outside of what `value` is asked for.
+fn tables<T: Real>(
     [rows, columns]: [usize; 2],
     [all_rows, all_columns]: [usize; 2],
-    value: impl Fn(usize, usize) -> f64,
-) -> Vec<T> {
-    let mut table = vec![T::ZERO; all_rows * all_columns];
+    value: impl Fn(usize, usize) -> [f64; 2],
+) -> [Vec<T>; 2] {
+    let mut tables = [0; 2].map(|_| vec![T::ZERO; all_rows * all_columns]);
     for row in 0..rows {
         for column in 0..columns {
-            table[row * all_columns + column] = T::from_f64(value(row, column));
+            for (table, value) in tables.iter_mut().zip(value(row, column)) {
+                table[row * all_columns + column] = T::from_f64(value);
+            }
         }
     }
-    table
+    tables
 }
 
 /// From the pixels of an image to its modes.
@@ -177,10 +110,9 @@ impl<T: Real> ToModes<T> {
     fn new(n: usize, period: Period) -> Self {
         let folding = Folding::new(n);
         let Folding { half, places, .. } = folding;
-        let wave = |parity: usize, k: usize, place: usize| {
-            // Folding doubles the middle pixel.
-            let middle = !n.is_multiple_of(2) && place == 0;
-            period.waves(n, k, place)[parity] * if middle { 0.5 } else { 1.0 }
+        let wave = |k: usize, place: usize| {
+            let share = folding.share(place);
+            period.waves(&folding, k, place).map(|wave| wave * share)
         };
         let Period {
             modes, rows, width, ..
@@ -188,29 +120,25 @@ impl<T: Real> ToModes<T> {
         ToModes {
             folding,
             period,
-            across: [0, 1].map(|parity| {
-                table([half, modes], [half, width], |place, k| {
-                    wave(parity, k, place)
-                })
-            }),
-            down: [0, 1].map(|parity| {
-                table([modes, half], [rows, places], |k, place| {
-                    wave(parity, k, place)
-                })
-            }),
+            across: tables([half, modes], [half, width], |place, k| wave(k, place)),
+            down: tables([modes, half], [rows, places], wave),
         }
     }
 
     /// Takes the modes of a folded image.
     #[inline(always)]
-    fn transform<const R: usize, const FUSED: bool>(&self, parts: &[T], scratch: &mut Scratch<T>) {
+    fn transform<const R: usize, const FUSED: bool>(
+        &self,
+        parts: &[T],
+        lines: &mut [Vec<T>; 2],
+        modes: &mut Modes<T>,
+    ) {
         let Period { rows, width, .. } = self.period;
         let Folding {
             half, places, band, ..
         } = self.folding;
-        let Scratch { lines, modes, .. } = scratch;
         for x in 0..2 {
-            let parts = Matrix::new(&parts[x * 2 * band * places..], places);
+            let parts = Matrix::new(&parts[x * self.folding.len()..], places);
             let across = Matrix::new(&self.across[x], width);
             let lines = &mut lines[x][..2 * band * width];
             product::<T, R, FUSED>(parts, across, half, lines, width);
@@ -229,6 +157,8 @@ impl<T: Real> ToModes<T> {
 struct ToPixels<T> {
     folding: Folding,
     period: Period,
+    /// Places along y, filled up.
+    padded: usize,
     /// By place and mode: cos and s along y, times how many modes each stands for.
     down: [Vec<T>; 2],
     /// By mode and place, the same along x.
@@ -239,55 +169,63 @@ impl<T: Real> ToPixels<T> {
     fn new(n: usize, period: Period) -> Self {
         let folding = Folding::new(n);
         let Folding { half, places, .. } = folding;
-        let wave = |parity: usize, k: usize, place: usize| {
+        let wave = |k: usize, place: usize| {
             let count = if k == 0 { 1.0 } else { 2.0 };
-            period.waves(n, k, place)[parity] * count / period.pixels as f64
+            let waves = period.waves(&folding, k, place);
+            waves.map(|wave| wave * count / period.pixels as f64)
         };
         let Period { modes, width, .. } = period;
+        let padded = half.next_multiple_of(ROWS);
         ToPixels {
             folding,
             period,
-            down: [0, 1].map(|parity| {
-                let all = [half.next_multiple_of(ROWS), width];
-                table([half, modes], all, |place, k| wave(parity, k, place))
-            }),
-            across: [0, 1].map(|parity| {
-                table([modes, half], [modes, places], |k, place| {
-                    wave(parity, k, place)
-                })
-            }),
+            padded,
+            down: tables([half, modes], [padded, width], |place, k| wave(k, place)),
+            across: tables([modes, half], [modes, places], wave),
         }
     }
 
-    /// Writes the parts, even and odd along each axis, of the image whose modes `scratch` has.
+    /// Writes the parts, even and odd along each axis, of the image of these modes.
     #[inline(always)]
     fn transform<const R: usize, const FUSED: bool>(
         &self,
-        scratch: &mut Scratch<T>,
+        Modes(spectrum): &Modes<T>,
+        lines: &mut [Vec<T>; 2],
         parts: &mut [T],
     ) {
         let Period { modes, width, .. } = self.period;
-        let Folding {
-            half, places, band, ..
-        } = self.folding;
-        let padded = half.next_multiple_of(ROWS);
-        for (at, spectrum) in scratch.modes.0.iter().enumerate() {
+        let Folding { places, band, .. } = self.folding;
+        let halves = parts.chunks_exact_mut(self.folding.len());
+        for (at, spectrum) in spectrum.iter().enumerate() {
             let (x, y) = (at / 2, at % 2);
             let down = Matrix::new(&self.down[y], width);
-            // Rows of the first part beyond `band` are written again by the second; those of the second are not used.
-            let lines = &mut scratch.lines[x][y * band * width..][..padded * width];
+            // Rows of the first part beyond `band` are written again by the second; such rows of the second are not used.
+            let lines = &mut lines[x][y * band * width..][..self.padded * width];
             product::<T, R, FUSED>(down, Matrix::new(spectrum, width), modes, lines, width);
         }
-        for x in 0..2 {
-            let lines = Matrix::new(&scratch.lines[x], width);
+        for (x, parts) in halves.take(2).enumerate() {
+            let lines = Matrix::new(&lines[x], width);
             let across = Matrix::new(&self.across[x], places);
-            let parts = &mut parts[x * 2 * band * places..][..2 * band * places];
             product::<T, R, FUSED>(lines, across, modes, parts, places);
         }
     }
 }
 
-/// Multiplies modes by those of a kernel.
+impl<T: Real> Scratch<T> {
+    /// For transforms of both.
+    fn new(stamp: &ToModes<T>, psf: &ToModes<T>) -> Self {
+        let Period { rows, width, .. } = stamp.period;
+        let band = stamp.folding.band.max(psf.folding.band);
+        let len = stamp.folding.len().max(psf.folding.len());
+        Scratch {
+            parts: vec![T::ZERO; 2 * len],
+            lines: [0; 2].map(|_| vec![T::ZERO; (2 * band + ROWS) * width]),
+            modes: Modes([0; 4].map(|_| vec![T::ZERO; rows * width])),
+        }
+    }
+}
+
+/// Multiplies modes by the modes of a kernel.
 #[inline(always)]
 fn filter<T: Real, const FUSED: bool>(Modes(modes): &mut Modes<T>, Modes(kernel): &Modes<T>) {
     for at in (0..modes[0].len()).step_by(LANES) {
@@ -337,34 +275,21 @@ impl<T: Real> Convolution<T> {
         let period = Period::new(n, reach);
         let psf = ToModes::new(2 * reach + 1, period);
         let (stamp, back) = (ToModes::new(n, period), ToPixels::new(n, period));
-        let modes = Modes([0; 4].map(|_| vec![T::ZERO; period.rows * period.width]));
-        let mut convolution = Convolution {
+        let scratch = Scratch::new(&stamp, &psf);
+        Convolution {
             centred: vec![T::ZERO; psf.folding.n * psf.folding.n],
-            scratch: Scratch {
-                parts: Vec::new(),
-                lines: [Vec::new(), Vec::new()],
-                modes: modes.clone(),
-            },
-            transfer: modes.clone(),
-            turned: modes,
+            transfer: scratch.modes.clone(),
+            turned: scratch.modes.clone(),
+            scratch,
             stamp,
             back,
             psf,
-        };
-        convolution.scratch = convolution.scratch();
-        convolution
+        }
     }
 
     /// Buffers that fit.
     pub(super) fn scratch(&self) -> Scratch<T> {
-        let [stamp, psf] = [self.stamp.folding, self.psf.folding];
-        let rows = 2 * stamp.band.max(psf.band) + ROWS;
-        let Period { width, .. } = self.stamp.period;
-        Scratch {
-            parts: vec![T::ZERO; 4 * stamp.part().max(psf.part())],
-            lines: [0, 1].map(|_| vec![T::ZERO; rows * width]),
-            modes: self.scratch.modes.clone(),
-        }
+        Scratch::new(&self.stamp, &self.psf)
     }
 
     /// Takes `factor` times a PSF of the planned size, whose centre is its pixel p/2. Allocates nothing.
@@ -381,12 +306,16 @@ impl<T: Real> Convolution<T> {
                 *to = T::from_f64(*value * factor);
             }
         }
-        let mut parts = std::mem::take(&mut self.scratch.parts);
-        self.psf.folding.fold(&self.centred, &mut parts);
-        self.psf.transform::<R, FUSED>(&parts, &mut self.scratch);
-        self.scratch.parts = parts;
+        let Scratch {
+            parts,
+            lines,
+            modes,
+        } = &mut self.scratch;
+        let (sums, differences) = parts.split_at_mut(self.psf.folding.len());
+        self.psf.folding.fold(&self.centred, sums, differences);
+        self.psf.transform::<R, FUSED>(parts, lines, modes);
         let four = T::from_f64(4.0);
-        for (part, modes) in self.scratch.modes.0.iter().enumerate() {
+        for (part, modes) in modes.0.iter().enumerate() {
             // Turned by 180°, what is odd along one axis changes its sign.
             let sign = T::from_f64(if part == 1 || part == 2 { -1.0 } else { 1.0 });
             let out = self.transfer.0[part]
@@ -400,18 +329,29 @@ impl<T: Real> Convolution<T> {
 
     /// Numbers in a folded stamp.
     pub(super) fn folded_len(&self) -> usize {
-        4 * self.stamp.folding.part()
+        2 * self.stamp.folding.len()
     }
 
     /// What the square of each number of a folded stamp adds to the sum of the squares of its pixels.
     pub(super) fn weights(&self) -> Vec<f64> {
-        self.stamp.folding.weights()
+        let folding = &self.stamp.folding;
+        let places = folding.band * folding.places;
+        let weight = |at: usize| {
+            let (y, x) = (at % places / folding.places, at % folding.places);
+            if y.max(x) >= folding.half {
+                return 0.0;
+            }
+            // Four pixels of a square; each part is four times as large as what it adds to a pixel.
+            folding.share(x) * folding.share(y) / 4.0
+        };
+        (0..self.folded_len()).map(weight).collect()
     }
 
     /// Folds a row-major stamp.
     #[inline(always)]
     pub(super) fn fold(&self, image: &[T], folded: &mut [T]) {
-        self.stamp.folding.fold(image, folded);
+        let (sums, differences) = folded.split_at_mut(self.stamp.folding.len());
+        self.stamp.folding.fold(image, sums, differences);
     }
 
     /// Writes H times a row-major image, folded.
@@ -419,13 +359,13 @@ impl<T: Real> Convolution<T> {
     pub(super) fn apply<const R: usize, const FUSED: bool>(
         &self,
         image: &[T],
-        scratch: &mut Scratch<T>,
+        Scratch { lines, modes, .. }: &mut Scratch<T>,
         folded: &mut [T],
     ) {
-        self.stamp.folding.fold(image, folded);
-        self.stamp.transform::<R, FUSED>(folded, scratch);
-        filter::<T, FUSED>(&mut scratch.modes, &self.transfer);
-        self.back.transform::<R, FUSED>(scratch, folded);
+        self.fold(image, folded);
+        self.stamp.transform::<R, FUSED>(folded, lines, modes);
+        filter::<T, FUSED>(modes, &self.transfer);
+        self.back.transform::<R, FUSED>(modes, lines, folded);
     }
 
     /// Writes Hᵀ times a folded image, row-major.
@@ -433,14 +373,17 @@ impl<T: Real> Convolution<T> {
     pub(super) fn apply_transposed<const R: usize, const FUSED: bool>(
         &self,
         folded: &[T],
-        scratch: &mut Scratch<T>,
+        Scratch {
+            parts,
+            lines,
+            modes,
+        }: &mut Scratch<T>,
         image: &mut [T],
     ) {
-        self.stamp.transform::<R, FUSED>(folded, scratch);
-        filter::<T, FUSED>(&mut scratch.modes, &self.turned);
-        let mut parts = std::mem::take(&mut scratch.parts);
-        self.back.transform::<R, FUSED>(scratch, &mut parts);
-        self.back.folding.unfold(&parts, image);
-        scratch.parts = parts;
+        self.stamp.transform::<R, FUSED>(folded, lines, modes);
+        filter::<T, FUSED>(modes, &self.turned);
+        self.back.transform::<R, FUSED>(modes, lines, parts);
+        let (even, odd) = parts.split_at(self.stamp.folding.len());
+        self.stamp.folding.unfold(even, odd, image);
     }
 }

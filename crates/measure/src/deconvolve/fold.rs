@@ -4,15 +4,79 @@
 //! places from the middle on, `half` in each of `half` rows; the middle pixel of an odd number is the first, and is added
 //! to itself.
 
+use super::product::{LANES, ROWS};
 use super::real::Real;
 
 /// Places that are folded side by side. See docs/constants.md.
 const SIDE: usize = 8;
 
+/// How a folded image of n×n pixels lies in memory: in two halves, for sums and differences along x. Each has two parts, for
+/// sums and differences along y, in `band` rows of `places` numbers.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Folding {
+    /// Pixels a side.
+    pub(super) n: usize,
+    /// Places along an axis from the middle on.
+    pub(super) half: usize,
+    /// The same, filled up for products.
+    pub(super) places: usize,
+    /// Rows of a part. The rows of two parts are a multiple of [`ROWS`].
+    pub(super) band: usize,
+}
+
+impl Folding {
+    /// Of images of `n` pixels a side.
+    pub(super) fn new(n: usize) -> Self {
+        let half = n.div_ceil(2);
+        Folding {
+            n,
+            half,
+            places: half.next_multiple_of(LANES),
+            band: half.next_multiple_of(ROWS / 2),
+        }
+    }
+
+    /// Numbers in a half.
+    pub(super) fn len(&self) -> usize {
+        2 * self.band * self.places
+    }
+
+    /// Pixels from the middle to a place.
+    pub(super) fn distance(&self, place: usize) -> f64 {
+        let middle = if self.n.is_multiple_of(2) { 0.5 } else { 0.0 };
+        place as f64 + middle
+    }
+
+    /// The share of a place along one axis: the middle pixel is its own opposite, and folding doubles it.
+    pub(super) fn share(&self, place: usize) -> f64 {
+        if self.distance(place) == 0.0 {
+            0.5
+        } else {
+            1.0
+        }
+    }
+
+    /// Folds a row-major image.
+    #[inline(always)]
+    pub(super) fn fold<T: Real>(&self, image: &[T], sums: &mut [T], differences: &mut [T]) {
+        let (ss, sd) = sums.split_at_mut(self.band * self.places);
+        let (ds, dd) = differences.split_at_mut(self.band * self.places);
+        fold(image, self.n, self.places, [ss, sd, ds, dd]);
+    }
+
+    /// The image from its parts, even and odd along each axis. `even` and `odd` are the halves along x.
+    #[inline(always)]
+    pub(super) fn unfold<T: Real>(&self, even: &[T], odd: &[T], image: &mut [T]) {
+        let (ee, eo) = even.split_at(self.band * self.places);
+        let (oe, oo) = odd.split_at(self.band * self.places);
+        unfold([ee, eo, oe, oo], self.places, self.n, image);
+    }
+}
+
 /// Folds a row-major image of `n`×`n` pixels into parts with rows of `half` places, `stride` apart: sums along x, of sums
 /// and then of differences along y; and differences along x, of the same.
 #[inline(always)]
-pub(super) fn fold<T: Real>(image: &[T], n: usize, stride: usize, parts: [&mut [T]; 4]) {
+fn fold<T: Real>(image: &[T], n: usize, stride: usize, parts: [&mut [T]; 4]) {
     let half = n.div_ceil(2);
     for y in 0..half {
         // From the middle on, and opposite.
@@ -52,9 +116,9 @@ pub(super) fn fold<T: Real>(image: &[T], n: usize, stride: usize, parts: [&mut [
 }
 
 /// The image of `n`×`n` pixels whose parts, even or odd along each axis, are given from the middle on, in rows `stride`
-/// apart; the order of the parts is that of [`fold`].
+/// apart; the parts have the order of [`fold`].
 #[inline(always)]
-pub(super) fn unfold<T: Real>(parts: [&[T]; 4], stride: usize, n: usize, image: &mut [T]) {
+fn unfold<T: Real>(parts: [&[T]; 4], stride: usize, n: usize, image: &mut [T]) {
     let half = n.div_ceil(2);
     for y in 0..half {
         let (above, below) = ((n / 2 + y) * n, (half - 1 - y) * n);
@@ -112,7 +176,7 @@ fn fold_four<T: Real>([upper, lower]: [[T; 2]; 2]) -> [T; 4] {
     ]
 }
 
-/// The opposite of [`fold_four`], of which it needs quarters.
+/// The opposite of [`fold_four`]. It needs quarters of its results.
 #[inline(always)]
 fn unfold_four<T: Real>([ee, eo, oe, oo]: [T; 4]) -> [[T; 2]; 2] {
     let (even, odd) = (ee.plus(eo), oe.plus(oo));

@@ -7,7 +7,7 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
 use shearq_files::table;
-use shearq_measure::{Flag, Measurement, Observables, Warning};
+use shearq_measure::{Flag, Flags, Measurement, Observables, Warning};
 use shearq_submissions::EllipticityType;
 
 use super::row::{MeasuredRow, psf_noise, warnings};
@@ -180,10 +180,12 @@ pub fn all_flagged(run: &Run, out: &Path) -> Result<Option<Warning>, FileError> 
                 if bits == 0.0 {
                     return Ok(None);
                 }
-                summary.add(true, |flag| bits as u32 & flag as u32 != 0);
+                summary.add(Flags::from_bits(bits as u32));
             }
         }
     }
+    // Also with a value that has no bits.
+    summary.flagged = summary.galaxies;
     Ok(summary.all_flagged())
 }
 
@@ -221,16 +223,16 @@ impl Summary {
     fn count(&mut self, rows: &[MeasuredRow]) {
         self.images += 1;
         for galaxy in rows.iter().flat_map(|row| &row.galaxies) {
-            self.add(!galaxy.flags.is_empty(), |flag| galaxy.flags.contains(flag));
+            self.add(galaxy.flags);
         }
     }
 
     /// Counts a galaxy.
-    fn add(&mut self, flagged: bool, with: impl Fn(Flag) -> bool) {
+    fn add(&mut self, flags: Flags) {
         self.galaxies += 1;
-        self.flagged += u64::from(flagged);
+        self.flagged += u64::from(!flags.is_empty());
         for (count, flag) in self.flags.iter_mut().zip(Flag::ALL) {
-            *count += u64::from(with(flag));
+            *count += u64::from(flags.contains(flag));
         }
     }
 }

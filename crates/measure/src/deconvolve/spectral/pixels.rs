@@ -6,19 +6,14 @@
 use multiversion::multiversion;
 
 use super::plane::{Plane, Quarters};
-use crate::deconvolve::fold::fold;
-use crate::deconvolve::product::{LANES, Matrix, ROWS, multiply};
+use crate::deconvolve::fold::Folding;
+use crate::deconvolve::product::{Matrix, multiply};
 
 /// Tables for images of one size.
 #[derive(Debug, Clone)]
 pub(super) struct Pixels {
-    n: usize,
-    /// Pixels from the middle to the edge; the middle one of an odd number is the first.
-    half: usize,
-    /// The same, filled up.
-    places: usize,
-    /// Rows of a folded image, filled up.
-    band: usize,
+    folding: Folding,
+    /// Columns of a quarter.
     width: usize,
     /// Of each place along x from the middle: cos and x·s of each mode, for sums of opposite pixels.
     sums: Vec<f32>,
@@ -40,14 +35,11 @@ pub(super) struct PixelsScratch {
 impl Pixels {
     /// For images of n×n pixels.
     pub(super) fn new(n: usize, plane: &Plane) -> Self {
-        let half = n.div_ceil(2);
-        let places = half.next_multiple_of(LANES);
-        let middle = if n.is_multiple_of(2) { 0.5 } else { 0.0 };
-        let at = |place: usize| place as f64 + middle;
-        // The middle pixel is its own opposite: folding doubles it.
-        let count = |place: usize| if at(place) == 0.0 { 0.5 } else { 1.0 };
+        let folding = Folding::new(n);
+        let Folding { half, places, .. } = folding;
+        let at = |place: usize| folding.distance(place);
         let (modes, width) = (plane.modes, plane.width);
-        let cos = |k: usize, place: usize| count(place) * (plane.wave(k) * at(place)).cos();
+        let cos = |k: usize, place: usize| folding.share(place) * (plane.wave(k) * at(place)).cos();
         let s = |k: usize, place: usize| -(plane.wave(k) * at(place)).sin();
         let across = |first: &dyn Fn(usize, usize) -> f64, second: &dyn Fn(usize, usize) -> f64| {
             let mut table = vec![0.0; half * 2 * width];
@@ -70,10 +62,7 @@ impl Pixels {
             table
         };
         Pixels {
-            n,
-            half,
-            places,
-            band: half.next_multiple_of(ROWS / 2),
+            folding,
             width,
             sums: across(&cos, &s),
             differences: across(&s, &cos),
@@ -88,14 +77,14 @@ impl Pixels {
 
     /// Pixels a side.
     pub(super) fn side(&self) -> usize {
-        self.n
+        self.folding.n
     }
 
     /// Buffers that fit.
     pub(super) fn scratch(&self) -> PixelsScratch {
         PixelsScratch {
-            folded: std::array::from_fn(|_| vec![0.0; 2 * self.band * self.places]),
-            lines: std::array::from_fn(|_| vec![0.0; 2 * self.band * 2 * self.width]),
+            folded: std::array::from_fn(|_| vec![0.0; self.folding.len()]),
+            lines: std::array::from_fn(|_| vec![0.0; 2 * self.folding.band * 2 * self.width]),
         }
     }
 
@@ -110,13 +99,11 @@ impl Pixels {
             folded: [sums, differences],
             lines: [of_sums, of_differences],
         } = scratch;
-        let below = self.band * self.places;
-        {
-            let (sums, differences) = (sums.split_at_mut(below), differences.split_at_mut(below));
-            let folded = [sums.0, sums.1, differences.0, differences.1];
-            fold_image(image, self.n, self.places, folded);
-        }
-        let (half, places, width) = (self.half, self.places, 2 * self.width);
+        fold_image(&self.folding, image, sums, differences);
+        let Folding {
+            half, places, band, ..
+        } = self.folding;
+        let width = 2 * self.width;
         for (folded, table, lines) in [
             (&*sums, &self.sums, &mut *of_sums),
             (&*differences, &self.differences, &mut *of_differences),
@@ -124,7 +111,7 @@ impl Pixels {
             let (folded, table) = (Matrix::new(folded, places), Matrix::new(table, width));
             multiply(folded, table, half, lines, width);
         }
-        let lower = self.band * width;
+        let lower = band * width;
         let [cos, s, y_cos, y_s] = &self.down;
         // Of sums and of differences along y, the one transformed along x, and times x.
         let take = |lines: &[f32], with: usize, table: &[f32], out: &mut [f32]| {
@@ -156,13 +143,16 @@ impl Pixels {
         scratch: &mut PixelsScratch,
         [re, im]: [&mut [f32]; 2],
     ) {
-        let (half, places, width) = (self.half, self.places, self.width);
+        let Folding {
+            n, half, places, ..
+        } = self.folding;
+        let width = self.width;
         let [sums, differences] = &mut scratch.folded;
         // There is room for it: two parts have at least eight rows.
         let folded = sums
             .chunks_exact_mut(places)
             .zip(differences.chunks_exact_mut(places));
-        for (line, (sums, differences)) in lines.chunks_exact(self.n).zip(folded) {
+        for (line, (sums, differences)) in lines.chunks_exact(n).zip(folded) {
             fold_line(line, &mut sums[..half], &mut differences[..half]);
         }
         let across = |table| Matrix::new(table, 2 * width);
@@ -181,8 +171,8 @@ impl Pixels {
 }
 
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn fold_image(image: &[f32], n: usize, stride: usize, folded: [&mut [f32]; 4]) {
-    fold(image, n, stride, folded);
+fn fold_image(folding: &Folding, image: &[f32], sums: &mut [f32], differences: &mut [f32]) {
+    folding.fold(image, sums, differences);
 }
 
 fn fold_line(line: &[f32], sums: &mut [f32], differences: &mut [f32]) {
