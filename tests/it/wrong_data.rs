@@ -206,7 +206,7 @@ fn a_mean_of_identical_galaxies_has_no_error() {
     succeed(&[&simulate[..], &["--out", text(&at("data"))]].concat());
     let (data, out) = (at("data"), at("out"));
     spoil(&data, 1, |s| {
-        Stamps::from_shape_fn(s.dim(), |(_, y, x)| s[(0, y, x)])
+        Stamps::from_shape_fn(s.dim(), |(_, y, x)| s[(5, y, x)])
     });
     let measure = ["measure", "--data", text(&data), "--out", text(&out)];
     let done = shearq(&[&measure[..], &["--submission", LINEAR]].concat());

@@ -29,8 +29,6 @@ mod fold;
 mod kernel;
 mod network;
 mod operator;
-mod product;
-mod real;
 mod reference;
 mod rule;
 mod spectral;

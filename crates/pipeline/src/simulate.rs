@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 use shearq_quantities::FunctionalPsf;
 use shearq_quantities::Shear;
@@ -243,8 +244,13 @@ pub(super) fn draw_stamps(
 pub(super) fn draw_stars(set: &SetSimulator, fields: &ImageFields, iy: usize) -> Vec<f32> {
     let n = set.grid().n;
     let mut strip = vec![0.0; n * STAMP * STAMP];
+    let mut light = Array2::zeros((STAMP, STAMP));
+    let mut star = vec![0.0; STAMP * STAMP];
     for ix in 0..n {
-        let star = star(fields.psf.at(ix, iy), STAMP);
+        fields.psf.at(ix, iy).stamp_into(STAMP, light.view_mut());
+        for (pixel, light) in star.iter_mut().zip(light.as_slice().unwrap_or_default()) {
+            *pixel = *light as f32;
+        }
         place(&star, STAMP, ix, n, &mut strip);
     }
     strip

@@ -4,7 +4,7 @@
 //! * [`units`]: degrees, radians, pixels and multipoles.
 //! * [`FunctionalPsf`]: a Moffat or Kolmogorov PSF, integrated over pixels, with its transform.
 //! * [`radial`]: tables of radial profiles, elliptical radii and quadrature rules.
-//! * [`linear`]: the solvers of linear equations.
+//! * [`linear`]: the solvers of linear equations; [`product`]: products of small matrices.
 //! * [`statistics`]: running means and medians.
 //!
 //! # Conventions
@@ -15,8 +15,10 @@
 
 mod ellipticity;
 pub mod linear;
+pub mod product;
 mod psf;
 pub mod radial;
+pub mod real;
 pub mod statistics;
 pub mod units;
 

@@ -161,11 +161,18 @@ impl FunctionalPsf {
     /// is where a star's stamp of that side would leave it.
     pub fn stamp_beside(&self, size: usize, side: usize) -> Array2<f64> {
         let mut stamp = Array2::zeros((size, size));
+        self.stamp_into(side, stamp.view_mut());
+        stamp
+    }
+
+    /// The same in place of what a square stamp holds.
+    pub fn stamp_into(&self, side: usize, mut stamp: ArrayViewMut2<f64>) {
+        let size = stamp.nrows();
         let off = if side % 2 == size % 2 { 0.0 } else { 0.5 };
         let centre = (size as f64 - 1.0) / 2.0 + off;
         self.draw_into(centre, centre, stamp.view_mut());
         let sum = stamp.sum();
-        stamp / sum
+        stamp /= sum;
     }
 
     /// The same for a PSF that may have been assembled with values that [`FunctionalPsf::new`] refuses.

@@ -11,6 +11,11 @@ const STEP_BITS: u32 = 5;
 const OCTAVES: usize = 32;
 const INTERVALS: usize = STEPS_PER_OCTAVE * OCTAVES;
 
+/// The same for the table in single precision.
+const SINGLE_STEPS_PER_OCTAVE: usize = 1 << SINGLE_STEP_BITS;
+const SINGLE_STEP_BITS: u32 = 9;
+const SINGLE_INTERVALS: usize = SINGLE_STEPS_PER_OCTAVE * OCTAVES;
+
 /// A smooth function of a squared radius u ≥ 0, as cubics on intervals that widen with u.
 ///
 /// With v = 1 + u/`unit`, each doubling of v is divided into 32 equal intervals. Both the doubling
@@ -19,11 +24,14 @@ const INTERVALS: usize = STEPS_PER_OCTAVE * OCTAVES;
 ///
 /// The cubics meet the function at both ends of an interval and at a quarter and three quarters
 /// of it (Chebyshev–Lobatto points). For (1 + u)^(−3/2) the error is near 4e-8 of the value.
+///
+/// [`RadialTable::single`] interpolates linearly between 512 nodes to each doubling, which takes two
+/// loads of memory instead of four.
 #[derive(Debug, Clone)]
 pub struct RadialTable {
     per_unit: f64,
     double: Box<[[f64; 4]; INTERVALS]>,
-    single: Box<[[f32; 4]; INTERVALS]>,
+    single: Box<[f32; SINGLE_INTERVALS + 1]>,
 }
 
 impl RadialTable {
@@ -60,15 +68,18 @@ impl RadialTable {
             ];
             start = end;
         }
-        let mut single = Box::new([[0.0; 4]; INTERVALS]);
-        for (narrow, wide) in single.iter_mut().zip(double.iter()) {
-            *narrow = wide.map(|c| c as f32);
-        }
-        RadialTable {
+        let mut table = RadialTable {
             per_unit: 1.0 / unit,
             double,
-            single,
+            single: Box::new([0.0; SINGLE_INTERVALS + 1]),
+        };
+        for index in 0..SINGLE_INTERVALS {
+            let octave = f64::powi(2.0, (index / SINGLE_STEPS_PER_OCTAVE) as i32);
+            let place = (index % SINGLE_STEPS_PER_OCTAVE) as f64;
+            let v = octave * (1.0 + place / SINGLE_STEPS_PER_OCTAVE as f64);
+            table.single[index] = table.at((v - 1.0) * unit) as f32;
         }
+        table
     }
 
     /// The function at squared radius `u` ≥ 0.
@@ -92,7 +103,7 @@ impl RadialTable {
     pub fn single(&self) -> SingleTable<'_> {
         SingleTable {
             per_unit: self.per_unit as f32,
-            cubics: &self.single,
+            nodes: &self.single,
         }
     }
 }
@@ -101,21 +112,22 @@ impl RadialTable {
 #[derive(Debug, Clone, Copy)]
 pub struct SingleTable<'a> {
     per_unit: f32,
-    cubics: &'a [[f32; 4]; INTERVALS],
+    nodes: &'a [f32; SINGLE_INTERVALS + 1],
 }
 
 impl SingleTable<'_> {
-    /// The function at squared radius `u` ≥ 0.
+    /// The function at squared radius `u` ≥ 0. For (1 + u)^(−3/2) it is up to 2e-6 of the value too large.
     #[inline(always)]
     pub fn at(self, u: f32) -> f32 {
-        const FRACTION: u32 = 23 - STEP_BITS;
+        const FRACTION: u32 = 23 - SINGLE_STEP_BITS;
         // The largest f32 under 2^32.
         const LAST: f32 = 4_294_967_040.0;
         let v = (1.0 + u * self.per_unit).min(LAST);
         let bits = v.to_bits().wrapping_sub(1.0f32.to_bits());
-        let [c0, c1, c2, c3] = self.cubics[(bits >> FRACTION) as usize & (INTERVALS - 1)];
+        let index = (bits >> FRACTION) as usize & (SINGLE_INTERVALS - 1);
+        let (below, above) = (self.nodes[index], self.nodes[index + 1]);
         let t = (bits & ((1 << FRACTION) - 1)) as i32 as f32 * (1.0 / (1u32 << FRACTION) as f32);
-        c0 + t * (c1 + t * (c2 + t * c3))
+        below + t * (above - below)
     }
 }
 
@@ -217,8 +229,9 @@ mod tests {
                 break;
             }
             assert!((table.at(u) / f(u) - 1.0).abs() < 1e-7, "u = {u}");
+            // f″ h²/8 is 1.8e-6 of f for intervals h of 1/512 of v, and f32 adds 1e-7.
             assert!(
-                (f64::from(single.at(u as f32)) / f(u) - 1.0).abs() < 1e-6,
+                (f64::from(single.at(u as f32)) / f(u) - 1.0).abs() < 2e-6,
                 "u = {u}"
             );
         }

@@ -10,6 +10,7 @@
 pub mod field;
 pub mod galaxy;
 pub mod kinds;
+mod noise;
 pub mod render;
 pub mod set;
 pub mod signal;

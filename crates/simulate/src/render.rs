@@ -1,29 +1,32 @@
 //! Noise-free stamps of PSF-convolved galaxies, integrated over pixels.
 //!
-//! The image is the inverse transform of galaxy × PSF × pixel on a grid of wavenumbers. A discrete
-//! transform of N × N points repeats the image every N pixels and repeats the spectrum every 2π:
-//! light from the repeated images folds into the stamp where N is small, and wavenumbers beyond π
-//! must be added onto those within (that is what sampling does to real light, too).
-//! [`Renderer::render`] chooses N and the largest wavenumber for each galaxy so that neither is
-//! seen; [`render_reference`] reads like the equation and is the oracle of its tests.
+//! The image is a sum over wavenumbers 2π/N · (i, j) of galaxy × PSF × pixel. It repeats every N pixels: light from the
+//! repeated images folds into the stamp where N is small. [`Renderer::render`] chooses N and the largest wavenumber for
+//! each galaxy so that neither is seen; [`render_reference`] reads like the equation and is the oracle of its tests.
+//!
+//! So few of the wavenumbers have light that their sums take less time as products with small tables than as fast
+//! transforms ([`shearq_quantities::product`]). Positions are counted from the stamp's middle, where cosines are even and
+//! sines are odd: one half of the stamp gives the other. At the centres of pixels, wavenumbers that differ by 2π are the
+//! same wave, so those beyond π are added onto those within (that is what sampling does to real light, too).
 
 use std::f64::consts::{PI, TAU};
-use std::sync::Arc;
+use std::ops::Range;
 
 use multiversion::multiversion;
 use ndarray::Array2;
-use shearq_fourier::{Complex32, Complex64, ComplexToReal, Plan32, Planner32};
+use shearq_fourier::{Complex32, Complex64};
 use shearq_quantities::FunctionalPsf;
 use shearq_quantities::Shear;
 use shearq_quantities::TransformedPsf;
+use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
 use shearq_quantities::radial::{QuadraticForm, SingleTable};
 
 use super::galaxy::{Component, EXPONENTIAL_HALF_LIGHT, Galaxy, Sersic};
 
-/// Wavenumbers are dropped where galaxy × PSF is below this share of the flux. The image loses
-/// about 1/(2π) ∫ k |F| dk over them; in a PSF's exponential tail near k = 3 that is of the same
-/// order, against a peak pixel of some 2e-2 of the flux.
-const SPECTRUM_TOLERANCE: f64 = 3e-6;
+/// Wavenumbers are dropped where galaxy × PSF × pixel is below this share of the flux. The image loses
+/// about 1/(2π) ∫ k |F| dk over them; in a PSF's exponential tail near k = 3.5 that is a fifth of it,
+/// against a peak pixel of some 2e-2 of the flux.
+const SPECTRUM_TOLERANCE: f64 = 6e-6;
 
 /// Light that may fold into the nearest corner of the stamp, relative to the galaxy's peak.
 const FOLDING_TOLERANCE: f64 = 3e-5;
@@ -31,12 +34,12 @@ const FOLDING_TOLERANCE: f64 = 3e-5;
 /// The largest wavenumber in units of π. It is reached only by PSFs with a FWHM near one pixel.
 const MAX_ORDER: usize = 3;
 
-/// Smallest transforms tried, in thirds of the stamp's size.
-const GRIDS_IN_THIRDS: [usize; 4] = [6, 8, 12, 24];
+/// Smallest periods tried, in thirds of the stamp's size.
+const PERIODS_IN_THIRDS: [usize; 4] = [6, 8, 12, 24];
 
 /// Draws galaxies on square stamps of one size.
 ///
-/// It holds the plans of the transforms and is shared between threads; what changes with a galaxy
+/// It holds the tables of cosines and sines and is shared between threads; what changes with a galaxy
 /// is in the caller's [`RenderScratch`].
 pub struct Renderer {
     stamp: usize,
@@ -49,14 +52,25 @@ impl std::fmt::Debug for Renderer {
     }
 }
 
-/// One size of transform.
+/// One period of the image, in pixels, and the wavenumbers 2πj/N that belong to it.
 struct Grid {
+    /// N. It is even, and N/2 + 1 wavenumbers are a whole number of lanes.
     size: usize,
-    /// The inverse transform along y.
-    columns: Plan32,
-    /// The inverse transform along x, from half of the wavenumbers to real values.
-    rows: Arc<dyn ComplexToReal<f32>>,
-    /// sin(k/2)/(k/2), a pixel's transform along one axis, at k = 2πj/N.
+    /// Half of the stamp, its middle included, and padded to rows of a product.
+    rows: usize,
+    /// Half of the stamp, padded to lanes of a product.
+    width: usize,
+    /// What a wave is multiplied by if its wavenumber changes by 2π. Positions in the stamp are half pixels from the
+    /// middle if its side is even.
+    turn: f32,
+    /// cos(2πjd/N) at distances d from the middle, and the same of sines. Rows are d.
+    cosines: Vec<f32>,
+    sines: Vec<f32>,
+    /// The same, rows are j. Sines have the opposite sign.
+    cosines_across: Vec<f32>,
+    sines_across: Vec<f32>,
+    /// sin(k/2)/(k/2), a pixel's transform along one axis, at k = 2πj/N; half at 0, because this wavenumber has no
+    /// opposite one that it stands for.
     pixel: Vec<f32>,
 }
 
@@ -64,18 +78,20 @@ struct Grid {
 /// influence the result.
 #[derive(Default)]
 pub struct RenderScratch {
-    /// One column after the other: y runs fastest.
-    spectrum: Vec<Complex32>,
-    fft: Vec<Complex32>,
-    row: Vec<Complex32>,
-    line: Vec<f32>,
-    /// Galaxy and PSF × pixel on one column.
-    amplitude: Vec<f32>,
-    blur: Vec<f32>,
-    /// Transform of pixels along y times 1/N², for ky from −last to last.
-    pixel_y: Vec<f32>,
+    /// Light at one ky and at its opposite.
+    lines: [Vec<f32>; 2],
+    /// Sum of both, and their difference times i, with the phases of the shift: real parts before imaginary parts.
+    pair: [Vec<f32>; 2],
+    /// The same for all ky, which are rows, with wavenumbers beyond π added onto those within.
+    sums: Vec<f32>,
+    differences: Vec<f32>,
+    /// Even and odd parts of what is transformed.
+    even: Vec<f32>,
+    odd: Vec<f32>,
+    /// Real and imaginary parts of what is transformed along y; rows are y.
+    along_y: [Vec<f32>; 2],
     transfer: Transfer,
-    phases: [Phases; Galaxy::MAX_COMPONENTS],
+    phases: Phases,
 }
 
 impl std::fmt::Debug for RenderScratch {
@@ -84,57 +100,59 @@ impl std::fmt::Debug for RenderScratch {
     }
 }
 
-/// The transform of the PSF that was used last: galaxies of an image often share it.
+/// PSF × pixel, of the PSF that was used last: galaxies of an image often share it.
 #[derive(Default)]
 struct Transfer {
-    /// The PSF and the size of the grid.
+    /// The PSF and the period.
     of: Option<(FunctionalPsf, usize)>,
-    /// Wavenumbers along an axis up to the largest, with those of column i at ky from −last to last in line i.
-    last: usize,
+    /// Wavenumbers along an axis. Lines of kx are at ky from 0, and after them at ky from 0 downwards.
+    count: usize,
     lines: Vec<f32>,
-    /// Reach of the line of each column.
-    reaches: Vec<Option<usize>>,
+    /// How many of the line of each |ky| are known.
+    known: Vec<usize>,
 }
 
 impl Transfer {
-    /// Forgets the PSF unless it is `psf` on a grid of `size`, up to wavenumber `last`.
-    fn prepare(&mut self, psf: &TransformedPsf<'_>, size: usize, last: usize) {
+    /// Forgets the PSF unless it is `psf` with a period of `size`, and `count` wavenumbers have room.
+    fn prepare(&mut self, psf: &TransformedPsf<'_>, size: usize, count: usize) {
         let of = Some((psf.functional(), size));
-        if self.of == of && last <= self.last {
+        if self.of == of && count <= self.count {
             return;
         }
         self.of = of;
-        self.last = last;
-        self.lines.resize((last + 1) * (2 * last + 1), 0.0);
-        self.reaches.clear();
-        self.reaches.resize(last + 1, None);
+        self.count = count;
+        self.lines.resize(2 * count * count, 0.0);
+        self.known.clear();
+        self.known.resize(count, 0);
     }
 
-    /// The transform on column `i` from −reach to reach, with a quadratic form of the wavenumbers.
-    fn line(
+    /// PSF × pixel at wavenumbers `j` and -`j` along y and the first `lit` along x; `form` is the PSF's in
+    /// wavenumbers.
+    fn lines(
         &mut self,
         table: SingleTable<'_>,
         form: QuadraticForm,
-        i: usize,
-        reach: usize,
-    ) -> &[f32] {
-        let wide = 2 * self.last + 1;
-        let span = i * wide + self.last - reach..i * wide + self.last + reach + 1;
-        let line = &mut self.lines[span];
-        if self.reaches[i].is_none_or(|known| known < reach) {
-            tabulate(table, form, i, reach, line);
-            self.reaches[i] = Some(reach);
+        (j, lit): (usize, usize),
+        pixel: &[f32],
+    ) -> [&[f32]; 2] {
+        let (above, below) = self.lines.split_at_mut(self.count * self.count);
+        let [above, below] = [above, below].map(|lines| &mut lines[j * self.count..][..lit]);
+        if self.known[j] < lit {
+            let pixel_y = pixel[j];
+            tabulate(table, form, j as f32, pixel_y, pixel, above);
+            tabulate(table, form, -(j as f32), pixel_y, pixel, below);
+            self.known[j] = lit;
         }
-        line
+        [above, below]
     }
 }
 
-/// e^{−ik·x} of a shift along both axes: kx from 0 to last, ky from −last to last.
+/// e^{−ik·x} of a shift along both axes, of wavenumbers from 0.
 #[derive(Default)]
 struct Phases {
-    x: Vec<Complex32>,
-    y_re: Vec<f32>,
-    y_im: Vec<f32>,
+    x_re: Vec<f32>,
+    x_im: Vec<f32>,
+    y: Vec<Complex32>,
 }
 
 impl RenderScratch {
@@ -151,22 +169,11 @@ impl Renderer {
     /// When `stamp` is 0.
     pub fn new(stamp: usize) -> Self {
         assert!(stamp > 0, "a stamp has at least one pixel");
-        let mut planner = Planner32::new();
-        let grids = GRIDS_IN_THIRDS
-            .iter()
-            .map(|thirds| {
-                let size = good_size((stamp * thirds).div_ceil(3).max(16));
-                Grid {
-                    size,
-                    columns: planner.inverse(size),
-                    rows: planner.real_inverse(size),
-                    pixel: (0..=MAX_ORDER * size / 2)
-                        .map(|j| sinc(TAU * j as f64 / size as f64) as f32)
-                        .collect(),
-                }
-            })
-            .collect();
-        Renderer { stamp, grids }
+        let grids = PERIODS_IN_THIRDS.map(|thirds| Grid::new((stamp * thirds).div_ceil(3), stamp));
+        Renderer {
+            stamp,
+            grids: grids.into(),
+        }
     }
 
     /// Pixels on a side.
@@ -181,7 +188,7 @@ impl Renderer {
     /// `centre` is the galaxy's centre in 0-based pixel-centre coordinates: (23.5, 23.5) is the
     /// corner of the four central pixels of a 48 × 48 stamp. The centre should lie in the stamp.
     /// The sum of `out` is the flux less the light outside the stamp. Errors are near 1e-4 of the
-    /// peak or less; the transform grows with galaxies whose wings would fold, up to eight stamps.
+    /// peak or less; the period grows with galaxies whose wings would fold, up to eight stamps.
     ///
     /// # Panics
     /// When `out` has not `stamp`² values.
@@ -199,17 +206,12 @@ impl Renderer {
             "the stamp's size differs"
         );
         let grid = self.choose_grid(galaxy, psf, centre);
-        grid.fill_spectrum(galaxy, psf, centre, scratch);
-        grid.transform(self.stamp, scratch, out);
+        let modes = grid.fill(self.stamp, galaxy, psf, centre, scratch);
+        grid.transform(self.stamp, modes, scratch, out);
     }
 
-    /// The side of the transform that [`Renderer::render`] takes for a galaxy.
-    pub fn transform_size(
-        &self,
-        galaxy: &Galaxy,
-        psf: &TransformedPsf<'_>,
-        centre: (f64, f64),
-    ) -> usize {
+    /// The period of the image, in pixels, that [`Renderer::render`] takes for a galaxy.
+    pub fn period(&self, galaxy: &Galaxy, psf: &TransformedPsf<'_>, centre: (f64, f64)) -> usize {
         self.choose_grid(galaxy, psf, centre).size
     }
 
@@ -227,146 +229,206 @@ impl Renderer {
 }
 
 impl Grid {
-    /// Puts galaxy × PSF × pixel × shift / N² into the half-plane kx ≥ 0 of `scratch.spectrum`.
-    fn fill_spectrum(
+    /// For a period near `period` pixels, at most 2 shorter.
+    fn new(period: usize, stamp: usize) -> Self {
+        let modes = (period / 2).next_multiple_of(LANES);
+        let size = 2 * (modes - 1);
+        let half = stamp.div_ceil(2);
+        let (rows, width) = (half.next_multiple_of(ROWS), half.next_multiple_of(LANES));
+        let even = stamp.is_multiple_of(2);
+        let step = TAU / size as f64;
+        let angle =
+            |row: usize, j: usize| step * j as f64 * (row as f64 + if even { 0.5 } else { 0.0 });
+        let table = |lines: usize, places: usize, value: &dyn Fn(usize, usize) -> f64| {
+            let values = (0..lines * places).map(|at| value(at / places, at % places) as f32);
+            values.collect::<Vec<f32>>()
+        };
+        let count = (MAX_ORDER * size / 2 + 1).next_multiple_of(LANES);
+        let pixel = |j: usize| if j == 0 { 0.5 } else { sinc(step * j as f64) };
+        Grid {
+            size,
+            rows,
+            width,
+            turn: if even { -1.0 } else { 1.0 },
+            cosines: table(rows, modes, &|row, j| angle(row, j).cos()),
+            sines: table(rows, modes, &|row, j| angle(row, j).sin()),
+            cosines_across: table(modes, width, &|j, row| angle(row, j).cos()),
+            sines_across: table(modes, width, &|j, row| -angle(row, j).sin()),
+            pixel: table(1, count, &|_, j| pixel(j)),
+        }
+    }
+
+    /// Wavenumbers from 0 to π.
+    fn modes(&self) -> usize {
+        self.size / 2 + 1
+    }
+
+    /// Where wavenumber `j` is added: the place within π, whether it is the opposite one, and the factor.
+    fn place(&self, j: usize) -> (usize, bool, f32) {
+        let (turns, rest) = (j / self.size, j % self.size);
+        let opposite = rest > self.size / 2;
+        let turns = turns + usize::from(opposite);
+        let factor = if turns % 2 == 1 { self.turn } else { 1.0 };
+        let rest = if opposite { self.size - rest } else { rest };
+        (rest, opposite, factor)
+    }
+
+    /// Puts galaxy × PSF × pixel × shift into `scratch`, ready to be transformed along y. Returns the number of
+    /// wavenumbers along an axis.
+    fn fill(
         &self,
+        stamp: usize,
         galaxy: &Galaxy,
         psf: &TransformedPsf<'_>,
         centre: (f64, f64),
         scratch: &mut RenderScratch,
-    ) {
-        let n = self.size;
-        let half = n / 2;
-        let step = TAU / n as f64;
-        let cut = largest_wavenumber(galaxy, psf).min(MAX_ORDER as f64 * PI);
-        let last = ((cut / step) as usize).min(MAX_ORDER * n / 2);
-        let wide = 2 * last + 1;
+    ) -> usize {
+        let step = TAU / self.size as f64;
+        let cut = largest_wavenumber(galaxy, psf).min(MAX_ORDER as f64 * PI) / step;
+        let last = (cut as usize).min(MAX_ORDER * self.size / 2);
+        // Whole lanes, so that a few wavenumbers beyond the largest have their light too.
+        let count = (last + 1).next_multiple_of(LANES);
+        let lit = |j: usize| {
+            let beside = (cut * cut - (j * j) as f64).max(0.0).sqrt() as usize + 1;
+            beside.next_multiple_of(LANES).min(count)
+        };
+        let middle = (stamp as f64 - 1.0) / 2.0;
+        // Each pair of opposite wave vectors is one, and the sum is over the square of the period.
+        let norm = 2.0 / (self.size * self.size) as f32;
 
         let RenderScratch {
-            spectrum,
-            row,
-            amplitude,
-            blur,
-            pixel_y,
+            lines: [above, below],
+            pair,
+            sums,
+            differences,
             transfer,
             phases,
             ..
         } = scratch;
-        spectrum.clear();
-        spectrum.resize(n * (half + 1), Complex32::ZERO);
-        amplitude.resize(wide, 0.0);
-        blur.resize(wide, 0.0);
-        let norm = 1.0 / (n as f32 * n as f32);
-        pixel_y.clear();
-        pixel_y.extend((0..wide).map(|j| self.pixel[j.abs_diff(last)] * norm));
-        for (phases, group) in phases.iter_mut().zip(groups(galaxy)) {
-            phases.set(step, last, centre.0 + group[0].dx, centre.1 + group[0].dy);
+        let modes = (last + 1).min(self.modes());
+        let width = 2 * modes.next_multiple_of(LANES);
+        for all in [&mut *sums, &mut *differences] {
+            all.clear();
+            all.resize(modes * width, 0.0);
         }
-
-        let psf_argument = argument(psf.shape, psf.fwhm, step);
+        above.resize(count, 0.0);
+        below.resize(count, 0.0);
+        for half in &mut *pair {
+            half.resize(2 * count, 0.0);
+        }
+        transfer.prepare(psf, self.size, count);
+        let psf_form = form_in_steps(psf.shape, psf.fwhm, step);
         let psf_table = psf.transform.table().single();
-        transfer.prepare(psf, n, last);
-        let bulge_table = Sersic::de_vaucouleurs_table().single();
-        for i in 0..=last {
-            let beside = (cut / step).powi(2) - (i * i) as f64;
-            let reach = (beside.max(0.0).sqrt() as usize).min(last);
-            let span = last - reach..last + reach + 1;
-            let blur = &mut blur[span.clone()];
-            let transfer = transfer.line(psf_table, psf_argument, i, reach);
-            blurred(self.pixel[i], &pixel_y[span.clone()], transfer, blur);
-            for (phases, group) in phases.iter().zip(groups(galaxy)) {
-                let amplitude = &mut amplitude[span.clone()];
-                amplitude.fill(0.0);
-                for component in group {
-                    let at = argument(component.shape, component.half_light_radius, step);
-                    let flux = component.flux as f32;
-                    match component.profile {
-                        Sersic::Exponential => {
-                            let h2 = EXPONENTIAL_HALF_LIGHT * EXPONENTIAL_HALF_LIGHT;
-                            add_exponential(at.scaled(1.0 / h2), i, reach, flux, amplitude);
-                        }
-                        Sersic::DeVaucouleurs => {
-                            add_tabulated(bulge_table, at, i, reach, flux, amplitude);
-                        }
-                    }
-                }
-                multiply(amplitude, blur);
-                let source = Line {
-                    amplitude,
-                    re: &phases.y_re[span.clone()],
-                    im: &phases.y_im[span.clone()],
-                    phase_x: phases.x[i],
-                };
-                // Wavenumbers that differ by N are one; the half-plane holds columns 0 to N/2,
-                // and of a column beyond them the mirror image, the complex conjugate.
-                let column = i % n;
-                if column <= half {
-                    add_line(&source, reach, &mut spectrum[column * n..][..n], false);
-                }
-                let mirror = (n - column) % n;
-                if i > 0 && mirror <= half {
-                    add_line(&source, reach, &mut spectrum[mirror * n..][..n], true);
-                }
+        for group in groups(galaxy) {
+            let (x, y) = (centre.0 + group[0].dx, centre.1 + group[0].dy);
+            phases.set(step, count, x - middle, y - middle);
+            let waves: [Option<Wave>; Galaxy::MAX_COMPONENTS] =
+                std::array::from_fn(|k| group.get(k).map(|c| Wave::new(c, step)));
+            for j in 0..=last {
+                let lit = lit(j);
+                let blur = transfer.lines(psf_table, psf_form, (j, lit), &self.pixel);
+                let (above, below) = (&mut above[..lit], &mut below[..lit]);
+                shine(&waves, j as f32, blur, above, below);
+                let [sum, difference] = pair.each_mut().map(|half| &mut half[..2 * lit]);
+                let shifted = [&mut *sum, &mut *difference];
+                shift(above, below, phases, phases.y[j] * norm, shifted);
+
+                let (row, opposite, factor) = self.place(j);
+                let row = row * width..(row + 1) * width;
+                self.add(sum, factor, &mut sums[row.clone()]);
+                let factor = if opposite { -factor } else { factor };
+                self.add(difference, factor, &mut differences[row]);
             }
         }
-        // Its length says how many columns are not empty.
-        row.clear();
-        row.resize(last.min(half) + 1, Complex32::ZERO);
+        modes
     }
 
-    fn transform(&self, stamp: usize, scratch: &mut RenderScratch, out: &mut [f32]) {
-        let n = self.size;
-        let columns = scratch.row.len();
-        let need = self
-            .columns
-            .get_inplace_scratch_len()
-            .max(self.rows.get_scratch_len());
-        scratch
-            .fft
-            .resize(need.max(scratch.fft.len()), Complex32::ZERO);
-        self.columns
-            .process_with_scratch(&mut scratch.spectrum[..columns * n], &mut scratch.fft);
-        scratch.row.resize(n / 2 + 1, Complex32::ZERO);
-        scratch.line.resize(n, 0.0);
-        for (y, pixels) in out.chunks_exact_mut(stamp).enumerate() {
-            for (i, value) in scratch.row[..columns].iter_mut().enumerate() {
-                *value = scratch.spectrum[i * n + y];
+    /// Adds wavenumbers from 0 along x to those within π: real parts before imaginary parts, times a factor.
+    fn add(&self, line: &[f32], factor: f32, to: &mut [f32]) {
+        let (re, im) = line.split_at(line.len() / 2);
+        let (to_re, to_im) = to.split_at_mut(to.len() / 2);
+        let mut from = 0;
+        // Parts without a jump.
+        while from < re.len() {
+            let (place, opposite, turn) = self.place(from);
+            let factor = turn * factor;
+            let room = if opposite {
+                place
+            } else {
+                self.modes() - place
+            };
+            let part = from..re.len().min(from + room);
+            from = part.end;
+            if opposite {
+                // The complex conjugate of the opposite wave vector.
+                let places = place + 1 - part.len()..place + 1;
+                add_reversed(&re[part.clone()], factor, &mut to_re[places.clone()]);
+                add_reversed(&im[part], -factor, &mut to_im[places]);
+            } else {
+                let places = place..place + part.len();
+                add_times(&re[part.clone()], factor, &mut to_re[places.clone()]);
+                add_times(&im[part], factor, &mut to_im[places]);
             }
-            scratch.row[columns..].fill(Complex32::ZERO);
-            // Real by symmetry; only rounding is removed.
-            scratch.row[0].im = 0.0;
-            if n.is_multiple_of(2) {
-                scratch.row[n / 2].im = 0.0;
-            }
-            self.rows
-                .process_with_scratch(&mut scratch.row, &mut scratch.line, &mut scratch.fft)
-                .expect("lengths come from the plan");
-            pixels.copy_from_slice(&scratch.line[..stamp]);
         }
+    }
+
+    /// The image from what [`Grid::fill`] left.
+    fn transform(&self, stamp: usize, modes: usize, scratch: &mut RenderScratch, out: &mut [f32]) {
+        let RenderScratch {
+            sums,
+            differences,
+            even,
+            odd,
+            along_y,
+            ..
+        } = scratch;
+        let pair = 2 * modes.next_multiple_of(LANES);
+        let lines = stamp.next_multiple_of(ROWS);
+        for half in [&mut *even, &mut *odd] {
+            half.resize((self.rows * pair).max(lines * self.width), 0.0);
+        }
+        let (up, down) = (&mut even[..self.rows * pair], &mut odd[..self.rows * pair]);
+        let cosines = Matrix::new(&self.cosines, self.modes());
+        let sines = Matrix::new(&self.sines, self.modes());
+        multiply(cosines, Matrix::new(sums, pair), modes, up, pair);
+        multiply(sines, Matrix::new(differences, pair), modes, down, pair);
+        // Whole rows of the next products. What is beyond the stamp stays finite, and is not used.
+        let width = pair / 2;
+        for (part, along_y) in along_y.iter_mut().enumerate() {
+            along_y.resize(lines * width, 0.0);
+            let columns = part * width..(part + 1) * width;
+            unfold_rows(up, down, (pair, columns), &mut along_y[..stamp * width]);
+        }
+
+        let (up, down) = (
+            &mut even[..lines * self.width],
+            &mut odd[..lines * self.width],
+        );
+        let cosines = Matrix::new(&self.cosines_across, self.width);
+        let sines = Matrix::new(&self.sines_across, self.width);
+        let [re, im] = along_y.each_ref().map(|part| Matrix::new(part, width));
+        multiply(re, cosines, modes, up, self.width);
+        multiply(im, sines, modes, down, self.width);
+        unfold_pixels(up, down, (self.width, stamp), out);
     }
 }
 
 impl Phases {
-    fn set(&mut self, step: f64, last: usize, x: f64, y: f64) {
-        self.x.clear();
-        let mut phase = Complex64::ONE;
-        let turn = Complex64::from_polar(1.0, -step * x);
-        for _ in 0..=last {
-            self.x
-                .push(Complex32::new(phase.re as f32, phase.im as f32));
-            phase *= turn;
+    fn set(&mut self, step: f64, count: usize, x: f64, y: f64) {
+        let powers = |shift: f64| {
+            let turn = Complex64::from_polar(1.0, -step * shift);
+            std::iter::successors(Some(Complex64::ONE), move |phase| Some(phase * turn))
+                .take(count)
+                .map(|phase| Complex32::new(phase.re as f32, phase.im as f32))
+        };
+        self.x_re.clear();
+        self.x_im.clear();
+        for phase in powers(x) {
+            self.x_re.push(phase.re);
+            self.x_im.push(phase.im);
         }
-        self.y_re.resize(2 * last + 1, 0.0);
-        self.y_im.resize(2 * last + 1, 0.0);
-        let mut phase = Complex64::ONE;
-        let turn = Complex64::from_polar(1.0, -step * y);
-        for j in 0..=last {
-            self.y_re[last + j] = phase.re as f32;
-            self.y_im[last + j] = phase.im as f32;
-            self.y_re[last - j] = phase.re as f32;
-            self.y_im[last - j] = -phase.im as f32;
-            phase *= turn;
-        }
+        self.y.clear();
+        self.y.extend(powers(y));
     }
 }
 
@@ -377,125 +439,213 @@ fn groups(galaxy: &Galaxy) -> impl Iterator<Item = &[Component]> {
         .chunk_by(|a, b| a.dx == b.dx && a.dy == b.dy)
 }
 
-/// A column of wavenumbers from −reach to reach: real values and the phases of the shift.
-struct Line<'a> {
-    amplitude: &'a [f32],
-    re: &'a [f32],
-    im: &'a [f32],
-    phase_x: Complex32,
-}
-
-/// The squared radius in a table's units at integer wavenumbers (i, j).
-fn argument(shape: Shear, length: f64, step: f64) -> QuadraticForm {
-    QuadraticForm::of_wavenumbers(shape).scaled((length * step).powi(2))
-}
-
-/// A quadratic form on column `i`, as a polynomial in j: `(constant, linear, square)`.
-#[inline(always)]
-fn on_column(form: QuadraticForm, i: usize) -> (f32, f32, f32) {
-    let i = i as f64;
-    (
-        (form.xx * i * i) as f32,
-        (2.0 * form.xy * i) as f32,
-        form.yy as f32,
-    )
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn add_exponential(form: QuadraticForm, i: usize, reach: usize, flux: f32, out: &mut [f32]) {
-    let (constant, linear, square) = on_column(form, i);
-    for (index, value) in out.iter_mut().enumerate() {
-        let j = index as i32 as f32 - reach as i32 as f32;
-        let v = 1.0 + constant + j * (linear + square * j);
-        *value += flux / (v * v.sqrt());
-    }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn add_tabulated(
-    table: SingleTable<'_>,
-    form: QuadraticForm,
-    i: usize,
-    reach: usize,
+/// A component in steps of wavenumbers.
+#[derive(Clone, Copy)]
+struct Wave {
+    profile: Sersic,
     flux: f32,
-    out: &mut [f32],
-) {
-    let (constant, linear, square) = on_column(form, i);
-    for (index, value) in out.iter_mut().enumerate() {
-        let j = index as i32 as f32 - reach as i32 as f32;
-        let u = constant + j * (linear + square * j);
-        *value += flux * table.at(u.max(0.0));
-    }
+    /// The squared radius in units of the profile's formula or table.
+    form: QuadraticForm,
 }
 
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn tabulate(table: SingleTable<'_>, form: QuadraticForm, i: usize, reach: usize, out: &mut [f32]) {
-    let (constant, linear, square) = on_column(form, i);
-    for (index, value) in out.iter_mut().enumerate() {
-        let j = index as i32 as f32 - reach as i32 as f32;
-        let u = constant + j * (linear + square * j);
-        *value = table.at(u.max(0.0));
-    }
-}
-
-/// The transform of the PSF and of pixels.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn blurred(pixel_x: f32, pixel_y: &[f32], transfer: &[f32], out: &mut [f32]) {
-    for (out, (pixel_y, transfer)) in out.iter_mut().zip(pixel_y.iter().zip(transfer)) {
-        *out = pixel_x * pixel_y * transfer;
-    }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn multiply(values: &mut [f32], factors: &[f32]) {
-    for (value, factor) in values.iter_mut().zip(factors) {
-        *value *= factor;
-    }
-}
-
-/// Adds a column, or its point reflection, onto wavenumbers modulo the length of `target`.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn add_line(line: &Line<'_>, reach: usize, target: &mut [Complex32], mirrored: bool) {
-    let n = target.len();
-    let count = 2 * reach + 1;
-    let mut from = 0;
-    // Parts without a jump from the last to the first wavenumber. Where several meet, they are added in order.
-    while from < count {
-        // index − reach, or its opposite, made positive before the remainder.
-        let j = if mirrored { 2 * reach - from } else { from };
-        let place = (j + n * reach.div_ceil(n) - reach) % n;
-        let room = if mirrored { place + 1 } else { n - place };
-        let part = from..(from + room).min(count);
-        from = part.end;
-        if mirrored {
-            let first = place + 1 - part.len();
-            let target = target[first..=place].iter_mut().rev();
-            add_values(line, part, target, -1.0);
-        } else {
-            add_values(line, part, target[place..].iter_mut(), 1.0);
+impl Wave {
+    fn new(component: &Component, step: f64) -> Self {
+        let form = form_in_steps(component.shape, component.half_light_radius, step);
+        Wave {
+            profile: component.profile,
+            flux: component.flux as f32,
+            form: match component.profile {
+                Sersic::Exponential => form.scaled(EXPONENTIAL_HALF_LIGHT.powi(-2)),
+                Sersic::DeVaucouleurs => form,
+            },
         }
     }
 }
 
-/// Adds a part of a column, or its complex conjugate if `sign` is −1.
+/// The squared radius in units of 1/`length` at integer wavenumbers (i, j).
+fn form_in_steps(shape: Shear, length: f64, step: f64) -> QuadraticForm {
+    QuadraticForm::of_wavenumbers(shape).scaled((length * step).powi(2))
+}
+
+/// A quadratic form at wavenumber `j` along y, as a polynomial of that along x: `[constant, linear, square]`.
 #[inline(always)]
-fn add_values<'a>(
-    line: &Line<'_>,
-    part: std::ops::Range<usize>,
-    target: impl Iterator<Item = &'a mut Complex32>,
-    sign: f32,
+fn on_line(form: QuadraticForm, j: f32) -> [f32; 3] {
+    let j = f64::from(j);
+    [form.yy * j * j, 2.0 * form.xy * j, form.xx].map(|c| c as f32)
+}
+
+/// Light of components that share a centre, behind PSF and pixel, at wavenumbers `j` and -`j` along y and all from 0
+/// along x.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn shine(
+    waves: &[Option<Wave>; Galaxy::MAX_COMPONENTS],
+    j: f32,
+    blur: [&[f32]; 2],
+    above: &mut [f32],
+    below: &mut [f32],
 ) {
-    let phases = line.re[part.clone()].iter().zip(&line.im[part.clone()]);
-    let values = line.amplitude[part].iter().zip(phases);
-    let p = line.phase_x;
-    for (sum, (a, (re, im))) in target.zip(values) {
-        let (re, im) = (a * re, a * im);
-        sum.re += re * p.re - im * p.im;
-        sum.im += sign * (re * p.im + im * p.re);
+    for (line, (j, blur)) in [above, below]
+        .into_iter()
+        .zip([j, -j].into_iter().zip(blur))
+    {
+        line.fill(0.0);
+        for wave in waves.iter().flatten() {
+            let form = on_line(wave.form, j);
+            match wave.profile {
+                Sersic::Exponential => add_exponential(form, wave.flux, line),
+                Sersic::DeVaucouleurs => {
+                    let table = Sersic::de_vaucouleurs_table().single();
+                    add_tabulated(table, form, wave.flux, line);
+                }
+            }
+        }
+        for (value, blur) in line.iter_mut().zip(blur) {
+            *value *= blur;
+        }
     }
 }
 
-/// The wavenumber (rad/px) beyond which galaxy × PSF is below the tolerance in all directions.
+#[inline(always)]
+fn add_exponential([constant, linear, square]: [f32; 3], flux: f32, line: &mut [f32]) {
+    for (i, value) in line.iter_mut().enumerate() {
+        let i = i as i32 as f32;
+        *value += flux * power_of_minus_three_halves(1.0 + constant + i * (linear + square * i));
+    }
+}
+
+#[inline(always)]
+fn add_tabulated(
+    table: SingleTable<'_>,
+    [constant, linear, square]: [f32; 3],
+    flux: f32,
+    line: &mut [f32],
+) {
+    for (i, value) in line.iter_mut().enumerate() {
+        let i = i as i32 as f32;
+        let u = constant + i * (linear + square * i);
+        *value += flux * table.at(u.max(0.0));
+    }
+}
+
+/// PSF × pixel on a line of wavenumbers.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn tabulate(
+    table: SingleTable<'_>,
+    form: QuadraticForm,
+    j: f32,
+    pixel_y: f32,
+    pixel: &[f32],
+    out: &mut [f32],
+) {
+    let [constant, linear, square] = on_line(form, j);
+    for (i, (value, pixel)) in out.iter_mut().zip(pixel).enumerate() {
+        let i = i as i32 as f32;
+        let u = constant + i * (linear + square * i);
+        *value = pixel_y * pixel * table.at(u.max(0.0));
+    }
+}
+
+/// v^(−3/2) of a number that is neither tiny nor huge, to 4·10⁻⁷ of it. Square root and division would take longer than
+/// Newton's steps for 1/√v.
+#[inline(always)]
+fn power_of_minus_three_halves(v: f32) -> f32 {
+    // Half of the exponent with the opposite sign, and a straight line for the fraction: right to 3.5 %.
+    let mut root = f32::from_bits(0x5f37_5a86 - (v.to_bits() >> 1));
+    let half = 0.5 * v;
+    for _ in 0..3 {
+        root *= 1.5 - half * root * root;
+    }
+    root * root * root
+}
+
+/// The sum of two lines of wavenumbers and i times their difference, shifted by phases.
+///
+/// With a and b at ±ky, and e^{−iky} = c + iq, the sum is (a + b)c + i(a − b)q, and i times the difference is
+/// −(a + b)q + i(a − b)c.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn shift(
+    above: &[f32],
+    below: &[f32],
+    phases: &Phases,
+    phase_y: Complex32,
+    [sum, difference]: [&mut [f32]; 2],
+) {
+    let count = above.len();
+    let (below, x_re, x_im) = (
+        &below[..count],
+        &phases.x_re[..count],
+        &phases.x_im[..count],
+    );
+    let (sum_re, sum_im) = sum.split_at_mut(count);
+    let (difference_re, difference_im) = difference.split_at_mut(count);
+    let (sum_im, difference_im) = (&mut sum_im[..count], &mut difference_im[..count]);
+    let (c, q) = (phase_y.re, phase_y.im);
+    for i in 0..count {
+        let (a, b) = (above[i], below[i]);
+        let (sum, difference) = (a + b, a - b);
+        let (re, im) = (sum * c, difference * q);
+        sum_re[i] = re * x_re[i] - im * x_im[i];
+        sum_im[i] = re * x_im[i] + im * x_re[i];
+        let (re, im) = (-sum * q, difference * c);
+        difference_re[i] = re * x_re[i] - im * x_im[i];
+        difference_im[i] = re * x_im[i] + im * x_re[i];
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add_times(values: &[f32], factor: f32, to: &mut [f32]) {
+    for (to, value) in to.iter_mut().zip(values) {
+        *to += factor * value;
+    }
+}
+
+fn add_reversed(values: &[f32], factor: f32, to: &mut [f32]) {
+    for (to, value) in to.iter_mut().rev().zip(values) {
+        *to += factor * value;
+    }
+}
+
+/// Lines on both sides of the middle, from `columns` of the even and odd parts, whose lines have `width` numbers.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn unfold_rows(
+    even: &[f32],
+    odd: &[f32],
+    (width, columns): (usize, Range<usize>),
+    out: &mut [f32],
+) {
+    let wide = columns.len();
+    let count = out.len() / wide;
+    let parts = even.chunks_exact(width).zip(odd.chunks_exact(width));
+    for (row, (even, odd)) in parts.enumerate().take(count.div_ceil(2)) {
+        let (even, odd) = (&even[columns.clone()], &odd[columns.clone()]);
+        let above = &mut out[(count / 2 + row) * wide..][..wide];
+        for (value, (even, odd)) in above.iter_mut().zip(even.iter().zip(odd)) {
+            *value = even + odd;
+        }
+        let below = &mut out[((count - 1) / 2 - row) * wide..][..wide];
+        for (value, (even, odd)) in below.iter_mut().zip(even.iter().zip(odd)) {
+            *value = even - odd;
+        }
+    }
+}
+
+/// Pixels on both sides of the middle, from even and odd parts of `width` numbers for each line of `stamp` pixels.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn unfold_pixels(even: &[f32], odd: &[f32], (width, stamp): (usize, usize), out: &mut [f32]) {
+    let parts = even.chunks_exact(width).zip(odd.chunks_exact(width));
+    for (line, (even, odd)) in out.chunks_exact_mut(stamp).zip(parts) {
+        let right = line[stamp / 2..].iter_mut();
+        for (value, (even, odd)) in right.zip(even.iter().zip(odd)) {
+            *value = even + odd;
+        }
+        let left = line[..=(stamp - 1) / 2].iter_mut().rev();
+        for (value, (even, odd)) in left.zip(even.iter().zip(odd)) {
+            *value = even - odd;
+        }
+    }
+}
+
+/// The wavenumber (rad/px) beyond which galaxy × PSF × pixel is below the tolerance in all directions.
 fn largest_wavenumber(galaxy: &Galaxy, psf: &TransformedPsf<'_>) -> f64 {
     // Along its short axis an ellipse's transform reaches farthest.
     let short = |modulus: f64| (1.0 - modulus) / (1.0 + modulus);
@@ -510,7 +660,9 @@ fn largest_wavenumber(galaxy: &Galaxy, psf: &TransformedPsf<'_>) -> f64 {
                 c.flux * c.profile.fourier(k * k * scale * short(c.shape.modulus()))
             })
             .sum();
-        light * psf.transform.at(k * k * psf_scale) > limit
+        // The sine of a pixel's transform changes sign.
+        let pixel = f64::min(1.0, 2.0 / k);
+        light * psf.transform.at(k * k * psf_scale) * pixel > limit
     };
     let (mut low, mut high) = (0.0, MAX_ORDER as f64 * PI);
     if above(high) {
@@ -574,20 +726,6 @@ fn folded_light(galaxy: &Galaxy, psf: &TransformedPsf<'_>, period: f64, reach: (
             c.flux * (wings + c.profile.brightness(radius) / area)
         })
         .sum()
-}
-
-/// The smallest product of 2s and 3s that is even and at least `n`: quick to transform.
-fn good_size(n: usize) -> usize {
-    let is_good = |candidate: &usize| {
-        let mut rest = *candidate;
-        for factor in [2, 3] {
-            while rest.is_multiple_of(factor) {
-                rest /= factor;
-            }
-        }
-        rest == 1 && candidate.is_multiple_of(2)
-    };
-    (n..).find(is_good).expect("powers of 2 do not end")
 }
 
 /// sin(k/2)/(k/2): the transform of a pixel along one axis.

@@ -21,6 +21,7 @@ use shearq_scoring::{Grid, TrueShear};
 use super::field::{Content, ShearSpectrum, random_field};
 use super::galaxy::Galaxy;
 use super::kinds::{ImageType, SetKind, Variability};
+use super::noise::add_noise;
 use super::render::{RenderScratch, Renderer};
 use super::signal::power;
 
@@ -430,10 +431,7 @@ impl SetSimulator {
         let (unlensed, _) = self.galaxy(version.intrinsic, Shear::new(0.0, 0.0), &mut again);
         let scale = (snr * NOISE_SIGMA / power(&unlensed, &psf).sqrt()) as f32;
         let sigma = version.noise * NOISE_SIGMA as f32;
-        for value in out.iter_mut() {
-            let noise: f32 = StandardNormal.sample(&mut rng);
-            *value = *value * scale + noise * sigma;
-        }
+        add_noise(&mut rng, scale, sigma, out);
     }
 
     /// Ellipticity of galaxy `(ix, iy)` after lensing.

@@ -4,14 +4,16 @@ use std::f64::consts::PI;
 use std::sync::LazyLock;
 
 use multiversion::multiversion;
-use shearq_quantities::TransformedPsf;
 use shearq_quantities::radial::{QuadraticForm, composite_rule};
+use shearq_quantities::{Shear, TransformedPsf};
 
-use super::galaxy::{Component, Galaxy};
+use super::galaxy::{Component, Galaxy, Sersic};
 use super::render::sinc;
 
-/// Directions over half a turn. Equal steps are exact but for terms that only ellipticities of 0.7 have.
-const DIRECTIONS: usize = 20;
+/// Directions over a quarter of a turn. Equal steps are exact but for terms that only ellipticities of 0.7 have.
+const QUARTER: usize = 10;
+/// Directions over half a turn.
+const HALF: usize = 2 * QUARTER;
 
 /// The end of the integral in radians per pixel: beyond it the square of a 3 px PSF's transform is below 10⁻¹².
 const END: f64 = 2.0 * PI;
@@ -24,12 +26,18 @@ struct Ring {
     weight: f64,
 }
 
-/// Cosine and sine of the directions.
-static TURNS: LazyLock<[(f64, f64); DIRECTIONS]> = LazyLock::new(|| {
-    std::array::from_fn(|i| {
-        let (sin, cos) = (PI * i as f64 / DIRECTIONS as f64).sin_cos();
-        (cos, sin)
-    })
+/// Cosines and sines of the directions, in the middle of equal parts of half a turn.
+struct Turns {
+    cos: [f64; HALF],
+    sin: [f64; HALF],
+}
+
+static TURNS: LazyLock<Turns> = LazyLock::new(|| {
+    let angle = |i: usize| PI * (i as f64 + 0.5) / HALF as f64;
+    Turns {
+        cos: std::array::from_fn(|i| angle(i).cos()),
+        sin: std::array::from_fn(|i| angle(i).sin()),
+    }
 });
 
 static RINGS: LazyLock<Vec<Ring>> = LazyLock::new(|| {
@@ -38,12 +46,13 @@ static RINGS: LazyLock<Vec<Ring>> = LazyLock::new(|| {
         .into_iter()
         .map(|(t, weight)| {
             let k = t.powi(3);
-            let pixels = TURNS.map(|(cos, sin)| (sinc(k * cos) * sinc(k * sin)).powi(2));
-            let pixel = pixels.iter().sum::<f64>() / DIRECTIONS as f64;
+            let turns = TURNS.cos.iter().zip(&TURNS.sin);
+            let pixels = turns.map(|(cos, sin)| (sinc(k * cos) * sinc(k * sin)).powi(2));
+            let pixel = pixels.sum::<f64>() / HALF as f64;
             Ring {
                 k,
                 // Twice the half plane over (2π)².
-                weight: weight * 3.0 * t * t * k * pixel / (2.0 * PI * DIRECTIONS as f64),
+                weight: weight * 3.0 * t * t * k * pixel / (2.0 * PI),
             }
         })
         .collect()
@@ -59,54 +68,81 @@ static RINGS: LazyLock<Vec<Ring>> = LazyLock::new(|| {
 /// By Parseval's theorem, ∫ |F|² d²k / (2π)², to 4·10⁻⁴ for PSFs of 3 px or more and ellipticities up to 0.7.
 pub fn power(galaxy: &Galaxy, psf: &TransformedPsf<'_>) -> f64 {
     let components = galaxy.components();
-    // The forms, once for all rings.
-    let forms: [Option<QuadraticForm>; Galaxy::MAX_COMPONENTS] =
-        std::array::from_fn(|k| components.get(k).map(Component::form));
-    RINGS
-        .iter()
-        .map(|ring| {
-            let (mut re, mut im) = ([0.0; DIRECTIONS], [0.0; DIRECTIONS]);
-            for (component, form) in components.iter().zip(forms.iter().flatten()) {
-                let mut values = [0.0; DIRECTIONS];
-                on_ring(component, *form, ring.k, &TURNS, &mut values);
-                let (dx, dy) = (component.dx, component.dy);
-                if (dx, dy) == (0.0, 0.0) {
-                    // Most galaxies: no phase, which costs as much as the rest.
-                    for (re, value) in re.iter_mut().zip(values) {
-                        *re += value;
-                    }
-                    continue;
-                }
-                let places = re.iter_mut().zip(&mut im).zip(&*TURNS);
-                for (((re, im), (cos, sin)), value) in places.zip(values) {
-                    let (turn_im, turn_re) = (ring.k * (dx * cos + dy * sin)).sin_cos();
-                    *re += value * turn_re;
-                    *im += value * turn_im;
-                }
-            }
+    let first = components[0];
+    let alike = |c: &Component| c.shape == first.shape && (c.dx, c.dy) == (first.dx, first.dy);
+    let sum = |squares: &dyn Fn(f64) -> f64| -> f64 {
+        let rings = RINGS.iter().map(|ring| {
             let blur = psf.transform.at((ring.k * psf.fwhm).powi(2));
-            let light: f64 = re.iter().zip(im).map(|(re, im)| re * re + im * im).sum();
-            ring.weight * light * blur * blur
-        })
-        .sum()
+            ring.weight * squares(ring.k) * blur * blur
+        });
+        rings.sum()
+    };
+    if components.iter().all(alike) {
+        // All is symmetric about one axis. Turned onto x, which changes nothing, it repeats after a quarter.
+        let shape = Shear::new(first.shape.modulus(), 0.0);
+        let along = |c: &Component| Component { shape, ..*c }.form();
+        let lights = lights(components, along);
+        sum(&|k| mean_square::<QUARTER>(&lights, k, &TURNS))
+    } else {
+        let lights = lights(components, Component::form);
+        sum(&|k| mean_square::<HALF>(&lights, k, &TURNS))
+    }
 }
 
-/// The transform of a component, whose form is `form`, about its centre on a ring.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn on_ring(
-    component: &Component,
+/// A component in wavenumbers.
+struct Light {
+    profile: Sersic,
+    flux: f64,
     form: QuadraticForm,
+    /// Place of the centre, relative to the first component.
+    offset: (f64, f64),
+}
+
+fn lights(
+    components: &[Component],
+    form: impl Fn(&Component) -> QuadraticForm,
+) -> [Option<Light>; Galaxy::MAX_COMPONENTS] {
+    std::array::from_fn(|k| {
+        components.get(k).map(|c| Light {
+            profile: c.profile,
+            flux: c.flux,
+            form: form(c),
+            offset: (c.dx - components[0].dx, c.dy - components[0].dy),
+        })
+    })
+}
+
+/// The squared modulus of the galaxy's transform at the modulus `k` of wavenumbers, in the mean over `D` directions.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn mean_square<const D: usize>(
+    lights: &[Option<Light>; Galaxy::MAX_COMPONENTS],
     k: f64,
-    turns: &[(f64, f64); DIRECTIONS],
-    out: &mut [f64; DIRECTIONS],
-) {
-    for (value, (cos, sin)) in out.iter_mut().zip(turns) {
-        *value = form.at(k * cos, k * sin);
+    turns: &Turns,
+) -> f64 {
+    let (mut re, mut im) = ([0.0; D], [0.0; D]);
+    for light in lights.iter().flatten() {
+        let QuadraticForm { xx, xy, yy } = light.form.scaled(k * k);
+        let mut values = [0.0; D];
+        for ((value, cos), sin) in values.iter_mut().zip(&turns.cos).zip(&turns.sin) {
+            *value = xx * cos * cos + 2.0 * xy * cos * sin + yy * sin * sin;
+        }
+        light.profile.fourier_each(&mut values);
+        if light.offset == (0.0, 0.0) {
+            // Most components: no phase, which costs as much as the rest.
+            for (re, value) in re.iter_mut().zip(values) {
+                *re += light.flux * value;
+            }
+            continue;
+        }
+        let (dx, dy) = light.offset;
+        for i in 0..D {
+            let (sin, cos) = (k * (dx * turns.cos[i] + dy * turns.sin[i])).sin_cos();
+            re[i] += light.flux * values[i] * cos;
+            im[i] += light.flux * values[i] * sin;
+        }
     }
-    component.profile.fourier_each(out);
-    for value in out {
-        *value *= component.flux;
-    }
+    let squares = re.iter().zip(im).map(|(re, im)| re * re + im * im);
+    squares.sum::<f64>() / D as f64
 }
 
 #[cfg(test)]
@@ -114,7 +150,6 @@ mod tests {
     use super::*;
     use crate::render::{RenderScratch, Renderer};
     use shearq_quantities::PsfTransform;
-    use shearq_quantities::Shear;
     use shearq_quantities::{FunctionalPsf, PsfProfile};
 
     const MOFFAT: PsfProfile = PsfProfile::Moffat { beta: 3.0 };

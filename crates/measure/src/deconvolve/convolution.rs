@@ -13,8 +13,8 @@
 use ndarray::ArrayView2;
 
 use super::fold::Folding;
-use super::product::{LANES, Matrix, ROWS, product};
-use super::real::Real;
+use shearq_quantities::product::{LANES, Matrix, ROWS, product};
+use shearq_quantities::real::Real;
 
 /// H of one stamp size and PSF size, holding one PSF.
 #[derive(Debug, Clone)]

@@ -4,8 +4,8 @@
 //! places from the middle on, `half` in each of `half` rows; the middle pixel of an odd number is the first, and is added
 //! to itself.
 
-use super::product::{LANES, ROWS};
-use super::real::Real;
+use shearq_quantities::product::{LANES, ROWS};
+use shearq_quantities::real::Real;
 
 /// Places that are folded side by side. See docs/constants.md.
 const SIDE: usize = 8;

@@ -11,10 +11,10 @@ use shearq_submissions::{Clipping, Kept};
 use super::convolution::Scratch;
 use super::descent::{Descent, Stop};
 use super::operator::{Operator, padded};
-use super::product::{LANES, ROWS};
-use super::real::Real;
 use super::rule::{Rule, Step};
 use super::sun::roughen;
+use shearq_quantities::product::{LANES, ROWS};
+use shearq_quantities::real::Real;
 
 /// Buffers of one network. Images are row-major, with zeros behind them that fill the last lanes. The zeros around
 /// `lines` and behind the parts of folded images stay, too. All else may have any value between runs.

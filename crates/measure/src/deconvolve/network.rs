@@ -225,9 +225,9 @@ mod tests {
     use shearq_submissions::{Clipping, Start};
 
     use super::*;
-    use crate::deconvolve::product::{ROWS, fuses};
     use crate::deconvolve::reference::Matrices;
     use crate::deconvolve::rule::Step;
+    use shearq_quantities::product::{ROWS, fuses};
 
     fn random(rng: &mut ChaCha8Rng, n: usize) -> Array2<f64> {
         Array2::from_shape_fn((n, n), |_| rng.random_range(-1.0..1.0))

@@ -4,11 +4,11 @@ use ndarray::ArrayView2;
 use shearq_submissions::limits::MAX_PSF;
 
 use super::convolution::Convolution;
-use super::product::LANES;
-use super::real::Real;
 use super::sun::SUN_KERNEL;
 use crate::error::MeasureError;
 use crate::sizes::check_sizes;
+use shearq_quantities::product::LANES;
+use shearq_quantities::real::Real;
 
 /// H, λ and thresholds of one stamp size and PSF.
 #[derive(Debug, Clone)]

@@ -1,6 +1,6 @@
 //! The high-pass D of the regularisation.
 
-use super::real::Real;
+use shearq_quantities::real::Real;
 
 /// High-pass kernel of the regularisation; its elements sum to zero. See docs/constants.md.
 pub(super) const SUN_KERNEL: [[f64; 3]; 3] = [

@@ -231,12 +231,25 @@ fn mean_square(psf: ArrayView2<'_, f64>) -> f64 {
 fn each_difference(psf: ArrayView2<'_, f64>, mut take: impl FnMut(f64)) {
     let n = psf.nrows();
     for k in [0, 1, n - 2, n - 1] {
-        for at in 0..n - 4 {
-            let fourth = |v: [f64; 5]| v[0] - 4.0 * v[1] + 6.0 * v[2] - 4.0 * v[3] + v[4];
-            take(fourth([0, 1, 2, 3, 4].map(|i| psf[(k, at + i)])));
-            take(fourth([0, 1, 2, 3, 4].map(|i| psf[(at + i, k)])));
+        let (mut across, mut down) = ([0.0; 4], [0.0; 4]);
+        for (at, (x, y)) in psf.row(k).iter().zip(psf.column(k)).enumerate() {
+            let (x, y) = (
+                fourth_difference(&mut across, *x),
+                fourth_difference(&mut down, *y),
+            );
+            if at >= 4 {
+                take(x);
+                take(y);
+            }
         }
     }
+}
+
+/// The fourth difference of `value` and the four numbers before it.
+fn fourth_difference(before: &mut [f64; 4], value: f64) -> f64 {
+    let [a, b, c, d] = *before;
+    *before = [b, c, d, value];
+    a - 4.0 * b + 6.0 * c - 4.0 * d + value
 }
 
 /// Gauss–Hermite functions of pixels about `at`, orthonormal, a row per order.

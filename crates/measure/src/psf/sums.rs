@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 
+use multiversion::multiversion;
 use ndarray::{ArrayView1, ArrayView2};
 
 use crate::pixel::Pixel;
@@ -11,19 +12,19 @@ const LANES: usize = 16;
 
 /// The sum of all pixels.
 pub(super) fn sum<P: Pixel>(pixels: ArrayView2<'_, P>) -> f64 {
-    sum_of(pixels, |value| value)
+    sum_of::<P, false>(pixels)
 }
 
 /// The sum of the squares of all pixels.
 pub(super) fn sum_of_squares<P: Pixel>(pixels: ArrayView2<'_, P>) -> f64 {
-    sum_of(pixels, |value| value * value)
+    sum_of::<P, true>(pixels)
 }
 
-#[inline(always)]
-fn sum_of<P: Pixel>(pixels: ArrayView2<'_, P>, of: impl Fn(f64) -> f64) -> f64 {
+/// The sum of all pixels, or of their squares.
+fn sum_of<P: Pixel, const SQUARES: bool>(pixels: ArrayView2<'_, P>) -> f64 {
     let mut sums = [0.0; LANES];
     for row in pixels.into_outer_iter() {
-        add(&contiguous(row), &of, &mut sums);
+        add::<P, SQUARES>(&contiguous(row), &mut sums);
     }
     sums.iter().sum()
 }
@@ -43,34 +44,55 @@ fn contiguous<P: Pixel>(row: ArrayView1<'_, P>) -> Cow<'_, [P]> {
         .map_or_else(|| Cow::Owned(row.to_vec()), Cow::Borrowed)
 }
 
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn largest<P: Pixel>(values: &[P]) -> Option<f64> {
     let (mut most, mut zero) = ([f64::NEG_INFINITY; LANES], [0.0; LANES]);
-    let mut take = |values: &[P]| {
-        for ((most, zero), value) in most.iter_mut().zip(&mut zero).zip(values) {
-            let value: f64 = (*value).into();
-            *most = if value > *most { value } else { *most };
-            // NaN unless the value is finite.
-            *zero += 0.0 * value;
-        }
-    };
-    let (whole, rest) = values.as_chunks::<LANES>();
-    whole.iter().for_each(|values| take(values));
-    take(rest);
-    let finite = zero.iter().all(|zero| *zero == 0.0);
-    finite.then(|| most.into_iter().fold(f64::NEG_INFINITY, f64::max))
-}
-
-#[inline(always)]
-fn add<P: Pixel>(values: &[P], of: impl Fn(f64) -> f64, sums: &mut [f64; LANES]) {
     let (whole, rest) = values.as_chunks::<LANES>();
     for values in whole {
-        for (sum, value) in sums.iter_mut().zip(values) {
-            *sum += of((*value).into());
+        for lane in 0..LANES {
+            let value: f64 = values[lane].into();
+            most[lane] = if value > most[lane] {
+                value
+            } else {
+                most[lane]
+            };
+            // NaN unless the value is finite.
+            zero[lane] += 0.0 * value;
         }
     }
-    for (sum, value) in sums.iter_mut().zip(rest) {
-        *sum += of((*value).into());
+    for (lane, value) in rest.iter().enumerate() {
+        let value: f64 = (*value).into();
+        most[lane] = if value > most[lane] {
+            value
+        } else {
+            most[lane]
+        };
+        zero[lane] += 0.0 * value;
     }
+    let finite = zero.iter().sum::<f64>() == 0.0;
+    let larger = |a: f64, b: f64| if b > a { b } else { a };
+    finite.then(|| most.into_iter().fold(f64::NEG_INFINITY, larger))
+}
+
+/// Adds each number, or its square, to one of the sums.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add<P: Pixel, const SQUARES: bool>(values: &[P], sums: &mut [f64; LANES]) {
+    let term = |value: &P| -> f64 {
+        let value: f64 = (*value).into();
+        if SQUARES { value * value } else { value }
+    };
+    let (whole, rest) = values.as_chunks::<LANES>();
+    // A copy, which stays in registers.
+    let mut all = *sums;
+    for values in whole {
+        for lane in 0..LANES {
+            all[lane] += term(&values[lane]);
+        }
+    }
+    for (sum, value) in all.iter_mut().zip(rest) {
+        *sum += term(value);
+    }
+    *sums = all;
 }
 
 #[cfg(test)]

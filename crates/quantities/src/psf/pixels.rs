@@ -114,9 +114,12 @@ impl<P: RoundProfile> Pixels<P> {
         if pixels.is_empty() {
             return;
         }
+        // About the middle of the stamp the profile is the same on opposite sides.
+        let middle = |at: f64, side: usize| 2.0 * at == side as f64 - 1.0;
+        let halved = middle(centre.0, size.1) && middle(centre.1, size.0);
         let rules = self.rules(centre, size);
         let mut waiting = vec![Waiting::default(); rules.count];
-        for row in 0..size.0 {
+        for row in 0..if halved { size.0.div_ceil(2) } else { size.0 } {
             let dy = [row as f64 - centre.1; LANES];
             for first in (0..size.1).step_by(LANES) {
                 let dx = std::array::from_fn(|lane| (first + lane) as f64 - centre.0);
@@ -143,6 +146,12 @@ impl<P: RoundProfile> Pixels<P> {
         }
         for (waiting, rule) in waiting.iter_mut().zip(rules.rules) {
             self.integrate_waiting(waiting, rule, pixels);
+        }
+        if halved {
+            let (first, rest) = pixels.split_at_mut(pixels.len() / 2);
+            for (pixel, opposite) in rest.iter_mut().rev().zip(&*first) {
+                *pixel = *opposite;
+            }
         }
     }
 

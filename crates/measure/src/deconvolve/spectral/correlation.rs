@@ -5,7 +5,7 @@
 //! would depend on whether a galaxy lies along the grid or across it.
 
 use super::plane::Plane;
-use crate::deconvolve::product::{LANES, Matrix, ROWS, multiply};
+use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
 
 /// Tables for lags dy = 0…reach, dx = −reach…reach.
 #[derive(Debug, Clone)]

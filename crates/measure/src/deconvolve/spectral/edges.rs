@@ -15,7 +15,7 @@ use multiversion::multiversion;
 
 use super::pixels::{Pixels, PixelsScratch};
 use super::plane::{Modes, Plane};
-use crate::deconvolve::product::ROWS;
+use shearq_quantities::product::ROWS;
 
 /// The edges of stamps of one size.
 #[derive(Debug, Clone)]

@@ -4,7 +4,7 @@ use super::modes::{multiply, scale_into};
 use super::parities::change;
 use super::plane::Modes;
 use super::{Lags, Spectral, SpectralPsf, SpectralScratch};
-use crate::deconvolve::product::LANES;
+use shearq_quantities::product::LANES;
 
 impl Spectral {
     /// Writes how the autocorrelation of the stamp last given changes with a field of noise of σ = 1

@@ -3,7 +3,7 @@
 use multiversion::multiversion;
 
 use super::plane::Quarters;
-use crate::deconvolve::product::LANES;
+use shearq_quantities::product::LANES;
 
 /// Writes scale·(|v̂|² − variance·floor).
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]

@@ -7,7 +7,7 @@ use multiversion::multiversion;
 
 use super::plane::{Plane, Quarters};
 use crate::deconvolve::fold::Folding;
-use crate::deconvolve::product::{Matrix, multiply};
+use shearq_quantities::product::{Matrix, multiply};
 
 /// Tables for images of one size.
 #[derive(Debug, Clone)]

@@ -18,8 +18,8 @@
 
 use multiversion::multiversion;
 
-use crate::deconvolve::product::{LANES, ROWS};
 use crate::fft::transform_size;
+use shearq_quantities::product::{LANES, ROWS};
 
 /// Least number of lags per pixel of a grid that samples the kept modes, along an axis. See docs/constants.md.
 const FINER: f64 = 1.5;

@@ -5,7 +5,7 @@ use multiversion::multiversion;
 use super::modes::sheared;
 use super::parities::{four, lanes, lanes_mut, parts};
 use super::plane::{Modes, Quarters};
-use crate::deconvolve::product::LANES;
+use shearq_quantities::product::LANES;
 
 /// What the modes of a stamp are restored with.
 pub(super) struct Restoration<'a> {

@@ -2,7 +2,7 @@
 //! a convolution along both axes.
 
 use super::plane::{Plane, Quarters};
-use crate::deconvolve::product::{Matrix, multiply};
+use shearq_quantities::product::{Matrix, multiply};
 
 /// A convolution of the kept modes.
 #[derive(Debug, Clone)]

@@ -3,23 +3,25 @@
 
 use multiversion::multiversion;
 
-use super::real::Real;
+use crate::real::Real;
 
-/// Columns that are summed side by side. See docs/constants.md.
-pub(super) const LANES: usize = 16;
-/// Multiple of the rows of a product. See docs/constants.md.
-pub(super) const ROWS: usize = 8;
+/// Columns that are summed side by side.
+pub const LANES: usize = 16;
+/// Multiple of the rows of a product.
+pub const ROWS: usize = 8;
 
-/// A matrix in row-major order.
+/// A part of a matrix in row-major order.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Matrix<'a, T = f32> {
-    pub(super) values: &'a [T],
+pub struct Matrix<'a, T = f32> {
+    /// The numbers, from the first of the part.
+    pub values: &'a [T],
     /// Numbers between the beginnings of two rows.
-    pub(super) stride: usize,
+    pub stride: usize,
 }
 
 impl<'a, T> Matrix<'a, T> {
-    pub(super) fn new(values: &'a [T], stride: usize) -> Self {
+    /// Rows of `stride` numbers.
+    pub fn new(values: &'a [T], stride: usize) -> Self {
         Matrix { values, stride }
     }
 }
@@ -30,13 +32,7 @@ impl<'a, T> Matrix<'a, T> {
 ///
 /// Sums run over `inner` in order, fused where the processor can: results are the same for AVX-512, AVX2 and NEON.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn multiply(
-    left: Matrix<'_>,
-    right: Matrix<'_>,
-    inner: usize,
-    out: &mut [f32],
-    width: usize,
-) {
+pub fn multiply(left: Matrix<'_>, right: Matrix<'_>, inner: usize, out: &mut [f32], width: usize) {
     // As many rows at a time as there are registers for.
     multiversion::target::match_target! {
         "x86_64+avx512f" => product::<_, ROWS, true>(left, right, inner, out, width),
@@ -49,7 +45,7 @@ pub(super) fn multiply(
 /// The product as [`multiply`] defines it, `R` rows at a time, for callers that are compiled for an instruction set
 /// themselves.
 #[inline(always)]
-pub(super) fn product<T: Real, const R: usize, const FUSED: bool>(
+pub fn product<T: Real, const R: usize, const FUSED: bool>(
     left: Matrix<'_, T>,
     right: Matrix<'_, T>,
     inner: usize,
@@ -116,76 +112,9 @@ fn add<T: Real, const FUSED: bool>(sums: &mut [T; LANES], factor: T, line: &[T; 
 }
 
 /// Whether this processor has fused multiply-adds, so that [`multiply`] has the bits of fused sums.
-#[cfg(test)]
-pub(super) fn fuses() -> bool {
+pub fn fuses() -> bool {
     #[cfg(target_arch = "x86_64")]
     return is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
     #[cfg(not(target_arch = "x86_64"))]
     return cfg!(target_arch = "aarch64");
-}
-
-#[cfg(test)]
-mod tests {
-    use rand::{RngExt, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
-
-    use super::*;
-
-    /// The product as a plain sum, and the sum of moduli.
-    fn plain(left: Matrix<'_>, right: Matrix<'_>, inner: usize, at: [usize; 2]) -> [f64; 2] {
-        let terms = (0..inner).map(|i| {
-            let (a, b) = (
-                left.values[at[0] * left.stride + i],
-                right.values[i * right.stride + at[1]],
-            );
-            f64::from(a) * f64::from(b)
-        });
-        terms.fold([0.0; 2], |[sum, size], term| {
-            [sum + term, size + term.abs()]
-        })
-    }
-
-    #[test]
-    fn products_are_plain_sums_for_all_sizes_and_strides_and_dirty_results() {
-        let mut rng = ChaCha8Rng::seed_from_u64(3);
-        for (rows, inner, width, more) in [
-            (8, 1, 16, 0),
-            (16, 24, 16, 16),
-            (48, 24, 32, 8),
-            (8, 0, 16, 1),
-            (24, 17, 48, 5),
-            (16, 12, 16, 4),
-            (8, 16, 32, 0),
-            (8, 45, 16, 3),
-        ] {
-            let mut numbers = |count: usize| -> Vec<f32> {
-                (0..count).map(|_| rng.random_range(-1.0..1.0)).collect()
-            };
-            let (a, b) = (
-                numbers(rows * (inner + more)),
-                numbers(inner * (width + more) + width),
-            );
-            let left = Matrix::new(&a, inner + more);
-            let right = Matrix::new(&b, width + more);
-            let mut all = vec![vec![f32::NAN; rows * width]; 4];
-            multiply(left, right, inner, &mut all[0], width);
-            product::<_, ROWS, true>(left, right, inner, &mut all[1], width);
-            product::<_, 4, true>(left, right, inner, &mut all[2], width);
-            product::<_, 4, false>(left, right, inner, &mut all[3], width);
-            // The number of rows at a time does not matter.
-            assert_eq!(all[1], all[2]);
-            if fuses() {
-                assert_eq!(all[0], all[1]);
-            }
-            for (found, at) in all.iter().flat_map(|all| all.iter().zip(0..)) {
-                let [sum, size] = plain(left, right, inner, [at / width, at % width]);
-                // As many roundings as terms, of half a bit of 24 each.
-                let tolerance = (inner as f64 + 1.0) * size * f64::from(f32::EPSILON) / 2.0;
-                assert!(
-                    (f64::from(*found) - sum).abs() <= tolerance,
-                    "{found} {sum}"
-                );
-            }
-        }
-    }
 }
