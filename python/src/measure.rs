@@ -13,7 +13,7 @@ use shearq_measure::{
     Subtraction, Survey, Warning, Worker, calibrate, examined_rows,
 };
 use shearq_pipeline::engine;
-use shearq_pipeline::measure::{COLUMNS, Value, observed};
+use shearq_pipeline::measure::{COLUMNS, Value, more_columns};
 use shearq_quantities::Shear;
 use shearq_quantities::statistics::upper_median;
 
@@ -153,8 +153,8 @@ pub(crate) fn measure<'py>(
         .flatten()
         .map(|warning| format!("stamps: no galaxy could be measured: {warning}"));
     let warnings = warnings.iter().map(Warning::to_string).collect();
-    let linear = configuration.linear().is_some();
-    Ok((catalogue(py, &galaxies, linear)?, warnings, all_flagged))
+    let columns = catalogue(py, configuration, &galaxies)?;
+    Ok((columns, warnings, all_flagged))
 }
 
 impl<'s> Request<'s> {
@@ -437,8 +437,8 @@ fn formulas(rows: ArrayView2<'_, f64>) -> Result<Vec<FunctionalPsf>, MeasureErro
 /// The columns of a catalogue, by name.
 fn catalogue<'py>(
     py: Python<'py>,
+    configuration: &shearq_submissions::Configuration,
     galaxies: &[Measurement],
-    linear: bool,
 ) -> PyResult<Bound<'py, PyDict>> {
     let columns = PyDict::new(py);
     for (name, value) in COLUMNS {
@@ -453,10 +453,9 @@ fn catalogue<'py>(
             }
         }
     }
-    if linear {
-        for (name, values) in observed(&galaxies.iter().collect::<Vec<_>>()) {
-            columns.set_item(name, values.into_pyarray(py))?;
-        }
+    let galaxies: Vec<&Measurement> = galaxies.iter().collect();
+    for (name, values) in more_columns(configuration, &galaxies) {
+        columns.set_item(name, values.into_pyarray(py))?;
     }
     Ok(columns)
 }

@@ -283,8 +283,16 @@ partial! {
         share_of: ShareOf,
         weight_scale: f64,
         half_snr: f64,
+        sheared_step: f64,
         ellipticity: EllipticityType,
         calibration: Calibration,
+    }
+}
+
+impl PartialShape {
+    /// No sheared versions, where nothing is said of them.
+    pub(crate) fn without_sheared_step(&mut self) {
+        self.sheared_step.get_or_insert(0.0);
     }
 }
 
@@ -314,6 +322,9 @@ section! {
         /// added to the weighted integral of x² + y² by which the moments are divided halves the ellipticity of such a
         /// galaxy, so that those of low S/N count less, as their noise asks. Zero for all alike.
         half_snr: f64,
+        /// Shear of sheared versions of ellipticity, S/N, flux and size (`1p`, `1m`, `2p`, `2m`), which catalogues then have in
+        /// addition. Zero for none.
+        sheared_step: f64,
         /// Which ellipticity the catalogue reports as e1, e2.
         ellipticity: EllipticityType,
         /// What ellipticities are divided by.

@@ -194,6 +194,9 @@ impl LinearMethod {
         real(good, "shape.weight_scale", scale, "0.5 to 10 pixels")?;
         let good = (0.0..=1e3).contains(&half);
         real(good, "shape.half_snr", half, "0 to 1000")?;
+        let h = self.shape.sheared_step;
+        let good = h == 0.0 || (1e-3..=0.05).contains(&h);
+        real(good, "shape.sheared_step", h, "0, or 0.001 to 0.05")?;
         // The largest eigenvalue of W is 1 for a PSF of sum one.
         need(
             c * (1.0 + MAX_ROUGHNESS * l) < 2.0,

@@ -138,6 +138,67 @@ fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
 }
 
 #[test]
+fn sheared_versions_give_the_response_of_any_selection() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let own = at("own.toml");
+    let settings = "name = \"own\"\nextends = \"48/linear/star\"\n[shape]\nsheared_step = 0.02\n";
+    std::fs::write(&own, settings).unwrap();
+    let data = at("data");
+    let sets = ["--sets", "8", "--images", "1", "--grid", "20"];
+    let shears = ["--constant-shear=0.03,0.03", "--opposite"];
+    succeed(&[&["simulate", "--out", text(&data)], &sets[..], &shears].concat());
+    let measured = ["+", "-"].map(|sign| {
+        let data = data.join(format!("g1_{sign}0.03_g2_{sign}0.03"));
+        let out = at(sign);
+        let folders = ["--data", text(&data), "--out", text(&out)];
+        succeed(&[&["measure", "--submission", text(&own)], &folders[..]].concat());
+        text(&out).to_owned()
+    });
+    let folders = [measured[0].as_str(), measured[1].as_str()];
+    let said = |options: &[&str]| succeed(&[&["bias"], &folders[..], options].concat());
+    // The ellipticity of each version may be cut, too.
+    let cut = [
+        "--select",
+        "e1*e1 + e2*e2 < 0.09 and size > 1",
+        "--step",
+        "0.02",
+    ];
+    let table: Value =
+        serde_json::from_str(&said(&[&cut[..], &["--format", "json"]].concat())).unwrap();
+    let row = &table["rows"][0];
+    let number = |name: &str| row[name].as_f64().unwrap();
+    assert!((200.0..800.0).contains(&number("n")), "{}", number("n"));
+    for k in ["m1", "m2"] {
+        let error = number(&format!("{k}_error"));
+        assert!(
+            number(k).abs() < 4.0 * error,
+            "{k}: {} ± {error}",
+            number(k)
+        );
+    }
+    assert!(said(&cut).contains("Columns: shearq, sheared versions."));
+    // Without a selection that needs them, and with one whose response is known, versions only add noise.
+    assert!(said(&[]).contains("Columns: shearq."));
+    assert!(said(&["--where", "snr > 20"]).contains("Columns: shearq."));
+    let refused = fail(&[&["bias"], &folders[..], &cut[..2]].concat());
+    assert!(
+        refused.contains("found 0.02, expected 0.01). Try: --step 0.02"),
+        "{refused}"
+    );
+    // What `select` wrote has none that are not selected.
+    let chosen = at("chosen");
+    let folders = ["--measured", &measured[0], "--out", text(&chosen)];
+    succeed(&[&["select"], &folders[..], &["--where", "snr > 20"]].concat());
+    for (folder, has) in [(at("+"), true), (chosen, false)] {
+        let path = folder.join("set08/catalogue-001.parquet");
+        let read = table::read(&path, None, table::MAX_ROWS).unwrap();
+        let names = read.get_column_names();
+        assert_eq!(names.iter().any(|name| *name == "snr_2m"), has);
+    }
+}
+
+#[test]
 fn selections_that_cannot_be_corrected_are_refused() {
     let small = Small::new("2");
     small.measure(&LINEAR);

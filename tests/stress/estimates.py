@@ -4,6 +4,10 @@ import numpy as np
 from scenes import PSF_SHAPE, SHEAR, TURNS
 
 
+#: Versions of a galaxy: as it is, under γ1 = ± the step, under γ2 = ± the step.
+VERSIONS = ["noshear", "1p", "1m", "2p", "2m"]
+
+
 def mean_of(values, good):
     """Mean over good galaxies and its error, from the scatter of groups of turned galaxies, which are not independent."""
     mean = values[good].mean()
@@ -18,15 +22,27 @@ def bias(apart, response, good):
     return 1e3 * m / mean, 1e3 * error / mean, mean
 
 
-def weighted(case, found, k, good, hard):
+def weighted(case, found, k, good, options):
     """Component k of what is summed over galaxies: weight times ellipticity, and its derivative with shear.
 
     Both are arrays `[field, ±shear, galaxy]`; the shear of a catalogue is the sum of the first over the sum of the
-    second. With `hard` cuts, the weight is one or zero, each catalogue is cut by its own columns, and the derivative of
-    the weight is left out. Otherwise `shearq select` has made both.
+    second. With hard cuts, the weight is one or zero, each catalogue is cut by its own columns, and the derivative of
+    the weight is left out. With sheared versions, each version is cut by its own columns, and the derivative is the difference of
+    two. Otherwise `shearq select` has made both.
     """
+    if options.versions:
+
+        def cut(version):
+            e = found[f"e{k}_{version}"]
+            if not case.cut:
+                return e
+            column, share = case.cut
+            least = np.quantile(found[f"{column}_noshear"][:, :, good], share)
+            return np.where(found[f"{column}_{version}"] > least, e, 0.0)
+
+        return cut("noshear"), (cut(f"{k}p") - cut(f"{k}m")) / (2 * options.versions)
     weight = np.ones(found["flags"].shape)
-    if case.cut and hard:
+    if case.cut and options.hard_cuts:
         column, share = case.cut
         weight = (found[column] > np.quantile(found[column][:, :, good], share)).astype(float)
     return weight * found[f"e{k}"], weight * found[f"R{k}{k}"]

@@ -21,7 +21,7 @@ import peers
 import pyarrow.parquet as parquet
 from astropy.io import fits
 from cases import CASES
-from estimates import bias, leakage, mean_of, scatter_of_images, weighted
+from estimates import VERSIONS, bias, leakage, mean_of, scatter_of_images, weighted
 from scenes import RENDERED, SHEAR, bound, noise_field, render
 
 #: Stamps of one shear that are in memory at a time.
@@ -72,13 +72,15 @@ def measured(case, stamps, stars, fields, options):
         if run.returncode:
             sys.exit(f"{case.name}: {run.stderr}")
         names = ["e1", "e2", "R11", "R22", "flags", "flux", "size"]
+        if options.versions:
+            names += [f"{name}_{version}" for name in ("e1", "e2", "flux", "size") for version in VERSIONS]
 
         def read(folder):
             paths = [folder / "set01" / f"catalogue-{k:03}.parquet" for k in range(1, number + 1)]
             return [parquet.read_table(path, columns=names) for path in paths]
 
         tables = read(out)
-        if case.cut and not options.hard_cuts:
+        if case.cut and not options.hard_cuts and not options.versions:
             column, share = case.cut
             values = np.concatenate([table[column].to_numpy()[table["flags"].to_numpy() == 0] for table in tables])
             selected = Path(folder) / "selected"
@@ -159,13 +161,16 @@ def measure_case(case, options, others):
         stars = stars_of(case, psf, grid, random, options.fields)
         found = measured(case, stamps, stars, fields, options)
         good = (found["flags"] == 0).all((0, 1))
+        if options.versions:
+            good &= np.isfinite(found["e1_noshear"]).all((0, 1))
         row = {"good": good, "flagged": (found["flags"] != 0).mean()}
         for k in (1, 2):
             response = np.where(found["flags"] == 0, found[f"R{k}{k}"], np.nan)
             if good.any():
                 # Ellipticities are divided by the mean response of their image: undone, for one mean over all.
-                found[f"e{k}"] = found[f"e{k}"] * np.nanmean(response, 2, keepdims=True)
-                row[k] = weighted(case, found, k, good, options.hard_cuts)
+                for name in [name for name in found if name.split("_")[0] == f"e{k}"]:
+                    found[name] = found[name] * np.nanmean(response, 2, keepdims=True)
+                row[k] = weighted(case, found, k, good, options)
         rows.append(row)
     return rows
 
@@ -275,6 +280,12 @@ def main():
     )
     words.add_argument(
         "--hard-cuts", action="store_true", help="cut the columns as a filter does, without the response of `select`"
+    )
+    words.add_argument(
+        "--versions",
+        type=float,
+        metavar="STEP",
+        help="cut the columns of each sheared version sharply; the submission has shape.sheared_step = STEP",
     )
     words.add_argument("--threads", type=int, default=1)
     words.add_argument("--json", type=Path, help="the table as JSON")

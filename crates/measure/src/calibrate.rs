@@ -44,8 +44,13 @@ where
             galaxy.e1 /= means[0];
             galaxy.e2 /= means[1];
             galaxy.divisor = Some(means);
+            for version in galaxy.versions.iter_mut().flat_map(|all| &mut all.each) {
+                version.e1 /= means[0];
+                version.e2 /= means[1];
+            }
         } else {
             (galaxy.e1, galaxy.e2) = (f64::NAN, f64::NAN);
+            galaxy.versions = None;
             galaxy.flags.add(Flag::NoResponse);
         }
     }

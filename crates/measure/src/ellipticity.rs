@@ -7,6 +7,7 @@ use crate::flag::Flag;
 use crate::measurement::ResponseMatrix;
 use crate::method::{Found, FoundObservables, Sheared};
 use crate::observables::{Coupling, Observables};
+use crate::versions::{Products, Versions, versions};
 
 /// The ellipticity of type `kind` with its response, if the method knows it.
 pub(crate) fn report(
@@ -71,6 +72,64 @@ pub(crate) fn reported(
             ]
         }
     }
+}
+
+/// Sheared versions of a galaxy with the ellipticity `e` of type `kind`, its `response` and its `observables`. `None` if none
+/// are asked for. If the effect of noise is not known, which is rare, it is not corrected.
+pub(crate) fn sheared_versions(
+    kind: EllipticityType,
+    found: &Found,
+    (e, response): ([f64; 2], ResponseMatrix),
+    observables: &Observables,
+) -> Option<Versions> {
+    let (chi, found) = (found.distortion.ok()?, found.observed.as_ref()?);
+    let settings = found.versions?;
+    let products = found.products.unwrap_or_default();
+    let jacobian = reported(kind, chi, [[1.0, 0.0], [0.0, 1.0]]);
+    let along = |row: [f64; 2]| [row[0], row[1], 0.0, 0.0];
+    // Rows are e1, e2, flux and size; columns χ₁, χ₂, T and flux.
+    let rows = [
+        along(jacobian[0]),
+        along(jacobian[1]),
+        [0.0, 0.0, 0.0, 1.0],
+        [0.0, 0.0, found.size[1], 0.0],
+    ];
+    // Number of the product of a pair, in the order 00, 01, 02, 03, 11, …
+    let number = |i: usize, j: usize| i.min(j) * (7 - i.min(j)) / 2 + i.max(j);
+    let product = |a: usize, b: usize, noise: usize| -> f64 {
+        let terms = (0..4).flat_map(|i| (0..4).map(move |j| [i, j]));
+        terms
+            .map(|[i, j]| rows[a][i] * rows[b][j] * products[number(i, j)][noise])
+            .sum()
+    };
+    let matrix =
+        |noise: usize| std::array::from_fn(|a| std::array::from_fn(|b| product(a, b, noise)));
+    let noise = Products {
+        plain: matrix(3),
+        sheared: [matrix(0), matrix(1)],
+        turned: matrix(2),
+    };
+    let Observables {
+        flux,
+        flux_error,
+        size,
+        flux_response,
+        size_response,
+        coupling,
+    } = *observables;
+    let [.., t_s] = coupling.turned;
+    let values = [e[0], e[1], flux, size + 0.5 * t_s];
+    let derivatives = [0, 1].map(|k| {
+        [
+            response[0][k],
+            response[1][k],
+            flux_response[k],
+            size_response[k],
+        ]
+    });
+    let of = |noise: &Products| versions(values, derivatives, noise, &settings);
+    let each = of(&noise).or_else(|| of(&Products::NONE))?;
+    Some(Versions { each, flux_error })
 }
 
 /// Flux and size with their couplings to an ellipticity of type `kind`, measured as the distortion `chi`.

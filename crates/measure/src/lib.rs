@@ -61,6 +61,7 @@ mod sizes;
 mod sky;
 mod steps;
 mod surroundings;
+mod versions;
 mod warning;
 mod worker;
 
@@ -85,6 +86,7 @@ pub use shearq_quantities::{Distortion, FunctionalPsf, PsfProfile, Shear};
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::{Sky, Subtraction};
 pub use steps::Steps;
+pub use versions::{Version, Versions};
 pub use warning::{Of, Warning};
 pub use worker::{ImageNoise, ImageWorker, PsfWorker, Worker};
 

@@ -3,6 +3,7 @@
 use crate::deconvolve::Descent;
 use crate::flag::Flags;
 use crate::observables::Observables;
+use crate::versions::Versions;
 
 /// Response ∂e_i/∂γ_j of an ellipticity to shear, as `[i][j]`: R11, R12 and R21, R22.
 pub type ResponseMatrix = [[f64; 2]; 2];
@@ -23,6 +24,8 @@ pub struct Measurement {
     pub response: Option<ResponseMatrix>,
     /// Flux and size before the PSF, with their responses; `None` for the network and for galaxies that could not be measured.
     pub observables: Option<Observables>,
+    /// The galaxy under small shears, if the configuration asks for them.
+    pub versions: Option<Versions>,
     /// Mean responses of the galaxies calibrated together, by which e1 and e2 were divided; `None` before calibration.
     pub divisor: Option<[f64; 2]>,
     /// Iterations of the network; `None` if it did not run.
@@ -52,6 +55,7 @@ impl Measurement {
             flags: flag.into(),
             response: None,
             observables: None,
+            versions: None,
             divisor: None,
             descent: None,
             noise: f64::NAN,

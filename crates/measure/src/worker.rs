@@ -11,7 +11,7 @@ use shearq_submissions::{Configuration, Method, NoiseSource};
 
 use crate::brightness::{PEAKS, all_finite, highest, is_level};
 use crate::denoise::{DenoiseScratch, border_noise};
-use crate::ellipticity::{observables, report};
+use crate::ellipticity::{observables, report, sheared_versions};
 use crate::error::{MeasureError, length};
 use crate::flag::{Flag, Flags};
 use crate::measurement::Measurement;
@@ -238,6 +238,11 @@ impl Worker {
                 flags: Flags::NONE,
                 response,
                 observables,
+                versions: observables
+                    .zip(response)
+                    .and_then(|(observables, response)| {
+                        sheared_versions(kind, &found, ([e1, e2], response), &observables)
+                    }),
                 ..measured
             },
         })

@@ -364,7 +364,7 @@ fn known(truth: &Truth, source: &Source) -> bool {
 /// Whether the catalogue has responses.
 fn has_response(source: &Source) -> bool {
     source.has_version_rows()
-        || source.columns.preset == Preset::Metacal
+        || matches!(source.columns.preset, Preset::Metacal | Preset::Versions)
         || source.columns.have(&[Role::R11])
 }
 

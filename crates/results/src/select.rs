@@ -6,7 +6,7 @@ use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::Place;
 use shearq_files::{FileError, atomic, table};
-use shearq_measure::{Observables, Selection};
+use shearq_measure::{Observables, Selection, Versions};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::run::{RUN_FILE, Run, Source, claim};
 use shearq_pipeline::inputs::PRINTS;
@@ -300,9 +300,12 @@ impl Weighted {
             "divisor2" => Some(divisor(1)),
             _ => None,
         };
+        // Sheared versions would not have the selection.
+        let kept = |own: &&Column| !Versions::columns().any(|name| own.name().as_str() == name);
         let mut columns: Vec<Column> = read
             .columns()
             .iter()
+            .filter(kept)
             .map(|own| match new(own.name()) {
                 Some(values) => Column::new(own.name().clone(), values),
                 None => own.clone(),

@@ -91,7 +91,7 @@ fn ln(x: f32) -> f32 {
     ] {
         p = p * t + c;
     }
-    // ln 2 in two parts, the larger of which e multiplies without rounding.
+    // ln 2 in two parts. The product of e and the larger part is exact.
     t * t2 * p + e * -2.121_944_4e-4 - 0.5 * t2 + t + e * 0.693_359_4
 }
 

@@ -210,7 +210,7 @@ impl Renderer {
         grid.transform(self.stamp, modes, scratch, out);
     }
 
-    /// The period of the image, in pixels, that [`Renderer::render`] takes for a galaxy.
+    /// The period of the image, in pixels, that [`Renderer::render`] chooses for a galaxy.
     pub fn period(&self, galaxy: &Galaxy, psf: &TransformedPsf<'_>, centre: (f64, f64)) -> usize {
         self.choose_grid(galaxy, psf, centre).size
     }
@@ -545,8 +545,8 @@ fn tabulate(
     }
 }
 
-/// v^(−3/2) of a number that is neither tiny nor huge, to 4·10⁻⁷ of it. Square root and division would take longer than
-/// Newton's steps for 1/√v.
+/// v^(−3/2) of a number that is neither tiny nor huge, to 4·10⁻⁷ of it. Newton's steps for 1/√v take less time
+/// than a square root and a division.
 #[inline(always)]
 fn power_of_minus_three_halves(v: f32) -> f32 {
     // Half of the exponent with the opposite sign, and a straight line for the fraction: right to 3.5 %.

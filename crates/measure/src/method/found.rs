@@ -8,6 +8,7 @@ use crate::error::MeasureError;
 use crate::flag::Flag;
 use crate::measurement::ResponseMatrix;
 use crate::noise::StampNoise;
+use crate::versions::VersionSettings;
 
 /// The plan, PSF and buffers of a method in one thread.
 pub(crate) trait CutWorker: Send {
@@ -71,8 +72,10 @@ pub(crate) struct FoundObservables {
     /// The size, and its first and second derivative with T.
     pub(crate) size: [f64; 3],
     /// Mean products of changes with noise of χ₁, χ₂, T and the flux, in the order 00, 01, 02, 03, 11, …, for noise changed
-    /// by γ₁, by γ₂, and turned, on the galaxies on which they are determined.
-    pub(crate) products: Option<[[f64; 3]; 10]>,
+    /// by γ₁, by γ₂, turned, and as it is, on the galaxies on which they are determined.
+    pub(crate) products: Option<[[f64; 4]; 10]>,
+    /// What sheared versions are made with, if they are asked for.
+    pub(crate) versions: Option<VersionSettings>,
 }
 
 /// How the response of a galaxy differs with a field of noise added and taken away, to a shear of

@@ -28,16 +28,17 @@ use super::found::{
 };
 use super::softening::Softening;
 use crate::deconvolve::{
-    Descent, Gradients, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop,
+    Descent, Gradients, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop, split_mix,
 };
 use crate::error::MeasureError;
 use crate::measurement::ResponseMatrix;
 use crate::noise::StampNoise;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Breadth};
 use crate::surroundings::{Surroundings, centre, followed};
+use crate::versions::VersionSettings;
 
-/// One galaxy in this many is measured with a field of noise, for the noise term of the response.
-/// See docs/constants.md.
+/// One galaxy in this many is measured with a field of noise, for the noise term of the response. With sheared versions it is
+/// every galaxy. See docs/constants.md.
 const SHARE: u64 = 8;
 /// Level of the field of noise in units of the image's noise. See docs/constants.md.
 const FIELD: f32 = 0.25;
@@ -46,6 +47,10 @@ const FIELD: f32 = 0.25;
 pub(super) struct LinearPlan {
     lengths: AdaptedSettings,
     iterations: u32,
+    /// One galaxy in this many is measured with a field of noise.
+    share: u64,
+    /// Shear of sheared versions, if there are any.
+    versions: Option<f64>,
     softening: Softening,
     spectral: Spectral,
     moments: AdaptiveMoments,
@@ -74,7 +79,11 @@ impl LinearPlan {
         let broad = breadth
             .gradients()
             .map(|weights| spectral.spectrum_of(&weights, &mut scratch));
+        let step = method.shape.sheared_step;
+        let versions = (step > 0.0).then_some(step);
         Ok(LinearPlan {
+            share: if versions.is_some() { 1 } else { SHARE },
+            versions,
             lengths: AdaptedSettings {
                 target_sigma: settings.target_sigma,
                 window_sigma: settings.window_sigma,
@@ -151,7 +160,13 @@ impl LinearWorker {
 
     /// Flux and size with their responses, of the galaxy whose `shape` was found last; with the effect of noise on them and
     /// on the ellipticity if `coupled`.
-    fn observed(&mut self, shape: &AdaptiveShape, noise: f32, coupled: bool) -> FoundObservables {
+    fn observed(
+        &mut self,
+        shape: &AdaptiveShape,
+        noise: f32,
+        seed: u64,
+        coupled: bool,
+    ) -> FoundObservables {
         let plan = &*self.plan;
         let lags = &self.lags;
         let (soft, typical) = (self.faint * noise * noise, plan.softening.typical);
@@ -169,7 +184,7 @@ impl LinearWorker {
             let found = plan
                 .spectral
                 .products(&self.psf, &self.gradients, &mut self.buffers);
-            let unit = f64::from(noise * noise) * SHARE as f64;
+            let unit = f64::from(noise * noise) * plan.share as f64;
             // The last of four quantities is the flux.
             let scale = [0, 0, 0, 1, 0, 0, 1, 0, 1, 2];
             std::array::from_fn(|k| {
@@ -184,6 +199,10 @@ impl LinearWorker {
             square_response: [response(&lags.shear1), response(&lags.shear2)],
             size: plan.breadth.size(f64::from(breadth.square)),
             products,
+            versions: plan.versions.map(|step| VersionSettings {
+                step,
+                normals: normals(seed),
+            }),
         }
     }
 
@@ -218,7 +237,7 @@ impl LinearWorker {
             sides: [plus.0, minus.0],
             turned: [plus.1, minus.1],
             breadth: [plus.2, minus.2],
-            weight: f64::from(noise * noise / (2.0 * step)) * SHARE as f64,
+            weight: f64::from(noise * noise / (2.0 * step)) * plan.share as f64,
         })
     }
 }
@@ -269,11 +288,11 @@ impl CutWorker for LinearWorker {
         if let Ok(shape) = &shape {
             response = Some(Self::response(&plan, shape, lags, &mut self.values));
             let seed = seed_of(whole, sigma);
-            let coupled = noise > 0.0 && seed.is_multiple_of(SHARE);
+            let coupled = noise > 0.0 && seed.is_multiple_of(plan.share);
             if coupled {
                 sheared_noise = self.sheared_noise(seed, sigma, softening);
             }
-            observed = Some(self.observed(shape, sigma, sheared_noise.is_some()));
+            observed = Some(self.observed(shape, sigma, seed, sheared_noise.is_some()));
         }
         Ok(Some(Found {
             descent: Descent {
@@ -323,4 +342,17 @@ fn seed_of(stamp: &[f32], noise: f32) -> u64 {
         (hash ^ u64::from(step.cast_unsigned())).wrapping_mul(0x0100_0000_01b3)
     });
     hash >> 16
+}
+
+/// Gaussian numbers from a seed (Box and Muller 1958), other than the signs of the field of noise.
+fn normals(seed: u64) -> [f64; 4] {
+    let mut state = seed ^ 0x5368_6561_7265_6421;
+    let mut uniform = || (split_mix(&mut state) >> 11) as f64 / (1u64 << 53) as f64;
+    let mut pair = || {
+        let radius = (-2.0 * (1.0 - uniform()).ln()).sqrt();
+        let (sin, cos) = (std::f64::consts::TAU * uniform()).sin_cos();
+        [radius * cos, radius * sin]
+    };
+    let ([a, b], [c, d]) = (pair(), pair());
+    [a, b, c, d]
 }

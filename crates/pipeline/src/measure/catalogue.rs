@@ -7,8 +7,8 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
 use shearq_files::table;
-use shearq_measure::{Flag, Flags, Measurement, Observables, Warning};
-use shearq_submissions::EllipticityType;
+use shearq_measure::{Flag, Flags, Measurement, Observables, Versions, Warning};
+use shearq_submissions::{Configuration, EllipticityType};
 
 use super::row::{MeasuredRow, psf_noise, warnings};
 use crate::PipelineError;
@@ -26,8 +26,8 @@ pub enum Value {
     Whole(fn(&Measurement) -> i32),
 }
 
-/// The columns of catalogues after the position, in order. The command line and Python use the same. [`observed`] gives the
-/// columns that follow for the linear method.
+/// The columns of catalogues after the position, in order. The command line and Python use the same. [`more_columns`] gives the
+/// columns that follow.
 pub const COLUMNS: [(&str, Value); 18] = [
     ("e1", Value::Real(|g| g.e1)),
     ("e2", Value::Real(|g| g.e2)),
@@ -65,22 +65,45 @@ pub const COLUMNS: [(&str, Value); 18] = [
     ("divisor2", Value::Real(|g| divisor(g)[1])),
 ];
 
-/// Columns of the catalogues of linear configurations after [`COLUMNS`]: the S/N, and the [`Observables`] that are not among
-/// these. NaN for galaxies that could not be measured.
-pub fn observed(galaxies: &[&Measurement]) -> Vec<(&'static str, Vec<f64>)> {
+/// Columns of catalogues after [`COLUMNS`]. Those of linear configurations are the S/N, and the [`Observables`] that are not among
+/// these; then sheared versions, if the configuration asks for them. NaN for galaxies that could not be measured.
+pub fn more_columns(
+    configuration: &Configuration,
+    galaxies: &[&Measurement],
+) -> Vec<(String, Vec<f64>)> {
+    let Some(linear) = configuration.linear() else {
+        return Vec::new();
+    };
     let found = || galaxies.iter().map(|galaxy| galaxy.observables.as_ref());
     let snr = found().map(|found| found.map_or(f64::NAN, Observables::snr));
-    let mut columns = vec![("snr", snr.collect())];
+    let mut columns = vec![("snr".to_owned(), snr.collect())];
     let nothing = [f64::NAN; Observables::COLUMNS.len()];
     let rows: Vec<_> = found()
         .map(|found| found.map_or(nothing, Observables::to_array))
         .collect();
     for (at, name) in Observables::COLUMNS.into_iter().enumerate() {
         if !COLUMNS.iter().any(|(known, _)| *known == name) {
-            columns.push((name, rows.iter().map(|row| row[at]).collect()));
+            columns.push((name.to_owned(), rows.iter().map(|row| row[at]).collect()));
         }
     }
+    if linear.shape.sheared_step > 0.0 {
+        columns.extend(versions(galaxies));
+    }
     columns
+}
+
+/// Each quantity of each sheared version.
+fn versions(galaxies: &[&Measurement]) -> Vec<(String, Vec<f64>)> {
+    const COUNT: usize = Versions::QUANTITIES.len();
+    let of = |at: usize| {
+        let value = move |galaxy: &&Measurement| {
+            let all = galaxy.versions.as_ref();
+            all.map_or(f64::NAN, |all| all.values(at / COUNT)[at % COUNT])
+        };
+        galaxies.iter().map(value).collect()
+    };
+    let names = Versions::columns().enumerate();
+    names.map(|(at, name)| (name, of(at))).collect()
 }
 
 /// Mean responses by which the ellipticity was divided; NaN if it was not.
@@ -109,7 +132,7 @@ pub const KEYS: [&str; 8] = [
 ///
 /// # Errors
 /// If polars cannot make the table.
-fn catalogue(rows: &[MeasuredRow], linear: bool) -> Result<DataFrame, TableError> {
+fn catalogue(rows: &[MeasuredRow], configuration: &Configuration) -> Result<DataFrame, TableError> {
     let galaxies = || rows.iter().flat_map(|row| &row.galaxies);
     let positions = rows.iter().flat_map(|row| {
         let mosaic = row.head.mosaic;
@@ -127,11 +150,9 @@ fn catalogue(rows: &[MeasuredRow], linear: bool) -> Result<DataFrame, TableError
             Column::new((*name).into(), values)
         }
     }));
-    if linear {
-        let galaxies: Vec<&Measurement> = galaxies().collect();
-        let observed = observed(&galaxies).into_iter();
-        columns.extend(observed.map(|(name, values)| Column::new(name.into(), values)));
-    }
+    let galaxies: Vec<&Measurement> = galaxies().collect();
+    let more = more_columns(configuration, &galaxies).into_iter();
+    columns.extend(more.map(|(name, values)| Column::new(name.into(), values)));
     frame(columns)
 }
 
@@ -304,8 +325,8 @@ impl<'a> Catalogues<'a> {
         self.claim.check()?;
         let path = self.run.catalogue(self.out, set, image);
         let linear = self.run.configuration.linear().is_some();
-        let table =
-            catalogue(rows, linear).map_err(|error| FileError::new(&path, error.to_string()))?;
+        let table = catalogue(rows, &self.run.configuration)
+            .map_err(|error| FileError::new(&path, error.to_string()))?;
         let mut metadata = metadata(self.run, head.id, head.prints.clone())?;
         if !found.is_empty() {
             let lines: Vec<String> = found.iter().map(Warning::to_string).collect();

@@ -314,6 +314,8 @@ pub enum Preset {
     Plain,
     /// shearq: ellipticities are already divided by the divisors.
     Shearq,
+    /// shearq with sheared versions of all columns.
+    Versions,
     /// GalSim's or LSST's HSM.
     Hsm,
     /// Metacalibration with columns per version.
@@ -330,6 +332,7 @@ impl Preset {
         match self {
             Preset::Plain => "plain columns",
             Preset::Shearq => "shearq",
+            Preset::Versions => "shearq, sheared versions",
             Preset::Hsm => "HSM",
             Preset::Metacal => "ngmix metacal",
             Preset::Metadetect => "metadetect",
@@ -396,10 +399,10 @@ impl Columns {
         let distortion = DISTORTIONS.contains(&e1.as_str());
         let preset = if roles.contains_key(&Role::Version) {
             Preset::Metadetect
-        } else if roles.contains_key(&Role::E1p) && roles.contains_key(&Role::E2p) {
-            Preset::Metacal
         } else if roles.contains_key(&Role::Divisor1) && roles.contains_key(&Role::R11) {
             Preset::Shearq
+        } else if roles.contains_key(&Role::E1p) && roles.contains_key(&Role::E2p) {
+            Preset::Metacal
         } else if distortion || e1 == "corrected_g1" {
             Preset::Hsm
         } else if roles.contains_key(&Role::Dw1) {
@@ -412,6 +415,24 @@ impl Columns {
             preset,
             distortion,
         })
+    }
+
+    /// Of a catalogue of shearq with sheared versions, takes these versions if a selection requires them, and otherwise the
+    /// columns without them, which have less noise.
+    pub fn choose_versions(&mut self, required: bool) {
+        if self.preset != Preset::Shearq || !self.roles.contains_key(&Role::E1p) {
+            return;
+        }
+        if required {
+            self.preset = Preset::Versions;
+            for (role, name) in [(Role::E1, "e1_noshear"), (Role::E2, "e2_noshear")] {
+                self.roles.insert(role, name.to_owned());
+            }
+        } else {
+            for role in [Role::E1p, Role::E1m, Role::E2p, Role::E2m] {
+                self.roles.remove(&role);
+            }
+        }
     }
 
     /// The column of a role.
@@ -454,6 +475,10 @@ mod tests {
         for (columns, preset) in [
             ("e1 e2 w flag", Preset::Plain),
             ("x y e1 e2 flags R11 R22 divisor1 divisor2", Preset::Shearq),
+            (
+                "e1 e2 flags R11 R22 divisor1 divisor2 e1_noshear e2_noshear e1_1p e1_1m e2_2p e2_2m",
+                Preset::Shearq,
+            ),
             ("corrected_e1 corrected_e2", Preset::Hsm),
             (
                 "e1_noshear e2_noshear e1_1p e1_1m e2_2p e2_2m",
@@ -465,6 +490,17 @@ mod tests {
             assert_eq!(found(columns, &[]).unwrap().preset, preset, "{columns}");
         }
         assert!(found("corrected_e1 corrected_e2", &[]).unwrap().distortion);
+        let names =
+            "e1 e2 flags R11 R22 divisor1 divisor2 e1_noshear e2_noshear e1_1p e1_1m e2_2p e2_2m";
+        for (required, preset, e1, plus) in [
+            (true, Preset::Versions, "e1_noshear", Some("e1_1p")),
+            (false, Preset::Shearq, "e1", None),
+        ] {
+            let mut own = found(names, &[]).unwrap();
+            own.choose_versions(required);
+            assert_eq!((own.preset, own.of(Role::E1)), (preset, Some(e1)));
+            assert_eq!(own.of(Role::E1p), plus);
+        }
         let given = found("a b R11 R22", &["e1=a", "e2=b", "R11=none", "R22=none"]).unwrap();
         assert_eq!((given.of(Role::E1), given.of(Role::R11)), (Some("a"), None));
     }

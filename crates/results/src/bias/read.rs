@@ -7,7 +7,7 @@ use std::path::Path;
 use shearq_bias::{Catalogue, Row, VERSIONS};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
-use shearq_files::table::{self, Place};
+use shearq_files::table::{self, FileFormat, Place};
 use shearq_measure::{Observables, Selection};
 use shearq_quantities::Distortion;
 
@@ -73,7 +73,7 @@ impl Source {
     /// Whether the selection is also known for each sheared version, so that its response follows.
     pub(super) fn selects_versions(&self, reading: &Reading) -> bool {
         let all = |places: &[Option<Vec<usize>>]| places.iter().all(Option::is_some);
-        self.columns.preset == Preset::Metacal
+        matches!(self.columns.preset, Preset::Metacal | Preset::Versions)
             && (reading.select.is_some() || reading.binned.is_some())
             && all(&self.selected)
             && all(&self.binned)
@@ -196,7 +196,17 @@ fn source(
     names: &[String],
     reading: &Reading,
 ) -> Result<Source, FileError> {
-    let columns = Columns::find(&place.path, names, &reading.names)?;
+    let mut columns = Columns::find(&place.path, names, &reading.names)?;
+    let by_measured = |expression: &Option<Expression>| {
+        let named = expression.iter().flat_map(Expression::columns);
+        let sheared = |name: &String| names.contains(&format!("{name}_1p"));
+        named.into_iter().any(sheared)
+    };
+    let by_versions = by_measured(&reading.select) || by_measured(&reading.binned);
+    columns.choose_versions(by_versions && reading.selection.is_none());
+    if columns.preset == Preset::Versions {
+        check_step(&place.path, reading.step)?;
+    }
     let skipped = |role: &Role| match role {
         Role::G1 | Role::G2 => !matches!(reading.truth, Truth::Columns),
         Role::Unit => true,
@@ -227,7 +237,12 @@ fn source(
             };
             let mut own = Vec::new();
             for name in expression.columns() {
-                let found = place_of(name).or_else(|| place_of(&format!("{name}_noshear")));
+                // Versions of shearq have noise that other columns do not have.
+                let plain = format!("{name}_noshear");
+                let found = match columns.preset {
+                    Preset::Versions => place_of(&plain).or_else(|| place_of(name)),
+                    _ => place_of(name).or_else(|| place_of(&plain)),
+                };
                 own.push(found.ok_or_else(|| FileError::no_column(&place.path, name, names))?);
             }
             let mut all = vec![Some(own)];
@@ -266,6 +281,30 @@ fn source(
     }
     source.wanted = wanted;
     Ok(source)
+}
+
+/// Checks that the versions of a catalogue of shearq are for a shear of `step`, if its settings are there.
+fn check_step(path: &Path, step: f64) -> Result<(), FileError> {
+    let key = "settings".to_owned();
+    let stated = || {
+        let ending = path.extension()?;
+        let formats = [FileFormat::Parquet, FileFormat::Fits].into_iter();
+        let format = formats
+            .into_iter()
+            .find(|format| ending == format.extension())?;
+        let metadata = table::read_metadata(path, format, std::iter::once(&key)).ok()?;
+        let settings: toml::Table = metadata.get(&key)?.parse().ok()?;
+        settings.get("shape")?.get("sheared_step")?.as_float()
+    };
+    match stated() {
+        Some(stated) if stated != step => Err(FileError::new(
+            path,
+            format!(
+                "the sheared versions are for another shear (found {stated}, expected {step}). Try: --step {stated}"
+            ),
+        )),
+        _ => Ok(()),
+    }
 }
 
 /// Reads the rows of a catalogue and gives those that count to `take`, with a description of the catalogue.

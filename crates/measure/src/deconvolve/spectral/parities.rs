@@ -79,28 +79,29 @@ pub(super) fn twice_scaled(v: &Quarters, real: &[f32], scale: &[f32], out: &mut 
     }
 }
 
-/// Sums over the plane of Re(conj(a)·b) times each of three real even spectra.
+/// Sums over the plane of Re(conj(a)·b) times each of four real even spectra.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn sums(a: &Quarters, b: &Quarters, kinds: &[Vec<f32>; 3]) -> [f32; 3] {
+pub(super) fn sums(a: &Quarters, b: &Quarters, kinds: &[Vec<f32>; 4]) -> [f32; 4] {
     let quarter = a.0.len() / 4;
     let (a, b) = (parts(&a.0, quarter), parts(&b.0, quarter));
     let (mut of_first, mut of_second) = ([0.0f32; LANES], [0.0f32; LANES]);
-    let mut of_third = [0.0f32; LANES];
-    let [first, second, third] = kinds;
-    let kinds = [first, second, third].map(|kind| (&kind[..quarter], &kind[quarter..]));
+    let (mut of_third, mut of_fourth) = ([0.0f32; LANES], [0.0f32; LANES]);
+    let [first, second, third, fourth] = kinds;
+    let kinds = [first, second, third, fourth].map(|kind| (&kind[..quarter], &kind[quarter..]));
     for at in (0..quarter).step_by(LANES) {
         let (a, b) = (four(a, at), four(b, at));
         let kind = |k: usize| (lanes(kinds[k].0, at), lanes(kinds[k].1, at));
-        let (first, second, third) = (kind(0), kind(1), kind(2));
+        let (first, second, third, fourth) = (kind(0), kind(1), kind(2), kind(3));
         for l in 0..LANES {
             let (even, odd) = (even_along(a, b, l), odd_along(a, b, l));
             of_first[l] += even * first.0[l] + odd * first.1[l];
             of_second[l] += even * second.0[l] + odd * second.1[l];
             of_third[l] += even * third.0[l] + odd * third.1[l];
+            of_fourth[l] += even * fourth.0[l] + odd * fourth.1[l];
         }
     }
     // Of modes above and below: (e − o)(E − O) + (e + o)(E + O).
-    [of_first, of_second, of_third].map(|lanes| 2.0 * lanes.iter().sum::<f32>())
+    [of_first, of_second, of_third, of_fourth].map(|lanes| 2.0 * lanes.iter().sum::<f32>())
 }
 
 /// The part cc of Re(conj(a)·b) of modes.

@@ -8,9 +8,9 @@
 use super::parities::{sums, twice_scaled};
 use super::{Spectral, SpectralPsf, SpectralScratch};
 
-/// Means of a product for three kinds t: the change of noise with γ₁, its change with γ₂, and what noise lacks to be that
-/// of a PSF turned by 90 degrees.
-pub(crate) type Kinds = [f32; 3];
+/// Means of a product for four kinds t: the change of noise with γ₁, its change with γ₂, what noise lacks to be that
+/// of a PSF turned by 90 degrees, and one, for the noise itself.
+pub(crate) type Kinds = [f32; 4];
 
 /// Weights of the lags whose sum with an autocorrelation's change is the change of a quantity.
 #[derive(Debug, Clone)]
@@ -67,7 +67,7 @@ impl Spectral {
         let [first, second, third] = windowed;
         // The flux is the sum under the window.
         let gradients = [first, second, third, &self.window_modes];
-        let mut found = [[0.0; 3]; 10];
+        let mut found = [[0.0; 4]; 10];
         let pairs = (0..4).flat_map(|a| (a..4).map(move |b| [a, b]));
         for (found, [a, b]) in found.iter_mut().zip(pairs) {
             *found = sums(gradients[a], gradients[b], &psf.powers);

@@ -44,8 +44,8 @@ pub struct SpectralPsf {
     /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ², by parity.
     pub(super) noise_tilts: [Vec<f32>; 2],
     /// Power of noise of σ = 1 before the window, of each mode and the modes that it stands for. It is multiplied by the change
-    /// with γ₁, by the change with γ₂, and by the difference to noise behind the PSF turned by 90 degrees; by parity.
-    pub(super) powers: [Vec<f32>; 3],
+    /// with γ₁, by the change with γ₂, by the difference to noise behind the PSF turned by 90 degrees, and by one; by parity.
+    pub(super) powers: [Vec<f32>; 4],
 }
 
 impl SpectralPsf {
@@ -170,7 +170,8 @@ impl Spectral {
             spread(root, out);
         }
         let area = (self.plane.size * self.plane.size) as f32 * self.inside;
-        let kinds = [&out.field_tilts[0], &out.field_tilts[1], &out.turned];
+        root.fill(1.0);
+        let kinds = [&out.field_tilts[0], &out.field_tilts[1], &out.turned, root];
         for (out, kind) in out.powers.iter_mut().zip(kinds) {
             weighted(kind, power, &self.counts, area, even);
             even_quarters(even, out);

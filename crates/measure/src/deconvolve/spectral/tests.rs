@@ -761,7 +761,7 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
         let found = plan.products(&psf, &gradients, &mut scratch);
 
         // A field of one mode at a time, real and imaginary.
-        let mut expected = [[0.0f64; 3]; 10];
+        let mut expected = [[0.0f64; 4]; 10];
         let mut sizes = [0.0f64; 10];
         for at in 0..2 * quarter {
             let (below, x, y) = (at >= quarter, at % width, at % quarter / width);

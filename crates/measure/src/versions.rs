@@ -1,0 +1,337 @@
+//! Galaxies as they would be measured under small shears, for selections of the user's own.
+//!
+//! The values X of a galaxy (ellipticity, flux, size) change to X ± hX′ if its image is sheared by ±h. But that shears the
+//! noise, too. For noise of covariance C, changed by D n, the mean of any smooth function φ(X) then changes by
+//!
+//! ```text
+//! h ⟨∇φ(X)·D n⟩ = h ⟨φ_a tr(D C X_a″) + φ_ab K_ab⟩,   K_ab = ∇X_a·D C ∇X_b
+//! ```
+//!
+//! (Stein's lemma). The responses X′ are already without the first term. Gaussian noise of covariance ∓2hK, added to X, takes
+//! out the second one. A covariance cannot be negative, so that a small share of C is added in all versions.
+//! In the same way, noise of covariance T takes out what the shape of the PSF gives to noise: T is half of the difference to the
+//! covariance of noise behind a PSF turned by 90 degrees.
+//!
+//! The difference of the means of versions 1p and 1m, divided by 2h, is then the response to γ1 for any selection by the values of
+//! each version.
+
+use shearq_quantities::linear::cholesky;
+
+/// Values that change with shear: e1, e2, flux and size.
+const VALUES: usize = 4;
+/// A symmetric matrix of all values.
+type Matrix = [[f64; VALUES]; VALUES];
+
+/// Share of the noise by which more is added than needed, against rounding. See docs/constants.md.
+const MARGIN: f64 = 1e-3;
+
+/// What is measured on a galaxy under a shear.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct Version {
+    /// First component of the ellipticity.
+    pub e1: f64,
+    /// Second component.
+    pub e2: f64,
+    /// As [`Observables::flux`](crate::Observables::flux).
+    pub flux: f64,
+    /// As [`Observables::size`](crate::Observables::size).
+    pub size: f64,
+}
+
+/// A galaxy without shear, under γ1 = ±h and under γ2 = ±h, in the order of [`Versions::NAMES`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct Versions {
+    /// All versions.
+    pub each: [Version; 5],
+    /// Standard deviation of the flux of each.
+    pub flux_error: f64,
+}
+
+impl Versions {
+    /// Names of the versions.
+    pub const NAMES: [&'static str; 5] = ["noshear", "1p", "1m", "2p", "2m"];
+
+    /// Names of what each version has.
+    pub const QUANTITIES: [&'static str; 5] = ["e1", "e2", "snr", "flux", "size"];
+
+    /// The names of all columns, version by version.
+    pub fn columns() -> impl Iterator<Item = String> {
+        let of = |version: &'static str| {
+            let names = Versions::QUANTITIES.into_iter();
+            names.map(move |quantity| format!("{quantity}_{version}"))
+        };
+        Versions::NAMES.into_iter().flat_map(of)
+    }
+
+    /// The values of a version, in the order of [`Versions::QUANTITIES`].
+    pub fn values(&self, version: usize) -> [f64; 5] {
+        let Version { e1, e2, flux, size } = self.each[version];
+        [e1, e2, flux / self.flux_error, flux, size]
+    }
+}
+
+/// What sheared versions of a galaxy are made with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct VersionSettings {
+    /// The shear.
+    pub(crate) step: f64,
+    /// Gaussian numbers of the galaxy's own.
+    pub(crate) normals: [f64; 4],
+}
+
+/// Mean products of the changes that noise makes of the values.
+pub(crate) struct Products {
+    /// Covariance C of the noise of the values.
+    pub(crate) plain: Matrix,
+    /// K for γ1 and for γ2.
+    pub(crate) sheared: [Matrix; 2],
+    /// T.
+    pub(crate) turned: Matrix,
+}
+
+impl Products {
+    /// Without noise.
+    pub(crate) const NONE: Products = Products {
+        plain: [[0.0; VALUES]; VALUES],
+        sheared: [[[0.0; VALUES]; VALUES]; 2],
+        turned: [[0.0; VALUES]; VALUES],
+    };
+}
+
+/// The versions of a galaxy, from its values, their derivatives with γ1 and γ2, and its noise. `None` if the products cannot
+/// be products of noise.
+pub(crate) fn versions(
+    values: [f64; VALUES],
+    derivatives: [[f64; VALUES]; 2],
+    products: &Products,
+    settings: &VersionSettings,
+) -> Option<[Version; 5]> {
+    let &VersionSettings { step, normals } = settings;
+    let Products {
+        plain,
+        sheared,
+        turned,
+    } = products;
+    let largest = |matrix: &Matrix, root: &Matrix| whitened_norm(matrix, root);
+    let share = match root(plain) {
+        _ if plain.iter().flatten().all(|value| *value == 0.0) => 0.0,
+        None => return None,
+        Some(root) => {
+            let [first, second] = sheared.each_ref().map(|matrix| largest(matrix, &root));
+            (largest(turned, &root) + 2.0 * step * first.max(second)) * (1.0 + MARGIN) + MARGIN
+        }
+    };
+    // Along no shear, γ1 and γ2.
+    let version = |along: [f64; 2]| -> Option<Version> {
+        let covariance = std::array::from_fn(|a| {
+            std::array::from_fn(|b| {
+                let of_shear = along[0] * sheared[0][a][b] + along[1] * sheared[1][a][b];
+                share * plain[a][b] + turned[a][b] - 2.0 * of_shear
+            })
+        });
+        let root = if share == 0.0 {
+            [[0.0; VALUES]; VALUES]
+        } else {
+            root(&covariance)?
+        };
+        let [e1, e2, flux, size] = std::array::from_fn(|a| {
+            let added: f64 = (0..=a).map(|k| root[a][k] * normals[k]).sum();
+            let changed = along[0] * derivatives[0][a] + along[1] * derivatives[1][a];
+            values[a] + changed + added
+        });
+        Some(Version { e1, e2, flux, size })
+    };
+    Some([
+        version([0.0; 2])?,
+        version([step, 0.0])?,
+        version([-step, 0.0])?,
+        version([0.0, step])?,
+        version([0.0, -step])?,
+    ])
+}
+
+/// The lower triangle L of LLᵀ = `matrix`; `None` if it is not positive.
+fn root(matrix: &Matrix) -> Option<Matrix> {
+    let mut root = *matrix;
+    let positive = |pivot: f64| (pivot > 0.0 && pivot.is_finite()).then_some(pivot);
+    cholesky(&mut root, &mut [0.0; VALUES], VALUES, positive)?;
+    for (a, row) in root.iter_mut().enumerate() {
+        row[a + 1..].fill(0.0);
+    }
+    Some(root)
+}
+
+/// The root of the sum of squares of L⁻¹ M L⁻ᵀ, no less than the modulus of its eigenvalues.
+fn whitened_norm(matrix: &Matrix, root: &Matrix) -> f64 {
+    // L⁻¹ of each column, twice: of the matrix, and of what that gives, turned over.
+    let solved = |matrix: &Matrix| -> Matrix {
+        let mut out = [[0.0; VALUES]; VALUES];
+        for column in 0..VALUES {
+            for a in 0..VALUES {
+                let known: f64 = (0..a).map(|k| root[a][k] * out[column][k]).sum();
+                out[column][a] = (matrix[a][column] - known) / root[a][a];
+            }
+        }
+        out
+    };
+    let whitened = solved(&solved(matrix));
+    let squares = whitened.iter().flatten().map(|value| value * value);
+    squares.sum::<f64>().sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    fn symmetric(lower: [[f64; 4]; 4]) -> Matrix {
+        std::array::from_fn(|a| std::array::from_fn(|b| lower[a.max(b)][a.min(b)]))
+    }
+
+    fn products() -> Products {
+        Products {
+            plain: symmetric([
+                [0.09, 0.0, 0.0, 0.0],
+                [0.01, 0.08, 0.0, 0.0],
+                [0.1, -0.05, 4.0, 0.0],
+                [0.02, 0.01, 0.3, 0.12],
+            ]),
+            sheared: [
+                symmetric([
+                    [0.03, 0.0, 0.0, 0.0],
+                    [0.0, -0.02, 0.0, 0.0],
+                    [0.2, 0.0, 0.1, 0.0],
+                    [0.08, 0.0, 0.2, -0.05],
+                ]),
+                symmetric([
+                    [0.0, 0.0, 0.0, 0.0],
+                    [0.02, 0.01, 0.0, 0.0],
+                    [0.0, 0.3, -0.2, 0.0],
+                    [0.0, 0.06, 0.1, 0.04],
+                ]),
+            ],
+            turned: symmetric([
+                [0.002, 0.0, 0.0, 0.0],
+                [0.001, -0.003, 0.0, 0.0],
+                [0.01, 0.02, 0.1, 0.0],
+                [-0.002, 0.001, 0.03, 0.002],
+            ]),
+        }
+    }
+
+    #[test]
+    fn versions_scatter_as_they_should() {
+        let products = products();
+        let values = [0.1, -0.2, 30.0, 2.5];
+        let derivatives = [[0.9, 0.05, 3.0, 0.4], [-0.02, 0.8, 1.0, 0.2]];
+        let step = 0.01;
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let count = 200_000;
+        let mut sums = [[0.0; 4]; 5];
+        let mut squares = [[[0.0; 4]; 4]; 5];
+        for _ in 0..count {
+            let normals = [0; 4].map(|_| StandardNormal.sample(&mut rng));
+            let settings = VersionSettings { step, normals };
+            let found = versions(values, derivatives, &products, &settings).unwrap();
+            for (version, Version { e1, e2, flux, size }) in found.into_iter().enumerate() {
+                let x = [e1, e2, flux, size];
+                for a in 0..4 {
+                    sums[version][a] += x[a] - values[a];
+                    for b in 0..4 {
+                        squares[version][a][b] += (x[a] - values[a]) * (x[b] - values[b]);
+                    }
+                }
+            }
+        }
+        let count = f64::from(count);
+        let along = [
+            [0.0, 0.0],
+            [step, 0.0],
+            [-step, 0.0],
+            [0.0, step],
+            [0.0, -step],
+        ];
+        let covariance = |version: usize, a: usize, b: usize| {
+            squares[version][a][b] / count - sums[version][a] * sums[version][b] / count / count
+        };
+        for a in 0..4 {
+            for version in 0..5 {
+                let expected =
+                    along[version][0] * derivatives[0][a] + along[version][1] * derivatives[1][a];
+                let error = (covariance(version, a, a) / count).sqrt();
+                let found = sums[version][a] / count;
+                assert!(
+                    (found - expected).abs() < 4.0 * error,
+                    "{version} {a}: {found} {expected}"
+                );
+            }
+            for b in 0..4 {
+                let scale = (covariance(0, a, a) * covariance(0, b, b)).sqrt();
+                // All versions have the same normals, so that their difference scatters much less than each.
+                let error = 4.0 * scale * (2.0 / count).sqrt();
+                for (k, [plus, minus]) in [[1, 2], [3, 4]].into_iter().enumerate() {
+                    let difference = covariance(plus, a, b) - covariance(minus, a, b);
+                    let expected = -4.0 * step * products.sheared[k][a][b];
+                    assert!(
+                        (difference - expected).abs() < error,
+                        "{k} {a} {b}: {difference} {expected}"
+                    );
+                    let mean = 0.5 * (covariance(plus, a, b) + covariance(minus, a, b));
+                    assert!((mean - covariance(0, a, b)).abs() < error);
+                }
+            }
+        }
+        // Next to T, what is added is noise of the galaxy's own kind.
+        let share = (covariance(0, 0, 0) - products.turned[0][0]) / products.plain[0][0];
+        assert!(share > 0.0 && share < 0.5, "{share}");
+        for a in 0..4 {
+            for b in 0..4 {
+                let expected = share * products.plain[a][b] + products.turned[a][b];
+                let scale = (covariance(0, a, a) * covariance(0, b, b)).sqrt();
+                let error = 6.0 * scale * (2.0 / count).sqrt();
+                assert!((covariance(0, a, b) - expected).abs() < error, "{a} {b}");
+            }
+        }
+    }
+
+    #[test]
+    fn without_noise_versions_are_exact_and_of_nonsense_there_are_none() {
+        let derivatives = [[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]];
+        let settings = |step: f64, normal: f64| VersionSettings {
+            step,
+            normals: [normal; 4],
+        };
+        let found = versions([0.0; 4], derivatives, &Products::NONE, &settings(0.5, 9.0)).unwrap();
+        let expected = |e1, e2, flux, size| Version { e1, e2, flux, size };
+        assert_eq!(found[0], expected(0.0, 0.0, 0.0, 0.0));
+        assert_eq!(found[1], expected(0.5, 1.0, 1.5, 2.0));
+        assert_eq!(found[4], expected(-2.5, -3.0, -3.5, -4.0));
+        let mut bad = products();
+        bad.plain[2][2] = -1.0;
+        assert_eq!(
+            versions([0.0; 4], derivatives, &bad, &settings(0.01, 0.0)),
+            None
+        );
+        bad.plain[2][2] = f64::NAN;
+        assert_eq!(
+            versions([0.0; 4], derivatives, &bad, &settings(0.01, 0.0)),
+            None
+        );
+    }
+
+    #[test]
+    fn the_norm_bounds_the_eigenvalues() {
+        let root = root(&products().plain).unwrap();
+        // Of C itself, whitened, all four eigenvalues are one.
+        assert!((whitened_norm(&products().plain, &root) - 2.0).abs() < 1e-12);
+        let once = products().sheared[0];
+        let twice = once.map(|row| row.map(|value| -2.0 * value));
+        let norms = [once, twice].map(|matrix| whitened_norm(&matrix, &root));
+        assert!((norms[1] / norms[0] - 2.0).abs() < 1e-12);
+    }
+}
