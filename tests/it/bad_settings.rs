@@ -188,3 +188,20 @@ fn a_header_that_must_give_the_noise_does_so() {
         "{message}"
     );
 }
+
+#[test]
+fn a_network_without_an_iteration_is_noticed() {
+    let small = Small::new("2");
+    let path = small.at("idle.toml");
+    for (setting, warned) in [
+        ("step = 0.5", true),
+        ("lambda = 1e300", true),
+        ("step = 0.002", false),
+    ] {
+        let settings = format!("extends = \"23/raw/star\"\n[deconvolution]\n{setting}\n");
+        fs::write(&path, settings).unwrap();
+        let said = small.measure(&["--submission", text(&path)]);
+        let expected = "the network makes no iteration (found ";
+        assert_eq!(said.contains(expected), warned, "{setting}: {said}");
+    }
+}

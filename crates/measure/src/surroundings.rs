@@ -32,7 +32,7 @@ const BLENDED: f32 = 0.1;
 /// docs/constants.md.
 const FITTED_FROM: f32 = 0.3;
 /// Distance below which a neighbour cannot be removed. See docs/constants.md.
-const TOO_NEAR: f32 = 13.0;
+const TOO_NEAR: f32 = 16.0;
 /// Light of a neighbour, in units of the galaxy's light within 8 px, above which it cannot be
 /// removed. See docs/constants.md.
 const TOO_BRIGHT: f32 = 5.0;

@@ -66,6 +66,13 @@ pub enum Warning {
         /// Mean correlation of pixels four and five apart along an axis.
         correlation: f64,
     },
+    /// The network stopped before its first iteration on most galaxies.
+    Idle {
+        /// Number of these galaxies.
+        count: usize,
+        /// Number of galaxies that the network ran on.
+        of: usize,
+    },
     /// Stamps are copies of other stamps.
     Copies {
         /// Stamps that are copies.
@@ -225,7 +232,18 @@ impl Warning {
         Warning::of_counts(with, count, of)
     }
 
-    /// The same if `count` galaxies of so many are flagged, each number of them `with` a flag.
+    /// A warning if the network made no iteration on more than half of the galaxies that it ran on.
+    pub fn of_idle<P: AsRef<[Measurement]>>(parts: &[P]) -> Option<Warning> {
+        let galaxies = parts.iter().flat_map(AsRef::as_ref);
+        let (mut count, mut of) = (0, 0);
+        for descent in galaxies.filter_map(|galaxy| galaxy.descent.as_ref()) {
+            count += usize::from(descent.iterations == 0);
+            of += 1;
+        }
+        (2 * count > of).then_some(Warning::Idle { count, of })
+    }
+
+    /// The same as [`Warning::of_flags`] if `count` galaxies of so many are flagged, each number of them `with` a flag.
     pub fn of_counts(with: impl Fn(Flag) -> usize, count: usize, of: usize) -> Option<Warning> {
         // Galaxies without a usable mean response have this flag together with the one that explains it.
         let explains = |flag: &Flag| *flag != Flag::NoResponse && 2 * with(*flag) > of;
@@ -246,6 +264,7 @@ impl Warning {
             Warning::Negative { .. } => "negative",
             Warning::Depths { .. } => "depths",
             Warning::LongCorrelation { .. } => "long-correlation",
+            Warning::Idle { .. } => "idle",
             Warning::Copies { .. } => "copies",
             Warning::Blank { .. } => "blank",
             Warning::Brightness { .. } => "brightness",
@@ -385,6 +404,10 @@ impl fmt::Display for Warning {
             Warning::LongCorrelation { correlation } => write!(
                 f,
                 "the noise is correlated over more than 3 px (found {correlation:.2} for pixels 4 and 5 px apart; expected 0). The response is corrected for shorter correlations only. Try: use images before resampling or smoothing"
+            ),
+            Warning::Idle { count, of } => write!(
+                f,
+                "the network makes no iteration (found {count} of {of} galaxies). Their images are not deconvolved. Try: other values of deconvolution.step and deconvolution.lambda"
             ),
             Warning::Copies { count, of } => write!(
                 f,

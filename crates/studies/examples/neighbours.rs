@@ -37,7 +37,7 @@ const DISTANCES: [[f64; 2]; 6] = [
 /// Fluxes of the neighbour in units of the galaxy's.
 const RATIOS: [[f64; 2]; 2] = [[0.3, 1.0], [1.0, 3.0]];
 /// Ends of the axis of m in the figure, in 10⁻³.
-const SHOWN: (f64, f64) = (-100.0, 40.0);
+const SHOWN: (f64, f64) = (-100.0, 100.0);
 /// Largest error of m that the figure shows.
 const MOST_ERROR: f64 = 0.05;
 /// Groups of scenes that the errors come from.

@@ -100,6 +100,7 @@ pub(super) fn warnings(rows: &[MeasuredRow]) -> Vec<Warning> {
         found.extend(stated.map(of_header));
     }
     found.extend(Warning::of_flags(rows));
+    found.extend(Warning::of_idle(rows));
     found
 }
 
