@@ -239,7 +239,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if !arguments.against.is_empty() {
         let other = of_catalogues(arguments, &arguments.against)?;
         let difference = summed.difference(&other)?;
-        let table = compared_table(&result, &other.result(errors)?, &difference);
+        let other = other.result(errors)?;
+        if let Some(chosen) = chosen_by_measurement(&other) {
+            tell(format_args!("warning: --against: {chosen}"));
+        }
+        let table = compared_table(&result, &other, &difference);
         return arguments.printing.print(&table);
     }
     let table = bias_table(&result);

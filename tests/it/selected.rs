@@ -102,6 +102,8 @@ fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
         assert!((a - b).abs() < 1e-3, "{a} {b}");
         assert!(a.abs() < 0.1, "{a}");
     }
+    let (_, warned) = m(&measured, &["--bins", "snr:2"]);
+    assert!(warned.contains("a choice by `snr`"), "{warned}");
     let (filtered, warned) = m(&measured, &["--select", "size > 2 and snr > 15"]);
     assert!(warned.contains("Try: --where"), "{warned}");
     // A cut in size removes sheared galaxies; m of 3200 galaxies without shape noise has an error of 0.03.
@@ -178,6 +180,53 @@ fn sheared_versions_give_the_response_of_any_selection() {
         );
     }
     assert!(said(&cut).contains("Columns: shearq, sheared versions."));
+    // Names of the unsheared version, and columns that shear does not change, select the same galaxies with the same response.
+    let json = |select: &str| {
+        let printed = said(&["--select", select, "--step", "0.02", "--format", "json"]);
+        let table: Value = serde_json::from_str(&printed).unwrap();
+        table["rows"][0].clone()
+    };
+    let plain = json("size > 2.7");
+    assert!(plain["n"].as_f64().unwrap() < 700.0, "{plain}");
+    for select in ["size_noshear > 2.7", "size > 2.7 and x > 0 and flags == 0"] {
+        assert_eq!(json(select), plain, "{select}");
+    }
+    // Bins of columns without versions keep the response of the selection, and the reverse.
+    let of_all = |options: &[&str]| {
+        let printed = said(&[options, &["--step", "0.02", "--format", "json"]].concat());
+        let table: Value = serde_json::from_str(&printed).unwrap();
+        ["m1", "m2", "r1", "r2"].map(|name| table["rows"][0][name].as_f64().unwrap())
+    };
+    let alone = of_all(&["--select", "size > 2.7"]);
+    let binned = of_all(&["--select", "size > 2.7", "--bins", "x:2"]);
+    for (alone, binned) in alone.iter().zip(binned) {
+        // Sums in another order.
+        assert!((alone - binned).abs() < 1e-9, "{alone} {binned}");
+    }
+    let by_place = of_all(&["--select", "x > 0", "--bins", "snr:2"]);
+    for (alone, binned) in of_all(&["--bins", "snr:2"]).iter().zip(by_place) {
+        assert!((alone - binned).abs() < 1e-9, "{alone} {binned}");
+    }
+    for (select, expected) in [
+        (
+            "size_1p > 2.7",
+            "belongs to one sheared version (expected a column of all). Try: size",
+        ),
+        (
+            "size > 2.7 and R11 > 0",
+            "`R11`: it changes with shear, and has no sheared versions",
+        ),
+    ] {
+        let refused = fail(
+            &[
+                &["bias"],
+                &folders[..],
+                &["--select", select, "--step", "0.02"],
+            ]
+            .concat(),
+        );
+        assert!(refused.contains(expected), "{refused}");
+    }
     // Without a selection that needs them, and with one whose response is known, versions only add noise.
     assert!(said(&[]).contains("Columns: shearq."));
     assert!(said(&["--where", "snr > 20"]).contains("Columns: shearq."));

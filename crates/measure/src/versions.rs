@@ -8,9 +8,10 @@
 //! ```
 //!
 //! (Stein's lemma). The responses X′ are already without the first term. Gaussian noise of covariance ∓2hK, added to X, takes
-//! out the second one. A covariance cannot be negative, so that a small share of C is added in all versions.
-//! In the same way, noise of covariance T takes out what the shape of the PSF gives to noise: T is half of the difference to the
-//! covariance of noise behind a PSF turned by 90 degrees.
+//! out the second one. A covariance cannot be negative, so that a small share of C is added in all versions, without its couplings of
+//! the ellipticity to flux and size.
+//! In the same way, noise of covariance T takes out what the shape of the PSF gives to noise. For each mode, T is the geometric mean
+//! of the power behind the PSF and the power behind a PSF turned by 90 degrees, less the former.
 //!
 //! The difference of the means of versions 1p and 1m, divided by 2h, is then the response to γ1 for any selection by the values of
 //! each version.
@@ -22,8 +23,10 @@ const VALUES: usize = 4;
 /// A symmetric matrix of all values.
 type Matrix = [[f64; VALUES]; VALUES];
 
-/// Share of the noise by which more is added than needed, against rounding. See docs/constants.md.
+/// Share of the noise that is enough by more than rounding. See docs/constants.md.
 const MARGIN: f64 = 1e-3;
+/// Steps of the bisection for the share of the noise that is added. See docs/constants.md.
+const HALVINGS: usize = 8;
 
 /// What is measured on a galaxy under a shear.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -114,27 +117,47 @@ pub(crate) fn versions(
         sheared,
         turned,
     } = products;
-    let largest = |matrix: &Matrix, root: &Matrix| whitened_norm(matrix, root);
-    let share = match root(plain) {
-        _ if plain.iter().flatten().all(|value| *value == 0.0) => 0.0,
-        None => return None,
-        Some(root) => {
-            let [first, second] = sheared.each_ref().map(|matrix| largest(matrix, &root));
-            (largest(turned, &root) + 2.0 * step * first.max(second)) * (1.0 + MARGIN) + MARGIN
+    let added = round(plain);
+    let covariance = |share: f64, along: [f64; 2]| -> Matrix {
+        std::array::from_fn(|a| {
+            std::array::from_fn(|b| {
+                let of_shear = along[0] * sheared[0][a][b] + along[1] * sheared[1][a][b];
+                share * added[a][b] + turned[a][b] - 2.0 * of_shear
+            })
+        })
+    };
+    let shears = [
+        [0.0; 2],
+        [step, 0.0],
+        [-step, 0.0],
+        [0.0, step],
+        [0.0, -step],
+    ];
+    let silent = plain.iter().flatten().all(|value| *value == 0.0);
+    let share = if silent {
+        0.0
+    } else {
+        let root_of_added = root(&added)?;
+        let norm = |matrix: &Matrix| whitened_norm(matrix, &root_of_added);
+        let most = norm(turned) + 2.0 * step * norm(&sheared[0]).max(norm(&sheared[1])) + MARGIN;
+        let enough = |share: f64| {
+            shears
+                .iter()
+                .all(|along| root(&covariance(share, *along)).is_some())
+        };
+        let (mut low, mut high) = (0.0, most);
+        for _ in 0..HALVINGS {
+            let middle = 0.5 * (low + high);
+            *(if enough(middle) { &mut high } else { &mut low }) = middle;
         }
+        high
     };
     // Along no shear, γ1 and γ2.
     let version = |along: [f64; 2]| -> Option<Version> {
-        let covariance = std::array::from_fn(|a| {
-            std::array::from_fn(|b| {
-                let of_shear = along[0] * sheared[0][a][b] + along[1] * sheared[1][a][b];
-                share * plain[a][b] + turned[a][b] - 2.0 * of_shear
-            })
-        });
-        let root = if share == 0.0 {
+        let root = if silent {
             [[0.0; VALUES]; VALUES]
         } else {
-            root(&covariance)?
+            root(&covariance(share, along))?
         };
         let [e1, e2, flux, size] = std::array::from_fn(|a| {
             let added: f64 = (0..=a).map(|k| root[a][k] * normals[k]).sum();
@@ -143,13 +166,28 @@ pub(crate) fn versions(
         });
         Some(Version { e1, e2, flux, size })
     };
+    let [plain, first_plus, first_minus, second_plus, second_minus] = shears.map(version);
     Some([
-        version([0.0; 2])?,
-        version([step, 0.0])?,
-        version([-step, 0.0])?,
-        version([0.0, step])?,
-        version([0.0, -step])?,
+        plain?,
+        first_plus?,
+        first_minus?,
+        second_plus?,
+        second_minus?,
     ])
+}
+
+/// Noise of the size of `covariance` that does not depend on the direction of the galaxy: couplings of the ellipticity to flux and
+/// size change with shear, which the versions do not.
+fn round(covariance: &Matrix) -> Matrix {
+    let mut round = [[0.0; VALUES]; VALUES];
+    let mean = 0.5 * (covariance[0][0] + covariance[1][1]);
+    (round[0][0], round[1][1]) = (mean, mean);
+    for a in 2..VALUES {
+        for b in 2..VALUES {
+            round[a][b] = covariance[a][b];
+        }
+    }
+    round
 }
 
 /// The lower triangle L of LLᵀ = `matrix`; `None` if it is not positive.
@@ -287,11 +325,11 @@ mod tests {
             }
         }
         // Next to T, what is added is noise of the galaxy's own kind.
-        let share = (covariance(0, 0, 0) - products.turned[0][0]) / products.plain[0][0];
+        let share = (covariance(0, 3, 3) - products.turned[3][3]) / products.plain[3][3];
         assert!(share > 0.0 && share < 0.5, "{share}");
         for a in 0..4 {
             for b in 0..4 {
-                let expected = share * products.plain[a][b] + products.turned[a][b];
+                let expected = share * round(&products.plain)[a][b] + products.turned[a][b];
                 let scale = (covariance(0, a, a) * covariance(0, b, b)).sqrt();
                 let error = 6.0 * scale * (2.0 / count).sqrt();
                 assert!((covariance(0, a, b) - expected).abs() < error, "{a} {b}");

@@ -9,6 +9,7 @@ pub mod positions;
 mod read;
 pub mod truth;
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -256,7 +257,10 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         request.bins.as_ref().map(|bins| &bins.of),
     ];
     let by = expressions.into_iter().flatten();
-    let measured = by.flat_map(|by| first.measured(by)).collect();
+    let measured = by
+        .flat_map(|by| first.measured(by))
+        .collect::<BTreeSet<_>>();
+    let measured = measured.into_iter().collect();
     let (truth, response) = (known(&request.truth, first), has_response(first));
     check_columns(request, &all)?;
     let edges = match &request.bins {

@@ -10,18 +10,22 @@
 //! same wave, so those beyond π are added onto those within (that is what sampling does to real light, too).
 
 use std::f64::consts::{PI, TAU};
-use std::ops::Range;
 
-use multiversion::multiversion;
 use ndarray::Array2;
 use shearq_fourier::{Complex32, Complex64};
 use shearq_quantities::FunctionalPsf;
-use shearq_quantities::Shear;
 use shearq_quantities::TransformedPsf;
 use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
 use shearq_quantities::radial::{QuadraticForm, SingleTable};
 
-use super::galaxy::{Component, EXPONENTIAL_HALF_LIGHT, Galaxy, Sersic};
+use super::galaxy::{Component, Galaxy};
+
+mod lines;
+
+use self::lines::{
+    Wave, add_reversed, add_times, form_in_steps, shift, shine, tabulate, unfold_pixels,
+    unfold_rows,
+};
 
 /// Wavenumbers are dropped where galaxy × PSF × pixel is below this share of the flux. The image loses
 /// about 1/(2π) ∫ k |F| dk over them; in a PSF's exponential tail near k = 3.5 that is a fifth of it,
@@ -34,7 +38,7 @@ const FOLDING_TOLERANCE: f64 = 3e-5;
 /// The largest wavenumber in units of π. It is reached only by PSFs with a FWHM near one pixel.
 const MAX_ORDER: usize = 3;
 
-/// Smallest periods tried, in thirds of the stamp's size.
+/// Smallest periods tried, in thirds of the stamp's size, or of 16 px if it is smaller.
 const PERIODS_IN_THIRDS: [usize; 4] = [6, 8, 12, 24];
 
 /// Draws galaxies on square stamps of one size.
@@ -169,7 +173,8 @@ impl Renderer {
     /// When `stamp` is 0.
     pub fn new(stamp: usize) -> Self {
         assert!(stamp > 0, "a stamp has at least one pixel");
-        let grids = PERIODS_IN_THIRDS.map(|thirds| Grid::new((stamp * thirds).div_ceil(3), stamp));
+        let grids =
+            PERIODS_IN_THIRDS.map(|thirds| Grid::new((stamp.max(16) * thirds).div_ceil(3), stamp));
         Renderer {
             stamp,
             grids: grids.into(),
@@ -188,7 +193,8 @@ impl Renderer {
     /// `centre` is the galaxy's centre in 0-based pixel-centre coordinates: (23.5, 23.5) is the
     /// corner of the four central pixels of a 48 × 48 stamp. The centre should lie in the stamp.
     /// The sum of `out` is the flux less the light outside the stamp. Errors are near 1e-4 of the
-    /// peak or less; the period grows with galaxies whose wings would fold, up to eight stamps.
+    /// peak or less; the period grows with galaxies whose wings would fold, up to eight stamps. PSFs and galaxies below
+    /// a pixel have light beyond the largest wavenumber.
     ///
     /// # Panics
     /// When `out` has not `stamp`² values.
@@ -219,7 +225,14 @@ impl Renderer {
         let limit = FOLDING_TOLERANCE * rough_peak(galaxy, psf);
         let last = (self.stamp - 1) as f64;
         let reach = |c: f64| c.max(last - c);
-        let reach = (reach(centre.0), reach(centre.1));
+        let offset = |of: fn(&Component) -> f64| -> f64 {
+            let all = galaxy.components().iter();
+            all.map(|c| of(c).abs()).fold(0.0, f64::max)
+        };
+        let reach = (
+            reach(centre.0) + offset(|c| c.dx),
+            reach(centre.1) + offset(|c| c.dy),
+        );
         let largest = self.grids.len() - 1;
         self.grids[..largest]
             .iter()
@@ -437,212 +450,6 @@ fn groups(galaxy: &Galaxy) -> impl Iterator<Item = &[Component]> {
     galaxy
         .components()
         .chunk_by(|a, b| a.dx == b.dx && a.dy == b.dy)
-}
-
-/// A component in steps of wavenumbers.
-#[derive(Clone, Copy)]
-struct Wave {
-    profile: Sersic,
-    flux: f32,
-    /// The squared radius in units of the profile's formula or table.
-    form: QuadraticForm,
-}
-
-impl Wave {
-    fn new(component: &Component, step: f64) -> Self {
-        let form = form_in_steps(component.shape, component.half_light_radius, step);
-        Wave {
-            profile: component.profile,
-            flux: component.flux as f32,
-            form: match component.profile {
-                Sersic::Exponential => form.scaled(EXPONENTIAL_HALF_LIGHT.powi(-2)),
-                Sersic::DeVaucouleurs => form,
-            },
-        }
-    }
-}
-
-/// The squared radius in units of 1/`length` at integer wavenumbers (i, j).
-fn form_in_steps(shape: Shear, length: f64, step: f64) -> QuadraticForm {
-    QuadraticForm::of_wavenumbers(shape).scaled((length * step).powi(2))
-}
-
-/// A quadratic form at wavenumber `j` along y, as a polynomial of that along x: `[constant, linear, square]`.
-#[inline(always)]
-fn on_line(form: QuadraticForm, j: f32) -> [f32; 3] {
-    let j = f64::from(j);
-    [form.yy * j * j, 2.0 * form.xy * j, form.xx].map(|c| c as f32)
-}
-
-/// Light of components that share a centre, behind PSF and pixel, at wavenumbers `j` and -`j` along y and all from 0
-/// along x.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn shine(
-    waves: &[Option<Wave>; Galaxy::MAX_COMPONENTS],
-    j: f32,
-    blur: [&[f32]; 2],
-    above: &mut [f32],
-    below: &mut [f32],
-) {
-    for (line, (j, blur)) in [above, below]
-        .into_iter()
-        .zip([j, -j].into_iter().zip(blur))
-    {
-        line.fill(0.0);
-        for wave in waves.iter().flatten() {
-            let form = on_line(wave.form, j);
-            match wave.profile {
-                Sersic::Exponential => add_exponential(form, wave.flux, line),
-                Sersic::DeVaucouleurs => {
-                    let table = Sersic::de_vaucouleurs_table().single();
-                    add_tabulated(table, form, wave.flux, line);
-                }
-            }
-        }
-        for (value, blur) in line.iter_mut().zip(blur) {
-            *value *= blur;
-        }
-    }
-}
-
-#[inline(always)]
-fn add_exponential([constant, linear, square]: [f32; 3], flux: f32, line: &mut [f32]) {
-    for (i, value) in line.iter_mut().enumerate() {
-        let i = i as i32 as f32;
-        *value += flux * power_of_minus_three_halves(1.0 + constant + i * (linear + square * i));
-    }
-}
-
-#[inline(always)]
-fn add_tabulated(
-    table: SingleTable<'_>,
-    [constant, linear, square]: [f32; 3],
-    flux: f32,
-    line: &mut [f32],
-) {
-    for (i, value) in line.iter_mut().enumerate() {
-        let i = i as i32 as f32;
-        let u = constant + i * (linear + square * i);
-        *value += flux * table.at(u.max(0.0));
-    }
-}
-
-/// PSF × pixel on a line of wavenumbers.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn tabulate(
-    table: SingleTable<'_>,
-    form: QuadraticForm,
-    j: f32,
-    pixel_y: f32,
-    pixel: &[f32],
-    out: &mut [f32],
-) {
-    let [constant, linear, square] = on_line(form, j);
-    for (i, (value, pixel)) in out.iter_mut().zip(pixel).enumerate() {
-        let i = i as i32 as f32;
-        let u = constant + i * (linear + square * i);
-        *value = pixel_y * pixel * table.at(u.max(0.0));
-    }
-}
-
-/// v^(−3/2) of a number that is neither tiny nor huge, to 4·10⁻⁷ of it. Newton's steps for 1/√v take less time
-/// than a square root and a division.
-#[inline(always)]
-fn power_of_minus_three_halves(v: f32) -> f32 {
-    // Half of the exponent with the opposite sign, and a straight line for the fraction: right to 3.5 %.
-    let mut root = f32::from_bits(0x5f37_5a86 - (v.to_bits() >> 1));
-    let half = 0.5 * v;
-    for _ in 0..3 {
-        root *= 1.5 - half * root * root;
-    }
-    root * root * root
-}
-
-/// The sum of two lines of wavenumbers and i times their difference, shifted by phases.
-///
-/// With a and b at ±ky, and e^{−iky} = c + iq, the sum is (a + b)c + i(a − b)q, and i times the difference is
-/// −(a + b)q + i(a − b)c.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn shift(
-    above: &[f32],
-    below: &[f32],
-    phases: &Phases,
-    phase_y: Complex32,
-    [sum, difference]: [&mut [f32]; 2],
-) {
-    let count = above.len();
-    let (below, x_re, x_im) = (
-        &below[..count],
-        &phases.x_re[..count],
-        &phases.x_im[..count],
-    );
-    let (sum_re, sum_im) = sum.split_at_mut(count);
-    let (difference_re, difference_im) = difference.split_at_mut(count);
-    let (sum_im, difference_im) = (&mut sum_im[..count], &mut difference_im[..count]);
-    let (c, q) = (phase_y.re, phase_y.im);
-    for i in 0..count {
-        let (a, b) = (above[i], below[i]);
-        let (sum, difference) = (a + b, a - b);
-        let (re, im) = (sum * c, difference * q);
-        sum_re[i] = re * x_re[i] - im * x_im[i];
-        sum_im[i] = re * x_im[i] + im * x_re[i];
-        let (re, im) = (-sum * q, difference * c);
-        difference_re[i] = re * x_re[i] - im * x_im[i];
-        difference_im[i] = re * x_im[i] + im * x_re[i];
-    }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn add_times(values: &[f32], factor: f32, to: &mut [f32]) {
-    for (to, value) in to.iter_mut().zip(values) {
-        *to += factor * value;
-    }
-}
-
-fn add_reversed(values: &[f32], factor: f32, to: &mut [f32]) {
-    for (to, value) in to.iter_mut().rev().zip(values) {
-        *to += factor * value;
-    }
-}
-
-/// Lines on both sides of the middle, from `columns` of the even and odd parts, whose lines have `width` numbers.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn unfold_rows(
-    even: &[f32],
-    odd: &[f32],
-    (width, columns): (usize, Range<usize>),
-    out: &mut [f32],
-) {
-    let wide = columns.len();
-    let count = out.len() / wide;
-    let parts = even.chunks_exact(width).zip(odd.chunks_exact(width));
-    for (row, (even, odd)) in parts.enumerate().take(count.div_ceil(2)) {
-        let (even, odd) = (&even[columns.clone()], &odd[columns.clone()]);
-        let above = &mut out[(count / 2 + row) * wide..][..wide];
-        for (value, (even, odd)) in above.iter_mut().zip(even.iter().zip(odd)) {
-            *value = even + odd;
-        }
-        let below = &mut out[((count - 1) / 2 - row) * wide..][..wide];
-        for (value, (even, odd)) in below.iter_mut().zip(even.iter().zip(odd)) {
-            *value = even - odd;
-        }
-    }
-}
-
-/// Pixels on both sides of the middle, from even and odd parts of `width` numbers for each line of `stamp` pixels.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn unfold_pixels(even: &[f32], odd: &[f32], (width, stamp): (usize, usize), out: &mut [f32]) {
-    let parts = even.chunks_exact(width).zip(odd.chunks_exact(width));
-    for (line, (even, odd)) in out.chunks_exact_mut(stamp).zip(parts) {
-        let right = line[stamp / 2..].iter_mut();
-        for (value, (even, odd)) in right.zip(even.iter().zip(odd)) {
-            *value = even + odd;
-        }
-        let left = line[..=(stamp - 1) / 2].iter_mut().rev();
-        for (value, (even, odd)) in left.zip(even.iter().zip(odd)) {
-            *value = even - odd;
-        }
-    }
 }
 
 /// The wavenumber (rad/px) beyond which galaxy × PSF × pixel is below the tolerance in all directions.

@@ -392,6 +392,8 @@ mod tests {
             // Sides that lanes divide and that they do not, and centres on, between and beside pixels.
             for (size, centre) in [
                 ((16, 24), (11.5, 7.5)),
+                ((15, 9), (4.0, 7.0)),
+                ((11, 6), (2.5, 5.0)),
                 ((11, 13), (6.3, 4.9)),
                 ((3, 5), (-2.0, 1.0)),
             ] {

@@ -410,27 +410,38 @@ impl Columns {
         } else {
             Preset::Plain
         };
-        Ok(Columns {
+        let mut columns = Columns {
             roles,
             preset,
             distortion,
-        })
+        };
+        if preset == Preset::Metacal && !names.0.contains_key("e1") {
+            columns.take_unsheared(found);
+        }
+        Ok(columns)
     }
 
     /// Of a catalogue of shearq with sheared versions, takes these versions if a selection requires them, and otherwise the
     /// columns without them, which have less noise.
-    pub fn choose_versions(&mut self, required: bool) {
+    pub fn choose_versions(&mut self, found: &[String], required: bool) {
         if self.preset != Preset::Shearq || !self.roles.contains_key(&Role::E1p) {
             return;
         }
         if required {
             self.preset = Preset::Versions;
-            for (role, name) in [(Role::E1, "e1_noshear"), (Role::E2, "e2_noshear")] {
-                self.roles.insert(role, name.to_owned());
-            }
+            self.take_unsheared(found);
         } else {
             for role in [Role::E1p, Role::E1m, Role::E2p, Role::E2m] {
                 self.roles.remove(&role);
+            }
+        }
+    }
+
+    /// Takes the ellipticity of the unsheared version if there is one: other columns may have less noise than versions.
+    fn take_unsheared(&mut self, found: &[String]) {
+        for (role, name) in [(Role::E1, "e1_noshear"), (Role::E2, "e2_noshear")] {
+            if found.iter().any(|own| own == name) {
+                self.roles.insert(role, name.to_owned());
             }
         }
     }
@@ -497,7 +508,8 @@ mod tests {
             (false, Preset::Shearq, "e1", None),
         ] {
             let mut own = found(names, &[]).unwrap();
-            own.choose_versions(required);
+            let all: Vec<String> = names.split(' ').map(str::to_owned).collect();
+            own.choose_versions(&all, required);
             assert_eq!((own.preset, own.of(Role::E1)), (preset, Some(e1)));
             assert_eq!(own.of(Role::E1p), plus);
         }

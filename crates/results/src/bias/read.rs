@@ -82,11 +82,9 @@ impl Source {
     /// Columns of an expression that were measured on galaxies that shear has changed.
     pub(super) fn measured(&self, expression: &Expression) -> Vec<String> {
         let own = self.columns.preset == Preset::Shearq;
-        let known = |name: &&String| {
-            Observables::COLUMNS.contains(&name.as_str()) || READ.contains(&name.as_str())
-        };
-        let columns = expression.columns().iter().filter(known);
-        columns.filter(|_| own).cloned().collect()
+        let columns = expression.columns().iter();
+        let columns = columns.filter(|name| own && is_measured(name));
+        columns.cloned().collect()
     }
 
     /// Whether rows belong to versions.
@@ -197,14 +195,18 @@ fn source(
     reading: &Reading,
 ) -> Result<Source, FileError> {
     let mut columns = Columns::find(&place.path, names, &reading.names)?;
-    let by_measured = |expression: &Option<Expression>| {
-        let named = expression.iter().flat_map(Expression::columns);
-        let sheared = |name: &String| names.contains(&format!("{name}_1p"));
-        named.into_iter().any(sheared)
-    };
-    let by_versions = by_measured(&reading.select) || by_measured(&reading.binned);
-    columns.choose_versions(by_versions && reading.selection.is_none());
+    let has_versions = |name: &str| names.contains(&format!("{}_1p", base(name)));
+    let expressions = [&reading.select, &reading.binned].into_iter().flatten();
+    let mut named = expressions.flat_map(Expression::columns);
+    // Also if one of them is named.
+    let by_versions = named
+        .clone()
+        .any(|name| has_versions(name) || version_of(name).is_some());
+    columns.choose_versions(names, by_versions && reading.selection.is_none());
     if columns.preset == Preset::Versions {
+        check_named(&place.path, named.clone(), has_versions)?;
+    }
+    if columns.have(&[Role::E1p]) && named.any(|name| has_versions(name)) {
         check_step(&place.path, reading.step)?;
     }
     let skipped = |role: &Role| match role {
@@ -247,11 +249,12 @@ fn source(
             }
             let mut all = vec![Some(own)];
             for (version, _) in VERSIONS {
-                let sheared = |name: &String| {
-                    let base = name.strip_suffix("_noshear").unwrap_or(name);
-                    place_of(&format!("{base}_{version}"))
+                // A column without versions is the same in all, if there are versions of another one.
+                let mut sheared = |name: &String| {
+                    let own = place_of(&format!("{}_{version}", base(name)));
+                    own.or_else(|| place_of(name).filter(|_| by_versions))
                 };
-                all.push(expression.columns().iter().map(sheared).collect());
+                all.push(expression.columns().iter().map(&mut sheared).collect());
             }
             Ok(all)
         };
@@ -283,16 +286,61 @@ fn source(
     Ok(source)
 }
 
+/// The name of a column without the name of the unsheared version.
+fn base(name: &str) -> &str {
+    name.strip_suffix("_noshear").unwrap_or(name)
+}
+
+/// The name of a column of one sheared version, without the name of the version.
+fn version_of(name: &str) -> Option<&str> {
+    let mut versions = VERSIONS.iter();
+    versions.find_map(|(version, _)| name.strip_suffix(version)?.strip_suffix('_'))
+}
+
+/// Whether a column of shearq's catalogues was measured on the galaxies.
+fn is_measured(name: &str) -> bool {
+    let known = Observables::COLUMNS.contains(&name) || READ.contains(&name);
+    (known || name == "snr" || name == "radius") && name != "flags"
+}
+
+/// Checks that the columns of an expression have versions, unless they do not change with shear.
+fn check_named<'a>(
+    path: &Path,
+    named: impl Iterator<Item = &'a String>,
+    has_versions: impl Fn(&str) -> bool,
+) -> Result<(), FileError> {
+    for name in named {
+        if let Some(base) = version_of(name).filter(|base| has_versions(base)) {
+            return Err(FileError::new(
+                path,
+                format!(
+                    "`{name}` belongs to one sheared version (expected a column of all). Try: {base}"
+                ),
+            ));
+        }
+        if is_measured(name) && !has_versions(name) {
+            return Err(FileError::new(
+                path,
+                format!(
+                    "galaxies cannot be selected by `{name}`: it changes with shear, and has no sheared versions (expected e1, e2, snr, flux or size)"
+                ),
+            ));
+        }
+    }
+    Ok(())
+}
+
 /// Checks that the versions of a catalogue of shearq are for a shear of `step`, if its settings are there.
 fn check_step(path: &Path, step: f64) -> Result<(), FileError> {
     let key = "settings".to_owned();
+    let read = |format| table::read_metadata(path, format, std::iter::once(&key)).ok();
     let stated = || {
-        let ending = path.extension()?;
-        let formats = [FileFormat::Parquet, FileFormat::Fits].into_iter();
-        let format = formats
-            .into_iter()
-            .find(|format| ending == format.extension())?;
-        let metadata = table::read_metadata(path, format, std::iter::once(&key)).ok()?;
+        let name = path.to_string_lossy().to_ascii_lowercase();
+        let metadata = if name.contains(".fit") {
+            read(FileFormat::Fits)?
+        } else {
+            read(FileFormat::Parquet)?
+        };
         let settings: toml::Table = metadata.get(&key)?.parse().ok()?;
         settings.get("shape")?.get("sheared_step")?.as_float()
     };

@@ -139,7 +139,7 @@ fn label(result: &BiasResult, [low, high]: [f64; 2]) -> String {
 pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     let column = result.measured.first()?;
     Some(format!(
-        "m contains the effect of shear on a choice by `{column}`, which was measured on the galaxies. Try: --where for cuts by snr, flux or size"
+        "m contains the effect of shear on a choice by `{column}`, which was measured on the galaxies. Try: --where for cuts by snr, flux or size, or catalogues with shape.sheared_step"
     ))
 }
 

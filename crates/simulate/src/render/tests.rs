@@ -3,6 +3,7 @@
 use super::*;
 use shearq_quantities::PsfProfile;
 use shearq_quantities::PsfTransform;
+use shearq_quantities::Shear;
 use shearq_quantities::radial::composite_rule;
 
 const STAMP: usize = 48;
@@ -375,4 +376,34 @@ fn odd_and_tiny_stamps_are_cut_from_the_same_image() {
     );
     let error = difference(&out, exact.iter().copied());
     assert!(error < 2e-4, "{error:e}");
+}
+
+#[test]
+fn stamps_of_few_pixels_and_odd_stamps_behind_narrow_psfs_are_drawn() {
+    for side in [1, 2, 3, 9, 16] {
+        for fwhm in [1.5, 3.4] {
+            let centre = (side as f64 - 1.0) / 2.0 + 0.2;
+            let case = case(
+                "",
+                (0.3, 1.8, 2.6),
+                (0.2, -0.1),
+                (0.4, -0.3),
+                (MOFFAT, fwhm, 0.05, 0.0),
+                (centre, centre - 0.3),
+            );
+            let exact = render_reference(side, &case.galaxy, &case.psf, case.centre, 180, 4.0);
+            let transform = PsfTransform::new(MOFFAT).unwrap();
+            let mut out = vec![f32::NAN; side * side];
+            Renderer::new(side).render(
+                &case.galaxy,
+                &transform.of(&case.psf).unwrap(),
+                case.centre,
+                &mut RenderScratch::new(),
+                &mut out,
+            );
+            let error = difference(&out, exact.iter().copied());
+            // Folded light is held near 3e-5 of the peak surface brightness, a rough one.
+            assert!(error < 2e-4, "{side} {fwhm}: {error:e}");
+        }
+    }
 }
