@@ -116,7 +116,7 @@ pub(super) fn tabulate(
     }
 }
 
-/// v^(−3/2) of a number that is neither tiny nor huge, to 4·10⁻⁷ of it. Newton's steps for 1/√v take less time
+/// v^(−3/2) of a number that is neither tiny nor huge, to 7·10⁻⁷ of it. Newton's steps for 1/√v take less time
 /// than a square root and a division.
 #[inline(always)]
 pub(super) fn power_of_minus_three_halves(v: f32) -> f32 {
@@ -217,6 +217,25 @@ pub(super) fn unfold_pixels(
         let left = line[..=(stamp - 1) / 2].iter_mut().rev();
         for (value, (even, odd)) in left.zip(even.iter().zip(odd)) {
             *value = even - odd;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_power_is_right_to_a_few_roundings() {
+        for i in 0..10_000 {
+            let v = (i as f32 * 2e-3).exp();
+            let exact = f64::from(v).powf(-1.5);
+            let found = f64::from(power_of_minus_three_halves(v));
+            // Three times the roundings of the root, three of 6e-8, and two more.
+            assert!(
+                (found / exact - 1.0).abs() < 11.0 * 6e-8,
+                "{v}: {found} {exact}"
+            );
         }
     }
 }
