@@ -309,8 +309,7 @@ impl<'s> Request<'s> {
         let mut warnings = examination.warnings();
         warnings.extend(self.given_noise(&examination)?);
         warnings.extend(Warning::of_settings(configuration));
-        warnings.extend(Warning::of_flags(galaxies));
-        warnings.extend(Warning::of_idle(galaxies));
+        warnings.extend(Warning::of_galaxies(galaxies));
         match warnings.iter().position(Warning::is_fatal) {
             Some(fatal) => Err(of_measuring(MeasureError::Data(
                 warnings.swap_remove(fatal),

@@ -101,8 +101,7 @@ impl Measurer {
         let mut warnings = examination.warnings();
         warnings.extend(noise.and_then(|noise| examination.given_noise(noise)));
         warnings.extend(Warning::of_settings(self.configuration()));
-        warnings.extend(Warning::of_flags(&galaxies));
-        warnings.extend(Warning::of_idle(&galaxies));
+        warnings.extend(Warning::of_galaxies(&galaxies));
         if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {
             return Err(MeasureError::Data(warnings.swap_remove(fatal)));
         }

@@ -232,8 +232,14 @@ impl Warning {
         Warning::of_counts(with, count, of)
     }
 
+    /// Warnings about what was found on the galaxies of an image, given in parts such as rows.
+    pub fn of_galaxies<P: AsRef<[Measurement]>>(parts: &[P]) -> impl Iterator<Item = Warning> {
+        let flags = Warning::of_flags(parts).into_iter();
+        flags.chain(Warning::of_idle(parts))
+    }
+
     /// A warning if the network made no iteration on more than half of the galaxies that it ran on.
-    pub fn of_idle<P: AsRef<[Measurement]>>(parts: &[P]) -> Option<Warning> {
+    fn of_idle<P: AsRef<[Measurement]>>(parts: &[P]) -> Option<Warning> {
         let galaxies = parts.iter().flat_map(AsRef::as_ref);
         let (mut count, mut of) = (0, 0);
         for descent in galaxies.filter_map(|galaxy| galaxy.descent.as_ref()) {

@@ -247,10 +247,7 @@ pub(super) fn draw_stars(set: &SetSimulator, fields: &ImageFields, iy: usize) ->
     let mut light = Array2::zeros((STAMP, STAMP));
     let mut star = vec![0.0; STAMP * STAMP];
     for ix in 0..n {
-        fields.psf.at(ix, iy).stamp_into(STAMP, light.view_mut());
-        for (pixel, light) in star.iter_mut().zip(light.as_slice().unwrap_or_default()) {
-            *pixel = *light as f32;
-        }
+        star_into(fields.psf.at(ix, iy), &mut light, &mut star);
         place(&star, STAMP, ix, n, &mut strip);
     }
     strip
@@ -266,7 +263,17 @@ pub fn place(stamp: &[f32], side: usize, ix: usize, n: usize, strip: &mut [f32])
 
 /// A noise-free star stamp with a sum of one.
 pub fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
-    psf.stamp(side).iter().map(|&v| v as f32).collect()
+    let mut star = vec![0.0; side * side];
+    star_into(psf, &mut Array2::zeros((side, side)), &mut star);
+    star
+}
+
+/// The same in place of what `star` holds, with room for its light in double precision.
+fn star_into(psf: &FunctionalPsf, light: &mut Array2<f64>, star: &mut [f32]) {
+    psf.stamp_into(light.nrows(), light.view_mut());
+    for (pixel, light) in star.iter_mut().zip(&*light) {
+        *pixel = *light as f32;
+    }
 }
 
 /// Writes the true shear of a set.

@@ -121,10 +121,10 @@ fn mean_square<const D: usize>(
 ) -> f64 {
     let (mut re, mut im) = ([0.0; D], [0.0; D]);
     for light in lights.iter().flatten() {
-        let QuadraticForm { xx, xy, yy } = light.form.scaled(k * k);
+        let form = light.form.scaled(k * k);
         let mut values = [0.0; D];
         for ((value, cos), sin) in values.iter_mut().zip(&turns.cos).zip(&turns.sin) {
-            *value = xx * cos * cos + 2.0 * xy * cos * sin + yy * sin * sin;
+            *value = form.at(*cos, *sin);
         }
         light.profile.fourier_each(&mut values);
         if light.offset == (0.0, 0.0) {

@@ -99,8 +99,7 @@ pub(super) fn warnings(rows: &[MeasuredRow]) -> Vec<Warning> {
         let stated = head.stated_noise.and_then(|noise| all.given_noise(noise));
         found.extend(stated.map(of_header));
     }
-    found.extend(Warning::of_flags(rows));
-    found.extend(Warning::of_idle(rows));
+    found.extend(Warning::of_galaxies(rows));
     found
 }
 

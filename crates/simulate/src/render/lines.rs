@@ -40,7 +40,7 @@ pub(super) fn form_in_steps(shape: Shear, length: f64, step: f64) -> QuadraticFo
 
 /// A quadratic form at wavenumber `j` along y, as a polynomial of that along x: `[constant, linear, square]`.
 #[inline(always)]
-pub(super) fn on_line(form: QuadraticForm, j: f32) -> [f32; 3] {
+fn on_line(form: QuadraticForm, j: f32) -> [f32; 3] {
     let j = f64::from(j);
     [form.yy * j * j, 2.0 * form.xy * j, form.xx].map(|c| c as f32)
 }
@@ -77,7 +77,7 @@ pub(super) fn shine(
 }
 
 #[inline(always)]
-pub(super) fn add_exponential([constant, linear, square]: [f32; 3], flux: f32, line: &mut [f32]) {
+fn add_exponential([constant, linear, square]: [f32; 3], flux: f32, line: &mut [f32]) {
     for (i, value) in line.iter_mut().enumerate() {
         let i = i as i32 as f32;
         *value += flux * power_of_minus_three_halves(1.0 + constant + i * (linear + square * i));
@@ -85,7 +85,7 @@ pub(super) fn add_exponential([constant, linear, square]: [f32; 3], flux: f32, l
 }
 
 #[inline(always)]
-pub(super) fn add_tabulated(
+fn add_tabulated(
     table: SingleTable<'_>,
     [constant, linear, square]: [f32; 3],
     flux: f32,
@@ -119,7 +119,7 @@ pub(super) fn tabulate(
 /// v^(−3/2) of a number that is neither tiny nor huge, to 7·10⁻⁷ of it. Newton's steps for 1/√v take less time
 /// than a square root and a division.
 #[inline(always)]
-pub(super) fn power_of_minus_three_halves(v: f32) -> f32 {
+fn power_of_minus_three_halves(v: f32) -> f32 {
     // Half of the exponent with the opposite sign, and a straight line for the fraction: right to 3.5 %.
     let mut root = f32::from_bits(0x5f37_5a86 - (v.to_bits() >> 1));
     let half = 0.5 * v;

@@ -155,9 +155,14 @@ fn cases() -> Vec<Case> {
 }
 
 fn fast(case: &Case, scratch: &mut RenderScratch) -> Vec<f32> {
+    fast_on(STAMP, case, scratch)
+}
+
+/// The same on a stamp of `side` × `side` pixels.
+fn fast_on(side: usize, case: &Case, scratch: &mut RenderScratch) -> Vec<f32> {
     let transform = PsfTransform::new(case.psf.profile).unwrap();
-    let mut out = vec![f32::NAN; STAMP * STAMP];
-    Renderer::new(STAMP).render(
+    let mut out = vec![f32::NAN; side * side];
+    Renderer::new(side).render(
         &case.galaxy,
         &transform.of(&case.psf).unwrap(),
         case.centre,
@@ -365,15 +370,7 @@ fn odd_and_tiny_stamps_are_cut_from_the_same_image() {
         (7.3, 6.8),
     );
     let exact = render_reference(15, &case.galaxy, &case.psf, case.centre, 240, 2.0);
-    let transform = PsfTransform::new(MOFFAT).unwrap();
-    let mut out = vec![0.0; 15 * 15];
-    Renderer::new(15).render(
-        &case.galaxy,
-        &transform.of(&case.psf).unwrap(),
-        case.centre,
-        &mut RenderScratch::new(),
-        &mut out,
-    );
+    let out = fast_on(15, &case, &mut RenderScratch::new());
     let error = difference(&out, exact.iter().copied());
     assert!(error < 2e-4, "{error:e}");
 }
@@ -392,15 +389,7 @@ fn stamps_of_few_pixels_and_odd_stamps_behind_narrow_psfs_are_drawn() {
                 (centre, centre - 0.3),
             );
             let exact = render_reference(side, &case.galaxy, &case.psf, case.centre, 180, 4.0);
-            let transform = PsfTransform::new(MOFFAT).unwrap();
-            let mut out = vec![f32::NAN; side * side];
-            Renderer::new(side).render(
-                &case.galaxy,
-                &transform.of(&case.psf).unwrap(),
-                case.centre,
-                &mut RenderScratch::new(),
-                &mut out,
-            );
+            let out = fast_on(side, &case, &mut RenderScratch::new());
             let error = difference(&out, exact.iter().copied());
             // Folded light is held near 3e-5 of the peak surface brightness, a rough one.
             assert!(error < 2e-4, "{side} {fwhm}: {error:e}");
