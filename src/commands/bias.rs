@@ -29,7 +29,8 @@ use shearq_submissions::EllipticityType;
 /// recognised.
 ///
 /// The design is recognised from the true shears: pairs of +γ and −γ, arms, one shear per catalogue, or shears that vary
-/// within a catalogue. Errors are from a jackknife over independent units. The output names design and units.
+/// within a catalogue. Errors are from a jackknife over independent units, and contain the noise of a star that several
+/// units share. The output names design and units.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Catalogues, all with the same columns, or folders that `measure` or `run` wrote. FILE[TABLE] is one table of a

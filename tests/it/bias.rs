@@ -673,6 +673,95 @@ fn folders_of_constant_shear_are_recognised_as_pairs() {
     assert!(message.contains("asked for twice"), "{message}");
 }
 
+/// Catalogues of shearq state what the noise of their star does to m and c.
+#[test]
+fn errors_contain_the_noise_of_a_star_that_all_galaxies_share() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, format, g: f64, psf: &[(&str, &str)]| {
+        let mut columns = complete(galaxies(3, [g; 2]), [g; 2]);
+        columns.retain(|(name, _)| *name != "w" && *name != "snr");
+        for divisor in ["divisor1", "divisor2"] {
+            columns.push((divisor, vec![1.0; GALAXIES]));
+        }
+        let renamed = |name: &'static str| if name == "flag" { "flags" } else { name };
+        let columns = columns.into_iter();
+        let columns = columns.map(|(name, values)| Column::new(renamed(name).into(), values));
+        let path = folder.path().join(name);
+        let metadata = psf.iter();
+        let metadata = metadata.map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
+        let table = frame(columns.collect()).unwrap();
+        table::write(&path, format, &table, &metadata.collect()).unwrap();
+        text(&path).to_owned()
+    };
+    let result = |of: &[String]| -> Value {
+        let all: Vec<&str> = of.iter().map(String::as_str).collect();
+        let found = shearq(&[&["bias"][..], &all, &["--format", "json"]].concat());
+        assert!(found.status.success(), "{found:?}");
+        serde_json::from_slice(&found.stdout).unwrap()
+    };
+    let pair = |name: &str, format, psfs: [&[(&str, &str)]; 2]| {
+        let [plus, minus] = [("plus", 0.02, psfs[0]), ("minus", -0.02, psfs[1])]
+            .map(|(sign, g, psf)| write(&format!("{sign}-{name}"), format, g, psf));
+        result(&[plus, minus])
+    };
+    let noise = ("psfnoise", "3.00e-1 4.00e-3");
+    let one: &[(&str, &str)] = &[noise, ("psf", "a")];
+    let other: &[(&str, &str)] = &[noise, ("psf", "b")];
+    let without = pair("0.parquet", FileFormat::Parquet, [&[], &[]]);
+    assert!(!without["notes"].to_string().contains("star"), "{without}");
+    for (name, format, psfs, [m, c], said) in [
+        (
+            "1.parquet",
+            FileFormat::Parquet,
+            [one, one],
+            [0.3, 4e-3],
+            "the star that all units share",
+        ),
+        (
+            "1.fits",
+            FileFormat::Fits,
+            [one, one],
+            [0.3, 4e-3],
+            "the star that all units share",
+        ),
+        // Each star has half of the galaxies, and an error of c under one sign only is one of m, too.
+        (
+            "2.parquet",
+            FileFormat::Parquet,
+            [one, other],
+            [
+                (0.3 / 2f64.sqrt()).hypot(4e-3 / 0.02 / 2f64.sqrt()),
+                (4e-3 / 2f64.sqrt()).hypot(0.3 * 0.02 / 2f64.sqrt()),
+            ],
+            "2 stars",
+        ),
+    ] {
+        let found = pair(name, format, psfs);
+        let notes = found["notes"].to_string();
+        assert!(notes.contains(said), "{notes}");
+        for (key, more) in [("m1", m), ("m2", m), ("c1", c), ("c2", c)] {
+            let (row, own) = (&found["rows"][0], &without["rows"][0]);
+            assert_eq!(row[key], own[key]);
+            let key = format!("{key}_error");
+            let expected = number(own, &key).hypot(more);
+            // The two halves of the galaxies differ by their responses, 0.2/√4000 of 0.8.
+            let error = number(row, &key);
+            assert!(
+                (error / expected - 1.0).abs() < 0.02,
+                "{name} {key}: {error} {expected}"
+            );
+        }
+    }
+    let bad = write(
+        "bad.parquet",
+        FileFormat::Parquet,
+        0.02,
+        &[("psfnoise", "x")],
+    );
+    let message = fail(&["bias", &bad]);
+    assert!(message.contains("`psfnoise`"), "{message}");
+}
+
 /// Two programs that measure the same galaxies with the same intrinsic scatter differ by less than either is uncertain.
 #[test]
 fn differences_of_two_programs_have_paired_errors() {

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::stars::{Behind, StarNoise, shared};
 use crate::units::UnitSums;
 
 /// Smallest and largest value.
@@ -54,6 +55,9 @@ pub struct Catalogue {
     pub shear: [Range; 2],
     /// Ellipticities e1 and e2.
     pub ellipticity: [Range; 2],
+    /// The noise of the star that is the PSF of all its galaxies, if it is known.
+    #[serde(default)]
+    pub star: Option<StarNoise>,
 }
 
 impl Catalogue {
@@ -143,6 +147,8 @@ impl Design {
 pub struct Grouping {
     /// The sums by unit.
     pub sums: UnitSums,
+    /// The galaxies of noisy stars that several units share.
+    pub stars: Vec<Behind>,
     /// What a unit is, in words.
     pub unit: &'static str,
     /// Whether galaxies under different shears may be in different units, so that errors are too large.
@@ -164,8 +170,10 @@ pub fn group(
     matched: bool,
 ) -> Grouping {
     let numbers = numbers(catalogues, design);
+    let noises: Vec<Option<&StarNoise>> = catalogues.iter().map(|own| own.star.as_ref()).collect();
     let groups = numbers.iter().max().map_or(0, |last| *last as usize + 1);
     if !by_key.unwrap_or(groups < FEWEST_GROUPS) {
+        let stars = shared(&sums, &noises, Some(&numbers));
         let sums = sums.by_group(|catalogue| {
             let number = numbers.get(catalogue as usize);
             number.copied().unwrap_or(catalogue)
@@ -177,6 +185,7 @@ pub fn group(
         };
         return Grouping {
             sums,
+            stars,
             unit,
             misaligned: false,
         };
@@ -185,6 +194,7 @@ pub fn group(
     let paired = matches!(design, Design::Pairs | Design::Arms | Design::Rotated);
     let differ = rows.clone().min() != rows.max();
     Grouping {
+        stars: shared(&sums, &noises, None),
         sums: sums.by_key(),
         unit: match (matched, catalogues.len()) {
             (true, _) => "galaxies with the same identifier",

@@ -5,6 +5,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::error::{BiasError, MIN_SIGMA};
 use crate::fit::{self, ESTIMATES, Estimates, Known, Plan, RESPONSE};
+use crate::stars::Behind;
 use crate::sums::{WEIGHT, WEIGHT2};
 use crate::units::{UnitSums, add};
 
@@ -106,12 +107,14 @@ impl Estimate {
     }
 }
 
-/// Estimates of the units of a bin, with a known true shear or not.
+/// Estimates of the units of a bin, with a known true shear or not. Errors include the noise of `stars` that several
+/// units share, to first order.
 ///
 /// # Errors
 /// If no galaxy or only one unit was added, or a mean response has less than five standard errors.
 pub fn estimate(
     sums: &UnitSums,
+    stars: &[Behind],
     bin: usize,
     truth: bool,
     errors: Errors,
@@ -129,10 +132,15 @@ pub fn estimate(
     }
     let plan = Plan::new(sums.layout(), &total, truth);
     let values = plan.estimates(&total);
-    let errors = match errors {
+    let mut errors = match errors {
         Errors::Jackknife => jackknife(&plan, &total, &units),
         Errors::Bootstrap { draws, seed } => bootstrap(&plan, &units, draws, seed),
     };
+    for change in by_stars(&plan, &total, stars, bin) {
+        for ((error, changed), value) in errors.iter_mut().zip(change).zip(values) {
+            *error = error.hypot(changed - value);
+        }
+    }
     for (component, place) in (1..).zip(RESPONSE) {
         let (found, error) = (values[place], errors[place]);
         // Rounding leaves an error of 10⁻¹⁶ for a response of 1.
@@ -156,6 +164,7 @@ pub fn estimate(
 
 /// Differences of the estimates of two programs on the same galaxies: those of `sums` minus those of `other`. The
 /// jackknife leaves out a unit of both, so what both have in common cancels in the errors.
+/// They do not include the noise of stars.
 ///
 /// # Errors
 /// As [`estimate`], of either program.
@@ -165,8 +174,8 @@ pub fn difference(
     bin: usize,
     truth: bool,
 ) -> Result<Estimate, BiasError> {
-    let first = estimate(sums, bin, truth, Errors::Jackknife)?;
-    let second = estimate(other, bin, truth, Errors::Jackknife)?;
+    let first = estimate(sums, &[], bin, truth, Errors::Jackknife)?;
+    let second = estimate(other, &[], bin, truth, Errors::Jackknife)?;
     let units = sums.pairs_with(other, bin);
     let plan_of = |place: usize, sums: &UnitSums| {
         let mut total = vec![0.0; sums.layout().len()];
@@ -199,6 +208,22 @@ pub fn difference(
         errors: squares(&left_out).map(|sum| ((n - 1.0) / n * sum).sqrt()),
         assumes_no_c: [0, 1].map(|k| first.assumes_no_c[k] || second.assumes_no_c[k]),
     })
+}
+
+/// Estimates under each change by one standard deviation that the noise of a star makes: of m, and of c of one component.
+fn by_stars(plan: &Plan, total: &[f64], stars: &[Behind], bin: usize) -> Vec<Estimates> {
+    let mut all = Vec::new();
+    for star in stars {
+        for own in star.sums.of_bin(bin) {
+            all.push(plan.shifted(total, own, (star.m, [0.0; 4])));
+            for k in 0..4 {
+                let mut c = [0.0; 4];
+                c[k] = star.c;
+                all.push(plan.shifted(total, own, (0.0, c)));
+            }
+        }
+    }
+    all
 }
 
 /// Standard errors from leaving out each unit: (n − 1)/n Σ (θ − ⟨θ⟩)².

@@ -143,6 +143,15 @@ impl Plan {
         found
     }
 
+    /// Estimates of `sums` if galaxies with the sums `own`, which are among them, had another m and c: larger by `change`,
+    /// of which c has a value for each component.
+    pub(crate) fn shifted(&self, sums: &[f64], own: &[f64], change: (f64, [f64; 4])) -> Estimates {
+        let mut changed = sums.to_vec();
+        self.layout
+            .shift(&mut changed, own, extra(self.layout, sums), change);
+        self.estimates(&changed)
+    }
+
     /// The last of `more` terms, from both components: the mean weighted by what each component contributes.
     fn joint(&self, sums: &[f64], more: &[usize]) -> f64 {
         let (mut sum, mut weight) = (0.0, 0.0);

@@ -197,6 +197,24 @@ impl Layout {
         sums[VERSION + 2 * version] / sums[VERSION + 2 * version + 1]
     }
 
+    /// Adds to `sums` what another m and c change the ellipticities of the galaxies with the sums `own`, which are among
+    /// them: e becomes e + R (m g + c). Responses are larger by `extra` than those of the rows.
+    pub(crate) fn shift(
+        self,
+        sums: &mut [f64],
+        own: &[f64],
+        extra: [f64; 4],
+        (m, c): (f64, [f64; 4]),
+    ) {
+        for k in 0..self.components() {
+            let of = self.of(own, k);
+            let start = HEAD + k * self.of_component();
+            for (s, with_e) in sums[start..][..self.terms()].iter_mut().enumerate() {
+                *with_e += m * of.slope(s, OWN, extra[k]) + c[k] * of.slope(s, ONE, extra[k]);
+            }
+        }
+    }
+
     /// The sums of a component.
     pub(crate) fn of(self, sums: &[f64], component: usize) -> Component<'_> {
         let n = self.terms();

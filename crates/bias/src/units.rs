@@ -204,6 +204,19 @@ impl UnitSums {
         self
     }
 
+    /// The sums of the catalogues that are `wanted`, in one unit.
+    pub(crate) fn of_catalogues(&self, wanted: impl Fn(u32) -> bool) -> Self {
+        let all = self.units.iter();
+        let units = all.filter(|((catalogue, _), _)| wanted(*catalogue));
+        UnitSums {
+            units: units.cloned().collect(),
+            places: HashMap::new(),
+            last: None,
+            ..*self
+        }
+        .by_group(|_| 0)
+    }
+
     /// The sums of each unit of a bin that has a galaxy.
     pub(crate) fn of_bin(&self, bin: usize) -> Vec<&[f64]> {
         let length = self.layout.len();

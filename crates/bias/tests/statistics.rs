@@ -5,7 +5,9 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_bias::{Catalogue, Design, Errors, Layout, Range, Row, UnitSums, estimate, group};
+use shearq_bias::{
+    Catalogue, Design, Errors, Layout, Range, Row, StarNoise, UnitSums, all_bins, estimate, group,
+};
 
 const M: [f64; 2] = [0.03, -0.05];
 const C: [f64; 2] = [2e-3, -3e-3];
@@ -203,7 +205,7 @@ fn pulls(
         } = draw(design, &mut galaxies, count);
         let truth = design != Design::Null;
         let grouping = group(units, &catalogues, design, None, false);
-        let found = estimate(&grouping.sums, 0, truth, errors).unwrap();
+        let found = estimate(&grouping.sums, &[], 0, truth, errors).unwrap();
         for (sums, (key, expected)) in sums.iter_mut().zip(expected) {
             let measured = found.value(key).unwrap();
             let pull = (measured.value - expected) / measured.error;
@@ -364,7 +366,7 @@ fn the_response_of_a_selection_follows_from_sheared_versions() {
             }
         }
     }
-    let of = |sums: UnitSums| estimate(&sums.by_key(), 0, true, Errors::Jackknife).unwrap();
+    let of = |sums: UnitSums| estimate(&sums.by_key(), &[], 0, true, Errors::Jackknife).unwrap();
     let (with, without) = (of(sums), of(direct));
     let (m, wrong) = (with.value("m1").unwrap(), without.value("m1").unwrap());
     assert!(m.value.abs() < 4.0 * m.error + 0.01, "{m:?}");
@@ -398,9 +400,12 @@ fn many_units_are_joined_and_shards_merge_to_the_same_sums() {
     merged.merge(other).unwrap();
     let [a, b] = [whole, merged].map(|sums| {
         let sums = sums.by_key();
-        let all = estimate(&sums.all_bins(), 0, true, Errors::Jackknife).unwrap();
+        let all = estimate(&sums.all_bins(), &[], 0, true, Errors::Jackknife).unwrap();
         assert!((512..=2048).contains(&all.units), "{}", all.units);
-        (all, estimate(&sums, 1, true, Errors::Jackknife).unwrap())
+        (
+            all,
+            estimate(&sums, &[], 1, true, Errors::Jackknife).unwrap(),
+        )
     });
     for (a, b) in [(&a.0, &b.0), (&a.1, &b.1)] {
         for key in ["m1", "m2", "c1", "c2"] {
@@ -416,7 +421,7 @@ fn many_units_are_joined_and_shards_merge_to_the_same_sums() {
 #[test]
 fn without_galaxies_units_or_response_there_is_an_error() {
     let mut sums = UnitSums::new(Layout::default(), 1, 1);
-    let of = |sums: &UnitSums| estimate(sums, 0, false, Errors::Jackknife).unwrap_err();
+    let of = |sums: &UnitSums| estimate(sums, &[], 0, false, Errors::Jackknife).unwrap_err();
     assert!(of(&sums).to_string().contains("no galaxy"));
     let mut row = Row {
         e: [0.1, 0.2],
@@ -431,4 +436,112 @@ fn without_galaxies_units_or_response_there_is_an_error() {
         sums.add(0, key, 0, &row);
     }
     assert!(of(&sums).to_string().contains("mean response R11"));
+}
+
+/// Catalogues under ±γ, of which the k-th of each sign have the star `star(k)`, whose noise changes m and c.
+fn behind_stars(
+    galaxies: &mut Galaxies,
+    pairs: usize,
+    star: impl Fn(usize) -> Option<usize>,
+) -> (UnitSums, Vec<Catalogue>) {
+    const NOISE: [f64; 2] = [0.06, 4e-3];
+    let layout = Layout {
+        psf: true,
+        ..Layout::default()
+    };
+    let mut sums = UnitSums::new(layout, 1, 2 * pairs);
+    let mut catalogues = Vec::new();
+    let faults: Vec<[f64; 3]> = (0..pairs)
+        .map(|_| [0; 3].map(|_| galaxies.normal()))
+        .collect();
+    for number in 0..2 * pairs {
+        let pair = number / 2;
+        let fault = star(pair).map_or([0.0; 3], |star| faults[star]);
+        let g = [if number % 2 == 0 { GAMMA } else { -GAMMA }; 2];
+        for key in 0..300 {
+            let response = 0.7;
+            let e = [0, 1].map(|k| {
+                let shear = (1.0 + NOISE[0] * fault[0]) * g[k] + NOISE[1] * fault[1 + k];
+                response * shear + 0.02 * galaxies.normal()
+            });
+            let row = Row {
+                e,
+                weight: 1.0,
+                slope: [response; 2],
+                g,
+                psf: [0.02, 0.01],
+                psf_size: 1.0,
+            };
+            sums.add(number as u32, key, 0, &row);
+        }
+        let range = |value| Range {
+            low: value,
+            high: value,
+        };
+        catalogues.push(Catalogue {
+            rows: 300,
+            shear: g.map(range),
+            star: star(pair).map(|star| StarNoise {
+                star: star.to_string(),
+                m: NOISE[0],
+                c: NOISE[1],
+            }),
+            ..Catalogue::default()
+        });
+    }
+    (sums, catalogues)
+}
+
+#[test]
+fn errors_contain_the_noise_of_stars_once() {
+    let rng = ChaCha8Rng::seed_from_u64(77);
+    let mut galaxies = Galaxies {
+        rng,
+        weights: Weights::Equal,
+        gamma: GAMMA,
+    };
+    type Star = fn(usize) -> Option<usize>;
+    // One star for all, one for two halves, one for every two pairs, and one for each pair, which is a unit then.
+    let cases: [(usize, Star, usize); 5] = [
+        (3, |_| Some(0), 1),
+        (2, Some, 2),
+        (40, |pair| Some(pair / 2), 20),
+        (40, Some, 0),
+        (3, |_| None, 0),
+    ];
+    for (pairs, star, shared) in cases {
+        let mut squares = [0.0; 5];
+        let draws = 300;
+        let keys = ["m1", "c2", "m_plus", "c_cross", "c_plus"];
+        for _ in 0..draws {
+            let (sums, catalogues) = behind_stars(&mut galaxies, pairs, star);
+            let grouping = group(sums, &catalogues, Design::Pairs, None, false);
+            assert_eq!(grouping.stars.len(), shared);
+            let (sums, stars) = (grouping.sums.all_bins(), all_bins(&grouping.stars));
+            let found = estimate(&sums, &stars, 0, true, Errors::Jackknife).unwrap();
+            let without = estimate(&sums, &[], 0, true, Errors::Jackknife).unwrap();
+            for (square, key) in squares.iter_mut().zip(keys) {
+                let measured = found.value(key).unwrap();
+                *square += (measured.value / measured.error).powi(2);
+                let same = measured.error == without.value(key).unwrap().error;
+                assert_eq!(same, shared == 0, "{key}");
+            }
+        }
+        for (square, key) in squares.iter().zip(keys) {
+            let deviation = (square / f64::from(draws)).sqrt();
+            // Four standard errors of the deviation, and the jackknife's own errors of 10 %. Where every two units have
+            // a star, the jackknife contains half of its variance: with what is added, errors are too large by √(3/2).
+            let least = 1.0 - 0.1 - 4.0 / (2.0 * f64::from(draws)).sqrt();
+            let least = if shared == 20 {
+                least / 1.5f64.sqrt()
+            } else {
+                least
+            };
+            let most = 1.1 + 4.0 / (2.0 * f64::from(draws)).sqrt();
+            assert!(
+                (least..most).contains(&deviation),
+                "{pairs} pairs, {key}: pulls scatter by {deviation}"
+            );
+        }
+    }
 }

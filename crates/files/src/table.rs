@@ -53,6 +53,15 @@ pub enum FileFormat {
 }
 
 impl FileFormat {
+    /// The format of a file by its name or first bytes; `None` of a text, which has no metadata.
+    pub fn of(path: &Path) -> Option<Self> {
+        match Ending::of(path) {
+            Ending::Parquet => Some(FileFormat::Parquet),
+            Ending::Fits => Some(FileFormat::Fits),
+            Ending::Text => None,
+        }
+    }
+
     /// Ending of file names.
     pub fn extension(self) -> &'static str {
         match self {

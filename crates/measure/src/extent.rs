@@ -4,10 +4,12 @@
 //! out, is that of a Gaussian of mean square s per axis where 1/q = 1/s + 1/25; this s is the extent. Those of a galaxy
 //! and of its PSF differ by about the galaxy's own, so that the difference compares images of any seeing.
 
+use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_quantities::statistics::upper_median;
 
 use crate::denoise::frame;
+use crate::pixel::{Pixel, contiguous};
 
 /// σ of the weight for sizes of galaxies and PSFs. See docs/constants.md.
 const WEIGHT: f64 = 5.0;
@@ -101,47 +103,83 @@ pub(crate) fn core_of_psf(
     Core::of(q, error)
 }
 
-/// Room for sums over a stamp: W and x² of each of its columns, and of its rows.
+/// Room for sums over a stamp.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Moments {
+    /// Sides and centre of the last stamp.
+    last: Option<([usize; 2], [f64; 2])>,
+    /// Its W and x² of each column, and of each row.
     columns: Vec<[f64; 2]>,
     rows: Vec<[f64; 2]>,
+    /// Of each column, the sums over rows of W I and W y² I.
+    light: Vec<f64>,
+    squares: Vec<f64>,
 }
 
 impl Moments {
-    /// Σ W I and Σ W r² I of rows of `sides` = [columns, rows] pixels about `centre`, (x, y) in pixels from the middle.
-    fn of<R: IntoIterator<Item = f64>>(
+    /// Σ W I and Σ W r² I of `sides` = [columns, rows] pixels less a sky, about `centre`, (x, y) in pixels from the middle.
+    fn of<P: Pixel, R: AsRef<[P]>>(
         &mut self,
         sides: [usize; 2],
         centre: [f64; 2],
+        sky: f64,
         pixels: impl Iterator<Item = R>,
     ) -> [f64; 2] {
-        for (axis, weights) in [&mut self.columns, &mut self.rows].into_iter().enumerate() {
-            let middle = (sides[axis] as f64 - 1.0) / 2.0;
-            weights.clear();
-            weights.extend((0..sides[axis]).map(|at| {
-                let square = (at as f64 - middle - centre[axis]).powi(2);
-                [(-0.5 * square / (WEIGHT * WEIGHT)).exp(), square]
-            }));
+        if self.last != Some((sides, centre)) {
+            self.last = Some((sides, centre));
+            for (axis, weights) in [&mut self.columns, &mut self.rows].into_iter().enumerate() {
+                let middle = (sides[axis] as f64 - 1.0) / 2.0;
+                weights.clear();
+                weights.extend((0..sides[axis]).map(|at| {
+                    let square = (at as f64 - middle - centre[axis]).powi(2);
+                    [(-0.5 * square / (WEIGHT * WEIGHT)).exp(), square]
+                }));
+            }
+        }
+        for sums in [&mut self.light, &mut self.squares] {
+            sums.clear();
+            sums.resize(sides[0], 0.0);
+        }
+        for (row, &weights) in pixels.zip(&self.rows) {
+            add_row(
+                row.as_ref(),
+                sky,
+                weights,
+                &mut self.light,
+                &mut self.squares,
+            );
         }
         let mut sums = [0.0; 2];
-        for (row, &[weight, square]) in pixels.zip(&self.rows) {
-            let [mut all, mut along] = [0.0; 2];
-            for (value, [weight, square]) in row.into_iter().zip(&self.columns) {
-                all += weight * value;
-                along += weight * square * value;
-            }
-            sums[0] += weight * all;
-            sums[1] += weight * (along + square * all);
+        let columns = self.light.iter().zip(&self.squares);
+        for ((light, squares), [weight, square]) in columns.zip(&self.columns) {
+            sums[0] += weight * light;
+            sums[1] += weight * (squares + square * light);
         }
         sums
     }
 
     /// The extent of a PSF stamp in px²; `None` where its light has none.
     pub(crate) fn of_psf(&mut self, psf: ArrayView2<'_, f64>) -> Option<f64> {
-        let rows = psf.rows().into_iter();
+        let rows = psf.into_outer_iter().map(contiguous);
         let sides = [psf.ncols(), psf.nrows()];
-        of_sums(self.of(sides, [0.0; 2], rows.map(|row| row.into_iter().copied())))
+        of_sums(self.of::<f64, _>(sides, [0.0; 2], 0.0, rows))
+    }
+}
+
+/// Adds a row of weight and square to the sums of all columns, which are side by side so that no addition waits for the one
+/// before.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add_row<P: Pixel>(
+    row: &[P],
+    sky: f64,
+    [weight, square]: [f64; 2],
+    light: &mut [f64],
+    squares: &mut [f64],
+) {
+    for ((light, squares), value) in light.iter_mut().zip(squares).zip(row) {
+        let value = weight * (Into::<f64>::into(*value) - sky);
+        *light += value;
+        *squares += square * value;
     }
 }
 
@@ -149,9 +187,8 @@ impl Light {
     /// Adds a stamp of `n` × `n` pixels with a galaxy at `centre`, (x, y) in pixels from the middle.
     pub(crate) fn add(&mut self, pixels: &[f32], n: usize, centre: [f32; 2]) {
         let sky = sky(pixels, n);
-        let rows = pixels.chunks_exact(n);
-        let rows = rows.map(|row| row.iter().map(|value| f64::from(*value) - sky));
-        let sums = self.moments.of([n; 2], centre.map(f64::from), rows);
+        let (rows, centre) = (pixels.chunks_exact(n), centre.map(f64::from));
+        let sums = self.moments.of([n; 2], centre, sky, rows);
         self.stamps.push(sums);
     }
 

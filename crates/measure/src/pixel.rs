@@ -1,6 +1,8 @@
 //! Pixels of either precision.
 
-use ndarray::ArrayView2;
+use std::borrow::Cow;
+
+use ndarray::{ArrayView1, ArrayView2};
 
 /// `f32` or `f64`.
 pub trait Pixel: Copy + Into<f64> + private::Sealed {
@@ -32,6 +34,12 @@ pub(crate) fn copy<P: Pixel>(stamp: ArrayView2<'_, P>, to: &mut [f32]) {
             None => convert(to, row.iter()),
         }
     }
+}
+
+/// The pixels of a row, copied where they are apart in memory.
+pub(crate) fn contiguous<P: Pixel>(row: ArrayView1<'_, P>) -> Cow<'_, [P]> {
+    row.to_slice()
+        .map_or_else(|| Cow::Owned(row.to_vec()), Cow::Borrowed)
 }
 
 fn convert<'a, P: Pixel + 'a>(to: &mut [f32], from: impl Iterator<Item = &'a P>) {

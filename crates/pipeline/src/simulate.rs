@@ -271,7 +271,8 @@ pub fn star(psf: &FunctionalPsf, side: usize) -> Vec<f32> {
 /// The same in place of what `star` holds, with room for its light in double precision.
 fn star_into(psf: &FunctionalPsf, light: &mut Array2<f64>, star: &mut [f32]) {
     psf.stamp_into(light.nrows(), light.view_mut());
-    for (pixel, light) in star.iter_mut().zip(&*light) {
+    let light = light.as_slice().expect("a whole array has one order");
+    for (pixel, light) in star.iter_mut().zip(light) {
         *pixel = *light as f32;
     }
 }

@@ -28,7 +28,7 @@ impl<'a, T> Matrix<'a, T> {
 
 /// Writes `left` times `right`, a sum over `inner` columns of the one and rows of the other, to rows of `width` numbers,
 /// a multiple of [`LANES`]. The number of rows is a multiple of [`ROWS`]. It takes least time if the stride of `left` is
-/// 16, 32 or 48.
+/// 16, 32, 48 or 64.
 ///
 /// Sums run over `inner` in order, fused where the processor can: results are the same for AVX-512, AVX2 and NEON.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
@@ -57,6 +57,7 @@ pub fn product<T: Real, const R: usize, const FUSED: bool>(
         16 => bands::<T, R, 16, FUSED>(left, right, inner, out, width),
         32 => bands::<T, R, 32, FUSED>(left, right, inner, out, width),
         48 => bands::<T, R, 48, FUSED>(left, right, inner, out, width),
+        64 => bands::<T, R, 64, FUSED>(left, right, inner, out, width),
         _ => bands::<T, R, 0, FUSED>(left, right, inner, out, width),
     }
 }

@@ -171,8 +171,7 @@ impl FunctionalPsf {
         let off = if side % 2 == size % 2 { 0.0 } else { 0.5 };
         let centre = (size as f64 - 1.0) / 2.0 + off;
         self.draw_into(centre, centre, stamp.view_mut());
-        let sum = stamp.sum();
-        stamp /= sum;
+        stamp *= 1.0 / stamp.sum();
     }
 
     /// The same for a PSF that may have been assembled with values that [`FunctionalPsf::new`] refuses.

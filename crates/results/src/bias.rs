@@ -14,8 +14,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
-    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, UnitSums, difference,
-    estimate, group,
+    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, UnitSums, all_bins,
+    difference, estimate, group,
 };
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
@@ -170,6 +170,8 @@ pub struct BiasResult {
     pub unit: &'static str,
     /// Whether errors may be too large, because rows of catalogues do not correspond.
     pub misaligned: bool,
+    /// Stars whose noise is in the errors, because several units have galaxies behind them.
+    pub noisy_stars: usize,
     /// The catalogues.
     pub catalogues: Vec<Catalogue>,
     /// The program that wrote them.
@@ -517,11 +519,12 @@ impl Summed {
         let own = self.grouped()?;
         let Grouping {
             sums,
+            stars,
             unit,
             misaligned,
         } = own.grouping;
         let design = own.design;
-        let all = estimate(&sums.all_bins(), 0, self.truth, errors)?;
+        let all = estimate(&sums.all_bins(), &all_bins(&stars), 0, self.truth, errors)?;
         check_slopes(&all, self.response)?;
         let mut bins = vec![BinResult {
             edges: None,
@@ -530,7 +533,7 @@ impl Summed {
         for (bin, edges) in self.edges.windows(2).enumerate() {
             bins.push(BinResult {
                 edges: Some([edges[0], edges[1]]),
-                estimate: estimate(&sums, bin, self.truth, errors),
+                estimate: estimate(&sums, &stars, bin, self.truth, errors),
             });
         }
         Ok(BiasResult {
@@ -539,6 +542,7 @@ impl Summed {
             design,
             unit,
             misaligned,
+            noisy_stars: stars.len(),
             catalogues: self.catalogues.clone(),
             program: self.program.clone(),
             measured: self.measured.clone(),
@@ -601,6 +605,7 @@ impl Summed {
             design: own.design,
             unit: units[0],
             misaligned: own.grouping.misaligned || theirs.grouping.misaligned,
+            noisy_stars: 0,
             catalogues: self.catalogues.clone(),
             program: format!("{} minus {}", self.program, other.program),
             measured: Vec::new(),

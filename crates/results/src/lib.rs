@@ -22,6 +22,7 @@ pub mod mean;
 pub mod row;
 pub mod score;
 pub mod select;
+mod star_noise;
 pub mod store;
 pub mod submit;
 pub mod views;

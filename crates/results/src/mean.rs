@@ -4,19 +4,16 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use shearq_bias::StarNoise;
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
 use shearq_measure::{Flag, Flags, MeanShear, Selection, ShearSum, Warning};
 use shearq_pipeline::data::run::Run;
-use shearq_pipeline::inputs::PSF;
-use shearq_pipeline::measure::PSF_NOISE;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
 use crate::select::Weighted;
-
-/// Largest effect on m or c that metadata can state: a star without any signal has 5.5.
-const MOST_PSF_NOISE: f64 = 10.0;
+use crate::star_noise;
 
 /// The mean shear of the galaxies of a set.
 #[derive(Debug, Clone, PartialEq)]
@@ -111,7 +108,7 @@ fn mean_of(
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
     let (mut flags, mut flagged, mut cut) = ([0; Flag::ALL.len()], 0, 0);
     let mut stars = Stars::default();
-    for (image, path) in catalogues {
+    for (_, path) in catalogues {
         let rows = match selection {
             Some(selection) => Rows::selected(path, selection)?,
             None => Rows::read(path, calibrated)?,
@@ -138,7 +135,7 @@ fn mean_of(
                 share[k] += response[k];
             }
         }
-        stars.add(*image, path, format, share)?;
+        stars.add(star_noise::of_catalogue(path, format)?, share);
     }
     let mut shear = sum.mean().ok();
     let mut psf_error = [0.0; 2];
@@ -166,9 +163,8 @@ fn mean_of(
 /// The noise of the stars of a set. Images with the same star have the same error.
 #[derive(Default)]
 struct Stars {
-    /// By the fingerprint of the star or, without one, the image: sums of responses, which are the shares in the mean, times
-    /// the scatter of m and of c.
-    effects: BTreeMap<Result<String, u32>, [[f64; 2]; 2]>,
+    /// By star: sums of responses, which are the shares in the mean, times the scatter of m and of c.
+    effects: BTreeMap<String, [[f64; 2]; 2]>,
     /// Sum of the responses of all images.
     responses: [f64; 2],
     /// Images whose catalogue states the effect of the noise.
@@ -176,32 +172,21 @@ struct Stars {
 }
 
 impl Stars {
-    /// Adds an image whose galaxies have responses of the sum `share`.
-    fn add(
-        &mut self,
-        image: u32,
-        path: &Path,
-        format: FileFormat,
-        share: [f64; 2],
-    ) -> Result<(), FileError> {
+    /// Adds an image with this star, if its noise is known, and galaxies with responses of the sum `share`.
+    fn add(&mut self, noise: Option<StarNoise>, share: [f64; 2]) {
         for (sum, share) in self.responses.iter_mut().zip(share) {
             *sum += share;
         }
-        let keys = [PSF_NOISE, PSF].map(str::to_owned);
-        let mut metadata = table::read_metadata(path, format, keys.iter())?;
-        let Some(text) = metadata.get(PSF_NOISE) else {
-            return Ok(());
+        let Some(StarNoise { star, m, c }) = noise else {
+            return;
         };
-        let effect = psf_noise(path, text)?;
         self.stated += 1;
-        let star = metadata.remove(PSF).ok_or(image);
         let sums = self.effects.entry(star).or_default();
-        for (sums, effect) in sums.iter_mut().zip(effect) {
+        for (sums, effect) in sums.iter_mut().zip([m, c]) {
             for (sum, share) in sums.iter_mut().zip(share) {
                 *sum += share * effect;
             }
         }
-        Ok(())
     }
 
     /// Errors of the mean `shear` by the noise.
@@ -213,26 +198,6 @@ impl Stars {
             });
             variances.sum::<f64>().sqrt()
         })
-    }
-}
-
-/// The scatter of m and c by the noise of a star, as the metadata state it.
-fn psf_noise(path: &Path, text: &str) -> Result<[f64; 2], FileError> {
-    let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
-    match numbers.as_deref() {
-        Some(&[m, c])
-            if [m, c]
-                .iter()
-                .all(|value| (0.0..=MOST_PSF_NOISE).contains(value)) =>
-        {
-            Ok([m, c])
-        }
-        _ => Err(FileError::new(
-            path,
-            format!(
-                "the metadata `{PSF_NOISE}` are {text:?} (expected the scatter of m and of c, two numbers from 0 to {MOST_PSF_NOISE} such as 2.3e-2 1.2e-2)"
-            ),
-        )),
     }
 }
 
@@ -305,6 +270,8 @@ impl Rows {
 mod tests {
     use shearq_files::frames::frame;
     use shearq_files::frames::polars::Column;
+    use shearq_pipeline::inputs::PSF;
+    use shearq_pipeline::measure::PSF_NOISE;
 
     use super::*;
 

@@ -39,7 +39,7 @@ const FOLDING_TOLERANCE: f64 = 3e-5;
 const MAX_ORDER: usize = 3;
 
 /// Smallest periods tried, in thirds of the stamp's size, or of 16 px if it is smaller.
-const PERIODS_IN_THIRDS: [usize; 4] = [6, 8, 12, 24];
+const PERIODS_IN_THIRDS: [usize; 7] = [5, 6, 7, 8, 10, 12, 24];
 
 /// Draws galaxies on square stamps of one size.
 ///
@@ -58,7 +58,7 @@ impl std::fmt::Debug for Renderer {
 
 /// One period of the image, in pixels, and the wavenumbers 2πj/N that belong to it.
 struct Grid {
-    /// N. It is even, and N/2 + 1 wavenumbers are a whole number of lanes.
+    /// N. It is even, and N/2 + 1 wavenumbers are a multiple of eight.
     size: usize,
     /// Half of the stamp, its middle included, and padded to rows of a product.
     rows: usize,
@@ -67,7 +67,7 @@ struct Grid {
     /// What a wave is multiplied by if its wavenumber changes by 2π. Positions in the stamp are half pixels from the
     /// middle if its side is even.
     turn: f32,
-    /// cos(2πjd/N) at distances d from the middle, and the same of sines. Rows are d.
+    /// cos(2πjd/N) at distances d from the middle, and the same of sines. Rows are d, and are padded to lanes.
     cosines: Vec<f32>,
     sines: Vec<f32>,
     /// The same, rows are j. Sines have the opposite sign.
@@ -94,7 +94,8 @@ pub struct RenderScratch {
     odd: Vec<f32>,
     /// Real and imaginary parts of what is transformed along y; rows are y.
     along_y: [Vec<f32>; 2],
-    transfer: Transfer,
+    /// For each period.
+    transfers: Vec<Transfer>,
     phases: Phases,
 }
 
@@ -211,17 +212,21 @@ impl Renderer {
             self.stamp * self.stamp,
             "the stamp's size differs"
         );
-        let grid = self.choose_grid(galaxy, psf, centre);
-        let modes = grid.fill(self.stamp, galaxy, psf, centre, scratch);
+        let at = self.choose_grid(galaxy, psf, centre);
+        let grid = &self.grids[at];
+        scratch
+            .transfers
+            .resize_with(self.grids.len(), Transfer::default);
+        let modes = grid.fill(self.stamp, galaxy, psf, centre, scratch, at);
         grid.transform(self.stamp, modes, scratch, out);
     }
 
     /// The period of the image, in pixels, that [`Renderer::render`] chooses for a galaxy.
     pub fn period(&self, galaxy: &Galaxy, psf: &TransformedPsf<'_>, centre: (f64, f64)) -> usize {
-        self.choose_grid(galaxy, psf, centre).size
+        self.grids[self.choose_grid(galaxy, psf, centre)].size
     }
 
-    fn choose_grid(&self, galaxy: &Galaxy, psf: &TransformedPsf<'_>, centre: (f64, f64)) -> &Grid {
+    fn choose_grid(&self, galaxy: &Galaxy, psf: &TransformedPsf<'_>, centre: (f64, f64)) -> usize {
         let limit = FOLDING_TOLERANCE * rough_peak(galaxy, psf);
         let last = (self.stamp - 1) as f64;
         let reach = |c: f64| c.max(last - c);
@@ -236,15 +241,16 @@ impl Renderer {
         let largest = self.grids.len() - 1;
         self.grids[..largest]
             .iter()
-            .find(|grid| folded_light(galaxy, psf, grid.size as f64, reach) <= limit)
-            .unwrap_or(&self.grids[largest])
+            .position(|grid| folded_light(galaxy, psf, grid.size as f64, reach) <= limit)
+            .unwrap_or(largest)
     }
 }
 
 impl Grid {
     /// For a period near `period` pixels, at most 2 shorter.
     fn new(period: usize, stamp: usize) -> Self {
-        let modes = (period / 2).next_multiple_of(LANES);
+        let modes = (period / 2).next_multiple_of(8);
+        let padded = modes.next_multiple_of(LANES);
         let size = 2 * (modes - 1);
         let half = stamp.div_ceil(2);
         let (rows, width) = (half.next_multiple_of(ROWS), half.next_multiple_of(LANES));
@@ -263,8 +269,8 @@ impl Grid {
             rows,
             width,
             turn: if even { -1.0 } else { 1.0 },
-            cosines: table(rows, modes, &|row, j| angle(row, j).cos()),
-            sines: table(rows, modes, &|row, j| angle(row, j).sin()),
+            cosines: table(rows, padded, &|row, j| angle(row, j).cos()),
+            sines: table(rows, padded, &|row, j| angle(row, j).sin()),
             cosines_across: table(modes, width, &|j, row| angle(row, j).cos()),
             sines_across: table(modes, width, &|j, row| -angle(row, j).sin()),
             pixel: table(1, count, &|_, j| pixel(j)),
@@ -295,6 +301,7 @@ impl Grid {
         psf: &TransformedPsf<'_>,
         centre: (f64, f64),
         scratch: &mut RenderScratch,
+        at: usize,
     ) -> usize {
         let step = TAU / self.size as f64;
         let cut = largest_wavenumber(galaxy, psf).min(MAX_ORDER as f64 * PI) / step;
@@ -314,10 +321,11 @@ impl Grid {
             pair,
             sums,
             differences,
-            transfer,
+            transfers,
             phases,
             ..
         } = scratch;
+        let transfer = &mut transfers[at];
         let modes = (last + 1).min(self.modes());
         let width = 2 * modes.next_multiple_of(LANES);
         for all in [&mut *sums, &mut *differences] {
@@ -341,7 +349,8 @@ impl Grid {
                 let lit = lit(j);
                 let blur = transfer.lines(psf_table, psf_form, (j, lit), &self.pixel);
                 let (above, below) = (&mut above[..lit], &mut below[..lit]);
-                shine(&waves, j as f32, blur, above, below);
+                shine(&waves, j as f32, blur[0], above);
+                shine(&waves, -(j as f32), blur[1], below);
                 let [sum, difference] = pair.each_mut().map(|half| &mut half[..2 * lit]);
                 let shifted = [&mut *sum, &mut *difference];
                 shift(above, below, phases, phases.y[j] * norm, shifted);
@@ -401,8 +410,9 @@ impl Grid {
             half.resize((self.rows * pair).max(lines * self.width), 0.0);
         }
         let (up, down) = (&mut even[..self.rows * pair], &mut odd[..self.rows * pair]);
-        let cosines = Matrix::new(&self.cosines, self.modes());
-        let sines = Matrix::new(&self.sines, self.modes());
+        let padded = self.modes().next_multiple_of(LANES);
+        let cosines = Matrix::new(&self.cosines, padded);
+        let sines = Matrix::new(&self.sines, padded);
         multiply(cosines, Matrix::new(sums, pair), modes, up, pair);
         multiply(sines, Matrix::new(differences, pair), modes, down, pair);
         // Whole rows of the next products. What is beyond the stamp stays finite, and is not used.

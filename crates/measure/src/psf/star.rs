@@ -86,7 +86,10 @@ fn centred_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<Star,
     };
     let brightest = brightest(stamp)?;
     let inner = sum(central(stamp, size, (y0, x0)));
-    let all = sum(stamp);
+    let all = match (rows, columns) == (size, size) {
+        true => inner,
+        false => sum(stamp),
+    };
     if all <= 0.0 {
         // There is nothing to look for elsewhere.
         light(inner)?;
@@ -116,10 +119,13 @@ fn centred_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<Star,
     let room = [x0, y0, columns - size - x0, rows - size - y0];
     let more = room.into_iter().fold((cut.size - size) / 2, usize::min);
     let taken = central(stamp, size + 2 * more, (y0 - more, x0 - more));
-    let taken: Array2<f64> = taken.mapv(Into::into);
-    let flux = light(sum(taken.view()))?;
+    let flux = light(match taken.dim() == stamp.dim() {
+        true => all,
+        false => sum(taken),
+    })?;
+    let share = 1.0 / flux;
     Ok(Star {
-        psf: taken / flux,
+        psf: taken.mapv(|value| share * Into::<f64>::into(value)),
         moved,
     })
 }

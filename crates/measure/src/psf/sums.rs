@@ -1,11 +1,9 @@
 //! Sums and maxima over the pixels of a PSF. Their order is the same wherever the pixels are in memory.
 
-use std::borrow::Cow;
-
 use multiversion::multiversion;
-use ndarray::{ArrayView1, ArrayView2};
+use ndarray::ArrayView2;
 
-use crate::pixel::Pixel;
+use crate::pixel::{Pixel, contiguous};
 
 /// Partial sums, so that an addition does not wait for the one before.
 const LANES: usize = 16;
@@ -21,10 +19,24 @@ pub(super) fn sum_of_squares<P: Pixel>(pixels: ArrayView2<'_, P>) -> f64 {
 }
 
 /// The sum of all pixels, or of their squares.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn sum_of<P: Pixel, const SQUARES: bool>(pixels: ArrayView2<'_, P>) -> f64 {
+    let term = |value: &P| -> f64 {
+        let value: f64 = (*value).into();
+        if SQUARES { value * value } else { value }
+    };
     let mut sums = [0.0; LANES];
     for row in pixels.into_outer_iter() {
-        add::<P, SQUARES>(&contiguous(row), &mut sums);
+        let row = contiguous(row);
+        let (whole, rest) = row.as_chunks::<LANES>();
+        for values in whole {
+            for lane in 0..LANES {
+                sums[lane] += term(&values[lane]);
+            }
+        }
+        for (sum, value) in sums.iter_mut().zip(rest) {
+            *sum += term(value);
+        }
     }
     sums.iter().sum()
 }
@@ -36,12 +48,6 @@ pub(super) fn largest_of_rows<P: Pixel>(
     pixels
         .into_outer_iter()
         .map(|row| largest(&contiguous(row)))
-}
-
-/// The pixels of a row, copied where they are apart in memory.
-fn contiguous<P: Pixel>(row: ArrayView1<'_, P>) -> Cow<'_, [P]> {
-    row.to_slice()
-        .map_or_else(|| Cow::Owned(row.to_vec()), Cow::Borrowed)
 }
 
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
@@ -72,27 +78,6 @@ fn largest<P: Pixel>(values: &[P]) -> Option<f64> {
     let finite = zero.iter().sum::<f64>() == 0.0;
     let larger = |a: f64, b: f64| if b > a { b } else { a };
     finite.then(|| most.into_iter().fold(f64::NEG_INFINITY, larger))
-}
-
-/// Adds each number, or its square, to one of the sums.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn add<P: Pixel, const SQUARES: bool>(values: &[P], sums: &mut [f64; LANES]) {
-    let term = |value: &P| -> f64 {
-        let value: f64 = (*value).into();
-        if SQUARES { value * value } else { value }
-    };
-    let (whole, rest) = values.as_chunks::<LANES>();
-    // A copy, which stays in registers.
-    let mut all = *sums;
-    for values in whole {
-        for lane in 0..LANES {
-            all[lane] += term(&values[lane]);
-        }
-    }
-    for (sum, value) in all.iter_mut().zip(rest) {
-        *sum += term(value);
-    }
-    *sums = all;
 }
 
 #[cfg(test)]

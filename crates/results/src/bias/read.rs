@@ -13,6 +13,7 @@ use shearq_quantities::Distortion;
 
 use crate::expression::Expression;
 use crate::select::{READ, Weighted, require_responses};
+use crate::star_noise;
 
 use super::Input;
 use super::columns::{Columns, Names, Preset, Role};
@@ -333,14 +334,9 @@ fn check_named<'a>(
 /// Checks that the versions of a catalogue of shearq are for a shear of `step`, if its settings are there.
 fn check_step(path: &Path, step: f64) -> Result<(), FileError> {
     let key = "settings".to_owned();
-    let read = |format| table::read_metadata(path, format, std::iter::once(&key)).ok();
     let stated = || {
-        let name = path.to_string_lossy().to_ascii_lowercase();
-        let metadata = if name.contains(".fit") {
-            read(FileFormat::Fits)?
-        } else {
-            read(FileFormat::Parquet)?
-        };
+        let read = table::read_metadata(path, FileFormat::of(path)?, std::iter::once(&key));
+        let metadata = read.ok()?;
         let settings: toml::Table = metadata.get(&key)?.parse().ok()?;
         settings.get("shape")?.get("sheared_step")?.as_float()
     };
@@ -366,6 +362,14 @@ pub(super) fn rows(
         name: path.display().to_string(),
         ..Catalogue::default()
     };
+    let own = [Preset::Shearq, Preset::Versions];
+    let first = sources.first().filter(|first| first.frame.is_none());
+    if let Some(first) = first.filter(|first| own.contains(&first.columns.preset)) {
+        let path = &first.place.path;
+        if let Some(format) = FileFormat::of(path) {
+            about.star = star_noise::of_catalogue(path, format)?;
+        }
+    }
     // Rows of each version so far.
     let mut counts = [0u64; COUNT];
     for source in sources {

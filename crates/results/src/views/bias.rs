@@ -157,6 +157,13 @@ fn notes(result: &BiasResult) -> Vec<String> {
         ),
         format!("Errors are from {} units: {}.", all.units, result.unit),
     ];
+    match result.noisy_stars {
+        0 => {}
+        1 => notes.push("They include the noise of the star that all units share.".into()),
+        count => notes.push(format!(
+            "They include the noise of {count} stars that several units share."
+        )),
+    }
     if let Some(selection) = &result.selection {
         notes.push(format!("Selection: {selection}."));
     }

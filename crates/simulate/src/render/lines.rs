@@ -45,34 +45,27 @@ fn on_line(form: QuadraticForm, j: f32) -> [f32; 3] {
     [form.yy * j * j, 2.0 * form.xy * j, form.xx].map(|c| c as f32)
 }
 
-/// Light of components that share a centre, behind PSF and pixel, at wavenumbers `j` and -`j` along y and all from 0
-/// along x.
+/// Light of components that share a centre, behind PSF and pixel, at wavenumber `j` along y and all from 0 along x.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(super) fn shine(
     waves: &[Option<Wave>; Galaxy::MAX_COMPONENTS],
     j: f32,
-    blur: [&[f32]; 2],
-    above: &mut [f32],
-    below: &mut [f32],
+    blur: &[f32],
+    line: &mut [f32],
 ) {
-    for (line, (j, blur)) in [above, below]
-        .into_iter()
-        .zip([j, -j].into_iter().zip(blur))
-    {
-        line.fill(0.0);
-        for wave in waves.iter().flatten() {
-            let form = on_line(wave.form, j);
-            match wave.profile {
-                Sersic::Exponential => add_exponential(form, wave.flux, line),
-                Sersic::DeVaucouleurs => {
-                    let table = Sersic::de_vaucouleurs_table().single();
-                    add_tabulated(table, form, wave.flux, line);
-                }
+    line.fill(0.0);
+    for wave in waves.iter().flatten() {
+        let form = on_line(wave.form, j);
+        match wave.profile {
+            Sersic::Exponential => add_exponential(form, wave.flux, line),
+            Sersic::DeVaucouleurs => {
+                let table = Sersic::de_vaucouleurs_table().single();
+                add_tabulated(table, form, wave.flux, line);
             }
         }
-        for (value, blur) in line.iter_mut().zip(blur) {
-            *value *= blur;
-        }
+    }
+    for (value, blur) in line.iter_mut().zip(blur) {
+        *value *= blur;
     }
 }
 
