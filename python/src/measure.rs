@@ -13,7 +13,7 @@ use shearq_measure::{
     Subtraction, Survey, Warning, Worker, calibrate, examined_rows,
 };
 use shearq_pipeline::engine;
-use shearq_pipeline::measure::{COLUMNS, Value, more_columns};
+use shearq_pipeline::measure::{COLUMNS, Value, more_columns, stated_psf_noise};
 use shearq_quantities::Shear;
 use shearq_quantities::statistics::upper_median;
 
@@ -49,6 +49,19 @@ impl AllPsfs<'_> {
             },
             AllPsfs::Formulas(formulas) => Psfs::functional(&formulas[start..end]),
         })
+    }
+}
+
+impl AllPsfs<'_> {
+    /// A whole number that distinguishes the star of all galaxies from others, below 2^48: Fowler, Noll and Vo's hash.
+    fn star(&self) -> f64 {
+        let AllPsfs::Shared { psf, .. } = self else {
+            return 0.0;
+        };
+        let hash = psf.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, pixel| {
+            (hash ^ pixel.to_bits()).wrapping_mul(0x0100_0000_01b3)
+        });
+        (hash >> 16) as f64
     }
 }
 
@@ -145,7 +158,9 @@ pub(crate) fn measure<'py>(
     let galaxies = request.measure(py, &psfs, survey.as_ref(), threads(threads_asked), progress)?;
     let mut galaxies = [galaxies];
     calibrate(configuration, &mut galaxies);
-    let warnings = request.warnings(&psfs, survey.as_deref(), &galaxies)?;
+    let subtraction = measurer.subtraction(survey.as_deref());
+    let examination = request.examine(&psfs, subtraction)?;
+    let warnings = request.warnings(&examination, &galaxies)?;
     let [galaxies] = galaxies;
     let flagged = galaxies.iter().filter(|g| !g.flags.is_empty()).count();
     let all_flagged = (count > 0 && flagged == count)
@@ -154,6 +169,14 @@ pub(crate) fn measure<'py>(
         .map(|warning| format!("stamps: no galaxy could be measured: {warning}"));
     let warnings = warnings.iter().map(Warning::to_string).collect();
     let columns = catalogue(py, configuration, &galaxies)?;
+    if configuration.linear().is_some() {
+        let effect = stated_psf_noise(configuration, examination.psf_noise());
+        let [m, c] = effect.unwrap_or_default();
+        let star = effect.map_or(0.0, |_| psfs.star());
+        for (name, value) in [("psf_id", star), ("psf_m", m), ("psf_c", c)] {
+            columns.set_item(name, vec![value; count].into_pyarray(py))?;
+        }
+    }
     Ok((columns, warnings, all_flagged))
 }
 
@@ -300,14 +323,12 @@ impl<'s> Request<'s> {
     /// The warnings about stamps and PSFs.
     fn warnings(
         &self,
-        psfs: &AllPsfs<'_>,
-        survey: Option<&Survey>,
+        examination: &Examination,
         galaxies: &[Vec<Measurement>],
     ) -> PyResult<Vec<Warning>> {
         let configuration = self.measurer.configuration();
-        let examination = self.examine(psfs, self.measurer.subtraction(survey))?;
         let mut warnings = examination.warnings();
-        warnings.extend(self.given_noise(&examination)?);
+        warnings.extend(self.given_noise(examination)?);
         warnings.extend(Warning::of_settings(configuration));
         warnings.extend(Warning::of_galaxies(galaxies));
         match warnings.iter().position(Warning::is_fatal) {

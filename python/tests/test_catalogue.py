@@ -116,7 +116,10 @@ def test_tables_of_other_packages_keep_every_bit(two, tmp_path):
         back = shearq.Catalogue.from_table(make())
         assert same_bits(back, a) and back.dtype == a.dtype, package
         assert back.attrs == ({} if package == "polars" else a.attrs)
-    assert a.to_astropy()["x"].unit == "pix" and str(a.to_astropy()["size"].unit) == "pix2"
+    image = shearq.simulate(grid=8)[0]
+    network = shearq.measure(image.stamps, image.psf, noise=image.noise, submission="23/raw/star")
+    assert [str(network.to_astropy()[name].unit) for name in ("radius", "size")] == ["pix", "pix2"]
+    assert [str(a.to_astropy()[name].unit) for name in ("x", "radius", "size")] == ["pix", "pix", "pix"]
     from astropy.table import Table
 
     for ending in ("fits", "ecsv"):
@@ -355,3 +358,72 @@ def test_warnings_point_to_the_line_that_called(image):
     script = "import sys, warnings, shearq\nimage = shearq.simulate(grid=8)[0]\nshearq.measure(image.stamps, image.psf, noise=2.0)\n"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert "<string>:3: DataWarning: the given noise disagrees" in done.stderr
+
+
+def _behind(star_seed, images):
+    """Catalogues of images whose one star has a S/N of 100."""
+    found = []
+    for image in images:
+        psf = image.psf.astype(float)
+        noise = np.sqrt((psf**2).sum()) / 100
+        noisy = psf + noise * np.random.default_rng(star_seed).standard_normal(psf.shape)
+        found.append(shearq.measure(image.stamps, noisy, noise=image.noise))
+    return found
+
+
+def test_errors_contain_the_noise_of_stars_that_galaxies_share(tmp_path):
+    images = shearq.simulate(set=2, images=2, grid=8, seed=6)
+    (a, b), (c,) = _behind(1, images), _behind(2, images[1:])
+    m, c_noise = a["psf_m"][0], a["psf_c"][0]
+    # docs/limitations.md; the noise of the star is known from its border, 170 pixels, to 5 %.
+    assert m == pytest.approx(0.023, rel=0.2) and c_noise == pytest.approx(0.012, rel=0.2)
+    assert (a["psf_id"] == b["psf_id"][0]).all() and a["psf_id"][0] not in (0.0, c["psf_id"][0])
+
+    def without(rows):
+        return rows[[name for name in rows.dtype.names if not name.startswith("psf_")]]
+
+    def more(rows):
+        """What the noise of stars adds to the variances."""
+        with_stars, plain = rows.mean_shear(), without(rows).mean_shear()
+        assert with_stars.g1 == plain.g1 and with_stars.covariance[0][1] == plain.covariance[0][1]
+        assert with_stars.g1_error == pytest.approx(np.sqrt(with_stars.covariance[0][0]))
+        return [with_stars.covariance[k][k] - plain.covariance[k][k] for k in (0, 1)], plain
+
+    for rows in (a, shearq.concatenate([a, b])):
+        added, plain = more(rows)
+        for variance, g in zip(added, plain):
+            assert variance == pytest.approx((m * g) ** 2 + c_noise**2, rel=0.05)
+    # Two stars halve it, up to the responses of their galaxies.
+    added, plain = more(shearq.concatenate([a, c]))
+    for variance, g in zip(added, plain):
+        assert variance == pytest.approx(((m * g) ** 2 + c_noise**2) / 2, rel=0.1)
+    both = shearq.mean_shear([a, c])
+    assert both.g1_error == shearq.concatenate([a, c]).mean_shear().g1_error
+    # A star for each galaxy, and a formula, have no noise that is shared.
+    other = shearq.measure(images[0].stamps, np.stack([images[0].psf] * 64), noise=images[0].noise)
+    assert (other["psf_m"] == 0).all() and more(shearq.concatenate([other]))[0] == [0.0, 0.0]
+    for name in ("a.parquet", "a.fits", "a.npy"):
+        path = tmp_path / name
+        a.write(path)
+        assert same_bits(shearq.read(path)["psf_m"], a["psf_m"])
+        assert shearq.read(path).mean_shear().g1_error == a.mean_shear().g1_error
+
+
+def test_files_of_the_command_line_state_the_noise_of_their_star(tmp_path):
+    images = shearq.simulate(set=2, images=1, grid=8, seed=6)
+    (catalogue,) = _behind(1, images)
+    plain = catalogue[[name for name in catalogue.dtype.names if not name.startswith("psf_")]]
+    columns = [(name, np.ascontiguousarray(plain[name], dtype=float)) for name in plain.dtype.names]
+    stated = {"psfnoise": "2.30e-2 1.20e-2", "psf": "a fingerprint"}
+    for name, metadata in (("a", stated), ("b", {**stated, "psf": "another"}), ("c", stated), ("d", {})):
+        shearq._shearq.write_table(str(tmp_path / f"{name}.parquet"), "parquet", columns, metadata)
+    a, b, c, d = (shearq.read(tmp_path / f"{name}.parquet") for name in "abcd")
+    assert (a["psf_m"] == 0.023).all() and (a["psf_c"] == 0.012).all() and (d["psf_m"] == 0).all()
+    assert a["psf_id"][0] == c["psf_id"][0] != b["psf_id"][0] and d["psf_id"][0] == 0
+    # One star instead of two of the same effect.
+    one, two = (shearq.mean_shear([a, other]).covariance[0][0] for other in (c, b))
+    g1 = a.mean_shear().g1
+    assert one - two == pytest.approx(((0.023 * g1) ** 2 + 0.012**2) / 2, rel=1e-6)
+    shearq._shearq.write_table(str(tmp_path / "e.parquet"), "parquet", columns, {"psfnoise": "x"})
+    with pytest.raises(ValueError, match="psfnoise"):
+        shearq.read(tmp_path / "e.parquet")

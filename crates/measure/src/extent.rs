@@ -73,13 +73,21 @@ pub(crate) fn core_sums(
         let last = (at[k] + CORE_REACH * CORE).floor().max(0.0) as usize;
         first..(last + 1).min(sides[k])
     };
+    let of = |at: usize, centre: f64| {
+        let square = (at as f64 - centre).powi(2);
+        ((-0.5 * square / (CORE * CORE)).exp(), square)
+    };
+    let mut along = [(0.0, 0.0); 2 * (CORE_REACH * CORE) as usize + 1];
+    for (weight, x) in along.iter_mut().zip(range(0)) {
+        *weight = of(x, at[0]);
+    }
     let mut sums = [0.0; 2];
     for y in range(1) {
-        for x in range(0) {
-            let square = (x as f64 - at[0]).powi(2) + (y as f64 - at[1]).powi(2);
-            let light = (-0.5 * square / (CORE * CORE)).exp() * value(x, y);
+        let (down, square_y) = of(y, at[1]);
+        for (x, (weight, square_x)) in range(0).zip(along) {
+            let light = down * weight * value(x, y);
             sums[0] += light;
-            sums[1] += square * light;
+            sums[1] += (square_x + square_y) * light;
         }
     }
     sums

@@ -15,7 +15,9 @@ use std::path::Path;
 use shearq_files::FileError;
 use shearq_measure::{Measurer, calibrate};
 
-pub use self::catalogue::{COLUMNS, KEYS, PSF_NOISE, Summary, Value, all_flagged, more_columns};
+pub use self::catalogue::{
+    COLUMNS, KEYS, PSF_NOISE, Summary, Value, all_flagged, more_columns, stated_psf_noise,
+};
 pub(crate) use self::catalogue::{Catalogues, metadata};
 pub(crate) use self::head::check_strip;
 pub use self::head::{ImageHead, StampRow};

@@ -132,6 +132,9 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         Flux over its error, and the error in image units. For linear configurations.
     flux_g1, …, t_s : float64
         How flux and size change with shear and noise; :meth:`Catalogue.select` uses them. For linear configurations.
+    psf_id, psf_m, psf_c : float64
+        A number for the star that all galaxies of the image share, and the standard deviations of m and c by its noise;
+        0 without such a star. :meth:`Catalogue.mean_shear` adds them to its errors. For linear configurations.
 
     Attributes
     ----------
@@ -261,7 +264,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         """The mean shear of the good galaxies: Σwe/ΣwR, with the ellipticities e before calibration.
 
         The error is the error of this ratio to first order, √(Σw²(e − gR)² n/(n − 1)) / ΣwR. It assumes independent
-        galaxies.
+        galaxies. If the columns ``psf_id``, ``psf_m`` and ``psf_c`` are there, the noise of stars adds to it: m·g and c
+        in quadrature, times the share of the galaxies behind each star.
 
         Parameters
         ----------
@@ -469,6 +473,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         As :meth:`Catalogue.mean_shear`; or if there is no catalogue.
     """
     parts: list[list[NDArray[np.float64]]] = []
+    stars: list[list[NDArray[np.float64]]] = []
     goods: list[NDArray[np.bool_]] = []
     calibrated = False
     for rows in [catalogues] if isinstance(catalogues, Catalogue) else catalogues:
@@ -478,6 +483,8 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         rows = np.atleast_1d(rows).view(Catalogue)
         e, responses = raw(rows)
         parts.append([*e, *responses])
+        known = all(name in (rows.dtype.names or ()) for name in _schema.STAR)
+        stars.append([np.nan_to_num(rows[name]) if known else np.zeros(len(rows)) for name in _schema.STAR])
         goods.append(rows.good)
         calibrated = calibrated or bool(np.isfinite(rows["divisor1"]).any())
     if not parts:
@@ -497,6 +504,10 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
     # A common factor changes nothing, but squares of weights could overflow.
     factor = weight[counted] / weight[counted].max()
     (g1, g2), (first, second), response, galaxies = _shearq.mean_shear(e1, e2, r11, r22, factor)
+    columns = [np.concatenate([star[k] for star in stars])[counted] for k in range(3)]
+    more = _star_variances(np.stack(columns), (g1, g2), (factor * r11, factor * r22))
+    first[0] += more[0]
+    second[1] += more[1]
     errors = [float(np.sqrt(value)) for value in (first[0], second[1])]
     return MeanShear(
         g1,
@@ -508,6 +519,21 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         galaxies,
         int((weight[~good] > 0).sum()),
     )
+
+
+def _star_variances(
+    stars: NDArray[np.float64],
+    shear: tuple[float, float],
+    responses: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> list[float]:
+    """Variances of both components of a mean shear by the noise of ``stars``: number and effects on m and c of each row."""
+    each, star = np.unique(stars, axis=1, return_inverse=True)
+    _, m, c = each
+    variances = []
+    for g, response in zip(shear, responses):
+        share = np.bincount(star.reshape(-1), weights=response) / response.sum()
+        variances.append(float((share**2 * ((m * g) ** 2 + c**2)).sum()))
+    return variances
 
 
 def _weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import pathlib
 import tempfile
@@ -52,13 +53,28 @@ def read(path: str | os.PathLike[str]) -> Catalogue:
         from astropy.table import Table  # type: ignore[import-untyped, unused-ignore]
 
         return _tables.from_table(Table.read(file, format="ascii.ecsv"))
-    keys = [*_schema.KEYS, *_schema.OTHER_KEYS]
+    keys = [*_schema.KEYS, *_schema.OTHER_KEYS, _schema.STAR_KEY, _schema.PSF_KEY]
     columns, metadata = _shearq.read_table(str(file), format, keys)
     found = {name: np.asarray(column) for name, column in columns.items()}
+    if "snr" in found and not any(name in found for name in _schema.STAR):
+        found.update(_star(file, dict(metadata), len(found["snr"])))
     try:
         return _tables.build(found, _schema.to_attrs(metadata))
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
+
+
+def _star(file: pathlib.Path, metadata: dict[str, str], count: int) -> dict[str, Any]:
+    """The columns of the noise of a star, which the command line states once."""
+    stated = metadata.get(_schema.STAR_KEY)
+    try:
+        m, c = [float(word) for word in (stated or "0 0").split()]
+    except ValueError:
+        raise ValueError(f"{file}: the metadata {_schema.STAR_KEY} are {stated!r}; expected two numbers") from None
+    # Without a fingerprint, the star is that of this file alone.
+    name = metadata.get(_schema.PSF_KEY, str(file))
+    star = int.from_bytes(hashlib.sha256(name.encode()).digest()[:6], "big") if stated else 0
+    return {name: np.full(count, float(value)) for name, value in zip(_schema.STAR, (star, m, c))}
 
 
 def read_all(folder: str | os.PathLike[str], sets: int | list[int] | None = None) -> list[Catalogue]:
@@ -110,7 +126,14 @@ def write(catalogue: Catalogue, path: str | os.PathLike[str], overwrite: bool) -
                 raise ValueError(
                     f"path: {file.suffix} files have columns of numbers (found words in {name}). Try: a name that ends in .ecsv"
                 )
-        _shearq.write_table(str(file), format, columns, _schema.to_keys(catalogue.attrs))
+        metadata = _schema.to_keys(catalogue.attrs)
+        stars = [np.unique(catalogue[name]) for name in _schema.STAR if name in (catalogue.dtype.names or ())]
+        # As the command line states it, which does not read the columns.
+        if len(stars) == 3 and all(len(star) == 1 and star[0] > 0 for star in stars):
+            star, *effects = (float(values[0]) for values in stars)
+            metadata[_schema.STAR_KEY] = " ".join(f"{effect:.2e}" for effect in effects)
+            metadata[_schema.PSF_KEY] = f"{star:.0f}"
+        _shearq.write_table(str(file), format, columns, metadata)
         return
     # Completely or not at all.
     with tempfile.TemporaryDirectory(dir=file.parent) as folder:

@@ -15,7 +15,9 @@ REAL += ("divisor1", "divisor2")
 OBSERVED: tuple[str, ...] = ("flux_error", "flux_g1", "flux_g2", "size_g1", "size_g2")
 OBSERVED += tuple(f"n{k}_{pair}" for k in "12" for pair in ("ef", "es", "ff", "fs", "ss"))
 OBSERVED += tuple(f"t_{pair}" for pair in ("e1f", "e1s", "e2f", "e2s", "ff", "fs", "ss", "s"))
-REAL += ("snr", *OBSERVED)
+# The star that all galaxies of an image share, and what its noise does to m and c.
+STAR: tuple[str, ...] = ("psf_id", "psf_m", "psf_c")
+REAL += ("snr", *OBSERVED, *STAR)
 # What a selection reads.
 SELECTED = ("e1", "e2", "flags", "R11", "R22", "R12", "R21", "divisor1", "divisor2", "flux", "size", *OBSERVED)
 UNITS = {"x": "pix", "y": "pix", "radius": "pix"}
@@ -24,6 +26,8 @@ UNITS = {"x": "pix", "y": "pix", "radius": "pix"}
 KEYS = {"submiss": "submission", "elltype": "ellipticity", "settings": "settings", "creator": "version"}
 # Keys of the command line's files that are kept as they are.
 OTHER_KEYS = ("set", "image", "warnings")
+# The keys of the command line's files for the noise of a star, and for its fingerprint.
+STAR_KEY, PSF_KEY = "psfnoise", "psf"
 _CREATOR = "shearq "
 _ESCAPED = re.compile(r"\\(?:([nrt\\])|u\{([0-9a-fA-F]{1,6})\})")
 _PLAIN = {"n": "\n", "r": "\r", "t": "\t", "\\": "\\"}

@@ -3,6 +3,7 @@
 use std::iter;
 use std::sync::Arc;
 
+use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::SkySource;
@@ -33,6 +34,9 @@ const AROUND: f32 = 16.0;
 /// docs/constants.md.
 const ROUNDING: f32 = 1e-4;
 
+/// Places that are compared side by side. See docs/constants.md.
+const LANES: usize = 16;
+
 /// What the stamps of an image tell of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Survey {
@@ -55,6 +59,7 @@ impl NoisePlan {
             contrasts: Contrasts::new(self.full),
             missing: Missing::new(self.full),
             over_noise: Vec::new(),
+            places: Default::default(),
             products: Vec::new(),
             brightest: Vec::new(),
             typical: Vec::new(),
@@ -79,6 +84,8 @@ pub struct NoiseSurvey {
     missing: Missing,
     /// Of each place of a stamp, how much brighter it is than its opposite, over the root of its pixels.
     over_noise: Vec<f32>,
+    /// Where they are, x and y from the galaxy's centre.
+    places: [Vec<f32>; 2],
     /// Of each block, frame by frame, the sum of products at each lag; NaN where pixels are missing.
     pub(super) products: Vec<f32>,
     /// Of each block, the most that a place around it is brighter than its opposite, over the root of its pixels.
@@ -136,8 +143,11 @@ impl NoiseSurvey {
         let blocks = Arc::clone(&self.plan.blocks);
         for &(y0, x0) in &*blocks {
             for (y, to) in (y0..).zip(self.block.chunks_exact_mut(BLOCK)) {
-                for (value, from) in to.iter_mut().zip(stamp.row(y).iter().skip(x0)) {
-                    *value = f64::from(from.to_f32());
+                // Without what was subtracted or filled.
+                let row = stamp.row(y);
+                match row.as_slice() {
+                    Some(row) => widen(to, row[x0..].iter()),
+                    None => widen(to, row.iter().skip(x0)),
                 }
             }
             let reaches = [y0 == 0, y0 + BLOCK == full, x0 == 0, x0 + BLOCK == full];
@@ -201,22 +211,17 @@ impl NoiseSurvey {
         let over_noise = places.iter().map(|at| at.excess / at.pixels.sqrt());
         self.over_noise.clear();
         self.over_noise.extend(over_noise);
+        for (axis, to) in self.places.iter_mut().enumerate() {
+            to.clear();
+            to.extend(places.iter().map(|at| at.place[axis]));
+        }
         for &(y0, x0) in &*self.plan.blocks {
             let middle = |first: usize, turn: i32| {
                 first as f32 + (BLOCK as f32 - 1.0) / 2.0 - turn as f32 / 2.0
             };
-            let (x, y) = (middle(x0, turn[0]), middle(y0, turn[1]));
-            let mut most = 0.0f32;
-            for (at, &over_noise) in places.iter().zip(&self.over_noise) {
-                let square = (at.place[0] - x).powi(2) + (at.place[1] - y).powi(2);
-                let near = if square < AROUND * AROUND {
-                    over_noise
-                } else {
-                    0.0
-                };
-                most = most.max(near);
-            }
-            self.brightest.push(most);
+            let place = [middle(x0, turn[0]), middle(y0, turn[1])];
+            self.brightest
+                .push(most_around(place, &self.places, &self.over_noise));
         }
         let most = places.iter().map(|at| at.excess).fold(0.0, f32::max);
         // Where one side was filled from the other there is no difference but rounding.
@@ -373,6 +378,39 @@ impl NoiseSurvey {
         let means: Vec<f64> = sums.iter().map(|sum| sum / count).collect();
         noise_of(&self.plan.matrix, self.plan.reach, &means, count)
     }
+}
+
+/// Single-precision pixels in double precision.
+fn widen<'a, T: Pixel + 'a>(to: &mut [f64], from: impl Iterator<Item = &'a T>) {
+    for (value, pixel) in to.iter_mut().zip(from) {
+        *value = f64::from(pixel.to_f32());
+    }
+}
+
+/// The largest of the `values` at `places` within [`AROUND`] of one, or zero if none is positive.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn most_around([x, y]: [f32; 2], [xs, ys]: &[Vec<f32>; 2], values: &[f32]) -> f32 {
+    let mut most = [0.0f32; LANES];
+    let near = |at: [f32; 2], value: f32| {
+        let square = (at[0] - x) * (at[0] - x) + (at[1] - y) * (at[1] - y);
+        if square < AROUND * AROUND { value } else { 0.0 }
+    };
+    // A value that is no number is not larger.
+    let larger = |a: f32, b: f32| if b > a { b } else { a };
+    let ((xs, last_x), (ys, last_y), (values, last)) = (
+        xs.as_chunks::<LANES>(),
+        ys.as_chunks::<LANES>(),
+        values.as_chunks::<LANES>(),
+    );
+    for ((xs, ys), values) in xs.iter().zip(ys).zip(values) {
+        for lane in 0..LANES {
+            most[lane] = larger(most[lane], near([xs[lane], ys[lane]], values[lane]));
+        }
+    }
+    for ((x, y), value) in last_x.iter().zip(last_y).zip(last) {
+        most[0] = larger(most[0], near([*x, *y], *value));
+    }
+    most.into_iter().fold(0.0, larger)
 }
 
 /// The power beyond which a block is left out.

@@ -128,6 +128,15 @@ pub const KEYS: [&str; 8] = [
     "creator", "submiss", "elltype", "set", "image", "settings", PSF_NOISE, WARNINGS,
 ];
 
+/// The effect of a star's noise on m and c, as a catalogue of this configuration states it: `None` unless it is known and
+/// matters.
+pub fn stated_psf_noise(
+    configuration: &Configuration,
+    effect: Option<[f64; 2]>,
+) -> Option<[f64; 2]> {
+    effect.filter(|effect| configuration.linear().is_some() && effect[0] > LEAST_PSF_NOISE)
+}
+
 /// Catalogue of one image from its rows of stamps, in order.
 ///
 /// # Errors
@@ -324,7 +333,6 @@ impl<'a> Catalogues<'a> {
         // Writing would make the folder again, without the earlier catalogues.
         self.claim.check()?;
         let path = self.run.catalogue(self.out, set, image);
-        let linear = self.run.configuration.linear().is_some();
         let table = catalogue(rows, &self.run.configuration)
             .map_err(|error| FileError::new(&path, error.to_string()))?;
         let mut metadata = metadata(self.run, head.id, head.prints.clone())?;
@@ -332,8 +340,7 @@ impl<'a> Catalogues<'a> {
             let lines: Vec<String> = found.iter().map(Warning::to_string).collect();
             metadata.insert(WARNINGS.into(), lines.join("\n"));
         }
-        let noise = psf_noise(rows).filter(|effect| linear && effect[0] > LEAST_PSF_NOISE);
-        if let Some([m, c]) = noise {
+        if let Some([m, c]) = stated_psf_noise(&self.run.configuration, psf_noise(rows)) {
             metadata.insert(PSF_NOISE.into(), format!("{m:.2e} {c:.2e}"));
         }
         table::write(&path, self.run.format, &table, &metadata)?;
