@@ -52,17 +52,12 @@ impl AllPsfs<'_> {
     }
 }
 
-impl AllPsfs<'_> {
-    /// A whole number that distinguishes the star of all galaxies from others, below 2^48: Fowler, Noll and Vo's hash.
-    fn star(&self) -> f64 {
-        let AllPsfs::Shared { psf, .. } = self else {
-            return 0.0;
-        };
-        let hash = psf.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, pixel| {
-            (hash ^ pixel.to_bits()).wrapping_mul(0x0100_0000_01b3)
-        });
-        (hash >> 16) as f64
-    }
+/// A whole number below 2^48 that distinguishes a star from others: Fowler, Noll and Vo's hash of its pixels.
+fn number_of(star: ArrayView2<'_, f64>) -> f64 {
+    let hash = star.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, pixel| {
+        (hash ^ pixel.to_bits()).wrapping_mul(0x0100_0000_01b3)
+    });
+    (hash >> 16) as f64
 }
 
 /// Noise levels of all stamps, or of a piece.
@@ -145,6 +140,7 @@ pub(crate) fn measure<'py>(
             Some(levels) => Noise::Each(levels.as_slice()?),
         },
     };
+    let number = star.as_ref().map_or(0.0, |star| number_of(star.as_array()));
     let psfs = match (star, &stars, formulas) {
         (Some(star), None, None) => request.star(&star),
         (None, Some(stars), None) => request.stars(stars),
@@ -172,7 +168,7 @@ pub(crate) fn measure<'py>(
     if configuration.linear().is_some() {
         let effect = stated_psf_noise(configuration, examination.psf_noise());
         let [m, c] = effect.unwrap_or_default();
-        let star = effect.map_or(0.0, |_| psfs.star());
+        let star = effect.map_or(0.0, |_| number);
         for (name, value) in [("psf_id", star), ("psf_m", m), ("psf_c", c)] {
             columns.set_item(name, vec![value; count].into_pyarray(py))?;
         }

@@ -392,7 +392,8 @@ def test_errors_contain_the_noise_of_stars_that_galaxies_share(tmp_path):
     for rows in (a, shearq.concatenate([a, b])):
         added, plain = more(rows)
         for variance, g in zip(added, plain):
-            assert variance == pytest.approx((m * g) ** 2 + c_noise**2, rel=0.05)
+            # m·g is a hundredth of it; variances of the shear are a hundred times larger.
+            assert variance == pytest.approx((m * g) ** 2 + c_noise**2, rel=1e-9)
     # Two stars halve it, up to the responses of their galaxies.
     added, plain = more(shearq.concatenate([a, c]))
     for variance, g in zip(added, plain):
@@ -424,6 +425,36 @@ def test_files_of_the_command_line_state_the_noise_of_their_star(tmp_path):
     one, two = (shearq.mean_shear([a, other]).covariance[0][0] for other in (c, b))
     g1 = a.mean_shear().g1
     assert one - two == pytest.approx(((0.023 * g1) ** 2 + 0.012**2) / 2, rel=1e-6)
-    shearq._shearq.write_table(str(tmp_path / "e.parquet"), "parquet", columns, {"psfnoise": "x"})
-    with pytest.raises(ValueError, match="psfnoise"):
-        shearq.read(tmp_path / "e.parquet")
+    for wrong in ("x", "0.1", "nan 0", "-1 5", "inf 0", "0 11", "0  0"):
+        shearq._shearq.write_table(str(tmp_path / "e.parquet"), "parquet", columns, {"psfnoise": wrong})
+        with pytest.raises(ValueError, match="psfnoise"):
+            shearq.read(tmp_path / "e.parquet")
+
+
+def test_a_star_is_known_again_in_other_cuts(two):
+    image = shearq.simulate(set=2, grid=8, seed=6)[0]
+    (whole,) = _behind(1, [image])
+    cut = {"extends": "48/linear/star", "psf": {"size": 40}}
+    noise = np.sqrt((image.psf.astype(float) ** 2).sum()) / 100
+    noisy = image.psf + noise * np.random.default_rng(1).standard_normal(image.psf.shape)
+    other = shearq.measure(image.stamps, noisy, noise=image.noise, submission=cut)
+    assert other["psf_id"][0] == whole["psf_id"][0] != 0
+    both = shearq.mean_shear([whole, other])
+    plain = shearq.mean_shear([rows[["e1", "e2", "flags", "R11", "R22", "divisor1", "divisor2"]] for rows in (whole, other)])
+    c = min(whole["psf_c"][0], other["psf_c"][0])
+    assert both.covariance[0][0] - plain.covariance[0][0] > 0.99 * c**2
+
+
+def test_bias_knows_the_star_of_catalogues_in_memory(tmp_path):
+    images = shearq.simulate(set=2, images=2, grid=8, seed=6)
+    a, b = _behind(1, images)
+    plain = [rows[[name for name in rows.dtype.names if not name.startswith("psf_")]] for rows in (a, b)]
+    found, without = (shearq.bias(rows, g1=0.02, g2=0.02) for rows in ([a, b], plain))
+    for name, rows in (("a", a), ("b", b)):
+        rows.write(tmp_path / f"{name}.parquet")
+    files = shearq.bias([tmp_path / "a.parquet", tmp_path / "b.parquet"], g1=0.02, g2=0.02)
+    added = found["m1_error"] ** 2 - without["m1_error"] ** 2
+    # One shear: c of the star is an error of m, too.
+    assert added == pytest.approx(a["psf_m"][0] ** 2 + (a["psf_c"][0] / 0.02) ** 2, rel=1e-6)
+    # Files state three digits.
+    assert files["m1_error"] == pytest.approx(found["m1_error"], rel=1e-2)

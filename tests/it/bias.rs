@@ -705,8 +705,9 @@ fn errors_contain_the_noise_of_a_star_that_all_galaxies_share() {
         result(&[plus, minus])
     };
     let noise = ("psfnoise", "3.00e-1 4.00e-3");
-    let one: &[(&str, &str)] = &[noise, ("psf", "a")];
-    let other: &[(&str, &str)] = &[noise, ("psf", "b")];
+    let creator = ("creator", "shearq 0.2.0");
+    let one: &[(&str, &str)] = &[creator, noise, ("psf", "a")];
+    let other: &[(&str, &str)] = &[creator, noise, ("psf", "b")];
     let without = pair("0.parquet", FileFormat::Parquet, [&[], &[]]);
     assert!(!without["notes"].to_string().contains("star"), "{without}");
     for (name, format, psfs, [m, c], said) in [
@@ -715,14 +716,14 @@ fn errors_contain_the_noise_of_a_star_that_all_galaxies_share() {
             FileFormat::Parquet,
             [one, one],
             [0.3, 4e-3],
-            "the star that all units share",
+            "a star that several units share",
         ),
         (
             "1.fits",
             FileFormat::Fits,
             [one, one],
             [0.3, 4e-3],
-            "the star that all units share",
+            "a star that several units share",
         ),
         // Each star has half of the galaxies, and an error of c under one sign only is one of m, too.
         (
@@ -752,12 +753,12 @@ fn errors_contain_the_noise_of_a_star_that_all_galaxies_share() {
             );
         }
     }
-    let bad = write(
-        "bad.parquet",
-        FileFormat::Parquet,
-        0.02,
-        &[("psfnoise", "x")],
-    );
+    // Of another program it means something else.
+    let bad = [("psfnoise", "x")];
+    let found = pair("3.parquet", FileFormat::Parquet, [&bad, &bad]);
+    assert_eq!(found["rows"], without["rows"]);
+    let bad = [creator, ("psfnoise", "x")];
+    let bad = write("bad.parquet", FileFormat::Parquet, 0.02, &bad);
     let message = fail(&["bias", &bad]);
     assert!(message.contains("`psfnoise`"), "{message}");
 }

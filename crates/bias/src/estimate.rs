@@ -110,6 +110,9 @@ impl Estimate {
 /// Estimates of the units of a bin, with a known true shear or not. Errors include the noise of `stars` that several
 /// units share, to first order.
 ///
+/// # Panics
+/// If the stars have other bins than the sums.
+///
 /// # Errors
 /// If no galaxy or only one unit was added, or a mean response has less than five standard errors.
 pub fn estimate(
@@ -119,6 +122,10 @@ pub fn estimate(
     truth: bool,
     errors: Errors,
 ) -> Result<Estimate, BiasError> {
+    assert!(
+        stars.iter().all(|star| star.sums.bins() == sums.bins()),
+        "stars and sums have the same bins"
+    );
     let units = sums.of_bin(bin);
     let mut total = vec![0.0; sums.layout().len()];
     for unit in &units {
@@ -136,9 +143,10 @@ pub fn estimate(
         Errors::Jackknife => jackknife(&plan, &total, &units),
         Errors::Bootstrap { draws, seed } => bootstrap(&plan, &units, draws, seed),
     };
-    for change in by_stars(&plan, &total, stars, bin) {
-        for ((error, changed), value) in errors.iter_mut().zip(change).zip(values) {
-            *error = error.hypot(changed - value);
+    for star in stars {
+        let more = variances(&plan, &total, star, (bin, units.len()));
+        for (error, more) in errors.iter_mut().zip(more) {
+            *error = error.hypot(more.sqrt());
         }
     }
     for (component, place) in (1..).zip(RESPONSE) {
@@ -210,20 +218,45 @@ pub fn difference(
     })
 }
 
-/// Estimates under each change by one standard deviation that the noise of a star makes: of m, and of c of one component.
-fn by_stars(plan: &Plan, total: &[f64], stars: &[Behind], bin: usize) -> Vec<Estimates> {
-    let mut all = Vec::new();
-    for star in stars {
-        for own in star.sums.of_bin(bin) {
-            all.push(plan.shifted(total, own, (star.m, [0.0; 4])));
-            for k in 0..4 {
-                let mut c = [0.0; 4];
-                c[k] = star.c;
-                all.push(plan.shifted(total, own, (0.0, c)));
+/// What the noise of a star adds to the variances of estimates from `n` units.
+///
+/// If the noise changes an estimate by Σ aᵤ, of which the galaxies of unit u make aᵤ, then its variance is A² = (Σ aᵤ)². A
+/// jackknife contains n/(n − 1) (Σ aᵤ² − A²/n) of it.
+fn variances(plan: &Plan, total: &[f64], star: &Behind, (bin, n): (usize, usize)) -> Estimates {
+    let units = star.sums.of_bin(bin);
+    let mut own = vec![0.0; total.len()];
+    for unit in &units {
+        add(&mut own, unit);
+    }
+    let values = plan.estimates(total);
+    let mut more = [0.0; ESTIMATES];
+    // m changes in all components alike, and c in each on its own.
+    for change in 0..5 {
+        let (mut m, mut c) = (0.0, [0.0; 4]);
+        match change {
+            4 => m = star.m,
+            k => c[k] = star.c,
+        }
+        let effect = |sums: &[f64]| -> Estimates {
+            let changed = plan.shifted(total, sums, (m, c));
+            std::array::from_fn(|k| changed[k] - values[k])
+        };
+        let whole = effect(&own).map(|effect| effect * effect);
+        let mut known = [0.0; ESTIMATES];
+        if star.by_unit {
+            for unit in &units {
+                for (sum, effect) in known.iter_mut().zip(effect(unit)) {
+                    *sum += effect * effect;
+                }
             }
+            let n = n as f64;
+            known = std::array::from_fn(|k| n / (n - 1.0) * (known[k] - whole[k] / n));
+        }
+        for k in 0..ESTIMATES {
+            more[k] += (whole[k] - known[k]).max(0.0);
         }
     }
-    all
+    more
 }
 
 /// Standard errors from leaving out each unit: (n − 1)/n Σ (θ − ⟨θ⟩)².

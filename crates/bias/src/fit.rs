@@ -143,8 +143,8 @@ impl Plan {
         found
     }
 
-    /// Estimates of `sums` if galaxies with the sums `own`, which are among them, had another m and c: larger by `change`,
-    /// of which c has a value for each component.
+    /// Estimates of `sums` if some of their galaxies, which have the sums `own`, had a larger m and c. `change` is the
+    /// difference of m, and of c for each component.
     pub(crate) fn shifted(&self, sums: &[f64], own: &[f64], change: (f64, [f64; 4])) -> Estimates {
         let mut changed = sums.to_vec();
         self.layout

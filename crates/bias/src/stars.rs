@@ -17,29 +17,24 @@ pub struct StarNoise {
     pub c: f64,
 }
 
-/// The galaxies behind a star that are in several units. Units differ by less than the noise of this star, so that a
-/// jackknife over them does not contain it.
+/// The galaxies behind a star that are in several units. A jackknife over the units contains only the part of its noise by
+/// which they differ.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Behind {
     pub(crate) m: f64,
     pub(crate) c: f64,
-    /// Their sums, in one unit.
+    /// Their sums: by unit, or in one if every unit has galaxies of all catalogues.
     pub(crate) sums: UnitSums,
-}
-
-impl Behind {
-    /// The same galaxies with all bins joined to one.
-    fn all_bins(&self) -> Self {
-        Behind {
-            sums: self.sums.all_bins(),
-            ..*self
-        }
-    }
+    pub(crate) by_unit: bool,
 }
 
 /// The same stars with all bins joined to one.
 pub fn all_bins(stars: &[Behind]) -> Vec<Behind> {
-    stars.iter().map(Behind::all_bins).collect()
+    let joined = |star: &Behind| Behind {
+        sums: star.sums.all_bins(),
+        ..*star
+    };
+    stars.iter().map(joined).collect()
 }
 
 /// The galaxies of each star that several units share. `noises` has the noise of each catalogue's star, and `units` the
@@ -57,20 +52,20 @@ pub(crate) fn shared(
             *most = [most[0].max(*m), most[1].max(*c)];
         }
     }
-    let unit_of = |catalogue: &u32| units.and_then(|units| units.get(*catalogue as usize));
-    stars.retain(|_, (catalogues, _)| {
-        units.is_none()
-            || catalogues
-                .iter()
-                .map(unit_of)
-                .collect::<BTreeSet<_>>()
-                .len()
-                > 1
-    });
+    let unit = |catalogue: u32| {
+        let units = units.unwrap_or_default();
+        units.get(catalogue as usize).copied().unwrap_or(0)
+    };
     let behind = stars.into_values().map(|(catalogues, [m, c])| Behind {
         m,
         c,
-        sums: sums.of_catalogues(|catalogue| catalogues.contains(&catalogue)),
+        sums: sums
+            .of_catalogues(|catalogue| catalogues.contains(&catalogue))
+            .by_group(unit),
+        by_unit: units.is_some(),
     });
-    behind.collect()
+    // A star in one unit differs from unit to unit, and is in the jackknife.
+    behind
+        .filter(|star| !star.by_unit || star.sums.count() > 1)
+        .collect()
 }

@@ -197,8 +197,8 @@ impl Layout {
         sums[VERSION + 2 * version] / sums[VERSION + 2 * version + 1]
     }
 
-    /// Adds to `sums` what another m and c change the ellipticities of the galaxies with the sums `own`, which are among
-    /// them: e becomes e + R (m g + c). Responses are larger by `extra` than those of the rows.
+    /// Changes `sums` as if some of their galaxies, which have the sums `own`, had a larger m and c: e becomes
+    /// e + R (m g + c). R is the response of the row plus `extra`.
     pub(crate) fn shift(
         self,
         sums: &mut [f64],

@@ -204,7 +204,12 @@ impl UnitSums {
         self
     }
 
-    /// The sums of the catalogues that are `wanted`, in one unit.
+    /// Number of units.
+    pub(crate) fn count(&self) -> usize {
+        self.units.len()
+    }
+
+    /// The sums of the catalogues that are `wanted`.
     pub(crate) fn of_catalogues(&self, wanted: impl Fn(u32) -> bool) -> Self {
         let all = self.units.iter();
         let units = all.filter(|((catalogue, _), _)| wanted(*catalogue));
@@ -214,7 +219,6 @@ impl UnitSums {
             last: None,
             ..*self
         }
-        .by_group(|_| 0)
     }
 
     /// The sums of each unit of a bin that has a galaxy.

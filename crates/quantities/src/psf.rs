@@ -136,9 +136,10 @@ impl FunctionalPsf {
     /// centred at (`centre_x`, `centre_y`), 0-based pixel-centre coordinates.
     ///
     /// The mean of a 48 × 48 stamp's corner of the four central pixels is (23.5, 23.5). Nothing is
-    /// renormalised: the sum falls short of 1 by the light outside. Each pixel is integrated in
-    /// real space by a Gauss–Legendre rule as long as the profile's sharpness there asks for;
-    /// errors are below 1e-6 of the brightest pixel (tested for FWHM of 0.3 px and more).
+    /// renormalised: the sum falls short of 1 by the light outside. Pixels near the centre are
+    /// integrated in real space by a Gauss–Legendre rule as long as the profile's sharpness there
+    /// asks for. The light of the others follows from the profile in the middles of pixels. Errors
+    /// are below 1e-6 of the brightest pixel (tested for FWHM of 0.3 px and more).
     pub fn draw_into(&self, centre_x: f64, centre_y: f64, out: ArrayViewMut2<f64>) {
         let centre = (centre_x, centre_y);
         match self.brightness() {

@@ -21,7 +21,7 @@ const SINGLE_INTERVALS: usize = SINGLE_STEPS_PER_OCTAVE * OCTAVES;
 const FALL_BITS: u32 = 12;
 const VALUE: f32 = 1.0 / ((1 << (32 - FALL_BITS)) - 1) as f32;
 
-/// A smooth function from 1 to 0 of a squared radius u ≥ 0, which never rises, as cubics on intervals that widen with u.
+/// A smooth function of a squared radius u ≥ 0, which never rises, as cubics on intervals that widen with u.
 ///
 /// With v = 1 + u/`unit`, each doubling of v is divided into 32 equal intervals. Both the doubling
 /// and the interval are read off the bits of the floating-point number v, so that a look-up needs
@@ -87,7 +87,8 @@ impl RadialTable {
         let nodes = (0..SINGLE_INTERVALS).map(|index| {
             let (here, next) = (value(index), value(index + 1));
             let fall = (2.0 * (here - next)).round() as u32;
-            (here.round() as u32) << FALL_BITS | fall.min((1 << FALL_BITS) - 1)
+            let here = here.round().min(f64::from(1.0 / VALUE)) as u32;
+            here << FALL_BITS | fall.min((1 << FALL_BITS) - 1)
         });
         let nodes: Vec<u32> = nodes.collect();
         table.single.copy_from_slice(&nodes);
@@ -111,7 +112,8 @@ impl RadialTable {
         (1.0 + u * self.per_unit).clamp(1.0, LAST).to_bits() - 1.0f64.to_bits()
     }
 
-    /// The same in single precision, in a form that the compiler can turn into vector code.
+    /// The same in single precision, in a form that the compiler can turn into vector code. For functions from 1 to 0 that
+    /// change by at most 1 if ln v changes by 1.
     pub fn single(&self) -> SingleTable<'_> {
         SingleTable {
             per_unit: self.per_unit as f32,
@@ -128,7 +130,8 @@ pub struct SingleTable<'a> {
 }
 
 impl SingleTable<'_> {
-    /// The function at squared radius `u` ≥ 0, to 7e-7. For (1 + u)^(−3/2) it is up to 2e-6 of the value too large, too.
+    /// The function at squared radius `u` ≥ 0. It has the units of the table, which are 7e-7, and the error of linear
+    /// interpolation, up to 2e-6 of the value for (1 + u)^(−3/2).
     #[inline(always)]
     pub fn at(self, u: f32) -> f32 {
         const FRACTION: u32 = 23 - SINGLE_STEP_BITS;

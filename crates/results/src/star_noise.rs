@@ -4,12 +4,48 @@ use std::path::Path;
 
 use shearq_bias::StarNoise;
 use shearq_files::FileError;
+use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, FileFormat};
 use shearq_pipeline::inputs::PSF;
 use shearq_pipeline::measure::PSF_NOISE;
 
 /// Largest effect on m or c that metadata can state: a star without any signal has 5.5.
 const MOST: f64 = 10.0;
+
+/// Key of the program that wrote a catalogue, and how its text begins in catalogues of shearq.
+const CREATOR: (&str, &str) = ("creator", "shearq ");
+/// Columns that Python's catalogues have instead: a number for the star, and the scatter of m and of c.
+const COLUMNS: [&str; 3] = ["psf_id", "psf_m", "psf_c"];
+
+/// The noise of the star of a catalogue of any program; `None` unless shearq wrote it and states the noise.
+///
+/// # Errors
+/// If the metadata cannot be read.
+pub(crate) fn of_any(path: &Path, format: FileFormat) -> Result<Option<StarNoise>, FileError> {
+    let (key, start) = CREATOR;
+    let found = table::read_metadata(path, format, std::iter::once(&key.to_owned()))?;
+    match found.get(key) {
+        Some(creator) if creator.starts_with(start) => of_catalogue(path, format),
+        _ => Ok(None),
+    }
+}
+
+/// The noise of the star of a table in memory; `None` if it has no such columns, no noise, or galaxies behind several
+/// stars.
+pub(crate) fn of_table(table: &DataFrame, name: &Path) -> Option<StarNoise> {
+    let [star, m, c] = COLUMNS.map(|column| {
+        let values = table::numbers(table, column, name).ok()?;
+        let first = *values.first()?;
+        values.iter().all(|value| *value == first).then_some(first)
+    });
+    let (star, m, c) = (star?, m?, c?);
+    let known = [m, c].iter().all(|effect| (0.0..=MOST).contains(effect)) && m > 0.0;
+    known.then(|| StarNoise {
+        star: format!("{star:.0}"),
+        m,
+        c,
+    })
+}
 
 /// The noise of the star of a catalogue, which is named by its fingerprint or, without one, as the catalogue. `None` if the
 /// catalogue does not state it.

@@ -58,7 +58,7 @@ impl std::fmt::Debug for Renderer {
 
 /// One period of the image, in pixels, and the wavenumbers 2πj/N that belong to it.
 struct Grid {
-    /// N. It is even, and N/2 + 1 wavenumbers are a multiple of eight.
+    /// N. It is even, and N/2 + 1 is a multiple of eight.
     size: usize,
     /// Half of the stamp, its middle included, and padded to rows of a product.
     rows: usize,
@@ -247,7 +247,7 @@ impl Renderer {
 }
 
 impl Grid {
-    /// For a period near `period` pixels, at most 2 shorter.
+    /// For a period near `period` pixels, at most 3 shorter.
     fn new(period: usize, stamp: usize) -> Self {
         let modes = (period / 2).next_multiple_of(8);
         let padded = modes.next_multiple_of(LANES);
@@ -410,7 +410,7 @@ impl Grid {
             half.resize((self.rows * pair).max(lines * self.width), 0.0);
         }
         let (up, down) = (&mut even[..self.rows * pair], &mut odd[..self.rows * pair]);
-        let padded = self.modes().next_multiple_of(LANES);
+        let padded = self.cosines.len() / self.rows;
         let cosines = Matrix::new(&self.cosines, padded);
         let sines = Matrix::new(&self.sines, padded);
         multiply(cosines, Matrix::new(sums, pair), modes, up, pair);

@@ -212,6 +212,8 @@ pub struct Version {
     pub intrinsic: Shear,
     /// The shear on it.
     pub shear: Shear,
+    /// Factor of its radii. Its flux stays the same.
+    pub size: f64,
     /// Factor of its noise.
     pub noise: f32,
 }
@@ -397,6 +399,7 @@ impl SetSimulator {
         let version = Version {
             intrinsic: Shear::new(e.re, e.im),
             shear: self.shear_at(ix, iy),
+            size: 1.0,
             noise: 1.0,
         };
         self.draw_as(fields, (ix, iy), version, scratch, out);
@@ -421,14 +424,15 @@ impl SetSimulator {
         let x = centre + rng.random_range(-0.5..0.5);
         let y = centre + rng.random_range(-0.5..0.5);
         let mut again = rng.clone();
-        let (galaxy, snr) = self.galaxy(version.intrinsic, version.shear, &mut rng);
+        let lensed = (version.shear, version.size);
+        let (galaxy, snr) = self.galaxy(version.intrinsic, lensed, &mut rng);
         let psf = self
             .transform
             .of(fields.psf.at(ix, iy))
             .expect("all PSFs of a set have one profile");
         self.renderer.render(&galaxy, &psf, (x, y), scratch, out);
         // Lensing leaves the flux as it is: S/N is that of the galaxy before.
-        let (unlensed, _) = self.galaxy(version.intrinsic, Shear::new(0.0, 0.0), &mut again);
+        let (unlensed, _) = self.galaxy(version.intrinsic, (Shear::ZERO, 1.0), &mut again);
         let scale = (snr * NOISE_SIGMA / power(&unlensed, &psf).sqrt()) as f32;
         let sigma = version.noise * NOISE_SIGMA as f32;
         add_noise(&mut rng, scale, sigma, out);
@@ -440,8 +444,13 @@ impl SetSimulator {
         Shear::new(e.re, e.im).sheared_by(self.shear_at(ix, iy))
     }
 
-    /// The galaxy of the set's kind, of an intrinsic ellipticity and under a shear, and its S/N.
-    fn galaxy(&self, intrinsic: Shear, shear: Shear, rng: &mut ChaCha8Rng) -> (Galaxy, f64) {
+    /// The galaxy of the set's kind, of an intrinsic ellipticity, under a shear and with radii times `size`, and its S/N.
+    fn galaxy(
+        &self,
+        intrinsic: Shear,
+        (shear, size): (Shear, f64),
+        rng: &mut ChaCha8Rng,
+    ) -> (Galaxy, f64) {
         let shape = intrinsic.sheared_by(shear);
         let (mut bulge, mut disc) = match self.kind.image {
             ImageType::SmallGalaxy => (1.8, 2.6),
@@ -478,6 +487,7 @@ impl SetSimulator {
             }
             _ => {}
         }
+        let (bulge, disc) = (size * bulge, size * disc);
         let galaxy = Galaxy::bulge_and_disc(1.0, fraction, bulge, disc, shape)
             .and_then(|galaxy| match offset {
                 Some((dx, dy)) => galaxy.with_bulge_offset(dx, dy),
@@ -526,6 +536,7 @@ mod tests {
             let version = |e: Complex64| Version {
                 intrinsic: Shear::new(e.re, e.im),
                 shear: set.shear_at(2, 5),
+                size: 1.0,
                 noise: 0.0,
             };
             let mut out = vec![0.0; STAMP * STAMP];
@@ -628,6 +639,7 @@ mod tests {
             let version = Version {
                 intrinsic: of(intrinsic),
                 shear: of(shear),
+                size: 1.0,
                 noise: 0.0,
             };
             simulator.draw_as(

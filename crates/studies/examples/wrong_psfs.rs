@@ -44,6 +44,7 @@ fn galaxies(set: u32, grid: usize) -> Result<Galaxies, Box<dyn Error>> {
             let version = Version {
                 intrinsic: Shear::new(e.re, e.im),
                 shear: Shear::new(shear, shear),
+                size: 1.0,
                 noise: [1.0, -1.0][of / 2],
             };
             simulator.draw_as(&fields, (ix, iy), version, &mut scratch, &mut pixels);

@@ -146,6 +146,7 @@ fn draw(
         let version = Version {
             intrinsic: Shear::new(e.re, e.im),
             shear: gamma,
+            size: 1.0,
             noise,
         };
         set.draw_as(fields, (ix, iy), version, scratch, &mut stamp);

@@ -5,7 +5,7 @@ use shearq_scoring::resample::mean_over_sets;
 use shearq_submissions::Configuration;
 
 use super::bias::{ShearBias, biases};
-use super::bound::{cramer_rao, expected_q};
+use super::bound::{cramer_rao, ensemble_bound, expected_q};
 use super::reproduce::{ConfigurationResult, Plan, SetResult, Study};
 use super::speed;
 use shearq_pipeline::PipelineError;
@@ -25,6 +25,9 @@ pub struct SetBiases {
     pub bound: Option<f64>,
     /// Standard error of the bound.
     pub bound_error: Option<f64>,
+    /// Bound on the scatter of shears from elliptical galaxies with the best weights, if there is one.
+    #[serde(default)]
+    pub ensemble_bound: Option<f64>,
     /// Expected Q for the images of the plan with a scatter at the bound.
     #[serde(rename = "limit")]
     pub expected_q: Option<f64>,
@@ -64,6 +67,7 @@ pub fn bias_sets(
             set,
             bound,
             bound_error,
+            ensemble_bound: ensemble_bound(&simulator).map(|(bound, _)| bound),
             expected_q: expected_q
                 .transpose()
                 .map_err(|source| PipelineError::Scoring {
@@ -113,7 +117,7 @@ pub fn contest_table(
                 Cell::Empty,
                 Cell::text(&configuration.name),
             ];
-            row.extend((0..10).map(|_| Cell::Empty));
+            row.extend((0..11).map(|_| Cell::Empty));
             row.push(mean(&|r| (r.score.metrics.q, r.score.errors.q), 1));
             row.push(mean(&spectrum, 0));
             row.push(Cell::number(limit, 0));
@@ -127,6 +131,7 @@ pub fn contest_table(
         ("submission", "Configuration"),
         ("scatter", "scatter"),
         ("scatter_over_bound", "/ bound"),
+        ("scatter_over_ensemble", "/ ensemble"),
         ("total", "total"),
         ("total_over_bound", "/ bound"),
         ("m1", "m1×10³"),
@@ -145,7 +150,7 @@ pub fn contest_table(
         headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
         rows,
         notes: vec![
-            "Scatter of ε per component after division by its response, and its ratio to the Cramér–Rao bound of a sample of the galaxies. Offset bulges have no bound. Total: the scatter with intrinsic shapes, and its ratio to that with noise at the bound. If S/N differ, galaxies of low S/N count less, and the scatter can be below the bound.".into(),
+            "Scatter of ε per component after division by its response, and its ratio to the Cramér–Rao bound of a sample of the galaxies, were they round. Ensemble: the bound on shears from the same galaxies with their ellipticities, of unknown flux and size, with the best weights. Offset bulges have no bound. Total: the scatter with intrinsic shapes, and its ratio to that with noise at the bound. If S/N differ, galaxies of low S/N count less, and the scatter can be below the bound.".into(),
             "m and c: from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign. Leakage: c along the ellipticity of the PSF. Unmeasured: galaxies without ellipticity; they are left out.".into(),
             "Q of the catalogues, and of cross-spectra between groups of images, which noise does not bias; leaderboard definition, standard convention. Expected Q: mean Q of a perfect method with noise at the bound.".into(),
         ],
@@ -161,6 +166,7 @@ pub fn contest_parts(table: &Table) -> [Table; 2] {
         "submission",
         "scatter",
         "scatter_over_bound",
+        "scatter_over_ensemble",
         "total",
         "total_over_bound",
         "m1",
@@ -209,6 +215,7 @@ fn row(
         Cell::text(&configuration.name),
         Cell::with_error(scatter, Some(scatter_error), 5),
         Cell::with_error(scatter / bound, Some(scatter / bound * relative), 3),
+        Cell::number(scatter / bias.ensemble_bound.unwrap_or(f64::NAN), 3),
         Cell::number(total, 4),
         Cell::number(total / total_bound, 4),
         scaled(biases.m[0], biases.m_error[0], 1e3),

@@ -473,7 +473,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         As :meth:`Catalogue.mean_shear`; or if there is no catalogue.
     """
     parts: list[list[NDArray[np.float64]]] = []
-    stars: list[list[NDArray[np.float64]]] = []
+    stars: list[tuple[NDArray[np.float64], NDArray[np.intp]]] = []
     goods: list[NDArray[np.bool_]] = []
     calibrated = False
     for rows in [catalogues] if isinstance(catalogues, Catalogue) else catalogues:
@@ -483,8 +483,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         rows = np.atleast_1d(rows).view(Catalogue)
         e, responses = raw(rows)
         parts.append([*e, *responses])
-        known = all(name in (rows.dtype.names or ()) for name in _schema.STAR)
-        stars.append([np.nan_to_num(rows[name]) if known else np.zeros(len(rows)) for name in _schema.STAR])
+        stars.append(_stars(rows))
         goods.append(rows.good)
         calibrated = calibrated or bool(np.isfinite(rows["divisor1"]).any())
     if not parts:
@@ -504,8 +503,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
     # A common factor changes nothing, but squares of weights could overflow.
     factor = weight[counted] / weight[counted].max()
     (g1, g2), (first, second), response, galaxies = _shearq.mean_shear(e1, e2, r11, r22, factor)
-    columns = [np.concatenate([star[k] for star in stars])[counted] for k in range(3)]
-    more = _star_variances(np.stack(columns), (g1, g2), (factor * r11, factor * r22))
+    more = _star_variances(stars, counted, (g1, g2), (factor * r11, factor * r22))
     first[0] += more[0]
     second[1] += more[1]
     errors = [float(np.sqrt(value)) for value in (first[0], second[1])]
@@ -521,18 +519,32 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
     )
 
 
+def _stars(rows: Catalogue) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Numbers of the stars of a catalogue with their effects on m and c, (3, stars), and the place of each row's star there."""
+    if not all(name in (rows.dtype.names or ()) for name in _schema.STAR):
+        return np.zeros((3, 1)), np.zeros(len(rows), dtype=np.intp)
+    _, first, star = np.unique(rows["psf_id"], return_index=True, return_inverse=True)
+    effects = np.stack([rows[name][first] for name in _schema.STAR])
+    return np.nan_to_num(effects), np.asarray(star.reshape(-1), dtype=np.intp)
+
+
 def _star_variances(
-    stars: NDArray[np.float64],
+    stars: list[tuple[NDArray[np.float64], NDArray[np.intp]]],
+    counted: NDArray[np.bool_],
     shear: tuple[float, float],
     responses: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> list[float]:
-    """Variances of both components of a mean shear by the noise of ``stars``: number and effects on m and c of each row."""
-    each, star = np.unique(stars, axis=1, return_inverse=True)
-    _, m, c = each
+    """Variances of both components of a mean shear by the noise of stars. `counted` says which rows have a response."""
+    firsts = np.cumsum([0, *(effects.shape[1] for effects, _ in stars)])
+    place = np.concatenate([first + star for first, (_, star) in zip(firsts, stars)])[counted]
+    numbers, m, c = np.concatenate([effects for effects, _ in stars], axis=1)
+    # The same star in several catalogues has one error.
+    each, same = np.unique(numbers, return_inverse=True)
     variances = []
     for g, response in zip(shear, responses):
-        share = np.bincount(star.reshape(-1), weights=response) / response.sum()
-        variances.append(float((share**2 * ((m * g) ** 2 + c**2)).sum()))
+        share = np.bincount(place, weights=response, minlength=len(numbers)) / response.sum()
+        sums = [np.bincount(same.reshape(-1), weights=share * effect, minlength=len(each)) for effect in (m, c)]
+        variances.append(float(((sums[0] * g) ** 2 + sums[1] ** 2).sum()))
     return variances
 
 

@@ -67,10 +67,13 @@ def read(path: str | os.PathLike[str]) -> Catalogue:
 def _star(file: pathlib.Path, metadata: dict[str, str], count: int) -> dict[str, Any]:
     """The columns of the noise of a star, which the command line states once."""
     stated = metadata.get(_schema.STAR_KEY)
+    most = 10.0
     try:
-        m, c = [float(word) for word in (stated or "0 0").split()]
+        m, c = [float(word) for word in (stated or "0 0").split(" ")]
+        if not (0 <= m <= most and 0 <= c <= most):
+            raise ValueError
     except ValueError:
-        raise ValueError(f"{file}: the metadata {_schema.STAR_KEY} are {stated!r}; expected two numbers") from None
+        raise ValueError(f"{file}: the metadata {_schema.STAR_KEY} are {stated!r}; expected two numbers from 0 to {most:.0f}") from None
     # Without a fingerprint, the star is that of this file alone.
     name = metadata.get(_schema.PSF_KEY, str(file))
     star = int.from_bytes(hashlib.sha256(name.encode()).digest()[:6], "big") if stated else 0

@@ -30,8 +30,10 @@ def to_astropy(catalogue: Catalogue) -> astropy.table.Table:
 
     meta = {key: _schema.in_header(value) for key, value in _schema.to_keys(catalogue.attrs).items()}
     table = Table(_columns(catalogue), meta=meta)
+    units = dict(_schema.UNITS)
     # The linear method has a standard deviation there, and the network a sum of moments.
-    units = {**_schema.UNITS, "size": "pix" if "snr" in table.colnames else "pix2"}
+    if "snr" in table.colnames or "iterations" in table.colnames:
+        units["size"] = "pix" if "snr" in table.colnames else "pix2"
     for name, unit in units.items():
         if name in table.colnames:
             table[name].unit = unit

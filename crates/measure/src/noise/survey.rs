@@ -143,7 +143,7 @@ impl NoiseSurvey {
         let blocks = Arc::clone(&self.plan.blocks);
         for &(y0, x0) in &*blocks {
             for (y, to) in (y0..).zip(self.block.chunks_exact_mut(BLOCK)) {
-                // Without what was subtracted or filled.
+                // Pixels as given, before sky is subtracted and missing ones are filled.
                 let row = stamp.row(y);
                 match row.as_slice() {
                     Some(row) => widen(to, row[x0..].iter()),

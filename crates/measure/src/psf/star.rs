@@ -124,6 +124,9 @@ fn centred_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<Star,
         false => sum(taken),
     })?;
     let share = 1.0 / flux;
+    if !share.is_finite() {
+        return Err(MeasureError::DarkPsf(flux));
+    }
     Ok(Star {
         psf: taken.mapv(|value| share * Into::<f64>::into(value)),
         moved,

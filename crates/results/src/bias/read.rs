@@ -363,12 +363,16 @@ pub(super) fn rows(
         ..Catalogue::default()
     };
     let own = [Preset::Shearq, Preset::Versions];
-    let first = sources.first().filter(|first| first.frame.is_none());
-    if let Some(first) = first.filter(|first| own.contains(&first.columns.preset)) {
+    if let Some(first) = sources
+        .first()
+        .filter(|first| own.contains(&first.columns.preset))
+    {
         let path = &first.place.path;
-        if let Some(format) = FileFormat::of(path) {
-            about.star = star_noise::of_catalogue(path, format)?;
-        }
+        about.star = match (&first.frame, FileFormat::of(path)) {
+            (Some(frame), _) => star_noise::of_table(frame, path),
+            (None, Some(format)) => star_noise::of_any(path, format)?,
+            (None, None) => None,
+        };
     }
     // Rows of each version so far.
     let mut counts = [0u64; COUNT];

@@ -159,7 +159,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
     ];
     match result.noisy_stars {
         0 => {}
-        1 => notes.push("They include the noise of the star that all units share.".into()),
+        1 => notes.push("They include the noise of a star that several units share.".into()),
         count => notes.push(format!(
             "They include the noise of {count} stars that several units share."
         )),
