@@ -12,7 +12,7 @@ use shearq_scoring::{Bins, Complex64, Convention, Definition, ScoringError};
 
 use shearq_simulate::kinds::ImageType;
 use shearq_simulate::render::RenderScratch;
-use shearq_simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, Version};
+use shearq_simulate::set::{ImageFields, NOISE_SIGMA, STAMP, SetSimulator, Version};
 
 /// Step of ellipticity for the numerical derivative of an image.
 const STEP: f64 = 0.02;
@@ -25,6 +25,54 @@ const LEAST_PIVOT: f64 = 1e-3;
 /// Number of noise fields for the mean Q. Q scatters by a third, so the mean has an error of 2 %.
 const TRIALS: u32 = 200;
 
+/// Cells of the sampled galaxies, from the whole field, because PSFs vary.
+fn sample(set: &SetSimulator) -> impl Iterator<Item = (usize, usize)> {
+    let n = set.grid().n;
+    let cells = (0..GALAXIES.min(n * n)).map(move |k| k * STRIDE % (n * n));
+    cells.map(move |cell| (cell % n, cell / n))
+}
+
+/// Galaxies of the first image of a set, as they might have been.
+struct Drawing<'a> {
+    set: &'a SetSimulator,
+    fields: ImageFields,
+    scratch: RenderScratch,
+}
+
+impl<'a> Drawing<'a> {
+    fn new(set: &'a SetSimulator) -> Self {
+        Drawing {
+            set,
+            fields: set.image_fields(1),
+            scratch: RenderScratch::new(),
+        }
+    }
+
+    fn intrinsic(&self, at: (usize, usize)) -> Shear {
+        let e = self.fields.intrinsic[at];
+        Shear::new(e.re, e.im)
+    }
+
+    /// A galaxy without noise, of an ellipticity, under a shear, and with radii times `size`.
+    fn stamp(
+        &mut self,
+        at: (usize, usize),
+        (intrinsic, shear): (Shear, Shear),
+        size: f64,
+    ) -> Vec<f32> {
+        let mut stamp = vec![0.0; STAMP * STAMP];
+        let version = Version {
+            intrinsic,
+            shear,
+            size,
+            noise: 0.0,
+        };
+        self.set
+            .draw_as(&self.fields, at, version, &mut self.scratch, &mut stamp);
+        stamp
+    }
+}
+
 /// Smallest possible scatter per component of unbiased ellipticities, and its standard error from the sample of
 /// galaxies. It is the root mean square over galaxies on full stamps with their noise.
 ///
@@ -35,30 +83,15 @@ pub fn cramer_rao(set: &SetSimulator) -> Option<(f64, f64)> {
     if set.kind().image == ImageType::OffsetBulge {
         return None;
     }
-    let n = set.grid().n;
-    let fields = set.image_fields(1);
-    let mut scratch = RenderScratch::new();
-    let mut draw = |at: (usize, usize), shape: Shear| {
-        let mut stamp = vec![0.0; STAMP * STAMP];
-        let version = Version {
-            intrinsic: Shear::new(0.0, 0.0),
-            shear: shape,
-            size: 1.0,
-            noise: 0.0,
-        };
-        set.draw_as(&fields, at, version, &mut scratch, &mut stamp);
-        stamp
-    };
-    let count = GALAXIES.min(n * n);
+    let mut draw = Drawing::new(set);
     let mut variances = RunningMean::default();
-    for k in 0..count {
-        // Sample the whole field, because PSFs vary.
-        let cell = k * STRIDE % (n * n);
-        let at = (cell % n, cell / n);
+    for at in sample(set) {
         let mut variance = 0.0;
         for (e1, e2) in [(STEP, 0.0), (0.0, STEP)] {
-            let plus = draw(at, Shear::new(e1, e2));
-            let minus = draw(at, Shear::new(-e1, -e2));
+            let [plus, minus] = [1.0, -1.0].map(|sign| {
+                let shape = Shear::new(sign * e1, sign * e2);
+                draw.stamp(at, (Shear::ZERO, shape), 1.0)
+            });
             let square: f64 = plus
                 .iter()
                 .zip(&minus)
@@ -69,7 +102,7 @@ pub fn cramer_rao(set: &SetSimulator) -> Option<(f64, f64)> {
         variances.add(variance);
     }
     let bound = variances.mean().sqrt();
-    let error = variances.deviation() / (count as f64).sqrt();
+    let error = variances.deviation() / (variances.count() as f64).sqrt();
     Some((bound, 0.5 * error / bound))
 }
 
@@ -82,26 +115,11 @@ pub fn ensemble_bound(set: &SetSimulator) -> Option<(f64, f64)> {
     if set.kind().image == ImageType::OffsetBulge {
         return None;
     }
-    let n = set.grid().n;
-    let fields = set.image_fields(1);
-    let mut scratch = RenderScratch::new();
-    let mut draw = |at: (usize, usize), shear: Shear, size: f64| {
-        let mut stamp = vec![0.0; STAMP * STAMP];
-        let e = fields.intrinsic[at];
-        let version = Version {
-            intrinsic: Shear::new(e.re, e.im),
-            shear,
-            size,
-            noise: 0.0,
-        };
-        set.draw_as(&fields, at, version, &mut scratch, &mut stamp);
-        stamp
-    };
-    let count = GALAXIES.min(n * n);
+    let mut draw = Drawing::new(set);
     let mut informations = RunningMean::default();
-    for k in 0..count {
-        let cell = k * STRIDE % (n * n);
-        let at = (cell % n, cell / n);
+    for at in sample(set) {
+        let own = draw.intrinsic(at);
+        let mut draw = |shear: Shear, size: f64| draw.stamp(at, (own, shear), size);
         let derivative = |plus: &[f32], minus: &[f32]| -> Vec<f64> {
             let pairs = plus.iter().zip(minus);
             pairs
@@ -109,14 +127,13 @@ pub fn ensemble_bound(set: &SetSimulator) -> Option<(f64, f64)> {
                 .collect()
         };
         let mut of_shear = |e1: f64, e2: f64| {
-            let [plus, minus] =
-                [1.0, -1.0].map(|sign| draw(at, Shear::new(sign * e1, sign * e2), 1.0));
+            let [plus, minus] = [1.0, -1.0].map(|sign| draw(Shear::new(sign * e1, sign * e2), 1.0));
             derivative(&plus, &minus)
         };
         let shears = [of_shear(STEP, 0.0), of_shear(0.0, STEP)];
-        let [larger, smaller] = [STEP, -STEP].map(|step| draw(at, Shear::ZERO, step.exp()));
+        let [larger, smaller] = [STEP, -STEP].map(|step| draw(Shear::ZERO, step.exp()));
         let size = derivative(&larger, &smaller);
-        let flux = draw(at, Shear::ZERO, 1.0);
+        let flux = draw(Shear::ZERO, 1.0);
         let flux = flux.iter().map(|light| f64::from(*light) / NOISE_SIGMA);
         let flux: Vec<f64> = flux.collect();
         for k in 0..2 {
