@@ -539,3 +539,54 @@ fn errors_contain_the_noise_of_stars_once() {
         }
     }
 }
+
+#[test]
+fn the_part_that_a_jackknife_knows_of_a_star_is_exact() {
+    // Twenty pairs without noise, so that a jackknife finds nothing.
+    let range = |value| Range {
+        low: value,
+        high: value,
+    };
+    let with = |star: &dyn Fn(u32) -> u32| {
+        let mut sums = UnitSums::new(Layout::default(), 1, 40);
+        let mut catalogues = Vec::new();
+        for number in 0..40 {
+            let g = [if number % 2 == 0 { GAMMA } else { -GAMMA }; 2];
+            let row = Row {
+                e: g.map(|g| 0.7 * g),
+                weight: 1.0,
+                slope: [0.7; 2],
+                g,
+                ..Row::default()
+            };
+            sums.add(number, 0, 0, &row);
+            catalogues.push(Catalogue {
+                rows: 1,
+                shear: g.map(range),
+                star: Some(StarNoise {
+                    star: star(number / 2).to_string(),
+                    m: 0.06,
+                    c: 4e-3,
+                }),
+                ..Catalogue::default()
+            });
+        }
+        let grouping = group(sums, &catalogues, Design::Pairs, None, false);
+        let (sums, stars) = (grouping.sums, grouping.stars);
+        let found = estimate(&sums, &stars, 0, true, Errors::Jackknife).unwrap();
+        ["m1", "c2"].map(|key| found.value(key).unwrap().error)
+    };
+    // The variance by k stars of 20/k units each is 1/k of that of one star. A jackknife of 20 units contains a part of it.
+    for count in [1u32, 2, 4, 10, 20] {
+        let k = f64::from(count);
+        let known = 20.0 / 19.0 * (20.0 / k * (1.0 / 20.0f64).powi(2) - 1.0 / (k * k * 20.0)) * k;
+        let share = (1.0 / k - known).max(0.0).sqrt();
+        let found = with(&|pair| pair % count);
+        for (found, noise) in found.into_iter().zip([0.06, 4e-3]) {
+            assert!(
+                (found - share * noise).abs() < 1e-9,
+                "{count}: {found} {share}"
+            );
+        }
+    }
+}
