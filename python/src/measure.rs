@@ -16,6 +16,7 @@ use shearq_pipeline::engine;
 use shearq_pipeline::measure::{COLUMNS, Value, more_columns, stated_psf_noise};
 use shearq_quantities::Shear;
 use shearq_quantities::statistics::upper_median;
+use shearq_results::star_noise::{StarNoise, Stars};
 
 use crate::errors::{no_memory, of_measuring};
 use crate::stamps::{Borrowed, Piece, Stamps};
@@ -50,14 +51,6 @@ impl AllPsfs<'_> {
             AllPsfs::Formulas(formulas) => Psfs::functional(&formulas[start..end]),
         })
     }
-}
-
-/// A whole number below 2^48 that distinguishes a star from others: Fowler, Noll and Vo's hash of its pixels.
-fn number_of(star: ArrayView2<'_, f64>) -> f64 {
-    let hash = star.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, pixel| {
-        (hash ^ pixel.to_bits()).wrapping_mul(0x0100_0000_01b3)
-    });
-    (hash >> 16) as f64
 }
 
 /// Noise levels of all stamps, or of a piece.
@@ -140,7 +133,6 @@ pub(crate) fn measure<'py>(
             Some(levels) => Noise::Each(levels.as_slice()?),
         },
     };
-    let number = star.as_ref().map_or(0.0, |star| number_of(star.as_array()));
     let psfs = match (star, &stars, formulas) {
         (Some(star), None, None) => request.star(&star),
         (None, Some(stars), None) => request.stars(stars),
@@ -168,8 +160,7 @@ pub(crate) fn measure<'py>(
     if configuration.linear().is_some() {
         let effect = stated_psf_noise(configuration, examination.psf_noise());
         let [m, c] = effect.unwrap_or_default();
-        let star = effect.map_or(0.0, |_| number);
-        for (name, value) in [("psf_id", star), ("psf_m", m), ("psf_c", c)] {
+        for (name, value) in [("psf_m", m), ("psf_c", c)] {
             columns.set_item(name, vec![value; count].into_pyarray(py))?;
         }
     }
@@ -480,7 +471,9 @@ fn catalogue<'py>(
 /// The mean shear: g1 and g2, their covariance, the mean responses, and the number of galaxies.
 type Mean = ([f64; 2], [[f64; 2]; 2], [f64; 2], usize);
 
-/// The mean shear of galaxies without flags from columns e1, e2, R11, R22 and weights of one length.
+/// The mean shear of galaxies without flags from columns e1, e2, R11, R22 and weights of one length. The covariance contains
+/// the noise of `stars`, which are numbers with the scatter of m and of c; `places` has the place of each galaxy's star among
+/// them.
 #[pyfunction]
 pub(crate) fn mean_shear(
     e1: PyReadonlyArray1<'_, f64>,
@@ -488,16 +481,27 @@ pub(crate) fn mean_shear(
     r11: PyReadonlyArray1<'_, f64>,
     r22: PyReadonlyArray1<'_, f64>,
     weights: PyReadonlyArray1<'_, f64>,
+    stars: Vec<[f64; 3]>,
+    places: PyReadonlyArray1<'_, i64>,
 ) -> PyResult<Mean> {
     let mut sum = ShearSum::default();
+    let mut shares = vec![[0.0; 2]; stars.len()];
     let e = e1.as_slice()?.iter().zip(e2.as_slice()?);
     let responses = r11.as_slice()?.iter().zip(r22.as_slice()?);
-    for (((&e1, &e2), (&r11, &r22)), &weight) in e.zip(responses).zip(weights.as_slice()?) {
+    let weighted = weights.as_slice()?.iter().zip(places.as_slice()?);
+    for (((&e1, &e2), (&r11, &r22)), (&weight, &place)) in e.zip(responses).zip(weighted) {
         sum.add([e1, e2], [r11, r22], weight);
+        shares[place as usize][0] += weight * r11;
+        shares[place as usize][1] += weight * r22;
+    }
+    let mut noise = Stars::default();
+    for ([star, m, c], share) in stars.into_iter().zip(shares) {
+        let star = format!("{star:.0}");
+        noise.add(Some(StarNoise { star, m, c }), share);
     }
     let MeanShear {
         shear,
-        covariance,
+        mut covariance,
         response,
         galaxies,
         ..
@@ -508,6 +512,9 @@ pub(crate) fn mean_shear(
         };
         PyValueError::new_err(format!("{argument}: {error}"))
     })?;
+    for (k, error) in noise.errors(shear).into_iter().enumerate() {
+        covariance[k][k] += error * error;
+    }
     Ok((shear, covariance, response, galaxies))
 }
 

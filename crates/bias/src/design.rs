@@ -155,6 +155,18 @@ pub struct Grouping {
     pub misaligned: bool,
 }
 
+impl Grouping {
+    /// The same units with all bins joined to one.
+    #[must_use]
+    pub fn all_bins(&self) -> Self {
+        Grouping {
+            sums: self.sums.all_bins(),
+            stars: self.stars.iter().map(Behind::all_bins).collect(),
+            ..*self
+        }
+    }
+}
+
 /// Fewest groups of catalogues that serve as units. Below, the same rows of all catalogues form a unit.
 const FEWEST_GROUPS: usize = 20;
 

@@ -3,6 +3,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::design::Grouping;
 use crate::error::{BiasError, MIN_SIGMA};
 use crate::fit::{self, ESTIMATES, Estimates, Known, Plan, RESPONSE};
 use crate::stars::Behind;
@@ -107,25 +108,37 @@ impl Estimate {
     }
 }
 
-/// Estimates of the units of a bin, with a known true shear or not. Errors include the noise of `stars` that several
-/// units share, to first order.
-///
-/// # Panics
-/// If the stars have other bins than the sums.
+/// Estimates of the units of a bin, with a known true shear or not.
 ///
 /// # Errors
 /// If no galaxy or only one unit was added, or a mean response has less than five standard errors.
 pub fn estimate(
+    sums: &UnitSums,
+    bin: usize,
+    truth: bool,
+    errors: Errors,
+) -> Result<Estimate, BiasError> {
+    behind_stars(sums, &[], bin, truth, errors)
+}
+
+impl Grouping {
+    /// Estimates of a bin. Errors include the noise of stars that several units share, to first order.
+    ///
+    /// # Errors
+    /// As [`estimate`].
+    pub fn estimate(&self, bin: usize, truth: bool, errors: Errors) -> Result<Estimate, BiasError> {
+        behind_stars(&self.sums, &self.stars, bin, truth, errors)
+    }
+}
+
+/// Estimates of a bin with errors that include the noise of `stars`.
+fn behind_stars(
     sums: &UnitSums,
     stars: &[Behind],
     bin: usize,
     truth: bool,
     errors: Errors,
 ) -> Result<Estimate, BiasError> {
-    assert!(
-        stars.iter().all(|star| star.sums.bins() == sums.bins()),
-        "stars and sums have the same bins"
-    );
     let units = sums.of_bin(bin);
     let mut total = vec![0.0; sums.layout().len()];
     for unit in &units {
@@ -144,7 +157,8 @@ pub fn estimate(
         Errors::Bootstrap { draws, seed } => bootstrap(&plan, &units, draws, seed),
     };
     for star in stars {
-        let more = variances(&plan, &total, star, (bin, units.len()));
+        let units = (star.sums.of_bin(bin), units.len());
+        let more = variances(&plan, (&total, &values), star, units);
         for (error, more) in errors.iter_mut().zip(more) {
             *error = error.hypot(more.sqrt());
         }
@@ -182,8 +196,8 @@ pub fn difference(
     bin: usize,
     truth: bool,
 ) -> Result<Estimate, BiasError> {
-    let first = estimate(sums, &[], bin, truth, Errors::Jackknife)?;
-    let second = estimate(other, &[], bin, truth, Errors::Jackknife)?;
+    let first = estimate(sums, bin, truth, Errors::Jackknife)?;
+    let second = estimate(other, bin, truth, Errors::Jackknife)?;
     let units = sums.pairs_with(other, bin);
     let plan_of = |place: usize, sums: &UnitSums| {
         let mut total = vec![0.0; sums.layout().len()];
@@ -218,17 +232,21 @@ pub fn difference(
     })
 }
 
-/// What the noise of a star adds to the variances of estimates from `n` units.
+/// What the noise of a star adds to the variances of the estimates `values` that follow from the sums `total` of `n` units.
+/// `units` are the sums of the galaxies behind the star.
 ///
 /// If the noise changes an estimate by Σ aᵤ, of which the galaxies of unit u make aᵤ, then its variance is A² = (Σ aᵤ)². A
 /// jackknife contains n/(n − 1) (Σ aᵤ² − A²/n) of it.
-fn variances(plan: &Plan, total: &[f64], star: &Behind, (bin, n): (usize, usize)) -> Estimates {
-    let units = star.sums.of_bin(bin);
+fn variances(
+    plan: &Plan,
+    (total, values): (&[f64], &Estimates),
+    star: &Behind,
+    (units, n): (Vec<&[f64]>, usize),
+) -> Estimates {
     let mut own = vec![0.0; total.len()];
     for unit in &units {
         add(&mut own, unit);
     }
-    let values = plan.estimates(total);
     let mut more = [0.0; ESTIMATES];
     // m changes in all components alike, and c in each on its own.
     for change in 0..5 {

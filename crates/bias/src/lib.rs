@@ -21,7 +21,7 @@
 //! * [`UnitSums`]: sums per unit and bin, in bounded memory; they merge.
 //! * [`Design`]: how catalogues belong together, recognised from their true shears.
 //! * [`StarNoise`]: an error of m and c that all galaxies behind one star have in common.
-//! * [`estimate`]: values with errors; [`Verdict`]: comparison with a requirement.
+//! * [`estimate`] and [`Grouping::estimate`]: values with errors; [`Verdict`]: comparison with a requirement.
 #![forbid(unsafe_code)]
 
 mod design;
@@ -36,7 +36,7 @@ mod verdict;
 pub use design::{Catalogue, Design, Grouping, Range, group};
 pub use error::BiasError;
 pub use estimate::{Errors, Estimate, Measured, QUANTITIES, Quantity, difference, estimate};
-pub use stars::{Behind, StarNoise, all_bins};
+pub use stars::{Behind, StarNoise};
 pub use sums::{Layout, Row, VERSIONS, Version};
 pub use units::UnitSums;
 pub use verdict::{REQUIREMENTS, Requirement, Verdict, student_t, verdict};

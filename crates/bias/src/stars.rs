@@ -28,13 +28,14 @@ pub struct Behind {
     pub(crate) by_unit: bool,
 }
 
-/// The same stars with all bins joined to one.
-pub fn all_bins(stars: &[Behind]) -> Vec<Behind> {
-    let joined = |star: &Behind| Behind {
-        sums: star.sums.all_bins(),
-        ..*star
-    };
-    stars.iter().map(joined).collect()
+impl Behind {
+    /// The same galaxies with all bins joined to one.
+    pub(crate) fn all_bins(&self) -> Self {
+        Behind {
+            sums: self.sums.all_bins(),
+            ..*self
+        }
+    }
 }
 
 /// The galaxies of each star that several units share. `noises` has the noise of each catalogue's star, and `units` the

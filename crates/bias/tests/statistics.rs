@@ -6,7 +6,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use shearq_bias::{
-    Catalogue, Design, Errors, Layout, Range, Row, StarNoise, UnitSums, all_bins, estimate, group,
+    Catalogue, Design, Errors, Layout, Range, Row, StarNoise, UnitSums, estimate, group,
 };
 
 const M: [f64; 2] = [0.03, -0.05];
@@ -205,7 +205,7 @@ fn pulls(
         } = draw(design, &mut galaxies, count);
         let truth = design != Design::Null;
         let grouping = group(units, &catalogues, design, None, false);
-        let found = estimate(&grouping.sums, &[], 0, truth, errors).unwrap();
+        let found = estimate(&grouping.sums, 0, truth, errors).unwrap();
         for (sums, (key, expected)) in sums.iter_mut().zip(expected) {
             let measured = found.value(key).unwrap();
             let pull = (measured.value - expected) / measured.error;
@@ -366,7 +366,7 @@ fn the_response_of_a_selection_follows_from_sheared_versions() {
             }
         }
     }
-    let of = |sums: UnitSums| estimate(&sums.by_key(), &[], 0, true, Errors::Jackknife).unwrap();
+    let of = |sums: UnitSums| estimate(&sums.by_key(), 0, true, Errors::Jackknife).unwrap();
     let (with, without) = (of(sums), of(direct));
     let (m, wrong) = (with.value("m1").unwrap(), without.value("m1").unwrap());
     assert!(m.value.abs() < 4.0 * m.error + 0.01, "{m:?}");
@@ -400,12 +400,9 @@ fn many_units_are_joined_and_shards_merge_to_the_same_sums() {
     merged.merge(other).unwrap();
     let [a, b] = [whole, merged].map(|sums| {
         let sums = sums.by_key();
-        let all = estimate(&sums.all_bins(), &[], 0, true, Errors::Jackknife).unwrap();
+        let all = estimate(&sums.all_bins(), 0, true, Errors::Jackknife).unwrap();
         assert!((512..=2048).contains(&all.units), "{}", all.units);
-        (
-            all,
-            estimate(&sums, &[], 1, true, Errors::Jackknife).unwrap(),
-        )
+        (all, estimate(&sums, 1, true, Errors::Jackknife).unwrap())
     });
     for (a, b) in [(&a.0, &b.0), (&a.1, &b.1)] {
         for key in ["m1", "m2", "c1", "c2"] {
@@ -421,7 +418,7 @@ fn many_units_are_joined_and_shards_merge_to_the_same_sums() {
 #[test]
 fn without_galaxies_units_or_response_there_is_an_error() {
     let mut sums = UnitSums::new(Layout::default(), 1, 1);
-    let of = |sums: &UnitSums| estimate(sums, &[], 0, false, Errors::Jackknife).unwrap_err();
+    let of = |sums: &UnitSums| estimate(sums, 0, false, Errors::Jackknife).unwrap_err();
     assert!(of(&sums).to_string().contains("no galaxy"));
     let mut row = Row {
         e: [0.1, 0.2],
@@ -517,9 +514,9 @@ fn errors_contain_the_noise_of_stars_once() {
             let (sums, catalogues) = behind_stars(&mut galaxies, pairs, star);
             let grouping = group(sums, &catalogues, Design::Pairs, None, false);
             assert_eq!(grouping.stars.len(), shared);
-            let (sums, stars) = (grouping.sums.all_bins(), all_bins(&grouping.stars));
-            let found = estimate(&sums, &stars, 0, true, Errors::Jackknife).unwrap();
-            let without = estimate(&sums, &[], 0, true, Errors::Jackknife).unwrap();
+            let grouping = grouping.all_bins();
+            let found = grouping.estimate(0, true, Errors::Jackknife).unwrap();
+            let without = estimate(&grouping.sums, 0, true, Errors::Jackknife).unwrap();
             for (square, key) in squares.iter_mut().zip(keys) {
                 let measured = found.value(key).unwrap();
                 *square += (measured.value / measured.error).powi(2);
@@ -572,8 +569,7 @@ fn the_part_that_a_jackknife_knows_of_a_star_is_exact() {
             });
         }
         let grouping = group(sums, &catalogues, Design::Pairs, None, false);
-        let (sums, stars) = (grouping.sums, grouping.stars);
-        let found = estimate(&sums, &stars, 0, true, Errors::Jackknife).unwrap();
+        let found = grouping.estimate(0, true, Errors::Jackknife).unwrap();
         ["m1", "c2"].map(|key| found.value(key).unwrap().error)
     };
     // The variance by k stars of 20/k units each is 1/k of that of one star. A jackknife of 20 units contains a part of it.

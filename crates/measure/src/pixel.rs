@@ -27,12 +27,17 @@ impl Pixel for f64 {
 /// Copies a stamp, row by row.
 pub(crate) fn copy<P: Pixel>(stamp: ArrayView2<'_, P>, to: &mut [f32]) {
     let columns = stamp.ncols().max(1);
-    for (to, row) in to.chunks_exact_mut(columns).zip(stamp.rows()) {
-        // Contiguous pixels, as in an image, are converted several at a time.
-        match row.as_slice() {
-            Some(row) => convert(to, row.iter()),
-            None => convert(to, row.iter()),
-        }
+    for (to, row) in to.chunks_exact_mut(columns).zip(stamp.into_outer_iter()) {
+        copy_row(row, to);
+    }
+}
+
+/// Copies a row to the beginning of another.
+pub(crate) fn copy_row<P: Pixel>(row: ArrayView1<'_, P>, to: &mut [f32]) {
+    // Contiguous pixels, as in an image, are converted several at a time.
+    match row.as_slice() {
+        Some(row) => convert(to, row.iter()),
+        None => convert(to, row.iter()),
     }
 }
 

@@ -14,8 +14,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
-    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, UnitSums, all_bins,
-    difference, estimate, group,
+    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, UnitSums, difference, group,
 };
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
@@ -516,15 +515,8 @@ impl Summed {
     /// If no galaxy counts, an ellipticity is constant, the mean response is too close to zero, or the ellipticities do
     /// not follow the true shear.
     pub fn result(&self, errors: Errors) -> Result<BiasResult, BiasFailure> {
-        let own = self.grouped()?;
-        let Grouping {
-            sums,
-            stars,
-            unit,
-            misaligned,
-        } = own.grouping;
-        let design = own.design;
-        let all = estimate(&sums.all_bins(), &all_bins(&stars), 0, self.truth, errors)?;
+        let Grouped { grouping, design } = self.grouped()?;
+        let all = grouping.all_bins().estimate(0, self.truth, errors)?;
         check_slopes(&all, self.response)?;
         let mut bins = vec![BinResult {
             edges: None,
@@ -533,16 +525,16 @@ impl Summed {
         for (bin, edges) in self.edges.windows(2).enumerate() {
             bins.push(BinResult {
                 edges: Some([edges[0], edges[1]]),
-                estimate: estimate(&sums, &stars, bin, self.truth, errors),
+                estimate: grouping.estimate(bin, self.truth, errors),
             });
         }
         Ok(BiasResult {
             bins,
             binned: self.binned.clone(),
             design,
-            unit,
-            misaligned,
-            noisy_stars: stars.len(),
+            unit: grouping.unit,
+            misaligned: grouping.misaligned,
+            noisy_stars: grouping.stars.len(),
             catalogues: self.catalogues.clone(),
             program: self.program.clone(),
             measured: self.measured.clone(),

@@ -4,6 +4,7 @@
 //! * [`bias`] estimates m and c of catalogues of any program.
 //! * [`select`] applies cuts and weights to catalogues without a bias; [`expression`] reads formulas of columns.
 //! * [`mean`] averages catalogues to one shear per set.
+//! * [`star_noise`] adds the noise of stars to the error of a mean shear.
 //! * [`row`] is the record of a scored set, and [`store`] keeps records in Parquet files.
 //! * [`conditions`] and [`groups`] choose and group records; [`compare`] compares configurations.
 //! * [`baseline`] compares metrics with stored metrics.
@@ -22,7 +23,7 @@ pub mod mean;
 pub mod row;
 pub mod score;
 pub mod select;
-mod star_noise;
+pub mod star_noise;
 pub mod store;
 pub mod submit;
 pub mod views;

@@ -1,10 +1,8 @@
 //! Mean shears of sets, for fields of constant shear.
 
 use std::borrow::Cow;
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_bias::StarNoise;
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
 use shearq_measure::{Flag, Flags, MeanShear, Selection, ShearSum, Warning};
@@ -13,7 +11,7 @@ use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
 use crate::select::Weighted;
-use crate::star_noise;
+use crate::star_noise::{Stars, of_catalogue};
 
 /// The mean shear of the galaxies of a set.
 #[derive(Debug, Clone, PartialEq)]
@@ -135,7 +133,7 @@ fn mean_of(
                 share[k] += response[k];
             }
         }
-        stars.add(star_noise::of_catalogue(path, format)?, share);
+        stars.add(of_catalogue(path, format)?, share);
     }
     let mut shear = sum.mean().ok();
     let mut psf_error = [0.0; 2];
@@ -155,50 +153,9 @@ fn mean_of(
         flags,
         shear,
         psf_error,
-        noisy_stars: stars.stated,
+        noisy_stars: stars.stated(),
         scatter: [0, 1].map(|k| moments[k].deviation() / response[k]),
     })
-}
-
-/// The noise of the stars of a set. Images with the same star have the same error.
-#[derive(Default)]
-struct Stars {
-    /// By star: sums of responses, which are the shares in the mean, times the scatter of m and of c.
-    effects: BTreeMap<String, [[f64; 2]; 2]>,
-    /// Sum of the responses of all images.
-    responses: [f64; 2],
-    /// Images whose catalogue states the effect of the noise.
-    stated: usize,
-}
-
-impl Stars {
-    /// Adds an image with this star, if its noise is known, and galaxies with responses of the sum `share`.
-    fn add(&mut self, noise: Option<StarNoise>, share: [f64; 2]) {
-        for (sum, share) in self.responses.iter_mut().zip(share) {
-            *sum += share;
-        }
-        let Some(StarNoise { star, m, c }) = noise else {
-            return;
-        };
-        self.stated += 1;
-        let sums = self.effects.entry(star).or_default();
-        for (sums, effect) in sums.iter_mut().zip([m, c]) {
-            for (sum, share) in sums.iter_mut().zip(share) {
-                *sum += share * effect;
-            }
-        }
-    }
-
-    /// Errors of the mean `shear` by the noise.
-    fn errors(&self, shear: [f64; 2]) -> [f64; 2] {
-        [0, 1].map(|k| {
-            let variances = self.effects.values().map(|[m, c]| {
-                let [m, c] = [m[k], c[k]].map(|sum| sum / self.responses[k]);
-                (m * shear[k]).powi(2) + c * c
-            });
-            variances.sum::<f64>().sqrt()
-        })
-    }
 }
 
 /// The columns of a catalogue from which a mean shear follows.

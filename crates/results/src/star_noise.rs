@@ -1,9 +1,12 @@
-//! What catalogues state of the noise of their star: how much it changes m and c of all galaxies of an image.
+//! What catalogues state of the noise of their star, which changes m and c of all galaxies of an image, and what this does to
+//! a mean shear.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
-use shearq_bias::StarNoise;
+pub use shearq_bias::StarNoise;
 use shearq_files::FileError;
+use shearq_files::frames::Metadata;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, FileFormat};
 use shearq_pipeline::inputs::PSF;
@@ -23,9 +26,10 @@ const COLUMNS: [&str; 3] = ["psf_id", "psf_m", "psf_c"];
 /// If the metadata cannot be read.
 pub(crate) fn of_any(path: &Path, format: FileFormat) -> Result<Option<StarNoise>, FileError> {
     let (key, start) = CREATOR;
-    let found = table::read_metadata(path, format, std::iter::once(&key.to_owned()))?;
-    match found.get(key) {
-        Some(creator) if creator.starts_with(start) => of_catalogue(path, format),
+    let keys = [key, PSF_NOISE, PSF].map(str::to_owned);
+    let metadata = table::read_metadata(path, format, keys.iter())?;
+    match metadata.get(key) {
+        Some(creator) if creator.starts_with(start) => stated(path, metadata),
         _ => Ok(None),
     }
 }
@@ -47,8 +51,7 @@ pub(crate) fn of_table(table: &DataFrame, name: &Path) -> Option<StarNoise> {
     })
 }
 
-/// The noise of the star of a catalogue, which is named by its fingerprint or, without one, as the catalogue. `None` if the
-/// catalogue does not state it.
+/// The noise of the star of a catalogue of shearq; `None` if the catalogue does not state it.
 ///
 /// # Errors
 /// If the metadata cannot be read.
@@ -57,7 +60,11 @@ pub(crate) fn of_catalogue(
     format: FileFormat,
 ) -> Result<Option<StarNoise>, FileError> {
     let keys = [PSF_NOISE, PSF].map(str::to_owned);
-    let mut metadata = table::read_metadata(path, format, keys.iter())?;
+    stated(path, table::read_metadata(path, format, keys.iter())?)
+}
+
+/// The noise that metadata state, of a star that is named by its fingerprint or, without one, as the catalogue.
+fn stated(path: &Path, mut metadata: Metadata) -> Result<Option<StarNoise>, FileError> {
     let Some(text) = metadata.get(PSF_NOISE) else {
         return Ok(None);
     };
@@ -78,5 +85,51 @@ fn effect(path: &Path, text: &str) -> Result<[f64; 2], FileError> {
                 "the metadata `{PSF_NOISE}` are {text:?} (expected the scatter of m and of c, two numbers from 0 to {MOST} such as 2.3e-2 1.2e-2)"
             ),
         )),
+    }
+}
+
+/// The noise of stars in a mean shear. Images with the same star have the same error.
+#[derive(Debug, Default)]
+pub struct Stars {
+    /// By star: sums of responses, which are the shares in the mean, times the scatter of m and of c.
+    effects: BTreeMap<String, [[f64; 2]; 2]>,
+    /// Sum of the responses of all images.
+    responses: [f64; 2],
+    /// Images whose catalogue states the effect of the noise.
+    stated: usize,
+}
+
+impl Stars {
+    /// Adds an image with this star, if its noise is known, and galaxies with responses of the sum `share`.
+    pub fn add(&mut self, noise: Option<StarNoise>, share: [f64; 2]) {
+        for (sum, share) in self.responses.iter_mut().zip(share) {
+            *sum += share;
+        }
+        let Some(StarNoise { star, m, c }) = noise else {
+            return;
+        };
+        self.stated += 1;
+        let sums = self.effects.entry(star).or_default();
+        for (sums, effect) in sums.iter_mut().zip([m, c]) {
+            for (sum, share) in sums.iter_mut().zip(share) {
+                *sum += share * effect;
+            }
+        }
+    }
+
+    /// Number of images whose star has a known noise.
+    pub fn stated(&self) -> usize {
+        self.stated
+    }
+
+    /// Errors of the mean `shear` by the noise.
+    pub fn errors(&self, shear: [f64; 2]) -> [f64; 2] {
+        [0, 1].map(|k| {
+            let variances = self.effects.values().map(|[m, c]| {
+                let [m, c] = [m[k], c[k]].map(|sum| sum / self.responses[k]);
+                (m * shear[k]).powi(2) + c * c
+            });
+            variances.sum::<f64>().sqrt()
+        })
     }
 }

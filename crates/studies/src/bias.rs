@@ -228,8 +228,8 @@ impl BiasSums {
 
     /// The biases; NaN without an estimate.
     fn bias(self) -> ShearBias {
-        let found = estimate(&self.units, &[], 0, true, Errors::Jackknife).ok();
-        let leakage = estimate(&self.leakage, &[], 0, false, Errors::Jackknife).ok();
+        let found = estimate(&self.units, 0, true, Errors::Jackknife).ok();
+        let leakage = estimate(&self.leakage, 0, false, Errors::Jackknife).ok();
         let of = |found: &Option<Estimate>, key: &str| {
             let value = found.as_ref().and_then(|found| found.value(key));
             value.map_or([f64::NAN; 2], |found| [found.value, found.error])

@@ -40,12 +40,13 @@ struct Drawing<'a> {
 }
 
 impl<'a> Drawing<'a> {
-    fn new(set: &'a SetSimulator) -> Self {
-        Drawing {
+    /// `None` for offset bulges: their images are not the same if they turn by 180 degrees.
+    fn new(set: &'a SetSimulator) -> Option<Self> {
+        (set.kind().image != ImageType::OffsetBulge).then(|| Drawing {
             set,
             fields: set.image_fields(1),
             scratch: RenderScratch::new(),
-        }
+        })
     }
 
     fn intrinsic(&self, at: (usize, usize)) -> Shear {
@@ -80,10 +81,7 @@ impl<'a> Drawing<'a> {
 /// and to the derivatives with flux, size and centre. None of these parameters costs information, so
 /// σ(ε) = σ/‖∂I/∂ε‖. `None` for offset bulges, which are not nearly round.
 pub fn cramer_rao(set: &SetSimulator) -> Option<(f64, f64)> {
-    if set.kind().image == ImageType::OffsetBulge {
-        return None;
-    }
-    let mut draw = Drawing::new(set);
+    let mut draw = Drawing::new(set)?;
     let mut variances = RunningMean::default();
     for at in sample(set) {
         let mut variance = 0.0;
@@ -112,10 +110,7 @@ pub fn cramer_rao(set: &SetSimulator) -> Option<(f64, f64)> {
 /// The information about a component of shear is that of a galaxy of unknown flux, size and other component. `None` for
 /// offset bulges, whose centre is unknown, too.
 pub fn ensemble_bound(set: &SetSimulator) -> Option<(f64, f64)> {
-    if set.kind().image == ImageType::OffsetBulge {
-        return None;
-    }
-    let mut draw = Drawing::new(set);
+    let mut draw = Drawing::new(set)?;
     let mut informations = RunningMean::default();
     for at in sample(set) {
         let own = draw.intrinsic(at);

@@ -473,7 +473,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         As :meth:`Catalogue.mean_shear`; or if there is no catalogue.
     """
     parts: list[list[NDArray[np.float64]]] = []
-    stars: list[tuple[NDArray[np.float64], NDArray[np.intp]]] = []
+    stars: list[tuple[list[list[float]], NDArray[np.int64]]] = []
     goods: list[NDArray[np.bool_]] = []
     calibrated = False
     for rows in [catalogues] if isinstance(catalogues, Catalogue) else catalogues:
@@ -502,10 +502,10 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         raise ValueError("catalogue: an ellipticity or response without a flag is not finite; expected flags")
     # A common factor changes nothing, but squares of weights could overflow.
     factor = weight[counted] / weight[counted].max()
-    (g1, g2), (first, second), response, galaxies = _shearq.mean_shear(e1, e2, r11, r22, factor)
-    more = _star_variances(stars, counted, (g1, g2), (factor * r11, factor * r22))
-    first[0] += more[0]
-    second[1] += more[1]
+    firsts = np.cumsum([0, *(len(each) for each, _ in stars)])
+    places = np.concatenate([first + place for first, (_, place) in zip(firsts, stars)])[counted]
+    each = [star for of_part, _ in stars for star in of_part]
+    (g1, g2), (first, second), response, galaxies = _shearq.mean_shear(e1, e2, r11, r22, factor, each, places)
     errors = [float(np.sqrt(value)) for value in (first[0], second[1])]
     return MeanShear(
         g1,
@@ -519,33 +519,13 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
     )
 
 
-def _stars(rows: Catalogue) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Numbers of the stars of a catalogue with their effects on m and c, (3, stars), and the place of each row's star there."""
+def _stars(rows: Catalogue) -> tuple[list[list[float]], NDArray[np.int64]]:
+    """Stars of a catalogue, each a number with its effects on m and c, and the place of each row's star among them."""
     if not all(name in (rows.dtype.names or ()) for name in _schema.STAR):
-        return np.zeros((3, 1)), np.zeros(len(rows), dtype=np.intp)
-    _, first, star = np.unique(rows["psf_id"], return_index=True, return_inverse=True)
-    effects = np.stack([rows[name][first] for name in _schema.STAR])
-    return np.nan_to_num(effects), np.asarray(star.reshape(-1), dtype=np.intp)
-
-
-def _star_variances(
-    stars: list[tuple[NDArray[np.float64], NDArray[np.intp]]],
-    counted: NDArray[np.bool_],
-    shear: tuple[float, float],
-    responses: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> list[float]:
-    """Variances of both components of a mean shear by the noise of stars. `counted` says which rows have a response."""
-    firsts = np.cumsum([0, *(effects.shape[1] for effects, _ in stars)])
-    place = np.concatenate([first + star for first, (_, star) in zip(firsts, stars)])[counted]
-    numbers, m, c = np.concatenate([effects for effects, _ in stars], axis=1)
-    # The same star in several catalogues has one error.
-    each, same = np.unique(numbers, return_inverse=True)
-    variances = []
-    for g, response in zip(shear, responses):
-        share = np.bincount(place, weights=response, minlength=len(numbers)) / response.sum()
-        sums = [np.bincount(same.reshape(-1), weights=share * effect, minlength=len(each)) for effect in (m, c)]
-        variances.append(float(((sums[0] * g) ** 2 + sums[1] ** 2).sum()))
-    return variances
+        return [[0.0, 0.0, 0.0]], np.zeros(len(rows), dtype=np.int64)
+    _, first, place = np.unique(rows["psf_id"], return_index=True, return_inverse=True)
+    stars = np.nan_to_num(np.stack([rows[name][first] for name in _schema.STAR], axis=1))
+    return stars.tolist(), place.reshape(-1).astype(np.int64)
 
 
 def _weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import pathlib
 import tempfile
@@ -76,8 +75,8 @@ def _star(file: pathlib.Path, metadata: dict[str, str], count: int) -> dict[str,
         raise ValueError(f"{file}: the metadata {_schema.STAR_KEY} are {stated!r}; expected two numbers from 0 to {most:.0f}") from None
     # Without a fingerprint, the star is that of this file alone.
     name = metadata.get(_schema.PSF_KEY, str(file))
-    star = int.from_bytes(hashlib.sha256(name.encode()).digest()[:6], "big") if stated else 0
-    return {name: np.full(count, float(value)) for name, value in zip(_schema.STAR, (star, m, c))}
+    star = _schema.star_number(name.encode()) if stated else 0.0
+    return {name: np.full(count, value) for name, value in zip(_schema.STAR, (star, m, c))}
 
 
 def read_all(folder: str | os.PathLike[str], sets: int | list[int] | None = None) -> list[Catalogue]:

@@ -319,6 +319,9 @@ def _measure(
         warn(doubt, DataWarning)
     if failure is not None:
         raise ValueError(failure)
+    if "psf_m" in found:
+        number = 0.0 if star is None else _schema.star_number(star.tobytes())
+        found["psf_id"] = np.where(found["psf_m"] > 0, number, 0.0)
     found = {**own, **found}
     catalogue = np.empty(count, dtype=[(name, column.dtype) for name, column in found.items()]).view(Catalogue)
     for name, column in found.items():

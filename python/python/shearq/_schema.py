@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from typing import Any
 
@@ -31,6 +32,11 @@ STAR_KEY, PSF_KEY = "psfnoise", "psf"
 _CREATOR = "shearq "
 _ESCAPED = re.compile(r"\\(?:([nrt\\])|u\{([0-9a-fA-F]{1,6})\})")
 _PLAIN = {"n": "\n", "r": "\r", "t": "\t", "\\": "\\"}
+
+
+def star_number(name: bytes) -> float:
+    """A whole number below 2^48 that distinguishes a star from others."""
+    return float(int.from_bytes(hashlib.sha256(name).digest()[:6], "big"))
 
 
 def to_keys(attrs: dict[str, Any]) -> dict[str, str]:

@@ -61,7 +61,13 @@ def measure(
     progress: Callable[[int], object] | None,
 ) -> tuple[dict[str, NDArray[Any]], list[str], str | None]: ...
 def mean_shear(
-    e1: _Doubles, e2: _Doubles, r11: _Doubles, r22: _Doubles, weights: _Doubles
+    e1: _Doubles,
+    e2: _Doubles,
+    r11: _Doubles,
+    r22: _Doubles,
+    weights: _Doubles,
+    stars: list[list[float]],
+    places: NDArray[np.int64],
 ) -> tuple[list[float], list[list[float]], list[float], int]: ...
 def select(
     columns: dict[str, _Doubles], cuts: str | None, weight: str | None

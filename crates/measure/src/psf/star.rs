@@ -85,11 +85,12 @@ fn centred_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<Star,
         return Err(MeasureError::square("a PSF stamp", stamp.dim(), expected));
     };
     let brightest = brightest(stamp)?;
-    let inner = sum(central(stamp, size, (y0, x0)));
-    let all = match (rows, columns) == (size, size) {
-        true => inner,
-        false => sum(stamp),
+    let all = sum(stamp);
+    let sum_of = |part: ArrayView2<'_, P>| match part.dim() == stamp.dim() {
+        true => all,
+        false => sum(part),
     };
+    let inner = sum_of(central(stamp, size, (y0, x0)));
     if all <= 0.0 {
         // There is nothing to look for elsewhere.
         light(inner)?;
@@ -119,10 +120,7 @@ fn centred_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<Star,
     let room = [x0, y0, columns - size - x0, rows - size - y0];
     let more = room.into_iter().fold((cut.size - size) / 2, usize::min);
     let taken = central(stamp, size + 2 * more, (y0 - more, x0 - more));
-    let flux = light(match taken.dim() == stamp.dim() {
-        true => all,
-        false => sum(taken),
-    })?;
+    let flux = light(sum_of(taken))?;
     let share = 1.0 / flux;
     if !share.is_finite() {
         return Err(MeasureError::DarkPsf(flux));

@@ -8,7 +8,7 @@ use super::plane::{Modes, even_quarters};
 use super::{Spectral, SpectralScratch};
 use crate::error::MeasureError;
 use crate::noise::StampNoise;
-use crate::pixel::contiguous;
+use crate::pixel::copy_row;
 use crate::sizes::check_psf;
 
 /// Least power of the PSF's transform; modes below it are left out as pure noise. See
@@ -127,7 +127,7 @@ impl Spectral {
         image.fill(0.0);
         let rows = image.chunks_exact_mut(p).skip(first);
         for (row, from) in rows.zip(psf.into_outer_iter()) {
-            rounded(&contiguous(from), &mut row[first..]);
+            copy_row(from, &mut row[first..]);
         }
         self.psf.transform(image, fft, quarters);
         for (modes, quarters) in [&mut *u, x, y].into_iter().zip(&*quarters) {
@@ -229,14 +229,6 @@ fn amplitudes([powers, rough, target]: [&[f32]; 3], step: f32, iterations: i32, 
                 target * (1.0 - rest) as f32 / (power + rough)
             };
         }
-    }
-}
-
-/// Numbers in single precision.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn rounded(values: &[f64], out: &mut [f32]) {
-    for (out, value) in out.iter_mut().zip(values) {
-        *out = *value as f32;
     }
 }
 
