@@ -189,7 +189,7 @@ def examine(case, options):
         "peers": others.results(),
     }
     if good.sum() < 8:
-        passes = case.or_flagged or case.flagged[0] > 0.0
+        passes = case.or_flagged or 0.0 < case.flagged[0] <= result["flagged_once"]
         return result | {"verdict": "flagged" if passes else "FAILED"}
     kept = [row for row in rows if 1 in row]
     of = np.concatenate([row["good"] for row in kept])
@@ -237,7 +237,8 @@ def verdict(case, result, count):
 
 def line(row):
     if "m1" not in row:
-        return f"{row['case']:12} all flagged: {row['verdict']}"
+        share = f"{100 * row['flagged_once']:.1f} % of measurements flagged"
+        return f"{row['case']:12} no m: {row['verdict']}; {share}"
     m = f"{row['m1']:+8.2f} {row['m2']:+8.2f} ± {max(row['m1_error'], row['m2_error']):.2f}"
     c = f"{row['c1']:+7.2f} {row['c2']:+7.2f} ± {max(row['c1_error'], row['c2_error']):.2f}"
     over = f"{row['over_bound']:.3f}" if "over_bound" in row else "–"

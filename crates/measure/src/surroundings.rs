@@ -10,12 +10,13 @@ mod contrast;
 mod missing;
 mod near;
 mod profile;
+mod usual;
 
 pub(crate) use self::centre::{centre, followed};
 pub(crate) use self::contrast::{Contrasts, turn};
 pub(crate) use self::missing::Missing;
 use self::near::Near;
-use self::profile::{Known, Profile};
+use self::profile::Profile;
 use crate::flag::Flag;
 
 /// Least difference of opposite places that is a neighbour, in units of its noise. See
@@ -25,7 +26,7 @@ const SIGNIFICANT: f32 = 5.0;
 /// docs/constants.md.
 const BRIGHT: f32 = 0.03;
 /// Least light of a neighbour that overlaps the galaxy, in units of its noise. See docs/constants.md.
-const OVERLAPPING: f32 = 6.0;
+const OVERLAPPING: f32 = 4.7;
 /// Least light of a neighbour that overlaps the galaxy, in units of the galaxy's. See docs/constants.md.
 const BLENDED: f32 = 0.1;
 /// Share of a neighbour's distance from the centre at which the fit of its profile begins. See
@@ -77,7 +78,8 @@ impl Surroundings {
             });
         let hits = &mut self.contrasts.blocks;
         if hits.is_empty() {
-            return self.blended(stamp, turn, noise).map(|()| false);
+            return blended(&mut self.near, stamp, centre, self.contrasts.light, noise)
+                .map(|()| false);
         }
         hits.sort_unstable_by(|a, b| b.excess.total_cmp(&a.excess));
         self.filled.copy_from_slice(stamp);
@@ -90,7 +92,7 @@ impl Surroundings {
             }
             let side = [x / distance, y / distance];
             let from = FITTED_FROM * distance;
-            let known = Known { peak, noise };
+            let known = profile::Known { peak, noise };
             let light = self
                 .profile
                 .subtract(&mut self.filled, turn, [x, y], from, known);
@@ -103,18 +105,28 @@ impl Surroundings {
         if most > TOO_BRIGHT * self.contrasts.inner(&self.filled, turn) {
             return Err(Flag::Neighbour);
         }
-        self.blended(&self.filled, turn, noise).map(|()| true)
+        let light = self.contrasts.light;
+        blended(&mut self.near, &self.filled, centre, light, noise).map(|()| true)
     }
+}
 
-    /// # Errors
-    /// Where another galaxy overlaps this one.
-    fn blended(&self, stamp: &[f32], turn: [i32; 2], noise: f32) -> Result<(), Flag> {
-        let least = BLENDED * self.contrasts.light;
-        let suspect = self.near.suspect(stamp, turn, noise, least);
-        match suspect {
-            Some(suspect) if suspect.significance > OVERLAPPING => Err(Flag::Neighbour),
-            _ => Ok(()),
-        }
+/// # Errors
+/// Where another galaxy overlaps this one, whose light is `light`, or cannot be subtracted.
+fn blended(
+    near: &mut Near,
+    stamp: &[f32],
+    centre: [f32; 2],
+    light: f32,
+    noise: f32,
+) -> Result<(), Flag> {
+    let known = near::Known {
+        noise,
+        light,
+        least: BLENDED * light,
+    };
+    match near.suspect(stamp, centre, known) {
+        Some(suspect) if suspect.significance > OVERLAPPING => Err(Flag::Neighbour),
+        _ => Ok(()),
     }
 }
 
