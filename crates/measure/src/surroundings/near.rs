@@ -20,7 +20,7 @@ const MARGIN: usize = REACH;
 /// Cells of a row with both margins, up to whole vectors.
 const ROW: usize = (ALONG + 2 * MARGIN).next_multiple_of(16);
 /// Distances of a neighbour from the galaxy in pixels: the least and the largest. See docs/constants.md.
-const DISTANCES: [f32; 2] = [4.0, 16.0];
+const DISTANCES: [f32; 2] = [4.0, 15.0];
 /// Least noise of a pixel in units of the galaxy's light. See docs/constants.md.
 const LEAST_NOISE: f32 = 0.0018;
 
