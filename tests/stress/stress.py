@@ -189,7 +189,8 @@ def examine(case, options):
         "peers": others.results(),
     }
     if good.sum() < 8:
-        passes = case.or_flagged or 0.0 < case.flagged[0] <= result["flagged_once"]
+        least = case.flagged[0] or 0.5
+        passes = (case.or_flagged or case.flagged[0] > 0.0) and result["flagged_once"] >= least
         return result | {"verdict": "flagged" if passes else "FAILED"}
     kept = [row for row in rows if 1 in row]
     of = np.concatenate([row["good"] for row in kept])
@@ -227,7 +228,7 @@ def verdict(case, result, count):
     if case.images:
         held.append(result["images"] <= case.images + 2 * result["images_error"])
     held.append(case.flagged[0] <= result["flagged_once"] <= case.flagged[1])
-    if case.or_flagged and result["flagged"] > 0.5:
+    if case.or_flagged and result["flagged_once"] > 0.5:
         return "flagged"
     if not all(held):
         return "FAILED"

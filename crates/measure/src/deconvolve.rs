@@ -40,5 +40,5 @@ pub use kernel::Wide;
 pub use network::{Network, NetworkScratch, psf_factor};
 pub use reference::{Matrices, convolve};
 pub use rule::{Rule, Step};
-pub(crate) use spectral::{Gradients, split_mix};
+pub(crate) use spectral::{Gradients, uniform};
 pub use spectral::{Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch};

@@ -2,8 +2,8 @@
 //!
 //! Galaxies look nearly the same turned by 180 degrees, and neighbours do not. If a place is brighter than its opposite
 //! by more than noise explains, there is a neighbour: a profile is fitted to the difference of the two sides and
-//! subtracted. No pixels are copied, because copies repeat noise. A neighbour that is too near or too bright flags the
-//! galaxy, and so does one that overlaps it.
+//! subtracted. No pixels are copied, because copies repeat noise. Nearer to the galaxy, the stamp is compared with usual
+//! galaxies. A neighbour that is too near or too bright flags the galaxy.
 
 mod centre;
 mod contrast;
@@ -12,6 +12,7 @@ mod near;
 mod profile;
 mod usual;
 
+use self::centre::refined;
 pub(crate) use self::centre::{centre, followed};
 pub(crate) use self::contrast::{Contrasts, turn};
 pub(crate) use self::missing::Missing;
@@ -25,7 +26,7 @@ const SIGNIFICANT: f32 = 5.0;
 /// Least difference of opposite places that is a neighbour, in units of the galaxy's light. See
 /// docs/constants.md.
 const BRIGHT: f32 = 0.03;
-/// Least light of a neighbour that overlaps the galaxy, in units of its noise. See docs/constants.md.
+/// Least light of a neighbour that overlaps the galaxy or cannot be subtracted, in units of its error. See docs/constants.md.
 const OVERLAPPING: f32 = 4.7;
 /// Least light of a neighbour that overlaps the galaxy, in units of the galaxy's. See docs/constants.md.
 const BLENDED: f32 = 0.1;
@@ -102,10 +103,10 @@ impl Surroundings {
             hits.remove(0);
             hits.retain(|hit| along(hit.place) <= from);
         }
-        if most > TOO_BRIGHT * self.contrasts.inner(&self.filled, turn) {
+        let light = self.contrasts.inner(&self.filled, turn);
+        if most > TOO_BRIGHT * light {
             return Err(Flag::Neighbour);
         }
-        let light = self.contrasts.light;
         blended(&mut self.near, &self.filled, centre, light, noise).map(|()| true)
     }
 }
@@ -122,8 +123,9 @@ fn blended(
     let known = near::Known {
         noise,
         light,
-        least: BLENDED * light,
+        least: BLENDED * light.max(0.0),
     };
+    let centre = refined(stamp, near.stamp_size(), centre);
     match near.suspect(stamp, centre, known) {
         Some(suspect) if suspect.significance > OVERLAPPING => Err(Flag::Neighbour),
         _ => Ok(()),

@@ -45,7 +45,7 @@ use shearq_submissions::LinearDeconvolution;
 
 use self::correlation::{Correlation, CorrelationScratch};
 use self::edges::{Edges, EdgesScratch};
-pub(crate) use self::field::split_mix;
+pub(crate) use self::field::uniform;
 use self::modes::multiply;
 use self::parities::{change, power};
 use self::pixels::{Pixels, PixelsScratch};

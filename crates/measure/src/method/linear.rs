@@ -28,7 +28,7 @@ use super::found::{
 };
 use super::softening::Softening;
 use crate::deconvolve::{
-    Descent, Gradients, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop, split_mix,
+    Descent, Gradients, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop, uniform,
 };
 use crate::error::MeasureError;
 use crate::measurement::ResponseMatrix;
@@ -347,10 +347,9 @@ fn seed_of(stamp: &[f32], noise: f32) -> u64 {
 /// Gaussian numbers from a seed (Box and Muller 1958), other than the signs of the field of noise.
 fn normals(seed: u64) -> [f64; 4] {
     let mut state = seed ^ 0x5368_6561_7265_6421;
-    let mut uniform = || (split_mix(&mut state) >> 11) as f64 / (1u64 << 53) as f64;
     let mut pair = || {
-        let radius = (-2.0 * (1.0 - uniform()).ln()).sqrt();
-        let (sin, cos) = (std::f64::consts::TAU * uniform()).sin_cos();
+        let radius = (-2.0 * (1.0 - uniform(&mut state)).ln()).sqrt();
+        let (sin, cos) = (std::f64::consts::TAU * uniform(&mut state)).sin_cos();
         [radius * cos, radius * sin]
     };
     let ([a, b], [c, d]) = (pair(), pair());

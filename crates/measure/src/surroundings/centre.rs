@@ -7,6 +7,10 @@ const WEIGHT: f32 = 2.0;
 const WEIGHT_REACH: i32 = 6;
 /// Steps to the centre. See docs/constants.md.
 const STEPS: usize = 3;
+/// Offset beyond which the centre takes more steps for the comparison with usual galaxies. See docs/constants.md.
+const FAR: f32 = 2.0;
+/// These steps. See docs/constants.md.
+const MORE: usize = 12;
 /// Step in units of the weighted centroid, which falls short of the centre. See docs/constants.md.
 const STRIDE: f32 = 1.5;
 /// Offset up to which the window stays in the middle of the stamp. See docs/constants.md.
@@ -16,11 +20,25 @@ const FOLLOWS: f32 = 2.0;
 
 /// Centre (x, y) of the galaxy from the middle of its stamp, in pixels; (0, 0) where none is found.
 pub(crate) fn centre(stamp: &[f32], n: usize) -> [f32; 2] {
+    moved(stamp, n, [0.0; 2], STEPS)
+}
+
+/// The centre that `STEPS` steps found, and for a galaxy that is far off its stamp's middle more steps: those of a large one
+/// fall short.
+pub(super) fn refined(stamp: &[f32], n: usize, found: [f32; 2]) -> [f32; 2] {
+    if found[0].hypot(found[1]) < FAR {
+        found
+    } else {
+        moved(stamp, n, found, MORE)
+    }
+}
+
+fn moved(stamp: &[f32], n: usize, from: [f32; 2], steps: usize) -> [f32; 2] {
     let n = n as i32;
     let middle = (n as f32 - 1.0) / 2.0;
     let most = middle / 2.0;
-    let [mut x, mut y] = [0.0f32; 2];
-    for _ in 0..STEPS {
+    let [mut x, mut y] = from;
+    for _ in 0..steps {
         let (first_x, first_y) = (start(middle + x), start(middle + y));
         let along = weights(first_x as f32 - middle - x);
         let down = weights(first_y as f32 - middle - y);

@@ -10,7 +10,7 @@ const CELL: i32 = 3;
 /// Least distance of a cell's centre from the galaxy's. See docs/constants.md.
 const LEAST_DISTANCE: f32 = 9.0;
 /// Half the side of the square whose sum is the galaxy's light. See docs/constants.md.
-const INNER: i32 = 8;
+pub(super) const INNER: i32 = 8;
 
 /// Weights of a cell and of those beside it, along an axis. See docs/constants.md.
 const SMOOTHED: [f32; 3] = [0.5, 1.0, 0.5];

@@ -1,8 +1,8 @@
 //! What galaxies usually look like, so that a neighbour can be told from a galaxy's own shape.
 //!
-//! A fixed ensemble of single galaxies behind PSFs is drawn on cells of 2 × 2 pixels. It has all sizes, ellipticities and
-//! displacements that a stamp may have, and no neighbours. Its principal components, each with the variance of its amplitude, are
-//! what is ascribed to the galaxy.
+//! A fixed ensemble of single galaxies behind PSFs is drawn on cells of 2 × 2 pixels. It has a wide range of sizes, ellipticities and
+//! displacements, and no neighbours. Light that its principal components explain belongs to the galaxy, as far as the variances of
+//! their amplitudes allow.
 //!
 //! The ensemble is the same after reflections of either axis and after an exchange of both. The components are therefore even or
 //! odd along each axis, and one quadrant of the cells is enough.
@@ -12,7 +12,8 @@ use std::sync::OnceLock;
 
 use shearq_quantities::linear::eigenvectors;
 
-use crate::deconvolve::split_mix;
+use super::contrast;
+use crate::deconvolve::uniform;
 
 /// Pixels on a side of a cell. See docs/constants.md.
 pub(super) const CELL: usize = 2;
@@ -20,17 +21,22 @@ pub(super) const CELL: usize = 2;
 pub(super) const HALF: usize = 11;
 /// Cells of a quadrant, in rows of [`HALF`], with room up to whole vectors.
 pub(super) const QUADRANT: usize = (HALF * HALF).next_multiple_of(16);
-/// Components of each parity. See docs/constants.md.
-pub(super) const COMPONENTS: usize = 24;
+/// Components of each parity: those of the largest variances. See docs/constants.md.
+pub(super) const COMPONENTS: usize = 12;
+/// Dimensions of the space in which they are looked for. See docs/constants.md.
+const DIMENSIONS: usize = 24;
 /// The parities along x and y: whether odd.
 pub(super) const PARITIES: [[bool; 2]; 4] =
     [[false, false], [true, true], [true, false], [false, true]];
+/// The quadrants: whether x and y are negative.
+pub(super) const SIDES: [[bool; 2]; 4] =
+    [[false, false], [true, false], [false, true], [true, true]];
 /// σ of the Gaussian neighbour in cells. See docs/constants.md.
 const WIDTH: f64 = 1.5;
 /// Cells from the middle of the neighbour to its last one. See docs/constants.md.
 pub(super) const REACH: usize = 4;
 
-/// Galaxies of the ensemble. See docs/constants.md.
+/// Galaxies that are drawn; the ensemble has each twice. See docs/constants.md.
 const GALAXIES: usize = 300;
 /// Smallest and largest scale of a galaxy before the PSF. See docs/constants.md.
 const SCALES: [f64; 2] = [0.5, 8.0];
@@ -42,8 +48,8 @@ const DISPLACED: f64 = 0.55;
 const PSFS: [f64; 2] = [1.0, 2.4];
 /// σ of the concentric Gaussians of a galaxy in units of its scale. See docs/constants.md.
 const WIDTHS: [f64; 4] = [0.35, 0.75, 1.5, 2.8];
-/// Cells from the centre to an edge of the square whose sum is the galaxy's light: 16 × 16 pixels. See docs/constants.md.
-const INNER: usize = 4;
+/// Cells from the centre to an edge of the square whose sum is the galaxy's light. See docs/constants.md.
+const INNER: usize = contrast::INNER as usize / CELL;
 /// Seed of the ensemble.
 const SEED: u64 = 0x6761_6c61_7879;
 
@@ -72,7 +78,7 @@ pub(super) struct Usual {
 }
 
 impl Usual {
-    /// Components on cells that reach `half` cells from the centre to each side; shared by all who ask.
+    /// Components on cells that reach `half` cells from the centre to each side, which are found once per process.
     pub(super) fn of(half: usize) -> &'static Usual {
         static ALL: [OnceLock<Usual>; HALF + 1] = [const { OnceLock::new() }; HALF + 1];
         let half = half.min(HALF);
@@ -116,27 +122,24 @@ type Folded = [[f64; HALF * HALF]; 4];
 /// The ensemble, with each galaxy once more under exchanged axes.
 fn ensemble(half: usize) -> Vec<Folded> {
     let mut state = SEED;
-    let mut uniform = move |[low, high]: [f64; 2]| {
-        let unit = (split_mix(&mut state) >> 11) as f64 / (1u64 << 53) as f64;
-        low + (high - low) * unit
-    };
+    let mut within = move |[low, high]: [f64; 2]| low + (high - low) * uniform(&mut state);
     let mut galaxies = Vec::with_capacity(2 * GALAXIES);
     for _ in 0..GALAXIES {
         let galaxy = Galaxy {
-            scale: uniform(SCALES.map(f64::ln)).exp(),
-            // As many per area of the plane.
-            ellipticity: ELLIPTICITY * uniform([0.0, 1.0]).sqrt(),
-            angle: uniform([0.0, PI]),
-            bulge: uniform([0.0, 1.0]),
-            place: [(); 2].map(|()| uniform([-DISPLACED, DISPLACED])),
-            psf: uniform(PSFS.map(f64::ln)).exp(),
+            scale: within(SCALES.map(f64::ln)).exp(),
+            // Uniform in the plane of both components.
+            ellipticity: ELLIPTICITY * within([0.0, 1.0]).sqrt(),
+            angle: within([0.0, PI]),
+            bulge: within([0.0, 1.0]),
+            place: [(); 2].map(|()| within([-DISPLACED, DISPLACED])),
+            psf: within(PSFS.map(f64::ln)).exp(),
         };
         let folded = galaxy.folded(half);
         galaxies.push(folded);
-        let turned = [0, 1, 3, 2].map(|parity: usize| {
+        let exchanged = [0, 1, 3, 2].map(|parity: usize| {
             std::array::from_fn(|at| folded[parity][at % HALF * HALF + at / HALF])
         });
-        galaxies.push(turned);
+        galaxies.push(exchanged);
     }
     galaxies
 }
@@ -152,48 +155,61 @@ struct Galaxy {
 }
 
 impl Galaxy {
-    fn folded(&self, half: usize) -> Folded {
+    /// The light of the cells that reach `half` cells to each side.
+    fn cells(&self, half: usize) -> Vec<f64> {
+        let along = 2 * half;
+        let mut cells = vec![0.0; along * along];
         let bulge = self.bulge;
         let lights = [0.5 * bulge, 0.5, 0.4 * (1.0 - 0.5 * bulge), 0.12];
         let stretch = (1.0 + self.ellipticity) / (1.0 - self.ellipticity);
         let (sin, cos) = self.angle.sin_cos();
-        let gaussians: [_; WIDTHS.len()] = std::array::from_fn(|k| {
-            let square = (self.scale * WIDTHS[k]).powi(2);
+        for (light, width) in lights.into_iter().zip(WIDTHS) {
+            let square = (self.scale * width).powi(2);
             let (long, short) = (square * stretch, square / stretch);
             let xx = long * cos * cos + short * sin * sin + self.psf * self.psf;
             let yy = long * sin * sin + short * cos * cos + self.psf * self.psf;
             let xy = (long - short) * sin * cos;
             let determinant = xx * yy - xy * xy;
-            let peak = lights[k] / determinant.sqrt();
-            (
-                peak,
-                [yy, xx, -2.0 * xy].map(|term| -0.5 * term / determinant),
-            )
-        });
-        // The four pixels of a cell.
-        let light = |side: [f64; 2], at: usize| {
-            let mut sum = 0.0;
-            for pixel in 0..CELL * CELL {
-                let middle = |cell: usize, step: usize| (CELL * cell + step) as f64 + 0.5;
-                let x = side[0] * middle(at % HALF, pixel % CELL) - self.place[0];
-                let y = side[1] * middle(at / HALF, pixel / CELL) - self.place[1];
-                for (peak, [a, b, c]) in &gaussians {
-                    sum += peak * (a * x * x + b * y * y + c * x * y).exp();
+            // The logarithm of the light is a x² + b y² + c x y.
+            let [a, b, c] = [yy, xx, -2.0 * xy].map(|term| -0.5 * term / determinant);
+            let from = 0.5 - (CELL * half) as f64;
+            let x = from - self.place[0];
+            for row in 0..CELL * along {
+                let y = from + row as f64 - self.place[1];
+                // From pixel to pixel the light changes by a factor, which changes by exp(2a).
+                let mut pixel =
+                    light / determinant.sqrt() * (a * x * x + b * y * y + c * x * y).exp();
+                let mut factor = (a * (2.0 * x + 1.0) + c * y).exp();
+                let change = (2.0 * a).exp();
+                let line = &mut cells[row / CELL * along..][..along];
+                for cell in line {
+                    for _ in 0..CELL {
+                        *cell += pixel;
+                        pixel *= factor;
+                        factor *= change;
+                    }
                 }
             }
-            sum
-        };
+        }
+        cells
+    }
+
+    fn folded(&self, half: usize) -> Folded {
+        let along = 2 * half;
+        let cells = self.cells(half);
         let mut folded = [[0.0; HALF * HALF]; 4];
-        for at in 0..HALF * HALF {
-            if at % HALF >= half || at / HALF >= half {
-                continue;
-            }
-            for x in [1.0, -1.0] {
-                for y in [1.0, -1.0] {
-                    let light = light([x, y], at);
-                    for (out, odd) in folded.iter_mut().zip(PARITIES) {
-                        out[at] += 0.5 * sign(odd, [x, y]) * light;
+        for at in (0..HALF * HALF).filter(|at| at % HALF < half && at / HALF < half) {
+            for side in SIDES {
+                let place = |cell: usize, negative: bool| {
+                    if negative {
+                        half - 1 - cell
+                    } else {
+                        half + cell
                     }
+                };
+                let light = cells[place(at / HALF, side[1]) * along + place(at % HALF, side[0])];
+                for (out, odd) in folded.iter_mut().zip(PARITIES) {
+                    out[at] += 0.5 * sign(odd, side) * light;
                 }
             }
         }
@@ -204,10 +220,13 @@ impl Galaxy {
     }
 }
 
-/// Sign of a component of parities `odd` in the quadrant of these signs.
-fn sign(odd: [bool; 2], side: [f64; 2]) -> f64 {
-    let along = |axis: usize| if odd[axis] { side[axis] } else { 1.0 };
-    along(0) * along(1)
+/// Sign of a component of parities `odd` on the negative side of these axes.
+pub(super) fn sign(odd: [bool; 2], negative: [bool; 2]) -> f64 {
+    if (odd[0] && negative[0]) == (odd[1] && negative[1]) {
+        1.0
+    } else {
+        -1.0
+    }
 }
 
 impl Components {
@@ -220,12 +239,12 @@ impl Components {
         }
         let count = basis.vectors.len();
         // The directions of those galaxies that the earlier directions explain the least.
-        while basis.vectors.len() < COMPONENTS {
-            let size = |row: &[f64; HALF * HALF]| dot(row, row);
-            let Some(least) = rows.iter().max_by(|a, b| size(a).total_cmp(&size(b))) else {
+        while basis.vectors.len() < DIMENSIONS {
+            let sizes = rows.iter().map(|row| (dot(row, row), row));
+            let Some((_, unexplained)) = sizes.max_by(|a, b| a.0.total_cmp(&b.0)) else {
                 break;
             };
-            basis.add(*least, &mut rows);
+            basis.add(*unexplained, &mut rows);
         }
         let (vectors, variances) = basis.principal(galaxies, parity, count);
         let mut components = Components {
@@ -233,10 +252,12 @@ impl Components {
             smoothed: [[0.0; QUADRANT]; COMPONENTS],
             variances: variances.map(|variance| variance as f32),
         };
+        let light = std::array::from_fn(|step| neighbour(step as i32));
         for (k, vector) in vectors.iter().enumerate() {
             for at in 0..HALF * HALF {
                 components.shapes[k][at] = vector[at] as f32;
-                components.smoothed[k][at] = under_a_neighbour(vector, half, odd, at) as f32;
+                components.smoothed[k][at] =
+                    under_a_neighbour(vector, half, odd, &light, at) as f32;
             }
         }
         components
@@ -273,7 +294,7 @@ impl Basis {
         // Once more for what rounding leaves.
         for _ in 0..2 {
             for old in &self.vectors {
-                take(&mut new, old);
+                project_out(&mut new, old);
             }
         }
         let size = dot(&new, &new).sqrt();
@@ -284,7 +305,7 @@ impl Basis {
         };
         let new = new.map(|value| scale * value);
         for row in rows.iter_mut() {
-            take(row, &new);
+            project_out(row, &new);
         }
         self.vectors.push(new);
     }
@@ -296,9 +317,9 @@ impl Basis {
         parity: usize,
         free: usize,
     ) -> ([[f64; HALF * HALF]; COMPONENTS], [f64; COMPONENTS]) {
-        let mut products = [[0.0; COMPONENTS]; COMPONENTS];
+        let mut products = [[0.0; DIMENSIONS]; DIMENSIONS];
         for galaxy in galaxies {
-            let mut amplitudes = [0.0; COMPONENTS];
+            let mut amplitudes = [0.0; DIMENSIONS];
             for (amplitude, vector) in amplitudes.iter_mut().zip(&self.vectors).skip(free) {
                 *amplitude = dot(&galaxy[parity], vector);
             }
@@ -309,40 +330,57 @@ impl Basis {
             }
         }
         let axes = eigenvectors(&mut products);
-        let vectors = axes.map(|axis| {
+        // Free ones have no products, and come first.
+        let variance = |k: usize| {
+            if k < free {
+                f64::INFINITY
+            } else {
+                products[k][k]
+            }
+        };
+        let mut order: [usize; DIMENSIONS] = std::array::from_fn(|k| k);
+        order.sort_by(|a, b| variance(*b).total_cmp(&variance(*a)));
+        let vectors = std::array::from_fn(|k| {
             let mut sum = [0.0; HALF * HALF];
-            for (share, vector) in axis.iter().zip(&self.vectors) {
+            for (share, vector) in axes[order[k]].iter().zip(&self.vectors) {
                 for (sum, value) in sum.iter_mut().zip(vector) {
                     *sum += share * value;
                 }
             }
             sum
         });
-        let variances = std::array::from_fn(|k| {
-            if k < free {
-                f64::INFINITY
-            } else {
-                products[k][k]
-            }
-        });
-        (vectors, variances)
+        (vectors, std::array::from_fn(|k| variance(order[k])))
     }
 }
 
+/// Sum of products, the columns side by side.
 fn dot(a: &[f64; HALF * HALF], b: &[f64; HALF * HALF]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
+    let mut columns = [0.0; HALF];
+    for (a, b) in a.chunks_exact(HALF).zip(b.chunks_exact(HALF)) {
+        for ((sum, a), b) in columns.iter_mut().zip(a).zip(b) {
+            *sum += a * b;
+        }
+    }
+    columns.iter().sum()
 }
 
 /// Takes from `vector` what is along a direction of length one.
-fn take(vector: &mut [f64; HALF * HALF], direction: &[f64; HALF * HALF]) {
+fn project_out(vector: &mut [f64; HALF * HALF], direction: &[f64; HALF * HALF]) {
     let along = dot(vector, direction);
     for (value, step) in vector.iter_mut().zip(direction) {
         *value -= along * step;
     }
 }
 
-/// The product of a component with a neighbour of flux 1 in the middle of a cell of the positive quadrant.
-fn under_a_neighbour(vector: &[f64; HALF * HALF], half: usize, odd: [bool; 2], at: usize) -> f64 {
+/// The product of a component with a neighbour of flux 1 in the middle of a cell of the positive quadrant. `light` is the
+/// neighbour's along an axis, from its middle on.
+fn under_a_neighbour(
+    vector: &[f64; HALF * HALF],
+    half: usize,
+    odd: [bool; 2],
+    light: &[f64; REACH + 1],
+    at: usize,
+) -> f64 {
     let reach = REACH as i32;
     let mut sum = 0.0;
     for down in -reach..=reach {
@@ -353,10 +391,116 @@ fn under_a_neighbour(vector: &[f64; HALF * HALF], half: usize, odd: [bool; 2], a
             }
             // Cell −1 is the mirror image of cell 0.
             let mirror = |cell: i32| if cell < 0 { -1 - cell } else { cell } as usize;
-            let side = [x, y].map(|cell| if cell < 0 { -1.0 } else { 1.0 });
-            let light = neighbour(along) * neighbour(down);
-            sum += 0.5 * sign(odd, side) * light * vector[mirror(y) * HALF + mirror(x)];
+            let side = [x, y].map(|cell| cell < 0);
+            let [across, along] = [along, down].map(|step| light[step.unsigned_abs() as usize]);
+            let value = vector[mirror(y) * HALF + mirror(x)];
+            sum += 0.5 * sign(odd, side) * across * along * value;
         }
     }
     sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn galaxy(scale: f64, ellipticity: f64, angle: f64, place: [f64; 2]) -> Galaxy {
+        Galaxy {
+            scale,
+            ellipticity,
+            angle,
+            bulge: 0.4,
+            place,
+            psf: 1.5,
+        }
+    }
+
+    #[test]
+    fn galaxies_are_drawn_where_and_as_long_as_they_are() {
+        for (scale, angle, place) in [(2.0, 0.3, [0.4, -0.2]), (3.0, 2.0, [-0.5, 0.5])] {
+            let cells = galaxy(scale, 0.3, angle, place).cells(HALF);
+            let mut sums = [0.0; 6];
+            for (at, light) in cells.iter().enumerate() {
+                let middle = |cell: usize| CELL as f64 * (cell as f64 + 0.5 - HALF as f64);
+                let (x, y) = (middle(at % (2 * HALF)), middle(at / (2 * HALF)));
+                for (sum, term) in sums.iter_mut().zip([1.0, x, y, x * x, x * y, y * y]) {
+                    *sum += term * light;
+                }
+            }
+            let [all, x, y, xx, xy, yy] = sums;
+            let (x, y) = (x / all, y / all);
+            // 2 % of the light of the larger one is beyond the cells, on one side more than on the other.
+            assert!(
+                (x - place[0]).abs() < 0.05 && (y - place[1]).abs() < 0.05,
+                "{x} {y}"
+            );
+            let found = 0.5 * (2.0 * xy / all - 2.0 * x * y).atan2((xx - yy) / all - x * x + y * y);
+            let apart = (found - angle).rem_euclid(PI);
+            assert!(apart.min(PI - apart) < 0.05, "{found} {angle}");
+        }
+    }
+
+    #[test]
+    fn components_are_at_right_angles_and_the_same_under_exchanged_axes() {
+        let usual = Usual::of(HALF);
+        for components in &usual.components {
+            for (i, a) in components.shapes.iter().enumerate() {
+                for (j, b) in components.shapes.iter().enumerate() {
+                    let product: f32 = a.iter().zip(b).map(|(a, b)| a * b).sum();
+                    // A hundred products of f32.
+                    assert!(
+                        (product - f32::from(u8::from(i == j))).abs() < 1e-5,
+                        "{i} {j} {product}"
+                    );
+                }
+            }
+            assert!(components.variances.is_sorted_by(|a, b| a >= b && *b > 0.0));
+        }
+        let [_, _, x, y] = &usual.components;
+        for k in 0..COMPONENTS {
+            assert!((x.variances[k] / y.variances[k] - 1.0).abs() < 1e-3 || k == 0);
+            let product: f32 = (0..HALF * HALF)
+                .map(|at| x.shapes[k][at] * y.shapes[k][at % HALF * HALF + at / HALF])
+                .sum();
+            // Of either sign.
+            assert!((product.abs() - 1.0).abs() < 1e-3, "{k} {product}");
+        }
+    }
+
+    #[test]
+    fn galaxies_are_explained_and_pairs_are_not() {
+        let usual = Usual::of(HALF);
+        // The square of what is left, in units of the square of the light.
+        let left = |folded: &Folded| -> f64 {
+            let parts = usual.components.iter().zip(folded);
+            let parts = parts.map(|(components, light)| {
+                let mut left = dot(light, light);
+                for shape in &components.shapes {
+                    let along: f64 = light
+                        .iter()
+                        .zip(shape)
+                        .map(|(a, b)| a * f64::from(*b))
+                        .sum();
+                    left -= along * along;
+                }
+                left / (light.iter().sum::<f64>().powi(2) + 1.0)
+            });
+            parts.sum()
+        };
+        let mut most = 0.0f64;
+        for ellipticity in [0.0, 0.5, 0.7] {
+            for angle in [0.2, 1.0, 2.5] {
+                most = most.max(left(
+                    &galaxy(2.0, ellipticity, angle, [0.3, -0.4]).folded(HALF),
+                ));
+            }
+        }
+        let (first, second) = (
+            galaxy(2.0, 0.1, 0.0, [0.0; 2]),
+            galaxy(2.0, 0.1, 1.0, [7.0, 3.0]),
+        );
+        let (first, second) = (first.folded(HALF), second.folded(HALF));
+        let pair = std::array::from_fn(|k| std::array::from_fn(|at| first[k][at] + second[k][at]));
+        assert!(most < 0.02 * left(&pair), "{most} {}", left(&pair));
+    }
 }

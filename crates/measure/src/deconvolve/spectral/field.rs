@@ -100,6 +100,11 @@ impl Spectral {
     }
 }
 
+/// The next number between 0 and 1 of the SplitMix64 sequence.
+pub(crate) fn uniform(state: &mut u64) -> f64 {
+    (split_mix(state) >> 11) as f64 / (1u64 << 53) as f64
+}
+
 /// The next number of the SplitMix64 sequence.
 pub(crate) fn split_mix(state: &mut u64) -> u64 {
     *state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
