@@ -70,6 +70,7 @@ impl Surroundings {
         centre: [f32; 2],
         noise: f32,
     ) -> Result<bool, Flag> {
+        let centre = refined(stamp, self.n, centre);
         // Pixel p is opposite to `turn − p`.
         let turn = turn(centre, self.n);
         let square = (SIGNIFICANT * noise).powi(2);
@@ -125,7 +126,6 @@ fn blended(
         light,
         least: BLENDED * light.max(0.0),
     };
-    let centre = refined(stamp, near.stamp_size(), centre);
     match near.suspect(stamp, centre, known) {
         Some(suspect) if suspect.significance > OVERLAPPING => Err(Flag::Neighbour),
         _ => Ok(()),

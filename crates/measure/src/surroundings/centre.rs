@@ -7,7 +7,7 @@ const WEIGHT: f32 = 2.0;
 const WEIGHT_REACH: i32 = 6;
 /// Steps to the centre. See docs/constants.md.
 const STEPS: usize = 3;
-/// Offset beyond which the centre takes more steps for the comparison with usual galaxies. See docs/constants.md.
+/// Offset beyond which there are more steps before a galaxy is compared with itself and with others. See docs/constants.md.
 const FAR: f32 = 2.0;
 /// These steps. See docs/constants.md.
 const MORE: usize = 12;

@@ -85,11 +85,6 @@ impl Near {
         }
     }
 
-    /// Pixels on a side of a stamp.
-    pub(super) fn stamp_size(&self) -> usize {
-        self.n
-    }
-
     /// The most significant neighbour of a galaxy centred at `centre`, (x, y) in pixels from the middle of the stamp.
     pub(super) fn suspect(
         &mut self,
