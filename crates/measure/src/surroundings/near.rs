@@ -11,7 +11,7 @@ use multiversion::multiversion;
 
 use super::usual::{
     CELL, COMPONENTS, Components, HALF, PARITIES, QUADRANT, Quadrant, REACH, SIDES, Usual,
-    neighbour, sign,
+    mirrored, neighbour, sign,
 };
 
 /// Cells along an axis.
@@ -20,11 +20,11 @@ const ALONG: usize = 2 * HALF;
 const MARGIN: usize = REACH;
 /// Cells of a row with both margins, up to whole vectors.
 const ROW: usize = (ALONG + 2 * MARGIN).next_multiple_of(16);
-/// Distances in pixels of the middle of a neighbour's cell from the corner of pixels that is nearest to the galaxy's centre. See docs/constants.md.
+/// Distances in pixels of the middle of a neighbour's cell from the corner of pixels that is nearest to the galaxy's
+/// centre: the least and the largest. See docs/constants.md.
 const DISTANCES: [f32; 2] = [4.0, 15.0];
 /// Least noise of a pixel in units of the galaxy's light. See docs/constants.md.
 const LEAST_NOISE: f32 = 0.0018;
-
 /// Least share of a neighbour's square that usual galaxies leave. See docs/constants.md.
 const LEFT: f32 = 1e-3;
 
@@ -255,16 +255,11 @@ fn folded(cells: &Rows) -> [Quadrant; 4] {
 #[inline(always)]
 fn unfold(cells: &Rows, quadrants: &mut [Quadrant; 4]) {
     for j in 0..HALF {
-        let rows = [&cells[HALF + j], &cells[HALF - 1 - j]];
         for (quadrant, side) in quadrants.iter_mut().zip(SIDES) {
-            let row = rows[usize::from(side[1])];
+            let row = &cells[mirrored(HALF, j, side[1])];
             let line = &mut quadrant[j * HALF..][..HALF];
             for (i, out) in line.iter_mut().enumerate() {
-                *out = if side[0] {
-                    row[MARGIN + HALF - 1 - i]
-                } else {
-                    row[MARGIN + HALF + i]
-                };
+                *out = row[MARGIN + mirrored(HALF, i, side[0])];
             }
         }
     }
@@ -490,16 +485,9 @@ mod tests {
                     let amplitude = noise * strength * components.variances[k].sqrt() * normal;
                     for at in 0..HALF * HALF {
                         for side in SIDES {
-                            let place = |cell: usize, negative: bool| {
-                                if negative {
-                                    HALF - 1 - cell
-                                } else {
-                                    HALF + cell
-                                }
-                            };
                             let light = 0.5 * sign(odd, side) as f32 * components.shapes[k][at];
-                            cells[place(at / HALF, side[1])][MARGIN + place(at % HALF, side[0])] +=
-                                amplitude * light;
+                            cells[mirrored(HALF, at / HALF, side[1])]
+                                [MARGIN + mirrored(HALF, at % HALF, side[0])] += amplitude * light;
                         }
                     }
                 }

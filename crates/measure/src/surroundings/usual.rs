@@ -87,7 +87,7 @@ impl Usual {
 
     fn new(half: usize) -> Usual {
         let galaxies = ensemble(half);
-        let components = PARITIES.map(|odd| Components::new(&galaxies, half, odd));
+        let components = std::array::from_fn(|parity| Components::new(&galaxies, half, parity));
         let along: [f64; HALF] = std::array::from_fn(|at| {
             let reach = REACH as i32;
             let light = (-reach..=reach).filter(|step| on_cells(at as i32 + step, half));
@@ -174,13 +174,13 @@ impl Galaxy {
             let [a, b, c] = [yy, xx, -2.0 * xy].map(|term| -0.5 * term / determinant);
             let from = 0.5 - (CELL * half) as f64;
             let x = from - self.place[0];
+            let peak = light / determinant.sqrt();
+            // From pixel to pixel the light changes by a factor, which changes by exp(2a).
+            let change = (2.0 * a).exp();
             for row in 0..CELL * along {
                 let y = from + row as f64 - self.place[1];
-                // From pixel to pixel the light changes by a factor, which changes by exp(2a).
-                let mut pixel =
-                    light / determinant.sqrt() * (a * x * x + b * y * y + c * x * y).exp();
+                let mut pixel = peak * (a * x * x + b * y * y + c * x * y).exp();
                 let mut factor = (a * (2.0 * x + 1.0) + c * y).exp();
-                let change = (2.0 * a).exp();
                 let line = &mut cells[row / CELL * along..][..along];
                 for cell in line {
                     for _ in 0..CELL {
@@ -200,14 +200,11 @@ impl Galaxy {
         let mut folded = [[0.0; HALF * HALF]; 4];
         for at in (0..HALF * HALF).filter(|at| at % HALF < half && at / HALF < half) {
             for side in SIDES {
-                let place = |cell: usize, negative: bool| {
-                    if negative {
-                        half - 1 - cell
-                    } else {
-                        half + cell
-                    }
-                };
-                let light = cells[place(at / HALF, side[1]) * along + place(at % HALF, side[0])];
+                let (x, y) = (
+                    mirrored(half, at % HALF, side[0]),
+                    mirrored(half, at / HALF, side[1]),
+                );
+                let light = cells[y * along + x];
                 for (out, odd) in folded.iter_mut().zip(PARITIES) {
                     out[at] += 0.5 * sign(odd, side) * light;
                 }
@@ -217,6 +214,16 @@ impl Galaxy {
         let inner = (0..HALF * HALF).filter(|at| at % HALF < INNER && at / HALF < INNER);
         let inner = 2.0 * inner.map(|at| folded[0][at]).sum::<f64>();
         folded.map(|cells| cells.map(|light| light / inner))
+    }
+}
+
+/// Place along an axis of the cell that is this many cells from the centre on one side, of `half` cells to each side.
+#[inline(always)]
+pub(super) fn mirrored(half: usize, cell: usize, negative: bool) -> usize {
+    if negative {
+        half - 1 - cell
+    } else {
+        half + cell
     }
 }
 
@@ -230,8 +237,9 @@ pub(super) fn sign(odd: [bool; 2], negative: [bool; 2]) -> f64 {
 }
 
 impl Components {
-    fn new(galaxies: &[Folded], half: usize, odd: [bool; 2]) -> Components {
-        let parity = PARITIES.iter().position(|one| *one == odd).unwrap_or(0);
+    /// Of the parity at this place of [`PARITIES`].
+    fn new(galaxies: &[Folded], half: usize, parity: usize) -> Components {
+        let odd = PARITIES[parity];
         let mut rows: Vec<[f64; HALF * HALF]> = galaxies.iter().map(|one| one[parity]).collect();
         let mut basis = Basis::default();
         for free in free(&rows, half, odd) {
