@@ -84,8 +84,7 @@ impl<'de> Deserialize<'de> for Configuration {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         use serde::de::Error;
         let mut file = File::deserialize(deserializer)?;
-        // Settings of earlier versions do not have it.
-        file.shape.without_sheared_step();
+        file.shape.as_before();
         let (name, description) = (file.name.take(), file.description.take());
         let configuration = file
             .settings()

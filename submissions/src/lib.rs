@@ -20,7 +20,7 @@ pub use name::{MAX_NAME, check_name, checked_name, is_control};
 pub use registry::{Entry, Registry};
 pub use settings::{
     AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Configuration,
-    Denoise, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method,
+    Denoise, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method, Neighbours,
     NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf,
     SkySource, Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
 };

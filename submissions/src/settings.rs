@@ -284,15 +284,17 @@ partial! {
         weight_scale: f64,
         half_snr: f64,
         sheared_step: f64,
+        neighbours: Neighbours,
         ellipticity: EllipticityType,
         calibration: Calibration,
     }
 }
 
 impl PartialShape {
-    /// No sheared versions, where nothing is said of them.
-    pub(crate) fn without_sheared_step(&mut self) {
+    /// What earlier versions did, which do not have these settings: no sheared versions, and neighbours are flagged.
+    pub(crate) fn as_before(&mut self) {
         self.sheared_step.get_or_insert(0.0);
+        self.neighbours.get_or_insert(Neighbours::Flag);
     }
 }
 
@@ -325,6 +327,8 @@ section! {
         /// Shear of sheared versions of ellipticity, S/N, flux and size (`1p`, `1m`, `2p`, `2m`), which catalogues then have in
         /// addition. Zero for none.
         sheared_step: f64,
+        /// What is done about neighbours.
+        neighbours: Neighbours,
         /// Which ellipticity the catalogue reports as e1, e2.
         ellipticity: EllipticityType,
         /// What ellipticities are divided by.
@@ -457,6 +461,16 @@ pub enum BrightnessUnit {
     Noise,
     /// The stamp's brightest pixel.
     Peak,
+}
+
+/// What is done about neighbours of a galaxy on its stamp.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Neighbours {
+    /// Those that overlap the galaxy flag it; others are subtracted.
+    Flag,
+    /// They are not looked for: all light counts as light of the galaxy.
+    Keep,
 }
 
 /// Calibration of reported ellipticities.

@@ -172,7 +172,7 @@ fn results_without_a_galaxy_are_an_error_with_the_likely_cause() {
     };
     let message = measured();
     assert!(message.contains("the sky has a gradient"), "{message}");
-    let expected = "256 of 256 galaxies are flagged (most frequent reason: a second peak near the galaxy). Try: check sky gradients";
+    let expected = "256 of 256 galaxies are flagged (most frequent reason: a neighbour or an unusual shape). Try: check sky gradients";
     assert!(
         message.contains(&format!("error: no galaxy could be measured: {expected}")),
         "{message}"

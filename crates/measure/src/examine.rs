@@ -215,7 +215,7 @@ impl Examination {
                 [a, b] if a.is_nan() => b,
                 [a, b] => 0.5 * (a + b),
             };
-            mean.max(0.0).sqrt()
+            mean.sqrt()
         };
         let mut pairs = [0.0; 3];
         for corner in corners {
@@ -602,6 +602,27 @@ mod tests {
         assert!(middle_of(&mut [f64::NAN; 4]).is_nan());
         assert_eq!(middle_of(&mut [3.0, -f64::NAN, f64::NAN, 1.0]), 2.0);
         assert_eq!(middle_of(&mut [4.0, 1.0, 9.0, 2.0]), 3.0);
+    }
+
+    #[test]
+    fn stamps_with_missing_pixels_in_all_corners_have_no_noise_to_tell() {
+        let mut examination = Examination::new(N, 8);
+        for k in 0..8u8 {
+            let mut stamp = stamp(0.5, [0.02, 0.0], [0.1 * f32::from(k), 0.0]);
+            // Of two stamps only the corners are complete.
+            if k > 1 {
+                for (y, x) in [(1, 1), (1, 46), (46, 1), (46, 46)] {
+                    stamp[(y, x)] = f32::NAN;
+                }
+            }
+            stamp[(5, 4)] += 10.0;
+            examination.add(stamp.view()).unwrap();
+        }
+        let (noise, error) = examination.noise();
+        // One bright pixel among the 64 of a corner, and its three neighbours in the mean: not 0, as a missing value would be.
+        assert!(noise > 0.1 && error.is_finite(), "{noise} {error}");
+        let known = |warning: &Warning| !warning.to_string().contains("inf");
+        assert!(examination.warnings().iter().all(known));
     }
 
     #[test]

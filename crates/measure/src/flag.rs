@@ -50,7 +50,7 @@ impl fmt::Display for Flag {
             Flag::NoExtent => "moments without extent",
             Flag::NoShear => "distortion above 1",
             Flag::NoResponse => "no response to shear to divide by",
-            Flag::Neighbour => "a second peak near the galaxy",
+            Flag::Neighbour => "a neighbour or an unusual shape",
         })
     }
 }

@@ -33,6 +33,8 @@ const BLENDED: f32 = 0.1;
 /// Share of a neighbour's distance from the centre at which the fit of its profile begins. See
 /// docs/constants.md.
 const FITTED_FROM: f32 = 0.3;
+/// Distance below which the comparison with usual galaxies alone finds neighbours. See docs/constants.md.
+const COMPARED_TO: f32 = 14.0;
 /// Distance below which a neighbour cannot be removed. See docs/constants.md.
 const TOO_NEAR: f32 = 16.0;
 /// Light of a neighbour, in units of the galaxy's light within 8 px, above which it cannot be
@@ -85,30 +87,33 @@ impl Surroundings {
         }
         hits.sort_unstable_by(|a, b| b.excess.total_cmp(&a.excess));
         self.filled.copy_from_slice(stamp);
-        let mut most = 0.0f32;
+        let mut most: Option<f32> = None;
         while let Some(&brightest) = hits.first() {
             let ([x, y], peak) = self.profile.place(&self.filled, turn, brightest.place);
             let distance = x.hypot(y);
-            if distance < TOO_NEAR {
+            if (COMPARED_TO..TOO_NEAR).contains(&distance) {
                 return Err(Flag::Neighbour);
             }
             let side = [x / distance, y / distance];
             let from = FITTED_FROM * distance;
-            let known = profile::Known { peak, noise };
-            let light = self
-                .profile
-                .subtract(&mut self.filled, turn, [x, y], from, known);
-            most = most.max(light);
             let along = |place: [f32; 2]| place[0] * side[0] + place[1] * side[1];
+            // Nearer than that, the comparison with usual galaxies tells a neighbour from the galaxy's own shape.
+            if distance >= TOO_NEAR {
+                let known = profile::Known { peak, noise };
+                let light = self
+                    .profile
+                    .subtract(&mut self.filled, turn, [x, y], from, known);
+                most = Some(most.map_or(light, |most| most.max(light)));
+            }
             // The brightest one is done wherever its light was found.
             hits.remove(0);
             hits.retain(|hit| along(hit.place) <= from);
         }
         let light = self.contrasts.inner(&self.filled, turn);
-        if most > TOO_BRIGHT * light {
+        if most.is_some_and(|most| most > TOO_BRIGHT * light) {
             return Err(Flag::Neighbour);
         }
-        blended(&mut self.near, &self.filled, centre, light, noise).map(|()| true)
+        blended(&mut self.near, &self.filled, centre, light, noise).map(|()| most.is_some())
     }
 }
 
@@ -201,6 +206,27 @@ mod tests {
         blob(&mut stamp, 5.0, -3.0, 12.0);
         assert_eq!(look.clear(&stamp, [0.0; 2], 1.0), Err(Flag::Neighbour));
         assert_eq!(look.clear(&stamp, [0.0; 2], 20.0), Ok(false));
+    }
+
+    #[test]
+    fn a_lopsided_galaxy_is_no_pair() {
+        let mut look = Surroundings::new(N);
+        let mut stamp = vec![0.0; N * N];
+        blob(&mut stamp, 0.5, 0.0, 20.0);
+        // A faint disc, 5 px off.
+        for (at, value) in stamp.iter_mut().enumerate() {
+            let (x, y) = ((at % N) as f32 - 29.0, (at / N) as f32 - 23.5);
+            *value += 2.0 * (-(x * x + y * y) / 50.0).exp();
+        }
+        let noise = 0.5;
+        assert_eq!(look.clear(&stamp, [0.0; 2], noise), Ok(false));
+        // Opposite places differ all the same.
+        let square = (SIGNIFICANT * noise).powi(2);
+        look.contrasts
+            .compare_smoothed(&stamp, turn([0.0; 2], N), |light, excess, pixels| {
+                excess > BRIGHT * light && excess * excess > square * pixels
+            });
+        assert!(!look.contrasts.blocks.is_empty());
     }
 
     #[test]

@@ -533,7 +533,9 @@ pub(crate) fn advice(flag: Flag) -> &'static str {
         Flag::NoResponse => {
             "check that the PSF has the pixel scale of the galaxies, and that there are galaxies"
         }
-        Flag::Neighbour => "check sky gradients and that the stamps are centred on the galaxies",
+        Flag::Neighbour => {
+            "check sky gradients and that the stamps are centred on the galaxies, or use shape.neighbours = \"keep\""
+        }
     }
 }
 

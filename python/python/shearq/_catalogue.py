@@ -38,7 +38,7 @@ class Flag(enum.IntFlag):
     NoResponse = 64
     """No response to shear to divide by."""
     Neighbour = 128
-    """A second peak near the galaxy."""
+    """A neighbour or an unusual shape."""
 
 
 @dataclass(frozen=True, repr=False)

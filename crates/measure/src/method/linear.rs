@@ -21,7 +21,7 @@
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2};
-use shearq_submissions::LinearMethod;
+use shearq_submissions::{LinearMethod, Neighbours};
 
 use super::found::{
     AdaptedSettings, CutWorker, Found, FoundObservables, Images, Sheared, image, whole,
@@ -57,6 +57,8 @@ pub(super) struct LinearPlan {
     breadth: Breadth,
     /// Gradients of P₀ and P₂.
     broad: [Vec<f32>; 2],
+    /// Whether neighbours are subtracted, or flag the galaxy.
+    clears: bool,
     /// What corrects the flux for the light beyond the window.
     aperture: f64,
 }
@@ -82,6 +84,7 @@ impl LinearPlan {
         let step = method.shape.sheared_step;
         let versions = (step > 0.0).then_some(step);
         Ok(LinearPlan {
+            clears: method.shape.neighbours == Neighbours::Flag,
             share: if versions.is_some() { 1 } else { SHARE },
             versions,
             lengths: AdaptedSettings {
@@ -106,7 +109,8 @@ pub(super) struct LinearWorker {
     noise: ModeNoise,
     /// Noise of sums over many pixels, in units of that of white noise.
     grain: f32,
-    surroundings: Surroundings,
+    /// None if neighbours are kept.
+    surroundings: Option<Surroundings>,
     psf: SpectralPsf,
     /// What is added to the divisor of the moments, in px⁴ times the unit of the autocorrelation, in noise of level one.
     added: f32,
@@ -134,7 +138,9 @@ impl LinearWorker {
             faint: 0.0,
             gradients: plan.spectral.gradients(),
             buffers: plan.spectral.scratch(),
-            surroundings: Surroundings::new(plan.spectral.stamp_size()),
+            surroundings: plan
+                .clears
+                .then(|| Surroundings::new(plan.spectral.stamp_size())),
             grain: 1.0,
             lags: plan.spectral.lags(),
             shape: None,
@@ -267,20 +273,25 @@ impl CutWorker for LinearWorker {
         let plan = Arc::clone(&self.plan);
         let sigma = noise as f32;
         let found = centre(cut, plan.spectral.stamp_size());
-        let cleared = self.surroundings.clear(cut, found, self.grain * sigma);
         let whole = cut;
-        let cut = if cleared == Ok(true) {
-            &self.surroundings.filled
-        } else {
-            cut
-        };
+        let mut cut = cut;
+        let mut neighbour = None;
+        if let Some(surroundings) = &mut self.surroundings {
+            match surroundings.clear(cut, found, self.grain * sigma) {
+                Ok(true) => cut = &surroundings.filled,
+                Ok(false) => {}
+                Err(flag) => neighbour = Some(flag),
+            }
+        }
         let (buffers, lags) = (&mut self.buffers, &mut self.lags);
         plan.spectral.place_window(followed(found), buffers);
         plan.spectral
             .autocorrelate(&self.psf, cut, sigma, buffers, lags);
         let softening = self.added * sigma * sigma;
-        let shape =
-            cleared.and_then(|_| plan.moments.measure(&lags.acf, softening, &mut self.values));
+        let shape = match neighbour {
+            Some(flag) => Err(flag),
+            None => plan.moments.measure(&lags.acf, softening, &mut self.values),
+        };
         self.shape = shape.as_ref().ok().copied();
         let mut response = None;
         let mut sheared_noise = None;

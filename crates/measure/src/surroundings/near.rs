@@ -23,8 +23,8 @@ const ROW: usize = (ALONG + 2 * MARGIN).next_multiple_of(16);
 /// Distances in pixels of the middle of a neighbour's cell from the corner of pixels that is nearest to the galaxy's
 /// centre: the least and the largest. See docs/constants.md.
 const DISTANCES: [f32; 2] = [4.0, 15.0];
-/// Least noise of a pixel in units of the galaxy's light. See docs/constants.md.
-const LEAST_NOISE: f32 = 0.0018;
+/// What galaxies differ from usual ones by, as noise of a pixel in units of the galaxy's light. See docs/constants.md.
+const UNUSUAL: f32 = 0.0014;
 /// Least share of a neighbour's square that usual galaxies leave. See docs/constants.md.
 const LEFT: f32 = 1e-3;
 
@@ -63,6 +63,14 @@ pub(super) struct Known {
     pub(super) least: f32,
 }
 
+impl Known {
+    /// Noise of a cell, or what galaxies differ from usual ones by: the larger one, with a smooth transition.
+    fn of_a_cell(self) -> f32 {
+        let squares = [self.noise, UNUSUAL * self.light].map(|noise| noise * noise);
+        CELL as f32 * squares[0].hypot(squares[1]).sqrt()
+    }
+}
+
 impl Near {
     pub(super) fn new(n: usize) -> Self {
         // The cells of a galaxy up to two pixels off the middle are on the stamp.
@@ -92,7 +100,7 @@ impl Near {
         centre: [f32; 2],
         known: Known,
     ) -> Option<Suspect> {
-        let noise = CELL as f32 * known.noise.max(LEAST_NOISE * known.light);
+        let noise = known.of_a_cell();
         if !known.noise.is_finite() || !known.light.is_finite() || noise <= 0.0 {
             return None;
         }
@@ -334,7 +342,9 @@ mod tests {
                 sum
             })
             .collect();
-        let noise = f64::from(CELL as f32 * known.noise.max(LEAST_NOISE * known.light));
+        let unusual = f64::from(UNUSUAL * known.light);
+        let noise = (f64::from(known.noise).powi(4) + unusual.powi(4)).powf(0.25);
+        let noise = CELL as f64 * noise;
         let light = f64::from(known.light).max(noise);
         let mirror = |cell: i32| if cell < 0 { -1 - cell } else { cell } as usize;
         // The inverse covariance times a vector, by the components.

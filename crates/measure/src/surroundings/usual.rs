@@ -22,9 +22,9 @@ pub(super) const HALF: usize = 11;
 /// Cells of a quadrant, in rows of [`HALF`], with room up to whole vectors.
 pub(super) const QUADRANT: usize = (HALF * HALF).next_multiple_of(16);
 /// Components of each parity: those of the largest variances. See docs/constants.md.
-pub(super) const COMPONENTS: usize = 12;
+pub(super) const COMPONENTS: usize = 16;
 /// Dimensions of the space in which they are looked for. See docs/constants.md.
-const DIMENSIONS: usize = 24;
+const DIMENSIONS: usize = 32;
 /// The parities along x and y: whether odd.
 pub(super) const PARITIES: [[bool; 2]; 4] =
     [[false, false], [true, true], [true, false], [false, true]];
@@ -46,8 +46,10 @@ const ELLIPTICITY: f64 = 0.9;
 const DISPLACED: f64 = 0.55;
 /// Smallest and largest σ of the PSF. See docs/constants.md.
 const PSFS: [f64; 2] = [1.0, 2.4];
+/// Range of the share of a galaxy's light that has the profile of a single Gaussian; below 0 it is none. See docs/constants.md.
+const SINGLE: [f64; 2] = [-0.5, 1.0];
 /// σ of the concentric Gaussians of a galaxy in units of its scale. See docs/constants.md.
-const WIDTHS: [f64; 4] = [0.35, 0.75, 1.5, 2.8];
+const WIDTHS: [f64; 5] = [0.35, 0.75, 1.5, 2.8, 1.0];
 /// Cells from the centre to an edge of the square whose sum is the galaxy's light. See docs/constants.md.
 const INNER: usize = contrast::INNER as usize / CELL;
 /// Seed of the ensemble.
@@ -131,6 +133,7 @@ fn ensemble(half: usize) -> Vec<Folded> {
             ellipticity: ELLIPTICITY * within([0.0, 1.0]).sqrt(),
             angle: within([0.0, PI]),
             bulge: within([0.0, 1.0]),
+            single: within(SINGLE).max(0.0),
             place: [(); 2].map(|()| within([-DISPLACED, DISPLACED])),
             psf: within(PSFS.map(f64::ln)).exp(),
         };
@@ -150,6 +153,7 @@ struct Galaxy {
     ellipticity: f64,
     angle: f64,
     bulge: f64,
+    single: f64,
     place: [f64; 2],
     psf: f64,
 }
@@ -160,7 +164,14 @@ impl Galaxy {
         let along = 2 * half;
         let mut cells = vec![0.0; along * along];
         let bulge = self.bulge;
-        let lights = [0.5 * bulge, 0.5, 0.4 * (1.0 - 0.5 * bulge), 0.12];
+        let core = 1.0 - self.single;
+        let lights = [
+            core * 0.5 * bulge,
+            core * 0.5,
+            core * 0.4 * (1.0 - 0.5 * bulge),
+            core * 0.12,
+            self.single,
+        ];
         let stretch = (1.0 + self.ellipticity) / (1.0 - self.ellipticity);
         let (sin, cos) = self.angle.sin_cos();
         for (light, width) in lights.into_iter().zip(WIDTHS) {
@@ -418,6 +429,7 @@ mod tests {
             ellipticity,
             angle,
             bulge: 0.4,
+            single: 0.0,
             place,
             psf: 1.5,
         }
@@ -498,9 +510,10 @@ mod tests {
         let mut most = 0.0f64;
         for ellipticity in [0.0, 0.5, 0.7] {
             for angle in [0.2, 1.0, 2.5] {
-                most = most.max(left(
-                    &galaxy(2.0, ellipticity, angle, [0.3, -0.4]).folded(HALF),
-                ));
+                for single in [0.0, 1.0] {
+                    let galaxy = galaxy(2.0, ellipticity, angle, [0.3, -0.4]);
+                    most = most.max(left(&Galaxy { single, ..galaxy }.folded(HALF)));
+                }
             }
         }
         let (first, second) = (
