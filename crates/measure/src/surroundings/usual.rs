@@ -461,6 +461,26 @@ mod tests {
     }
 
     #[test]
+    fn a_single_gaussian_is_as_broad_as_its_scale() {
+        let galaxy = Galaxy {
+            single: 1.0,
+            ..galaxy(3.0, 0.3, 0.6, [0.0; 2])
+        };
+        let mut sums = [0.0; 2];
+        for (at, light) in galaxy.cells(HALF).iter().enumerate() {
+            let middle = |cell: usize| CELL as f64 * (cell as f64 + 0.5 - HALF as f64);
+            let (x, y) = (middle(at % (2 * HALF)), middle(at / (2 * HALF)));
+            sums[0] += light;
+            sums[1] += (x * x + y * y) * light;
+        }
+        let stretch: f64 = 1.3 / 0.7;
+        let expected = 9.0 * (stretch + 1.0 / stretch) + 2.0 * 1.5 * 1.5;
+        // Sheppard: the middle of a cell instead of its pixels adds 2 (4 − 1)/12 px². A tail of 10⁻³ is beyond the cells.
+        let found = sums[1] / sums[0] - 0.5;
+        assert!((found / expected - 1.0).abs() < 0.01, "{found} {expected}");
+    }
+
+    #[test]
     fn components_are_at_right_angles_and_the_same_under_exchanged_axes() {
         let usual = Usual::of(HALF);
         for components in &usual.components {
