@@ -278,10 +278,12 @@ pub fn stages(
         rows: rows
             .into_iter()
             .map(|(stage, time)| {
+                // The rest is a difference, and may be less than its error.
+                let rate = if time > 0.0 { 1e6 / time } else { f64::NAN };
                 vec![
                     Cell::text(stage),
                     Cell::number(time, 1),
-                    Cell::number(1e6 / time, 0),
+                    Cell::number(rate, 0),
                 ]
             })
             .collect(),
