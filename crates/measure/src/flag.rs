@@ -22,7 +22,7 @@ pub enum Flag {
     NoShear = 32,
     /// The response by which the ellipticities were to be divided is not positive.
     NoResponse = 64,
-    /// Another galaxy is so near that its light cannot be told from this one's.
+    /// Another galaxy is so near that its light cannot be told from this one's, or the galaxy's own shape looks like that.
     Neighbour = 128,
 }
 

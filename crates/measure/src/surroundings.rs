@@ -1,9 +1,9 @@
 //! What a linear measurement looks at before it measures: where the galaxy is, and whether there is another.
 //!
-//! Galaxies look nearly the same turned by 180 degrees, and neighbours do not. If a place is brighter than its opposite
-//! by more than noise explains, there is a neighbour: a profile is fitted to the difference of the two sides and
-//! subtracted. No pixels are copied, because copies repeat noise. Nearer to the galaxy, the stamp is compared with usual
-//! galaxies. A neighbour that is too near or too bright flags the galaxy.
+//! Galaxies look nearly the same turned by 180 degrees, and neighbours do not. If a place far from the galaxy is brighter than
+//! its opposite by more than noise explains, there is a neighbour: a profile is fitted to the difference of the two sides and
+//! subtracted. No pixels are copied, because copies repeat noise. Nearer to the galaxy, where lopsided galaxies differ from their
+//! own opposites, the stamp is compared with usual galaxies. A neighbour that is too near or too bright flags the galaxy.
 
 mod centre;
 mod contrast;
@@ -62,7 +62,7 @@ impl Surroundings {
     }
 
     /// Looks for neighbours of a galaxy centred at `centre`, in noise of level `noise` on large scales. True
-    /// where there are some, and the stamp without them is in `self.filled`.
+    /// where some were subtracted; the stamp without them is in `self.filled`.
     ///
     /// # Errors
     /// Where one is too near, or too bright.
@@ -75,21 +75,14 @@ impl Surroundings {
         let centre = refined(stamp, self.n, centre);
         // Pixel p is opposite to `turn − p`.
         let turn = turn(centre, self.n);
-        let square = (SIGNIFICANT * noise).powi(2);
-        self.contrasts
-            .compare_smoothed(stamp, turn, |light, excess, pixels| {
-                excess > BRIGHT * light && excess * excess > square * pixels
-            });
+        self.contrasts.compare_smoothed(stamp, turn, differs(noise));
         let hits = &mut self.contrasts.blocks;
-        if hits.is_empty() {
-            return blended(&mut self.near, stamp, centre, self.contrasts.light, noise)
-                .map(|()| false);
-        }
         hits.sort_unstable_by(|a, b| b.excess.total_cmp(&a.excess));
-        self.filled.copy_from_slice(stamp);
+        // Light of the brightest neighbour that was subtracted.
         let mut most: Option<f32> = None;
         while let Some(&brightest) = hits.first() {
-            let ([x, y], peak) = self.profile.place(&self.filled, turn, brightest.place);
+            let seen = if most.is_some() { &self.filled } else { stamp };
+            let ([x, y], peak) = self.profile.place(seen, turn, brightest.place);
             let distance = x.hypot(y);
             if (COMPARED_TO..TOO_NEAR).contains(&distance) {
                 return Err(Flag::Neighbour);
@@ -97,24 +90,38 @@ impl Surroundings {
             let side = [x / distance, y / distance];
             let from = FITTED_FROM * distance;
             let along = |place: [f32; 2]| place[0] * side[0] + place[1] * side[1];
-            // Nearer than that, the comparison with usual galaxies tells a neighbour from the galaxy's own shape.
+            // Below 14 px, the comparison with usual galaxies tells a neighbour from the galaxy's own shape.
             if distance >= TOO_NEAR {
+                if most.is_none() {
+                    self.filled.copy_from_slice(stamp);
+                }
                 let known = profile::Known { peak, noise };
                 let light = self
                     .profile
                     .subtract(&mut self.filled, turn, [x, y], from, known);
-                most = Some(most.map_or(light, |most| most.max(light)));
+                most = Some(most.unwrap_or(0.0).max(light));
             }
             // The brightest one is done wherever its light was found.
             hits.remove(0);
             hits.retain(|hit| along(hit.place) <= from);
         }
+        let Some(most) = most else {
+            let light = self.contrasts.light;
+            return blended(&mut self.near, stamp, centre, light, noise).map(|()| false);
+        };
         let light = self.contrasts.inner(&self.filled, turn);
-        if most.is_some_and(|most| most > TOO_BRIGHT * light) {
+        if most > TOO_BRIGHT * light {
             return Err(Flag::Neighbour);
         }
-        blended(&mut self.near, &self.filled, centre, light, noise).map(|()| most.is_some())
+        blended(&mut self.near, &self.filled, centre, light, noise).map(|()| true)
     }
+}
+
+/// Whether a place differs from its opposite by more than noise explains: by the galaxy's light, the excess and the number of
+/// pixels.
+fn differs(noise: f32) -> impl Fn(f32, f32, f32) -> bool {
+    let square = (SIGNIFICANT * noise).powi(2);
+    move |light, excess, pixels| excess > BRIGHT * light && excess * excess > square * pixels
 }
 
 /// # Errors
@@ -221,11 +228,8 @@ mod tests {
         let noise = 0.5;
         assert_eq!(look.clear(&stamp, [0.0; 2], noise), Ok(false));
         // Opposite places differ all the same.
-        let square = (SIGNIFICANT * noise).powi(2);
         look.contrasts
-            .compare_smoothed(&stamp, turn([0.0; 2], N), |light, excess, pixels| {
-                excess > BRIGHT * light && excess * excess > square * pixels
-            });
+            .compare_smoothed(&stamp, turn([0.0; 2], N), differs(noise));
         assert!(!look.contrasts.blocks.is_empty());
     }
 

@@ -273,25 +273,22 @@ impl CutWorker for LinearWorker {
         let plan = Arc::clone(&self.plan);
         let sigma = noise as f32;
         let found = centre(cut, plan.spectral.stamp_size());
+        let surroundings = self.surroundings.as_mut();
+        let cleared = surroundings.map_or(Ok(false), |surroundings| {
+            surroundings.clear(cut, found, self.grain * sigma)
+        });
         let whole = cut;
-        let mut cut = cut;
-        let mut neighbour = None;
-        if let Some(surroundings) = &mut self.surroundings {
-            match surroundings.clear(cut, found, self.grain * sigma) {
-                Ok(true) => cut = &surroundings.filled,
-                Ok(false) => {}
-                Err(flag) => neighbour = Some(flag),
-            }
-        }
+        let cut = match &self.surroundings {
+            Some(surroundings) if cleared == Ok(true) => &surroundings.filled,
+            _ => cut,
+        };
         let (buffers, lags) = (&mut self.buffers, &mut self.lags);
         plan.spectral.place_window(followed(found), buffers);
         plan.spectral
             .autocorrelate(&self.psf, cut, sigma, buffers, lags);
         let softening = self.added * sigma * sigma;
-        let shape = match neighbour {
-            Some(flag) => Err(flag),
-            None => plan.moments.measure(&lags.acf, softening, &mut self.values),
-        };
+        let shape =
+            cleared.and_then(|_| plan.moments.measure(&lags.acf, softening, &mut self.values));
         self.shape = shape.as_ref().ok().copied();
         let mut response = None;
         let mut sheared_noise = None;

@@ -23,7 +23,7 @@ const ROW: usize = (ALONG + 2 * MARGIN).next_multiple_of(16);
 /// Distances in pixels of the middle of a neighbour's cell from the corner of pixels that is nearest to the galaxy's
 /// centre: the least and the largest. See docs/constants.md.
 const DISTANCES: [f32; 2] = [4.0, 15.0];
-/// What galaxies differ from usual ones by, as noise of a pixel in units of the galaxy's light. See docs/constants.md.
+/// Difference between a galaxy and usual ones, as noise of a pixel in units of the galaxy's light. See docs/constants.md.
 const UNUSUAL: f32 = 0.0014;
 /// Least share of a neighbour's square that usual galaxies leave. See docs/constants.md.
 const LEFT: f32 = 1e-3;
@@ -64,7 +64,7 @@ pub(super) struct Known {
 }
 
 impl Known {
-    /// Noise of a cell, or what galaxies differ from usual ones by: the larger one, with a smooth transition.
+    /// Noise of a cell, or the difference between a galaxy and usual ones: the larger one, with a smooth transition.
     fn of_a_cell(self) -> f32 {
         let squares = [self.noise, UNUSUAL * self.light].map(|noise| noise * noise);
         CELL as f32 * squares[0].hypot(squares[1]).sqrt()
