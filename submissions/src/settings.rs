@@ -291,7 +291,7 @@ partial! {
 }
 
 impl PartialShape {
-    /// What earlier versions did, which do not have these settings: no sheared versions, and neighbours are flagged.
+    /// Sets what earlier versions, without these settings, did: no sheared versions, and neighbours flag galaxies.
     pub(crate) fn as_before(&mut self) {
         self.sheared_step.get_or_insert(0.0);
         self.neighbours.get_or_insert(Neighbours::Flag);
@@ -467,7 +467,7 @@ pub enum BrightnessUnit {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Neighbours {
-    /// Those that overlap the galaxy flag it; others are subtracted.
+    /// Those that are near or much brighter flag the galaxy; others are subtracted.
     Flag,
     /// They are not looked for: all light counts as light of the galaxy.
     Keep,
