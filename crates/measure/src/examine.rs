@@ -209,7 +209,7 @@ impl Examination {
         let [a, b, c, d] = corners.map(|corner| corner.mean);
         let apart = 2.0 * edge as f64;
         let noise = |one: Block, other: Block| {
-            // A variance is NaN if pixels of the corner are missing.
+            // NaN if most of a corner is missing.
             let mean = match [one.variance, other.variance] {
                 [a, b] if b.is_nan() => a,
                 [a, b] if a.is_nan() => b,
@@ -236,10 +236,12 @@ impl Examination {
             flux: 0.0,
             core: [0.0; 2],
         };
+        // Of stamps without corners the sky is not known.
+        let sky = if corner.is_nan() { 0.0 } else { corner };
         for value in &mut self.pixels {
             // Missing pixels are as bright as the sky.
             *value = if value.is_finite() {
-                (f64::from(*value) - corner) as f32
+                (f64::from(*value) - sky) as f32
             } else {
                 0.0
             };
@@ -491,25 +493,45 @@ impl Examination {
     }
 }
 
-/// Mean, variance and pairs of a square block from (y, x) on; not numbers if a pixel is missing.
+/// Mean, variance and pairs of a square block from (y, x) on. A missing pixel counts as the mean of those that are present;
+/// if these are less than half, nothing is a number.
 fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Block {
-    let row = |y: usize| &pixels[(y0 + y) * n + x0..][..side];
-    let (count, middle) = ((side * side) as f64, (side as f64 - 1.0) / 2.0);
-    let [mut sum, mut square, mut along, mut across, mut spread] = [0.0; 5];
+    let mut all = [0.0; BLOCK * BLOCK];
+    let all = &mut all[..side * side];
+    for (y, out) in all.chunks_exact_mut(side).enumerate() {
+        let row = &pixels[(y0 + y) * n + x0..][..side];
+        out.iter_mut()
+            .zip(row)
+            .for_each(|(out, &pixel)| *out = f64::from(pixel));
+    }
+    let present = || all.iter().filter(|value| value.is_finite());
+    let count = present().count();
+    if 2 * count < all.len() {
+        return Block {
+            mean: f64::NAN,
+            variance: f64::NAN,
+            pairs: [f64::NAN; 3],
+        };
+    }
+    let mean = present().sum::<f64>() / count as f64;
+    for value in all.iter_mut().filter(|value| !value.is_finite()) {
+        *value = mean;
+    }
+    let row = |y: usize| &all[y * side..][..side];
+    let middle = (side as f64 - 1.0) / 2.0;
+    let [mut square, mut along, mut across, mut spread] = [0.0; 4];
     for y in 0..side {
         let dy = y as f64 - middle;
         spread += dy * dy * side as f64;
         for (x, value) in row(y).iter().enumerate() {
-            let value = f64::from(*value);
-            sum += value;
+            let value = value - mean;
             square += value * value;
             along += value * (x as f64 - middle);
             across += value * dy;
         }
     }
     let mut pairs = [0.0; 3];
-    let mut pair = |a: f32, b: f32| {
-        let (a, b) = (f64::from(a), f64::from(b));
+    let mut pair = |a: f64, b: f64| {
         pairs[0] += a * b;
         pairs[1] += a + b;
         pairs[2] += 1.0;
@@ -527,11 +549,10 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
             }
         }
     }
-    let plane = sum * sum / count + (along * along + across * across) / spread;
+    let plane = (along * along + across * across) / spread;
     Block {
-        mean: sum / count,
-        // NaN if pixels are missing.
-        variance: ((square - plane) / (count - 3.0)).clamp(0.0, f64::MAX),
+        mean,
+        variance: ((square - plane) / (count as f64 - 3.0)).clamp(0.0, f64::MAX),
         pairs,
     }
 }
@@ -563,6 +584,7 @@ mod tests {
     use ndarray::Array2;
 
     use super::*;
+    use crate::sky::Sky;
 
     const N: usize = 48;
 
@@ -605,24 +627,70 @@ mod tests {
     }
 
     #[test]
-    fn stamps_with_missing_pixels_in_all_corners_have_no_noise_to_tell() {
+    fn a_missing_pixel_changes_nothing_about_a_plane() {
+        let pixels = stamp(0.5, [0.02, -0.01], [0.0; 2]);
+        let mut pixels = pixels.into_raw_vec_and_offset().0;
+        let whole = block(&pixels, N, 8, (0, 0));
+        pixels[N + 1] = f32::NAN;
+        pixels[6 * N + 6] = f32::INFINITY;
+        let most = block(&pixels, N, 8, (0, 0));
+        assert!((most.mean - whole.mean).abs() < 1e-6, "{most:?} {whole:?}");
+        // Two of 64 pixels on the plane's mean: their share of its slope's square, 0.03.
+        assert!(most.variance < 1e-4, "{most:?}");
+        for pixel in pixels.iter_mut().take(5 * N) {
+            *pixel = f32::NAN;
+        }
+        let few = block(&pixels, N, 8, (0, 0));
+        assert!(few.mean.is_nan() && few.variance.is_nan());
+    }
+
+    /// Bright pixels in the noise of corners, of which one pixel or all are missing.
+    fn without_corners(all: bool) -> Examination {
         let mut examination = Examination::new(N, 8);
         for k in 0..8u8 {
-            let mut stamp = stamp(0.5, [0.02, 0.0], [0.1 * f32::from(k), 0.0]);
-            // Of two stamps only the corners are complete.
-            if k > 1 {
-                for (y, x) in [(1, 1), (1, 46), (46, 1), (46, 46)] {
-                    stamp[(y, x)] = f32::NAN;
+            let mut stamp = stamp(0.0, [0.0, 0.0], [0.1 * f32::from(k), 0.0]);
+            stamp[(5, 4)] += 10.0;
+            for ((y, x), value) in stamp.indexed_iter_mut() {
+                let away = |at: usize| at.min(N - 1 - at);
+                let missing = if all {
+                    away(x) < 8 && away(y) < 8
+                } else {
+                    away(x) == 1 && away(y) == 1
+                };
+                if missing {
+                    *value = f32::NAN;
                 }
             }
-            stamp[(5, 4)] += 10.0;
             examination.add(stamp.view()).unwrap();
         }
-        let (noise, error) = examination.noise();
-        // One bright pixel among the 64 of a corner, and its three neighbours in the mean: not 0, as a missing value would be.
-        assert!(noise > 0.1 && error.is_finite(), "{noise} {error}");
-        let known = |warning: &Warning| !warning.to_string().contains("inf");
-        assert!(examination.warnings().iter().all(known));
+        examination
+    }
+
+    #[test]
+    fn noise_is_that_of_the_pixels_that_corners_have() {
+        let (noise, error) = without_corners(false).noise();
+        // One pixel of 10 among the 63 of a corner, in the mean with three corners without noise: √(10² / 60 / 4).
+        assert!((noise - 0.645).abs() < 0.03, "{noise}");
+        assert!(error.is_finite());
+    }
+
+    #[test]
+    fn of_stamps_without_corners_all_but_noise_and_sky_is_told() {
+        let examination = without_corners(true);
+        assert!(examination.noise().0.is_nan());
+        let sky = Sky {
+            level: 0.1,
+            level_error: 0.01,
+            slope: [0.01, 0.0],
+            slope_error: 0.001,
+        };
+        let subtracted = examination.clone().without(Subtraction::Plane(sky));
+        for warning in [examination.warnings(), subtracted.warnings()].concat() {
+            let text = warning.to_string();
+            assert!(!text.contains("inf") && !text.contains("NaN"), "{text}");
+        }
+        assert!(examination.core().is_none() && examination.looks.len() < FEWEST);
+        assert!(examination.looks.iter().all(|look| look.flux > 100.0));
     }
 
     #[test]

@@ -17,7 +17,7 @@ pub(crate) use self::centre::{centre, followed};
 pub(crate) use self::contrast::{Contrasts, turn};
 pub(crate) use self::missing::Missing;
 use self::near::Near;
-use self::profile::Profile;
+use self::profile::{AROUND, Profile};
 use crate::flag::Flag;
 
 /// Least difference of opposite places that is a neighbour, in units of its noise. See
@@ -33,7 +33,8 @@ const BLENDED: f32 = 0.1;
 /// Share of a neighbour's distance from the centre at which the fit of its profile begins. See
 /// docs/constants.md.
 const FITTED_FROM: f32 = 0.3;
-/// Distance below which the comparison with usual galaxies alone finds neighbours. See docs/constants.md.
+/// Distance below which the comparison with usual galaxies alone finds neighbours, on stamps that it covers so far. See
+/// docs/constants.md.
 const COMPARED_TO: f32 = 14.0;
 /// Distance below which a neighbour cannot be removed. See docs/constants.md.
 const TOO_NEAR: f32 = 16.0;
@@ -47,16 +48,20 @@ pub(crate) struct Surroundings {
     pub(crate) filled: Vec<f32>,
     contrasts: Contrasts,
     near: Near,
+    /// Distance below which `near` alone finds neighbours.
+    compared_to: f32,
     profile: Profile,
 }
 
 impl Surroundings {
     pub(crate) fn new(n: usize) -> Self {
+        let near = Near::new(n);
         Surroundings {
             n,
             filled: vec![0.0; n * n],
             contrasts: Contrasts::new(n),
-            near: Near::new(n),
+            compared_to: COMPARED_TO.min(near.reach()),
+            near,
             profile: Profile::new(n),
         }
     }
@@ -84,25 +89,28 @@ impl Surroundings {
             let seen = if most.is_some() { &self.filled } else { stamp };
             let ([x, y], peak) = self.profile.place(seen, turn, brightest.place);
             let distance = x.hypot(y);
-            if (COMPARED_TO..TOO_NEAR).contains(&distance) {
+            // The brightest one is done wherever its light was found.
+            hits.remove(0);
+            if distance < self.compared_to {
+                // It is a neighbour or the galaxy's own shape, which the comparison with usual galaxies tells. Either hides
+                // nothing farther away.
+                hits.retain(|hit| (hit.place[0] - x).hypot(hit.place[1] - y) > AROUND);
+                continue;
+            }
+            if distance < TOO_NEAR {
                 return Err(Flag::Neighbour);
             }
             let side = [x / distance, y / distance];
             let from = FITTED_FROM * distance;
             let along = |place: [f32; 2]| place[0] * side[0] + place[1] * side[1];
-            // Below 14 px, the comparison with usual galaxies tells a neighbour from the galaxy's own shape.
-            if distance >= TOO_NEAR {
-                if most.is_none() {
-                    self.filled.copy_from_slice(stamp);
-                }
-                let known = profile::Known { peak, noise };
-                let light = self
-                    .profile
-                    .subtract(&mut self.filled, turn, [x, y], from, known);
-                most = Some(most.unwrap_or(0.0).max(light));
+            if most.is_none() {
+                self.filled.copy_from_slice(stamp);
             }
-            // The brightest one is done wherever its light was found.
-            hits.remove(0);
+            let known = profile::Known { peak, noise };
+            let light = self
+                .profile
+                .subtract(&mut self.filled, turn, [x, y], from, known);
+            most = Some(most.unwrap_or(0.0).max(light));
             hits.retain(|hit| along(hit.place) <= from);
         }
         let Some(most) = most else {
@@ -150,11 +158,18 @@ mod tests {
 
     const N: usize = 48;
 
-    fn blob(stamp: &mut [f32], x: f32, y: f32, light: f32) {
+    /// A Gaussian on a square stamp, (x, y) from its middle.
+    fn gaussian(stamp: &mut [f32], [x, y]: [f32; 2], width: f32, peak: f32) {
+        let n = stamp.len().isqrt();
+        let middle = 0.5 * (n - 1) as f32;
         for (at, value) in stamp.iter_mut().enumerate() {
-            let (dx, dy) = ((at % N) as f32 - 23.5 - x, (at / N) as f32 - 23.5 - y);
-            *value += light * (-(dx * dx + dy * dy) / 18.0).exp();
+            let (dx, dy) = ((at % n) as f32 - middle - x, (at / n) as f32 - middle - y);
+            *value += peak * (-(dx * dx + dy * dy) / (2.0 * width * width)).exp();
         }
+    }
+
+    fn blob(stamp: &mut [f32], x: f32, y: f32, light: f32) {
+        gaussian(stamp, [x, y], 3.0, light);
     }
 
     #[test]
@@ -215,22 +230,71 @@ mod tests {
         assert_eq!(look.clear(&stamp, [0.0; 2], 20.0), Ok(false));
     }
 
+    /// With a faint disc, 5.5 px off.
+    fn lopsided() -> Vec<f32> {
+        let mut stamp = vec![0.0; N * N];
+        blob(&mut stamp, 0.5, 0.0, 20.0);
+        gaussian(&mut stamp, [5.5, 0.0], 5.0, 2.0);
+        stamp
+    }
+
     #[test]
     fn a_lopsided_galaxy_is_no_pair() {
         let mut look = Surroundings::new(N);
-        let mut stamp = vec![0.0; N * N];
-        blob(&mut stamp, 0.5, 0.0, 20.0);
-        // A faint disc, 5 px off.
-        for (at, value) in stamp.iter_mut().enumerate() {
-            let (x, y) = ((at % N) as f32 - 29.0, (at / N) as f32 - 23.5);
-            *value += 2.0 * (-(x * x + y * y) / 50.0).exp();
-        }
+        let stamp = lopsided();
         let noise = 0.5;
         assert_eq!(look.clear(&stamp, [0.0; 2], noise), Ok(false));
         // Opposite places differ all the same.
         look.contrasts
             .compare_smoothed(&stamp, turn([0.0; 2], N), differs(noise));
         assert!(!look.contrasts.blocks.is_empty());
+    }
+
+    #[test]
+    fn a_lopsided_galaxy_hides_no_neighbours() {
+        let mut look = Surroundings::new(N);
+        for y in [0.0, 6.0, -10.0] {
+            let mut stamp = lopsided();
+            blob(&mut stamp, 19.5, y, 4.0);
+            assert_eq!(look.clear(&stamp, [0.0; 2], 0.5), Ok(true), "{y}");
+            let mut left = look.filled.iter().zip(lopsided()).map(|(a, b)| a - b);
+            // Of 4, with the disc's wing.
+            assert!(left.all(|left| left.abs() < 1.0), "{y}");
+        }
+    }
+
+    #[test]
+    fn neighbours_too_near_to_be_subtracted_are_told_if_they_are_faint() {
+        let mut look = Surroundings::new(N);
+        for (distance, expected) in [(14.8, Err(Flag::Neighbour)), (16.8, Ok(true))] {
+            let mut stamp = vec![0.0; N * N];
+            blob(&mut stamp, 0.0, 0.0, 20.0);
+            // Less light than the comparison with usual galaxies requires.
+            let (share, width) = (0.08, 2.0);
+            assert!(share < BLENDED && share > BRIGHT);
+            let peak = share * 20.0 * (3.0 / width as f32).powi(2);
+            let place = [-0.6 * distance, 0.8 * distance];
+            gaussian(&mut stamp, place, width, peak);
+            assert_eq!(look.clear(&stamp, [0.0; 2], 0.05), expected, "{distance}");
+        }
+    }
+
+    #[test]
+    fn neighbours_on_small_stamps_are_told() {
+        for n in [24, 25, 28, 31, 32] {
+            let mut look = Surroundings::new(n);
+            let mut stamp = vec![0.0; n * n];
+            gaussian(&mut stamp, [0.0; 2], 2.5, 20.0);
+            assert_eq!(look.clear(&stamp, [0.0; 2], 1.0), Ok(false), "{n}");
+            // Where the cells end, whose sums see half of it.
+            let edge = look.near.reach() + 1.0;
+            for place in [[edge, 0.0], [0.0, -edge], [-0.6 * edge, 0.8 * edge]] {
+                let mut pair = stamp.clone();
+                gaussian(&mut pair, place, 2.5, 10.0);
+                let found = look.clear(&pair, [0.0; 2], 1.0);
+                assert_eq!(found, Err(Flag::Neighbour), "{n} {place:?}");
+            }
+        }
     }
 
     #[test]

@@ -328,6 +328,15 @@ impl fmt::Display for Scale {
     }
 }
 
+/// A level in units of the noise, where there is noise and it is known.
+fn share_of_noise(level: f64, noise: f64, decimals: usize) -> String {
+    if noise > 0.0 {
+        format!(", or {:.decimals$} of the noise", level / noise)
+    } else {
+        String::new()
+    }
+}
+
 /// A level of noise to five digits, in whatever unit pixels have.
 fn level(sigma: f64) -> String {
     if sigma == 0.0 {
@@ -352,10 +361,10 @@ impl fmt::Display for Warning {
                 ..
             } => write!(
                 f,
-                "the stamps contain sky (found {} ± {}, or {:.3} of the noise; expected 0). It was subtracted from all stamps",
+                "the stamps contain sky (found {} ± {}{}; expected 0). It was subtracted from all stamps",
                 Shown(*level),
                 Shown(*error),
-                *level / *noise
+                share_of_noise(*level, *noise, 3)
             ),
             Warning::Sky {
                 level,
@@ -365,10 +374,10 @@ impl fmt::Display for Warning {
                 subtracted: false,
             } => write!(
                 f,
-                "the stamps contain sky (found {} ± {} in their corners, or {:.2} of the noise; expected 0). Its light within 8 px of a galaxy is {:.0} % of the galaxy's, which biases shears. Try: subtract the sky",
+                "the stamps contain sky (found {} ± {} in their corners{}; expected 0). Its light within 8 px of a galaxy is {:.0} % of the galaxy's, which biases shears. Try: subtract the sky",
                 Shown(*level),
                 Shown(*error),
-                *level / *noise,
+                share_of_noise(*level, *noise, 2),
                 100.0 * share
             ),
             Warning::Gradient {
@@ -376,18 +385,25 @@ impl fmt::Display for Warning {
                 error,
                 noise,
                 subtracted,
-            } => write!(
-                f,
-                "the sky has a gradient (found {:+.4} along x and {:+.4} along y, ± {:.4}, in units of the noise per pixel; expected 0){}",
-                slope[0] / noise,
-                slope[1] / noise,
-                error / noise,
-                if *subtracted {
-                    ". It was subtracted from all stamps"
+            } => {
+                let (unit, name) = if *noise > 0.0 {
+                    (*noise, "the noise")
                 } else {
-                    ", which biases shears. Try: subtract the sky"
-                }
-            ),
+                    (1.0, "the image")
+                };
+                write!(
+                    f,
+                    "the sky has a gradient (found {:+.4} along x and {:+.4} along y, ± {:.4}, in units of {name} per pixel; expected 0){}",
+                    slope[0] / unit,
+                    slope[1] / unit,
+                    error / unit,
+                    if *subtracted {
+                        ". It was subtracted from all stamps"
+                    } else {
+                        ", which biases shears. Try: subtract the sky"
+                    }
+                )
+            }
             Warning::OffCentre { offset, error } => write!(
                 f,
                 "the galaxies are off the centre of their stamps (found a median of {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected the middle). Try: cut the stamps around the galaxies",

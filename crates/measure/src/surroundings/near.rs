@@ -93,6 +93,11 @@ impl Near {
         }
     }
 
+    /// Distance from the middle, in pixels, to which the cells reach.
+    pub(super) fn reach(&self) -> f32 {
+        (CELL * self.usual.half) as f32
+    }
+
     /// The most significant neighbour of a galaxy centred at `centre`, (x, y) in pixels from the middle of the stamp.
     pub(super) fn suspect(
         &mut self,

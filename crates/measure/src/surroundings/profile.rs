@@ -34,7 +34,7 @@ const RIDGE: f64 = 1e-6;
 /// σ of the Gaussian weight for a neighbour's position. See docs/constants.md.
 const PLACED_BY: f32 = 3.0;
 /// Radius around a neighbour that counts for its position. See docs/constants.md.
-const AROUND: f32 = 9.0;
+pub(super) const AROUND: f32 = 9.0;
 /// Steps to a neighbour's position. See docs/constants.md.
 const STEPS: usize = 4;
 /// Longest step to a neighbour's position. See docs/constants.md.
