@@ -8,9 +8,9 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_measure::{
-    EXAMINED_PSFS, Examination, Flag, FunctionalPsf, ImageNoise, MeanShear, MeanShearError,
-    MeasureError, Measurement, Measurer, NoisePlan, NoiseSurvey, Pixel, PsfProfile, Psfs, ShearSum,
-    Subtraction, Survey, Warning, Worker, calibrate, examined_rows,
+    CommonProfile, EXAMINED_PSFS, Examination, Flag, FunctionalPsf, ImageNoise, MeanShear,
+    MeanShearError, MeasureError, Measurement, Measurer, NoisePlan, NoiseSurvey, Pixel, PsfProfile,
+    Psfs, ShearSum, Subtraction, Survey, Warning, Worker, calibrate, examined_rows,
 };
 use shearq_pipeline::engine;
 use shearq_pipeline::measure::{COLUMNS, Value, more_columns, stated_psf_noise};
@@ -143,7 +143,11 @@ pub(crate) fn measure<'py>(
         one_each("noise", levels.len(), count)?;
     }
     let survey = request.survey()?;
-    let galaxies = request.measure(py, &psfs, survey.as_ref(), threads(threads_asked), progress)?;
+    let known = Known {
+        survey: survey.as_ref(),
+        stars: request.stars_in_common(&psfs)?,
+    };
+    let galaxies = request.measure(py, &psfs, &known, threads(threads_asked), progress)?;
     let mut galaxies = [galaxies];
     calibrate(configuration, &mut galaxies);
     let subtraction = measurer.subtraction(survey.as_deref());
@@ -257,12 +261,26 @@ impl<'s> Request<'s> {
         Ok(survey)
     }
 
+    /// What noisy stars, one per galaxy, have in common, from some of them.
+    fn stars_in_common(&self, psfs: &AllPsfs<'_>) -> PyResult<Option<Arc<CommonProfile>>> {
+        let (AllPsfs::Stars(_), Some(mut survey)) = (psfs, self.measurer.star_survey()) else {
+            return Ok(None);
+        };
+        for at in examined_rows(1, self.dim.0) {
+            survey.add(&psfs.piece(at, at + 1)?, 0);
+            if survey.is_over() {
+                break;
+            }
+        }
+        Ok(survey.common())
+    }
+
     /// Measures all galaxies, without calibration.
     fn measure(
         &self,
         py: Python<'_>,
         psfs: &AllPsfs<'_>,
-        survey: Option<&Arc<Survey>>,
+        known: &Known<'_>,
         threads: usize,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<Vec<Measurement>> {
@@ -286,7 +304,7 @@ impl<'s> Request<'s> {
                     Ok(())
                 },
                 || self.measurer.worker(),
-                |worker, job: Job<'_, '_>| Ok(measure_job(worker, survey, &job)?),
+                |worker, job: Job<'_, '_>| Ok(measure_job(worker, known, &job)?),
                 |measured: Vec<Measurement>| {
                     watch.advance(measured.len())?;
                     galaxies.extend(measured);
@@ -386,31 +404,38 @@ impl<'s> Request<'s> {
     }
 }
 
+/// What is known of all galaxies before they are measured.
+struct Known<'a> {
+    survey: Option<&'a Arc<Survey>>,
+    stars: Option<Arc<CommonProfile>>,
+}
+
 fn measure_job(
     worker: &mut Worker,
-    survey: Option<&Arc<Survey>>,
+    known: &Known<'_>,
     job: &Job<'_, '_>,
 ) -> Result<Vec<Measurement>, MeasureError> {
     match &job.stamps {
-        Piece::Single(stamps) => each(worker, survey, stamps.view(), job),
-        Piece::Double(stamps) => each(worker, survey, stamps.view(), job),
-        Piece::Copied(stamps) => each(worker, survey, stamps.view(), job),
+        Piece::Single(stamps) => each(worker, known, stamps.view(), job),
+        Piece::Double(stamps) => each(worker, known, stamps.view(), job),
+        Piece::Copied(stamps) => each(worker, known, stamps.view(), job),
     }
 }
 
 fn each<T: Pixel>(
     worker: &mut Worker,
-    survey: Option<&Arc<Survey>>,
+    known: &Known<'_>,
     stamps: ArrayView3<'_, T>,
     job: &Job<'_, '_>,
 ) -> Result<Vec<Measurement>, MeasureError> {
     match job.noise {
         Noise::One(level) => {
-            let mut image = worker.image(ImageNoise::of(survey, level));
+            let noise = ImageNoise::of(known.survey, level);
+            let mut image = worker.image_with_stars(noise, known.stars.as_ref());
             image.measure_each(stamps, &job.psfs)
         }
         Noise::Each(levels) => {
-            let mut image = worker.image(ImageNoise::Unknown);
+            let mut image = worker.image_with_stars(ImageNoise::Unknown, known.stars.as_ref());
             image.measure_each_with_noise(stamps, &job.psfs, levels)
         }
     }

@@ -54,7 +54,10 @@ impl File {
         })
     }
 
+    /// What the file sets. Without `extends` it is to have all settings. Those that earlier versions did not have are as they
+    /// were then.
     pub(crate) fn settings(self) -> PartialConfiguration {
+        let complete = self.extends.is_none();
         let File {
             name: _,
             description: _,
@@ -65,9 +68,12 @@ impl File {
             noise,
             denoise,
             deconvolution,
-            shape,
+            mut shape,
             published: _,
         } = self;
+        if complete {
+            shape.as_before();
+        }
         PartialConfiguration {
             method,
             stamp,
@@ -84,7 +90,6 @@ impl<'de> Deserialize<'de> for Configuration {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         use serde::de::Error;
         let mut file = File::deserialize(deserializer)?;
-        file.shape.as_before();
         let (name, description) = (file.name.take(), file.description.take());
         let configuration = file
             .settings()

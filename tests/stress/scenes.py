@@ -70,6 +70,8 @@ def psf_of(case, random):
     if case.psf == "airy":
         return galsim.Airy(lam_over_diam=2.4, obscuration=0.3).shear(**PSF_SHAPE)
     fwhm = random.uniform(*case.fwhm) if isinstance(case.fwhm, tuple) else case.fwhm
+    if case.psf == "kolmogorov":
+        return galsim.Kolmogorov(fwhm=fwhm).shear(**PSF_SHAPE)
     return galsim.Moffat(beta=3, fwhm=fwhm).shear(**PSF_SHAPE)
 
 

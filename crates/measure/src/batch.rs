@@ -93,7 +93,9 @@ impl Measurer {
             Some(_) => None,
         };
         let mut worker = self.worker();
-        let mut image = worker.image(ImageNoise::of(survey.as_ref(), noise));
+        let stars = self.stars(psfs);
+        let noise_of_image = ImageNoise::of(survey.as_ref(), noise);
+        let mut image = worker.image_with_stars(noise_of_image, stars.as_ref());
         let mut galaxies = [image.measure_each(stamps, psfs)?];
         let response = calibrate(self.configuration(), &mut galaxies);
         let mut examination = examine(stamps, self.subtraction(survey.as_deref()))?;

@@ -7,9 +7,12 @@ use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registr
 
 use crate::denoise::WaveletWiener;
 use crate::error::MeasureError;
+use crate::examine::examined_rows;
 use crate::method::MethodPlan;
 use crate::noise::{NoisePlan, Survey};
 use crate::plan::Plan;
+use crate::psf::{CommonProfile, StarSurvey};
+use crate::psfs::Psfs;
 use crate::sky::Subtraction;
 use crate::worker::Worker;
 
@@ -98,6 +101,26 @@ impl Measurer {
     /// What is subtracted from stamps of an image with this survey.
     pub fn subtraction(&self, survey: Option<&Survey>) -> Subtraction {
         self.plan.subtraction(survey)
+    }
+
+    /// A survey of the stars of an image with one per galaxy; `None` if the configuration uses them as they are.
+    pub fn star_survey(&self) -> Option<StarSurvey> {
+        let configuration = self.configuration();
+        configuration.linear()?;
+        Some(StarSurvey::new(configuration.psf_cut(), self.full()))
+    }
+
+    /// What noisy stars, one per galaxy, have in common, from [`examined_rows`] of them. `None` if there are no noisy stars,
+    /// or too few, or the configuration uses them as they are.
+    pub fn stars(&self, psfs: &Psfs<'_>) -> Option<Arc<CommonProfile>> {
+        let mut survey = self.star_survey()?;
+        for at in examined_rows(1, psfs.count()?) {
+            survey.add(psfs, at);
+            if survey.is_over() {
+                break;
+            }
+        }
+        survey.common()
     }
 
     /// Pixels a side of the full stamps.

@@ -79,7 +79,7 @@ pub use ndarray;
 pub use noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
 pub use observables::{Coupling, Observables};
 pub use pixel::Pixel;
-pub use psf::{Star, average_stars, star, star_psf};
+pub use psf::{CommonProfile, Star, StarSurvey, average_stars, star, star_psf};
 pub use psfs::{Psfs, StarPixels};
 pub use selection::{Cut, Quantity, Selected, Selection, SelectionError};
 pub use shearq_quantities::{Distortion, FunctionalPsf, PsfProfile, Shear};

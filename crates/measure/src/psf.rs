@@ -2,6 +2,7 @@
 
 mod average;
 pub(crate) mod breadth;
+mod common;
 mod effect;
 pub(crate) mod examine;
 mod halfway;
@@ -11,5 +12,6 @@ mod star;
 mod sums;
 
 pub use average::average_stars;
+pub use common::{CommonProfile, StarSurvey};
 pub(crate) use star::cut_start;
 pub use star::{Star, star, star_psf};

@@ -19,7 +19,7 @@ use crate::method::{AdaptedSettings, CutWorker};
 use crate::noise::{StampNoise, Survey};
 use crate::pixel::{self, Pixel};
 use crate::plan::Plan;
-use crate::psf::cut_start;
+use crate::psf::{CommonProfile, cut_start};
 use crate::psfs::Psfs;
 use crate::sky::{Cells, Subtraction};
 use crate::surroundings::Missing;
@@ -136,6 +136,17 @@ impl Worker {
     /// Noise of a survey is treated as white if its correlation is not significant. Without a survey, noise is white, and
     /// the window is the configuration's own. The same survey as before costs nothing.
     pub fn image(&mut self, noise: ImageNoise<'_>) -> ImageWorker<'_> {
+        self.image_with_stars(noise, None)
+    }
+
+    /// The same for an image whose noisy stars, one per galaxy, have this in common: [`Measurer::stars`](crate::Measurer::stars)
+    /// or [`StarSurvey::common`](crate::StarSurvey::common).
+    pub fn image_with_stars(
+        &mut self,
+        noise: ImageNoise<'_>,
+        stars: Option<&Arc<CommonProfile>>,
+    ) -> ImageWorker<'_> {
+        self.method.set_stars(stars);
         let survey = noise.survey();
         self.subtraction = self.plan.subtraction(survey.map(Arc::as_ref));
         if self.survey.as_ref() != survey {

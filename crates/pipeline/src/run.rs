@@ -220,6 +220,7 @@ fn heads(
             noise: Some(NOISE_SIGMA),
             stated_noise: None,
             survey,
+            stars: None,
             warnings: warnings.into_iter().collect(),
             run_warnings: Vec::new(),
             prints: BTreeMap::new(),

@@ -16,6 +16,7 @@ use super::window;
 use crate::error::MeasureError;
 use crate::extent::Moments;
 use crate::noise::StampNoise;
+use crate::psf::CommonProfile;
 use crate::psf::breadth;
 use crate::psf::shrink::Shrinker;
 
@@ -136,6 +137,10 @@ impl CutWorker for FamilyWorker {
 
     fn set_extent(&mut self, extent: Option<f64>) {
         self.extent = extent;
+    }
+
+    fn set_stars(&mut self, common: Option<&Arc<CommonProfile>>) {
+        self.shrinker.set_common(common);
     }
 
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {

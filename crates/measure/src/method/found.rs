@@ -1,5 +1,7 @@
 //! The common interface of the methods.
 
+use std::sync::Arc;
+
 use ndarray::{Array2, ArrayView2};
 use shearq_quantities::Distortion;
 
@@ -8,6 +10,7 @@ use crate::error::MeasureError;
 use crate::flag::Flag;
 use crate::measurement::ResponseMatrix;
 use crate::noise::StampNoise;
+use crate::psf::CommonProfile;
 use crate::versions::VersionSettings;
 
 /// The plan, PSF and buffers of a method in one thread.
@@ -18,6 +21,9 @@ pub(crate) trait CutWorker: Send {
     /// Sets the mean square radius per axis of the galaxies that follow, with the PSF, in px², if it is known. Call
     /// `set_psf` after it.
     fn set_extent(&mut self, _extent: Option<f64>) {}
+
+    /// Sets what the noisy stars of the image have in common, if that is known. Call `set_psf` after it.
+    fn set_stars(&mut self, _common: Option<&Arc<CommonProfile>>) {}
 
     /// Sets the PSF.
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;

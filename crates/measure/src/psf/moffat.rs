@@ -102,6 +102,22 @@ impl Moffat {
         (at.values[0] > 0.0 && at.values.iter().all(|value| value.is_finite())).then_some(at)
     }
 
+    /// Its amplitude.
+    pub(super) fn amplitude(&self) -> f64 {
+        self.values[0]
+    }
+
+    /// The form s at (x, y) in pixels from the first.
+    pub(super) fn square(&self) -> impl Fn(f64, f64) -> f64 {
+        let [_, x0, y0, width, e1, e2, ..] = self.values;
+        let scale = (-2.0 * width).exp();
+        move |x, y| {
+            let (dx, dy) = (x - x0, y - y0);
+            // Not negative: ellipticities are below 0.9.
+            scale * ((1.0 - e1) * dx * dx + (1.0 + e1) * dy * dy - 2.0 * e2 * dx * dy)
+        }
+    }
+
     /// Its place (x, y) in pixels from the first.
     pub(super) fn place(&self) -> [f64; 2] {
         [self.values[1], self.values[2]]

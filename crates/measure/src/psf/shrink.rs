@@ -2,11 +2,14 @@
 //!
 //! What is left is expanded in Gauss–Hermite functions. Those of one order, which span the same space in any direction, are
 //! shrunk together: with Stein's factor 1 − (n − 2)σ²/Σc², or to nothing. A star of high S/N is left as it is, with a
-//! smooth transition.
+//! smooth transition. Many stars of an image show what they have in common beyond such profiles, which is added first.
+
+use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2};
 
 use super::breadth;
+use super::common::{CommonProfile, Sums};
 use super::moffat::Moffat;
 use super::star;
 use super::sums::sum_of_squares;
@@ -39,40 +42,35 @@ pub(crate) struct Shrinker {
     /// Functions of x and of y, a row per order.
     along: [Array2<f64>; 2],
     partial: Array2<f64>,
+    common: Option<Arc<CommonProfile>>,
+}
+
+/// A star's profile, the noise of a pixel, and the star's S/N.
+struct Fitted {
+    profile: Moffat,
+    sigma: f64,
+    snr: f64,
 }
 
 impl Shrinker {
+    /// Stars are noisy versions of profiles with this in common, or of any.
+    pub(crate) fn set_common(&mut self, common: Option<&Arc<CommonProfile>>) {
+        self.common = common.cloned();
+    }
+
     /// The star `psf` of sum one with as little noise as can be: as it is if it has hardly any.
     pub(crate) fn shrunk<'a>(&'a mut self, psf: ArrayView2<'a, f64>) -> ArrayView2<'a, f64> {
-        let n = psf.nrows();
-        if n != psf.ncols() || n < LEAST_SIDE {
-            return psf;
-        }
-        let power = sum_of_squares(psf);
-        // Hardly ever below the noise's, and quick.
-        let least = power.sqrt() / AS_IT_IS[1];
-        let square = mean_square(psf);
-        if square.is_nan() || square <= 0.25 * least * least {
-            return psf;
-        }
-        let sigma = self.noise(psf);
-        let snr = (power - psf.len() as f64 * sigma * sigma).max(0.0).sqrt() / sigma;
-        if snr.is_nan() || snr >= AS_IT_IS[1] {
-            return psf;
-        }
-        let middle = (n as f64 - 1.0) / 2.0;
-        let place = star::place(psf).map(|off| middle + off);
-        let area = breadth::area(psf);
-        if !(area > 0.0 && area.is_finite()) {
-            return psf;
-        }
-        let Some(profile) = Moffat::fit(psf, place, area, sigma) else {
+        let Some(Fitted {
+            profile,
+            sigma,
+            snr,
+        }) = self.fit(psf)
+        else {
             return psf;
         };
-        if self.star.dim() != psf.dim() {
-            self.star = Array2::zeros(psf.dim());
+        if let Some(common) = &self.common {
+            common.add(&profile, self.star.view_mut());
         }
-        profile.draw(self.star.view_mut());
         self.add_significant(psf, &profile, sigma);
         let kept = kept(snr);
         let sum = self.star.sum();
@@ -83,6 +81,49 @@ impl Shrinker {
             *value = (1.0 - kept) * *value / sum + kept * own;
         });
         self.star.view()
+    }
+
+    /// Adds what the profile leaves of the star `psf` of sum one to sums over stars, if it has noise.
+    pub(super) fn survey(&mut self, psf: ArrayView2<'_, f64>, sums: &mut Sums) {
+        if let Some(Fitted { profile, sigma, .. }) = self.fit(psf) {
+            sums.add(psf, self.star.view(), &profile, sigma);
+        }
+    }
+
+    /// Draws the profile that fits a star; `None` if the star has hardly any noise, or there is no fit.
+    fn fit(&mut self, psf: ArrayView2<'_, f64>) -> Option<Fitted> {
+        let n = psf.nrows();
+        if n != psf.ncols() || n < LEAST_SIDE {
+            return None;
+        }
+        let power = sum_of_squares(psf);
+        // Hardly ever below the noise's, and quick.
+        let least = power.sqrt() / AS_IT_IS[1];
+        let square = mean_square(psf);
+        if square.is_nan() || square <= 0.25 * least * least {
+            return None;
+        }
+        let sigma = self.noise(psf);
+        let snr = (power - psf.len() as f64 * sigma * sigma).max(0.0).sqrt() / sigma;
+        if snr.is_nan() || snr >= AS_IT_IS[1] {
+            return None;
+        }
+        let middle = (n as f64 - 1.0) / 2.0;
+        let place = star::place(psf).map(|off| middle + off);
+        let area = breadth::area(psf);
+        if !(area > 0.0 && area.is_finite()) {
+            return None;
+        }
+        let profile = Moffat::fit(psf, place, area, sigma)?;
+        if self.star.dim() != psf.dim() {
+            self.star = Array2::zeros(psf.dim());
+        }
+        profile.draw(self.star.view_mut());
+        Some(Fitted {
+            profile,
+            sigma,
+            snr,
+        })
     }
 
     /// Adds what is significant of the difference between a star and its profile.
@@ -202,7 +243,7 @@ fn share(k: usize) -> f64 {
 }
 
 /// Stein's factor for `count` values of the sum of squares `square`, with noise `sigma` each.
-fn stein(square: f64, count: f64, sigma: f64) -> f64 {
+pub(super) fn stein(square: f64, count: f64, sigma: f64) -> f64 {
     if square > 0.0 {
         (1.0 - (count - 2.0) * sigma * sigma / square).max(0.0)
     } else {

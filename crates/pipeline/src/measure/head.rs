@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use shearq_files::FileError;
-use shearq_measure::{ImageNoise, Psfs, Survey, Warning};
+use shearq_measure::{CommonProfile, ImageNoise, ImageWorker, Psfs, Survey, Warning, Worker};
 
 use crate::data::mosaic::Mosaic;
 use crate::images::ImageId;
@@ -26,6 +26,8 @@ pub struct ImageHead {
     pub stated_noise: Option<f64>,
     /// Noise and galaxy sizes measured on the stamps, if the configuration requires them.
     pub survey: Option<Arc<Survey>>,
+    /// What the stars have in common, if there is a noisy star for each galaxy.
+    pub stars: Option<Arc<CommonProfile>>,
     /// Warnings about this image.
     pub warnings: Vec<Warning>,
     /// Warnings about all images of the run, which were examined on this image.
@@ -35,9 +37,10 @@ pub struct ImageHead {
 }
 
 impl ImageHead {
-    /// What is known about the noise of the image.
-    pub fn noise(&self) -> ImageNoise<'_> {
-        ImageNoise::of(self.survey.as_ref(), self.noise)
+    /// Prepares a worker for the galaxies of the image.
+    pub fn prepare<'w>(&self, worker: &'w mut Worker) -> ImageWorker<'w> {
+        let noise = ImageNoise::of(self.survey.as_ref(), self.noise);
+        worker.image_with_stars(noise, self.stars.as_ref())
     }
 }
 

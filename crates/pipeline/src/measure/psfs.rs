@@ -1,11 +1,12 @@
 //! The PSFs of an image: one for all galaxies, or one per galaxy along the rows of stamps.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use ndarray::{ArcArray2, ArrayView2};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
-use shearq_measure::{FunctionalPsf, Psfs, Star, star};
+use shearq_measure::{CommonProfile, FunctionalPsf, Measurer, Psfs, Star, examined_rows, star};
 use shearq_submissions::{Configuration, PsfCut, PsfForm};
 
 use super::head::check_strip;
@@ -37,22 +38,56 @@ impl PsfSource {
         mosaic: Mosaic,
         iy: usize,
     ) -> Result<Psfs<'static>, PipelineError> {
-        let count = mosaic.of_row(iy);
         Ok(match self {
             PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
-            PsfSource::Stars { image, side } => {
-                let pixels = image.read_rows(*side)?;
-                let mut stars = Psfs::strip(pixels, mosaic.columns, *side)?;
-                // The last row may be shorter.
-                stars.truncate(count);
-                stars
-            }
+            PsfSource::Stars { image, side } => stars(image, *side, mosaic, iy)?,
             PsfSource::Functional(field) => {
                 let first = iy * mosaic.columns;
-                Psfs::functional(field[first..first + count].to_vec())
+                Psfs::functional(field[first..first + mosaic.of_row(iy)].to_vec())
             }
         })
     }
+
+    /// What stars of the image have in common, from some of its rows. Goes back to the first row.
+    ///
+    /// # Errors
+    /// If star stamps cannot be read.
+    pub(super) fn survey(
+        &mut self,
+        mosaic: Mosaic,
+        measurer: &Measurer,
+    ) -> Result<Option<Arc<CommonProfile>>, PipelineError> {
+        let (PsfSource::Stars { image, side }, Some(mut survey)) = (self, measurer.star_survey())
+        else {
+            return Ok(None);
+        };
+        let mut next = 0;
+        for iy in examined_rows(mosaic.columns, mosaic.rows()) {
+            image.skip_rows((iy - next) * *side);
+            next = iy + 1;
+            let row = stars(image, *side, mosaic, iy)?;
+            (0..mosaic.of_row(iy)).for_each(|k| survey.add(&row, k));
+            if survey.is_over() {
+                break;
+            }
+        }
+        image.rewind();
+        Ok(survey.common())
+    }
+}
+
+/// The star stamps of row `iy`, which is the next of the image.
+fn stars(
+    image: &mut ImageReader,
+    side: usize,
+    mosaic: Mosaic,
+    iy: usize,
+) -> Result<Psfs<'static>, PipelineError> {
+    let pixels = image.read_rows(side)?;
+    let mut stars = Psfs::strip(pixels, mosaic.columns, side)?;
+    // The last row may be shorter.
+    stars.truncate(mosaic.of_row(iy));
+    Ok(stars)
 }
 
 /// The PSFs of an image, and what is known about their file.

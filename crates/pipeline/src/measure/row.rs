@@ -45,7 +45,7 @@ pub fn measure_row(worker: &mut Worker, row: &StampRow) -> Result<MeasuredRow, P
     let stamps = strip(&row.pixels, columns, head.mosaic.stamp)?;
     // The last row may be shorter.
     let stamps = stamps.slice_axis(Axis(0), Slice::from(..count));
-    let galaxies = worker.image(head.noise()).measure_each(stamps, &row.psfs)?;
+    let galaxies = head.prepare(worker).measure_each(stamps, &row.psfs)?;
     Ok(MeasuredRow {
         head: Arc::clone(head),
         iy: row.iy,

@@ -81,6 +81,7 @@ impl ImageSource {
             noise: header_noise,
             stated_noise: header_noise.filter(|_| uses_header),
             survey: None,
+            stars: None,
             warnings,
             run_warnings: Vec::new(),
             prints: BTreeMap::new(),
@@ -103,18 +104,20 @@ impl ImageSource {
         Arc::make_mut(&mut self.head)
     }
 
-    /// Measures noise and galaxy sizes on the stamps, if the configuration of `measurer` requires it. If all stamps
-    /// have too many missing pixels, the galaxies are flagged: NOISESIG does not replace the measurement.
+    /// Measures noise and galaxy sizes on the stamps, if the configuration of `measurer` requires it, and looks at noisy stars
+    /// if there is one for each galaxy. If all stamps have too many missing pixels, the galaxies are flagged: NOISESIG does
+    /// not replace the measurement.
     ///
     /// # Errors
-    /// If stamps cannot be read, or have no border of noise.
+    /// If stamps or stars cannot be read, or stamps have no border of noise.
     pub fn survey(&mut self, data: &DataFolder, measurer: &Measurer) -> Result<(), PipelineError> {
+        let mosaic = self.head.mosaic;
+        self.head_mut().stars = self.psfs.survey(mosaic, measurer)?;
         let Some(plan) = measurer.noise_plan() else {
             return Ok(());
         };
         let id = self.head.id;
         let path = data.galaxies(id.set, id.image);
-        let mosaic = self.head.mosaic;
         let found = noise::survey(&mut self.image, &path, mosaic, plan)?;
         let head = self.head_mut();
         match &found {
