@@ -102,6 +102,8 @@ CASES += [
     mixed("star50-each", 5.0, star=50.0, star_of="galaxy", flagged=(0.0, 0.0)),
     mixed("kolm100-each", 2.0, psf="kolmogorov", star=100.0, star_of="galaxy", flagged=(0.0, 0.0)),
     mixed("kolm50-each", 5.0, psf="kolmogorov", star=50.0, star_of="galaxy", flagged=(0.0, 0.0)),
+    mixed("airy100-each", 2.0, psf="airy", star=100.0, star_of="galaxy", flagged=(0.0, 0.0)),
+    mixed("airy50-each", 5.0, psf="airy", star=50.0, star_of="galaxy", flagged=(0.0, 0.0)),
     mixed("star100-image", float("inf"), star=100.0, grid=16, images=22.0),
     mixed("sky+0.5", 2.0, sky=0.5),
     mixed("sky-0.5", 2.0, sky=-0.5),

@@ -275,6 +275,39 @@ mod tests {
     }
 
     #[test]
+    fn noisy_stars_one_each_share_what_they_have_in_common() {
+        let measurer = Measurer::named("48/linear/star", 48).unwrap();
+        let psf = FunctionalPsf::new(PsfProfile::Kolmogorov, 3.4, Shear::ZERO).unwrap();
+        let psf = psf.stamp(48).mapv(|v| v as f32);
+        let count = 80;
+        let sigma = psf.mapv(|v| v * v).sum().sqrt() / 100.0;
+        // Uniform noise: enough for a test of who gets what.
+        let mut state = 5;
+        let mut noise = || {
+            let uniform = crate::deconvolve::uniform(&mut state) as f32;
+            12f32.sqrt() * (uniform - 0.5)
+        };
+        let stars =
+            Array3::from_shape_fn((count, 48, 48), |(_, y, x)| psf[(y, x)] + sigma * noise());
+        let (stamps, psfs) = (stamps(count, 48), Psfs::stars(stars.view()));
+        let batch = measurer.batch(stamps.view(), &psfs, Some(0.5)).unwrap();
+        let common = measurer.stars(&psfs);
+        assert!(common.is_some());
+        let mut worker = measurer.worker();
+        let mut responses = |stars| {
+            let mut image = worker.image_with_stars(ImageNoise::Level(0.5), stars);
+            let found = image.measure_each(stamps.view(), &psfs).unwrap();
+            found.iter().map(|one| one.response).collect::<Vec<_>>()
+        };
+        let of_batch: Vec<_> = batch.galaxies.iter().map(|one| one.response).collect();
+        assert_eq!(responses(common.as_ref()), of_batch);
+        // The next image knows nothing of it.
+        assert_ne!(responses(None), of_batch);
+        let network = Measurer::named("23/raw/star", 48).unwrap();
+        assert_eq!(network.stars(&psfs), None);
+    }
+
+    #[test]
     fn what_cannot_be_measured_is_an_error_for_one_and_a_flag_for_one_of_many() {
         let measurer = Measurer::named("48/linear/star", 48).unwrap();
         let mut stamps = stamps(3, 48);

@@ -9,9 +9,12 @@ mod halfway;
 mod moffat;
 pub(crate) mod shrink;
 mod star;
+mod stein;
 mod sums;
+mod survey;
 
 pub use average::average_stars;
-pub use common::{CommonProfile, StarSurvey};
+pub use common::CommonProfile;
 pub(crate) use star::cut_start;
 pub use star::{Star, star, star_psf};
+pub use survey::StarSurvey;

@@ -550,7 +550,7 @@ pub(crate) fn advice(flag: Flag) -> &'static str {
             "check that the PSF has the pixel scale of the galaxies, and that there are galaxies"
         }
         Flag::Neighbour => {
-            "check sky gradients and that the stamps are centred on the galaxies, or use shape.neighbours = \"keep\""
+            "check sky gradients and that the stamps are centred on the galaxies. If each stamp has one galaxy, set shape.neighbours = \"keep\""
         }
     }
 }

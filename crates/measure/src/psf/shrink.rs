@@ -12,6 +12,7 @@ use super::breadth;
 use super::common::{CommonProfile, Sums};
 use super::moffat::Moffat;
 use super::star;
+use super::stein::stein;
 use super::sums::sum_of_squares;
 use shearq_quantities::statistics::{SCATTER, median};
 
@@ -240,15 +241,6 @@ fn share(k: usize) -> f64 {
     (1..=k)
         .map(|i| ((2 * i - 1) as f64 / (2 * i) as f64).sqrt())
         .product()
-}
-
-/// Stein's factor for `count` values of the sum of squares `square`, with noise `sigma` each.
-pub(super) fn stein(square: f64, count: f64, sigma: f64) -> f64 {
-    if square > 0.0 {
-        (1.0 - (count - 2.0) * sigma * sigma / square).max(0.0)
-    } else {
-        0.0
-    }
 }
 
 /// Share of a star of such an S/N that is used as it is.
