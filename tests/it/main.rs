@@ -29,6 +29,7 @@ mod killed;
 mod language;
 mod ledger;
 mod limits;
+mod noisy_stars;
 mod odd_files;
 mod orientation;
 mod own_images;
