@@ -270,9 +270,9 @@ mod tests {
             let mut stamp = vec![0.0; N * N];
             blob(&mut stamp, 0.0, 0.0, 20.0);
             // Less light than the comparison with usual galaxies requires.
-            let (share, width) = (0.08, 2.0);
+            let (share, width) = (0.08, 2.0f32);
             assert!(share < BLENDED && share > BRIGHT);
-            let peak = share * 20.0 * (3.0 / width as f32).powi(2);
+            let peak = share * 20.0 * (3.0 / width).powi(2);
             let place = [-0.6 * distance, 0.8 * distance];
             gaussian(&mut stamp, place, width, peak);
             assert_eq!(look.clear(&stamp, [0.0; 2], 0.05), expected, "{distance}");
