@@ -116,9 +116,6 @@ impl Measurer {
         let mut survey = self.star_survey()?;
         for at in examined_rows(1, psfs.count()?) {
             survey.add(psfs, at);
-            if survey.is_over() {
-                break;
-            }
         }
         survey.common()
     }

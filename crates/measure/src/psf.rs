@@ -12,6 +12,8 @@ mod star;
 mod stein;
 mod sums;
 mod survey;
+#[cfg(test)]
+mod test_stars;
 
 pub use average::average_stars;
 pub use common::CommonProfile;

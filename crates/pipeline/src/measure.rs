@@ -8,6 +8,7 @@ mod head;
 mod noise;
 mod psfs;
 mod row;
+mod some_rows;
 mod source;
 
 use std::path::Path;

@@ -306,39 +306,15 @@ fn hermite(functions: &mut Array2<f64>, at: f64, scale: f64) {
 mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
-    use rand_distr::{Distribution, StandardNormal};
     use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 
+    use super::super::test_stars::{self, noisy, power};
     use super::*;
 
     const MOFFAT: PsfProfile = PsfProfile::Moffat { beta: 3.0 };
 
     fn drawn(profile: PsfProfile, fwhm: f64, side: usize) -> Array2<f64> {
-        let psf = FunctionalPsf::new(profile, fwhm, Shear::new(0.06, -0.04));
-        let stamp = psf.unwrap().stamp(side);
-        let sum = stamp.sum();
-        stamp / sum
-    }
-
-    fn noisy(psf: &Array2<f64>, snr: f64, rng: &mut ChaCha8Rng) -> Array2<f64> {
-        let sigma = psf.iter().map(|v| v * v).sum::<f64>().sqrt() / snr;
-        let star = psf.mapv(|value| {
-            let noise: f64 = StandardNormal.sample(rng);
-            value + sigma * noise
-        });
-        let sum = star.sum();
-        star / sum
-    }
-
-    /// Power of the transform at wave vector (kx, ky).
-    fn power(psf: ArrayView2<'_, f64>, [kx, ky]: [f64; 2]) -> f64 {
-        let (mut re, mut im) = (0.0, 0.0);
-        for ((y, x), value) in psf.indexed_iter() {
-            let phase = kx * x as f64 + ky * y as f64;
-            re += value * phase.cos();
-            im += value * phase.sin();
-        }
-        (re * re + im * im) / psf.sum().powi(2)
+        test_stars::drawn(profile, fwhm, Shear::new(0.06, -0.04), side)
     }
 
     #[test]

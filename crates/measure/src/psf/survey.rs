@@ -34,9 +34,9 @@ impl StarSurvey {
     }
 
     /// Looks at the star of galaxy `k`. Stars without noise and stars that cannot be used are left out, as are formulas and PSFs
-    /// for all galaxies.
+    /// for all galaxies. Costs nothing once the survey is over.
     pub fn add(&mut self, psfs: &Psfs<'_>, k: usize) {
-        if !matches!(psfs, Psfs::Stars(_)) {
+        if !matches!(psfs, Psfs::Stars(_)) || self.is_over() {
             return;
         }
         self.looked_at += 1;
@@ -60,37 +60,28 @@ impl StarSurvey {
 
 #[cfg(test)]
 mod tests {
-    use ndarray::{Array2, Array3, ArrayView2, Axis};
+    use ndarray::{Array2, Array3, Axis};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
-    use rand_distr::{Distribution, StandardNormal};
-    use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
+    use shearq_quantities::{PsfProfile, Shear};
 
+    use super::super::test_stars::{drawn, noisy, power};
     use super::*;
 
     const N: usize = 48;
-
-    fn drawn(profile: PsfProfile, fwhm: f64, e1: f64) -> Array2<f64> {
-        let psf = FunctionalPsf::new(profile, fwhm, Shear::new(e1, -0.03));
-        let stamp = psf.unwrap().stamp(N);
-        let sum = stamp.sum();
-        stamp / sum
-    }
 
     /// Stars of different widths and ellipticities with an S/N, and the same without noise.
     fn stars(profile: PsfProfile, snr: f64, count: usize) -> (Array3<f64>, Vec<Array2<f64>>) {
         let mut rng = ChaCha8Rng::seed_from_u64(11);
         let true_ones: Vec<_> = (0..count)
-            .map(|k| drawn(profile, 2.8 + 0.25 * (k % 5) as f64, 0.04 * (k % 3) as f64))
+            .map(|k| {
+                let shear = Shear::new(0.04 * (k % 3) as f64, -0.03);
+                drawn(profile, 2.8 + 0.25 * (k % 5) as f64, shear, N)
+            })
             .collect();
         let mut stars = Array3::zeros((count, N, N));
         for (psf, mut star) in true_ones.iter().zip(stars.outer_iter_mut()) {
-            let sigma = psf.iter().map(|v| v * v).sum::<f64>().sqrt() / snr;
-            star.assign(psf);
-            star.mapv_inplace(|value| {
-                let noise: f64 = StandardNormal.sample(&mut rng);
-                value + sigma * noise
-            });
+            star.assign(&noisy(psf, snr, &mut rng));
         }
         (stars, true_ones)
     }
@@ -107,17 +98,6 @@ mod tests {
         survey
     }
 
-    /// Power at a wave of 0.5 along x, in units of the square of the light.
-    fn power(psf: ArrayView2<'_, f64>) -> f64 {
-        let (mut re, mut im) = (0.0, 0.0);
-        for ((_, x), value) in psf.indexed_iter() {
-            let (sin, cos) = (0.5 * x as f64).sin_cos();
-            re += value * cos;
-            im += value * sin;
-        }
-        (re * re + im * im) / psf.sum().powi(2)
-    }
-
     #[test]
     fn stars_share_the_wings_that_noise_hides() {
         for (profile, without) in [
@@ -130,11 +110,10 @@ mod tests {
             let mean = |common: Option<&Arc<CommonProfile>>| {
                 let mut shrinker = Shrinker::default();
                 shrinker.set_common(common);
+                let wave = [0.5, 0.0];
                 let pairs = noisy.outer_iter().zip(&true_ones);
                 let ratios = pairs.map(|(star, psf)| {
-                    let sum = star.sum();
-                    let star = &star / sum;
-                    power(shrinker.shrunk(star.view())) / power(psf.view()) - 1.0
+                    power(shrinker.shrunk(star), wave) / power(psf.view(), wave) - 1.0
                 });
                 ratios.sum::<f64>() / true_ones.len() as f64
             };

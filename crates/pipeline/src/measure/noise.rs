@@ -1,5 +1,6 @@
 //! Checks of the noise of an image before it is measured.
 
+use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -9,6 +10,7 @@ use shearq_measure::{MeasureError, Measurer, NoisePlan, NoiseSurvey, Survey, War
 use shearq_submissions::NoiseSource;
 
 use super::head::ImageHead;
+use super::some_rows;
 use crate::PipelineError;
 use crate::data::mosaic::Mosaic;
 
@@ -32,17 +34,14 @@ pub(super) fn survey(
 ) -> Result<Option<Arc<Survey>>, PipelineError> {
     let Mosaic { columns, stamp, .. } = mosaic;
     let mut look = |mut survey: NoiseSurvey| {
-        let mut next = 0;
-        for row in plan.rows(columns, mosaic.rows()) {
-            image.skip_rows((row - next) * stamp);
-            next = row + 1;
-            let pixels = image.read_rows(stamp)?;
+        let rows = plan.rows(columns, mosaic.rows());
+        some_rows::read(image, stamp, rows, |row, pixels| {
             let stamps = strip(&pixels, columns, stamp)?;
             for stamp in stamps.outer_iter().take(mosaic.of_row(row)) {
                 survey.add(stamp)?;
             }
-        }
-        image.rewind();
+            Ok(ControlFlow::Continue(()))
+        })?;
         Ok::<_, PipelineError>(survey)
     };
     let mut survey = look(plan.survey())?;

@@ -1,5 +1,6 @@
 //! The PSFs of an image: one for all galaxies, or one per galaxy along the rows of stamps.
 
+use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -10,6 +11,7 @@ use shearq_measure::{CommonProfile, FunctionalPsf, Measurer, Psfs, Star, examine
 use shearq_submissions::{Configuration, PsfCut, PsfForm};
 
 use super::head::check_strip;
+use super::some_rows;
 use crate::PipelineError;
 use crate::data::layout::{DataFolder, MAX_STAMP};
 use crate::data::mosaic::Mosaic;
@@ -40,7 +42,7 @@ impl PsfSource {
     ) -> Result<Psfs<'static>, PipelineError> {
         Ok(match self {
             PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
-            PsfSource::Stars { image, side } => stars(image, *side, mosaic, iy)?,
+            PsfSource::Stars { image, side } => stars(image.read_rows(*side)?, *side, mosaic, iy)?,
             PsfSource::Functional(field) => {
                 let first = iy * mosaic.columns;
                 Psfs::functional(field[first..first + mosaic.of_row(iy)].to_vec())
@@ -61,29 +63,27 @@ impl PsfSource {
         else {
             return Ok(None);
         };
-        let mut next = 0;
-        for iy in examined_rows(mosaic.columns, mosaic.rows()) {
-            image.skip_rows((iy - next) * *side);
-            next = iy + 1;
-            let row = stars(image, *side, mosaic, iy)?;
+        let rows = examined_rows(mosaic.columns, mosaic.rows());
+        some_rows::read(image, *side, rows, |iy, pixels| {
+            let row = stars(pixels, *side, mosaic, iy)?;
             (0..mosaic.of_row(iy)).for_each(|k| survey.add(&row, k));
-            if survey.is_over() {
-                break;
-            }
-        }
-        image.rewind();
+            Ok(if survey.is_over() {
+                ControlFlow::Break(())
+            } else {
+                ControlFlow::Continue(())
+            })
+        })?;
         Ok(survey.common())
     }
 }
 
-/// The star stamps of row `iy`, which is the next of the image.
+/// The star stamps of row `iy`.
 fn stars(
-    image: &mut ImageReader,
+    pixels: Vec<f32>,
     side: usize,
     mosaic: Mosaic,
     iy: usize,
 ) -> Result<Psfs<'static>, PipelineError> {
-    let pixels = image.read_rows(side)?;
     let mut stars = Psfs::strip(pixels, mosaic.columns, side)?;
     // The last row may be shorter.
     stars.truncate(mosaic.of_row(iy));
