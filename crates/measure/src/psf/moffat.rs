@@ -26,8 +26,6 @@ const STEPS: usize = 12;
 const SMALL: f64 = 1e-2;
 /// Pixels that are summed side by side. See docs/constants.md.
 const LANES: usize = 8;
-/// Sums of products for a step: of squares, and for each parameter with what is left and those up to it.
-const PRODUCTS: usize = 1 + PARAMETERS * (PARAMETERS + 3) / 2;
 /// Base of the power of a profile with κ < 0 at which it ends.
 const LEAST_BASE: f32 = 1e-6;
 
@@ -36,6 +34,25 @@ const LEAST_BASE: f32 = 1e-6;
 pub(super) struct Moffat {
     /// Amplitude; place (x, y) in pixels from the first; logarithm of the width of s = r²/w²; ellipticities; κ.
     values: [f64; PARAMETERS],
+}
+
+/// Sums of products over pixels in each lane, in units of the amplitude.
+#[derive(Clone, Copy)]
+struct Products {
+    /// Of what is left, squared.
+    square: [f32; LANES],
+    /// Of derivatives with what is left.
+    gradient: [[f32; LANES]; PARAMETERS],
+    /// Of derivatives with each other, up to the diagonal.
+    curvature: [[[f32; LANES]; PARAMETERS]; PARAMETERS],
+}
+
+impl Products {
+    const ZERO: Products = Products {
+        square: [0.0; LANES],
+        gradient: [[0.0; LANES]; PARAMETERS],
+        curvature: [[[0.0; LANES]; PARAMETERS]; PARAMETERS],
+    };
 }
 
 /// Sums for a step: of squares, and their derivatives.
@@ -154,7 +171,7 @@ impl Moffat {
             first.min(last)..last
         };
         let single = self.single();
-        let mut lanes = [[0.0; LANES]; PRODUCTS];
+        let mut products = Products::ZERO;
         let columns = range(middle[0], star.ncols());
         for y in range(middle[1], star.nrows()) {
             for x in columns.clone().step_by(LANES) {
@@ -163,25 +180,30 @@ impl Moffat {
                     values[lane] = (star[(y, x + lane)] / self.values[0]) as f32;
                     weights[lane] = 1.0;
                 }
-                add(&single, [x as f32, y as f32], &values, &weights, &mut lanes);
+                add(
+                    &single,
+                    [x as f32, y as f32],
+                    &values,
+                    &weights,
+                    &mut products,
+                );
             }
         }
-        let mut products = lanes.iter().map(|lanes| {
-            let sum: f64 = lanes.iter().map(|&value| f64::from(value)).sum();
+        let total = |lanes: [f32; LANES]| {
+            let sum: f64 = lanes.into_iter().map(f64::from).sum();
             sum * (self.values[0] / sigma).powi(2)
-        });
-        let mut next = || products.next().unwrap_or(0.0);
+        };
         let mut sums = Sums {
-            square: next(),
-            gradient: [0.0; PARAMETERS],
+            square: total(products.square),
+            gradient: products.gradient.map(total),
             curvature: [[0.0; PARAMETERS]; PARAMETERS],
         };
         // The derivative with the amplitude is in units of it.
         let unit = |i: usize| if i == 0 { 1.0 / self.values[0] } else { 1.0 };
         for i in 0..PARAMETERS {
-            sums.gradient[i] = next() * unit(i);
+            sums.gradient[i] *= unit(i);
             for j in 0..=i {
-                sums.curvature[i][j] = next() * unit(i) * unit(j);
+                sums.curvature[i][j] = total(products.curvature[i][j]) * unit(i) * unit(j);
                 sums.curvature[j][i] = sums.curvature[i][j];
             }
         }
@@ -221,7 +243,7 @@ fn add(
     at: [f32; 2],
     values: &[f32; LANES],
     weights: &[f32; LANES],
-    sums: &mut [[f32; LANES]; PRODUCTS],
+    sums: &mut Products,
 ) {
     let [_, x0, y0, scale, e1, e2, kappa, wing] = *single;
     let dy = at[1] - y0;
@@ -249,18 +271,16 @@ fn add(
         by[7][lane] = weight * tail;
         left[lane] = weight * (values[lane] - mean - wing * tail);
     }
-    let mut place = 0;
-    let mut take = |a: &[f32; LANES], b: &[f32; LANES]| {
+    let take = |sum: &mut [f32; LANES], a: &[f32; LANES], b: &[f32; LANES]| {
         for lane in 0..LANES {
-            sums[place][lane] += a[lane] * b[lane];
+            sum[lane] += a[lane] * b[lane];
         }
-        place += 1;
     };
-    take(&left, &left);
+    take(&mut sums.square, &left, &left);
     for i in 0..PARAMETERS {
-        take(&by[i], &left);
+        take(&mut sums.gradient[i], &by[i], &left);
         for j in 0..=i {
-            take(&by[i], &by[j]);
+            take(&mut sums.curvature[i][j], &by[i], &by[j]);
         }
     }
 }
