@@ -10,7 +10,7 @@ use pyo3::types::PyDict;
 use shearq_measure::{
     CommonProfile, EXAMINED_PSFS, Examination, Flag, FunctionalPsf, ImageNoise, MeanShear,
     MeanShearError, MeasureError, Measurement, Measurer, NoisePlan, NoiseSurvey, Pixel, PsfProfile,
-    Psfs, ShearSum, Subtraction, Survey, Warning, Worker, calibrate, examined_rows,
+    Psfs, ShearSum, StarSurvey, Subtraction, Survey, Warning, Worker, calibrate, examined_stamps,
 };
 use shearq_pipeline::engine;
 use shearq_pipeline::measure::{COLUMNS, Value, more_columns, stated_psf_noise};
@@ -250,7 +250,7 @@ impl<'s> Request<'s> {
 
     /// Adds the stamps that `plan` chooses to a survey.
     fn look(&self, plan: &NoisePlan, mut survey: NoiseSurvey) -> PyResult<NoiseSurvey> {
-        for at in plan.rows(1, self.dim.0) {
+        for at in plan.stamps(self.dim.0) {
             match self.stamps.piece(at, at + 1)? {
                 Piece::Single(one) => survey.add(one.index_axis(Axis(0), 0)),
                 Piece::Double(one) => survey.add(one.index_axis(Axis(0), 0)),
@@ -263,11 +263,15 @@ impl<'s> Request<'s> {
 
     /// What noisy stars, one per galaxy, have in common, from some of them.
     fn stars_in_common(&self, psfs: &AllPsfs<'_>) -> PyResult<Option<Arc<CommonProfile>>> {
-        let (AllPsfs::Stars(_), Some(mut survey)) = (psfs, self.measurer.star_survey()) else {
+        let (AllPsfs::Stars(_), Some(mut looker)) = (psfs, self.measurer.star_looker()) else {
             return Ok(None);
         };
-        for at in examined_rows(1, self.dim.0) {
-            survey.add(&psfs.piece(at, at + 1)?, 0);
+        let mut survey = StarSurvey::default();
+        for at in examined_stamps(self.dim.0) {
+            survey.add(&looker.look(&psfs.piece(at, at + 1)?, 0));
+            if survey.is_over() {
+                break;
+            }
         }
         Ok(survey.common())
     }
@@ -344,7 +348,7 @@ impl<'s> Request<'s> {
     /// Examines some of the stamps and PSFs.
     fn examine(&self, psfs: &AllPsfs<'_>, subtraction: Subtraction) -> PyResult<Examination> {
         let (count, side, _) = self.dim;
-        let chosen = examined_rows(1, count);
+        let chosen = examined_stamps(count);
         let mut examination = Examination::new(side, chosen.len()).without(subtraction);
         for at in chosen {
             match self.stamps.piece(at, at + 1)? {
@@ -380,7 +384,7 @@ impl<'s> Request<'s> {
             Noise::Each(levels) => levels,
         };
         let (count, side, _) = self.dim;
-        let chosen = examined_rows(1, count);
+        let chosen = examined_stamps(count);
         let mut positive: Vec<f64> = chosen.iter().map(|&at| levels[at]).collect();
         positive.retain(|level| *level > 0.0);
         let Some(median) = upper_median(&mut positive) else {

@@ -12,6 +12,7 @@ use shearq_submissions::Registry;
 use crate::{print, tell};
 use shearq_pipeline::data::mosaic::Mosaic;
 use shearq_pipeline::data::run::open_data;
+use shearq_pipeline::engine;
 use shearq_pipeline::images::ImageId;
 use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
@@ -74,6 +75,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     PictureFormat::of(out)?;
     let submission = Registry::embedded()?.get(submission)?.configuration;
     let data = open_data(data)?;
+    let threads = engine::pool(0)?;
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
@@ -82,7 +84,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             // Stamps of the other parity require other pixels of the PSFs.
             source = ImageSource::open(&data, image, measurer.configuration())?;
         }
-        source.survey(&data, &measurer)?;
+        source.survey(&data, &measurer, &threads)?;
         let Mosaic {
             columns,
             galaxies,

@@ -8,11 +8,14 @@ use shearq_measure::{ImageNoise, Measurer, Psfs, strip};
 
 use crate::support::{Small, fits_image, floats, pixels_of, succeed, text};
 
+/// Stamps in a row of the images: more stamps than are surveyed.
+const COLUMNS: usize = 34;
+
 #[test]
 fn files_and_arrays_with_a_noisy_star_per_galaxy_give_the_same() {
     let small = Small::new("2");
     let (star, side) = pixels_of(&small.at("data/set02/psf-001.fits"));
-    let n = 8;
+    let n = COLUMNS;
     std::fs::remove_file(small.at("data/set02/galaxies-002.fits")).unwrap();
     let sigma = star.iter().map(|v| v * v).sum::<f32>().sqrt() / 200.0;
     let mut rng = ChaCha8Rng::seed_from_u64(4);
@@ -31,6 +34,18 @@ fn files_and_arrays_with_a_noisy_star_per_galaxy_give_the_same() {
     let card = format!("STAMP   = {side:>20}");
     let file = fits_image(-32, &[n * side, n * side], &[&card], &floats(&mosaic));
     std::fs::write(small.at("data/set02/psf-001.fits"), file).unwrap();
+    // The stamps of a small image again and again.
+    let (pixels, width) = pixels_of(&small.at("data/set02/galaxies-001.fits"));
+    let full = width / 8;
+    let tiled: Vec<f32> = (0..n * full * n * full)
+        .map(|at| {
+            let (x, y) = (at % (n * full) % width, at / (n * full) % width);
+            pixels[y * width + x]
+        })
+        .collect();
+    let card = format!("STAMP   = {full:>20}");
+    let file = fits_image(-32, &[n * full, n * full], &[&card], &floats(&tiled));
+    std::fs::write(small.at("data/set02/galaxies-001.fits"), file).unwrap();
     let (data, out) = (small.at("data"), small.at("out"));
     succeed(&[
         "measure",
@@ -41,8 +56,6 @@ fn files_and_arrays_with_a_noisy_star_per_galaxy_give_the_same() {
         "--out",
         text(&out),
     ]);
-    let (pixels, width) = pixels_of(&small.at("data/set02/galaxies-001.fits"));
-    let full = width / n;
     let rows = |pixels: &[f32], side: usize| {
         let mut stamps = Vec::new();
         for row in pixels.chunks_exact(n * side * side) {
@@ -50,7 +63,7 @@ fn files_and_arrays_with_a_noisy_star_per_galaxy_give_the_same() {
         }
         Array3::from_shape_vec((n * n, side, side), stamps).unwrap()
     };
-    let (stamps, stars) = (rows(&pixels, full), rows(&mosaic, side));
+    let (stamps, stars) = (rows(&tiled, full), rows(&mosaic, side));
     let measurer = Measurer::named("48/linear/star", full).unwrap();
     let psfs = Psfs::stars(stars.view());
     let (survey, common) = (

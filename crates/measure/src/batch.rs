@@ -8,7 +8,7 @@ use shearq_submissions::{Configuration, NoiseSource};
 use crate::brightness::is_level;
 use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
-use crate::examine::{EXAMINED_PSFS, Examination, examined_rows};
+use crate::examine::{EXAMINED_PSFS, Examination, examined_stamps};
 use crate::flag::Flag;
 use crate::galaxy::Measurer;
 use crate::measurement::Measurement;
@@ -133,7 +133,7 @@ impl Measurer {
             return Err(MeasureError::Noise("not given".into()));
         }
         let look = |mut survey: NoiseSurvey| {
-            for at in plan.rows(1, count) {
+            for at in plan.stamps(count) {
                 survey.add(stamps.index_axis(Axis(0), at))?;
             }
             Ok::<_, MeasureError>(survey)
@@ -152,9 +152,9 @@ fn examine<T: Pixel>(
     subtraction: Subtraction,
 ) -> Result<Examination, MeasureError> {
     let (count, side, _) = stamps.dim();
-    let rows = examined_rows(1, count);
-    let mut examination = Examination::new(side, rows.len()).without(subtraction);
-    for at in rows {
+    let chosen = examined_stamps(count);
+    let mut examination = Examination::new(side, chosen.len()).without(subtraction);
+    for at in chosen {
         examination.add(stamps.index_axis(Axis(0), at))?;
     }
     Ok(examination)

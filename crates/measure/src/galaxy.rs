@@ -7,11 +7,11 @@ use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registr
 
 use crate::denoise::WaveletWiener;
 use crate::error::MeasureError;
-use crate::examine::examined_rows;
+use crate::examine::examined_stamps;
 use crate::method::MethodPlan;
 use crate::noise::{NoisePlan, Survey};
 use crate::plan::Plan;
-use crate::psf::{CommonProfile, StarSurvey};
+use crate::psf::{CommonProfile, StarLooker, StarSurvey};
 use crate::psfs::Psfs;
 use crate::sky::Subtraction;
 use crate::worker::Worker;
@@ -103,19 +103,24 @@ impl Measurer {
         self.plan.subtraction(survey)
     }
 
-    /// A survey of the stars of an image with one per galaxy; `None` if the configuration uses them as they are.
-    pub fn star_survey(&self) -> Option<StarSurvey> {
+    /// Looks at the stars of an image with one per galaxy, for a [`StarSurvey`]; `None` if the configuration uses stars as
+    /// they are.
+    pub fn star_looker(&self) -> Option<StarLooker> {
         let configuration = self.configuration();
         configuration.linear()?;
-        Some(StarSurvey::new(configuration.psf_cut(), self.full()))
+        Some(StarLooker::new(configuration.psf_cut(), self.full()))
     }
 
-    /// What noisy stars, one per galaxy, have in common, from [`examined_rows`] of them. `None` if there are no noisy stars,
+    /// What noisy stars, one per galaxy, have in common, from [`examined_stamps`]. `None` if there are no noisy stars,
     /// or too few, or the configuration uses them as they are.
     pub fn stars(&self, psfs: &Psfs<'_>) -> Option<Arc<CommonProfile>> {
-        let mut survey = self.star_survey()?;
-        for at in examined_rows(1, psfs.count()?) {
-            survey.add(psfs, at);
+        let mut looker = self.star_looker()?;
+        let mut survey = StarSurvey::default();
+        for at in examined_stamps(psfs.count()?) {
+            survey.add(&looker.look(psfs, at));
+            if survey.is_over() {
+                break;
+            }
         }
         survey.common()
     }

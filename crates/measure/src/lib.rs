@@ -69,7 +69,7 @@ pub use batch::{Batch, strip};
 pub use calibrate::calibrate;
 pub use deconvolve::{Descent, Stop};
 pub use error::MeasureError;
-pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
+pub use examine::{EXAMINED_PSFS, Examination, columns_of, examined_rows, examined_stamps};
 pub use flag::{Flag, Flags};
 pub use galaxy::Measurer;
 pub use mean_shear::{MeanShear, MeanShearError, ShearSum};
@@ -79,7 +79,9 @@ pub use ndarray;
 pub use noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
 pub use observables::{Coupling, Observables};
 pub use pixel::Pixel;
-pub use psf::{CommonProfile, Star, StarSurvey, average_stars, star, star_psf};
+pub use psf::{
+    CommonProfile, Star, StarLook, StarLooker, StarSurvey, average_stars, star, star_psf,
+};
 pub use psfs::{Psfs, StarPixels};
 pub use selection::{Cut, Quantity, Selected, Selection, SelectionError};
 pub use shearq_quantities::{Distortion, FunctionalPsf, PsfProfile, Shear};

@@ -19,4 +19,4 @@ pub use average::average_stars;
 pub use common::CommonProfile;
 pub(crate) use star::cut_start;
 pub use star::{Star, star, star_psf};
-pub use survey::StarSurvey;
+pub use survey::{StarLook, StarLooker, StarSurvey};

@@ -10,6 +10,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Mutex, PoisonError};
 
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
+use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use super::PipelineError;
 
@@ -47,7 +48,7 @@ pub struct Feeder<'a, I> {
     permits: &'a Receiver<()>,
     next: u64,
     /// Threads for work before items are handed over.
-    ahead: &'a rayon::ThreadPool,
+    ahead: &'a ThreadPool,
 }
 
 impl<I> Feeder<'_, I> {
@@ -59,6 +60,11 @@ impl<I> Feeder<'_, I> {
         }
         self.next += 1;
         self.items.send((self.next - 1, item)).is_ok()
+    }
+
+    /// Threads for work before items are handed over.
+    pub fn ahead(&self) -> &ThreadPool {
+        self.ahead
     }
 
     /// Maps values on several threads, in order, before items are handed over.
@@ -73,6 +79,14 @@ impl<I> Feeder<'_, I> {
 
 /// Result of an item; a panic is passed to the calling thread.
 type Done<O> = Result<Result<O, PipelineError>, Box<dyn Any + Send>>;
+
+/// A pool of `threads`, or of one per core for 0.
+///
+/// # Errors
+/// If threads cannot be started.
+pub fn pool(threads: usize) -> Result<ThreadPool, PipelineError> {
+    Ok(ThreadPoolBuilder::new().num_threads(threads).build()?)
+}
 
 /// Runs `read` on one thread, `work` on `threads` workers with one scratch each, and `write` on the calling thread in
 /// the order of reading.
@@ -93,8 +107,7 @@ where
     I: Send,
     O: Send,
 {
-    let threads_of = || rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-    let (pool, ahead) = (threads_of()?, threads_of()?);
+    let (pool, ahead) = (pool(threads)?, pool(threads)?);
     let capacity = IN_FLIGHT * threads;
     let (item_sender, item_receiver) = sync_channel::<(u64, I)>(capacity);
     let (result_sender, result_receiver) = sync_channel::<(u64, Done<O>)>(capacity);

@@ -136,7 +136,7 @@ impl<'a> Session<'a> {
                 return Err(FileError::new(path, message).into());
             }
             source.head_mut().prints = prints;
-            source.survey(self.data, measurer)?;
+            source.survey(self.data, measurer, feeder.ahead())?;
             if k == 0 {
                 source.check_correlation(self.data, measurer)?;
             }

@@ -24,34 +24,34 @@ pub struct CommonProfile {
     values: [f64; COUNT],
 }
 
-/// Sums over stars of the normal equations for the values at the radii. Only radii next to each other have products.
+/// Sums of the normal equations for the values at the radii. Only radii next to each other have products.
 #[derive(Debug, Clone)]
 pub(super) struct Sums {
-    pub(super) stars: usize,
     squares: [f64; COUNT],
     /// Products with the radius before.
     products: [f64; COUNT],
     right: [f64; COUNT],
 }
 
-impl Sums {
-    pub(super) fn new() -> Self {
+impl Default for Sums {
+    fn default() -> Self {
         Sums {
-            stars: 0,
             squares: [0.0; COUNT],
             products: [0.0; COUNT],
             right: [0.0; COUNT],
         }
     }
+}
 
-    /// Adds a star with noise `sigma`, and the profile that fits it, which is drawn in `model`.
-    pub(super) fn add(
-        &mut self,
+impl Sums {
+    /// Those of a star with noise `sigma`, and the profile that fits it, which is drawn in `model`.
+    pub(super) fn of(
         star: ArrayView2<'_, f64>,
         model: ArrayView2<'_, f64>,
         profile: &Moffat,
         sigma: f64,
-    ) {
+    ) -> Self {
+        let mut sums = Sums::default();
         let amplitude = profile.amplitude();
         let weight = (amplitude / sigma).powi(2);
         let square = profile.square();
@@ -59,13 +59,26 @@ impl Sums {
             let left = (value - model) / amplitude;
             let (at, far) = place(square(x as f64, y as f64).sqrt());
             let near = 1.0 - far;
-            self.squares[at] += weight * near * near;
-            self.squares[at + 1] += weight * far * far;
-            self.products[at + 1] += weight * near * far;
-            self.right[at] += weight * near * left;
-            self.right[at + 1] += weight * far * left;
+            sums.squares[at] += weight * near * near;
+            sums.squares[at + 1] += weight * far * far;
+            sums.products[at + 1] += weight * near * far;
+            sums.right[at] += weight * near * left;
+            sums.right[at + 1] += weight * far * left;
         }
-        self.stars += 1;
+        sums
+    }
+
+    /// Adds those of more stars.
+    pub(super) fn add(&mut self, more: &Sums) {
+        for (sums, more) in [
+            (&mut self.squares, &more.squares),
+            (&mut self.products, &more.products),
+            (&mut self.right, &more.right),
+        ] {
+            for (sum, more) in sums.iter_mut().zip(more) {
+                *sum += more;
+            }
+        }
     }
 
     /// The function that fits best, less what noise adds to it (Stein).
@@ -130,11 +143,11 @@ mod tests {
         // Any function that is linear between the radii is found again.
         let values = std::array::from_fn(|k| 0.01 * (k as f64).sin());
         let common = CommonProfile { values };
-        let (mut model, mut sums) = (Array2::zeros((N, N)), Sums::new());
+        let mut model = Array2::zeros((N, N));
         profile.draw(model.view_mut());
         let mut star = model.clone();
         common.add(&profile, star.view_mut());
-        sums.add(star.view(), model.view(), &profile, 1e-7);
+        let sums = Sums::of(star.view(), model.view(), &profile, 1e-7);
         let found = sums.common().unwrap();
         let reach = profile.square()(0.0, 0.0).sqrt() * FINE as f64;
         let seen = (reach as usize).min(COUNT - 1);

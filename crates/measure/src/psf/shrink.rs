@@ -84,11 +84,10 @@ impl Shrinker {
         self.star.view()
     }
 
-    /// Adds what the profile leaves of the star `psf` of sum one to sums over stars, if it has noise.
-    pub(super) fn survey(&mut self, psf: ArrayView2<'_, f64>, sums: &mut Sums) {
-        if let Some(Fitted { profile, sigma, .. }) = self.fit(psf) {
-            sums.add(psf, self.star.view(), &profile, sigma);
-        }
+    /// What the profile leaves of the star `psf` of sum one, if it has noise.
+    pub(super) fn left(&mut self, psf: ArrayView2<'_, f64>) -> Option<Sums> {
+        let Fitted { profile, sigma, .. } = self.fit(psf)?;
+        Some(Sums::of(psf, self.star.view(), &profile, sigma))
     }
 
     /// Draws the profile that fits a star; `None` if the star has hardly any noise, or there is no fit.

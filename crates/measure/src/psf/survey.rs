@@ -11,48 +11,64 @@ use crate::psfs::Psfs;
 /// Fewest noisy stars that tell what they have in common. See docs/constants.md.
 const FEWEST: usize = 30;
 
-/// Looks at stars of an image, one per galaxy, before galaxies are measured.
+/// Looks at stars of an image, one per galaxy: buffers for one thread.
 #[derive(Debug)]
-pub struct StarSurvey {
+pub struct StarLooker {
     cut: PsfCut,
     full: usize,
     shrinker: Shrinker,
+}
+
+/// What one star shows: nothing if it has no noise or cannot be used.
+#[derive(Debug)]
+pub struct StarLook(Option<Sums>);
+
+impl StarLooker {
+    /// For stars of which `cut` is used, and galaxies on stamps of `full` pixels a side.
+    pub(crate) fn new(cut: PsfCut, full: usize) -> Self {
+        StarLooker {
+            cut,
+            full,
+            shrinker: Shrinker::default(),
+        }
+    }
+
+    /// Looks at the star of galaxy `k`. Formulas and PSFs for all galaxies show nothing.
+    pub fn look(&mut self, psfs: &Psfs<'_>, k: usize) -> StarLook {
+        if !matches!(psfs, Psfs::Stars(_)) {
+            return StarLook(None);
+        }
+        let star = psfs.at(k, self.cut, self.full).ok();
+        StarLook(star.and_then(|star| self.shrinker.left(star.psf.view())))
+    }
+}
+
+/// What stars of an image show together, before galaxies are measured.
+#[derive(Debug, Default)]
+pub struct StarSurvey {
     looked_at: usize,
+    noisy: usize,
     sums: Sums,
 }
 
 impl StarSurvey {
-    /// For stars of which `cut` is used, and galaxies on stamps of `full` pixels a side.
-    pub(crate) fn new(cut: PsfCut, full: usize) -> Self {
-        StarSurvey {
-            cut,
-            full,
-            shrinker: Shrinker::default(),
-            looked_at: 0,
-            sums: Sums::new(),
-        }
-    }
-
-    /// Looks at the star of galaxy `k`. Stars without noise and stars that cannot be used are left out, as are formulas and PSFs
-    /// for all galaxies. Costs nothing once the survey is over.
-    pub fn add(&mut self, psfs: &Psfs<'_>, k: usize) {
-        if !matches!(psfs, Psfs::Stars(_)) || self.is_over() {
-            return;
-        }
+    /// Adds a star. Results depend on the order, but not on the threads that looked at the stars.
+    pub fn add(&mut self, StarLook(sums): &StarLook) {
         self.looked_at += 1;
-        if let Ok(star) = psfs.at(k, self.cut, self.full) {
-            self.shrinker.survey(star.psf.view(), &mut self.sums);
+        if let Some(sums) = sums {
+            self.noisy += 1;
+            self.sums.add(sums);
         }
     }
 
     /// Whether no more stars are of use: the first ones have no noise, and stars of an image all have noise or none has.
     pub fn is_over(&self) -> bool {
-        self.looked_at >= FEWEST && self.sums.stars == 0
+        self.looked_at >= FEWEST && self.noisy == 0
     }
 
     /// What the stars have in common; `None` if too few of them have noise.
     pub fn common(&self) -> Option<Arc<CommonProfile>> {
-        (self.sums.stars >= FEWEST)
+        (self.noisy >= FEWEST)
             .then(|| self.sums.common().map(Arc::new))
             .flatten()
     }
@@ -69,6 +85,11 @@ mod tests {
     use super::*;
 
     const N: usize = 48;
+    const CUT: PsfCut = PsfCut {
+        size: N,
+        least: 32,
+        centred: false,
+    };
 
     /// Stars of different widths and ellipticities with an S/N, and the same without noise.
     fn stars(profile: PsfProfile, snr: f64, count: usize) -> (Array3<f64>, Vec<Array2<f64>>) {
@@ -87,14 +108,9 @@ mod tests {
     }
 
     fn survey(stars: &Array3<f64>) -> StarSurvey {
-        let cut = PsfCut {
-            size: N,
-            least: 32,
-            centred: false,
-        };
-        let mut survey = StarSurvey::new(cut, N);
+        let (mut looker, mut survey) = (StarLooker::new(CUT, N), StarSurvey::default());
         let psfs = Psfs::stars(stars.view());
-        (0..stars.len_of(Axis(0))).for_each(|k| survey.add(&psfs, k));
+        (0..stars.len_of(Axis(0))).for_each(|k| survey.add(&looker.look(&psfs, k)));
         survey
     }
 
@@ -137,9 +153,9 @@ mod tests {
         let clean = survey(&clean);
         assert!(clean.is_over() && clean.common().is_none());
         assert!(!survey(&some(FEWEST)).is_over());
-        // A PSF for all, and formulas.
-        let mut none = survey(&some(0));
-        none.add(&Psfs::star(noisy.index_axis(Axis(0), 0)), 0);
-        assert!(!none.is_over() && none.looked_at == 0);
+        // A PSF for all.
+        let mut looker = StarLooker::new(CUT, N);
+        let StarLook(none) = looker.look(&Psfs::star(noisy.index_axis(Axis(0), 0)), 0);
+        assert!(none.is_none());
     }
 }

@@ -1,5 +1,6 @@
 //! The postage stamps of an image side by side.
 
+use shearq_measure::columns_of;
 use shearq_quantities::units::Pixels;
 use shearq_scoring::{cell_at, centre_of};
 
@@ -26,9 +27,8 @@ impl Mosaic {
 
     /// The arrangement of `galaxies` stamps that is nearest to a square.
     pub fn of(galaxies: usize, stamp: usize) -> Self {
-        let root = galaxies.isqrt();
         Mosaic {
-            columns: (root + usize::from(root * root < galaxies)).max(1),
+            columns: columns_of(galaxies),
             galaxies,
             stamp,
         }

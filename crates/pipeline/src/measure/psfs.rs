@@ -5,9 +5,14 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::{ArcArray2, ArrayView2};
+use rayon::ThreadPool;
+use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
-use shearq_measure::{CommonProfile, FunctionalPsf, Measurer, Psfs, Star, examined_rows, star};
+use shearq_measure::{
+    CommonProfile, FunctionalPsf, Measurer, Psfs, Star, StarLook, StarLooker, StarSurvey,
+    examined_rows, star,
+};
 use shearq_submissions::{Configuration, PsfCut, PsfForm};
 
 use super::head::check_strip;
@@ -50,7 +55,8 @@ impl PsfSource {
         })
     }
 
-    /// What stars of the image have in common, from some of its rows. Goes back to the first row.
+    /// What stars of the image have in common, from some of its rows. Goes back to the first row. `threads` look at the stars
+    /// of a row together.
     ///
     /// # Errors
     /// If star stamps cannot be read.
@@ -58,15 +64,28 @@ impl PsfSource {
         &mut self,
         mosaic: Mosaic,
         measurer: &Measurer,
+        threads: &ThreadPool,
     ) -> Result<Option<Arc<CommonProfile>>, PipelineError> {
-        let (PsfSource::Stars { image, side }, Some(mut survey)) = (self, measurer.star_survey())
-        else {
+        let PsfSource::Stars { image, side } = self else {
             return Ok(None);
         };
+        if measurer.star_looker().is_none() {
+            return Ok(None);
+        }
+        let mut survey = StarSurvey::default();
         let rows = examined_rows(mosaic.columns, mosaic.rows());
         some_rows::read(image, *side, rows, |iy, pixels| {
             let row = stars(pixels, *side, mosaic, iy)?;
-            (0..mosaic.of_row(iy)).for_each(|k| survey.add(&row, k));
+            let looks: Vec<StarLook> = threads.install(|| {
+                let stars = (0..mosaic.of_row(iy)).into_par_iter();
+                let look =
+                    |looker: &mut Option<StarLooker>, k| Some(looker.as_mut()?.look(&row, k));
+                stars
+                    .map_init(|| measurer.star_looker(), look)
+                    .flatten()
+                    .collect()
+            });
+            looks.iter().for_each(|look| survey.add(look));
             Ok(if survey.is_over() {
                 ControlFlow::Break(())
             } else {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
 
+use rayon::ThreadPool;
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 use shearq_measure::{Measurer, Warning};
@@ -105,14 +106,19 @@ impl ImageSource {
     }
 
     /// Measures noise and galaxy sizes on the stamps, if the configuration of `measurer` requires it, and looks at noisy stars
-    /// if there is one for each galaxy. If all stamps have too many missing pixels, the galaxies are flagged: NOISESIG does
+    /// if there is one for each galaxy, on `threads`. If all stamps have too many missing pixels, the galaxies are flagged: NOISESIG does
     /// not replace the measurement.
     ///
     /// # Errors
     /// If stamps or stars cannot be read, or stamps have no border of noise.
-    pub fn survey(&mut self, data: &DataFolder, measurer: &Measurer) -> Result<(), PipelineError> {
+    pub fn survey(
+        &mut self,
+        data: &DataFolder,
+        measurer: &Measurer,
+        threads: &ThreadPool,
+    ) -> Result<(), PipelineError> {
         let mosaic = self.head.mosaic;
-        self.head_mut().stars = self.psfs.survey(mosaic, measurer)?;
+        self.head_mut().stars = self.psfs.survey(mosaic, measurer, threads)?;
         let Some(plan) = measurer.noise_plan() else {
             return Ok(());
         };
