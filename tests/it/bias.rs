@@ -443,7 +443,7 @@ fn bad_catalogues_give_one_clear_error() {
         &nothing,
         &["--truth", text(&other)],
         false,
-        "does not contain this catalogue (found other.csv)",
+        "does not contain this catalogue (found other.csv;",
     );
 }
 

@@ -171,6 +171,12 @@ impl Examination {
         }
     }
 
+    /// The same for PSFs of one galaxy each.
+    #[must_use]
+    pub fn with_psf_of_each(self) -> Self {
+        Examination { each: true, ..self }
+    }
+
     /// Examines the PSF of all galaxies, of sum one, which was `moved` by so many pixels to be in the middle.
     pub fn add_psf(&mut self, psf: ArrayView2<'_, f64>, moved: Option<[f64; 2]>) {
         self.psfs.extend(PsfLook::of(psf, moved));
@@ -750,6 +756,14 @@ mod tests {
         let mut several = Examination::new(N, 2);
         several.add_psfs(&Psfs::stars(stars), N.into(), 2);
         assert_eq!((several.psfs.len(), several.psf_noise()), (2, None));
+        // Stars of S/N 100 are enough for a galaxy each, but not for all galaxies.
+        let snr = one.psfs[0].snr;
+        assert!((100.0..1000.0).contains(&snr), "{snr}");
+        let noisy = |examination: &Examination| {
+            let mut warnings = examination.warnings().into_iter();
+            warnings.any(|warning| matches!(warning, Warning::PsfNoise { .. }))
+        };
+        assert!(noisy(&one) && !noisy(&one.clone().with_psf_of_each()));
     }
 
     #[test]

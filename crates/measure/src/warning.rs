@@ -142,8 +142,8 @@ pub enum Warning {
         snr: f64,
         /// The same that is enough.
         enough: f64,
-        /// Standard deviations of m and c by the noise of one star.
-        effect: [f64; 2],
+        /// Standard deviations of m and c by the noise of one star for all galaxies.
+        effect: Option<[f64; 2]>,
         /// PSFs.
         of: Of,
     },
@@ -492,13 +492,22 @@ impl fmt::Display for Warning {
             Warning::PsfNoise {
                 snr,
                 enough,
-                effect: [m, c],
+                effect,
                 of,
             } => {
                 write!(
                     f,
-                "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). The noise of one star changes m by about {m:.3} and c by about {c:.3}. Try: average several stars, or fit a model"
-                )
+                    "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). "
+                )?;
+                match effect {
+                    Some([m, c]) => write!(
+                        f,
+                        "The noise of one star changes m by about {m:.3} and c by about {c:.3}. Try: average several stars, or fit a model"
+                    ),
+                    None => f.write_str(
+                        "With a star of S/N 50 for each galaxy, m is right to 0.002 behind Moffat and Kolmogorov PSFs, and to 0.01 behind others. Try: a model of the PSF, fitted to all stars"
+                    ),
+                }
             }
             Warning::PsfNarrow { area, of } => write!(
                 f,

@@ -211,10 +211,11 @@ impl Request {
         (!parts.is_empty()).then(|| parts.join("; "))
     }
 
-    fn reading(&self) -> Reading {
-        Reading {
+    fn reading(&self) -> Result<Reading, FileError> {
+        let paths = self.catalogues.iter().map(|input| input.name.as_path());
+        Ok(Reading {
             names: self.names.clone(),
-            truth: self.truth.clone(),
+            truth: self.truth.of_paths(paths)?,
             distortion: self.distortion,
             flip_g2: self.flip_g2,
             select: self.select.clone(),
@@ -231,7 +232,7 @@ impl Request {
                 Units::Column(name) => Some(name.clone()),
                 Units::Rows | Units::Catalogues => Some(String::new()),
             },
-        }
+        })
     }
 }
 
@@ -241,7 +242,7 @@ impl Request {
 /// If a catalogue cannot be read, lacks a column, or contains values that are not usable.
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     read::distinct(&request.catalogues)?;
-    let reading = request.reading();
+    let reading = request.reading()?;
     let mut all: Vec<Vec<Source>> = Vec::new();
     for input in &request.catalogues {
         all.push(read::sources(input, &reading)?);

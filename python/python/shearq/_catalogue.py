@@ -208,7 +208,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         """The galaxies of a selection, with ellipticities and responses that keep the mean shear unbiased.
 
         Ellipticities are multiplied by the weights. Responses contain how shear and noise change the weights. Rows with a
-        flag or without weight are left out. Do not combine the result with rows of other selections.
+        flag or without weight are left out. Without a column ``id``, the result gets one: the number of the row, from 0, by which
+        ``bias`` finds the same galaxies under other shears. Do not combine the result with rows of other selections.
 
         Parameters
         ----------
@@ -256,7 +257,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
             chosen[f"divisor{k}"] = mean
         # A second selection would need responses that the rows do not have.
         left = [name for name in chosen.dtype.names or () if name not in _schema.OBSERVED]
-        return concatenate([chosen[left]])
+        found = concatenate([chosen[left]])
+        return found if "id" in left else _with_ids(found, np.flatnonzero(kept))
 
     def mean_shear(
         self, weights: ArrayLike | None = None, *, where: str | None = None, weight: str | None = None
@@ -396,6 +398,17 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         from ._display import plot_catalogue
 
         return plot_catalogue(self, kind, ax)
+
+
+def _with_ids(catalogue: Catalogue, ids: NDArray[np.intp]) -> Catalogue:
+    """The catalogue with a first column ``id``."""
+    kinds = [("id", np.int64), *((name, catalogue.dtype[name]) for name in catalogue.dtype.names or ())]
+    found = np.empty(len(catalogue), dtype=kinds).view(Catalogue)
+    found["id"] = ids
+    for name in catalogue.dtype.names or ():
+        found[name] = catalogue[name]
+    found.attrs = dict(catalogue.attrs)
+    return found
 
 
 def concatenate(catalogues: Iterable[Catalogue]) -> Catalogue:

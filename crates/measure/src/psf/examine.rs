@@ -222,7 +222,7 @@ pub(crate) fn warnings(looks: &[PsfLook], shared: bool, galaxies: Option<Core>) 
     with(&|look| look.snr < enough, &|those, of| Warning::PsfNoise {
         snr: middle(those, &|look| look.snr),
         enough,
-        effect: [0, 1].map(|k| middle(those, &|look| look.effect_of_noise()[k])),
+        effect: shared.then(|| [0, 1].map(|k| middle(those, &|look| look.effect_of_noise()[k]))),
         of,
     });
     with(&|look| look.area < LEAST_AREA, &|those, of| {

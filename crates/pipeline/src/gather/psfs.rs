@@ -63,6 +63,9 @@ pub(super) fn gather_psfs(
     let mut image = Rows::create(&path, Mosaic::of(count, side), &[])?;
     let mut planes = Planes::of(files);
     let mut examination = Examination::new(side, 0);
+    if count > 1 {
+        examination = examination.with_psf_of_each();
+    }
     let mut dark = 0;
     while let Some((origin, pixels)) = planes.next()? {
         let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();

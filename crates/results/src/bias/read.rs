@@ -441,7 +441,7 @@ impl<'a> OfRows<'a> {
             let id = places.id.ok_or_else(|| absent("identifier", "id=NAME"))?;
             return Ok(OfRows::Identifiers(galaxies, id));
         }
-        Ok(match (truth.of_catalogue(path)?, places.shear) {
+        Ok(match (truth.of_catalogue(path), places.shear) {
             (Some(shear), _) => OfRows::Constant(shear),
             (None, Some(columns)) => OfRows::Columns(columns),
             (None, None) => OfRows::Nowhere,

@@ -19,7 +19,7 @@ pub enum Truth {
     Columns,
     /// All catalogues have one shear.
     Constant([f64; 2]),
-    /// A shear per catalogue, by its path or file name.
+    /// A shear per catalogue, by its path or parts of it: the name of its file or of a folder above.
     Catalogues(BTreeMap<String, [f64; 2]>),
     /// A shear per galaxy, by the bits of its identifier.
     Galaxies(Arc<HashMap<u64, [f64; 2]>>),
@@ -79,32 +79,39 @@ impl Truth {
         Ok(Truth::Galaxies(Arc::new(galaxies)))
     }
 
-    /// The shear of a catalogue; `None` if it depends on the galaxy.
+    /// The same with the shear of each of `catalogues` by its path, if catalogues have a shear each.
     ///
     /// # Errors
-    /// If the table of catalogues does not contain this one.
-    pub(crate) fn of_catalogue(&self, path: &Path) -> Result<Option<[f64; 2]>, FileError> {
-        match self {
-            Truth::Constant(shear) => Ok(Some(*shear)),
-            Truth::Catalogues(all) => {
-                let name = path
-                    .file_name()
-                    .map(|name| name.to_string_lossy().into_owned());
-                let found = all
-                    .get(&path.display().to_string())
-                    .or_else(|| all.get(&name.unwrap_or_default()));
-                found.copied().map(Some).ok_or_else(|| {
-                    let names: Vec<&String> = all.keys().collect();
-                    FileError::new(
-                        path,
-                        format!(
-                            "the table of true shears does not contain this catalogue (found {})",
-                            shearq_files::names_of(&names)
-                        ),
-                    )
-                })
+    /// If the table of catalogues does not contain one, or it is not clear which rows belong to which catalogues.
+    pub(super) fn of_paths<'p>(
+        &self,
+        catalogues: impl IntoIterator<Item = &'p Path>,
+    ) -> Result<Self, FileError> {
+        let Truth::Catalogues(all) = self else {
+            return Ok(self.clone());
+        };
+        let (mut found, mut files) = (BTreeMap::new(), BTreeMap::new());
+        for path in catalogues {
+            let name = row_of(all.keys(), path)?;
+            let is_file = Path::new(name).file_name() == path.file_name();
+            if let Some(other) = files.insert(name, path).filter(|_| is_file) {
+                let message = format!(
+                    "`{name}` in the table of true shears is this catalogue and {}; expected one. Try: the folder before the name",
+                    other.display()
+                );
+                return Err(FileError::new(path, message));
             }
-            Truth::Columns | Truth::Galaxies(_) | Truth::Positions(_) | Truth::Data(_) => Ok(None),
+            found.insert(path.display().to_string(), all[name]);
+        }
+        Ok(Truth::Catalogues(found))
+    }
+
+    /// The shear of a catalogue; `None` if it is not known, or depends on the galaxy.
+    pub(crate) fn of_catalogue(&self, path: &Path) -> Option<[f64; 2]> {
+        match self {
+            Truth::Constant(shear) => Some(*shear),
+            Truth::Catalogues(all) => all.get(&path.display().to_string()).copied(),
+            Truth::Columns | Truth::Galaxies(_) | Truth::Positions(_) | Truth::Data(_) => None,
         }
     }
 
@@ -124,6 +131,43 @@ impl Truth {
             },
             _ => Ok(None),
         }
+    }
+}
+
+/// The name among `names` that is the path of a catalogue, or the longest one that is a part of it.
+fn row_of<'n>(
+    names: impl IntoIterator<Item = &'n String>,
+    path: &Path,
+) -> Result<&'n String, FileError> {
+    let parts: Vec<_> = path.components().collect();
+    let (mut best, mut length, mut all) = (Vec::new(), 0, Vec::new());
+    for name in names {
+        all.push(name);
+        let own: Vec<_> = Path::new(name).components().collect();
+        if own.is_empty() || own.len() < length || !parts.windows(own.len()).any(|some| some == own)
+        {
+            continue;
+        }
+        if own.len() > length {
+            (length, best) = (own.len(), Vec::new());
+        }
+        best.push(name);
+    }
+    match best[..] {
+        [one] => Ok(one),
+        [] => Err(FileError::new(
+            path,
+            format!(
+                "the table of true shears does not contain this catalogue (found {}; expected this path, the name of the file, or a folder of it)",
+                shearq_files::names_of(&all)
+            ),
+        )),
+        [first, second, ..] => Err(FileError::new(
+            path,
+            format!(
+                "`{first}` and `{second}` in the table of true shears both fit this catalogue; expected one. Try: longer names"
+            ),
+        )),
     }
 }
 
@@ -176,4 +220,60 @@ fn of_catalogues(path: &Path) -> Result<Truth, FileError> {
         }
     }
     Ok(Truth::Catalogues(all))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The shears of catalogues by a table of names, or why they are not known.
+    fn shears(table: &[(&str, f64)], catalogues: &[&str]) -> Result<Vec<f64>, String> {
+        let table = table.iter().map(|(name, g)| ((*name).to_owned(), [*g; 2]));
+        let truth = Truth::Catalogues(table.collect());
+        let truth = truth.of_paths(catalogues.iter().map(Path::new));
+        let truth = truth.map_err(|error| error.to_string())?;
+        let found = catalogues.iter().map(Path::new);
+        Ok(found
+            .map(|path| truth.of_catalogue(path).unwrap()[0])
+            .collect())
+    }
+
+    #[test]
+    fn catalogues_are_named_by_paths_files_or_folders() {
+        let (plus, minus) = ("out/plus/set01/c-1.parquet", "out/minus/set01/c-1.parquet");
+        let more = "out/plus/set01/c-2.parquet";
+        for names in [
+            [plus, minus],
+            ["plus", "minus"],
+            ["out/plus", "out/minus/set01"],
+            // The longest name counts.
+            ["out", "minus/set01/c-1.parquet"],
+        ] {
+            let table = [(names[0], 0.02), (names[1], -0.02)];
+            let found = shears(&table, &[plus, more, minus]);
+            match names[0] == plus {
+                true => assert!(
+                    found
+                        .unwrap_err()
+                        .contains("does not contain this catalogue")
+                ),
+                false => assert_eq!(found.unwrap(), [0.02, 0.02, -0.02]),
+            }
+        }
+        assert_eq!(shears(&[("c-1.parquet", 0.01)], &[plus]).unwrap(), [0.01]);
+        for (table, reason) in [
+            (vec![("c-1.parquet", 0.01)], "expected one. Try: the folder"),
+            (
+                vec![("plus", 0.01), ("minus", 0.0), ("out", 0.0)],
+                "both fit",
+            ),
+            (
+                vec![("plus", 0.01), ("inus", 0.0), ("", 0.0)],
+                "found , inus, plus",
+            ),
+        ] {
+            let found = shears(&table, &[plus, minus]).unwrap_err();
+            assert!(found.contains(reason), "{reason}: {found}");
+        }
+    }
 }

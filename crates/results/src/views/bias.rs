@@ -143,6 +143,22 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     ))
 }
 
+/// |m| above which catalogue and truth hardly belong together.
+const IMPLAUSIBLE: f64 = 0.3;
+/// Standard errors by which it has to be larger.
+const CLEAR: f64 = 5.0;
+
+/// A warning if m is larger than a bias of shapes can be.
+fn implausible(all: &Estimate) -> Option<String> {
+    let large = |m: &Measured| m.value.abs() > IMPLAUSIBLE + CLEAR * m.error;
+    let mut found = ["m1", "m2"].into_iter();
+    let (name, m) = found.find_map(|name| Some((name, all.value(name).filter(large)?)))?;
+    Some(format!(
+        "{name} is {:+.2} (expected |m| below {IMPLAUSIBLE}). m = −2 is a wrong sign, m = −1 a wrong truth. Ellipticities that are divided by their response already have a response of one. Try: --columns R11=none,R22=none",
+        m.value
+    ))
+}
+
 /// Design, units, rows that do not count, and verdicts.
 fn notes(result: &BiasResult) -> Vec<String> {
     let Ok(all) = result.all() else {
@@ -174,6 +190,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
             student_t(0.975, all.units - 1)
         ));
     }
+    notes.extend(implausible(all));
     if result.misaligned {
         notes.push(
             "The catalogues of different shears have different numbers of rows, so errors may be too large. Try: a column of identifiers".into(),
