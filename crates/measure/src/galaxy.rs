@@ -117,7 +117,7 @@ impl Measurer {
         let mut looker = self.star_looker()?;
         let mut survey = StarSurvey::default();
         for at in examined_stamps(psfs.count()?) {
-            survey.add(&looker.look(psfs, at));
+            survey.add(looker.look(psfs, at));
             if survey.is_over() {
                 break;
             }

@@ -9,7 +9,6 @@ mod halfway;
 mod moffat;
 pub(crate) mod shrink;
 mod star;
-mod stein;
 mod sums;
 mod survey;
 #[cfg(test)]

@@ -8,7 +8,6 @@ use ndarray::{ArrayView2, ArrayViewMut2};
 use shearq_quantities::linear::cholesky;
 
 use super::moffat::Moffat;
-use super::stein::stein;
 
 /// Steps per unit of √s between radii, between which the function is linear. See docs/constants.md.
 const FINE: usize = 2;
@@ -20,6 +19,13 @@ const RIDGE: f64 = 1e-9;
 /// What the noisy stars of an image have in common: [`StarSurvey::common`](crate::StarSurvey::common).
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommonProfile {
+    /// For each range of S/N its lower end, and the function. The first is for all stars below as well.
+    pub(super) ranges: Vec<(f64, Common)>,
+}
+
+/// A function of the radius √s of profiles, in units of their amplitudes.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Common {
     /// Values at the radii.
     values: [f64; COUNT],
 }
@@ -27,6 +33,8 @@ pub struct CommonProfile {
 /// Sums of the normal equations for the values at the radii. Only radii next to each other have products.
 #[derive(Debug, Clone)]
 pub(super) struct Sums {
+    /// Mean square of what is left, in units of the noise.
+    pub(super) left: f64,
     squares: [f64; COUNT],
     /// Products with the radius before.
     products: [f64; COUNT],
@@ -36,6 +44,7 @@ pub(super) struct Sums {
 impl Default for Sums {
     fn default() -> Self {
         Sums {
+            left: 0.0,
             squares: [0.0; COUNT],
             products: [0.0; COUNT],
             right: [0.0; COUNT],
@@ -64,25 +73,28 @@ impl Sums {
             sums.products[at + 1] += weight * near * far;
             sums.right[at] += weight * near * left;
             sums.right[at + 1] += weight * far * left;
+            sums.left += weight * left * left;
         }
+        sums.left /= star.len() as f64;
         sums
     }
 
-    /// Adds those of more stars.
-    pub(super) fn add(&mut self, more: &Sums) {
+    /// Adds those of another star with a weight.
+    pub(super) fn add(&mut self, more: &Sums, weight: f64) {
         for (sums, more) in [
             (&mut self.squares, &more.squares),
             (&mut self.products, &more.products),
             (&mut self.right, &more.right),
         ] {
             for (sum, more) in sums.iter_mut().zip(more) {
-                *sum += more;
+                *sum += weight * more;
             }
         }
     }
 
-    /// The function that fits best, less what noise adds to it (Stein).
-    pub(super) fn common(&self) -> Option<CommonProfile> {
+    /// The function that fits best. It is not reduced for its noise: that is small beside the noise of each star, and what is
+    /// missing of the mean would bias all images alike.
+    pub(super) fn common(&self) -> Option<Common> {
         let most = self.squares.iter().copied().fold(0.0, f64::max);
         let mut matrix = [[0.0; COUNT]; COUNT];
         for (k, row) in matrix.iter_mut().enumerate() {
@@ -94,15 +106,28 @@ impl Sums {
         let mut values = self.right;
         let positive = |pivot: f64| (pivot > 0.0 && pivot.is_finite()).then_some(pivot);
         cholesky(&mut matrix, &mut values, COUNT, positive)?;
-        let square: f64 = values.iter().zip(self.right).map(|(a, b)| a * b).sum();
-        let factor = stein(square, COUNT as f64, 1.0);
-        Some(CommonProfile {
-            values: values.map(|value| factor * value),
-        })
+        Some(Common { values })
     }
 }
 
 impl CommonProfile {
+    /// The function for stars of an S/N.
+    pub(super) fn of(&self, snr: f64) -> &Common {
+        let above = self.ranges.partition_point(|(from, _)| *from <= snr);
+        &self.ranges[above.saturating_sub(1)].1
+    }
+}
+
+impl Common {
+    /// Largest difference to another one, in units of the largest value of that one.
+    #[cfg(test)]
+    pub(super) fn unlike(&self, other: &Self) -> f64 {
+        let pairs = self.values.iter().zip(&other.values);
+        let most = |sum: f64, value: f64| sum.max(value.abs());
+        let off = pairs.map(|(a, b)| a - b).fold(0.0, most);
+        off / other.values.iter().copied().fold(0.0, most)
+    }
+
     /// Adds it to a profile that was drawn.
     pub(super) fn add(&self, profile: &Moffat, mut star: ArrayViewMut2<'_, f64>) {
         let (amplitude, square) = (profile.amplitude(), profile.square());
@@ -142,7 +167,7 @@ mod tests {
         let profile = Moffat::fit(star.view(), [23.5; 2], area, 1e-4).unwrap();
         // Any function that is linear between the radii is found again.
         let values = std::array::from_fn(|k| 0.01 * (k as f64).sin());
-        let common = CommonProfile { values };
+        let common = Common { values };
         let mut model = Array2::zeros((N, N));
         profile.draw(model.view_mut());
         let mut star = model.clone();

@@ -12,7 +12,6 @@ use super::breadth;
 use super::common::{CommonProfile, Sums};
 use super::moffat::Moffat;
 use super::star;
-use super::stein::stein;
 use super::sums::sum_of_squares;
 use shearq_quantities::statistics::{SCATTER, median};
 
@@ -70,7 +69,7 @@ impl Shrinker {
             return psf;
         };
         if let Some(common) = &self.common {
-            common.add(&profile, self.star.view_mut());
+            common.of(snr).add(&profile, self.star.view_mut());
         }
         self.add_significant(psf, &profile, sigma);
         let kept = kept(snr);
@@ -84,10 +83,14 @@ impl Shrinker {
         self.star.view()
     }
 
-    /// What the profile leaves of the star `psf` of sum one, if it has noise.
-    pub(super) fn left(&mut self, psf: ArrayView2<'_, f64>) -> Option<Sums> {
-        let Fitted { profile, sigma, .. } = self.fit(psf)?;
-        Some(Sums::of(psf, self.star.view(), &profile, sigma))
+    /// S/N of the star `psf` of sum one, and what the profile leaves of it, if it has noise.
+    pub(super) fn left(&mut self, psf: ArrayView2<'_, f64>) -> Option<(f64, Sums)> {
+        let Fitted {
+            profile,
+            sigma,
+            snr,
+        } = self.fit(psf)?;
+        Some((snr, Sums::of(psf, self.star.view(), &profile, sigma)))
     }
 
     /// Draws the profile that fits a star; `None` if the star has hardly any noise, or there is no fit.
@@ -232,6 +235,16 @@ fn shrink(coefficients: &mut Coefficients, sigma: f64) {
                 coefficients[2 * (order / 2 - k)][2 * k] += share * all * round[order / 2];
             }
         }
+    }
+}
+
+/// Stein's factor for `count` values of the sum of squares `square`, with noise `sigma` each: how much of them is kept
+/// (James and Stein 1961).
+fn stein(square: f64, count: f64, sigma: f64) -> f64 {
+    if square > 0.0 {
+        (1.0 - (count - 2.0) * sigma * sigma / square).max(0.0)
+    } else {
+        0.0
     }
 }
 

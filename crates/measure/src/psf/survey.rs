@@ -2,14 +2,19 @@
 
 use std::sync::Arc;
 
+use shearq_quantities::statistics::scatter;
 use shearq_submissions::PsfCut;
 
-use super::common::{CommonProfile, Sums};
+use super::common::{Common, CommonProfile, Sums};
 use super::shrink::Shrinker;
 use crate::psfs::Psfs;
 
 /// Fewest noisy stars that tell what they have in common. See docs/constants.md.
-const FEWEST: usize = 30;
+const FEWEST: usize = 10;
+/// Stars share a function up to so many times the S/N of the faintest. See docs/constants.md.
+const RANGE: f64 = 2.0;
+/// Standard deviations by which more may be left of a star than of others. See docs/constants.md.
+const OUTSIDE: f64 = 10.0;
 
 /// Looks at stars of an image, one per galaxy: buffers for one thread.
 #[derive(Debug)]
@@ -21,7 +26,7 @@ pub struct StarLooker {
 
 /// What one star shows: nothing if it has no noise or cannot be used.
 #[derive(Debug)]
-pub struct StarLook(Option<Sums>);
+pub struct StarLook(Option<(f64, Sums)>);
 
 impl StarLooker {
     /// For stars of which `cut` is used, and galaxies on stamps of `full` pixels a side.
@@ -47,31 +52,54 @@ impl StarLooker {
 #[derive(Debug, Default)]
 pub struct StarSurvey {
     looked_at: usize,
-    noisy: usize,
-    sums: Sums,
+    /// S/N of each noisy star, and what is left of it.
+    noisy: Vec<(f64, Sums)>,
 }
 
 impl StarSurvey {
     /// Adds a star. Results depend on the order, but not on the threads that looked at the stars.
-    pub fn add(&mut self, StarLook(sums): &StarLook) {
+    pub fn add(&mut self, StarLook(left): StarLook) {
         self.looked_at += 1;
-        if let Some(sums) = sums {
-            self.noisy += 1;
-            self.sums.add(sums);
-        }
+        self.noisy.extend(left);
     }
 
     /// Whether no more stars are of use: the first ones have no noise, and stars of an image all have noise or none has.
     pub fn is_over(&self) -> bool {
-        self.looked_at >= FEWEST && self.noisy == 0
+        self.looked_at >= FEWEST && self.noisy.is_empty()
     }
 
     /// What the stars have in common; `None` if too few of them have noise.
-    pub fn common(&self) -> Option<Arc<CommonProfile>> {
-        (self.noisy >= FEWEST)
-            .then(|| self.sums.common().map(Arc::new))
-            .flatten()
+    pub fn common(mut self) -> Option<Arc<CommonProfile>> {
+        // Equal S/N stay in their order.
+        self.noisy.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+        let (mut ranges, mut rest) = (Vec::new(), self.noisy.as_slice());
+        while rest.len() >= FEWEST {
+            let from = rest[0].0;
+            let within = rest.partition_point(|(snr, _)| *snr <= RANGE * from);
+            let mut count = within.max(FEWEST);
+            if rest.len() - count < FEWEST {
+                count = rest.len();
+            }
+            ranges.push((from, of_range(&rest[..count])?));
+            rest = &rest[count..];
+        }
+        (!ranges.is_empty()).then(|| Arc::new(CommonProfile { ranges }))
     }
+}
+
+/// What stars have in common, the faintest of which is the first. Stars of which much more is left than of the others have
+/// faults of their own, and are left out.
+fn of_range(stars: &[(f64, Sums)]) -> Option<Common> {
+    let mut left: Vec<f64> = stars.iter().map(|(_, sums)| sums.left).collect();
+    let (middle, scatter) = scatter(&mut left)?;
+    let most = middle + OUTSIDE * scatter;
+    let brightest = RANGE * stars[0].0;
+    let mut all = Sums::default();
+    for (snr, sums) in stars.iter().filter(|(_, sums)| sums.left <= most) {
+        // The few stars beyond the range would outweigh the others.
+        all.add(sums, (brightest / snr).powi(2).min(1.0));
+    }
+    all.common()
 }
 
 #[cfg(test)]
@@ -110,7 +138,7 @@ mod tests {
     fn survey(stars: &Array3<f64>) -> StarSurvey {
         let (mut looker, mut survey) = (StarLooker::new(CUT, N), StarSurvey::default());
         let psfs = Psfs::stars(stars.view());
-        (0..stars.len_of(Axis(0))).for_each(|k| survey.add(&looker.look(&psfs, k)));
+        (0..stars.len_of(Axis(0))).for_each(|k| survey.add(looker.look(&psfs, k)));
         survey
     }
 
@@ -138,6 +166,68 @@ mod tests {
             // Powers of single stars scatter by 4/(S/N); this is four errors of their mean.
             assert!(shared.abs() < 0.01, "{profile:?} {shared}");
         }
+    }
+
+    #[test]
+    fn a_star_with_a_fault_is_left_out() {
+        let (mut noisy, _) = stars(PsfProfile::Kolmogorov, 100.0, 40);
+        let without = survey(&noisy.slice(ndarray::s![..39, .., ..]).to_owned());
+        noisy[(39, 20, 30)] += 0.5;
+        let with = survey(&noisy);
+        assert_eq!(with.noisy.len(), 40);
+        assert_eq!(with.common(), without.common());
+    }
+
+    #[test]
+    fn stars_share_with_those_of_their_signal_to_noise() {
+        let (mut both, _) = stars(PsfProfile::Kolmogorov, 50.0, 60);
+        let (bright, _) = stars(PsfProfile::Kolmogorov, 300.0, 30);
+        let faint = survey(&both.slice(ndarray::s![..30, .., ..]).to_owned());
+        let bright_ones = survey(&bright);
+        // One faint, one bright, and so on.
+        for k in 0..30 {
+            let star = both.index_axis(Axis(0), k).to_owned();
+            both.index_axis_mut(Axis(0), 30 + k).assign(&star);
+        }
+        for k in 0..30 {
+            let star = both.index_axis(Axis(0), 30 + k).to_owned();
+            both.index_axis_mut(Axis(0), 2 * k).assign(&star);
+            let star = bright.index_axis(Axis(0), k).to_owned();
+            both.index_axis_mut(Axis(0), 2 * k + 1).assign(&star);
+        }
+        let both = survey(&both).common().unwrap();
+        let [(low, first), (high, second)] = &both.ranges[..] else {
+            panic!("{} ranges", both.ranges.len());
+        };
+        // The faintest of thirty of different widths.
+        assert!(
+            (30.0..50.0).contains(low) && (230.0..300.0).contains(high),
+            "{low} {high}"
+        );
+        assert_eq!(first, &faint.common().unwrap().ranges[0].1);
+        assert_eq!(second, &bright_ones.common().unwrap().ranges[0].1);
+        for (snr, function) in [
+            (20.0, first),
+            (60.0, first),
+            (250.0, first),
+            (400.0, second),
+        ] {
+            assert_eq!(both.of(snr), function, "{snr}");
+        }
+        assert_ne!(first, second);
+    }
+
+    #[test]
+    fn a_few_bright_stars_count_as_some_more() {
+        let (noisy, _) = stars(PsfProfile::Kolmogorov, 50.0, 40);
+        let (bright, _) = stars(PsfProfile::Moffat { beta: 3.0 }, 400.0, 3);
+        let with = ndarray::concatenate![Axis(0), noisy, bright];
+        let (with, without) = (survey(&with).common(), survey(&noisy).common());
+        let [with, without] = [with.unwrap(), without.unwrap()];
+        assert_eq!(with.ranges.len(), 1);
+        // Three of S/N 90 beside forty of 50. Without a limit the bright ones would have 83 % of the weight.
+        let share = with.of(50.0).unlike(without.of(50.0));
+        assert!(share > 0.0 && share < 0.4, "{share}");
     }
 
     #[test]

@@ -85,7 +85,7 @@ impl PsfSource {
                     .flatten()
                     .collect()
             });
-            looks.iter().for_each(|look| survey.add(look));
+            looks.into_iter().for_each(|look| survey.add(look));
             Ok(if survey.is_over() {
                 ControlFlow::Break(())
             } else {
