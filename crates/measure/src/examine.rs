@@ -72,32 +72,30 @@ pub fn examined_rows(columns: usize, rows: usize) -> Vec<usize> {
         .collect()
 }
 
+/// Which of `count` stamps are examined: those of [`examined_rows`] in the arrangement nearest to a square, in which
+/// images of stamps have them.
+pub fn examined_stamps(count: usize) -> Vec<usize> {
+    in_rows(count, examined_rows)
+}
+
+/// How many of `rows` rows of `columns` stamps are enough.
+pub(crate) fn enough(columns: usize, rows: usize) -> usize {
+    ENOUGH.div_ceil(columns.max(1)).min(rows)
+}
+
 /// Stamps in a row of the arrangement of `count` stamps that is nearest to a square: 1 or more.
 pub fn columns_of(count: usize) -> usize {
     let root = count.isqrt();
     (root + usize::from(root * root < count)).max(1)
 }
 
-/// Which of `count` stamps are examined: those of [`examined_rows`] in the arrangement nearest to a square, in which
-/// images of stamps have them.
-pub fn examined_stamps(count: usize) -> Vec<usize> {
+/// The stamps of the rows that `choose` chooses by the numbers of columns and rows, of `count` stamps in the arrangement
+/// nearest to a square.
+pub(crate) fn in_rows(count: usize, choose: impl Fn(usize, usize) -> Vec<usize>) -> Vec<usize> {
     let columns = columns_of(count);
-    stamps_of(
-        examined_rows(columns, count.div_ceil(columns)),
-        columns,
-        count,
-    )
-}
-
-/// The stamps of `rows`, of `count` stamps in rows of `columns`.
-pub(crate) fn stamps_of(rows: Vec<usize>, columns: usize, count: usize) -> Vec<usize> {
     let row = |row: usize| row * columns..((row + 1) * columns).min(count);
+    let rows = choose(columns, count.div_ceil(columns));
     rows.into_iter().flat_map(row).collect()
-}
-
-/// How many of `rows` rows of `columns` stamps are enough.
-pub(crate) fn enough(columns: usize, rows: usize) -> usize {
-    ENOUGH.div_ceil(columns.max(1)).min(rows)
 }
 
 /// What one stamp shows.

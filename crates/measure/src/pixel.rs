@@ -24,6 +24,40 @@ impl Pixel for f64 {
     }
 }
 
+/// How many rows of pixels at the lower and upper edge, and columns at the left and right edge, are all equal.
+pub(crate) fn padding(pixels: &[f32], n: usize) -> [usize; 4] {
+    [0, 1, 2, 3].map(|edge| {
+        let at = |depth: usize, along: usize| match edge {
+            0 => depth * n + along,
+            1 => (n - 1 - depth) * n + along,
+            2 => along * n + depth,
+            _ => along * n + n - 1 - depth,
+        };
+        let value = pixels[at(0, 0)];
+        let equal = |depth: &usize| (0..n).all(|along| pixels[at(*depth, along)] == value);
+        (0..n).take_while(equal).count()
+    })
+}
+
+/// Makes rows and columns of padding missing, unless the opposite edge has some as well: a stamp beyond an edge of an
+/// exposure. Whether there are any.
+pub(crate) fn lose_padding(pixels: &mut [f32], n: usize) -> bool {
+    let [low, high, left, right] = padding(pixels, n);
+    let one = |a: usize, b: usize| if a > 0 && b > 0 { [0; 2] } else { [a, b] };
+    let ([low, high], [left, right]) = (one(low, high), one(left, right));
+    if low + high + left + right == 0 {
+        return false;
+    }
+    for (y, row) in pixels.chunks_exact_mut(n).enumerate() {
+        if y < low || y >= n - high {
+            row.fill(f32::NAN);
+        }
+        row[..left].fill(f32::NAN);
+        row[n - right..].fill(f32::NAN);
+    }
+    true
+}
+
 /// Copies a stamp, row by row.
 pub(crate) fn copy<P: Pixel>(stamp: ArrayView2<'_, P>, to: &mut [f32]) {
     let columns = stamp.ncols().max(1);
@@ -57,4 +91,43 @@ mod private {
     pub trait Sealed {}
     impl Sealed for f32 {}
     impl Sealed for f64 {}
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const N: usize = 8;
+
+    fn stamp() -> Vec<f32> {
+        (0..N * N).map(|at| at as f32).collect()
+    }
+
+    #[test]
+    fn rows_and_columns_of_padding_are_counted_from_each_edge() {
+        let mut stamp = stamp();
+        stamp[..2 * N].fill(1.0);
+        (0..N).for_each(|y| stamp[y * N + N - 3..(y + 1) * N].fill(1.0));
+        assert_eq!(padding(&stamp, N), [2, 0, 0, 3]);
+    }
+
+    #[test]
+    fn padding_at_one_of_opposite_edges_is_missing() {
+        let (mut corner, mut around) = (stamp(), stamp());
+        assert!(!lose_padding(&mut corner, N));
+        corner[(N - 2) * N..].fill(0.0);
+        (0..N).for_each(|y| corner[y * N] = 0.0);
+        assert!(lose_padding(&mut corner, N));
+        for (at, value) in corner.iter().enumerate() {
+            let missing = at / N >= N - 2 || at % N == 0;
+            assert_eq!(value.is_nan(), missing, "{at}");
+        }
+        // The light of a small galaxy without noise ends before all edges.
+        for at in
+            (0..N * N).filter(|at| [0, N - 1].contains(&(at / N)) || [0, N - 1].contains(&(at % N)))
+        {
+            around[at] = 0.0;
+        }
+        assert!(!lose_padding(&mut around, N));
+    }
 }

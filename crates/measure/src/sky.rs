@@ -10,6 +10,8 @@ use shearq_quantities::linear::cholesky;
 use shearq_quantities::statistics::{FROM_MODULI, OF_MEDIAN, median, scatter};
 use shearq_submissions::SkySource;
 
+use crate::pixel;
+
 /// Radius within which a galaxy's light is summed. See docs/constants.md.
 pub(crate) const INNER: f64 = 8.0;
 /// Cells along a side of a stamp. See docs/constants.md.
@@ -179,7 +181,7 @@ impl Cells {
     /// Measures the levels of the cells of a stamp.
     pub(crate) fn look(&mut self, pixels: &[f32]) {
         let (n, side) = (self.full, self.side);
-        let [low, high, left, right] = padding(pixels, n);
+        let [low, high, left, right] = pixel::padding(pixels, n);
         for (level, cell) in self.levels.iter_mut().zip(&self.cells) {
             let (y, x) = cell.first;
             let padded = y < low || x < left || y + side > n - high || x + side > n - right;
@@ -259,21 +261,6 @@ pub(crate) fn inner(pixels: &[f32], n: usize) -> f64 {
         sum += row[first..=last].iter().map(|v| f64::from(*v)).sum::<f64>();
     }
     sum
-}
-
-/// How many rows of pixels at the lower and upper edge, and columns at the left and right edge, are all equal.
-fn padding(pixels: &[f32], n: usize) -> [usize; 4] {
-    [0, 1, 2, 3].map(|edge| {
-        let at = |depth: usize, along: usize| match edge {
-            0 => depth * n + along,
-            1 => (n - 1 - depth) * n + along,
-            2 => along * n + depth,
-            _ => along * n + n - 1 - depth,
-        };
-        let value = pixels[at(0, 0)];
-        let equal = |depth: &usize| (0..n).all(|along| pixels[at(*depth, along)] == value);
-        (0..n).take_while(equal).count()
-    })
 }
 
 /// Levels of the cells of many stamps.
@@ -763,14 +750,6 @@ mod tests {
         {
             assert!((found - expected).abs() < 4.0 * error, "{mean:?}");
         }
-    }
-
-    #[test]
-    fn rows_and_columns_of_padding_are_counted_from_each_edge() {
-        let mut stamp: Vec<f32> = (0..N * N).map(|at| at as f32).collect();
-        stamp[..2 * N].fill(1.0);
-        (0..N).for_each(|y| stamp[y * N + N - 3..(y + 1) * N].fill(1.0));
-        assert_eq!(padding(&stamp, N), [2, 0, 0, 3]);
     }
 
     #[test]

@@ -175,8 +175,12 @@ impl Worker {
     ) -> Result<Measurement, MeasureError> {
         let plan = Arc::clone(&self.plan);
         let n = plan.n;
-        let whole = self.read(stamp)?;
-        if !whole && !matches!(plan.configuration.method, Method::Linear(_)) {
+        let linear = matches!(plan.configuration.method, Method::Linear(_));
+        let mut whole = self.read(stamp)?;
+        if linear && pixel::lose_padding(&mut self.full, plan.full) {
+            whole = false;
+        }
+        if !whole && !linear {
             return Ok(Measurement::flagged(Flag::NotFinite));
         }
         if !usable_psf {

@@ -103,12 +103,3 @@ fn product(rows: &[[f64; 3 * BLOCK]; BLOCK], dx: i32, dy: i32) -> f64 {
     }
     columns.iter().sum()
 }
-
-/// Whether the pixels along the lower, upper, left and right edge of a stamp of `n` × `n` are all equal.
-pub(super) fn padded(pixels: &[f32], n: usize) -> [bool; 4] {
-    let last = n * (n - 1);
-    [(0, 1), (last, 1), (0, n), (n - 1, n)].map(|(first, step)| {
-        let mut edge = (0..n).map(|at| pixels[first + at * step]);
-        edge.all(|value| value == pixels[first])
-    })
-}

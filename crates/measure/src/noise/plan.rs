@@ -8,7 +8,7 @@ use shearq_submissions::SkySource;
 use super::blocks::{BLOCK, PIXELS, POLYNOMIALS, frame, polynomials};
 use super::covariance::{lags, matrix};
 use crate::error::MeasureError;
-use crate::examine::{columns_of, enough, stamps_of};
+use crate::examine::{enough, in_rows};
 
 /// Side of the smallest stamps whose border is free of the galaxy. See docs/constants.md.
 const LEAST_STAMP: usize = 24;
@@ -80,7 +80,6 @@ impl NoisePlan {
     /// Which of `count` stamps are looked at: those of [`NoisePlan::rows`] in the arrangement nearest to a square, in which
     /// images of stamps have them.
     pub fn stamps(&self, count: usize) -> Vec<usize> {
-        let columns = columns_of(count);
-        stamps_of(self.rows(columns, count.div_ceil(columns)), columns, count)
+        in_rows(count, |columns, rows| self.rows(columns, rows))
     }
 }

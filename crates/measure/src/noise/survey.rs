@@ -8,7 +8,7 @@ use ndarray::ArrayView2;
 use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::SkySource;
 
-use super::blocks::{BLOCK, PIXELS, look_at, padded};
+use super::blocks::{BLOCK, PIXELS, look_at};
 use super::covariance::noise_of;
 use super::plan::NoisePlan;
 use super::stamp_noise::StampNoise;
@@ -118,7 +118,7 @@ impl NoiseSurvey {
         }
         pixel::copy(stamp, &mut self.pixels);
         let whole = self.pixels.iter().all(|value| value.is_finite());
-        let padded = padded(&self.pixels, full);
+        let padded = pixel::padding(&self.pixels, full).map(|depth| depth > 0);
         let flat = self.pixels.iter().all(|value| *value == self.pixels[0]);
         self.peak = self.peak.max(highest(&self.pixels));
         self.counts[0] += 1;

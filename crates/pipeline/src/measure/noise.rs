@@ -1,6 +1,5 @@
 //! Checks of the noise of an image before it is measured.
 
-use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -40,7 +39,7 @@ pub(super) fn survey(
             for stamp in stamps.outer_iter().take(mosaic.of_row(row)) {
                 survey.add(stamp)?;
             }
-            Ok(ControlFlow::Continue(()))
+            Ok(())
         })?;
         Ok::<_, PipelineError>(survey)
     };

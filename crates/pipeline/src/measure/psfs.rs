@@ -1,6 +1,5 @@
 //! The PSFs of an image: one for all galaxies, or one per galaxy along the rows of stamps.
 
-use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -86,11 +85,7 @@ impl PsfSource {
                     .collect()
             });
             looks.into_iter().for_each(|look| survey.add(look));
-            Ok(if survey.is_over() {
-                ControlFlow::Break(())
-            } else {
-                ControlFlow::Continue(())
-            })
+            Ok(())
         })?;
         Ok(survey.common())
     }
