@@ -41,15 +41,15 @@ pub struct CommonProfile {
 pub(super) struct Common {
     /// Values at the radii, of each term.
     values: [[f64; TERMS]; COUNT],
-    /// Whether there is more than the round part.
-    turns: bool,
+    /// Terms that are not zero.
+    terms: usize,
 }
 
 /// Sums of the normal equations for the values at the radii. Only radii next to each other have products.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Sums {
-    /// Mean square of what is left, in units of the noise.
-    pub(super) left: f64,
+    /// Mean square of what is left, and its sum, in units of the noise.
+    pub(super) left: [f64; 2],
     /// Products of the terms at each radius.
     squares: [[f64; PAIRS]; COUNT],
     /// Products with the terms at the radius before, which are symmetric.
@@ -60,7 +60,7 @@ pub(super) struct Sums {
 impl Default for Sums {
     fn default() -> Self {
         Sums {
-            left: 0.0,
+            left: [0.0; 2],
             squares: [[0.0; PAIRS]; COUNT],
             products: [[0.0; PAIRS]; COUNT],
             right: [[0.0; TERMS]; COUNT],
@@ -98,9 +98,12 @@ impl Sums {
                 sums.right[at][i] += weight * near * left * terms[i];
                 sums.right[at + 1][i] += weight * far * left * terms[i];
             }
-            sums.left += weight * left * left;
+            sums.left[0] += weight * left * left;
+            sums.left[1] += left * amplitude / sigma;
         }
-        sums.left /= star.len() as f64;
+        let pixels = star.len() as f64;
+        sums.left[0] /= pixels;
+        sums.left[1] /= pixels.sqrt();
         sums
     }
 
@@ -123,27 +126,24 @@ impl Sums {
     /// of each star, and what is missing of the mean would bias all images alike. The others are zero unless they are
     /// significant: their noise would be an ellipticity that all galaxies of the image share.
     pub(super) fn common(&self, stars: usize) -> Option<Common> {
-        let (round, gain_of_round) = self.solved(1)?;
-        let kept = Common {
-            values: round,
-            turns: false,
-        };
+        let (mut values, gain) = self.solved(1)?;
+        let mut found = Common { values, terms: 1 };
         if stars < ENOUGH_TO_TURN {
-            return Some(kept);
+            return Some(found);
         }
-        let (values, gain) = self.solved(TERMS)?;
         let seen = self.squares.iter().skip(1).filter(|pairs| pairs[0] > 0.0);
-        let count = ((TERMS - 1) * seen.count() / COARSE) as f64;
-        // The sum of `count` squares of noise has the variance 2 `count`.
-        let excess = (gain - gain_of_round - count) / (2.0 * count).sqrt();
-        Some(if excess > CLEAR {
-            Common {
-                values,
-                turns: true,
+        let more = (2 * seen.count() / COARSE) as f64;
+        let mut before = gain;
+        for terms in [3, TERMS] {
+            let gain;
+            (values, gain) = self.solved(terms)?;
+            // The sum of so many squares of noise has twice their number as variance.
+            if gain - before - more > CLEAR * (2.0 * more).sqrt() {
+                found = Common { values, terms };
             }
-        } else {
-            kept
-        })
+            before = gain;
+        }
+        Some(found)
     }
 
     /// The functions that fit best, if only the first `terms` are not zero, and by how much they lower the sum of squares.
@@ -165,7 +165,7 @@ impl Sums {
         };
         for at in 0..COUNT {
             let mut pair = 0;
-            for i in 0..TERMS {
+            for i in 0..terms {
                 for j in 0..=i {
                     add((at, i), (at, j), self.squares[at][pair]);
                     if i != j {
@@ -192,7 +192,7 @@ impl Sums {
         }
         let mut found = right;
         let positive = |pivot: f64| (pivot > 0.0 && pivot.is_finite()).then_some(pivot);
-        cholesky(&mut matrix, &mut found, UNKNOWNS, positive)?;
+        cholesky(&mut matrix, &mut found, COUNT * terms, positive)?;
         let gain = found.iter().zip(right).map(|(a, b)| a * b).sum();
         let mut values = [[0.0; TERMS]; COUNT];
         for (at, values) in values.iter_mut().enumerate() {
@@ -214,7 +214,7 @@ fn knots(at: usize, term: usize, terms: usize) -> impl Iterator<Item = (usize, f
     let parts = [(before, 1.0 - share), (before + step, share)];
     parts.into_iter().filter_map(move |(knot, share)| {
         let free = term < terms && share > 0.0 && (term == 0 || knot > 0);
-        free.then_some((knot * TERMS + term, share))
+        free.then_some((knot * terms + term, share))
     })
 }
 
@@ -250,9 +250,9 @@ impl Common {
                 let (at, far) = place(square(x, y).sqrt());
                 let [near, next] = [self.values[at], self.values[at + 1]];
                 let mut sum = near[0] + far * (next[0] - near[0]);
-                if self.turns {
+                if self.terms > 1 {
                     let terms = terms(x - x0, y - y0);
-                    for k in 1..TERMS {
+                    for k in 1..self.terms {
                         sum += terms[k] * (near[k] + far * (next[k] - near[k]));
                     }
                 }
@@ -308,7 +308,7 @@ mod tests {
         });
         let common = Common {
             values,
-            turns: true,
+            terms: TERMS,
         };
         let mut model = Array2::zeros((N, N));
         profile.draw(model.view_mut());

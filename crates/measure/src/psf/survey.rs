@@ -15,8 +15,8 @@ const FEWEST: usize = 10;
 const LEAST_SNR: f64 = 5.0;
 /// Stars share a function up to so many times the S/N of the faintest. See docs/constants.md.
 const RANGE: f64 = 2.0;
-/// Standard deviations by which more may be left of a star than of others. See docs/constants.md.
-const OUTSIDE: f64 = 10.0;
+/// Standard deviations by which what is left of a star may differ from others. See docs/constants.md.
+const OUTSIDE: f64 = 5.0;
 
 /// Looks at stars of an image, one per galaxy: buffers for one thread.
 #[derive(Debug)]
@@ -84,15 +84,19 @@ impl StarSurvey {
     }
 }
 
-/// What stars have in common, the faintest of which is the first. Stars of which much more is left than of the others have
-/// faults of their own, and are left out.
+/// What stars have in common, the faintest of which is the first. Stars of which much more or less is left than of the others
+/// have faults of their own, and are left out.
 fn of_range(stars: &[(f64, Sums)]) -> Option<Common> {
-    let mut left: Vec<f64> = stars.iter().map(|(_, sums)| sums.left).collect();
-    let (middle, scatter) = scatter(&mut left)?;
-    let most = middle + OUTSIDE * scatter;
+    let usual = |which: usize| {
+        let mut left: Vec<f64> = stars.iter().map(|(_, sums)| sums.left[which]).collect();
+        let (middle, scatter) = scatter(&mut left)?;
+        Some(move |sums: &Sums| (sums.left[which] - middle).abs() <= OUTSIDE * scatter)
+    };
+    let (of_square, of_sum) = (usual(0)?, usual(1)?);
+    let kept = |(_, sums): &&(f64, Sums)| of_square(sums) && of_sum(sums);
     let brightest = RANGE * stars[0].0;
     let mut all = Sums::default();
-    for (snr, sums) in stars.iter().filter(|(_, sums)| sums.left <= most) {
+    for (snr, sums) in stars.iter().filter(kept) {
         // The few stars beyond the range would outweigh the others.
         all.add(sums, (brightest / snr).powi(2).min(1.0));
     }
