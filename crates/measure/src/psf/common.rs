@@ -301,9 +301,13 @@ mod tests {
             _ => 0.01 * ((2 * term + 1) as f64 * k as f64 / 6.0).sin(),
         };
         let values = std::array::from_fn(|k| {
-            std::array::from_fn(|term| match (term, k % COARSE) {
-                (1.., 1) => 0.5 * (wave(term, k - 1) + wave(term, k + 1)),
-                _ => wave(term, k),
+            std::array::from_fn(|term| {
+                let (knot, after) = match term {
+                    0 => (k, 0),
+                    _ => (k / COARSE * COARSE, k % COARSE),
+                };
+                let [from, to] = [knot, knot + COARSE].map(|knot| wave(term, knot));
+                from + (to - from) * after as f64 / COARSE as f64
             })
         });
         let common = Common {

@@ -24,6 +24,8 @@ const CLEAR: f64 = 5.0;
 /// Light of a background, in units of the star's, above which |m| may exceed 2·10⁻³. See
 /// docs/constants.md.
 const BACKGROUND: f64 = 0.1;
+/// Highest level that is stated, in units of the peak: of stamps without a star. See docs/constants.md.
+const MOST_LEVEL: f64 = 100.0;
 /// Light of a gradient extrapolated from the brighter edge, above which a warning is due. See
 /// docs/constants.md.
 const GRADIENT: f64 = 0.3;
@@ -129,14 +131,20 @@ impl PsfLook {
             }
         }
         let bright = (peak - outer.mean()).max(f64::MIN_POSITIVE);
+        let area = breadth::area(psf);
         Some(PsfLook {
             side: n,
             snr: (power - count * sigma * sigma).max(0.0).sqrt() / sigma,
-            level: level / bright,
+            level: (level / bright).clamp(-MOST_LEVEL, MOST_LEVEL),
             background: level * pixels / star,
             slope: slope.map(|slope| slope / bright),
             gradient: steep * 0.5 * n as f64 * pixels / star,
-            area: breadth::area(psf),
+            // More noise than light, or light without end, has no area.
+            area: if area > 0.0 && area < pixels {
+                area
+            } else {
+                f64::INFINITY
+            },
             core: core_of_psf(psf, star::place(psf), outer.mean(), sigma),
             moved,
         })
@@ -330,6 +338,17 @@ mod tests {
         delta[(24, 23)] = 3.0;
         assert_eq!(kinds(&delta), ["psf-narrow"]);
         assert_eq!(kinds(&drawn(MOFFAT, 0.3, 48)), ["psf-narrow"]);
+    }
+
+    #[test]
+    fn stamps_without_a_star_have_numbers_that_can_be_read() {
+        let look = PsfLook::of(Array2::from_elem((48, 48), 1.0 / 2304.0).view(), None).unwrap();
+        let found = warnings(&[look], true, None);
+        let text: Vec<String> = found.iter().map(ToString::to_string).collect();
+        assert!(
+            !text.is_empty() && text.iter().all(|line| line.len() < 300),
+            "{text:?}"
+        );
     }
 
     #[test]
