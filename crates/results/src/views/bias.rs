@@ -145,7 +145,7 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
 
 /// |m| above which catalogue and truth hardly belong together.
 const IMPLAUSIBLE: f64 = 0.3;
-/// Standard errors by which it has to be larger.
+/// The same in standard errors of m, added to it.
 const CLEAR: f64 = 5.0;
 
 /// A warning if m is larger than a bias of shapes can be.
