@@ -149,7 +149,8 @@ def watch():
 watcher = threading.Thread(target=watch)
 watcher.start()
 before = len(os.listdir("/proc/self/task"))
-shearq.measure(image.stamps, image.psf, noise=1.0)
+for _ in range(5):
+    shearq.measure(image.stamps, image.psf, noise=1.0)
 done.set(); watcher.join()
 print(most - before)
 """

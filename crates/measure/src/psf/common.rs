@@ -227,6 +227,12 @@ impl CommonProfile {
 }
 
 impl Common {
+    /// Terms that are not zero.
+    #[cfg(test)]
+    pub(super) fn terms(&self) -> usize {
+        self.terms
+    }
+
     /// Largest difference to another one, in units of the largest value of that one.
     #[cfg(test)]
     pub(super) fn unlike(&self, other: &Self) -> f64 {

@@ -51,7 +51,7 @@ impl StarLooker {
 }
 
 /// What stars of an image show together, before galaxies are measured.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Clone)]
 pub struct StarSurvey {
     /// S/N of each noisy star, and what is left of it.
     noisy: Vec<(f64, Sums)>,
@@ -171,12 +171,60 @@ mod tests {
 
     #[test]
     fn a_star_with_a_fault_is_left_out() {
-        let (mut noisy, _) = stars(PsfProfile::Kolmogorov, 100.0, 40);
+        let (noisy, _) = stars(PsfProfile::Kolmogorov, 100.0, 40);
         let without = survey(&noisy.slice(ndarray::s![..39, .., ..]).to_owned());
-        noisy[(39, 20, 30)] += 0.5;
-        let with = survey(&noisy);
-        assert_eq!(with.noisy.len(), 40);
-        assert_eq!(with.common(), without.common());
+        let [mut hot, mut level] = [&noisy, &noisy].map(Clone::clone);
+        hot[(39, 20, 30)] += 0.5;
+        // A background of half the noise, which changes the square by a fraction of the noise's own.
+        let one = noisy.index_axis(Axis(0), 39);
+        let background = 0.005 * one.iter().map(|v| v * v).sum::<f64>().sqrt();
+        level
+            .index_axis_mut(Axis(0), 39)
+            .map_inplace(|value| *value += background);
+        // Stripes of twice the noise change the square and not the sum.
+        let mut stripes = noisy.clone();
+        let mut last = stripes.index_axis_mut(Axis(0), 39);
+        for ((y, x), value) in last.indexed_iter_mut() {
+            let far = y.abs_diff(24).max(x.abs_diff(24));
+            if (14..20).contains(&far) {
+                *value += if x % 2 == 0 { 4.0 } else { -4.0 } * background;
+            }
+        }
+        for (name, stars) in [("hot", hot), ("level", level), ("stripes", stripes)] {
+            let with = survey(&stars);
+            assert_eq!(with.noisy.len(), 40, "{name}");
+            assert_eq!(with.common(), without.clone().common(), "{name}");
+        }
+    }
+
+    #[test]
+    fn copies_of_a_star_count_once() {
+        let (noisy, _) = stars(PsfProfile::Kolmogorov, 100.0, 20);
+        let twice = ndarray::concatenate![Axis(0), noisy, noisy];
+        assert_eq!(survey(&twice).common(), survey(&noisy).common());
+        let one = noisy.slice(ndarray::s![..1, .., ..]);
+        let copies = ndarray::concatenate(Axis(0), &[one; 40]).unwrap();
+        assert_eq!(survey(&copies).common(), None);
+    }
+
+    #[test]
+    fn many_stars_share_what_turns_if_it_is_significant() {
+        // Terms of stars with light that varies with the angle, in units of the peak.
+        let terms = |times: f64, count: usize| {
+            let (mut noisy, _) = stars(PsfProfile::Moffat { beta: 3.0 }, 100.0, count);
+            for mut star in noisy.outer_iter_mut() {
+                let peak = star.iter().copied().fold(0.0, f64::max);
+                for ((y, x), value) in star.indexed_iter_mut() {
+                    let (dx, dy) = (x as f64 - 23.5, y as f64 - 23.5);
+                    let fall = (-(dx * dx + dy * dy) / 72.0).exp();
+                    *value += 0.01 * peak * fall * (times * dy.atan2(dx)).cos();
+                }
+            }
+            survey(&noisy).common().unwrap().of(100.0).terms()
+        };
+        assert_eq!([terms(2.0, 120), terms(4.0, 120)], [3, 5]);
+        // Too few stars, and three times the angle, which is no term.
+        assert_eq!([terms(4.0, 99), terms(3.0, 120)], [1, 1]);
     }
 
     #[test]
@@ -216,6 +264,15 @@ mod tests {
             assert_eq!(both.of(snr), function, "{snr}");
         }
         assert_ne!(first, second);
+        // A bright star gets the function of bright ones.
+        let star = bright.index_axis(Axis(0), 0);
+        let shrunk = |common: CommonProfile| {
+            let mut shrinker = Shrinker::default();
+            shrinker.set_common(Some(&Arc::new(common)));
+            shrinker.shrunk(star).to_owned()
+        };
+        let ranges = vec![both.ranges[1].clone()];
+        assert_eq!(shrunk((*both).clone()), shrunk(CommonProfile { ranges }));
     }
 
     #[test]
@@ -243,6 +300,13 @@ mod tests {
         }
         let clean = survey(&clean);
         assert!(clean.noisy.is_empty() && clean.common().is_none());
+        let (faint, _) = stars(PsfProfile::Kolmogorov, 4.0, 30);
+        assert!(
+            survey(&faint)
+                .noisy
+                .iter()
+                .all(|(snr, _)| *snr >= LEAST_SNR)
+        );
         // A PSF for all.
         let mut looker = StarLooker::new(CUT, N);
         let StarLook(none) = looker.look(&Psfs::star(noisy.index_axis(Axis(0), 0)), 0);
