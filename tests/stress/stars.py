@@ -115,11 +115,12 @@ def estimates(found, shape):
     return np.array([*values, leaks.sum()]), np.array([*shares, leaks - leaks.mean()])
 
 
-def added(case, snr, seed):
-    """What noise of stars adds to m1, m2 and the leakage, and the errors."""
+def added(case, between, seed):
+    """What noise of stars with S/N between two values adds to m1, m2 and the leakage, and the errors."""
     psf, shape, count, fields, images = CASES[case]
     rng = np.random.default_rng([seed, list(CASES).index(case)])
     stamps, stars = scene(psf, count, rng)
+    snr = np.exp(rng.uniform(*np.log(between), count))
     sigma = (np.sqrt((stars**2).sum((1, 2))) / snr)[:, None, None]
     noisy, clean = [], []
     for _ in range(fields // 2):
@@ -139,14 +140,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="*", default=list(CASES), metavar="CASE", help=", ".join(CASES))
     parser.add_argument("--snr", type=float, nargs="+", default=[50.0, 100.0], help="S/N of the stars")
+    parser.add_argument("--between", type=float, nargs=2, metavar=("LOW", "HIGH"), help="S/N between these instead")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     for case in options.cases:
-        for snr in options.snr:
-            (m1, m2, leak), (error1, error2, error) = added(case, snr, options.seed)
+        for low, high in [options.between] if options.between else [(snr, snr) for snr in options.snr]:
+            (m1, m2, leak), (error1, error2, error) = added(case, (low, high), options.seed)
             m = f"{1e3 * m1:+6.2f} {1e3 * m2:+6.2f} ± {1e3 * max(error1, error2):.2f}"
-            print(f"{case:15s} S/N {snr:5.0f}   m1, m2 (1e-3) {m}   leakage {leak:+.4f} ± {error:.4f}", flush=True)
+            print(f"{case:15s} S/N {low:.0f} to {high:.0f}   m1, m2 (1e-3) {m}   leakage {leak:+.4f} ± {error:.4f}", flush=True)
 
 
 if __name__ == "__main__":
