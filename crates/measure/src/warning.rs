@@ -505,7 +505,7 @@ impl fmt::Display for Warning {
                         "The noise of one star changes m by about {m:.3} and c by about {c:.3}. Try: average several stars, or fit a model"
                     ),
                     None => f.write_str(
-                        "With a star of S/N 50 for each galaxy, m is right to 0.002 behind Moffat and Kolmogorov PSFs, and to 0.01 behind others. Try: a model of the PSF, fitted to all stars"
+                        "With a star of S/N 50 for each galaxy, m is right to 0.003 behind Moffat and Kolmogorov PSFs, and to 0.01 behind others. Try: a model of the PSF, fitted to all stars"
                     ),
                 }
             }

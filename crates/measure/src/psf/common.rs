@@ -32,7 +32,7 @@ const RIDGE: f64 = 1e-9;
 /// What the noisy stars of an image have in common: [`StarSurvey::common`](crate::StarSurvey::common).
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommonProfile {
-    /// For each range of S/N its lower end, and what its stars have in common. The first is for all stars below as well.
+    /// For each range of S/N its lower end, and what its stars have in common. It also serves stars below the first range.
     pub(super) ranges: Vec<(f64, Common)>,
 }
 
@@ -122,7 +122,7 @@ impl Sums {
         add(self.right.as_flattened_mut(), more.right.as_flattened());
     }
 
-    /// The functions that fit best, to `stars` stars. The round one is not reduced for its noise: that is small beside the noise
+    /// The functions that fit best, to `stars` stars. The round one is not reduced for its noise: that is small compared with the noise
     /// of each star, and what is missing of the mean would bias all images alike. The others are zero unless they are
     /// significant: their noise would be an ellipticity that all galaxies of the image share.
     pub(super) fn common(&self, stars: usize) -> Option<Common> {
