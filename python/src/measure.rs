@@ -269,6 +269,9 @@ impl<'s> Request<'s> {
         let mut survey = StarSurvey::default();
         for at in examined_stamps(self.dim.0) {
             survey.add(looker.look(&psfs.piece(at, at + 1)?, 0));
+            if survey.is_over() {
+                break;
+            }
         }
         Ok(survey.common())
     }

@@ -118,6 +118,9 @@ impl Measurer {
         let mut survey = StarSurvey::default();
         for at in examined_stamps(psfs.count()?) {
             survey.add(looker.look(psfs, at));
+            if survey.is_over() {
+                break;
+            }
         }
         survey.common()
     }

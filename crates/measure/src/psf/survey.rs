@@ -11,6 +11,8 @@ use crate::psfs::Psfs;
 
 /// Fewest noisy stars that tell what they have in common. See docs/constants.md.
 const FEWEST: usize = 10;
+/// Stars without noise in the beginning after which no more are looked at. See docs/constants.md.
+const WITHOUT_NOISE: usize = 100;
 /// Least S/N of stars that show something. See docs/constants.md.
 const LEAST_SNR: f64 = 5.0;
 /// Stars share a function up to so many times the S/N of the faintest. See docs/constants.md.
@@ -53,6 +55,7 @@ impl StarLooker {
 /// What stars of an image show together, before galaxies are measured.
 #[derive(Debug, Default, Clone)]
 pub struct StarSurvey {
+    looked_at: usize,
     /// S/N of each noisy star, and what is left of it.
     noisy: Vec<(f64, Sums)>,
 }
@@ -60,7 +63,13 @@ pub struct StarSurvey {
 impl StarSurvey {
     /// Adds a star. Results depend on the order, but not on the threads that looked at the stars.
     pub fn add(&mut self, StarLook(left): StarLook) {
+        self.looked_at += 1;
         self.noisy.extend(left.filter(|(snr, _)| *snr >= LEAST_SNR));
+    }
+
+    /// Whether no more stars are of use, because the first ones have no noise.
+    pub fn is_over(&self) -> bool {
+        self.looked_at >= WITHOUT_NOISE && self.noisy.is_empty()
     }
 
     /// What the stars have in common; `None` if too few of them have noise.
@@ -300,6 +309,15 @@ mod tests {
         }
         let clean = survey(&clean);
         assert!(clean.noisy.is_empty() && clean.common().is_none());
+        // Without noise in the beginning.
+        let mut late = StarSurvey::default();
+        (0..WITHOUT_NOISE - 1).for_each(|_| late.add(StarLook(None)));
+        assert!(!late.is_over());
+        late.add(StarLook(Some((50.0, Sums::default()))));
+        assert!(!late.is_over());
+        let mut none = StarSurvey::default();
+        (0..WITHOUT_NOISE).for_each(|_| none.add(StarLook(None)));
+        assert!(none.is_over());
         let (faint, _) = stars(PsfProfile::Kolmogorov, 4.0, 30);
         assert!(
             survey(&faint)

@@ -1,5 +1,6 @@
 //! Checks of the noise of an image before it is measured.
 
+use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -39,7 +40,7 @@ pub(super) fn survey(
             for stamp in stamps.outer_iter().take(mosaic.of_row(row)) {
                 survey.add(stamp)?;
             }
-            Ok(())
+            Ok(ControlFlow::Continue(()))
         })?;
         Ok::<_, PipelineError>(survey)
     };

@@ -1,5 +1,6 @@
 //! The PSFs of an image: one for all galaxies, or one per galaxy along the rows of stamps.
 
+use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -84,8 +85,13 @@ impl PsfSource {
                     .flatten()
                     .collect()
             });
-            looks.into_iter().for_each(|look| survey.add(look));
-            Ok(())
+            for look in looks {
+                survey.add(look);
+                if survey.is_over() {
+                    return Ok(ControlFlow::Break(()));
+                }
+            }
+            Ok(ControlFlow::Continue(()))
         })?;
         Ok(survey.common())
     }
