@@ -21,7 +21,7 @@ const COARSE: usize = 2;
 /// Standard deviations by which those with angles must lower the sum of squares. See docs/constants.md.
 const CLEAR: f64 = 3.0;
 /// Fewest stars for those with angles. See docs/constants.md.
-pub(super) const ENOUGH_TO_TURN: usize = 100;
+const ENOUGH_TO_TURN: usize = 100;
 /// Products of terms with those up to them.
 const PAIRS: usize = TERMS * (TERMS + 1) / 2;
 /// All unknowns.
@@ -86,14 +86,12 @@ impl Sums {
             let (at, far) = place(square(x, y).sqrt());
             let (near, terms) = (1.0 - far, terms(x - x0, y - y0));
             let parts = [near * near, near * far, far * far].map(|share| weight * share);
-            let mut pair = 0;
             for i in 0..TERMS {
                 for j in 0..=i {
-                    let product = terms[i] * terms[j];
+                    let (pair, product) = (pair(i, j), terms[i] * terms[j]);
                     sums.squares[at][pair] += parts[0] * product;
                     sums.products[at + 1][pair] += parts[1] * product;
                     sums.squares[at + 1][pair] += parts[2] * product;
-                    pair += 1;
                 }
                 sums.right[at][i] += weight * near * left * terms[i];
                 sums.right[at + 1][i] += weight * far * left * terms[i];
@@ -122,9 +120,9 @@ impl Sums {
         add(self.right.as_flattened_mut(), more.right.as_flattened());
     }
 
-    /// The functions that fit best, to `stars` stars. The round one is not reduced for its noise: that is small compared with the noise
-    /// of each star, and what is missing of the mean would bias all images alike. The others are zero unless they are
-    /// significant: their noise would be an ellipticity that all galaxies of the image share.
+    /// The functions that fit best, to `stars` stars. The round one is not reduced for its noise: that is small compared with
+    /// the noise of each star, and what is missing of the mean would bias all images alike. The others are zero unless they
+    /// are significant: their noise would be an ellipticity that all galaxies of the image share.
     pub(super) fn common(&self, stars: usize) -> Option<Common> {
         let (mut values, gain) = self.solved(1)?;
         let mut found = Common { values, terms: 1 };
@@ -164,23 +162,15 @@ impl Sums {
             }
         };
         for at in 0..COUNT {
-            let mut pair = 0;
             for i in 0..terms {
-                for j in 0..=i {
+                for j in 0..terms {
+                    let pair = pair(i, j);
                     add((at, i), (at, j), self.squares[at][pair]);
-                    if i != j {
-                        add((at, j), (at, i), self.squares[at][pair]);
-                    }
                     if at > 0 {
                         let sum = self.products[at][pair];
                         add((at, i), (at - 1, j), sum);
                         add((at - 1, j), (at, i), sum);
-                        if i != j {
-                            add((at, j), (at - 1, i), sum);
-                            add((at - 1, i), (at, j), sum);
-                        }
                     }
-                    pair += 1;
                 }
                 for (row, share) in knots(at, i, terms) {
                     right[row] += share * self.right[at][i];
@@ -203,6 +193,13 @@ impl Sums {
         }
         Some((values, gain))
     }
+}
+
+/// Place of a product of two terms among the `PAIRS`.
+#[inline(always)]
+fn pair(i: usize, j: usize) -> usize {
+    let (low, high) = (i.min(j), i.max(j));
+    high * (high + 1) / 2 + low
 }
 
 /// The unknowns on which the value of a term at a radius rests, with their shares: that at the radius, or for terms with

@@ -292,7 +292,7 @@ mod tests {
         let (with, without) = (survey(&with).common(), survey(&noisy).common());
         let [with, without] = [with.unwrap(), without.unwrap()];
         assert_eq!(with.ranges.len(), 1);
-        // Three of S/N 90 beside forty of 50. Without a limit the bright ones would have 83 % of the weight.
+        // Three of S/N 90 next to forty of 50. Without a limit the bright ones would have 83 % of the weight.
         let share = with.of(50.0).unlike(without.of(50.0));
         assert!(share > 0.0 && share < 0.4, "{share}");
     }
