@@ -27,6 +27,8 @@
 //! ```
 //!
 //! [`cross_spectrum`] uses pairs of images only, so noise does not bias it.
+
+#![warn(missing_docs, clippy::missing_errors_doc)]
 #![forbid(unsafe_code)]
 
 pub mod bandpower;

@@ -26,7 +26,6 @@ mod gathered;
 mod generated;
 mod identity;
 mod killed;
-mod language;
 mod ledger;
 mod limits;
 mod noisy_stars;

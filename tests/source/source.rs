@@ -1,4 +1,4 @@
-//! The source code itself: levels of crates, cycles of modules, lengths of files, the public API.
+//! The source code itself: levels of crates and cycles of modules.
 
 #![allow(
     clippy::unwrap_used,
@@ -6,9 +6,7 @@
     reason = "a failed test stops at the cause"
 )]
 
-mod api;
 mod crates;
-mod lengths;
 mod modules;
 mod tree;
 mod unsafe_code;

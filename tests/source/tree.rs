@@ -156,14 +156,6 @@ impl Tree {
         None
     }
 
-    /// The item of a target.
-    pub fn item(&self, module: &ModulePath, name: &str) -> Option<&Item> {
-        let items = &self.0.get(module)?.items;
-        items
-            .iter()
-            .find(|item| name_of(item).as_deref() == Some(name))
-    }
-
     /// The imports of a module.
     pub fn imports(&self, module: &ModulePath) -> &[Import] {
         &self.0[module].imports
@@ -242,22 +234,6 @@ pub fn name_of(item: &Item) -> Option<String> {
         _ => return None,
     };
     Some(name.to_string())
-}
-
-/// Whether an item is public.
-pub fn is_public(item: &Item) -> bool {
-    let visibility = match item {
-        Item::Const(item) => &item.vis,
-        Item::Enum(item) => &item.vis,
-        Item::Fn(item) => &item.vis,
-        Item::Mod(item) => &item.vis,
-        Item::Static(item) => &item.vis,
-        Item::Struct(item) => &item.vis,
-        Item::Trait(item) => &item.vis,
-        Item::Type(item) => &item.vis,
-        _ => return false,
-    };
-    matches!(visibility, Visibility::Public(_))
 }
 
 /// The names of a path.

@@ -22,6 +22,8 @@
 //! * [`Design`]: how catalogues belong together, recognised from their true shears.
 //! * [`StarNoise`]: an error of m and c that all galaxies behind one star have in common.
 //! * [`estimate`] and [`Grouping::estimate`]: values with errors; [`Verdict`]: comparison with a requirement.
+
+#![warn(missing_docs, clippy::missing_errors_doc)]
 #![forbid(unsafe_code)]
 
 mod design;

@@ -33,6 +33,8 @@
 //! pixel in image units. A request that cannot be met is a [`MeasureError`]. A galaxy that cannot be measured has
 //! [`Flags`] and no ellipticity.
 
+#![warn(missing_docs, clippy::missing_errors_doc)]
+
 mod batch;
 mod brightness;
 mod calibrate;

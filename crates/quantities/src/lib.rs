@@ -11,6 +11,8 @@
 //!
 //! Positions are in pixels, x along columns and y along rows; arrays are indexed `[y, x]`. e1 > 0 is elongation along
 //! +x, e2 > 0 along x = y. Wavenumbers are in radians per pixel. A transform is F(k) = ∫ I(x) e^(−ik·x) d²x.
+
+#![warn(missing_docs, clippy::missing_errors_doc)]
 #![cfg_attr(not(test), forbid(unsafe_code))] // ndarray's slicing in tests allows it
 
 mod ellipticity;
