@@ -242,7 +242,11 @@ impl SimulationArguments {
             tilt,
         } = self;
         let settings = SimulationSettings {
-            spectrum: ShearSpectrum { amplitude, tilt },
+            spectrum: ShearSpectrum {
+                amplitude,
+                tilt,
+                ..ShearSpectrum::default()
+            },
             ..SimulationSettings::new(seed, usize::from(grid))
         };
         settings.validate()?;

@@ -48,7 +48,11 @@ pub(crate) fn simulate<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let usual = SimulationSettings::new(seed, grid);
     let settings = SimulationSettings {
-        spectrum: ShearSpectrum { amplitude, tilt },
+        spectrum: ShearSpectrum {
+            amplitude,
+            tilt,
+            ..ShearSpectrum::default()
+        },
         intrinsic_sigma: intrinsic_sigma.unwrap_or(usual.intrinsic_sigma),
         ..usual
     };

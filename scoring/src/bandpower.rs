@@ -144,6 +144,12 @@ impl Bins {
         bins
     }
 
+    /// The bin of multipole `l` between ℓ_min and ℓ_max; the first or the last one beyond them.
+    pub fn nearest(&self, l: f64) -> usize {
+        let bin = ((l + 1.0 - self.grid.l_min().0) / self.width).round();
+        bin.clamp(0.0, BINS as f64 - 1.0) as usize
+    }
+
     /// Side of the field in radians.
     fn side(&self) -> f64 {
         self.grid.side().0

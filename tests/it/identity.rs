@@ -117,6 +117,7 @@ fn settings_of_all_digits_are_read_as_they_were_written() {
             spectrum: ShearSpectrum {
                 amplitude: 100.0 * random.random::<f64>(),
                 tilt: random.random::<f64>() - 0.5,
+                scatter: 1.0 + random.random::<f64>(),
             },
             ..SimulationSettings::new(random.random(), 12)
         };

@@ -1,12 +1,12 @@
 //! Gaussian random ellipticity fields on a grid, from E- and B-mode power spectra.
 
 use ndarray::Array2;
-use rand::Rng;
+use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 use shearq_fourier::Complex64;
-use shearq_scoring::Grid;
 use shearq_scoring::modes::{Decomposer, Modes};
+use shearq_scoring::{BINS, Grid};
 
 /// ℓ²C_ℓ/2π of the fiducial ΛCDM shear, sources at z ≈ 1: the table that GREAT3 used.
 const FIDUCIAL: [(f64, f64); 12] = [
@@ -27,13 +27,26 @@ const FIDUCIAL: [(f64, f64); 12] = [
 /// Multipole at which the tilt turns.
 const PIVOT: f64 = 1000.0;
 
-/// The shear power spectrum of a set: the fiducial one times amplitude·(ℓ/1000)^tilt.
+/// The shear power spectrum of a set: the fiducial one times amplitude·(ℓ/1000)^tilt, and in each bandpower of the scoring
+/// times a random factor.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ShearSpectrum {
     /// Factor on the power.
     pub amplitude: f64,
     /// Extra slope of the power.
     pub tilt: f64,
+    /// Largest factor s on a bandpower. Each set and bandpower has its own factor, log-uniform between 1/s and s, so
+    /// that neither other sets nor other simulations predict it. 1 for the same smooth spectrum in all sets.
+    #[serde(default = "unscattered", skip_serializing_if = "is_unscattered")]
+    pub scatter: f64,
+}
+
+fn unscattered() -> f64 {
+    1.0
+}
+
+fn is_unscattered(scatter: &f64) -> bool {
+    *scatter == 1.0
 }
 
 impl Default for ShearSpectrum {
@@ -41,6 +54,7 @@ impl Default for ShearSpectrum {
         ShearSpectrum {
             amplitude: 1.0,
             tilt: 0.0,
+            scatter: 1.0,
         }
     }
 }
@@ -58,6 +72,12 @@ impl ShearSpectrum {
         let slope = (p1 / p0).ln() / (l1 / l0).ln();
         let power = p0 * (l / l0).powf(slope);
         power * self.amplitude * (l / PIVOT).powf(self.tilt) * 2.0 * std::f64::consts::PI / (l * l)
+    }
+
+    /// Random factors on the bandpowers of a set.
+    pub(crate) fn factors(&self, rng: &mut impl RngExt) -> [f64; BINS] {
+        let range = self.scatter.ln();
+        std::array::from_fn(|_| (range * (2.0 * rng.random::<f64>() - 1.0)).exp())
     }
 }
 
@@ -142,12 +162,32 @@ mod tests {
         let tilted = ShearSpectrum {
             amplitude: 2.0,
             tilt: 0.5,
+            ..fiducial
         };
         assert!((power(&tilted, 1000.0) / power(&fiducial, 1000.0) - 2.0).abs() < 1e-12);
         assert!(
             (power(&tilted, 2000.0) / power(&fiducial, 2000.0) / 2.0f64.powf(1.5) - 1.0).abs()
                 < 1e-12
         );
+    }
+
+    #[test]
+    fn factors_of_bandpowers_are_log_uniform() {
+        let spectrum = ShearSpectrum {
+            scatter: 4.0,
+            ..ShearSpectrum::default()
+        };
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let logs: Vec<f64> = (0..1000)
+            .flat_map(|_| spectrum.factors(&mut rng).map(f64::ln))
+            .collect();
+        let (count, range) = (logs.len() as f64, 4f64.ln());
+        let mean = logs.iter().sum::<f64>() / count;
+        let square = logs.iter().map(|log| log * log).sum::<f64>() / count;
+        // A uniform number between ±r has the variance r²/3; four standard errors of 20,000 numbers are 3 %.
+        assert!(mean.abs() < 0.03 * range && (3.0 * square / range.powi(2) - 1.0).abs() < 0.03);
+        assert!(logs.iter().all(|log| log.abs() <= range));
+        assert_eq!(ShearSpectrum::default().factors(&mut rng), [1.0; BINS]);
     }
 
     #[test]

@@ -16,7 +16,7 @@ use shearq_quantities::PsfTransform;
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
 use shearq_scoring::modes::Decomposer;
-use shearq_scoring::{Grid, TrueShear};
+use shearq_scoring::{Bins, Definition, Grid, TrueShear};
 
 use super::field::{Content, ShearSpectrum, random_field};
 use super::galaxy::Galaxy;
@@ -50,6 +50,9 @@ const SIDES: RangeInclusive<usize> = 8..=400;
 
 /// Tilts of a spectrum: beyond these all power lies in one mode or none.
 const TILTS: RangeInclusive<f64> = -20.0..=20.0;
+
+/// Factors on bandpowers: beyond these, most sets have all power in one bandpower.
+const SCATTERS: RangeInclusive<f64> = 1.0..=100.0;
 
 /// What a simulation is made from, beside the sets and images asked for. Wherever it is read from, it is
 /// checked by [`SimulationSettings::validate`].
@@ -95,6 +98,7 @@ enum Purpose {
     Intrinsic = 2,
     Psf = 3,
     Galaxy = 4,
+    Bandpowers = 5,
 }
 
 /// Image number in a key that stands for the whole set.
@@ -121,7 +125,12 @@ impl SimulationSettings {
         let &SimulationSettings {
             seed: _,
             grid,
-            spectrum: ShearSpectrum { amplitude, tilt },
+            spectrum:
+                ShearSpectrum {
+                    amplitude,
+                    tilt,
+                    scatter,
+                },
             intrinsic_sigma,
             constant_shear,
             rotated: _,
@@ -149,6 +158,12 @@ impl SimulationSettings {
                     "the simulation's {what} is {value}; expected a finite number, not negative"
                 )));
             }
+        }
+        if !SCATTERS.contains(&scatter) {
+            let (least, most) = (SCATTERS.start(), SCATTERS.end());
+            return Err(SettingsError(format!(
+                "the simulation's scatter of bandpowers is {scatter}; expected {least} to {most}"
+            )));
         }
         if !TILTS.contains(&tilt) {
             let (least, most) = (TILTS.start(), TILTS.end());
@@ -248,9 +263,12 @@ impl SetSimulator {
         let shear = match settings.constant_shear {
             Some([g1, g2]) => Array2::from_elem((grid.n, grid.n), Complex64::new(g1, g2)),
             None => {
+                let mut rng = settings.stream(kind.set, WHOLE_SET, Purpose::Bandpowers);
+                let factors = settings.spectrum.factors(&mut rng);
+                let bins = Bins::new(&grid, Definition::Leaderboard);
                 let mut rng = settings.stream(kind.set, WHOLE_SET, Purpose::Shear);
                 random_field(&decomposer, &mut rng, Content::EOnly, |l| {
-                    settings.spectrum.c_l(l)
+                    settings.spectrum.c_l(l) * factors[bins.nearest(l)]
                 })
             }
         };
