@@ -8,7 +8,7 @@ use crate::convention::Convention;
 use crate::grid::Grid;
 use crate::matching::ConventionMatch;
 use crate::metrics::Metrics;
-use crate::quality::{BiasFits, Quality};
+use crate::quality::{BiasFits, Quality, quality};
 
 /// One convention's spectra and metrics.
 #[derive(Debug, Clone)]
@@ -139,6 +139,12 @@ impl SetScore {
     /// a wrong convention, not to a good measurement.
     pub fn wrong_convention_wins(&self) -> bool {
         self.best.class() != self.chosen.class()
+    }
+
+    /// Q of zero shear: what an entry without images has. It exceeds the Q of measurements while their noise power exceeds
+    /// the power of the shear.
+    pub fn zero_quality(&self) -> Quality {
+        quality(&self.bins, &[0.0; BINS], &self.true_ee)
     }
 
     /// Share of B modes in the scored true power. It is about one half if the sign of g₂ is wrong.

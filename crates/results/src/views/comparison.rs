@@ -15,7 +15,7 @@ use crate::row::mean_metric;
 use crate::row::{RunRecord, SetRecord};
 use crate::views::diagnosis::of_sets;
 use crate::views::metrics::{metric_cell, metric_heading};
-use crate::views::scores::{best_is_another, definition_note, notes};
+use crate::views::scores::{best_is_another, definition_note, notes, zero_shear_note};
 use crate::views::verdict::verdict;
 use shearq_render::figure::{ColourMap, HeatMap};
 use shearq_render::table::{Cell, Heading, Table};
@@ -229,8 +229,17 @@ pub fn compact(variants: &[Variant]) -> Table {
             ),
             "Q: the challenge's score. Q cal.: Q after division by the response.".into(),
             "m: multiplicative bias. noise: scatter per galaxy and component.".into(),
-        ],
+        ]
+        .into_iter()
+        .chain(highest_q(variants).and_then(|best| zero_shear_note(&best.sets)))
+        .collect(),
     }
+}
+
+/// The variant with the highest mean Q.
+fn highest_q(variants: &[Variant]) -> Option<&Variant> {
+    let q = |variant: &Variant| mean_metric(&variant.records(), "q").0;
+    variants.iter().max_by(|a, b| q(a).total_cmp(&q(b)))
 }
 
 /// Runs side by side: means over sets or groups of sets, and the difference in Q from the first row, or the first row

@@ -120,6 +120,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
     lines.extend(diagnosis::of_sets(
         scored.iter().map(|set| (set.set, believable(set))),
     ));
+    lines.extend(zero_shear_note(scored));
     let blank = |set: &&ScoredSet| {
         set.score.constant.is_none() && set.rows.used > 0 && set.score.metrics.q_calibrated.is_nan()
     };
@@ -135,6 +136,23 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         ));
     }
     lines
+}
+
+/// Q of zero shear, which is above that of a measurement while noise dominates.
+pub(super) fn zero_shear_note(scored: &[ScoredSet]) -> Option<String> {
+    let varying = || scored.iter().filter(|set| set.score.constant.is_none());
+    let count = varying().count() as f64;
+    let mean = |q: fn(&SetScore) -> f64| varying().map(|set| q(&set.score)).sum::<f64>() / count;
+    let (zero, own) = (
+        mean(|score| score.zero_quality().q),
+        mean(|score| score.metrics.q),
+    );
+    let verdict = match zero > own {
+        true => ", above the Q of these catalogues: noise dominates Q. Compare Q cal., m and noise",
+        false => "",
+    };
+    zero.is_finite()
+        .then(|| format!("note: without any image, zero shear has Q = {zero:.2}{verdict}."))
 }
 
 /// Findings of a set that odd images do not explain. Copies appear to have no noise, and constant ellipticities no
