@@ -58,7 +58,8 @@ choices! {
         QCorrected: "q-corrected", "Q with azimuthal averages over fixed bins";
         QCalibrated: "q-calibrated", "Q after dividing by the measured response";
         M: "m", "Modulus of the multiplicative bias";
-        C: "c", "Modulus of the additive bias";
+        C: "c", "Modulus of the additive bias, divided by the response";
+        Qc: "qc", "GREAT3's Q_c, from m and c of sets with one shear each";
         Noise: "noise", "Noise of one galaxy's ellipticity";
     }
     Contents {

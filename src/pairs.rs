@@ -69,8 +69,8 @@ const WAYS: [(&str, &[&str]); 32] = [
     (
         "challenge new",
         &[
-            "name kind public private sets images grid amplitude tilt seed metric entries-per-team opens closes contact data-version threads",
-            "name kind public private data truth-table metric entries-per-team opens closes contact data-version threads",
+            "name kind public private sets images grid amplitude tilt seed metric spectra entries-per-team opens closes contact data-version threads",
+            "name kind public private data truth-table metric spectra entries-per-team opens closes contact data-version threads",
         ],
     ),
     ("challenge check", &["ENTRY challenge json threads"]),

@@ -14,8 +14,8 @@ use shearq_challenge::shapes::References;
 use shearq_challenge::terms::Challenge;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::pattern::MAX_IMAGE;
-use shearq_results::submit::check::{check, check_sent};
-use shearq_results::submit::packed::Sent;
+use shearq_results::submit::check::{Finding, Severity, check, check_sent};
+use shearq_results::submit::packed::{Sent, Submission};
 
 use super::check::report;
 use crate::arguments::{Form, SetList, Threads};
@@ -104,9 +104,17 @@ struct NewArguments {
     /// Tables of the true shear of --data: x, y, g1, g2, with `{set}` for the set number [default: as in the data folder].
     #[arg(long, value_name = "PATTERN", requires = "data", conflicts_with_all = ["sets", "images", "grid", "amplitude", "tilt", "seed"])]
     truth_table: Option<String>,
-    /// Metric that ranks entries [default: the metric of the kind].
+    /// Metric that ranks entries [default: q-calibrated, or qc if each set has one shear].
+    ///
+    /// Neither default rewards shrunk ellipticities or entries without images. `q` does while noise dominates it, `m`
+    /// can be tuned with two entries, and `c` and `noise` measure one property only.
     #[arg(long, value_parser = named::<RankBy>())]
     metric: Option<RankBy>,
+    /// Accept power spectra, too, with `--metric q` or `q-corrected`.
+    ///
+    /// Entry by entry, a team can tune a spectrum to the truth without images.
+    #[arg(long)]
+    spectra: bool,
     /// Most entries of a team [default: as the kind, or any number].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     entries_per_team: Option<u32>,
@@ -129,8 +137,9 @@ struct NewArguments {
 /// Check an entry, without the true shear.
 ///
 /// ENTRY is an archive (.tar.gz) or a folder of catalogues or power spectra. Grid, sets and conventions come from
-/// challenge.toml. If the images are there, one image of each set is measured for comparison. This finds swapped or
-/// flipped components, exchanged rows, and distortions that are given as shear.
+/// challenge.toml. If the images are there, they are measured for comparison, in the time of `48/linear/star`. This finds
+/// swapped or flipped components, exchanged rows, images without measured shapes, and distortions that are given as
+/// shear.
 ///
 /// Exit code 0: no errors, perhaps warnings; 1: errors.
 #[derive(Debug, Args)]
@@ -213,7 +222,8 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         name: arguments.name.clone(),
         version: arguments.data_version,
         kind: arguments.kind,
-        metric: arguments.metric.unwrap_or(arguments.kind.metric),
+        metric: arguments.metric,
+        spectra: arguments.spectra,
         contact: arguments.contact.clone(),
         entries_per_team: arguments
             .entries_per_team
@@ -279,14 +289,29 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
         return report(&check(entry, &expected), entry, *json);
     };
     let mut findings = check_sent(&sent, &expected, &mut |_| {});
+    // Unreadable entries are among the findings already.
+    if let Ok(submission) = Submission::read(&sent)
+        && let Err(message) = challenge.rules.accept(&submission)
+    {
+        findings.push(Finding {
+            path: entry.clone(),
+            severity: Severity::Error,
+            check: "contents",
+            message,
+        });
+    }
     let references = match place.is_dir() {
         true => {
             let (data, sets) = (DataFolder::open(place)?, &challenge.data.sets);
+            let ids = References::ids(&data, sets)?;
+            let galaxies = (ids.len() * expected.grid.cells()) as u64;
+            let mut bar = Bar::new("measuring", galaxies);
             Some(References::measure(
                 &data,
-                sets,
+                &ids,
                 expected.grid,
                 threads.number(),
+                &mut bar,
             )?)
         }
         false => None,
@@ -323,11 +348,12 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
         false => Vec::new(),
     };
     let rules = &judge.challenge.rules;
-    let board = ranking::rank(&entries, rules);
+    let board = ranking::rank(&entries, rules, judge.constant.as_ref());
     let view = View {
         challenge: &judge.challenge,
         board: &board,
         refused: &round.refused,
+        zero_shear: judge.zero_shear(),
         expected: judge.key.expected.as_ref(),
         disclosure: Disclosure {
             digits: arguments

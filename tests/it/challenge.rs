@@ -233,7 +233,7 @@ fn leaks(public: &Path, (texts, words): &(HashSet<String>, HashSet<u64>)) -> Vec
 
 #[test]
 fn a_challenge_runs_from_its_data_to_its_leaderboard() {
-    let pilot = Pilot::new(&["--closes", "2999-12-31"]);
+    let pilot = Pilot::new(&["--closes", "2999-12-31", "--metric", "q", "--spectra"]);
     let public = pilot.at("public");
     let secrets = secrets(&pilot.at("private"), &[SEED, seed_of(NAME, 1, SEED)]);
     assert_eq!(leaks(&public, &secrets), Vec::<String>::new());
@@ -313,14 +313,15 @@ fn a_challenge_runs_from_its_data_to_its_leaderboard() {
         "broken.tar.gz: not scored: cannot unpack",
         "not scored: identical content as ",
         "flipped.tar.gz: not scored: g10_v1_objs_2_1.d.dat: the shapes agree with the image only after a change of signs or axes",
+        "expected 5, standard); also image 2-8 [reference",
         "entries: 5 scored, 0 scored earlier, 3 not scored",
     ] {
         assert!(said.contains(expected), "{expected}\n{said}");
     }
     let ranked = teams(&board);
     let rank_of = |team: &str| ranked.iter().find(|(_, own)| own == team).unwrap().0;
-    assert_eq!(ranked.len(), 5);
-    assert_eq!(rank_of("spectra"), 0);
+    assert_eq!(ranked.len(), 6);
+    assert_eq!((rank_of("spectra"), rank_of("zero shear")), (0, 0));
     assert!(rank_of("Linear") < rank_of("Regauss"), "{ranked:?}");
     assert!(rank_of("Linear") < rank_of(hostile), "{ranked:?}");
     assert!(ranked.iter().all(|(_, team)| team != "ignored"));
@@ -528,9 +529,11 @@ fn no_small_seed_regenerates_the_public_files() {
             "--sets",
             "2",
             "--images",
-            "1",
-            "--grid",
             "8",
+            "--grid",
+            "20",
+            "--amplitude",
+            "30",
         ];
         let folders = ["--public", text(&public), "--private", text(&private)];
         let output = shearq(&[&new[..], &folders, more].concat());
@@ -556,9 +559,11 @@ fn no_small_seed_regenerates_the_public_files() {
         "--sets",
         "2",
         "--images",
-        "1",
-        "--grid",
         "8",
+        "--grid",
+        "20",
+        "--amplitude",
+        "30",
         "--seed",
         "77",
     ];
@@ -582,7 +587,7 @@ fn images_of_another_simulator_make_a_challenge() {
     let at = |name: &str| root.path().join(name);
     let data = at("data");
     let simulate = [
-        "simulate", "--sets", "2,8", "--images", "2", "--grid", "12", "--seed", "4321",
+        "simulate", "--sets", "2,8", "--images", "4", "--grid", "12", "--seed", "4321",
     ];
     succeed(&[&simulate[..], &["--amplitude", "100", "--out", text(&data)]].concat());
     fs::create_dir(at("tables")).unwrap();
@@ -658,7 +663,7 @@ fn images_of_another_simulator_make_a_challenge() {
     };
     let path = public.join("challenge.toml");
     let description = fs::read_to_string(&path).unwrap();
-    fs::write(&path, description.replace("images = 2", "images = 1")).unwrap();
+    fs::write(&path, description.replace("images = 4", "images = 1")).unwrap();
     refused("challenge.toml: the file was changed");
     fs::write(&path, description).unwrap();
     fs::write(public.join("SHA256SUMS"), "").unwrap();
@@ -727,4 +732,205 @@ fn submissions_are_compared_and_recorded_like_folders() {
         message.contains("this submission contains power spectra; expected catalogues"),
         "{message}"
     );
+}
+
+/// Entries without images, or with shapes in some images only, against an honest one.
+#[test]
+fn entries_without_images_have_no_rank() {
+    let pilot = Pilot::new(&[]);
+    let honest = pilot.enter("48/linear/star", "h", "in/honest.tar.gz", &["--team", "H"]);
+    let calls = std::cell::Cell::new(0.0);
+    let random = || {
+        calls.set(calls.get() + 12.9898);
+        (f64::sin(calls.get()) * 43758.5453).fract()
+    };
+    let noise = |_: usize, [x, y, ..]: [f64; 4]| [x, y, 1e-6 * random(), 1e-6 * random()];
+    let shrunk =
+        |factor: f64| move |_: usize, [x, y, e1, e2]: [f64; 4]| [x, y, factor * e1, factor * e2];
+    pilot.edited(&honest, "in/zero", |_, [x, y, ..]| [x, y, 0.0, 0.0]);
+    pilot.edited(&honest, "in/noise", noise);
+    // Shapes in image 1 and noise in the others; the same with shapes that are there, but tiny.
+    let first = |folder: PathBuf| {
+        for set in [2, 8] {
+            let name = format!("g10_v1_objs_{set}_1.48-linear-star.dat");
+            fs::copy(pilot.at("whole").join(&name), folder.join(&name)).unwrap();
+        }
+        folder
+    };
+    pilot.edited(&honest, "whole", |_, row| row);
+    let one_image = first(pilot.edited(&honest, "in/first", noise));
+    let tiny = first(pilot.edited(&honest, "in/tiny", shrunk(1e-6)));
+    // Shrinking all shapes changes nothing.
+    pilot.edited(&honest, "in/shrunk", shrunk(0.1));
+    fs::create_dir(pilot.at("in/spectra")).unwrap();
+    for set in [2, 8] {
+        let lines: String = (2..10)
+            .map(|bin| format!("{bin} {} 0\n", 100 * bin))
+            .collect();
+        fs::write(pilot.at(&format!("in/spectra/Z_set{set}.dat")), lines).unwrap();
+    }
+    let (found, accepted) = pilot.check(&one_image);
+    assert!(
+        !accepted && found.contains(&"shapes".to_owned()),
+        "{found:?}"
+    );
+    let (found, accepted) = pilot.check(&tiny);
+    assert!(!accepted && found == ["shapes"], "{found:?}");
+    let (board, said) = pilot.rank("in", "store", &[]);
+    for expected in [
+        "noise: not scored: g10_v1_objs_2_1.48-linear-star.dat: the shapes do not agree with the image; were the rows or images exchanged?; also image 2-8",
+        "first: not scored: g10_v1_objs_2_2.48-linear-star.dat: the shapes do not agree with the image; were the rows or images exchanged?; also image 3-8",
+        "tiny: not scored: ",
+        "zero: not scored: ",
+        "spectra: not scored: the challenge does not accept power spectra (expected catalogues)",
+    ] {
+        assert!(said.contains(expected), "{expected}\n{said}");
+    }
+    let rows = board["rows"].as_array().unwrap();
+    let of = |team: &str| rows.iter().find(|row| row["team"] == team).unwrap();
+    assert_eq!(of("shrunk")["q_calibrated"], of("H")["q_calibrated"]);
+    assert_eq!(
+        (of("shrunk")["rank"].as_u64(), of("H")["rank"].as_u64()),
+        (Some(1), Some(1))
+    );
+    assert!(of("zero shear")["rank"].is_null() && of("zero shear")["q_calibrated"].is_null());
+    assert_eq!(rows.len(), 3, "{board}");
+    let notes = board["notes"].to_string();
+    assert!(
+        notes.contains("Zero shear has Q = ") && notes.contains("It has no Q cal."),
+        "{notes}"
+    );
+}
+
+#[test]
+fn challenges_that_cannot_be_ranked_are_refused() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let new = |more: &[&str]| {
+        for folder in ["p", "t"] {
+            let _ = fs::remove_dir_all(at(folder));
+        }
+        let (public, private) = (at("p"), at("t"));
+        let new = ["challenge", "new", "--name", "c", "--public", text(&public)];
+        shearq(&[&new[..], &["--private", text(&private)], more].concat())
+    };
+    let refused = |more: &[&str], expected: &str| {
+        let output = new(more);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(
+            output.status.code() == Some(1) && said.contains(expected),
+            "{expected}\n{said}"
+        );
+        assert!(!at("p/challenge.toml").exists());
+    };
+    let small = [
+        "--sets",
+        "2,8",
+        "--images",
+        "8",
+        "--grid",
+        "16",
+        "--seed",
+        "9876543210123456789",
+    ];
+    let with = |more: &[&'static str]| [&small[..], more].concat();
+    refused(
+        &small,
+        "the data are too small to rank entries by Q cal.: the response of set 2 is expected to be ",
+    );
+    refused(
+        &with(&["--amplitude", "0"]),
+        "--amplitude 0: without shear, entries cannot be ranked",
+    );
+    let dates = ["--opens", "2030-02-01", "--closes", "2030-01-31"];
+    refused(
+        &with(&dates),
+        "--closes: the last day is before the first one (found 2030-01-31, expected 2030-02-01 or later)",
+    );
+    refused(
+        &with(&["--spectra"]),
+        "--spectra: Q cal. is not defined for power spectra. Try: --metric q or q-corrected",
+    );
+    refused(
+        &with(&["--metric", "qc", "--amplitude", "30"]),
+        "the true shear varies within the sets, so Q_c is not defined. Try: ",
+    );
+    // One constant shear, and shears that differ between the sets.
+    let simulate = |set: &str, shear: &str, seed: &str| {
+        let data = at("d");
+        let simulate = [
+            "simulate", "--sets", set, "--images", "2", "--grid", "20", "--seed", seed,
+        ];
+        succeed(
+            &[
+                &simulate[..],
+                &["--constant-shear", shear, "--out", text(&at(set))],
+            ]
+            .concat(),
+        );
+        fs::create_dir_all(&data).unwrap();
+        let name = format!("set0{set}");
+        fs::rename(at(set).join(&name), data.join(&name)).unwrap();
+    };
+    simulate("1", "0.05,-0.05", "1");
+    let data = at("d");
+    let theirs = ["--data", text(&data)];
+    refused(
+        &theirs,
+        "constant shears need at least 3 sets with different g1 to separate m from c (found 1)",
+    );
+    simulate("2", "-0.05,0.05", "2");
+    simulate("3", "0.02,0.02", "3");
+    for metric in ["q", "q-calibrated", "noise"] {
+        let wrong = [&theirs[..], &["--metric", metric]].concat();
+        refused(
+            &wrong,
+            "the true shear is the same for all galaxies of a set, so ",
+        );
+    }
+    let output = new(&theirs);
+    assert!(output.status.success(), "{output:?}");
+    let (public, private, out, store) = (at("p"), at("t"), at("o"), at("s"));
+    assert!(
+        fs::read_to_string(public.join("challenge.toml"))
+            .unwrap()
+            .contains("metric = \"qc\"")
+    );
+    let measure = [
+        "measure",
+        "--submission",
+        "48/linear/star",
+        "--data",
+        text(&public),
+    ];
+    succeed(&[&measure[..], &["--out", text(&out)]].concat());
+    let archive = at("in/A.tar.gz");
+    fs::create_dir(at("in")).unwrap();
+    let pack = [
+        "pack",
+        "--measured",
+        text(&out),
+        "--challenge",
+        "c",
+        "--team",
+        "A",
+    ];
+    succeed(&[&pack[..], &["--out", text(&archive)]].concat());
+    let rank = [
+        "challenge",
+        "rank",
+        text(&archive),
+        "--challenge",
+        text(&public),
+        "--truth",
+        text(&private),
+    ];
+    let board = succeed(&[&rank[..], &["--store", text(&store), "--format", "csv"]].concat());
+    let lines: Vec<&str> = board.lines().collect();
+    assert!(
+        lines[1].starts_with("1,A,48-linear-star,") && lines[2].contains("zero shear"),
+        "{board}"
+    );
+    // Zero shear has m = −1: 2464/√(2·500² + 4).
+    assert!(lines[2].contains(",3.5,"), "{board}");
 }

@@ -9,6 +9,7 @@ use shearq_files::{FileError, atomic};
 use shearq_pipeline::data::layout::{DataFolder, LAYOUT_FILE};
 use shearq_pipeline::data::pattern::fill;
 use shearq_pipeline::data::psf_table;
+use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::images::{self, ImageId};
 use shearq_pipeline::simulate::{SimulationRecord, simulate_blind, simulator};
 use shearq_pipeline::truth::{
@@ -16,14 +17,20 @@ use shearq_pipeline::truth::{
 };
 use shearq_pipeline::{PipelineError, Progress};
 use shearq_quantities::units::{Degrees, Pixels};
+use shearq_results::row::SetRecord;
+use shearq_results::score::{Basis, OddImages, ScoredSet};
+use shearq_results::submit::manifest::Contents;
+use shearq_scoring::{Choice, Convention, Options, RowCounts, SetImages, SetScorer, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::{STAMP, SimulationSettings};
 use shearq_studies::bound::{cramer_rao, expected_qs};
 
+use crate::constant::ConstantShears;
 use crate::date::Date;
-use crate::kind::{Kind, RankBy};
+use crate::kind::{Kind, RankBy, response};
 use crate::readme;
 use crate::seal::{Expected, Key, list, seal};
+use crate::shapes::References;
 use crate::terms::{CHALLENGE_FILE, Challenge, Data, Rules};
 
 /// Name and rules of a new challenge.
@@ -35,8 +42,10 @@ pub struct Plan {
     pub version: u32,
     /// Kind of the challenge.
     pub kind: &'static Kind,
-    /// Metric that ranks the entries.
-    pub metric: RankBy,
+    /// Metric that ranks the entries; `None` for that of the kind, which depends on the true shear.
+    pub metric: Option<RankBy>,
+    /// Whether power spectra are accepted, too.
+    pub spectra: bool,
     /// Address of the organiser; may be empty.
     pub contact: String,
     /// Most entries of a team.
@@ -77,6 +86,15 @@ pub struct Folders<'a> {
 const AMPLITUDES: (f64, f64) = (0.5, 2.0);
 /// Largest extra slope of the shear power that a seed determines.
 const TILT: f64 = 0.2;
+/// Factor s on bandpowers, log-uniform between 1/s and s. The best spectrum that can be had without images is the median,
+/// with σ_sys = (s − 1)/(s + 1) of that of zero shear: ⟨|x − 1|⟩/⟨x⟩ of a log-uniform x. With 4, no template exceeds 5/3 of
+/// the Q of zero shear, and the shear stays weak.
+pub const SCATTER: f64 = 4.0;
+/// Q of the best template relative to the Q of zero shear.
+pub const TEMPLATE_GAIN: f64 = (SCATTER + 1.0) / (SCATTER - 1.0);
+/// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
+/// chance unlikely.
+const EXPECTED_RESPONSE: f64 = 5.0;
 
 impl Folders<'_> {
     /// Checks that the public folder can become one of this challenge. Returns the key of an earlier, stopped command.
@@ -162,6 +180,11 @@ pub fn simulated(
         tilt,
         seed,
     } = simulation;
+    plan.check()?;
+    if *amplitude == Some(0.0) {
+        let message = "--amplitude 0: without shear, entries cannot be ranked (found 0, expected a positive number)";
+        return Err(PipelineError::Request(message.into()));
+    }
     let earlier = folders.prepare(plan)?;
     let kept = earlier.and_then(|key| key.seed?.parse().ok());
     if let (Some(kept), Some(seed)) = (kept, *seed)
@@ -185,6 +208,7 @@ pub fn simulated(
             amplitude: amplitude
                 .unwrap_or_else(|| least * (most / least).powf(drawn(secret, "amplitude"))),
             tilt: tilt.unwrap_or_else(|| TILT * (2.0 * drawn(secret, "tilt") - 1.0)),
+            scatter: SCATTER,
         },
         ..SimulationSettings::new(secret, *grid)
     };
@@ -200,10 +224,6 @@ pub fn simulated(
         DataFolder::new(folders.public),
         DataFolder::new(folders.private),
     );
-    let ids = images::of_simulation(sets, *images);
-    simulate_blind(&record, &ids, &public, &private, threads, progress)?;
-    progress.note("computing the expected Q");
-    key.expected = expected(settings, sets, *images)?;
     let data = Data {
         sets: sets.clone(),
         images: *images,
@@ -211,7 +231,15 @@ pub fn simulated(
         stamp: STAMP,
         field_degrees: public.layout().field_degrees,
     };
-    finish(plan, data, folders, key, threads)
+    // One image of each set shows whether entries can be ranked, before hours of simulation.
+    let first = images::of_simulation(sets, 1);
+    simulate_blind(&record, &first, &public, &private, threads, progress)?;
+    let metric = rankable(plan, &data, &public, &private, threads, progress)?;
+    let ids = images::of_simulation(sets, *images);
+    simulate_blind(&record, &ids, &public, &private, threads, progress)?;
+    progress.note("computing the expected Q");
+    key.expected = expected(settings, sets, *images)?;
+    finish(plan, metric, data, folders, key, threads)
 }
 
 /// Mean Q over sets of a perfect method with noise at the Cramér–Rao bound; `None` if it is unknown for all sets.
@@ -260,6 +288,7 @@ pub fn of_images(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Challenge, PipelineError> {
+    plan.check()?;
     let about = about(data)?;
     folders.prepare(plan)?;
     let key = Key {
@@ -300,12 +329,160 @@ pub fn of_images(
             return Err(FileError::new(&path, message).into());
         }
         write_truth(&private.truth(set), &grid, &shear)?;
+        copy_image(data, &public, ImageId { set, image: 1 }, &about)?;
+    }
+    let metric = rankable(plan, &about, &public, &private, threads, progress)?;
+    for &set in &about.sets {
         for image in 1..=about.images {
-            copy_image(data, &public, ImageId { set, image }, &about)?;
+            if image > 1 {
+                copy_image(data, &public, ImageId { set, image }, &about)?;
+            }
             progress.advance((about.grid * about.grid) as u64);
         }
     }
-    finish(plan, about, folders, key, threads)
+    finish(plan, metric, about, folders, key, threads)
+}
+
+impl Plan {
+    /// Checks what does not depend on the data.
+    fn check(&self) -> Result<(), PipelineError> {
+        let refuse = |message: String| Err(PipelineError::Request(message));
+        if let (Some(opens), Some(closes)) = (self.opens, self.closes)
+            && closes < opens
+        {
+            return refuse(format!(
+                "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
+            ));
+        }
+        match self.metric.unwrap_or(self.kind.metric) {
+            metric if self.spectra && !metric.is_of_spectra() => refuse(format!(
+                "--spectra: {} is not defined for power spectra. Try: --metric q or q-corrected",
+                metric.label()
+            )),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// The metric of a challenge, if entries can be ranked by it. A reference measurement of the first image of each set gives
+/// the noise that entries will have.
+fn rankable(
+    plan: &Plan,
+    data: &Data,
+    public: &DataFolder,
+    private: &DataFolder,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<RankBy, PipelineError> {
+    let refuse = |message: String| Err(PipelineError::Request(message));
+    let unscored = |source| PipelineError::Scoring { set: None, source };
+    let grid = data.grid().map_err(unscored)?;
+    let truths = data.sets.iter().map(|&set| {
+        let truth = private.read_truth(set, &grid)?;
+        Ok((set, truth))
+    });
+    let truths: Vec<(u32, TrueShear)> = truths.collect::<Result<_, PipelineError>>()?;
+    let constant = ConstantShears::of(truths.iter().map(|(set, truth)| (*set, truth)))
+        .map_err(PipelineError::Request)?;
+    let metric = plan.metric.unwrap_or(match &constant {
+        Some(_) => plan.kind.constant_metric,
+        None => plan.kind.metric,
+    });
+    if !metric.suits(constant.is_some()) {
+        let (kind, better) = match &constant {
+            Some(_) => ("is the same for all galaxies of a set", "qc, m or c"),
+            None => ("varies within the sets", "q-calibrated, m or c"),
+        };
+        return refuse(format!(
+            "the true shear {kind}, so {} is not defined. Try: --metric {better}",
+            metric.label()
+        ));
+    }
+    if plan.spectra && data.sets.len() < 2 {
+        return refuse("--spectra: the response of power spectra follows from differences between sets (found 1 set, expected at least 2)".into());
+    }
+    if metric == RankBy::Noise && data.images < 2 {
+        return refuse("noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8".into());
+    }
+    progress.note("measuring the first images");
+    let first = data.sets.iter().map(|&set| ImageId { set, image: 1 });
+    let first: Vec<ImageId> = first.collect();
+    let references = References::measure(public, &first, grid, threads, &mut Quiet)?;
+    let images = f64::from(data.images);
+    let mut scored = Vec::new();
+    let mut zero = 0.0;
+    for (set, truth) in truths {
+        let options = Options {
+            definition: metric.definition(),
+            choice: Choice::Insist(Convention::STANDARD),
+            ..Options::default()
+        };
+        let wrong = |source| PipelineError::Scoring {
+            set: Some(set),
+            source,
+        };
+        let scorer = SetScorer::new(grid, truth, options).map_err(wrong)?;
+        let mut sum = SetImages::new(&grid);
+        if let Some(shapes) = references.of(set, 1) {
+            sum.add(&shapes).map_err(wrong)?;
+        }
+        let mut score = scorer.score(&sum).map_err(wrong)?;
+        // Noise averages down; its power, which dominates Q, by the number of images.
+        score.metrics.q *= images;
+        for error in [
+            &mut score.errors.m_cross,
+            &mut score.errors.c1,
+            &mut score.errors.c2,
+        ] {
+            *error /= images.sqrt();
+        }
+        zero += score.zero_quality().q / data.sets.len() as f64;
+        let scored_set = ScoredSet {
+            set: Some(set),
+            kind: None,
+            images: vec![1],
+            score,
+            rows: RowCounts::default(),
+            basis: Basis::Given,
+            sign: SignBasis::Specified,
+            findings: Vec::new(),
+            odd_images: OddImages::default(),
+        };
+        scored.push(SetRecord::new(set, &scored_set, String::new()));
+    }
+    let constant = constant.as_ref();
+    let groups: Vec<&[SetRecord]> = match metric.needs_the_response_of_each_set() {
+        true => scored.chunks(1).collect(),
+        false => vec![&scored],
+    };
+    for sets in groups {
+        // The response itself is one; that of a single image scatters too much.
+        let (_, error) = response(sets, constant);
+        if error * EXPECTED_RESPONSE > 1.0 || error.is_nan() {
+            let of = match sets {
+                [one] => format!("the response of set {}", one.set),
+                _ => "the response".into(),
+            };
+            let more = (images * (error * EXPECTED_RESPONSE).powi(2)).ceil();
+            return refuse(format!(
+                "the data are too small to rank entries by {}: {of} is expected to be {:.1}σ from zero (expected at least {EXPECTED_RESPONSE}). Try: {more} images per set, or more galaxies per image",
+                metric.label(),
+                1.0 / error
+            ));
+        }
+    }
+    if matches!(metric, RankBy::Q | RankBy::QCorrected) {
+        let (q, _) = metric.of(&scored, None);
+        if q < TEMPLATE_GAIN * zero {
+            let more = (images * TEMPLATE_GAIN * zero / q).ceil();
+            return refuse(format!(
+                "the data are too small to rank entries by {}: a spectrum without images reaches {:.0}, a catalogue with the noise of these images about {q:.0}. Try: --metric q-calibrated, or {more} images per set",
+                metric.label(),
+                TEMPLATE_GAIN * zero
+            ));
+        }
+    }
+    Ok(metric)
 }
 
 /// Sets, images and grid of a data folder, which must be the same for all sets.
@@ -396,6 +573,7 @@ fn copy_pixels(
 /// Writes description, layout and page for participants, and seals the public folder.
 fn finish(
     plan: &Plan,
+    metric: RankBy,
     data: Data,
     folders: Folders<'_>,
     mut key: Key,
@@ -405,7 +583,8 @@ fn finish(
         name,
         version,
         kind,
-        metric,
+        metric: _,
+        spectra,
         contact,
         entries_per_team,
         opens,
@@ -424,12 +603,10 @@ fn finish(
             .collect(),
         rules: Rules {
             metric,
-            contents: kind
-                .contents
-                .iter()
-                .copied()
-                .filter(|contents| metric.is_of_spectra() || !contents.is_spectra())
-                .collect(),
+            contents: match spectra {
+                true => [kind.contents, &[Contents::Spectra, Contents::CrossSpectra]].concat(),
+                false => kind.contents.to_vec(),
+            },
             entries_per_team,
             opens,
             closes,

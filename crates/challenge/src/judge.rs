@@ -18,11 +18,13 @@ use shearq_results::submit::challenge::read_bandpowers;
 use shearq_results::submit::check::{CheckedSet, Severity, check_sent};
 use shearq_results::submit::manifest::{Contents, Entry as Team, Manifest};
 use shearq_results::submit::packed::{Packed, Sent, Submission};
-use shearq_scoring::{Choice, Convention, Fault, Grid, Options, ScoringError, SetScorer};
+use shearq_scoring::{Choice, Convention, Fault, Grid, Options, SCORED, ScoringError, SetScorer};
 use shearq_simulate::kinds::SetKind;
 use shearq_submissions::check_name;
 
+use crate::constant::ConstantShears;
 use crate::inbox::{Content, Identity, Sending, content, identify};
+use crate::kind::response;
 use crate::seal::{Key, verify};
 use crate::shapes::References;
 use crate::terms::Challenge;
@@ -106,6 +108,8 @@ pub struct Judge {
     public: PathBuf,
     grid: Grid,
     truths: BTreeMap<u32, Truth>,
+    /// The true shears, if each set has one.
+    pub constant: Option<ConstantShears>,
 }
 
 impl std::fmt::Debug for Judge {
@@ -138,9 +142,10 @@ impl Judge {
             choice: Choice::Insist(Convention::STANDARD),
             ..Options::default()
         };
-        let mut truths = BTreeMap::new();
+        let (mut truths, mut shears) = (BTreeMap::new(), Vec::new());
         for &set in &challenge.data.sets {
             let truth = data.read_truth(set, &grid)?;
+            shears.push((set, truth.clone()));
             truths.insert(
                 set,
                 Truth {
@@ -150,6 +155,8 @@ impl Judge {
                 },
             );
         }
+        let constant = ConstantShears::of(shears.iter().map(|(set, truth)| (*set, truth)))
+            .map_err(|message| FileError::new(private, message))?;
         Ok(Judge {
             challenge,
             key,
@@ -157,7 +164,23 @@ impl Judge {
             public: public.to_owned(),
             grid,
             truths,
+            constant,
         })
+    }
+
+    /// Mean Q over sets of an entry of zeros. `None` for constant shears, which have no Q.
+    pub fn zero_shear(&self) -> Option<f64> {
+        if self.constant.is_some() {
+            return None;
+        }
+        let q = |truth: &Truth| {
+            let zero = truth
+                .scorer
+                .score_spectrum(&[0.0; SCORED.end - SCORED.start], None);
+            zero.map_or(f64::NAN, |score| score.quality.q)
+        };
+        let sum: f64 = self.truths.values().map(q).sum();
+        Some(sum / self.truths.len() as f64)
     }
 
     /// The entries of this challenge in a store, in order of their arrival.
@@ -203,7 +226,9 @@ impl Judge {
         }
         let public = DataFolder::open(&self.public)?;
         let sets = &self.challenge.data.sets;
-        let references = References::measure(&public, sets, self.grid, threads)?;
+        let ids = References::ids(&public, sets)?;
+        let references =
+            References::measure(&public, &ids, self.grid, threads, &mut engine::Quiet)?;
         engine::ordered(
             // Large entries take most of the time, so a few of them are in work at a time.
             threads,
@@ -301,31 +326,36 @@ impl Judge {
         let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
         let sent = Sent::open(&sending.path).map_err(plain)?;
         let submission = Submission::read(&sent).map_err(plain)?;
-        let contents = match (&submission.packed, &submission.manifest) {
-            (Packed::Catalogues(_), _) => Contents::Catalogues,
-            (Packed::Spectra(_), Some(manifest)) if manifest.contents.is_spectra() => {
-                manifest.contents
-            }
-            (Packed::Spectra(_), _) => Contents::Spectra,
-        };
-        if !rules.contents.contains(&contents) {
-            return Err("the challenge accepts catalogues only, because power spectra do not have its metric".into());
-        }
+        let contents = rules.accept(&submission)?;
         let mut sets = match &submission.packed {
             Packed::Catalogues(_) => self.catalogues(&sent, sending, references)?,
             Packed::Spectra(files) => {
                 self.check(&sent, sending, references, &mut |_| {})?;
                 let manifest = submission.manifest.as_ref();
-                self.spectra(files, manifest)
-                    .map_err(|error| plain(sent.named(error)))?
+                let (sets, powers) = self
+                    .spectra(files, manifest)
+                    .map_err(|error| plain(sent.named(error)))?;
+                let (slope, error) = slope_over_sets(&powers);
+                if !is_measurable(slope, error) {
+                    return Err("the spectra do not follow the differences of the true spectra between sets, so they contain no measurable shear".into());
+                }
+                sets
             }
         };
         sets.sort_by_key(|set| set.set);
-        if !rules.metric.of(&sets).0.is_finite() {
-            return Err(format!(
-                "{} cannot be computed, because the response is consistent with zero or the images do not determine the noise",
-                rules.metric.label()
-            ));
+        if contents == Contents::Catalogues {
+            let constant = self.constant.as_ref();
+            // Without numbers, because they contain the correlation with the truth.
+            let (value, error) = response(&sets, constant);
+            if !is_measurable(value, error) {
+                return Err("the response to the shear is consistent with zero".into());
+            }
+            if !rules.metric.of(&sets, constant).0.is_finite() {
+                return Err(format!(
+                    "{} cannot be computed, because the response of a set is consistent with zero or the images do not determine the noise",
+                    rules.metric.label()
+                ));
+            }
         }
         Ok(Scored {
             method: submission.method,
@@ -382,8 +412,8 @@ impl Judge {
         &self,
         files: &BTreeMap<u32, PathBuf>,
         manifest: Option<&Manifest>,
-    ) -> Result<Vec<SetRecord>, FileError> {
-        let mut sets = Vec::new();
+    ) -> Result<(Vec<SetRecord>, Vec<Powers>), FileError> {
+        let (mut sets, mut all) = (Vec::new(), Vec::new());
         for (&set, path) in files {
             let Some(truth) = self.truths.get(&set) else {
                 continue;
@@ -395,6 +425,8 @@ impl Judge {
                 .scorer
                 .score_spectrum(&powers, covariance)
                 .map_err(|error| FileError::new(path, error))?;
+            let truth_powers = truth.scorer.true_bandpowers();
+            all.push((truth_powers[SCORED].to_vec(), powers));
             sets.push(SetRecord::of_spectrum(
                 set,
                 truth.kind.is_some(),
@@ -403,7 +435,7 @@ impl Judge {
                 truth.print.clone(),
             ));
         }
-        Ok(sets)
+        Ok((sets, all))
     }
 
     /// The record of a set of catalogues. `None` if the set does not belong to the challenge.
@@ -457,6 +489,44 @@ struct Scored {
     method: String,
     contents: Contents,
     sets: Vec<SetRecord>,
+}
+
+/// Significance that the response to the shear needs, as for Q cal.
+const CLEAR_RESPONSE: f64 = 3.0;
+
+/// Whether a response is clearly above zero. An unknown error counts as small.
+fn is_measurable(response: f64, error: f64) -> bool {
+    response > 0.0 && !(response <= CLEAR_RESPONSE * error)
+}
+
+/// True and sent bandpowers of a set.
+type Powers = (Vec<f64>, Vec<f64>);
+
+/// Slope of sent bandpowers on true ones over sets, and its standard error from the residuals. Each bandpower is divided by
+/// its true mean over sets: what all sets have in common can be had from own simulations, without images.
+fn slope_over_sets(sets: &[Powers]) -> (f64, f64) {
+    let bins = sets.first().map_or(0, |(truth, _)| truth.len());
+    let count = sets.len() as f64;
+    let mean = |b: usize| sets.iter().map(|(truth, _)| truth[b]).sum::<f64>() / count;
+    let means: Vec<f64> = (0..bins).map(mean).collect();
+    let rows = || {
+        sets.iter().flat_map(|(truth, sent)| {
+            let each = truth.iter().zip(sent).zip(&means);
+            each.map(|((truth, sent), mean)| (truth / mean - 1.0, sent / mean))
+        })
+    };
+    let (mut square, mut cross, mut all, mut squares) = (0.0, 0.0, 0.0, 0.0);
+    for (x, y) in rows() {
+        square += x * x;
+        cross += x * y;
+        all += y;
+        squares += y * y;
+    }
+    let number = count * bins as f64;
+    let slope = cross / square;
+    // x has the mean zero.
+    let residual = squares - all * all / number - slope * cross;
+    (slope, (residual.max(0.0) / (number - 2.0) / square).sqrt())
 }
 
 fn unscored(source: ScoringError) -> PipelineError {
@@ -575,4 +645,42 @@ fn candidates(
         });
     }
     Ok(candidates)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spectra_of_own_simulations_have_no_response() {
+        // Two sets with different factors on one spectrum.
+        let smooth = [1.0, 2.0, 3.0, 5.0, 8.0, 9.0, 9.5, 10.0];
+        let factors = [
+            [0.3, 2.0, 1.0, 3.0, 0.5, 0.4, 1.5, 2.5],
+            [1.2, 0.6, 3.5, 0.3, 2.2, 1.9, 0.4, 0.9],
+        ];
+        let truth = factors.map(|of| {
+            of.iter()
+                .zip(smooth)
+                .map(|(f, p)| f * p)
+                .collect::<Vec<_>>()
+        });
+        let slope = |edit: &dyn Fn(usize, usize, f64) -> f64| {
+            let sent = |set: usize| (0..8).map(|b| edit(set, b, truth[set][b])).collect();
+            let sets: Vec<Powers> = (0..2).map(|set| (truth[set].clone(), sent(set))).collect();
+            let (slope, error) = slope_over_sets(&sets);
+            (slope, is_measurable(slope, error))
+        };
+        let (found, clear) = slope(&|_, _, p| 0.9 * p);
+        assert!((found - 0.9).abs() < 1e-12 && clear);
+        // Noise of a tenth, and a bias that depends on the scale.
+        let noisy =
+            |set: usize, b: usize, p: f64| p * (1.0 + 0.1 * ((set * 8 + b) as f64 * 2.3).sin());
+        assert!(slope(&noisy).1);
+        // Zeros, a template, and a template of random amplitude.
+        assert!(!slope(&|_, _, _| 0.0).1 && !slope(&|_, b, _| smooth[b]).1);
+        assert!(!slope(&|set, b, _| smooth[b] * (1.0 + ((set * 8 + b) as f64 * 1.7).cos())).1);
+        let (only, error) = slope_over_sets(&[(truth[0].clone(), truth[0].clone())]);
+        assert!(!is_measurable(only, error));
+    }
 }

@@ -7,6 +7,8 @@ use shearq_results::row::{SetRecord, mean_metric};
 use shearq_results::submit::manifest::Contents;
 use shearq_scoring::Definition;
 
+use crate::constant::ConstantShears;
+
 /// Metric that ranks the entries of a challenge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -17,10 +19,12 @@ pub enum RankBy {
     QCorrected,
     /// Q after dividing by the measured response.
     QCalibrated,
-    /// |m|, the multiplicative bias by cross-correlation.
+    /// |m|, the multiplicative bias by cross-correlation; of constant shears, the mean over both components.
     M,
-    /// c, the modulus of the additive bias.
+    /// c, the modulus of the additive bias, divided by the response: otherwise shrunk shapes have less of it.
     C,
+    /// GREAT3's Q_c, from m and c of constant shears.
+    Qc,
     /// Noise of one galaxy's ellipticity per component.
     Noise,
 }
@@ -42,6 +46,7 @@ impl RankBy {
             RankBy::QCalibrated => "Q cal.",
             RankBy::M => "|m|",
             RankBy::C => "c",
+            RankBy::Qc => "Q_c",
             RankBy::Noise => "noise",
         }
     }
@@ -56,12 +61,15 @@ impl RankBy {
                 "Q is the quality factor 5·10⁻³/σ_sys, with azimuthal averages over fixed bins."
             }
             RankBy::QCalibrated => {
-                "Q cal. is the quality factor after dividing by the measured response."
+                "Q cal. is the quality factor after dividing by the measured response, so that it does not change if all ellipticities are shrunk or stretched."
             }
             RankBy::M => {
                 "|m| is the modulus of the multiplicative bias, by cross-correlation with the true shear."
             }
-            RankBy::C => "c is the modulus of the additive bias.",
+            RankBy::C => "c is the modulus of the additive bias, divided by the response.",
+            RankBy::Qc => {
+                "Q_c is GREAT3's quality factor of constant shear, 2464/√(Σ (m/0.002)² + Σ (c/0.0002)² + 4) over both components."
+            }
             RankBy::Noise => {
                 "Noise is the scatter of one galaxy's ellipticity per component, divided by the response."
             }
@@ -70,13 +78,16 @@ impl RankBy {
 
     /// Whether a larger value is better.
     pub fn larger_is_better(self) -> bool {
-        matches!(self, RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated)
+        matches!(
+            self,
+            RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated | RankBy::Qc
+        )
     }
 
     /// Decimals of a leaderboard, unless the organiser chooses other.
     pub fn decimals(self) -> usize {
         match self {
-            RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated => 1,
+            RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated | RankBy::Qc => 1,
             RankBy::M | RankBy::Noise => 4,
             RankBy::C => 5,
         }
@@ -87,24 +98,57 @@ impl RankBy {
         matches!(self, RankBy::Q | RankBy::QCorrected)
     }
 
-    /// Mean over sets, and its standard error.
-    pub fn of(self, sets: &[SetRecord]) -> (f64, f64) {
+    /// Whether sets with one shear each (`constant`), or with a shear that varies, have this metric.
+    pub fn suits(self, constant: bool) -> bool {
+        match self {
+            RankBy::M | RankBy::C => true,
+            RankBy::Qc => constant,
+            RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated | RankBy::Noise => !constant,
+        }
+    }
+
+    /// Whether the metric is unknown for a set without a measurable response, not only for all sets together.
+    pub fn needs_the_response_of_each_set(self) -> bool {
+        matches!(self, RankBy::QCalibrated | RankBy::Noise)
+    }
+
+    /// Value and standard error over all sets. `constant` has the true shears of sets with one shear each.
+    pub fn of(self, sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, f64) {
         let mean = |name: &str| mean_metric(sets, name);
         match self {
             RankBy::Q | RankBy::QCorrected => mean("q"),
             RankBy::QCalibrated => mean("q_calibrated"),
             RankBy::M => {
-                let (m, error) = mean("m_cross");
-                (m.abs(), error)
+                let (response, error) = response(sets, constant);
+                ((response - 1.0).abs(), error)
             }
             RankBy::C => {
-                let (c1, c2) = (mean("c1"), mean("c2"));
+                let (c1, c2) = match constant {
+                    None => (mean("c1"), mean("c2")),
+                    Some(shears) => {
+                        let [(_, c1), (_, c2)] = shears.biases(sets);
+                        (c1, c2)
+                    }
+                };
                 let modulus = c1.0.hypot(c2.0);
                 // The error along the direction of c.
                 let error = (c1.0 * c1.1).hypot(c2.0 * c2.1) / modulus;
-                (modulus, error)
+                let (response, _) = response(sets, constant);
+                (modulus / response, error / response)
             }
+            RankBy::Qc => constant.map_or((f64::NAN, f64::NAN), |shears| shears.q_c(sets)),
             RankBy::Noise => mean("galaxy_noise"),
+        }
+    }
+
+    /// Value of an entry of zeros, whose mean Q is `q`: its m is −1 and its c is 0. NaN where the metric divides by the
+    /// response.
+    pub fn of_zero_shear(self, q: f64) -> f64 {
+        match self {
+            RankBy::Q | RankBy::QCorrected => q,
+            RankBy::M => 1.0,
+            RankBy::Qc => 1.232 * 2000.0 / (2.0 * 500f64.powi(2) + 4.0).sqrt(),
+            RankBy::QCalibrated | RankBy::C | RankBy::Noise => f64::NAN,
         }
     }
 
@@ -113,7 +157,21 @@ impl RankBy {
         match self {
             RankBy::Q | RankBy::QCorrected => Some(Paired::Q),
             RankBy::QCalibrated => Some(Paired::Calibrated),
-            RankBy::M | RankBy::C | RankBy::Noise => None,
+            RankBy::M | RankBy::C | RankBy::Qc | RankBy::Noise => None,
+        }
+    }
+}
+
+/// Mean response 1 + m of all sets and both components, and its standard error.
+pub fn response(sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, f64) {
+    match constant {
+        None => {
+            let (m, error) = mean_metric(sets, "m_cross");
+            (1.0 + m, error)
+        }
+        Some(shears) => {
+            let [(m1, _), (m2, _)] = shears.biases(sets);
+            (1.0 + 0.5 * (m1.0 + m2.0), 0.5 * m1.1.hypot(m2.1))
         }
     }
 }
@@ -127,7 +185,9 @@ pub struct Kind {
     pub title: &'static str,
     /// Metric that ranks the entries.
     pub metric: RankBy,
-    /// Accepted files.
+    /// Metric that ranks the entries if each set has one shear.
+    pub constant_metric: RankBy,
+    /// Files that are accepted without another rule.
     pub contents: &'static [Contents],
     /// Most entries of a team; `None` for any number.
     pub entries_per_team: Option<u32>,
@@ -143,12 +203,11 @@ pub struct Kind {
 pub static GREAT10: Kind = Kind {
     name: "great10",
     title: "GREAT10 Galaxy Challenge",
-    metric: RankBy::Q,
-    contents: &[
-        Contents::Catalogues,
-        Contents::Spectra,
-        Contents::CrossSpectra,
-    ],
+    // Q itself is the challenge's, but entries without images win it while noise dominates, and so do shrunk shapes.
+    metric: RankBy::QCalibrated,
+    constant_metric: RankBy::Qc,
+    // Q of a spectrum can be tuned without images, entry by entry (tests/extraction.rs).
+    contents: &[Contents::Catalogues],
     entries_per_team: None,
     layout: Layout::default,
     conventions: &[

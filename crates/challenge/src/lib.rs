@@ -3,11 +3,13 @@
 //! * [`kind`] has the rules of each kind of challenge, and the metrics that rank entries.
 //! * [`terms`] is the machine-readable description of a challenge, `challenge.toml`.
 //! * [`create`] writes the public and the private folder; [`seal`] ties them together.
+//! * [`constant`] has m and c of sets with one shear each.
 //! * [`shapes`] compares an entry with the public images, without the true shear.
 //! * [`inbox`] finds entries, [`judge`] checks and scores them, and [`ranking`] ranks them.
 //! * [`page`] makes the leaderboard.
 #![forbid(unsafe_code)]
 
+pub mod constant;
 pub mod create;
 pub mod date;
 pub mod inbox;

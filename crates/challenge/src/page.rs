@@ -14,7 +14,7 @@ use shearq_results::views::metrics::metric_cell;
 use crate::date::day_of;
 use crate::judge::{EntryInfo, Refused};
 use crate::kind::RankBy;
-use crate::ranking::{Leaderboard, Standing};
+use crate::ranking::{Leaderboard, Standing, better};
 use crate::seal::Expected;
 use crate::terms::Challenge;
 
@@ -41,11 +41,16 @@ pub struct View<'a> {
     pub board: &'a Leaderboard<'a>,
     /// Entries that were not scored.
     pub refused: &'a [Refused],
+    /// Mean Q of an entry of zeros; `None` for constant shears.
+    pub zero_shear: Option<f64>,
     /// Q that a perfect method can expect, if known.
     pub expected: Option<&'a Expected>,
     /// How much is published.
     pub disclosure: Disclosure,
 }
+
+/// Name of the line of an entry without images. Teams may have this name, too, but they have a rank.
+const ZERO_SHEAR: &str = "zero shear";
 
 /// Names of the columns of a metric and its error.
 fn key(metric: RankBy) -> (&'static str, &'static str) {
@@ -55,6 +60,7 @@ fn key(metric: RankBy) -> (&'static str, &'static str) {
         RankBy::QCalibrated => ("q_calibrated", "q_calibrated_error"),
         RankBy::M => ("m", "m_error"),
         RankBy::C => ("c", "c_error"),
+        RankBy::Qc => ("qc", "qc_error"),
         RankBy::Noise => ("noise", "noise_error"),
     }
 }
@@ -125,7 +131,29 @@ impl View<'_> {
         };
         let mut notes = vec![metric.meaning().to_owned()];
         notes.push("Each team is ranked by its best entry. Teams share a rank if their difference is below its error.".into());
+        notes.extend(self.zero_note());
         notes.extend(self.expected_note());
+        let zero = metric.of_zero_shear(self.zero_shear.unwrap_or(f64::NAN));
+        let standings = &self.board.standings;
+        let mut rows: Vec<Vec<Cell>> = standings.iter().map(row).collect();
+        let behind = |standing: &Standing<'_>| better(metric, zero, standing.best.value);
+        let place = standings.iter().position(behind).unwrap_or(rows.len());
+        let text = |text: &str| Cell::text(text);
+        let title = "reference: an entry of zeros";
+        rows.insert(
+            place,
+            vec![
+                Cell::Empty,
+                text(ZERO_SHEAR),
+                text("no image"),
+                text(title),
+                Cell::Empty,
+                Cell::number(rounded(zero, digits), digits),
+                Cell::Empty,
+                Cell::Empty,
+                Cell::Empty,
+            ],
+        );
         Table {
             title: format!("Leaderboard of {}", self.challenge.name),
             headings: vec![
@@ -139,7 +167,7 @@ impl View<'_> {
                 Heading::new("received", "received"),
                 Heading::new("entries", "entries"),
             ],
-            rows: self.board.standings.iter().map(row).collect(),
+            rows,
             notes,
         }
     }
@@ -147,6 +175,22 @@ impl View<'_> {
     /// The expected Q, if the metric is Q.
     fn expected_of_metric(&self) -> Option<&Expected> {
         self.expected.filter(|_| self.metric() == RankBy::Q)
+    }
+
+    /// Q of zero shear on boards of other metrics, too: whoever reads Q elsewhere must see it.
+    fn zero_note(&self) -> Option<String> {
+        let q = metric_cell("q", rounded(self.zero_shear?, 1), f64::NAN)
+            .digits()?
+            .0;
+        let unknown = self.metric().of_zero_shear(1.0).is_nan();
+        let why = match unknown {
+            true => format!(
+                " It has no {}, because it does not respond to the shear.",
+                self.metric().label()
+            ),
+            false => String::new(),
+        };
+        Some(format!("Zero shear has Q = {q} without images.{why}"))
     }
 
     fn expected_note(&self) -> Option<String> {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use shearq_results::compare::difference;
 
+use crate::constant::ConstantShears;
 use crate::date::day_of;
 use crate::judge::{Entry, EntryInfo};
 use crate::kind::RankBy;
@@ -50,15 +51,19 @@ pub struct Leaderboard<'a> {
 }
 
 /// Ranks entries, which are in order of arrival. Each team has the rank of its best entry. A team shares the rank of a
-/// better team if the difference of both is below its error.
-pub fn rank<'a>(entries: &'a [Entry], rules: &Rules) -> Leaderboard<'a> {
+/// better team if the difference of both is below its error. `constant` has the true shears of sets with one shear each.
+pub fn rank<'a>(
+    entries: &'a [Entry],
+    rules: &Rules,
+    constant: Option<&ConstantShears>,
+) -> Leaderboard<'a> {
     let metric = rules.metric;
     let mut board = Leaderboard::default();
     let mut teams: BTreeMap<(bool, &str), Vec<Result<'a>>> = BTreeMap::new();
     let mut numbers: BTreeMap<&str, usize> = BTreeMap::new();
     for entry in entries {
         let info = &entry.info;
-        let (value, error) = metric.of(&entry.sets);
+        let (value, error) = metric.of(&entry.sets, constant);
         if info.reference {
             // Each reference has its own line.
             let own = teams.entry((true, info.sha256.as_str())).or_default();
@@ -137,38 +142,59 @@ fn excluded(info: &EntryInfo, number: usize, rules: &Rules) -> Option<String> {
     (number > most as usize).then(|| format!("the team has {most} entries already"))
 }
 
-fn better(metric: RankBy, a: f64, b: f64) -> bool {
+pub(crate) fn better(metric: RankBy, a: f64, b: f64) -> bool {
     match metric.larger_is_better() {
         true => a > b,
         false => a < b,
     }
 }
 
-/// Whether the difference of two entries is below its error. The error is of the paired difference over the same images;
-/// otherwise the errors of both are added in quadrature, which neglects common noise.
-fn equal(metric: RankBy, a: &Result<'_>, b: &Result<'_>) -> bool {
+/// Whether `other` is behind `best` by less than the error of the difference.
+///
+/// This error is the smallest of three. The jackknife of the paired difference over the same images is right if both entries
+/// respond to the images alike; for an entry with shapes in one of eight images, whose Q was
+/// 171.8 ± 20.7, it exceeded the lead of 154 over 17.9 ± 1.7. The quadratic sum of both errors neglects common noise, so it is an upper limit. In that sum, the error of
+/// `other` counts at most as much as that of `best`: otherwise an entry with much noise would share every rank.
+fn equal(metric: RankBy, best: &Result<'_>, other: &Result<'_>) -> bool {
+    let gap = other.value - best.value;
+    let apart = best.error.hypot(other.error.min(best.error));
     let paired = metric
         .paired()
-        .and_then(|paired| difference(paired, &a.entry.sets, &b.entry.sets))
-        .filter(|difference| difference.error.is_finite());
-    let (gap, error) = match paired {
-        Some(found) => (found.difference, found.error),
-        None => (a.value - b.value, a.error.hypot(b.error)),
-    };
+        .and_then(|paired| difference(paired, &best.entry.sets, &other.entry.sets))
+        .map_or(f64::NAN, |found| found.error);
     // Without a known error, only equal values are equal.
-    gap == 0.0 || gap.abs() < error
+    gap == 0.0 || gap.abs() < paired.min(apart)
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use shearq_results::row::SetRecord;
     use shearq_results::submit::manifest::Contents;
     use shearq_scoring::Metrics;
 
-    fn entry(team: &str, received: &str, q: f64, replicates: &[f64]) -> Entry {
+    pub(crate) fn record(set: u32, q: f64, replicates: &[f64]) -> SetRecord {
         let mut metrics = Metrics::unknown();
         metrics.q = q;
+        SetRecord {
+            set,
+            simulated: true,
+            data: "d".into(),
+            images: (1..=replicates.len() as u32).collect(),
+            galaxies: 1,
+            flagged: 0,
+            metrics,
+            errors: Metrics::unknown(),
+            q_replicates: replicates.to_vec(),
+            q_calibrated_replicates: Vec::new(),
+            q_leaderboard: q,
+            convention: 5,
+            convention_known: true,
+            convention_leaderboard: 5,
+        }
+    }
+
+    fn entry(team: &str, received: &str, q: f64, replicates: &[f64]) -> Entry {
         Entry {
             info: EntryInfo {
                 challenge: "c".into(),
@@ -182,22 +208,7 @@ mod tests {
                 contents: Contents::Catalogues,
                 reference: team.starts_with("our"),
             },
-            sets: vec![SetRecord {
-                set: 2,
-                simulated: true,
-                data: "d".into(),
-                images: (1..=replicates.len() as u32).collect(),
-                galaxies: 1,
-                flagged: 0,
-                metrics,
-                errors: Metrics::unknown(),
-                q_replicates: replicates.to_vec(),
-                q_calibrated_replicates: Vec::new(),
-                q_leaderboard: q,
-                convention: 5,
-                convention_known: true,
-                convention_leaderboard: 5,
-            }],
+            sets: vec![record(2, q, replicates)],
         }
     }
 
@@ -231,7 +242,7 @@ mod tests {
             entry("D", "2026-12-01 00:00:00", 200.0, &common(200.0, 0.0)),
             entry("ours", day, 99.5, &common(99.5, 0.0)),
         ];
-        let board = rank(&entries, &rules());
+        let board = rank(&entries, &rules(), None);
         let found: Vec<(Option<usize>, &str, f64, usize)> = board
             .standings
             .iter()
@@ -265,8 +276,34 @@ mod tests {
     #[test]
     fn without_errors_values_rank() {
         let entries = [entry("A", "x", 2.0, &[2.0]), entry("B", "x", 1.0, &[1.0])];
-        let board = rank(&entries, &rules());
+        let board = rank(&entries, &rules(), None);
         let ranks: Vec<_> = board.standings.iter().map(|s| s.rank).collect();
         assert_eq!(ranks, [Some(1), Some(2)]);
+    }
+
+    #[test]
+    fn an_error_of_its_own_does_not_buy_a_rank() {
+        // Found with shapes in one image and noise in seven: replicates of 3 to 900.
+        let (mut cheat, mut honest) = (
+            entry("A", "x", 171.8, &[900.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0]),
+            entry(
+                "B",
+                "x",
+                17.9,
+                &[18.0, 17.0, 18.0, 17.0, 18.0, 17.0, 18.0, 17.0],
+            ),
+        );
+        (cheat.sets[0].errors.q, honest.sets[0].errors.q) = (20.7, 1.7);
+        let ranks = |entries: &[Entry]| -> Vec<Option<usize>> {
+            let board = rank(entries, &rules(), None);
+            board.standings.iter().map(|s| s.rank).collect()
+        };
+        assert_eq!(ranks(&[cheat, honest.clone()]), [Some(1), Some(2)]);
+        // An entry with much noise does not share the first rank, one within the errors does.
+        let mut noisy = entry("C", "x", 10.0, &[10.0]);
+        noisy.sets[0].errors.q = 15.0;
+        let mut near = entry("D", "x", 16.0, &[16.0]);
+        near.sets[0].errors.q = 1.7;
+        assert_eq!(ranks(&[honest, noisy, near]), [Some(1), Some(1), Some(3)]);
     }
 }

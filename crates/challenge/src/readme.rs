@@ -55,14 +55,14 @@ pub(crate) fn text(challenge: &Challenge) -> String {
         ));
     }
     text.push_str(&format!(
-        "Put the files of an entry into one `.tar.gz` without folders. [shearq](https://github.com/shearq/shearq) does it for its own catalogues, and for yours if you describe them (`--foreign`):\n\n```sh\nshearq measure --data . --submission 48/linear/star --out ../catalogues\nshearq pack --measured ../catalogues --challenge \"{}\" --team TEAM --out ../entry.tar.gz\nshearq challenge check ../entry.tar.gz --challenge .\n```\n\nThe last command checks any entry, and needs no true shear. It finds missing and duplicate galaxies, swapped or flipped components, and distortions that are given as shear.\n\n## Rules\n\n",
+        "Put the files of an entry into one `.tar.gz` without folders. [shearq](https://github.com/shearq/shearq) does it for its own catalogues, and for yours if you describe them (`--foreign`):\n\n```sh\nshearq measure --data . --submission 48/linear/star --out ../catalogues\nshearq pack --measured ../catalogues --challenge \"{}\" --team TEAM --out ../entry.tar.gz\nshearq challenge check ../entry.tar.gz --challenge .\n```\n\nThe last command checks any entry, and needs no true shear. It finds missing and duplicate galaxies, swapped or flipped components, shapes that do not agree with their images, and distortions that are given as shear.\n\n## Rules\n\n",
         name.replace(['"', '\\', '$', '`'], "")
     ));
     for rule in kind.rules {
         text.push_str(&format!("* {rule}\n"));
     }
     text.push_str(&format!(
-        "* Entries are ranked by {}, averaged over the sets. {}\n",
+        "* Entries are ranked by {}, over all sets. {}\n* The shapes of every image must agree with the image, with one scale in all images of a set, and their response to the shear must be at least 3σ from zero.\n",
         rules.metric.label(),
         rules.metric.meaning()
     ));

@@ -1,22 +1,22 @@
-//! Compares an entry with the public images: a reference measurement of one image per set finds swapped and flipped
-//! components without the true shear.
+//! Compares an entry with the public images: a reference measurement of every image finds swapped and flipped components,
+//! and shapes that were not measured, without the true shear.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
 use shearq_files::atomic::Scratch;
 use shearq_files::table::{FileFormat, most_rows};
-use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::layout::{DataFolder, read_rows};
 use shearq_pipeline::data::run::{Run, Source};
-use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::images::ImageId;
 use shearq_pipeline::measure::measure_folder;
+use shearq_pipeline::{PipelineError, Progress};
 use shearq_results::score::COLUMNS;
 use shearq_results::submit::challenge::Kind;
 use shearq_results::submit::check::{Finding, Severity};
 use shearq_results::submit::packed::Sent;
+use shearq_scoring::ndarray::Array2;
 use shearq_scoring::{Convention, FieldSum, Grid};
 use shearq_submissions::Registry;
 
@@ -27,6 +27,9 @@ const CLEAR: f64 = 5.0;
 /// Slope on the reference above which ellipticities are probably distortions, which are nearly twice as large. It is the
 /// geometric mean of 1 and 2.
 const SLOPE: f64 = std::f64::consts::SQRT_2;
+/// Largest ratio of an image's slope to the median slope of its set, or inverse. A method has one response for all images of
+/// a set; the noise of the slope is 1/√(2·64) = 9 % on the smallest grid.
+const SLOPE_RATIO: f64 = 2.0;
 
 /// What is wrong with the shapes of an image.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,10 +45,35 @@ pub enum Fault {
         /// Slope on the reference.
         slope: f64,
     },
+    /// Larger or smaller than the shapes of the other images.
+    Scale {
+        /// Ratio to the median of the set.
+        ratio: f64,
+    },
 }
 
-/// Compares the galaxies of an image with a reference measurement of it.
-pub fn compare(reference: &FieldSum, sent: &FieldSum) -> Option<Fault> {
+impl Fault {
+    /// Whether both are reported in one line.
+    fn is_like(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Fault::Convention(a), Fault::Convention(b)) => a == b,
+            _ => std::mem::discriminant(self) == std::mem::discriminant(other),
+        }
+    }
+}
+
+/// Ellipticities of one image by cell, in single precision because all images are in memory; NaN for none.
+pub(crate) type Shapes = Array2<[f32; 2]>;
+
+fn shapes_of(sum: &FieldSum) -> Shapes {
+    Array2::from_shape_fn(sum.count.dim(), |at| match sum.count[at] > 0.0 {
+        true => [sum.e1[at] as f32, sum.e2[at] as f32],
+        false => [f32::NAN; 2],
+    })
+}
+
+/// Compares the galaxies of an image with a reference measurement of it. Returns the slope on the reference, too.
+fn compare(reference: &Shapes, sent: &FieldSum) -> (Option<Fault>, f64) {
     let swapped = FieldSum {
         e1: sent.e2.clone(),
         e2: sent.e1.clone(),
@@ -53,7 +81,7 @@ pub fn compare(reference: &FieldSum, sent: &FieldSum) -> Option<Fault> {
     };
     let own = product(reference, sent, Convention::STANDARD);
     if own.galaxies == 0.0 {
-        return None;
+        return (None, f64::NAN);
     }
     // Each component of each galaxy is an independent number.
     let chance = CLEAR / (2.0 * own.galaxies).sqrt();
@@ -74,11 +102,12 @@ pub fn compare(reference: &FieldSum, sent: &FieldSum) -> Option<Fault> {
     });
     let best = others.chain(exchanged).max_by(|a, b| a.0.total_cmp(&b.0));
     let correlation = own.correlation();
-    match best {
+    let fault = match best {
         Some((other, fault)) if other > chance && other > correlation + chance => Some(fault),
         _ if correlation < chance => Some(Fault::Unrelated),
         _ => (own.slope() > SLOPE).then(|| Fault::Distortion { slope: own.slope() }),
-    }
+    };
+    (fault, own.slope())
 }
 
 /// Sums over the galaxies of two fields.
@@ -104,7 +133,7 @@ impl Product {
 }
 
 /// Sums over the galaxies that both have, with the sent field in a convention.
-fn product(reference: &FieldSum, sent: &FieldSum, convention: Convention) -> Product {
+fn product(reference: &Shapes, sent: &FieldSum, convention: Convention) -> Product {
     let (s1, s2) = convention.signs();
     let mut sums = Product {
         cross: 0.0,
@@ -112,15 +141,15 @@ fn product(reference: &FieldSum, sent: &FieldSum, convention: Convention) -> Pro
         sent: 0.0,
         galaxies: 0.0,
     };
-    for ((i, j), &count) in reference.count.indexed_iter() {
+    for ((i, j), own) in reference.indexed_iter() {
         let cell = match convention.transposes() {
             true => (j, i),
             false => (i, j),
         };
-        if count == 0.0 || sent.count[cell] == 0.0 {
+        if own[0].is_nan() || sent.count[cell] == 0.0 {
             continue;
         }
-        let (r1, r2) = (reference.e1[(i, j)], reference.e2[(i, j)]);
+        let [r1, r2] = own.map(f64::from);
         let (e1, e2) = (s1 * sent.e1[cell], s2 * sent.e2[cell]);
         sums.cross += r1 * e1 + r2 * e2;
         sums.reference += r1 * r1 + r2 * r2;
@@ -130,38 +159,28 @@ fn product(reference: &FieldSum, sent: &FieldSum, convention: Convention) -> Pro
     sums
 }
 
-/// Reference measurements of the first image of each set.
+/// Reference measurements of images.
 #[derive(Debug)]
 pub struct References {
     grid: Grid,
-    sets: BTreeMap<u32, FieldSum>,
+    images: BTreeMap<(u32, u32), Shapes>,
 }
 
-/// Number of the image that is measured.
-const IMAGE: u32 = 1;
-
 impl References {
-    /// Measures the first image of `sets` in the public folder `data`. Sets without this image are left out.
+    /// Measures the images `ids` in the public folder `data`.
     ///
     /// # Errors
     /// If an image cannot be measured.
     pub fn measure(
         data: &DataFolder,
-        sets: &[u32],
+        ids: &[ImageId],
         grid: Grid,
         threads: usize,
+        progress: &mut dyn Progress,
     ) -> Result<Self, PipelineError> {
-        let files = data.images(sets)?;
-        let has = |set: &u32| files.of_set(*set).iter().any(|(image, _)| *image == IMAGE);
-        let ids: Vec<ImageId> = sets
-            .iter()
-            .copied()
-            .filter(has)
-            .map(|set| ImageId { set, image: IMAGE })
-            .collect();
         let mut references = References {
             grid,
-            sets: BTreeMap::new(),
+            images: BTreeMap::new(),
         };
         if ids.is_empty() {
             return Ok(references);
@@ -173,17 +192,49 @@ impl References {
             .configuration;
         let source = Source::folder(data, folder.path())?;
         let run = Run::new(source, configuration, FileFormat::Parquet);
-        measure_folder(&run, data, folder.path(), &ids, threads, &mut Quiet)?;
-        for ImageId { set, image } in ids {
+        measure_folder(&run, data, folder.path(), ids, threads, progress)?;
+        for &ImageId { set, image } in ids {
             let path = run.catalogue(folder.path(), set, image);
-            references.sets.insert(set, references.read(&path)?);
+            let shapes = shapes_of(&references.read(&path)?);
+            references.images.insert((set, image), shapes);
         }
         Ok(references)
     }
 
+    /// The images of `sets` that the public folder `data` contains.
+    ///
+    /// # Errors
+    /// If the folder cannot be listed.
+    pub fn ids(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileError> {
+        let files = data.images(sets)?;
+        let of_set = |set: &u32| {
+            let set = *set;
+            let images = files.of_set(set).into_iter();
+            images.map(move |(image, _)| ImageId { set, image })
+        };
+        Ok(sets.iter().flat_map(of_set).collect())
+    }
+
     /// Whether there was no image to measure.
     pub fn is_empty(&self) -> bool {
-        self.sets.is_empty()
+        self.images.is_empty()
+    }
+
+    /// The measured ellipticities of an image.
+    pub(crate) fn of(&self, set: u32, image: u32) -> Option<FieldSum> {
+        let shapes = self.images.get(&(set, image))?;
+        let known = |e: &[f32; 2]| !e[0].is_nan();
+        let component = |k: usize| {
+            shapes.mapv(|e| match known(&e) {
+                true => f64::from(e[k]),
+                false => 0.0,
+            })
+        };
+        let mut sum = FieldSum::new(&self.grid);
+        sum.images = 1;
+        sum.count = shapes.mapv(|e| f64::from(u8::from(known(&e))));
+        (sum.e1, sum.e2) = (component(0), component(1));
+        Some(sum)
     }
 
     /// A catalogue on the grid.
@@ -194,7 +245,7 @@ impl References {
         Ok(sum)
     }
 
-    /// Findings about the catalogues of an entry.
+    /// Findings about the catalogues of an entry: one for each fault and set, with the numbers of its images.
     ///
     /// # Errors
     /// If the files of the entry cannot be listed.
@@ -202,25 +253,69 @@ impl References {
         let files = sent
             .files()
             .map_err(FileError::doing(sent.path(), "cannot list the folder"))?;
-        let mut found = Vec::new();
+        let mut sets: BTreeMap<u32, BTreeMap<u32, PathBuf>> = BTreeMap::new();
         for file in files {
-            let Some(Kind::Catalogue { set, image, .. }) = Kind::of(&file) else {
-                continue;
-            };
-            let Some(reference) = self.sets.get(&set).filter(|_| image == IMAGE) else {
-                continue;
-            };
-            // An unreadable file is reported by the other checks.
-            if let Ok(own) = self.read(&file) {
-                found.extend(compare(reference, &own).map(|fault| finding(fault, sent, &file)));
+            if let Some(Kind::Catalogue { set, image, .. }) = Kind::of(&file) {
+                sets.entry(set).or_default().insert(image, file);
+            }
+        }
+        let mut found = Vec::new();
+        for (set, files) in sets {
+            let compared = files.iter().filter_map(|(image, file)| {
+                let reference = self.images.get(&(set, *image))?;
+                // An unreadable file is reported by the other checks.
+                let (fault, slope) = compare(reference, &self.read(file).ok()?);
+                Some((*image, fault, slope))
+            });
+            for (fault, images) in faults(compared.collect()) {
+                let Some(file) = images.first().and_then(|image| files.get(image)) else {
+                    continue;
+                };
+                found.push(finding(fault, &images, sent, file));
             }
         }
         Ok(found)
     }
 }
 
-/// A fault in words.
-fn finding(fault: Fault, sent: &Sent, file: &Path) -> Finding {
+/// Faults of the images of a set, with the numbers of their images.
+fn faults(mut compared: Vec<(u32, Option<Fault>, f64)>) -> Vec<(Fault, Vec<u32>)> {
+    // Images with a fault have no slope to compare with.
+    let sound = |fault: &Option<Fault>| matches!(fault, None | Some(Fault::Distortion { .. }));
+    let slopes = compared.iter().filter(|(_, fault, _)| sound(fault));
+    let mut slopes: Vec<f64> = slopes.map(|(.., slope)| *slope).collect();
+    slopes.retain(|slope| slope.is_finite());
+    slopes.sort_by(f64::total_cmp);
+    if let Some(&median) = slopes.get(slopes.len() / 2) {
+        for (_, fault, slope) in &mut compared {
+            let ratio = *slope / median;
+            if sound(fault) && !(1.0 / SLOPE_RATIO..=SLOPE_RATIO).contains(&ratio) {
+                *fault = ratio.is_finite().then_some(Fault::Scale { ratio });
+            }
+        }
+    }
+    let mut found: Vec<(Fault, Vec<u32>)> = Vec::new();
+    for (image, fault, _) in compared {
+        let Some(fault) = fault else { continue };
+        match found.iter_mut().find(|(known, _)| known.is_like(&fault)) {
+            Some((_, images)) => images.push(image),
+            None => found.push((fault, vec![image])),
+        }
+    }
+    found
+}
+
+/// Numbers as `1-3,7`.
+fn ranges(numbers: &[u32]) -> String {
+    let texts = numbers.chunk_by(|a, b| a + 1 == *b).map(|run| match run {
+        [one] => one.to_string(),
+        run => format!("{}-{}", run[0], run[run.len() - 1]),
+    });
+    texts.collect::<Vec<_>>().join(",")
+}
+
+/// A fault of `images` in words. `file` is the first of them.
+fn finding(fault: Fault, images: &[u32], sent: &Sent, file: &Path) -> Finding {
     let (severity, check, message) = match fault {
         Fault::Convention(convention) => (
             Severity::Error,
@@ -248,19 +343,29 @@ fn finding(fault: Fault, sent: &Sent, file: &Path) -> Finding {
                 "the ellipticities are {slope:.1} times as large as shear-type ellipticities; are they distortions, (a² − b²)/(a² + b²)?"
             ),
         ),
+        Fault::Scale { ratio } => (
+            Severity::Error,
+            "shapes",
+            format!(
+                "the ellipticities are {ratio:.1e} times as large as in the other images of the set (expected 0.5 to 2)"
+            ),
+        ),
+    };
+    let more = match images {
+        [] | [_] => String::new(),
+        [_, more @ ..] => format!("; also image {}", ranges(more)),
     };
     Finding {
         path: sent.as_given(file),
         severity,
         check,
-        message: format!("{message} [reference: {REFERENCE}]"),
+        message: format!("{message}{more} [reference: {REFERENCE}]"),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::Array2;
     use shearq_quantities::units::{Degrees, Pixels};
 
     /// Ellipticities that are neither symmetric nor of one sign, in the order that `edit` gives them.
@@ -283,22 +388,52 @@ mod tests {
     #[test]
     fn swapped_flipped_and_larger_shapes_are_found() {
         let right = field(|a, b| (a, b));
-        assert_eq!(compare(&right, &right), None);
-        assert_eq!(compare(&right, &field(|a, b| (0.7 * a, 0.7 * b))), None);
-        let fault = |edit: fn(f64, f64) -> (f64, f64)| compare(&right, &field(edit));
+        let reference = shapes_of(&right);
+        let compare = |sent: &FieldSum| compare(&reference, sent).0;
+        assert_eq!(compare(&right), None);
+        assert_eq!(compare(&field(|a, b| (0.7 * a, 0.7 * b))), None);
+        let fault = |edit: fn(f64, f64) -> (f64, f64)| compare(&field(edit));
         let convention = |number: u8| Some(Fault::Convention(number.try_into().unwrap()));
         assert_eq!(fault(|a, b| (a, -b)), convention(6));
         assert_eq!(fault(|a, b| (-a, b)), convention(8));
         assert_eq!(fault(|a, b| (-a, -b)), convention(7));
         assert_eq!(fault(|a, b| (b, a)), Some(Fault::Swapped));
         assert_eq!(fault(|_, _| (0.0, 0.0)), Some(Fault::Unrelated));
+        // The reference has single precision.
         assert!(matches!(
             fault(|a, b| (2.0 * a, 2.0 * b)),
-            Some(Fault::Distortion { slope }) if (slope - 2.0).abs() < 1e-12
+            Some(Fault::Distortion { slope }) if (slope - 2.0).abs() < 1e-6
         ));
         let mut turned = right.clone();
         turned.e1 = right.e1.t().to_owned();
         turned.e2 = right.e2.t().to_owned();
-        assert_eq!(compare(&right, &turned), convention(1));
+        assert_eq!(compare(&turned), convention(1));
+    }
+
+    #[test]
+    fn faulty_images_are_named_by_set() {
+        let unrelated = Some(Fault::Unrelated);
+        let distortion = |slope| (Some(Fault::Distortion { slope }), slope);
+        let set = |images: &[(Option<Fault>, f64)]| {
+            let compared = (1..)
+                .zip(images)
+                .map(|(k, (fault, slope))| (k, *fault, *slope));
+            faults(compared.collect())
+        };
+        assert_eq!(set(&[(None, 0.9), (None, 1.1)]), []);
+        // Shapes in one image and noise in the others.
+        let noise = (unrelated, 1e-8);
+        assert_eq!(
+            set(&[(None, 0.9), noise, noise, noise]),
+            [(Fault::Unrelated, vec![2, 3, 4])]
+        );
+        // Measured shapes, but shrunk in most images: the median is theirs.
+        let shrunk = (None, 1e-6);
+        let found = set(&[(None, 1.0), shrunk, shrunk, shrunk]);
+        assert!(
+            matches!(&found[..], [(Fault::Scale { ratio }, images)] if *ratio > 9e5 && images == &[1])
+        );
+        assert_eq!(set(&[distortion(1.9), distortion(1.8)])[0].1, [1, 2]);
+        assert_eq!(ranges(&[1, 2, 3, 7, 9, 10]), "1-3,7,9-10");
     }
 }

@@ -8,6 +8,7 @@ use shearq_files::{FileError, open};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::submit::check::Expected;
 use shearq_results::submit::manifest::Contents;
+use shearq_results::submit::packed::{Packed, Submission};
 use shearq_scoring::Grid;
 use shearq_submissions::{check_name, checked_name};
 
@@ -92,6 +93,32 @@ pub struct Rules {
     /// Last day of entries, in UTC.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub closes: Option<Date>,
+}
+
+impl Rules {
+    /// Kind of the files of an entry.
+    ///
+    /// # Errors
+    /// If the challenge does not accept it.
+    pub fn accept(&self, submission: &Submission) -> Result<Contents, String> {
+        let contents = match (&submission.packed, &submission.manifest) {
+            (Packed::Catalogues(_), _) => Contents::Catalogues,
+            (Packed::Spectra(_), Some(manifest)) if manifest.contents.is_spectra() => {
+                manifest.contents
+            }
+            (Packed::Spectra(_), _) => Contents::Spectra,
+        };
+        match self.contents.contains(&contents) {
+            true => Ok(contents),
+            false => Err(format!(
+                "the challenge does not accept {} (expected catalogues)",
+                match contents {
+                    Contents::Catalogues => "catalogues",
+                    Contents::Spectra | Contents::CrossSpectra => "power spectra",
+                }
+            )),
+        }
+    }
 }
 
 impl Challenge {

@@ -1,9 +1,19 @@
-//! How many entries extract how much of the truth from a leaderboard. docs/run-a-challenge.md quotes the result.
+//! How many entries extract how much of the truth from a leaderboard, and what that gains under each metric.
+//! docs/run-a-challenge.md quotes the results.
 
 #![allow(clippy::unwrap_used, reason = "a failed test stops at the cause")]
 
+use ndarray::Array2;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Normal};
+use shearq_challenge::create::{SCATTER, TEMPLATE_GAIN};
 use shearq_pipeline::simulate::simulator;
-use shearq_scoring::{Options, SCORED, SetScorer};
+use shearq_scoring::modes::{Decomposer, Modes};
+use shearq_scoring::{
+    Bins, Choice, Complex64, Convention, Definition, FieldSum, Grid, Options, SCORED, SetImages,
+    SetScorer, TrueShear,
+};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::SimulationSettings;
 
@@ -50,4 +60,162 @@ fn decimals_limit_what_nine_entries_extract() {
         "{found:?}"
     );
     assert!(found[1] < found[3], "{found:?}");
+}
+
+/// A scorer of a blind set: the seed determines amplitude, tilt and the factors on the bandpowers.
+fn blind(seed: u64, scatter: f64) -> SetScorer {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let settings = SimulationSettings {
+        spectrum: ShearSpectrum {
+            amplitude: 0.5 * 4f64.powf(random.random()),
+            tilt: 0.2 * (2.0 * random.random::<f64>() - 1.0),
+            scatter,
+        },
+        ..SimulationSettings::new(random.random(), 48)
+    };
+    let set = simulator(2, settings).unwrap();
+    SetScorer::new(set.grid(), set.truth(), Options::default()).unwrap()
+}
+
+/// Mean Q of the template of own simulations relative to Q of zero shear, with two entries: the Q of the first, zero
+/// shear, is the scale of the second.
+fn template_gain(scatter: f64) -> f64 {
+    let powers = |scorer: &SetScorer| scorer.true_bandpowers()[SCORED].to_vec();
+    let own: Vec<Vec<f64>> = (1000..1100).map(|k| powers(&blind(k, scatter))).collect();
+    // The median bandpower has the least mean modulus of the distance.
+    let median = |b: usize| {
+        let mut all: Vec<f64> = own.iter().map(|powers| powers[b]).collect();
+        all.sort_by(f64::total_cmp);
+        all[all.len() / 2]
+    };
+    let template: Vec<f64> = (0..SCORED.len()).map(median).collect();
+    let secrets = 60;
+    let gains = (0..secrets).map(|k| {
+        let scorer = blind(k, scatter);
+        let q = |powers: &[f64]| scorer.score_spectrum(powers, None).unwrap().quality.q;
+        let zero = q(&[0.0; 8]);
+        let dln_l = &scorer.bins().dln_l[SCORED];
+        let total: f64 = template.iter().zip(dln_l).map(|(p, d)| p * d).sum();
+        let scale = 5e-3 / zero / total;
+        q(&template.iter().map(|p| scale * p).collect::<Vec<_>>()) / zero
+    });
+    gains.sum::<f64>() / f64::from(secrets as u32)
+}
+
+#[test]
+fn scattered_bandpowers_have_no_template() {
+    let [smooth, scattered] = [1.0, SCATTER].map(template_gain);
+    println!("{smooth} {scattered}; expected {TEMPLATE_GAIN}");
+    assert!(smooth > 5.0, "{smooth}");
+    // The total, which the first entry reveals, and the cosmic variance, which adds to the scatter, nearly cancel.
+    assert!(
+        (scattered / TEMPLATE_GAIN - 1.0).abs() < 0.25,
+        "{scattered}"
+    );
+}
+
+/// Fields that a cheat makes of one measurement, in units of its modes: factors by bandpower.
+struct Attack {
+    scorer: SetScorer,
+    decomposer: Decomposer,
+    bins: Bins,
+    modes: Modes,
+}
+
+impl Attack {
+    /// A measurement of a blind set with white noise of `noise` per galaxy and component.
+    fn new(seed: u64, noise: f64) -> Self {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let settings = SimulationSettings {
+            spectrum: ShearSpectrum {
+                scatter: SCATTER,
+                ..ShearSpectrum::default()
+            },
+            ..SimulationSettings::new(random.random(), 48)
+        };
+        let set = simulator(2, settings).unwrap();
+        let grid = set.grid();
+        let options = Options {
+            choice: Choice::Insist(Convention::STANDARD),
+            ..Options::default()
+        };
+        let TrueShear { g1, g2 } = set.truth();
+        let normal = Normal::new(0.0, noise).unwrap();
+        let mut noisy = |g: &Array2<f64>| g.mapv(|g| g + normal.sample(&mut random));
+        let (e1, e2) = (noisy(&g1), noisy(&g2));
+        let field = Array2::from_shape_fn(e1.dim(), |at| Complex64::new(e1[at], e2[at]));
+        let decomposer = Decomposer::new(grid);
+        Attack {
+            scorer: SetScorer::new(grid, set.truth(), options).unwrap(),
+            modes: decomposer.decompose(field).unwrap(),
+            bins: Bins::new(&grid, Definition::Leaderboard),
+            decomposer,
+        }
+    }
+
+    fn grid(&self) -> Grid {
+        self.decomposer.grid()
+    }
+
+    /// Q and calibrated Q after the modes of each bandpower are multiplied by its factor.
+    fn score(&self, factor: impl Fn(usize) -> f64) -> [f64; 2] {
+        let n = self.grid().n;
+        let wave = |k: usize| {
+            let k = k as f64;
+            let side = n as f64;
+            self.grid().l_min().0 * if k > side / 2.0 { k - side } else { k }
+        };
+        let mut modes = self.modes.clone();
+        for ((i, j), mode) in modes.e.indexed_iter_mut() {
+            *mode *= factor(self.bins.nearest(wave(i).hypot(wave(j))));
+        }
+        let field = self.decomposer.compose(&modes).unwrap();
+        let sum = FieldSum {
+            e1: field.mapv(|e| e.re),
+            e2: field.mapv(|e| e.im),
+            count: Array2::from_elem((n, n), 1.0),
+            images: 1,
+        };
+        let mut images = SetImages::new(&self.grid());
+        images.add(&sum).unwrap();
+        let metrics = self.scorer.score(&images).unwrap().metrics;
+        [metrics.q, metrics.q_calibrated]
+    }
+}
+
+/// The end of every attack on bandpowers: the true ones are known. Q then has no limit. Q cal. has, because the calibrated
+/// power Σ|E|²/(1 + m)² is at least Σ|T|²/r² with the correlation r of the modes with the true ones, which only images
+/// give.
+#[test]
+fn true_bandpowers_gain_q_but_little_calibrated_q() {
+    let trials = 12;
+    let mut means = [[0.0; 2]; 4];
+    for seed in 0..trials {
+        // The power of this noise is about twice that of the shear: Q of zero shear is above the honest Q.
+        let attack = Attack::new(seed, 0.01);
+        let truth = attack.scorer.true_bandpowers();
+        let found = attack.bins.power(&attack.modes.e, &attack.modes.e).unwrap();
+        let exact = |b: usize| (truth[b] / found[b]).sqrt();
+        let found = [
+            attack.score(|_| 1.0),
+            attack.score(|_| 0.1),
+            attack.score(exact),
+            attack.score(|b| exact(b).powi(2)),
+        ];
+        for (mean, found) in means.iter_mut().zip(found) {
+            for (mean, found) in mean.iter_mut().zip(found) {
+                *mean += found / trials as f64;
+            }
+        }
+    }
+    let [honest, shrunk, known, smoothed] = means;
+    println!(
+        "honest {honest:?}, shrunk {shrunk:?}, true bandpowers {known:?}, smoothed {smoothed:?}"
+    );
+    assert!(shrunk[0] > 1.4 * honest[0] && known[0] > 1e3 * honest[0]);
+    assert!((shrunk[1] / honest[1] - 1.0).abs() < 1e-9);
+    assert!(
+        known[1] < 1.7 * honest[1] && smoothed[1] < 1.7 * honest[1],
+        "{known:?}"
+    );
 }
