@@ -11,7 +11,7 @@ use shearq_challenge::kind::{Kind, RankBy, kind};
 use shearq_challenge::page::{Disclosure, View};
 use shearq_challenge::ranking;
 use shearq_challenge::shapes::References;
-use shearq_challenge::terms::Challenge;
+use shearq_challenge::terms::{Challenge, TUNING_ENTRIES};
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_results::submit::check::{Finding, Severity, check, check_sent};
@@ -264,7 +264,14 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         }
         _ => anyhow::bail!("cannot determine the data. Try: --sets LIST --images N, or --data DIR"),
     };
-    let data = &challenge.data;
+    let (data, rules) = (&challenge.data, &challenge.rules);
+    if let Some(found) = rules.tunable_entries() {
+        tell(format_args!(
+            "warning: a team can tune {} to the truth with {TUNING_ENTRIES} entries (found {found} per team). Try: --entries-per-team {}",
+            rules.metric.label(),
+            TUNING_ENTRIES - 1
+        ));
+    }
     tell(format_args!(
         "wrote {} of {} each to {}; keep {} secret",
         count(data.sets.len(), "set"),

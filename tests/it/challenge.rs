@@ -889,7 +889,12 @@ fn challenges_that_cannot_be_ranked_are_refused() {
         );
     }
     let output = new(&theirs);
-    assert!(output.status.success(), "{output:?}");
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success(), "{said}");
+    assert!(
+        said.contains("warning: a team can tune Q_c to the truth with 5 entries"),
+        "{said}"
+    );
     let (public, private, out, store) = (at("p"), at("t"), at("o"), at("s"));
     assert!(
         fs::read_to_string(public.join("challenge.toml"))

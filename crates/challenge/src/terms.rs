@@ -95,7 +95,21 @@ pub struct Rules {
     pub closes: Option<Date>,
 }
 
+/// Entries that determine m and c of both components: one, and a shift and a stretch of each (tests/extraction.rs).
+pub const TUNING_ENTRIES: u32 = 5;
+
 impl Rules {
+    /// The entries of a team, in words, if they suffice to tune m and c to the truth.
+    pub fn tunable_entries(&self) -> Option<String> {
+        if !matches!(self.metric, RankBy::M | RankBy::C | RankBy::Qc) {
+            return None;
+        }
+        match self.entries_per_team {
+            None => Some("any number".into()),
+            Some(most) => (most >= TUNING_ENTRIES).then(|| most.to_string()),
+        }
+    }
+
     /// Kind of the files of an entry.
     ///
     /// # Errors

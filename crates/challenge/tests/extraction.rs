@@ -7,12 +7,14 @@ use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
+use shearq_challenge::constant::ConstantShears;
 use shearq_challenge::create::{SCATTER, TEMPLATE_GAIN};
 use shearq_pipeline::simulate::simulator;
+use shearq_results::row::SetRecord;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Bins, Choice, Complex64, Convention, Definition, FieldSum, Grid, Options, SCORED, SetImages,
-    SetScorer, TrueShear,
+    Bins, Choice, Complex64, Convention, Definition, FieldSum, Grid, Metrics, Options, SCORED,
+    SetImages, SetScorer, TrueShear,
 };
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::SimulationSettings;
@@ -218,4 +220,80 @@ fn true_bandpowers_gain_q_but_little_calibrated_q() {
         known[1] < 1.7 * honest[1] && smoothed[1] < 1.7 * honest[1],
         "{known:?}"
     );
+}
+
+/// Q_c of sets with these means of the ellipticities, as it is published.
+fn published_q_c(shears: &ConstantShears, truth: &[[f64; 2]], means: &[[f64; 2]]) -> f64 {
+    let sets: Vec<SetRecord> = (1..)
+        .zip(truth.iter().zip(means))
+        .map(|(set, (g, e))| {
+            let mut metrics = Metrics::unknown();
+            (metrics.c1, metrics.c2) = (e[0] - g[0], e[1] - g[1]);
+            SetRecord {
+                set,
+                simulated: false,
+                data: String::new(),
+                images: vec![1],
+                galaxies: 1,
+                flagged: 0,
+                metrics,
+                errors: Metrics::unknown(),
+                q_replicates: Vec::new(),
+                q_calibrated_replicates: Vec::new(),
+                q_leaderboard: f64::NAN,
+                convention: 5,
+                convention_known: true,
+                convention_leaderboard: 5,
+            }
+        })
+        .collect();
+    (10.0 * shears.q_c(&sets).0).round() / 10.0
+}
+
+#[test]
+fn five_entries_tune_m_and_c_of_constant_shears() {
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    let truth: Vec<[f64; 2]> = (0..20)
+        .map(|_| [(); 2].map(|()| 0.1 * random.random::<f64>() - 0.05))
+        .collect();
+    let all = |g| Array2::from_elem((8, 8), g);
+    let fields: Vec<TrueShear> = truth
+        .iter()
+        .map(|&[g1, g2]| TrueShear {
+            g1: all(g1),
+            g2: all(g2),
+        })
+        .collect();
+    let shears = ConstantShears::of((1..).zip(&fields)).unwrap().unwrap();
+    // A biased measurement, whose means are known to its team.
+    let (m, c) = ([-0.03, 0.02], [4e-4, -7e-4]);
+    let measured = |k: usize, g: f64| (1.0 + m[k]) * g + c[k];
+    let entry = |scale: [f64; 2], shift: [f64; 2]| {
+        let means: Vec<[f64; 2]> = truth
+            .iter()
+            .map(|g| [0, 1].map(|k| scale[k] * measured(k, g[k]) + shift[k]))
+            .collect();
+        published_q_c(&shears, &truth, &means)
+    };
+    // Σ (m/0.002)² + Σ (c/0.0002)².
+    let sum = |q: f64| (2464.0 / q).powi(2) - 4.0;
+    let first = entry([1.0; 2], [0.0; 2]);
+    let found = [0, 1].map(|k| {
+        let (step, mut shift, mut scale) = (1e-3_f64, [0.0; 2], [1.0; 2]);
+        shift[k] = step;
+        let moved = sum(entry([1.0; 2], shift)) - sum(first);
+        let c = (moved * 2e-4f64.powi(2) / step - step) / 2.0;
+        // Scaling by 1 + s adds s(1 + m) to m and s·c to c.
+        let stretch: f64 = 0.05;
+        scale[k] += stretch;
+        let of_c = ((1.0 + stretch).powi(2) - 1.0) * (c / 2e-4).powi(2);
+        let square = (sum(entry(scale, [0.0; 2])) - sum(first) - of_c) * 2e-3f64.powi(2);
+        // ((1 + s)(1 + m) − 1)² − m² = (2s + s²)r² − 2sr with r = 1 + m.
+        let (a, b) = (2.0 * stretch + stretch * stretch, -2.0 * stretch);
+        let response = (-b + (b * b + 4.0 * a * square).sqrt()) / (2.0 * a);
+        (1.0 / response, -c / response)
+    });
+    let last = entry(found.map(|f| f.0), found.map(|f| f.1));
+    println!("Q_c {first} before, {last} after five entries: {found:?}");
+    assert!(first < 200.0 && last > 1100.0, "{first} {last}");
 }
