@@ -170,6 +170,15 @@ pub enum Warning {
         /// Arcseconds per pixel of the galaxy image.
         galaxies: f64,
     },
+    /// The header of a file states the set and image of another file.
+    OtherImage {
+        /// What the file is of: galaxies, or the PSF.
+        of: &'static str,
+        /// SET and IMAGE of the header.
+        stated: [u32; 2],
+        /// Set and image of the path.
+        expected: [u32; 2],
+    },
     /// The configuration uses so little of the PSF that its wings are missing.
     PsfSize {
         /// Pixels a side that are used.
@@ -285,6 +294,7 @@ impl Warning {
             Warning::PsfNarrow { .. } => "psf-narrow",
             Warning::PsfBroad { .. } => "psf-broad",
             Warning::PixelScale { .. } => "pixel-scale",
+            Warning::OtherImage { .. } => "other-image",
             Warning::PsfSize { .. } => "psf-size",
             Warning::Flagged { .. } => "flagged",
         }
@@ -533,6 +543,15 @@ impl fmt::Display for Warning {
                 "the PSF image and the galaxy image have different pixel scales (found {}, expected {} arcsec per pixel). This can bias m by 0.1 or more. Try: resample the PSF to the pixels of the galaxies, or correct its header",
                 Scale(*psf),
                 Scale(*galaxies)
+            ),
+            Warning::OtherImage {
+                of,
+                stated: [set, image],
+                expected,
+            } => write!(
+                f,
+                "the header of the {of} states another image (found SET = {set} and IMAGE = {image}, expected {} and {}). With galaxies or a PSF of another image shears are wrong. Try: put the files back, or correct the header",
+                expected[0], expected[1]
             ),
             Warning::PsfSize { size } => write!(
                 f,

@@ -17,6 +17,7 @@ use shearq_submissions::{Configuration, PsfCut, PsfForm};
 
 use super::head::check_strip;
 use super::some_rows;
+use super::source::stated_image;
 use crate::PipelineError;
 use crate::data::layout::{DataFolder, MAX_STAMP};
 use crate::data::mosaic::Mosaic;
@@ -117,6 +118,8 @@ pub(super) struct OpenPsfs {
     pub(super) moved: Option<[f64; 2]>,
     /// Pixel scale in arcseconds, if the header states it.
     pub(super) scale: Option<f64>,
+    /// Set and image that the header states.
+    pub(super) stated: Option<[u32; 2]>,
 }
 
 /// Opens the PSFs of an image.
@@ -137,6 +140,7 @@ pub(super) fn open_psf(
                 source: open_functional(&path, cut, mosaic)?,
                 moved: None,
                 scale: None,
+                stated: None,
             })
         }
         PsfForm::Star => open_stars(&data.psf_star(id.set, id.image), cut, mosaic),
@@ -169,7 +173,7 @@ fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSourc
 fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, FileError> {
     let least = cut.least;
     let mut image = ImageReader::open(path)?;
-    let scale = pixel_scale::of_header(&image);
+    let (scale, stated) = (pixel_scale::of_header(&image), stated_image(&image));
     let (width, height) = (image.width(), image.height());
     let (columns, rows) = (mosaic.columns, mosaic.rows());
     let side = match whole(&image, path, "STAMP", MAX_STAMP)? {
@@ -204,6 +208,7 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
             source: PsfSource::Stars { image, side },
             moved: None,
             scale,
+            stated,
         });
     }
     if !one || side > MAX_STAMP {
@@ -221,5 +226,6 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
         source: PsfSource::Shared(psf.into_shared()),
         moved,
         scale,
+        stated,
     })
 }

@@ -71,11 +71,21 @@ impl ImageSource {
             source: psfs,
             moved,
             scale,
+            stated,
         } = open_psf(data, id, configuration, &mosaic)?;
         let mut warnings: Vec<Warning> = Warning::of_settings(configuration).into_iter().collect();
         warnings.extend(moved.map(Warning::of_moved));
         let own_scale = pixel_scale::of_header(&image);
         warnings.extend(pixel_scale::disagreement(scale, own_scale));
+        for (of, stated) in [("galaxies", stated_image(&image)), ("PSF", stated)] {
+            let expected = [id.set, id.image];
+            let other = stated.filter(|stated| *stated != expected);
+            warnings.extend(other.map(|stated| Warning::OtherImage {
+                of,
+                stated,
+                expected,
+            }));
+        }
         let head = ImageHead {
             id,
             mosaic,
@@ -174,6 +184,16 @@ impl ImageSource {
             psfs: self.psfs.next_row(mosaic, iy)?,
         }))
     }
+}
+
+/// Set and image that the header of a simulated image states. Headers of other programs may have one of these keys with
+/// another meaning, so that both must be whole numbers.
+pub(super) fn stated_image(image: &ImageReader) -> Option<[u32; 2]> {
+    let whole = |key: &str| {
+        let value = image.number(key).ok().flatten()?;
+        (value.fract() == 0.0 && value >= 1.0).then_some(value as u32)
+    };
+    Some([whole("SET")?, whole("IMAGE")?])
 }
 
 /// Why stamps of `stamp` pixels a side cannot be measured, with the lines of a configuration that measures them.
