@@ -78,8 +78,12 @@ impl<'a> Rows<'a> {
         }
     }
 
-    /// Sums the images onto the grid; also how their rows were used.
-    fn sum(&self, grid: &Grid) -> PyResult<(SetImages, RowCounts, ImageFaults)> {
+    /// Gives each image on the grid to `take`, with how its rows were used.
+    fn each(
+        &self,
+        grid: &Grid,
+        mut take: impl FnMut(&FieldSum, RowCounts) -> PyResult<()>,
+    ) -> PyResult<()> {
         let count = self.e1.len();
         let fits = self
             .lengths
@@ -95,12 +99,10 @@ impl<'a> Rows<'a> {
                 "e1, e2, positions: lengths that differ",
             ));
         }
-        let (mut images, mut counts) = (SetImages::new(grid), RowCounts::default());
-        let mut faults = ImageFaults::default();
         let mut start = 0;
         for length in &self.lengths {
             let mut sum = FieldSum::new(grid);
-            counts += sum.add_image(
+            let counts = sum.add_image(
                 grid,
                 (0..*length).map(|k| {
                     let (x, y) = match self.positions {
@@ -115,11 +117,10 @@ impl<'a> Rows<'a> {
                     }
                 }),
             );
-            faults.add(&sum);
-            images.add(&sum).map_err(of_scoring)?;
+            take(&sum, counts)?;
             start += length;
         }
-        Ok((images, counts, faults))
+        Ok(())
     }
 }
 
@@ -165,7 +166,11 @@ pub(crate) fn score<'py>(
         });
         let sign = given.unwrap_or(TruthSign::Standard);
         let mut truth = TrueShear::from_rows(&grid, sign, truth).map_err(of_scoring)?;
-        let (images, counts, faults) = catalogue.sum(&grid)?;
+        let (mut images, mut counts) = (SetImages::new(&grid), RowCounts::default());
+        catalogue.each(&grid, |image, rows| {
+            counts += rows;
+            images.add(image).map_err(of_scoring)
+        })?;
         if counts.used == 0 {
             return Err(PyValueError::new_err(format!(
                 "e1, e2: no galaxy has an ellipticity on the grid ({} are not finite, {} lie outside); expected numbers",
@@ -193,10 +198,16 @@ pub(crate) fn score<'py>(
                 "warning: truth_g2 seems to have the other sign: with it the shear is an E-mode field. Try: truth_sign=\"{other}\""
             ));
         }
-        let odd = diagnosis::odd_arrays(&faults).into_iter();
-        warnings.extend(odd.map(|line| format!("warning: {line}.")));
         let scorer = SetScorer::new(grid, truth, options).map_err(of_scoring)?;
         let scored = scorer.score(&images).map_err(of_scoring)?;
+        let mut faults = ImageFaults::default();
+        catalogue.each(&grid, |image, _| {
+            faults.add(image);
+            faults.add_response(scorer.response(image, scored.chosen));
+            Ok(())
+        })?;
+        let odd = diagnosis::odd_arrays(&faults).into_iter();
+        warnings.extend(odd.map(|line| format!("warning: {line}.")));
         let faults_of_set = scorer.diagnose(&images, &scored, scored.chosen);
         for fault in faults_of_set.map_err(of_scoring)? {
             let told = match fault {

@@ -31,6 +31,14 @@ const LARGE_BIAS: (f64, f64) = (0.1, 3.0);
 const OF_DISTORTION: f64 = 0.5;
 /// A shear field whose rms exceeds this is not weak lensing.
 const STRONG_SHEAR: f64 = 0.3;
+/// Chance that an image of a set is reported whose response differs by noise only. Over the 24 sets of the challenge
+/// this is at most 2 %, and less in fact, because the bound of the normal distribution below is not tight.
+const FALSE_ALARM: f64 = 1e-3;
+/// Least relative difference of an image's response from that of the others. Images of one set with other PSFs or
+/// noise respond differently too, in S/N 10 against 20 by 0.2; a wrong order, sign or type changes it by 1 or more.
+const LEAST_CHANGE: f64 = 0.4;
+/// Standard deviation of a normal distribution in median absolute deviations.
+const SIGMA_OF_MAD: f64 = 1.4826;
 /// Difference of the shares of B modes that determines the sign of g₂. A pure E-mode field has a share of 0 in
 /// the right sign and of about one half in the other.
 const SHARES_APART: f64 = 0.2;
@@ -97,11 +105,37 @@ pub enum Fault {
     },
 }
 
+/// How the ellipticities of one image follow the true shear: by E modes of the scored bins, or by their mean if the true
+/// shear is constant.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ImageResponse {
+    /// Slope of the ellipticities on the true shear; 1 without bias.
+    pub slope: f64,
+    /// Standard error of the slope by the noise of the image.
+    pub error: f64,
+    /// Correlation with the true shear, −1 to 1.
+    pub correlation: f64,
+}
+
+/// An image that follows the true shear differently from the other images of its set.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OddResponse {
+    /// Place of the image, from 0.
+    pub place: usize,
+    /// Its response.
+    pub response: ImageResponse,
+    /// Median slope of all images.
+    pub slope: f64,
+    /// Median correlation of all images.
+    pub correlation: f64,
+}
+
 /// Faults of single images, found while they are added one after the other.
 #[derive(Debug, Clone, Default)]
 pub struct ImageFaults {
     seen: HashMap<u64, usize>,
     images: usize,
+    responses: Vec<(usize, ImageResponse)>,
     /// Places of images with the ellipticities of an earlier one, and the place of that one, from 0.
     pub copies: Vec<(usize, usize)>,
     /// Places of images whose galaxies all have one ellipticity, and that ellipticity.
@@ -137,6 +171,67 @@ impl ImageFaults {
         if first != place {
             self.copies.push((place, first));
         }
+    }
+
+    /// Adds what [`SetScorer::response`] found for the image that was added last.
+    pub fn add_response(&mut self, response: Option<ImageResponse>) {
+        if let (Some(response), Some(place)) = (response, self.images.checked_sub(1)) {
+            self.responses.push((place, response));
+        }
+    }
+
+    /// Images that follow the true shear differently from the others of the set, in order. Images of one ellipticity are
+    /// not among them.
+    ///
+    /// An image differs if its slope s is farther from the median s₀ than `LEAST_CHANGE` × |s₀| and than
+    /// √(2 ln(K/p)) σ for K images and a chance p of a false alarm, because 2Q(z) ≤ exp(−z²/2). σ contains the errors of s and
+    /// s₀, or the scatter of all slopes if that is larger.
+    pub fn odd(&self) -> Vec<OddResponse> {
+        let all = &self.responses;
+        if all.len() < 2 {
+            return Vec::new();
+        }
+        let of = |value: fn(&ImageResponse) -> f64| all.iter().map(move |(_, own)| value(own));
+        let slope = median(of(|own| own.slope), 1.0);
+        let correlation = median(of(|own| own.correlation), 1.0);
+        let apart = of(|own| own.slope).map(|own| (own - slope).abs());
+        let images = all.len() as f64;
+        // The median deviation of few images is noisy: its relative error is 1.17/√K (Rousseeuw & Croux 1993). Only what
+        // exceeds twice this error is scatter that the noise of the images does not explain.
+        let scatter = SIGMA_OF_MAD * median(apart, 0.0) / (1.0 + 2.0 * 1.17 / images.sqrt());
+        // The variance of a median is π/2 times that of a mean; of two slopes it is that of one.
+        let error = median(of(|own| own.error), 0.0);
+        let of_median = error * (0.5 * PI / (images - 1.0)).sqrt().min(1.0);
+        let clear = (2.0 * (images / FALSE_ALARM).ln()).sqrt();
+        let differs = |(place, own): &&(usize, ImageResponse)| {
+            let sigma = own.error.hypot(of_median).max(scatter);
+            let apart = (own.slope - slope).abs();
+            apart > LEAST_CHANGE * slope.abs()
+                && apart > clear * sigma
+                && !self.constant.iter().any(|(constant, _)| constant == place)
+        };
+        let odd = all
+            .iter()
+            .filter(differs)
+            .map(|&(place, response)| OddResponse {
+                place,
+                response,
+                slope,
+                correlation,
+            });
+        odd.collect()
+    }
+}
+
+/// The median; of the two middle values of an even number the one nearer to `expected`, so that two images of which one is
+/// wrong do not meet halfway.
+fn median(values: impl Iterator<Item = f64>, expected: f64) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_unstable_by(f64::total_cmp);
+    let (below, above) = (values[(values.len() - 1) / 2], values[values.len() / 2]);
+    match (below - expected).abs() < (above - expected).abs() {
+        true => below,
+        false => above,
     }
 }
 
@@ -179,6 +274,56 @@ impl SetScorer {
             None => {}
         }
         Ok(findings)
+    }
+
+    /// How the ellipticities of one image follow the true shear in a convention. `None` if the image has no galaxy or the
+    /// true shear is zero.
+    ///
+    /// # Panics
+    /// If the shape of the image differs from the grid.
+    pub fn response(&self, image: &FieldSum, convention: Convention) -> Option<ImageResponse> {
+        let counted = image.count.mapv(|count| f64::from(u8::from(count > 0.0)));
+        let field = convention.field(&image.e1, &image.e2);
+        // Galaxies that are missing have no response.
+        let weight = convention.turn(&counted);
+        let (g1, g2) = (&self.truth().g1 * &weight, &self.truth().g2 * &weight);
+        let truth = Convention::STANDARD.field(&g1, &g2);
+        let (mut cross, mut of_truth, mut of_image) = (0.0, 0.0, 0.0);
+        let mut each: Vec<(Complex64, Complex64)> = Vec::new();
+        let mut add = |truth: Complex64, e: Complex64| {
+            cross += (truth.conj() * e).re;
+            of_truth += truth.norm_sqr();
+            of_image += e.norm_sqr();
+            each.push((truth, e));
+        };
+        let constant = self.truth().constant().is_some();
+        if constant {
+            truth
+                .iter()
+                .zip(&field)
+                .for_each(|(truth, e)| add(*truth, *e));
+        } else {
+            let [truth, e] = [truth, field].map(|field| self.modes_of(field).e);
+            self.bins().each_scored(|at, _, _| add(truth[at], e[at]));
+        }
+        let slope = cross / of_truth;
+        if !slope.is_finite() {
+            return None;
+        }
+        // A mode and the opposite one are conjugates, so that N modes have N independent numbers. The galaxies of a
+        // constant shear have two each.
+        let numbers = each.len() as f64 * if constant { 2.0 } else { 1.0 };
+        let white = (of_image - slope * cross).max(0.0) * of_truth / numbers;
+        // The same from the modes themselves, for noise that has more power where the true shear has (White 1980).
+        let own = each
+            .iter()
+            .map(|(truth, e)| (truth.conj() * (e - slope * truth)).re.powi(2));
+        let coloured = own.sum::<f64>() * if constant { 1.0 } else { 2.0 };
+        Some(ImageResponse {
+            slope,
+            error: white.max(coloured).sqrt() / of_truth,
+            correlation: cross / (of_truth * of_image).sqrt(),
+        })
     }
 
     /// A fault of the order of rows or components, if there is one.

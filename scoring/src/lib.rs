@@ -53,7 +53,9 @@ pub use bandpower::{BINS, Bins, Definition, SCORED};
 pub use catalogue::{FieldSum, OddRow, Row, RowCounts, RowFault, TrueShear, TruthSign};
 pub use convention::{Convention, ConventionClass};
 pub use cross::{CrossSpectrum, cross_spectrum};
-pub use diagnosis::{Fault, ImageFaults, sign_by_correlation, sign_by_modes};
+pub use diagnosis::{
+    Fault, ImageFaults, ImageResponse, OddResponse, sign_by_correlation, sign_by_modes,
+};
 pub use error::ScoringError;
 pub use grid::{Grid, cell_at, centre_of};
 pub use images::SetImages;

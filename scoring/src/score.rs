@@ -188,6 +188,11 @@ impl SetScorer {
         &self.truth
     }
 
+    /// E and B modes of a field.
+    pub(crate) fn modes_of(&self, field: Array2<Complex64>) -> Modes {
+        self.decomposer.modes_of(field)
+    }
+
     /// Modes of the averaged field in a convention, and modes of the truth to compare them with.
     pub(crate) fn both_modes(&self, sum: &FieldSum, convention: Convention) -> (Modes, Modes) {
         (

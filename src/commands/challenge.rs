@@ -377,6 +377,9 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
             refused.reason
         ));
     }
+    for (path, doubt) in &round.doubtful {
+        tell(format_args!("warning: {}: {doubt}", path.display()));
+    }
     for (info, reason) in &board.excluded {
         tell(format_args!(
             "warning: the entry of {} of {} does not count: {reason}",

@@ -104,6 +104,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let expected = Expected {
         grid,
         truth,
+        secret_truth: BTreeMap::new(),
         images: *images,
         sets: Vec::new(),
     };

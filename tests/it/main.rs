@@ -30,6 +30,7 @@ mod ledger;
 mod limits;
 mod noisy_stars;
 mod odd_files;
+mod odd_images;
 mod orientation;
 mod own_images;
 mod packed;

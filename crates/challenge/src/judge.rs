@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shearq_files::FileError;
+use shearq_files::{FileError, names_of};
 use shearq_pipeline::data::fingerprint;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::run::Source;
@@ -18,7 +18,9 @@ use shearq_results::submit::challenge::read_bandpowers;
 use shearq_results::submit::check::{CheckedSet, Severity, check_sent};
 use shearq_results::submit::manifest::{Contents, Entry as Team, Manifest};
 use shearq_results::submit::packed::{Packed, Sent, Submission};
-use shearq_scoring::{Choice, Convention, Fault, Grid, Options, SCORED, ScoringError, SetScorer};
+use shearq_scoring::{
+    Choice, Convention, Fault, Grid, Options, SCORED, ScoringError, SetScorer, TrueShear,
+};
 use shearq_simulate::kinds::SetKind;
 use shearq_submissions::check_name;
 
@@ -89,10 +91,13 @@ pub struct Round {
     pub known: usize,
     /// Entries that were not scored.
     pub refused: Vec<Refused>,
+    /// Scored entries with a probable fault, and the fault.
+    pub doubtful: Vec<(PathBuf, String)>,
 }
 
 /// The true shear of a set.
 struct Truth {
+    shear: TrueShear,
     scorer: SetScorer,
     print: String,
     kind: Option<SetKind>,
@@ -149,7 +154,8 @@ impl Judge {
             truths.insert(
                 set,
                 Truth {
-                    scorer: SetScorer::new(grid, truth, options).map_err(unscored)?,
+                    scorer: SetScorer::new(grid, truth.clone(), options).map_err(unscored)?,
+                    shear: truth,
                     print: fingerprint::of_set(&source, &data, set, &[])?,
                     kind: kind_of(&data, set),
                 },
@@ -245,8 +251,9 @@ impl Judge {
             |result| {
                 progress.advance(self.challenge.data.galaxies());
                 match result {
-                    Ok(run) => {
+                    Ok((run, doubts)) => {
                         store::write(store, &run)?;
+                        round.doubtful.extend(doubts);
                         round.scored += 1;
                     }
                     Err(refused) => round.refused.push(refused),
@@ -258,7 +265,11 @@ impl Judge {
     }
 
     /// Checks and scores one entry.
-    fn judge(&self, candidate: Candidate, references: &References) -> Result<RunRecord, Refused> {
+    fn judge(
+        &self,
+        candidate: Candidate,
+        references: &References,
+    ) -> Result<(RunRecord, Option<(PathBuf, String)>), Refused> {
         let Candidate {
             sending,
             reference,
@@ -295,7 +306,7 @@ impl Judge {
         let configuration = short(&format!("{}: {}", info.team, info.method));
         let settings =
             toml::to_string(&Stored { entry: info }).map_err(|error| refuse(error.to_string()))?;
-        Ok(RunRecord {
+        let run = RunRecord {
             configuration,
             version: shearq_pipeline::VERSION.into(),
             settings,
@@ -304,7 +315,9 @@ impl Judge {
             choice: Convention::STANDARD.number().to_string(),
             noise: "measured".into(),
             sets: scored.sets,
-        })
+        };
+        let doubt = scored.doubt.map(|doubt| (sending.path.clone(), doubt));
+        Ok((run, doubt))
     }
 
     /// Scores the files of an entry, or gives the reason why not.
@@ -327,7 +340,7 @@ impl Judge {
         let sent = Sent::open(&sending.path).map_err(plain)?;
         let submission = Submission::read(&sent).map_err(plain)?;
         let contents = rules.accept(&submission)?;
-        let mut sets = match &submission.packed {
+        let (mut sets, doubt) = match &submission.packed {
             Packed::Catalogues(_) => self.catalogues(&sent, sending, references)?,
             Packed::Spectra(files) => {
                 self.check(&sent, sending, references, &mut |_| {})?;
@@ -339,7 +352,7 @@ impl Judge {
                 if !is_measurable(slope, error) {
                     return Err("the spectra do not follow the differences of the true spectra between sets, so they contain no measurable shear".into());
                 }
-                sets
+                (sets, None)
             }
         };
         sets.sort_by_key(|set| set.set);
@@ -361,6 +374,7 @@ impl Judge {
             method: submission.method,
             contents,
             sets,
+            doubt,
         })
     }
 
@@ -373,7 +387,10 @@ impl Judge {
         done: &mut dyn FnMut(CheckedSet<'_>),
     ) -> Result<(), String> {
         let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
-        let mut findings = check_sent(sent, &self.challenge.expected().map_err(plain)?, done);
+        let mut expected = self.challenge.expected().map_err(plain)?;
+        let truths = self.truths.iter();
+        expected.secret_truth = truths.map(|(set, own)| (*set, own.shear.clone())).collect();
+        let mut findings = check_sent(sent, &expected, done);
         findings.extend(references.findings(sent).map_err(plain)?);
         findings.retain(|finding| finding.severity == Severity::Error);
         let Some(first) = findings.first() else {
@@ -386,25 +403,36 @@ impl Judge {
         })
     }
 
-    /// Checks and scores the catalogues of an entry.
+    /// Checks and scores the catalogues of an entry; also names images that do not follow the shear as the others do.
     fn catalogues(
         &self,
         sent: &Sent,
         sending: &Sending,
         references: &References,
-    ) -> Result<Vec<SetRecord>, String> {
+    ) -> Result<(Vec<SetRecord>, Option<String>), String> {
         let mut sets = Vec::new();
         let mut failed = None;
-        self.check(
-            sent,
-            sending,
-            references,
-            &mut |set: CheckedSet<'_>| match self.score_set(&set) {
+        let mut odd: Vec<String> = Vec::new();
+        self.check(sent, sending, references, &mut |set: CheckedSet<'_>| {
+            let of_set = set.set;
+            odd.extend(
+                set.odd
+                    .iter()
+                    .map(|image| format!("{image} of set {of_set}")),
+            );
+            match self.score_set(&set) {
                 Ok(record) => sets.extend(record),
                 Err(reason) => failed = failed.take().or(Some(reason)),
-            },
-        )?;
-        failed.map_or(Ok(sets), Err)
+            }
+        })?;
+        // Without numbers, because correlations with the truth are secret.
+        let doubt = (!odd.is_empty()).then(|| {
+            format!(
+                "image {} does not follow the shear as the others of the set do",
+                names_of(&odd)
+            )
+        });
+        failed.map_or(Ok((sets, doubt)), Err)
     }
 
     /// Scores the power spectra of an entry.
@@ -445,6 +473,7 @@ impl Judge {
             images,
             numbers,
             rows,
+            odd: _,
         } = checked;
         let Some(truth) = self.truths.get(set) else {
             return Ok(None);
@@ -489,6 +518,7 @@ struct Scored {
     method: String,
     contents: Contents,
     sets: Vec<SetRecord>,
+    doubt: Option<String>,
 }
 
 /// Significance that the response to the shear needs, as for Q cal.

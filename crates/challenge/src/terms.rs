@@ -167,6 +167,7 @@ impl Challenge {
         Ok(Expected {
             grid: grid.map_err(|error| FileError::new(CHALLENGE_FILE, error))?,
             truth: BTreeMap::new(),
+            secret_truth: BTreeMap::new(),
             images: Some(*images),
             sets: sets.clone(),
         })

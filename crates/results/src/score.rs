@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
-    Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, Metrics, Options,
-    RowCounts, ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
+    Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, Metrics, OddResponse,
+    Options, RowCounts, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
 };
 
 use shearq_files::FileError;
@@ -55,6 +55,8 @@ pub struct OddImages {
     pub copies: Vec<(PathBuf, PathBuf)>,
     /// Catalogues whose galaxies all have one ellipticity, and this ellipticity.
     pub constant: Vec<(PathBuf, [f64; 2])>,
+    /// Catalogues that follow the true shear differently from the others of the set.
+    pub responses: Vec<(PathBuf, OddResponse)>,
 }
 
 impl OddImages {
@@ -71,6 +73,11 @@ impl OddImages {
                 .iter()
                 .map(|(place, e)| (paths[*place].clone(), *e))
                 .collect(),
+            responses: faults
+                .odd()
+                .into_iter()
+                .map(|odd| (paths[odd.place].clone(), odd))
+                .collect(),
         }
     }
 
@@ -79,25 +86,53 @@ impl OddImages {
         for (copy, first) in &mut self.copies {
             (*copy, *first) = (name(copy), name(first));
         }
-        for (path, _) in &mut self.constant {
+        let constant = self.constant.iter_mut().map(|(path, _)| path);
+        let responses = self.responses.iter_mut().map(|(path, _)| path);
+        for path in constant.chain(responses) {
             *path = name(path);
         }
     }
 }
 
-/// Probable faults of a scored set.
-fn findings(
-    scorer: &SetScorer,
-    images: &SetImages,
-    score: &SetScore,
-    choice: Choice,
-) -> Result<Vec<Fault>, ScoringError> {
-    // The convention with the highest Q may be wrong.
-    let convention = match choice {
+/// The convention in which faults are looked for.
+fn convention_of_faults(score: &SetScore, choice: Choice) -> Convention {
+    match choice {
+        // The convention with the highest Q may be wrong.
         Choice::Best => score.matching.convention(),
         Choice::Matched | Choice::Insist(_) => score.chosen,
-    };
-    scorer.diagnose(images, score, convention)
+    }
+}
+
+/// Scores the catalogues of a set with their probable faults. The convention of `scorer` may be known only afterwards;
+/// images are then read again, so that each can be compared with the truth in it.
+fn score_added(
+    scorer: &SetScorer,
+    added: &mut Added,
+    files: (&[PathBuf], ReadImage<'_>),
+    choice: Choice,
+    threads: usize,
+) -> Result<(SetScore, Vec<Fault>), PipelineError> {
+    let unnumbered = |source| PipelineError::Scoring { set: None, source };
+    let score = scorer.score(&added.images).map_err(unnumbered)?;
+    let convention = convention_of_faults(&score, choice);
+    if !added.compared && files.0.len() > 1 {
+        let grid = score.grid;
+        let compared = Some((scorer, convention));
+        added.odd_images = add_up(&grid, files.0, files.1, compared, threads)?.odd_images;
+    }
+    let faults = scorer.diagnose(&added.images, &score, convention);
+    Ok((score, faults.map_err(unnumbered)?))
+}
+
+/// The same error with the number of a set.
+fn of_set(error: PipelineError, set: u32) -> PipelineError {
+    match error {
+        PipelineError::Scoring { set: None, source } => PipelineError::Scoring {
+            set: Some(set),
+            source,
+        },
+        other => other,
+    }
 }
 
 /// How the convention of the metrics was chosen. It is the same for all sets of a variant.
@@ -154,14 +189,10 @@ pub fn score_files(
         mut basis,
     } = read_truth(truth, reading)?;
     let scoring = |source| PipelineError::Scoring { set: None, source };
-    let Added {
-        images,
-        rows,
-        odd_images,
-    } = add_up(&grid, catalogues, read, threads)?;
+    let mut added = add_up(&grid, catalogues, read, None, threads)?;
     if basis == SignBasis::Unknown
         && let Some(sign) =
-            sign_by_correlation(&shear.flipped(), images.total()).map_err(scoring)?
+            sign_by_correlation(&shear.flipped(), added.images.total()).map_err(scoring)?
     {
         basis = SignBasis::Correlation(sign);
         if sign == TruthSign::Standard {
@@ -169,12 +200,13 @@ pub fn score_files(
         }
     }
     let scorer = SetScorer::new(grid, shear, options).map_err(scoring)?;
-    let score = scorer.score(&images).map_err(scoring)?;
+    let files = (catalogues, read);
+    let (score, findings) = score_added(&scorer, &mut added, files, options.choice, threads)?;
     Ok(ScoredSet {
         set: None,
         kind: None,
-        findings: findings(&scorer, &images, &score, options.choice).map_err(scoring)?,
-        odd_images,
+        findings,
+        odd_images: added.odd_images,
         sign: basis,
         images: (1..=catalogues.len() as u32).collect(),
         basis: match options.choice {
@@ -183,7 +215,7 @@ pub fn score_files(
             Choice::Insist(_) => Basis::Given,
         },
         score,
-        rows,
+        rows: added.rows,
     })
 }
 
@@ -192,13 +224,17 @@ struct Added {
     images: SetImages,
     rows: RowCounts,
     odd_images: OddImages,
+    /// Whether each image was compared with the true shear.
+    compared: bool,
 }
 
-/// Reads catalogues in parallel and sums them in order.
+/// Reads catalogues in parallel and sums them in order. Each is compared with the true shear of `compared` in its
+/// convention.
 fn add_up(
     grid: &Grid,
     catalogues: &[PathBuf],
     read: ReadImage<'_>,
+    compared: Option<(&SetScorer, Convention)>,
     threads: usize,
 ) -> Result<Added, PipelineError> {
     let mut faults = ImageFaults::default();
@@ -215,9 +251,14 @@ fn add_up(
             Ok(())
         },
         || (),
-        |(), path: PathBuf| Ok(read(grid, &path)?),
-        |(sum, more)| {
+        |(), path: PathBuf| {
+            let (sum, counts) = read(grid, &path)?;
+            let response = compared.and_then(|(scorer, own)| scorer.response(&sum, own));
+            Ok((sum, counts, response))
+        },
+        |(sum, more, response)| {
             faults.add(&sum);
+            faults.add_response(response);
             images
                 .add(&sum)
                 .map_err(|source| PipelineError::Scoring { set: None, source })?;
@@ -234,6 +275,7 @@ fn add_up(
         images,
         rows: counts,
         odd_images: OddImages::new(&faults, catalogues),
+        compared: compared.is_some(),
     })
 }
 
@@ -303,18 +345,17 @@ pub fn score_variants(
         };
         let mut own = Vec::new();
         for (set, files) in &sets {
-            let scoring = |source| PipelineError::Scoring {
-                set: Some(*set),
-                source,
-            };
-            let (scorer, added) = prepare(data, *set, &files[k], variant.read, options, threads)?;
-            let score = scorer.score(&added.images).map_err(scoring)?;
+            let paths: Vec<PathBuf> = files[k].iter().map(|file| file.1.clone()).collect();
+            let (scorer, mut added) = prepare(data, *set, &paths, variant.read, options, threads)?;
+            let files_of_set = (paths.as_slice(), variant.read);
+            let (score, findings) =
+                score_added(&scorer, &mut added, files_of_set, options.choice, threads)
+                    .map_err(|error| of_set(error, *set))?;
             own.push(ScoredSet {
                 set: Some(*set),
                 kind: kind_of(data, *set),
                 images: files[k].iter().map(|file| file.0).collect(),
-                findings: findings(&scorer, &added.images, &score, options.choice)
-                    .map_err(scoring)?,
+                findings,
                 odd_images: added.odd_images,
                 score,
                 rows: added.rows,
@@ -363,14 +404,9 @@ fn match_over_sets(
 ) -> Result<ConventionMatch, PipelineError> {
     let mut all = ConventionMatch::default();
     for (set, files) in sets {
-        let (scorer, added) = prepare(
-            data,
-            *set,
-            &files[k],
-            variant.read,
-            Options::default(),
-            threads,
-        )?;
+        let paths: Vec<PathBuf> = files[k].iter().map(|file| file.1.clone()).collect();
+        let options = Options::default();
+        let (scorer, added) = prepare(data, *set, &paths, variant.read, options, threads)?;
         let found = scorer.match_convention(&added.images);
         all.merge(&found.map_err(|source| PipelineError::Scoring {
             set: Some(*set),
@@ -384,7 +420,7 @@ fn match_over_sets(
 fn prepare(
     data: &DataFolder,
     set: u32,
-    files: &[(u32, PathBuf)],
+    files: &[PathBuf],
     read: ReadImage<'_>,
     options: Options,
     threads: usize,
@@ -394,8 +430,12 @@ fn prepare(
         set: Some(set),
         source,
     })?;
-    let files: Vec<PathBuf> = files.iter().map(|file| file.1.clone()).collect();
-    Ok((scorer, add_up(&grid, &files, read, threads)?))
+    let compared = match options.choice {
+        Choice::Insist(convention) => Some((&scorer, convention)),
+        Choice::Matched | Choice::Best => None,
+    };
+    let added = add_up(&grid, files, read, compared, threads)?;
+    Ok((scorer, added))
 }
 
 /// Scores sets of a data folder from catalogues found by `catalogues`: `sets`, or if it is empty, all sets with

@@ -15,3 +15,4 @@ mod derivations;
 mod edges;
 mod great10_cases;
 mod input;
+mod responses;

@@ -12,7 +12,7 @@ use super::challenge::{Kind, SpectrumLine, read_spectrum, wrong_multipoles};
 use super::manifest::{Contents, FileSum, Manifest};
 use super::packed::Sent;
 use crate::score::COLUMNS;
-use crate::views::diagnosis::words;
+use crate::views::diagnosis::{odd_response, words};
 use crate::views::rows::fault as odd_rows;
 use shearq_files::table::most_rows;
 use shearq_pipeline::data::layout::read_rows;
@@ -50,6 +50,8 @@ pub struct Expected {
     pub grid: Grid,
     /// True shear by set, if known, to check conventions and type of ellipticity.
     pub truth: BTreeMap<u32, TrueShear>,
+    /// True shear that findings must not reveal: only images that do not follow it as the others do are told, to `done`.
+    pub secret_truth: BTreeMap<u32, TrueShear>,
     /// Number of images of every set, if known.
     pub images: Option<u32>,
     /// Sets that a submission must contain; it must contain no other sets. Empty if unknown.
@@ -70,6 +72,8 @@ pub struct CheckedSet<'a> {
     pub numbers: &'a [u32],
     /// How the rows were used.
     pub rows: RowCounts,
+    /// Image numbers of those that follow the true shear differently from the others.
+    pub odd: Vec<u32>,
 }
 
 /// Checks a file, or all files of a folder or an archive.
@@ -158,11 +162,14 @@ fn check_files(
             let Some((sum, counts)) = check_catalogue(file, expected, &mut report) else {
                 continue;
             };
-            let files = files.get_or_insert_with(|| SetFiles::new(&expected.grid, file));
+            let files = files.get_or_insert_with(|| SetFiles::new(expected, set, file));
             files.add(&sum, counts, image, file);
         }
         if let Some(mut files) = files {
             check_copies(&files, &mut report);
+            let odd = files.faults.odd();
+            let odd = odd.iter().map(|odd| files.numbers[odd.place]).collect();
+            check_responses(set, &files, expected, &mut report);
             check_images(set, &mut files, most, path, expected, &mut report);
             check_against_truth(set, &files, expected, &mut report);
             done(CheckedSet {
@@ -170,6 +177,7 @@ fn check_files(
                 images: &files.images,
                 numbers: &files.numbers,
                 rows: files.rows,
+                odd,
             });
         }
     }
@@ -182,9 +190,9 @@ fn check_unnamed(file: &Path, single: bool, expected: &Expected, report: &mut Re
         return;
     };
     if single && expected.truth.len() == 1 {
-        let mut entry = SetFiles::new(&expected.grid, file);
-        entry.add(&sum, counts, 1, file);
         for set in expected.truth.keys() {
+            let mut entry = SetFiles::new(expected, *set, file);
+            entry.add(&sum, counts, 1, file);
             check_against_truth(*set, &entry, expected, report);
         }
     } else if !expected.truth.is_empty() {
@@ -229,6 +237,8 @@ fn check_name(file: &Path, single: bool, report: &mut Report) -> Option<Kind> {
 
 /// Catalogues of a set.
 struct SetFiles {
+    /// With the true shear of the set, if it is known.
+    scorer: Option<SetScorer>,
     images: SetImages,
     faults: ImageFaults,
     paths: Vec<PathBuf>,
@@ -238,9 +248,17 @@ struct SetFiles {
 }
 
 impl SetFiles {
-    fn new(grid: &Grid, first: &Path) -> Self {
+    fn new(expected: &Expected, set: u32, first: &Path) -> Self {
+        let open = expected.truth.get(&set);
+        let truth = open.or_else(|| expected.secret_truth.get(&set));
+        let options = Options {
+            choice: Choice::Insist(Convention::STANDARD),
+            ..Options::default()
+        };
+        let scorer = |truth: &TrueShear| SetScorer::new(expected.grid, truth.clone(), options).ok();
         SetFiles {
-            images: SetImages::new(grid),
+            scorer: truth.and_then(scorer),
+            images: SetImages::new(&expected.grid),
             faults: ImageFaults::default(),
             paths: Vec::new(),
             numbers: Vec::new(),
@@ -252,6 +270,9 @@ impl SetFiles {
     fn add(&mut self, sum: &FieldSum, rows: RowCounts, image: u32, file: &Path) {
         self.rows += rows;
         self.faults.add(sum);
+        let scorer = self.scorer.as_ref();
+        let response = scorer.and_then(|scorer| scorer.response(sum, Convention::STANDARD));
+        self.faults.add_response(response);
         self.images.add(sum).expect(ONE_IMAGE);
         self.numbers.push(image);
         self.paths.push(file.to_owned());
@@ -440,6 +461,17 @@ fn check_copies(files: &SetFiles, report: &mut Report) {
     }
 }
 
+/// Catalogues that follow the true shear differently from the others of their set.
+fn check_responses(set: u32, files: &SetFiles, expected: &Expected, report: &mut Report) {
+    if !expected.truth.contains_key(&set) {
+        return;
+    }
+    for odd in files.faults.odd() {
+        let message = format!("set {set}: the image {}", odd_response(&odd));
+        report.error(&files.paths[odd.place], "image", message);
+    }
+}
+
 /// The name of a file without its folder, which may be temporary.
 fn name_of(path: &Path) -> String {
     path.file_name()
@@ -487,25 +519,20 @@ fn check_images(
 /// Conventions and type of ellipticity, if the truth is known.
 fn check_against_truth(set: u32, files: &SetFiles, expected: &Expected, report: &mut Report) {
     let SetFiles {
+        scorer: Some(scorer),
         images,
         faults,
         first: path,
         ..
-    } = files;
-    if images.total().count.iter().all(|count| *count == 0.0) {
+    } = files
+    else {
+        return;
+    };
+    let absent = images.total().count.iter().all(|count| *count == 0.0);
+    if absent || !expected.truth.contains_key(&set) {
         return;
     }
-    let Some(truth) = expected.truth.get(&set) else {
-        return;
-    };
     let before = report.findings.len();
-    let options = Options {
-        choice: Choice::Insist(Convention::STANDARD),
-        ..Options::default()
-    };
-    let Ok(scorer) = SetScorer::new(expected.grid, truth.clone(), options) else {
-        return;
-    };
     let Ok(score) = scorer.score(images) else {
         return;
     };
@@ -626,6 +653,7 @@ mod tests {
         let expected = Expected {
             grid: Grid::new(8, Pixels(48.0), Degrees(10.0)).unwrap(),
             truth: BTreeMap::new(),
+            secret_truth: BTreeMap::new(),
             images: None,
             sets: Vec::new(),
         };

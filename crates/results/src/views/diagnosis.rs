@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use shearq_scoring::{Fault, ImageFaults, TruthSign};
+use shearq_scoring::{Fault, ImageFaults, OddResponse, TruthSign};
 
 use crate::score::OddImages;
 use shearq_pipeline::truth::SignBasis;
@@ -81,7 +81,44 @@ pub fn odd_images(odd: &OddImages) -> Vec<String> {
             more(odd.constant.len())
         ));
     }
+    for (path, response) in odd.responses.iter().take(MOST_NAMED) {
+        lines.push(format!("{} {}", path.display(), odd_response(response)));
+    }
+    if let Some(left) = odd.responses.len().checked_sub(MOST_NAMED + 1) {
+        let names = odd.responses[MOST_NAMED..].iter().map(|(path, _)| path);
+        let names: Vec<String> = names.map(|path| path.display().to_string()).collect();
+        lines.push(format!(
+            "{} more images likewise: {}",
+            left + 1,
+            names.join(", ")
+        ));
+    }
     lines
+}
+
+/// Most images that are described one by one.
+const MOST_NAMED: usize = 4;
+
+/// How an image differs from the others of its set, with the probable cause.
+pub fn odd_response(odd: &OddResponse) -> String {
+    let OddResponse {
+        response,
+        slope,
+        correlation,
+        ..
+    } = odd;
+    let ratio = response.slope / slope;
+    let cause = match ratio {
+        _ if ratio < -0.5 => "Its signs are probably wrong",
+        _ if ratio < 0.5 => {
+            "Its galaxies are probably in another order, at other positions or of another set"
+        }
+        _ => "Its ellipticities are probably of another type or scale",
+    };
+    format!(
+        "follows the true shear by {:.2} ± {:.2} (correlation {:.2}), the images of its set by {slope:.2} ({correlation:.2}). {cause}",
+        response.slope, response.error, response.correlation
+    )
 }
 
 /// A remark on the sign of the true g2, if the reader needs it.
@@ -168,6 +205,7 @@ mod tests {
         let odd = OddImages {
             copies: vec![(path("b"), path("a")), (path("c"), path("a"))],
             constant: vec![(path("d"), [0.0, 0.5])],
+            responses: Vec::new(),
         };
         let lines = odd_images(&odd);
         assert!(lines[0].starts_with("b has the ellipticities of a, and 1 more likewise;"));
