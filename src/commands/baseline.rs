@@ -82,7 +82,8 @@ struct RecordArguments {
 /// Measure baselines again and compare the metrics.
 ///
 /// Each configuration is measured with its present settings, and changed settings are listed. A baseline of
-/// catalogues (--measured) contains no configuration file, so its stored settings are used.
+/// catalogues (--measured) contains no configuration file, so the stored settings of other than named configurations
+/// are used: such a check finds changes of data and shearq, but not of a settings file.
 ///
 /// Compared are Q, M/2, √A and the scatter of e1 and e2. On the same data they must agree up to rounding, on other
 /// data (--data) within the noise. CSV and JSON list every metric, the other formats the moved ones.
@@ -254,6 +255,17 @@ fn of_folders(
             folder.display(),
         );
         let sets = metrics_of(&run, &run.source.data(folder)?, folder, threads)?;
+        // A named configuration is checked with its present settings.
+        if !Registry::embedded()?
+            .names()
+            .contains(&run.configuration.name)
+        {
+            tell(format_args!(
+                "note: {}: a check finds changes of the data and of shearq, but not of your settings file, because the catalogues do not name it; the baseline keeps the settings of {}. Try: baseline record NAME --data DIR --submission FILE",
+                folder.display(),
+                run.configuration.name
+            ));
+        }
         configurations.push(BaselineConfiguration::new(&run.configuration, None, sets)?);
     }
     Ok((

@@ -73,6 +73,16 @@ pub enum ConfigurationError {
         /// The expected form.
         expected: &'static str,
     },
+    /// A file with the name of a known configuration, but other settings.
+    #[error("{path}: the name `{name}` is that of a known configuration with other settings ({difference}). Try: another `name`", path = path.display())]
+    Taken {
+        /// The file.
+        path: PathBuf,
+        /// The name.
+        name: String,
+        /// The first setting that differs.
+        difference: String,
+    },
     /// A value of a file that is out of range.
     #[error("{path}: {error}")]
     Range {

@@ -1,6 +1,6 @@
 //! Finding submissions by name or file, and resolving what they inherit.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -142,7 +142,32 @@ impl Registry {
     /// # Errors
     /// Where there is no such name or file, or it or what it extends is not valid.
     pub fn get(&self, name_or_path: &str) -> Result<Entry, ConfigurationError> {
-        self.entry(self.find(name_or_path, None)?, name_or_path)
+        let link = self.find(name_or_path, None)?;
+        let file = link.text.is_some().then(|| link.path.clone());
+        let entry = self.entry(link, name_or_path)?;
+        match file {
+            Some(path) => self.distinct(path, entry),
+            None => Ok(entry),
+        }
+    }
+
+    /// Refuses a file with the name of a known configuration and other settings: tables and stores would show two methods
+    /// of one name.
+    fn distinct(&self, path: PathBuf, entry: Entry) -> Result<Entry, ConfigurationError> {
+        let own = &entry.configuration;
+        if !self.files.contains_key(&own.name) {
+            return Ok(entry);
+        }
+        let known = self.get(&own.name)?.configuration;
+        let table = |configuration| toml::Table::try_from(configuration).unwrap_or_default();
+        match difference(&table(own), &table(&known)) {
+            None => Ok(entry),
+            Some(difference) => Err(ConfigurationError::Taken {
+                path,
+                name: own.name.clone(),
+                difference,
+            }),
+        }
     }
 
     /// The submission of a settings file with this text. Errors speak of it as `path`, after which it is named
@@ -275,6 +300,29 @@ fn own_name(file: &File, path: &Path) -> String {
     })
 }
 
+/// The first setting that differs, in words. A description changes no result.
+fn difference(own: &toml::Table, known: &toml::Table) -> Option<String> {
+    let keys: BTreeSet<&String> = own.keys().chain(known.keys()).collect();
+    keys.into_iter().find_map(|key| {
+        let (found, expected) = (own.get(key), known.get(key));
+        if found == expected || key == "description" {
+            return None;
+        }
+        if let (Some(toml::Value::Table(found)), Some(toml::Value::Table(expected))) =
+            (found, expected)
+        {
+            return difference(found, expected).map(|inner| format!("{key}.{inner}"));
+        }
+        let shown =
+            |value: Option<&toml::Value>| value.map_or("absent".into(), ToString::to_string);
+        Some(format!(
+            "{key}: found {}, expected {}",
+            shown(found),
+            shown(expected)
+        ))
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -338,6 +386,36 @@ mod tests {
         assert_eq!(network.deconvolution.lambda, 0.5);
         assert!(entry.configuration.wavelet().is_some());
         assert_eq!(entry.published, None);
+    }
+
+    #[test]
+    fn files_with_the_name_of_a_known_configuration_have_its_settings() {
+        let folder = tempfile::tempdir().unwrap();
+        let registry = Registry::embedded().unwrap();
+        let read = |file: &str, text: &str| {
+            let path = write(folder.path(), file, text);
+            registry.get(&path).map_err(|error| error.to_string())
+        };
+        let named = "name = \"48/linear/star\"\n";
+        let other = format!("{named}extends = \"23/raw/star\"\n");
+        let error = read("own.toml", &other).unwrap_err();
+        assert!(
+            error.contains("own.toml: the name `48/linear/star` is that of a known"),
+            "{error}"
+        );
+        let changed = format!("{named}extends = \"48/linear/star\"\n[stamp]\nsize = 40\n");
+        let error = read("own.toml", &changed).unwrap_err();
+        assert!(
+            error.contains("(stamp.size: found 40, expected 48). Try: another"),
+            "{error}"
+        );
+        // The bases, which are not listed, have names too; a file without one has the name of its path.
+        assert!(read("paper.toml", "extends = \"48/linear/star\"\n").is_err());
+        let same = format!("{named}extends = \"48/linear/star\"\ndescription = \"mine\"\n");
+        assert_eq!(
+            read("own.toml", &same).unwrap().configuration.name,
+            "48/linear/star"
+        );
     }
 
     #[test]

@@ -456,7 +456,16 @@ fn compare_with_other_programs(folder: &Path) {
     ]);
     let table: Value = serde_json::from_str(&table).unwrap();
     let value = |row: usize, key: &str| table["rows"][row][key].as_f64().unwrap();
-    assert_eq!(table["rows"][1]["submission"], "regauss");
+    // Two of one name are told apart by their files.
+    let name = |row: usize| {
+        table["rows"][row]["submission"]
+            .as_str()
+            .unwrap()
+            .to_owned()
+    };
+    assert_eq!(name(1), format!("regauss ({})", regauss.display()));
+    assert_eq!(name(2), "ksb");
+    assert_eq!(name(3), format!("regauss ({})", distortion.display()));
     // Shape noise: the jackknife error comes from two images per set.
     for row in [1, 2] {
         let (m, error) = (value(row, "m_cross"), value(row, "m_cross_error"));

@@ -95,6 +95,8 @@ pub fn by_name(variants: &[Variant]) -> Vec<(String, Vec<SetRecord>)> {
 /// A variant before it is scored.
 struct Entrant<'a> {
     name: String,
+    /// Folder, archive or file.
+    path: PathBuf,
     published: Option<Published>,
     catalogues: Origin<'a>,
     settings: String,
@@ -180,7 +182,8 @@ pub fn score_all(
     way: Way,
     threads: usize,
 ) -> Result<Vec<Variant>, PipelineError> {
-    let foreign: Vec<Foreign> = foreign
+    let files = foreign;
+    let foreign: Vec<Foreign> = files
         .iter()
         .map(|path| Foreign::read(path))
         .collect::<Result<_, _>>()?;
@@ -189,9 +192,10 @@ pub fn score_all(
     let data = data.ok_or_else(|| {
         PipelineError::Request("--foreign needs the true shear. Try: --data DIR".into())
     })?;
-    for foreign in &foreign {
+    for (path, foreign) in files.iter().zip(&foreign) {
         entrants.push(Entrant {
             name: foreign.name.clone(),
+            path: path.clone(),
             published: None,
             catalogues: Origin::Foreign(foreign, foreign.catalogues(&[])?),
             settings: foreign.pattern().display().to_string(),
@@ -251,8 +255,13 @@ pub fn score_all(
                 noise: "measured".into(),
                 sets: records(&sets),
             };
+            let alike = entrants.iter().filter(|own| own.name == entrant.name);
             Ok(Variant {
-                name: entrant.name.clone(),
+                // Runs of one name may have other settings or versions.
+                name: match alike.count() {
+                    1 => entrant.name.clone(),
+                    _ => format!("{} ({})", entrant.name, entrant.path.display()),
+                },
                 published: entrant.published,
                 unscored: {
                     let unread = entrant.catalogues.unread().into_iter();
@@ -307,6 +316,7 @@ fn own_entrants(
             inputs::verify(data, folder, &run, &[], threads)?;
         }
         entrants.push(Entrant {
+            path: folder.clone(),
             // Published metrics belong to the built-in settings, not to a file with their name.
             published: registry
                 .get(&run.configuration.name)
@@ -338,6 +348,7 @@ fn packed_entrant(path: &Path, given: bool) -> Result<Entrant<'static>, Pipeline
     let settings = run.map(|run| toml::to_string(&run.configuration));
     let settings = settings.unwrap_or_else(|| Ok(path.display().to_string()));
     Ok(Entrant {
+        path: path.to_owned(),
         name: packed.method.clone(),
         published: None,
         settings: settings.map_err(FileError::doing(path, "cannot write the settings as TOML"))?,
