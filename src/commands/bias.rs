@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use clap::builder::PossibleValue;
 use clap::{Args, ValueEnum};
 use shearq_bias::{Design, Errors};
 
@@ -18,7 +19,8 @@ use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, su
 use shearq_results::expression::Expression;
 use shearq_results::select::selection;
 use shearq_results::views::bias::{
-    Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, junit, section,
+    Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, junit, of_design,
+    section,
 };
 use shearq_submissions::EllipticityType;
 
@@ -98,7 +100,7 @@ pub(crate) struct Arguments {
     #[arg(long, conflicts_with = "merge")]
     drop_missing: bool,
     /// Artificial shear of metacalibration.
-    #[arg(long, value_name = "G", default_value_t = 0.01, value_parser = positive, conflicts_with = "merge")]
+    #[arg(long, value_name = "G", default_value_t = DEFAULT_STEP, value_parser = positive, conflicts_with = "merge")]
     step: f64,
     /// Errors from so many bootstrap draws of units instead of a jackknife.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(10..=100_000))]
@@ -130,6 +132,9 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     report: ReportFile,
 }
+
+/// Artificial shear of metacalibration in ngmix and metadetect.
+const DEFAULT_STEP: f64 = 0.01;
 
 /// Type of ellipticities on the command line.
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -234,8 +239,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         result => result?,
     };
-    if let Some(chosen) = chosen_by_measurement(&result) {
-        tell(format_args!("warning: {chosen}"));
+    let warnings = of_design(&result).into_iter();
+    for warning in warnings.chain(chosen_by_measurement(&result)) {
+        tell(format_args!("warning: {warning}"));
     }
     if !arguments.against.is_empty() {
         let other = of_catalogues(arguments, &arguments.against)?;
@@ -299,6 +305,51 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
             made_by.push((name.into(), text.clone()));
         }
     }
+    let design = arguments
+        .design
+        .and_then(|design| design.to_possible_value());
+    let ellipticity = arguments
+        .ellipticity
+        .and_then(|own| own.to_possible_value());
+    let shown = |value: Option<PossibleValue>| value.map(|value| value.get_name().to_owned());
+    let bins = arguments.bins.as_ref().map(|bins| {
+        let edges = match &bins.edges {
+            Edges::Equal(count) => format!("{count} with equally many galaxies"),
+            Edges::Given(edges) => format!("{edges:?}"),
+        };
+        format!("{}: {edges}", bins.of.text())
+    });
+    let yes = |given: bool| given.then(|| "yes".to_owned());
+    let limits = arguments.fail_above.iter();
+    let limits: Vec<String> = limits
+        .map(|limit| {
+            format!(
+                "|{}| ≤ {:e} within {} σ",
+                limit.of, limit.limit, limit.sigma
+            )
+        })
+        .collect();
+    let options = [
+        ("Design", shown(design)),
+        ("Units", arguments.units.clone()),
+        ("Ellipticities", shown(ellipticity)),
+        ("Minus the true g2", yes(arguments.flip_g2)),
+        ("Bins", bins),
+        (
+            "Rows with missing numbers are left out",
+            yes(arguments.drop_missing),
+        ),
+        (
+            "Step of metacalibration",
+            (arguments.step != DEFAULT_STEP).then(|| arguments.step.to_string()),
+        ),
+        ("Limits", Some(limits.join(", "))),
+    ];
+    made_by.extend(
+        options
+            .into_iter()
+            .filter_map(|(name, value)| Some((name.into(), value?))),
+    );
     if let Some(draws) = arguments.bootstrap {
         let seed = arguments.seed;
         made_by.push(("Bootstrap".into(), format!("{draws} draws, seed {seed}")));

@@ -12,6 +12,7 @@ mod bad_images;
 mod bad_settings;
 mod baselines;
 mod bias;
+mod bias_design;
 mod chain;
 mod challenge;
 mod documents;

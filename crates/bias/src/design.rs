@@ -1,5 +1,7 @@
 //! How catalogues belong together.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use serde::{Deserialize, Serialize};
 
 use crate::stars::{Behind, StarNoise, shared};
@@ -124,15 +126,15 @@ impl Design {
         let Some(shears) = shears else {
             return Design::Galaxies;
         };
-        let count = |shear: [f64; 2]| shears.iter().filter(|other| **other == shear).count();
-        let mut kinds: Vec<[f64; 2]> = Vec::new();
-        for shear in &shears {
-            if !kinds.contains(shear) {
-                kinds.push(*shear);
-            }
-        }
-        // Zero and minus zero are equal.
-        let paired = kinds.iter().all(|&[a, b]| count([-a, -b]) == count([a, b]));
+        let kinds = kinds(&shears);
+        let count = |shear: [f64; 2]| shears.iter().filter(|own| same(**own, shear)).count();
+        let opposite = |[a, b]: [f64; 2]| [-a, -b];
+        let equal = kinds
+            .iter()
+            .all(|&kind| count(opposite(kind)) == count(kind));
+        let both = || kinds.iter().all(|&kind| count(opposite(kind)) > 0);
+        // Catalogues of one shear may be missing if the names state which belong together.
+        let paired = equal || both() && by_name(catalogues).is_some();
         match (kinds.len(), paired) {
             (0 | 1, _) => Design::Single,
             (2, true) => Design::Pairs,
@@ -140,6 +142,35 @@ impl Design {
             (_, false) => Design::Fields,
         }
     }
+}
+
+/// Largest relative difference of equal shears: single precision rounds by 6·10⁻⁸.
+const ROUNDING: f64 = 1e-6;
+
+/// Whether two shears are equal, perhaps in single and in double precision.
+fn same(a: [f64; 2], b: [f64; 2]) -> bool {
+    let modulus = a[0].hypot(a[1]).max(b[0].hypot(b[1]));
+    (a[0] - b[0]).hypot(a[1] - b[1]) <= ROUNDING * modulus
+}
+
+/// Different shears, in the order in which they appear.
+fn kinds(shears: &[[f64; 2]]) -> Vec<[f64; 2]> {
+    let mut kinds: Vec<[f64; 2]> = Vec::new();
+    for &shear in shears {
+        if !kinds.iter().any(|known| same(*known, shear)) {
+            kinds.push(shear);
+        }
+    }
+    kinds
+}
+
+/// A catalogue that other ones with the same galaxies lack.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Missing {
+    /// One of the catalogues that are there.
+    pub beside: String,
+    /// The shear of the absent one.
+    pub shear: [f64; 2],
 }
 
 /// Units of the errors.
@@ -151,8 +182,17 @@ pub struct Grouping {
     pub stars: Vec<Behind>,
     /// What a unit is, in words.
     pub unit: &'static str,
-    /// Whether galaxies under different shears may be in different units, so that errors are too large.
+    /// Whether galaxies under different shears may be in different units: their numbers differ. The error of m is then too
+    /// large, and that of c too small, by up to √2.
     pub misaligned: bool,
+    /// The correlation of the ellipticities in units under opposite shears, if it shows that they are not the same
+    /// galaxies. Errors are wrong as above if they are the same in another order.
+    pub uncorrelated: Option<f64>,
+    /// Catalogues that are absent.
+    pub missing: Vec<Missing>,
+    /// A shear and the numbers of catalogues under it and under the opposite one, if these differ and names do not state
+    /// which belong together. The catalogues are then independent units, and errors contain shapes that pairs cancel.
+    pub unpaired: Option<([f64; 2], [usize; 2])>,
 }
 
 impl Grouping {
@@ -162,6 +202,7 @@ impl Grouping {
         Grouping {
             sums: self.sums.all_bins(),
             stars: self.stars.iter().map(Behind::all_bins).collect(),
+            missing: self.missing.clone(),
             ..*self
         }
     }
@@ -184,6 +225,11 @@ pub fn group(
     let numbers = numbers(catalogues, design);
     let noises: Vec<Option<&StarNoise>> = catalogues.iter().map(|own| own.star.as_ref()).collect();
     let groups = numbers.iter().max().map_or(0, |last| *last as usize + 1);
+    let paired = matches!(design, Design::Pairs | Design::Arms);
+    let missing = match paired {
+        true => missing(catalogues, &numbers),
+        false => Vec::new(),
+    };
     if !by_key.unwrap_or(groups < FEWEST_GROUPS) {
         let stars = shared(&sums, &noises, Some(&numbers));
         let sums = sums.by_group(|catalogue| {
@@ -200,31 +246,196 @@ pub fn group(
             stars,
             unit,
             misaligned: false,
+            uncorrelated: None,
+            missing,
+            unpaired: unpaired(catalogues, design),
         };
     }
-    let rows = catalogues.iter().map(|catalogue| catalogue.rows);
-    let paired = matches!(design, Design::Pairs | Design::Arms | Design::Rotated);
-    let differ = rows.clone().min() != rows.max();
+    let rotated = design == Design::Rotated;
+    // Tiles differ in their galaxies, but not under another shear.
+    let differ = |(number, own): (&u32, &Catalogue)| {
+        let group = numbers.iter().zip(catalogues);
+        let mut group = group.filter(|(other, _)| *other == number);
+        group.any(|(_, other)| other.rows != own.rows)
+    };
+    let differ = numbers.iter().zip(catalogues).any(differ);
+    let correlation = match paired {
+        true => correlation(&sums, catalogues, &numbers),
+        false => None,
+    };
     Grouping {
         stars: shared(&sums, &noises, None),
+        uncorrelated: correlation,
+        missing,
+        unpaired: unpaired(catalogues, design),
         sums: sums.by_key(),
         unit: match (matched, catalogues.len()) {
             (true, _) => "galaxies with the same identifier",
             (false, 1) => "galaxies in blocks of neighbouring rows",
             (false, _) => "the same rows of all catalogues",
         },
-        misaligned: paired && !matched && differ,
+        misaligned: (paired || rotated) && !matched && differ,
     }
 }
 
-/// The group of each catalogue: the k-th catalogues of each shear belong together.
+/// Numbers from which a correlation is tested, and the correlation below which rows are other galaxies. The ellipticities of a
+/// galaxy under opposite shears have its shape in common: they correlate by 0.3 if noise is 1.5 times the shapes, which is
+/// three standard deviations of 400 numbers above the limit. A few rows before the first that is absent may correspond.
+const ENOUGH_TO_CORRELATE: usize = 400;
+const LEAST_CORRELATION: f64 = 0.15;
+
+/// The correlation of the ellipticities of units under opposite shears, if there are enough units and it is too small for
+/// the same galaxies.
+fn correlation(sums: &UnitSums, catalogues: &[Catalogue], numbers: &[u32]) -> Option<f64> {
+    let shears: Vec<Option<[f64; 2]>> = catalogues.iter().map(Catalogue::constant).collect();
+    let opposite = |k: usize| {
+        let [a, b] = shears[k]?;
+        let own = (a, b) > (0.0, 0.0);
+        let mut others = (0..catalogues.len()).filter(|other| numbers[*other] == numbers[k]);
+        let partner = others.find(|other| shears[*other].is_some_and(|g| same(g, [-a, -b])));
+        partner.filter(|partner| own && *partner != k)
+    };
+    let (mut count, mut cross, mut squares) = (0, 0.0, [0.0; 2]);
+    for (k, partner) in (0..catalogues.len()).filter_map(|k| Some((k, opposite(k)?))) {
+        let pairs = sums.mean_pairs(k as u32, partner as u32);
+        for component in 0..2 {
+            let mean = |of: usize| {
+                let values = pairs.iter().map(|pair| pair[of][component]);
+                values.sum::<f64>() / pairs.len() as f64
+            };
+            let means = [mean(0), mean(1)];
+            for pair in &pairs {
+                let [a, b] = [0, 1].map(|of| pair[of][component] - means[of]);
+                cross += a * b;
+                squares = [squares[0] + a * a, squares[1] + b * b];
+            }
+        }
+        count += 2 * pairs.len();
+    }
+    let found = cross / (squares[0] * squares[1]).sqrt();
+    (count >= ENOUGH_TO_CORRELATE && found < LEAST_CORRELATION).then_some(found)
+}
+
+/// The catalogues that complete groups have and others lack.
+fn missing(catalogues: &[Catalogue], numbers: &[u32]) -> Vec<Missing> {
+    let shears: Vec<[f64; 2]> = catalogues.iter().filter_map(Catalogue::constant).collect();
+    if shears.len() < catalogues.len() {
+        return Vec::new();
+    }
+    let mut groups: BTreeMap<u32, Vec<usize>> = BTreeMap::new();
+    for (k, number) in numbers.iter().enumerate() {
+        groups.entry(*number).or_default().push(k);
+    }
+    let absent = |group: &Vec<usize>, kind: [f64; 2]| !group.iter().any(|k| same(shears[*k], kind));
+    let kinds = kinds(&shears);
+    let of_group = |group: Vec<usize>| {
+        let kinds: Vec<[f64; 2]> = kinds
+            .iter()
+            .copied()
+            .filter(|kind| absent(&group, *kind))
+            .collect();
+        let beside = catalogues[group[0]].name.clone();
+        kinds.into_iter().map(move |shear| Missing {
+            beside: beside.clone(),
+            shear,
+        })
+    };
+    groups.into_values().flat_map(of_group).collect()
+}
+
+/// The first shear with an opposite one under which there are more or fewer catalogues, with both numbers.
+fn unpaired(catalogues: &[Catalogue], design: Design) -> Option<([f64; 2], [usize; 2])> {
+    if design != Design::Fields {
+        return None;
+    }
+    let shears: Vec<[f64; 2]> = catalogues.iter().filter_map(Catalogue::constant).collect();
+    let count = |shear: [f64; 2]| shears.iter().filter(|own| same(**own, shear)).count();
+    let both = |[a, b]: [f64; 2]| ([a, b], [count([a, b]), count([-a, -b])]);
+    let mut all = kinds(&shears).into_iter().map(both);
+    all.find(|(_, [own, opposite])| *opposite > 0 && own != opposite)
+}
+
+/// The words, numbers and signs of a name.
+fn parts(name: &str) -> Vec<&str> {
+    let kind = |c: char| match c {
+        c if c.is_ascii_digit() => 1,
+        c if c.is_alphabetic() => 2,
+        '+' | '-' => 3,
+        _ => 0,
+    };
+    let ends = name.char_indices().zip(name.chars().skip(1));
+    let ends = ends.filter(|((_, a), b)| kind(*a) != kind(*b));
+    let mut start = 0;
+    let ends: Vec<usize> = ends.map(|((at, a), _)| at + a.len_utf8()).collect();
+    let mut parts = Vec::new();
+    for end in ends.into_iter().chain([name.len()]) {
+        let part = &name[start..end];
+        if part.chars().all(|c| kind(c) != 0) && !part.is_empty() {
+            parts.push(part);
+        }
+        start = end;
+    }
+    parts
+}
+
+/// The group of each catalogue by the parts of its name that do not follow from its shear, such as `tile03` of
+/// `plus/tile03.fits` and `minus/tile03.fits`. `None` if names do not state it: they have different numbers of parts, those
+/// of one shear are not distinct, or less than half of the groups are complete.
+fn by_name(catalogues: &[Catalogue]) -> Option<Vec<u32>> {
+    let shears: Vec<[f64; 2]> = catalogues
+        .iter()
+        .map(Catalogue::constant)
+        .collect::<Option<_>>()?;
+    let names: Vec<Vec<&str>> = catalogues.iter().map(|own| parts(&own.name)).collect();
+    let length = names.first()?.len();
+    if names.iter().any(|parts| parts.len() != length) {
+        return None;
+    }
+    let kinds = kinds(&shears);
+    let kind_of = |k: usize| kinds.iter().position(|kind| same(*kind, shears[k]));
+    let kind_of: Vec<usize> = (0..shears.len()).map(kind_of).collect::<Option<_>>()?;
+    // A part states the shear if all catalogues of a shear have it, and not all catalogues.
+    let states_shear = |part: usize| {
+        let mut of_kind: Vec<Option<&str>> = vec![None; kinds.len()];
+        let constant = names
+            .iter()
+            .zip(&kind_of)
+            .all(|(parts, kind)| *of_kind[*kind].get_or_insert(parts[part]) == parts[part]);
+        constant && of_kind.iter().any(|own| *own != of_kind[0])
+    };
+    let kept: Vec<usize> = (0..length).filter(|part| !states_shear(*part)).collect();
+    let mut groups: BTreeMap<Vec<&str>, u32> = BTreeMap::new();
+    let (mut numbers, mut seen) = (Vec::new(), BTreeSet::new());
+    for (parts, kind) in names.iter().zip(&kind_of) {
+        let key: Vec<&str> = kept.iter().map(|part| parts[*part]).collect();
+        let next = groups.len() as u32;
+        let number = *groups.entry(key).or_insert(next);
+        if !seen.insert((number, *kind)) {
+            return None;
+        }
+        numbers.push(number);
+    }
+    let of_group = |number: u32| numbers.iter().filter(|own| **own == number).count();
+    let complete = (0..groups.len() as u32).filter(|number| of_group(*number) == kinds.len());
+    (2 * complete.count() >= groups.len()).then_some(numbers)
+}
+
+/// The group of each catalogue: by name, or else the k-th catalogues of each shear belong together.
 fn numbers(catalogues: &[Catalogue], design: Design) -> Vec<u32> {
+    if matches!(design, Design::Pairs | Design::Arms)
+        && let Some(numbers) = by_name(catalogues)
+    {
+        return numbers;
+    }
     let number = |k: usize| -> usize {
         match design {
             Design::Pairs | Design::Arms => {
                 let own = catalogues[k].constant();
-                let same = |other: &&Catalogue| other.constant() == own;
-                catalogues[..k].iter().filter(same).count()
+                let alike = |other: &&Catalogue| match (other.constant(), own) {
+                    (Some(other), Some(own)) => same(other, own),
+                    (other, own) => other == own,
+                };
+                catalogues[..k].iter().filter(alike).count()
             }
             Design::Rotated => k / 2,
             _ => k,
@@ -272,5 +483,64 @@ mod tests {
         assert_eq!(numbers(&shears, Design::Pairs), [0, 1, 0, 1]);
         assert_eq!(numbers(&shears, Design::Rotated), [0, 0, 1, 1]);
         assert_eq!(numbers(&shears, Design::Fields), [0, 1, 2, 3]);
+    }
+
+    fn named(of: &[(&str, [f64; 2])]) -> Vec<Catalogue> {
+        let shears: Vec<[f64; 2]> = of.iter().map(|own| own.1).collect();
+        let mut all = catalogues(&shears);
+        for (catalogue, (name, _)) in all.iter_mut().zip(of) {
+            catalogue.name = (*name).to_owned();
+        }
+        all
+    }
+
+    #[test]
+    fn catalogues_pair_by_name_if_some_are_missing() {
+        let (plus, minus) = ([0.02, 0.0], [-0.02, 0.0]);
+        let tiles = named(&[
+            ("1p2z/tile01.fits", plus),
+            ("1p2z/tile02.fits", plus),
+            ("1p2z/tile04.fits", plus),
+            ("1m2z/tile04.fits", minus),
+            ("1m2z/tile03.fits", minus),
+            ("1m2z/tile01.fits", minus),
+            ("1m2z/tile02.fits", minus),
+        ]);
+        assert_eq!(Design::of(&tiles, true), Design::Pairs);
+        let numbers = numbers(&tiles, Design::Pairs);
+        assert_eq!(numbers, [0, 1, 2, 2, 3, 0, 1]);
+        let expected = Missing {
+            beside: "1m2z/tile03.fits".into(),
+            shear: plus,
+        };
+        assert_eq!(missing(&tiles, &numbers), [expected]);
+        // Signs in names, and numbers of tiles behind them.
+        let signs = named(&[
+            ("cat_g1+0.02_7.csv", plus),
+            ("cat_g1+0.02_9.csv", plus),
+            ("cat_g1-0.02_9.csv", minus),
+            ("cat_g1-0.02_7.csv", minus),
+        ]);
+        assert_eq!(by_name(&signs), Some(vec![0, 1, 1, 0]));
+        // Numbers that go on do not pair; the order does.
+        let runs = named(&[
+            ("run1", plus),
+            ("run2", plus),
+            ("run3", minus),
+            ("run4", minus),
+        ]);
+        assert_eq!(by_name(&runs), None);
+        assert_eq!(super::numbers(&runs, Design::Pairs), [0, 1, 0, 1]);
+        let three = named(&[("a1", plus), ("b2", plus), ("c3", minus)]);
+        assert_eq!(Design::of(&three, true), Design::Fields);
+    }
+
+    #[test]
+    fn single_precision_shears_pair_with_double_precision() {
+        let plus = [0.02_f32, -0.015].map(f64::from);
+        let both = catalogues(&[plus, [-0.02, 0.015]]);
+        assert_eq!(Design::of(&both, true), Design::Pairs);
+        let other = catalogues(&[plus, [-0.02002, 0.015]]);
+        assert_eq!(Design::of(&other, true), Design::Fields);
     }
 }

@@ -16,9 +16,7 @@ pub enum BiasError {
         found: usize,
     },
     /// The mean response is not significant.
-    #[error(
-        "the mean response R{component}{component} is too close to zero (found {found:.4} ± {error:.4}, expected more than {MIN_SIGMA} standard errors)"
-    )]
+    #[error("{}", response(*component, *found, *error))]
     Response {
         /// Component, 1 or 2.
         component: usize,
@@ -34,3 +32,16 @@ pub enum BiasError {
 
 /// Smallest significance of the mean response.
 pub const MIN_SIGMA: f64 = 5.0;
+
+/// Why a mean response cannot be divided by.
+fn response(component: usize, found: f64, error: f64) -> String {
+    let expected = format!("expected more than {MIN_SIGMA} standard errors");
+    if found < -MIN_SIGMA * error {
+        return format!(
+            "the mean response R{component}{component} is negative (found {found:.4} ± {error:.4}, {expected}). Its sign is wrong, or the versions of positive and negative shear are exchanged. Try: minus R{component}{component}, or --columns with the other versions"
+        );
+    }
+    format!(
+        "the mean response R{component}{component} is too close to zero (found {found:.4} ± {error:.4}, {expected})"
+    )
+}

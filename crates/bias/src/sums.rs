@@ -192,6 +192,11 @@ impl Layout {
         sums[VERSION + 2 * version + 1] += weight;
     }
 
+    /// Mean ellipticity.
+    pub(crate) fn mean(self, sums: &[f64]) -> [f64; 2] {
+        [0, 1].map(|k| self.of(sums, k).with_e[ONE] / sums[WEIGHT])
+    }
+
     /// Mean ellipticity of a version, in its component of shear.
     pub(crate) fn version_mean(self, sums: &[f64], version: usize) -> f64 {
         sums[VERSION + 2 * version] / sums[VERSION + 2 * version + 1]

@@ -221,6 +221,25 @@ impl UnitSums {
         }
     }
 
+    /// The mean ellipticities of units with the same key in two catalogues, over all bins.
+    pub(crate) fn mean_pairs(&self, a: u32, b: u32) -> Vec<[[f64; 2]; 2]> {
+        let length = self.layout.len();
+        let mean = |unit: &[f64]| {
+            let mut all = vec![0.0; length];
+            unit.chunks_exact(length).for_each(|bin| add(&mut all, bin));
+            let own = self.layout.mean(&all);
+            own.iter().all(|e| e.is_finite()).then_some(own)
+        };
+        let of = |catalogue: u32| {
+            let units = self.units.iter();
+            let own = units.filter(move |((own, _), _)| *own == catalogue);
+            own.filter_map(move |((_, key), sums)| Some((*key, mean(sums)?)))
+        };
+        let first: BTreeMap<u64, [f64; 2]> = of(a).collect();
+        let pair = |(key, own): (u64, [f64; 2])| Some([*first.get(&key)?, own]);
+        of(b).filter_map(pair).collect()
+    }
+
     /// The sums of each unit of a bin that has a galaxy.
     pub(crate) fn of_bin(&self, bin: usize) -> Vec<&[f64]> {
         let length = self.layout.len();

@@ -14,7 +14,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
-    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, UnitSums, difference, group,
+    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, Missing, Range, UnitSums,
+    difference, group,
 };
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
@@ -127,8 +128,13 @@ pub struct Summed {
     truth: bool,
     /// Whether responses were read, or the type of the ellipticities was given.
     response: bool,
+    /// Whether rows have a response in a column.
+    #[serde(default)]
+    response_column: bool,
     /// Whether units are named by identifiers.
     matched: bool,
+    #[serde(default)]
+    unit_column: Option<String>,
     design: Option<Design>,
     by_key: Option<bool>,
     /// Text of the binned expression.
@@ -167,8 +173,18 @@ pub struct BiasResult {
     pub design: Design,
     /// What a unit is.
     pub unit: &'static str,
-    /// Whether errors may be too large, because rows of catalogues do not correspond.
+    /// Whether errors are wrong, because rows of catalogues do not correspond.
     pub misaligned: bool,
+    /// The correlation of ellipticities under opposite shears, if it shows that rows of catalogues are different galaxies.
+    pub uncorrelated: Option<f64>,
+    /// Catalogues that are absent beside others with the same galaxies.
+    pub missing: Vec<Missing>,
+    /// A shear and the numbers of catalogues under it and under the opposite one, if they do not pair.
+    pub unpaired: Option<([f64; 2], [usize; 2])>,
+    /// A column that is not used and looks like independent units.
+    pub unit_column: Option<String>,
+    /// Whether rows have a response that `--columns R11=none` leaves out.
+    pub has_response_column: bool,
     /// Stars whose noise is in the errors, because several units have galaxies behind them.
     pub noisy_stars: usize,
     /// The catalogues.
@@ -317,7 +333,9 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         program: first.columns.preset.name().into(),
         truth,
         response: response || request.distortion.is_some(),
+        response_column: first.columns.have(&[Role::R11]),
         matched: named_unit || first.columns.of(Role::Id).is_some(),
+        unit_column: first.unit_column.clone().filter(|_| !named_unit),
         design: request.design,
         by_key: match request.units {
             Units::Rows | Units::Column(_) => Some(true),
@@ -518,7 +536,7 @@ impl Summed {
     pub fn result(&self, errors: Errors) -> Result<BiasResult, BiasFailure> {
         let Grouped { grouping, design } = self.grouped()?;
         let all = grouping.all_bins().estimate(0, self.truth, errors)?;
-        check_slopes(&all, self.response)?;
+        check_slopes(&all, self.response, ratio(&self.catalogues))?;
         let mut bins = vec![BinResult {
             edges: None,
             estimate: Ok(all),
@@ -535,6 +553,11 @@ impl Summed {
             design,
             unit: grouping.unit,
             misaligned: grouping.misaligned,
+            uncorrelated: grouping.uncorrelated,
+            missing: grouping.missing,
+            unpaired: grouping.unpaired,
+            unit_column: self.unit_column.clone(),
+            has_response_column: self.response_column,
             noisy_stars: grouping.stars.len(),
             catalogues: self.catalogues.clone(),
             program: self.program.clone(),
@@ -598,6 +621,11 @@ impl Summed {
             design: own.design,
             unit: units[0],
             misaligned: own.grouping.misaligned || theirs.grouping.misaligned,
+            uncorrelated: None,
+            missing: own.grouping.missing,
+            unpaired: own.grouping.unpaired,
+            unit_column: self.unit_column.clone(),
+            has_response_column: self.response_column,
             noisy_stars: 0,
             catalogues: self.catalogues.clone(),
             program: format!("{} minus {}", self.program, other.program),
@@ -638,8 +666,52 @@ impl Summed {
 /// Significance at which an implausible slope is refused.
 const SIGNIFICANT: f64 = 5.0;
 
-/// Refuses ellipticities that follow minus the true shear, or do not follow it, and distortions without responses.
-fn check_slopes(all: &Estimate, response: bool) -> Result<(), BiasFailure> {
+/// g2/g1 of the true shears, if it is the same in all catalogues: slopes on g1 and g2 then do not tell e1 from e2.
+fn ratio(catalogues: &[Catalogue]) -> Option<f64> {
+    let used = catalogues.iter().filter(|catalogue| catalogue.rows > 0);
+    let ratios = used.map(|catalogue| {
+        let [g1, g2] = catalogue.shear.map(Range::constant);
+        Some(g2? / g1?).filter(|ratio| ratio.is_finite() && *ratio != 0.0)
+    });
+    let ratios: Vec<f64> = ratios.collect::<Option<_>>()?;
+    let first = *ratios.first()?;
+    ratios
+        .iter()
+        .all(|ratio| (ratio / first - 1.0).abs() < 1e-6)
+        .then_some(first)
+}
+
+/// Largest relative difference of slopes from those of exchanged components: a bias of the shapes.
+const BIASED: f64 = 0.3;
+
+/// Whether e1 follows g2, and e2 follows g1.
+fn are_exchanged(all: &Estimate, ratio: Option<f64>) -> bool {
+    let known = |key: &str| all.value(key).filter(|found| found.error.is_finite());
+    let Some([m1, m2]) = known("m1").zip(known("m2")).map(<[_; 2]>::from) else {
+        return false;
+    };
+    let cross = ["m12", "m21"]
+        .map(|key| known(key).is_some_and(|found| found.value - SIGNIFICANT * found.error > 0.5));
+    let lost = [m1, m2].map(|m| m.value + SIGNIFICANT * m.error < -0.5);
+    if cross == [true; 2] && lost == [true; 2] {
+        return true;
+    }
+    // All shears lie on one line: the slopes are g2/g1 and g1/g2.
+    let Some(ratio) = ratio else {
+        return false;
+    };
+    let expected = [(m1, ratio), (m2, 1.0 / ratio)];
+    expected.iter().all(|(m, ratio)| {
+        let like = ((1.0 + m.value) / ratio - 1.0).abs() < BIASED;
+        // Neither the own component nor minus it.
+        let clear = SIGNIFICANT * m.error;
+        like && m.value.abs() > clear.max(BIASED) && (2.0 + m.value).abs() > clear
+    })
+}
+
+/// Refuses ellipticities that follow minus the true shear, or do not follow it, and distortions without responses. `ratio`
+/// is g2/g1 of the true shears, if it is constant.
+fn check_slopes(all: &Estimate, response: bool, ratio: Option<f64>) -> Result<(), BiasFailure> {
     let slopes = ["m1", "m2"].map(|key| {
         let m = all.value(key).filter(|m| m.error.is_finite())?;
         Some((1.0 + m.value, SIGNIFICANT * m.error))
@@ -647,6 +719,13 @@ fn check_slopes(all: &Estimate, response: bool) -> Result<(), BiasFailure> {
     let negative = slopes.map(|slope| slope.is_some_and(|(slope, error)| slope + error < 0.0));
     let shown = |k: usize| slopes[k].map_or(f64::NAN, |(slope, _)| slope);
     let refused = |text: String| Err(BiasFailure::Data(text));
+    if are_exchanged(all, ratio) {
+        return refused(format!(
+            "e1 follows the true g2, and e2 the true g1 (found slopes of {:.3} and {:.3} on the own component, expected about 1): e1 and e2 are probably exchanged. Try: --columns with the names exchanged",
+            shown(0),
+            shown(1)
+        ));
+    }
     match negative {
         [false, false] => {}
         [false, true] => {
@@ -666,7 +745,7 @@ fn check_slopes(all: &Estimate, response: bool) -> Result<(), BiasFailure> {
     // A response below 0.1 is no calibration error: rows and true shears do not belong together.
     if known().count() > 0 && known().all(|(slope, error)| slope + error < 0.1) {
         return refused(format!(
-            "the ellipticities do not follow the true shear (found slopes of {:.3} and {:.3}, expected about 1). Try: check the order of the rows, or join by id",
+            "the ellipticities do not follow the true shear (found slopes of {:.3} and {:.3}, expected about 1). Try: check the order of the rows and of e1 and e2, or join by id",
             shown(0),
             shown(1)
         ));

@@ -241,7 +241,8 @@ fn add_up(
     let mut images = SetImages::new(grid);
     let mut counts = RowCounts::default();
     engine::ordered(
-        threads,
+        // More threads than catalogues have nothing to do.
+        threads.min(catalogues.len()).max(1),
         |feeder| {
             for path in catalogues {
                 if !feeder.push(path.clone()) {

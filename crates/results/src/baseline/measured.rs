@@ -141,7 +141,7 @@ fn scatter(
     let catalogues = run.catalogues(out, &[set])?.of_set(set);
     let (mut squares, mut count) = ([0.0; 2], 0.0_f64);
     engine::ordered(
-        threads,
+        threads.min(catalogues.len()).max(1),
         |feeder| {
             for (_, path) in catalogues {
                 if !feeder.push(path) {

@@ -63,7 +63,23 @@ impl Positions {
             check(shear).map_err(fault)?;
             entries.push(Entry { x, y, shear });
         }
-        entries.sort_by_key(Entry::cell);
+        entries.sort_by(|a, b| {
+            let places = || a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y));
+            a.cell().cmp(&b.cell()).then_with(places)
+        });
+        // A table of several images, or of several catalogues: the first shear would be used for all of them.
+        let contradictory = |pair: &&[Entry]| {
+            (pair[0].x, pair[0].y) == (pair[1].x, pair[1].y) && pair[0].shear != pair[1].shear
+        };
+        if let Some([a, b]) = entries.windows(2).find(contradictory) {
+            return Err(FileError::new(
+                path,
+                format!(
+                    "the position x = {}, y = {} has two true shears (found {:?} and {:?}, expected one). Try: a table per catalogue, or the columns id, g1, g2",
+                    a.x, a.y, a.shear, b.shear
+                ),
+            ));
+        }
         Ok(Positions { entries })
     }
 

@@ -44,6 +44,29 @@ pub(super) struct Reading {
 /// Versions of a catalogue: the unsheared one and [`VERSIONS`].
 const COUNT: usize = 1 + VERSIONS.len();
 
+/// Columns of surveys and simulations that look like independent units. They are suggested, not used: a field or seed may
+/// also be the same in all rows.
+const UNITS: [&str; 18] = [
+    "tile",
+    "tile_id",
+    "tileid",
+    "tilename",
+    "tile_name",
+    "field",
+    "field_id",
+    "patch",
+    "patch_id",
+    "seed",
+    "tract",
+    "pointing",
+    "exposure",
+    "exp_id",
+    "ccd",
+    "chip",
+    "healpix",
+    "realisation",
+];
+
 /// A row that counts.
 pub(super) struct Item {
     /// Unit.
@@ -63,6 +86,8 @@ pub(super) struct Source {
     /// The version of all rows, if a FITS file has one table per version.
     version: Option<Option<usize>>,
     pub(super) columns: Columns,
+    /// A column without a role that looks like independent units.
+    pub(super) unit_column: Option<String>,
     /// Names of all columns that are read.
     wanted: Vec<String>,
     /// Places of the columns of expressions among them: of the rows, and under each version.
@@ -266,10 +291,12 @@ fn source(
             place_of(name).ok_or_else(|| FileError::no_column(&place.path, name, names))?;
         }
     }
+    let like_unit = |name: &&String| UNITS.contains(&name.to_ascii_lowercase().as_str());
     let mut source = Source {
         place,
         frame: None,
         version,
+        unit_column: names.iter().find(like_unit).cloned(),
         columns,
         wanted: Vec::new(),
         selected,
