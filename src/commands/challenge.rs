@@ -3,15 +3,20 @@
 use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Subcommand};
+use shearq_challenge::copies::near_copies;
 use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
-use shearq_challenge::date::Date;
+use shearq_challenge::deadline::Deadline;
 use shearq_challenge::inbox;
 use shearq_challenge::judge::Judge;
 use shearq_challenge::kind::{Kind, RankBy, kind};
+use shearq_challenge::organiser::{BOARD_FILE, Decisions};
 use shearq_challenge::page::{Disclosure, View};
 use shearq_challenge::ranking;
+use shearq_challenge::seal::{is_open_to_others, verify_public};
 use shearq_challenge::shapes::References;
 use shearq_challenge::terms::{Challenge, TUNING_ENTRIES};
+use shearq_files::FileError;
+use shearq_files::open::is_there;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_results::submit::check::{Finding, Severity, check, check_sent};
@@ -118,12 +123,18 @@ struct NewArguments {
     /// Most entries of a team [default: as the kind, or any number].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     entries_per_team: Option<u32>,
-    /// First day of entries, as YYYY-MM-DD in UTC.
-    #[arg(long, value_name = "DATE")]
-    opens: Option<Date>,
-    /// Last day of entries, as YYYY-MM-DD in UTC.
-    #[arg(long, value_name = "DATE")]
-    closes: Option<Date>,
+    /// First day of entries in UTC, or a moment with its zone, such as 2026-12-01T18:00[Europe/Berlin].
+    #[arg(long, value_name = "TIME")]
+    opens: Option<Deadline>,
+    /// Last day of entries in UTC, or a moment with its zone. Later entries have their own board.
+    #[arg(long, value_name = "TIME")]
+    closes: Option<Deadline>,
+    /// Accept entries of some sets. They are listed without a rank.
+    #[arg(long)]
+    partial: bool,
+    /// Where the data and the rules are published, for the leaderboard.
+    #[arg(long, value_name = "URL", default_value = "")]
+    address: String,
     /// Address for participants.
     #[arg(long, value_name = "TEXT", default_value = "")]
     contact: String,
@@ -139,7 +150,7 @@ struct NewArguments {
 /// ENTRY is an archive (.tar.gz) or a folder of catalogues or power spectra. Grid, sets and conventions come from
 /// challenge.toml. If the images are there, they are measured for comparison, in the time of `48/linear/star`. This finds
 /// swapped or flipped components, exchanged rows, images without measured shapes, and distortions that are given as
-/// shear.
+/// shear. Images that differ from SHA256SUMS and symbolic links are refused.
 ///
 /// Exit code 0: no errors, perhaps warnings; 1: errors.
 #[derive(Debug, Args)]
@@ -152,6 +163,13 @@ struct CheckArguments {
     /// Print the findings as JSON.
     #[arg(long)]
     json: bool,
+    /// Private folder, for organisers: if there are no errors, sign the time of arrival in ENTRY.receipt.toml. An earlier
+    /// receipt of the same content is kept.
+    #[arg(long, value_name = "DIR")]
+    truth: Option<PathBuf>,
+    /// Team of the receipt [default: as in the manifest, or the name of the file].
+    #[arg(long, value_name = "NAME", requires = "truth", value_parser = name)]
+    team: Option<String>,
     #[command(flatten)]
     threads: Threads,
 }
@@ -163,6 +181,9 @@ struct CheckArguments {
 ///
 /// Every scored entry is kept in the results store. Later runs score only new entries, so a stopped run continues, and
 /// several processes may share a store. Without INBOX, the store alone is ranked.
+///
+/// The time of an entry is that of its receipt, which `check --truth` signs, or the time at which `rank` first scored it.
+/// board.toml in the private folder withdraws entries and names teams (docs/run-a-challenge.md).
 #[derive(Debug, Args)]
 struct RankArguments {
     /// Entries: archives, or folders of entries.
@@ -225,11 +246,13 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         metric: arguments.metric,
         spectra: arguments.spectra,
         contact: arguments.contact.clone(),
+        address: arguments.address.clone(),
         entries_per_team: arguments
             .entries_per_team
             .or(arguments.kind.entries_per_team),
-        opens: arguments.opens,
-        closes: arguments.closes,
+        opens: arguments.opens.clone(),
+        closes: arguments.closes.clone(),
+        partial: arguments.partial,
     };
     let folders = Folders {
         public: &arguments.public,
@@ -287,10 +310,20 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
         entry,
         challenge: place,
         json,
+        truth,
+        team,
         threads,
     } = arguments;
+    let threads = threads.number();
+    let judge = truth
+        .as_ref()
+        .map(|truth| Judge::open(place, truth, threads))
+        .transpose()?;
     let challenge = Challenge::read(place)?;
     let expected = challenge.expected()?;
+    if is_there(entry) {
+        inbox::refuse_links(entry)?;
+    }
     let Ok(sent) = Sent::open(entry) else {
         // The error is one of the findings.
         return report(&check(entry, &expected), entry, *json);
@@ -309,6 +342,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
     }
     let references = match place.is_dir() {
         true => {
+            verify_public(place, threads)?;
             let (data, sets) = (DataFolder::open(place)?, &challenge.data.sets);
             let ids = References::ids(&data, sets)?;
             let galaxies = (ids.len() * expected.grid.cells()) as u64;
@@ -317,7 +351,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
                 &data,
                 &ids,
                 expected.grid,
-                threads.number(),
+                threads,
                 &mut bar,
             )?)
         }
@@ -330,12 +364,25 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
             place.display()
         )),
     }
-    report(&findings, entry, *json)
+    report(&findings, entry, *json)?;
+    if let Some(judge) = judge {
+        let receipt = judge.sign(entry, team.as_deref())?;
+        tell(format_args!("receipt: {}", receipt.display()));
+    }
+    Ok(())
 }
 
 fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
     goes_on();
-    let judge = Judge::open(&arguments.challenge, &arguments.truth)?;
+    let threads = arguments.threads.number();
+    let judge = Judge::open(&arguments.challenge, &arguments.truth, threads)?;
+    let decisions = Decisions::read(&arguments.truth)?;
+    if is_open_to_others(&arguments.truth) {
+        tell(format_args!(
+            "warning: {}: other users may read the truth. Try: chmod -R go= {0}",
+            arguments.truth.display()
+        ));
+    }
     let mut sendings = Vec::new();
     for (paths, reference) in [(&arguments.inbox, false), (&arguments.reference, true)] {
         let found = inbox::find(paths)?;
@@ -343,29 +390,36 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
     }
     let galaxies = judge.challenge.data.galaxies() * sendings.len() as u64;
     let mut bar = Bar::new("scoring", galaxies);
-    let round = judge.round(
-        &sendings,
-        &arguments.store,
-        arguments.threads.number(),
-        &mut bar,
-    )?;
+    let round = judge.round(&sendings, &arguments.store, threads, &mut bar)?;
     drop(bar);
-    let entries = match arguments.store.is_dir() {
+    let mut entries = match arguments.store.is_dir() {
         true => judge.entries(&arguments.store)?,
         false => Vec::new(),
     };
     let rules = &judge.challenge.rules;
-    let board = ranking::rank(&entries, rules, judge.constant.as_ref());
+    let path = arguments.truth.join(BOARD_FILE);
+    decisions
+        .apply(&mut entries, &judge.key)
+        .map_err(|message| FileError::new(path, message))?;
+    let digits = arguments
+        .digits
+        .map_or(rules.metric.decimals(), usize::from);
+    let board = ranking::rank(&entries, &judge.challenge, judge.constant.as_ref(), digits);
+    let copies = near_copies(&entries);
     let view = View {
         challenge: &judge.challenge,
         board: &board,
-        refused: &round.refused,
+        // Names of files and reasons tell who sent an entry.
+        refused: match decisions.anonymous {
+            true => &[],
+            false => &round.refused,
+        },
+        copies: &copies,
         zero_shear: judge.zero_shear(),
+        constant: judge.constant.as_ref(),
         expected: judge.key.expected.as_ref(),
         disclosure: Disclosure {
-            digits: arguments
-                .digits
-                .map_or(rules.metric.decimals(), usize::from),
+            digits,
             detail: arguments.detail,
         },
     };
@@ -384,6 +438,16 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
         tell(format_args!(
             "warning: the entry of {} of {} does not count: {reason}",
             info.team, info.received
+        ));
+    }
+    for copy in &copies {
+        tell(format_args!(
+            "warning: {} of {} is a near copy of {} of {}: {}",
+            copy.entry.file,
+            copy.entry.team,
+            copy.earlier.file,
+            copy.earlier.team,
+            copy.reason()
         ));
     }
     tell(format_args!(

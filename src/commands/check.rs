@@ -107,6 +107,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         secret_truth: BTreeMap::new(),
         images: *images,
         sets: Vec::new(),
+        partial: false,
     };
     let findings = match &sent {
         Ok(sent) => check_sent(sent, &expected, &mut |_| {}),

@@ -11,6 +11,8 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 use shearq_challenge::create::seed_of;
+use shearq_challenge::receipt::Receipt;
+use shearq_challenge::seal::{Key, sha256};
 
 use crate::support::{contents, fail, shearq, succeed, text};
 
@@ -415,7 +417,20 @@ fn concurrent_and_killed_rankings_lose_nothing() {
     for process in &mut both {
         assert!(process.wait().unwrap().success());
     }
-    assert_eq!(contents(&together), contents(&pilot.at("alone")));
+    // Without the time of arrival, which is that of the first scoring.
+    let untimed = |board: Value| {
+        let mut rows = board["rows"].as_array().unwrap().clone();
+        for row in &mut rows {
+            row["received"] = Value::Null;
+        }
+        rows
+    };
+    let (board, said) = pilot.rank("inbox", "together", &[]);
+    assert!(
+        said.contains("entries: 0 scored, 12 scored earlier"),
+        "{said}"
+    );
+    assert_eq!(untimed(board), untimed(expected.clone()));
     let killed = pilot.at("killed");
     for wait in [5, 20, 40, 60, 80, 100] {
         let mut process = start(&killed);
@@ -424,10 +439,7 @@ fn concurrent_and_killed_rankings_lose_nothing() {
         process.wait().unwrap();
     }
     let (board, _) = pilot.rank("inbox", "killed", &[]);
-    assert_eq!(
-        (board, contents(&killed)),
-        (expected, contents(&pilot.at("alone")))
-    );
+    assert_eq!(untimed(board), untimed(expected));
 }
 
 #[test]
@@ -845,7 +857,7 @@ fn challenges_that_cannot_be_ranked_are_refused() {
     let dates = ["--opens", "2030-02-01", "--closes", "2030-01-31"];
     refused(
         &with(&dates),
-        "--closes: the last day is before the first one (found 2030-01-31, expected 2030-02-01 or later)",
+        "--closes: the last day is before the first one (found 2030-01-31 (UTC), expected 2030-02-01 (UTC) or later)",
     );
     refused(
         &with(&["--spectra"]),
@@ -938,4 +950,254 @@ fn challenges_that_cannot_be_ranked_are_refused() {
     );
     // Zero shear has m = −1: 2464/√(2·500² + 4).
     assert!(lines[2].contains(",3.5,"), "{board}");
+}
+
+/// Copies a folder of files.
+fn copied(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for (name, content) in contents(from) {
+        fs::write(to.join(name), content).unwrap();
+    }
+}
+
+#[test]
+fn changed_truth_images_stores_and_links_are_refused() {
+    let pilot = Pilot::new(&[]);
+    let (public, private) = (pilot.at("public"), pilot.at("private"));
+    let linear = pilot.enter("48/linear/star", "linear", "in/a.tar.gz", &["--team", "A"]);
+    pilot.rank("in", "store", &[]);
+    let inbox = pilot.at("in");
+    let refused = |private: &Path, public: &Path, store: &str, expected: &str| {
+        let rank = [
+            "challenge",
+            "rank",
+            text(&inbox),
+            "--challenge",
+            text(public),
+        ];
+        let store = pilot.at(store);
+        let folders = ["--truth", text(private), "--store", text(&store)];
+        let message = fail(&[&rank[..], &folders].concat());
+        assert!(message.contains(expected), "{message}");
+    };
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::{PermissionsExt, symlink};
+        let mode = |path: &Path| path.metadata().unwrap().permissions().mode() & 0o777;
+        assert_eq!(
+            (mode(&private), mode(&private.join("set02"))),
+            (0o700, 0o700)
+        );
+        for (name, _) in contents(&private) {
+            assert_eq!(mode(&private.join(&name)), 0o600, "{name}");
+        }
+        // Links could name the truth.
+        let links = pilot.at("links/B");
+        let folder = pilot.edited(&linear, "whole", |_, row| row);
+        copied(&folder, &links);
+        let file = links.join("g10_v1_objs_2_1.48-linear-star.dat");
+        fs::remove_file(&file).unwrap();
+        symlink(private.join("set02/truth.csv"), &file).unwrap();
+        symlink(&linear, pilot.at("links/c.tar.gz")).unwrap();
+        symlink(&private, pilot.at("links/D")).unwrap();
+        let (_, said) = pilot.rank("links", "other", &[]);
+        assert_eq!(said.matches("this is a link").count(), 3, "{said}");
+        let check = ["challenge", "check", text(&links), "--challenge"];
+        let message = fail(&[&check[..], &[text(&public)]].concat());
+        assert!(message.contains("g10_v1_objs_2_1.48-linear-star.dat: this is a link"));
+    }
+    // Any private file, and its checksum in the key.
+    for name in ["set02/truth.csv", "simulation.json", "layout.toml"] {
+        let (path, key) = (private.join(name), private.join("key.toml"));
+        let (content, sealed) = (fs::read(&path).unwrap(), fs::read_to_string(&key).unwrap());
+        let changed = [&content[..], b"\n"].concat();
+        fs::write(&path, &changed).unwrap();
+        refused(
+            &private,
+            &public,
+            "store",
+            &format!("{name}: the file was changed"),
+        );
+        let forged = sealed.replace(&sha256(&content), &sha256(&changed));
+        assert_ne!(forged, sealed);
+        fs::write(&key, forged).unwrap();
+        refused(
+            &private,
+            &public,
+            "store",
+            "key.toml: the checksums are not those",
+        );
+        fs::write(&key, sealed).unwrap();
+        fs::write(&path, content).unwrap();
+    }
+    // A public image.
+    let image = public.join("set02/galaxies-001.fits");
+    let content = fs::read(&image).unwrap();
+    let mut changed = content.clone();
+    changed[20_000..40_000].fill(0);
+    fs::write(&image, changed).unwrap();
+    let expected = "galaxies-001.fits: the file was changed (found SHA-256 ";
+    refused(&private, &public, "new", expected);
+    let check = [
+        "challenge",
+        "check",
+        text(&linear),
+        "--challenge",
+        text(&public),
+    ];
+    assert!(fail(&check).contains(expected));
+    fs::write(&image, content).unwrap();
+    // A second release with the store of the first.
+    let second = Pilot::new(&["--data-version", "2"]);
+    refused(
+        &second.at("private"),
+        &second.at("public"),
+        "store",
+        ".parquet: the entry was scored with another truth or other data of `pilot`",
+    );
+}
+
+#[test]
+fn receipts_copies_and_decisions_shape_the_board() {
+    let pilot = Pilot::new(&["--closes", "2020-06-30T18:00:00+02:00", "--partial"]);
+    let (public, private) = (pilot.at("public"), pilot.at("private"));
+    let linear = pilot.enter("48/linear/star", "linear", "a.tar.gz", &["--team", "First"]);
+    let first = pilot.edited(&linear, "in/First", |_, row| row);
+    // One digit of one file, and noise below a millionth in all files.
+    let digit = pilot.at("in/Digit");
+    copied(&first, &digit);
+    let file = digit.join("g10_v1_objs_2_1.48-linear-star.dat");
+    let content = fs::read_to_string(&file).unwrap();
+    fs::write(&file, content.replacen('\n', "1\n", 1)).unwrap();
+    let noisy = pilot.edited(&linear, "in/Noise", |k, [x, y, e1, e2]| {
+        let noise = 1e-6 * (k as f64 * 12.9898).sin();
+        [x, y, e1 + noise, e2 - noise]
+    });
+    let other = pilot.enter("23/den/star", "den", "b.tar.gz", &["--team", "Other"]);
+    let half = pilot.edited(&other, "in/Half", |_, row| row);
+    for image in 1..=8 {
+        fs::remove_file(half.join(format!("g10_v1_objs_8_{image}.23-den-star.dat"))).unwrap();
+    }
+    let (found, accepted) = pilot.check(&half);
+    assert!(accepted && found.contains(&"sets".into()), "{found:?}");
+    // Receipts of the past make entries arrive in time; without one, entries arrive when they are ranked, and are late.
+    let key = Key::read(&private).unwrap().unwrap();
+    let sign = |folder: &Path, time: &str| {
+        let team = text(folder).rsplit('/').next().unwrap();
+        let listed: String = contents(folder)
+            .iter()
+            .map(|(name, content)| format!("{name} {}\n", sha256(content)))
+            .collect();
+        let id = sha256(listed.as_bytes());
+        let receipt = Receipt::sign(&key, team, time.parse().unwrap(), &id);
+        receipt.write(folder).unwrap();
+        id
+    };
+    sign(&first, "2020-06-30T15:59:58Z");
+    sign(&digit, "2020-06-30T16:00:00Z");
+    let withdrawn = sign(&noisy, "2020-06-30T15:59:59Z");
+    let (board, said) = pilot.rank("in", "store", &[]);
+    assert_eq!(
+        teams(&board)[..3].iter().filter(|team| team.0 == 1).count(),
+        3,
+        "{board}"
+    );
+    let rows = board["rows"].as_array().unwrap();
+    let half_row = rows.iter().find(|row| row["team"] == "Half").unwrap();
+    assert_eq!(
+        (&half_row["team"], &half_row["board"]),
+        (&"Half".into(), &"1 of 2 sets".into())
+    );
+    assert!(half_row["rank"].is_null(), "{half_row}");
+    for column in ["q_calibrated", "m", "c"] {
+        assert!(board["rows"][0][column].is_number(), "{column} {board}");
+    }
+    for expected in [
+        "warning: Noise of Noise is a near copy of First of First: 0 of 16 files",
+        "warning: Digit of Digit is a near copy of First of First: 15 of 16 files",
+    ] {
+        assert!(said.contains(expected), "{said}");
+    }
+    assert_eq!(said.matches("near copy").count(), 2, "{said}");
+    // The team of the folder, and a receipt that was changed.
+    let receipt = Receipt::path(&digit);
+    let signed = fs::read_to_string(&receipt).unwrap();
+    for (from, to, expected) in [
+        ("16:00:00", "15:00:00", "was not signed with the key"),
+        ("\"Digit\"", "\"First\"", "was not signed with the key"),
+        ("sha256 = \"", "sha256 = \"0", "belongs to other content"),
+    ] {
+        fs::write(&receipt, signed.replace(from, to)).unwrap();
+        let (_, said) = pilot.rank("in", "store", &[]);
+        assert!(said.contains(expected), "{said}");
+    }
+    // `check` signs the present, once, which is after the deadline.
+    let check = [
+        "challenge",
+        "check",
+        text(&other),
+        "--challenge",
+        text(&public),
+    ];
+    let sign = [&check[..], &["--truth", text(&private)]].concat();
+    succeed(&sign);
+    let receipt = fs::read(Receipt::path(&other)).unwrap();
+    succeed(&sign);
+    assert_eq!(fs::read(Receipt::path(&other)).unwrap(), receipt);
+    fs::create_dir(pilot.at("late")).unwrap();
+    fs::rename(&other, pilot.at("late/b.tar.gz")).unwrap();
+    fs::write(Receipt::path(&pilot.at("late/b.tar.gz")), receipt).unwrap();
+    let decisions = format!(
+        "anonymous = true\n[aliases]\nOther = \"Anon\"\n[withdrawn]\n{} = \"by mistake\"\n",
+        &withdrawn[..8]
+    );
+    fs::write(private.join("board.toml"), &decisions).unwrap();
+    let page = pilot.at("board.html");
+    let (board, said) = pilot.rank("late", "store", &["--report", text(&page)]);
+    let late = board["rows"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .find(|row| row["board"] == "late");
+    assert_eq!(
+        (&late.unwrap()["team"], &late.unwrap()["rank"]),
+        (&"Anon".into(), &1.into())
+    );
+    assert!(
+        said.contains("does not count: withdrawn: by mistake"),
+        "{said}"
+    );
+    let html = fs::read_to_string(&page).unwrap();
+    for secret in [">First", ">Digit", ">Noise", "48-linear-star"] {
+        assert!(!html.contains(secret), "{secret}");
+    }
+    for expected in [
+        "Late entries",
+        "Near copies",
+        "Rules",
+        "2020-06-30T16:00:00Z",
+    ] {
+        assert!(html.contains(expected), "{expected}");
+    }
+    for (wrong, expected) in [
+        (
+            decisions.replace("Other", "Nobody"),
+            "`aliases` has an unknown team (found `Nobody`",
+        ),
+        (
+            decisions.replace(&withdrawn[..8], "0000"),
+            "`withdrawn` names no single entry (found `0000`",
+        ),
+        (
+            decisions.replace("anonymous", "secret"),
+            "unknown field `secret`",
+        ),
+    ] {
+        fs::write(private.join("board.toml"), wrong).unwrap();
+        let rank = ["challenge", "rank", "--challenge", text(&public), "--truth"];
+        let store = pilot.at("store");
+        let folders = [text(&private), "--store", text(&store)];
+        let message = fail(&[&rank[..], &folders].concat());
+        assert!(message.contains(expected), "{message}");
+    }
 }

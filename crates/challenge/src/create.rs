@@ -26,10 +26,10 @@ use shearq_simulate::set::{STAMP, SimulationSettings};
 use shearq_studies::bound::{cramer_rao, expected_qs};
 
 use crate::constant::ConstantShears;
-use crate::date::Date;
+use crate::deadline::Deadline;
 use crate::kind::{Kind, RankBy, response};
 use crate::readme;
-use crate::seal::{Expected, Key, list, seal};
+use crate::seal::{Expected, Key, close, names, seal_public, sums};
 use crate::shapes::References;
 use crate::terms::{CHALLENGE_FILE, Challenge, Data, Rules};
 
@@ -48,12 +48,16 @@ pub struct Plan {
     pub spectra: bool,
     /// Address of the organiser; may be empty.
     pub contact: String,
+    /// Where the data and the rules are published; may be empty.
+    pub address: String,
     /// Most entries of a team.
     pub entries_per_team: Option<u32>,
-    /// First day of entries.
-    pub opens: Option<Date>,
-    /// Last day of entries.
-    pub closes: Option<Date>,
+    /// First day or moment of entries.
+    pub opens: Option<Deadline>,
+    /// Last day or moment of entries.
+    pub closes: Option<Deadline>,
+    /// Whether entries may cover some sets only.
+    pub partial: bool,
 }
 
 /// Settings of simulated images.
@@ -131,15 +135,16 @@ impl Folders<'_> {
             }
             Some(_) => Ok(key),
             None => {
-                let mut files = Vec::new();
-                list(public, &mut files)?;
-                match files.first() {
-                    None => Ok(None),
-                    Some(_) => Err(FileError::new(
-                        public,
-                        "the folder has files already; expected a new or an empty folder",
-                    )),
+                for folder in [public, private] {
+                    // A command that was killed leaves hidden files.
+                    if names(folder)?.iter().any(|name| !name.starts_with('.')) {
+                        let message =
+                            "the folder has files already; expected a new or an empty folder";
+                        return Err(FileError::new(folder, message));
+                    }
                 }
+                close(private)?;
+                Ok(None)
             }
         }
     }
@@ -186,7 +191,9 @@ pub fn simulated(
         return Err(PipelineError::Request(message.into()));
     }
     let earlier = folders.prepare(plan)?;
-    let kept = earlier.and_then(|key| key.seed?.parse().ok());
+    let kept = earlier
+        .as_ref()
+        .and_then(|key| key.seed.as_ref()?.parse().ok());
     if let (Some(kept), Some(seed)) = (kept, *seed)
         && kept != seed
     {
@@ -194,13 +201,7 @@ pub fn simulated(
         return Err(FileError::new(folders.private, message).into());
     }
     let seed: u64 = kept.or(*seed).unwrap_or_else(rand::random);
-    let mut key = Key {
-        name: plan.name.clone(),
-        version: plan.version,
-        seed: Some(seed.to_string()),
-        public: None,
-        expected: None,
-    };
+    let mut key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, Some(seed)));
     let secret = seed_of(&plan.name, plan.version, seed);
     let (least, most) = AMPLITUDES;
     let settings = SimulationSettings {
@@ -290,14 +291,8 @@ pub fn of_images(
 ) -> Result<Challenge, PipelineError> {
     plan.check()?;
     let about = about(data)?;
-    folders.prepare(plan)?;
-    let key = Key {
-        name: plan.name.clone(),
-        version: plan.version,
-        seed: None,
-        public: None,
-        expected: None,
-    };
+    let earlier = folders.prepare(plan)?;
+    let key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, None));
     key.write(folders.private)?;
     let (public, private) = (
         DataFolder::new(folders.public),
@@ -347,8 +342,8 @@ impl Plan {
     /// Checks what does not depend on the data.
     fn check(&self) -> Result<(), PipelineError> {
         let refuse = |message: String| Err(PipelineError::Request(message));
-        if let (Some(opens), Some(closes)) = (self.opens, self.closes)
-            && closes < opens
+        if let (Some(opens), Some(closes)) = (&self.opens, &self.closes)
+            && closes.last < opens.first
         {
             return refuse(format!(
                 "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
@@ -586,16 +581,20 @@ fn finish(
         metric: _,
         spectra,
         contact,
+        address,
         entries_per_team,
         opens,
         closes,
+        partial,
     } = plan.clone();
     let layout = layout_text(kind, &data);
-    let challenge = Challenge {
+    let mut challenge = Challenge {
         name,
         version,
         kind,
         contact,
+        address,
+        seal: String::new(),
         conventions: kind
             .conventions
             .iter()
@@ -610,11 +609,14 @@ fn finish(
             entries_per_team,
             opens,
             closes,
+            partial,
         },
         data,
     };
     let Folders { public, private } = folders;
     atomic::write(private.join(LAYOUT_FILE), layout.as_bytes())?;
+    key.files = sums(private, names(private)?, threads)?;
+    challenge.seal = key.seal();
     atomic::write(public.join(LAYOUT_FILE), layout.as_bytes())?;
     atomic::write(
         public.join("README.md"),
@@ -622,8 +624,9 @@ fn finish(
     )?;
     let path = public.join(CHALLENGE_FILE);
     atomic::write(&path, challenge.text(&path)?.as_bytes())?;
-    key.public = Some(seal(public, threads)?);
+    key.public = Some(seal_public(public, threads)?);
     key.write(private)?;
+    close(private)?;
     Ok(challenge)
 }
 

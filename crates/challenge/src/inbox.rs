@@ -7,13 +7,15 @@ use shearq_results::submit::archive::{self, is_archive};
 use shearq_results::submit::challenge::Kind;
 use shearq_results::submit::manifest::{Entry, FileSum, MANIFEST_FILE, Manifest};
 
-use crate::date::moment;
 use crate::seal::sha256;
 
 /// Folders below a given folder that are searched.
 const DEPTH: usize = 3;
 /// Endings of archives that cannot be read.
 const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"];
+
+/// Digits of a file's checksum that a store keeps. Two of a million files agree by chance once in 10⁷ challenges.
+const FILE_DIGITS: usize = 16;
 
 /// An entry as it was found.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -62,8 +64,10 @@ fn search(
     if name.starts_with('.') && depth < DEPTH {
         return Ok(());
     }
-    if !path.is_dir() {
-        if is_archive(path) || other {
+    // Links inside an inbox are entries, which are refused later.
+    let link = depth < DEPTH && path.is_symlink();
+    if link || !path.is_dir() {
+        if link || is_archive(path) || other {
             add();
         }
         return Ok(());
@@ -92,32 +96,36 @@ fn search(
     Ok(())
 }
 
-/// Identity of an entry.
-#[derive(Debug, Clone)]
-pub struct Identity {
-    /// SHA-256 of the archive, or of the list of a folder's files.
-    pub sha256: String,
-    /// When the file was last written, in UTC.
-    pub received: String,
-}
-
-/// Identifies an entry.
+/// Refuses an entry that is a symbolic link or contains one: it could name any file of the organiser's system, such as
+/// the truth.
 ///
 /// # Errors
-/// If it cannot be read.
-pub fn identify(sending: &Sending) -> Result<Identity, FileError> {
-    let path = &sending.path;
-    let about = path
-        .metadata()
-        .and_then(|about| about.modified())
-        .map_err(FileError::doing(path, "cannot read the file"))?;
-    let sha256 = match path.is_dir() {
+/// If there is a link, or the entry cannot be read.
+pub fn refuse_links(entry: &Path) -> Result<(), FileError> {
+    let mut paths = vec![entry.to_owned()];
+    if entry.is_dir() {
+        let inside: std::io::Result<Vec<PathBuf>> = std::fs::read_dir(entry)
+            .and_then(|inside| inside.map(|file| Ok(file?.path())).collect());
+        paths.extend(inside.map_err(FileError::doing(entry, "cannot list the folder"))?);
+    }
+    match paths.into_iter().find(|path| path.is_symlink()) {
+        Some(link) => Err(FileError::new(
+            link,
+            "this is a link; expected a file or a folder",
+        )),
+        None => Ok(()),
+    }
+}
+
+/// SHA-256 of an archive, or of the list of a folder's files.
+///
+/// # Errors
+/// If it cannot be read, or contains a link.
+pub fn identify(path: &Path) -> Result<String, FileError> {
+    refuse_links(path)?;
+    Ok(match path.is_dir() {
         true => sha256(&list_of(&sums(path)?)),
         false => FileSum::of(path)?.sha256,
-    };
-    Ok(Identity {
-        sha256,
-        received: moment(about),
     })
 }
 
@@ -150,6 +158,8 @@ pub struct Content {
     /// SHA-256 of sets, images and checksums of the files. It depends neither on the name of the method nor on the
     /// compression.
     pub sha256: String,
+    /// First digits of the checksum of each file.
+    pub files: Vec<String>,
     /// Team and challenge, if a manifest states them.
     pub entry: Option<Entry>,
 }
@@ -185,6 +195,10 @@ pub fn content(sending: &Sending) -> Result<Content, FileError> {
     sums.sort_by(|a, b| a.0.cmp(&b.0));
     Ok(Content {
         sha256: sha256(&list_of(&sums)),
+        files: sums
+            .iter()
+            .map(|(_, sum)| sum.sha256[..FILE_DIGITS].to_owned())
+            .collect(),
         entry: manifest.and_then(|manifest| manifest.entry),
     })
 }

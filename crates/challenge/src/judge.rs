@@ -1,8 +1,10 @@
 //! Checks entries, scores them against the true shear, and keeps them in a results store.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry as Slot;
 use std::path::{Path, PathBuf};
 
+use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use shearq_files::{FileError, names_of};
 use shearq_pipeline::data::fingerprint;
@@ -25,9 +27,12 @@ use shearq_simulate::kinds::SetKind;
 use shearq_submissions::check_name;
 
 use crate::constant::ConstantShears;
-use crate::inbox::{Content, Identity, Sending, content, identify};
+use crate::copies::sketch;
+use crate::deadline::now;
+use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::response;
-use crate::seal::{Key, verify};
+use crate::receipt::Receipt;
+use crate::seal::{Key, verify, verify_public};
 use crate::shapes::References;
 use crate::terms::Challenge;
 
@@ -44,17 +49,35 @@ pub struct EntryInfo {
     pub title: String,
     /// Address for questions; may be empty. The leaderboard does not show it.
     pub contact: String,
-    /// When the file was last written, in UTC.
-    pub received: String,
+    /// Time of arrival: of the receipt, or of the first `rank` that scored the entry.
+    pub received: Timestamp,
+    /// Whether a receipt states the time.
+    pub receipt: bool,
+    /// Name of the archive or folder.
+    pub file: String,
     /// SHA-256 of the archive.
     pub sha256: String,
     /// SHA-256 of sets, images and files.
     pub content: String,
+    /// First digits of the checksum of each file.
+    pub files: Vec<String>,
+    /// Some mean shapes of each set of catalogues ([`sketch`]).
+    pub shapes: BTreeMap<String, Vec<i32>>,
     /// Kind of files.
     pub contents: Contents,
     /// Whether it is a reference of the organiser, without a rank.
     pub reference: bool,
 }
+
+impl EntryInfo {
+    /// The first digits of the SHA-256, which name the entry.
+    pub fn short_id(&self) -> &str {
+        &self.sha256[..self.sha256.len().min(8)]
+    }
+}
+
+/// How the settings column of an entry starts, in contrast to those of runs.
+const STORED: &str = "[entry]\n";
 
 /// The settings column of an entry in a store.
 #[derive(Serialize, Deserialize)]
@@ -69,6 +92,8 @@ pub struct Entry {
     pub info: EntryInfo,
     /// Scores of each set.
     pub sets: Vec<SetRecord>,
+    /// Why the organiser withdrew it.
+    pub withdrawn: Option<String>,
 }
 
 /// An entry that was not scored.
@@ -127,18 +152,25 @@ impl std::fmt::Debug for Judge {
 struct Candidate {
     sending: Sending,
     reference: bool,
-    identity: Identity,
+    arrival: Arrival,
     content: Content,
+}
+
+/// When an entry arrived.
+struct Arrival {
+    sha256: String,
+    received: Timestamp,
+    receipt: Option<Receipt>,
 }
 
 impl Judge {
     /// Opens the public and the private folder of a challenge.
     ///
     /// # Errors
-    /// If they do not belong together, or the truth cannot be read.
-    pub fn open(public: &Path, private: &Path) -> Result<Self, PipelineError> {
+    /// If they do not belong together, the truth was changed or cannot be read.
+    pub fn open(public: &Path, private: &Path, threads: usize) -> Result<Self, PipelineError> {
         let challenge = Challenge::read(public)?;
-        let (key, id) = verify(public, private)?;
+        let (key, id) = verify(public, private, &challenge, threads)?;
         let data = DataFolder::open(private)?;
         let source = Source::folder(&data, private)?;
         let grid = challenge.data.grid().map_err(unscored)?;
@@ -192,22 +224,44 @@ impl Judge {
     /// The entries of this challenge in a store, in order of their arrival.
     ///
     /// # Errors
-    /// If the store cannot be read.
+    /// If the store cannot be read, or contains entries that were scored with another truth or other data.
     pub fn entries(&self, store: &Path) -> Result<Vec<Entry>, FileError> {
-        let (runs, _) = store::read(store)?;
-        let mut entries: Vec<Entry> = runs
-            .into_iter()
-            .filter(|run| run.source == self.id)
-            .filter_map(|run| {
-                let stored: Stored = toml::from_str(&run.settings).ok()?;
-                Some(Entry {
-                    info: stored.entry,
-                    sets: run.sets,
-                })
-            })
-            .collect();
-        let order = |entry: &Entry| (entry.info.received.clone(), entry.info.sha256.clone());
-        entries.sort_by_key(order);
+        let mut entries: BTreeMap<String, Entry> = BTreeMap::new();
+        for (path, run) in store::files(store)? {
+            if !run.settings.starts_with(STORED) {
+                continue;
+            }
+            let Stored { entry: info } = toml::from_str(&run.settings)
+                .map_err(|e| FileError::new(&path, e.to_string().trim_end()))?;
+            if info.challenge != self.challenge.name {
+                continue;
+            }
+            if run.source != self.id {
+                let message = format!(
+                    "the entry was scored with another truth or other data of `{}` (found SHA-256 {}, expected {}). Try: another --store",
+                    info.challenge, run.source, self.id
+                );
+                return Err(FileError::new(path, message));
+            }
+            let entry = Entry {
+                info,
+                sets: run.sets,
+                withdrawn: None,
+            };
+            // Of two processes at the same time, or of a time with and without a receipt, the earlier one counts.
+            match entries.entry(entry.info.sha256.clone()) {
+                Slot::Occupied(mut slot) if entry.info.received < slot.get().info.received => {
+                    slot.insert(entry);
+                }
+                Slot::Occupied(_) => {}
+                Slot::Vacant(slot) => _ = slot.insert(entry),
+            }
+        }
+        let mut entries: Vec<Entry> = entries.into_values().collect();
+        entries.sort_by(|a, b| {
+            let order = |entry: &Entry| (entry.info.received, entry.info.file.clone());
+            order(a).cmp(&order(b))
+        });
         Ok(entries)
     }
 
@@ -226,10 +280,11 @@ impl Judge {
         let _prepared = store::prepare(store)?;
         let known = self.entries(store)?;
         let mut round = Round::default();
-        let candidates = candidates(sendings, &known, threads, &mut round)?;
+        let candidates = self.candidates(sendings, &known, threads, &mut round)?;
         if candidates.is_empty() {
             return Ok(round);
         }
+        verify_public(&self.public, threads)?;
         let public = DataFolder::open(&self.public)?;
         let sets = &self.challenge.data.sets;
         let ids = References::ids(&public, sets)?;
@@ -264,6 +319,147 @@ impl Judge {
         Ok(round)
     }
 
+    /// When an entry arrived, without a receipt `now`.
+    fn arrival(&self, sending: &Sending, now: Timestamp) -> Result<Arrival, FileError> {
+        let sha256 = identify(&sending.path)?;
+        let receipt = Receipt::read(&self.key, &sending.path, &sha256)?;
+        if let (Some(receipt), Some(team)) = (&receipt, &sending.team)
+            && receipt.team != *team
+        {
+            let message = format!(
+                "the receipt is of another team (found `{}`, expected the folder's `{team}`)",
+                receipt.team
+            );
+            return Err(FileError::new(Receipt::path(&sending.path), message));
+        }
+        Ok(Arrival {
+            sha256,
+            received: receipt.as_ref().map_or(now, |receipt| receipt.received),
+            receipt,
+        })
+    }
+
+    /// Signs the arrival of an entry, now, for `team` or the team in the manifest, and returns the file of the receipt. A
+    /// receipt that the same content has already is kept.
+    ///
+    /// # Errors
+    /// If the entry cannot be read, or the receipt cannot be written.
+    pub fn sign(&self, entry: &Path, team: Option<&str>) -> Result<PathBuf, FileError> {
+        let sha256 = identify(entry)?;
+        let sending = Sending {
+            path: entry.to_owned(),
+            team: team.map(str::to_owned),
+        };
+        let stated = content(&sending)?.entry;
+        let team = team_of(&sending, stated.as_ref(), None);
+        check_name(&team).map_err(|error| FileError::new(entry, error))?;
+        match Receipt::read(&self.key, entry, &sha256) {
+            Ok(Some(earlier)) if earlier.team == team => Ok(Receipt::path(entry)),
+            _ => Receipt::sign(&self.key, &team, now(), &sha256).write(entry),
+        }
+    }
+
+    /// The entries that must be scored. Known entries are counted; unreadable entries and copies are refused.
+    fn candidates(
+        &self,
+        sendings: &[(Sending, bool)],
+        known: &[Entry],
+        threads: usize,
+        round: &mut Round,
+    ) -> Result<Vec<Candidate>, PipelineError> {
+        let now = now();
+        let earlier: BTreeMap<&str, Timestamp> = known
+            .iter()
+            .map(|entry| (entry.info.sha256.as_str(), entry.info.received))
+            .collect();
+        let mut identified = Vec::new();
+        engine::ordered(
+            threads,
+            |feeder| {
+                for (sending, reference) in sendings {
+                    if !feeder.push((sending.clone(), *reference)) {
+                        break;
+                    }
+                }
+                Ok(())
+            },
+            || (),
+            |(), (sending, reference): (Sending, bool)| {
+                let found = self.arrival(&sending, now).and_then(|arrival| {
+                    // A receipt that is found later states an earlier time than the store.
+                    let stored = earlier.get(arrival.sha256.as_str());
+                    let content = match stored.is_some_and(|stored| *stored <= arrival.received) {
+                        true => None,
+                        false => Some(content(&sending)?),
+                    };
+                    Ok((arrival, content))
+                });
+                Ok((sending, reference, found))
+            },
+            |(sending, reference, found)| {
+                match found {
+                    Ok((arrival, content)) => {
+                        identified.push((sending, reference, arrival, content));
+                    }
+                    Err(error) => {
+                        let reason = reason_of(&error.path, &error.message, &sending);
+                        round.refused.push(Refused {
+                            team: team_of(&sending, None, None),
+                            path: sending.path,
+                            reason,
+                        });
+                    }
+                }
+                Ok(())
+            },
+        )?;
+        identified.sort_by(|a, b| (a.2.received, &a.0).cmp(&(b.2.received, &b.0)));
+        let mut contents: BTreeMap<String, (Timestamp, String, String)> = BTreeMap::new();
+        for Entry { info, .. } in known {
+            let name = format!("the entry of {} of {}", info.team, info.received);
+            let first = (info.received, info.sha256.clone(), name);
+            contents.entry(info.content.clone()).or_insert(first);
+        }
+        let mut archives: BTreeMap<String, PathBuf> = BTreeMap::new();
+        let mut candidates = Vec::new();
+        for (sending, reference, arrival, content) in identified {
+            let entry = content.as_ref().and_then(|content| content.entry.as_ref());
+            let team = team_of(&sending, entry, arrival.receipt.as_ref());
+            let path = sending.path.clone();
+            let refuse = |reason| round.refused.push(Refused { path, team, reason });
+            if let Some(first) = archives.get(&arrival.sha256) {
+                refuse(format!("identical content as {}", first.display()));
+                continue;
+            }
+            archives.insert(arrival.sha256.clone(), sending.path.clone());
+            let Some(content) = content else {
+                round.known += 1;
+                continue;
+            };
+            // An entry with a receipt may be earlier than a copy in the store, which is then listed as a near copy.
+            if let Some((received, sha256, first)) = contents.get(&content.sha256)
+                && *sha256 != arrival.sha256
+                && *received <= arrival.received
+            {
+                refuse(format!("identical content as {first}"));
+                continue;
+            }
+            let own = (
+                arrival.received,
+                arrival.sha256.clone(),
+                sending.path.display().to_string(),
+            );
+            contents.insert(content.sha256.clone(), own);
+            candidates.push(Candidate {
+                sending,
+                reference,
+                arrival,
+                content,
+            });
+        }
+        Ok(candidates)
+    }
+
     /// Checks and scores one entry.
     fn judge(
         &self,
@@ -273,10 +469,10 @@ impl Judge {
         let Candidate {
             sending,
             reference,
-            identity,
+            arrival,
             content,
         } = candidate;
-        let team = team_of(&sending, content.entry.as_ref());
+        let team = team_of(&sending, content.entry.as_ref(), arrival.receipt.as_ref());
         let refuse = |reason: String| Refused {
             path: sending.path.clone(),
             team: team.clone(),
@@ -294,9 +490,13 @@ impl Judge {
             method: scored.method,
             title,
             contact,
-            received: identity.received,
-            sha256: identity.sha256,
+            received: arrival.received,
+            receipt: arrival.receipt.is_some(),
+            file: file_name(&sending.path),
+            sha256: arrival.sha256,
             content: content.sha256,
+            files: content.files,
+            shapes: scored.shapes,
             contents: scored.contents,
             reference,
         };
@@ -340,8 +540,9 @@ impl Judge {
         let sent = Sent::open(&sending.path).map_err(plain)?;
         let submission = Submission::read(&sent).map_err(plain)?;
         let contents = rules.accept(&submission)?;
+        let mut shapes = BTreeMap::new();
         let (mut sets, doubt) = match &submission.packed {
-            Packed::Catalogues(_) => self.catalogues(&sent, sending, references)?,
+            Packed::Catalogues(_) => self.catalogues(&sent, sending, references, &mut shapes)?,
             Packed::Spectra(files) => {
                 self.check(&sent, sending, references, &mut |_| {})?;
                 let manifest = submission.manifest.as_ref();
@@ -375,6 +576,7 @@ impl Judge {
             contents,
             sets,
             doubt,
+            shapes,
         })
     }
 
@@ -409,6 +611,7 @@ impl Judge {
         sent: &Sent,
         sending: &Sending,
         references: &References,
+        shapes: &mut BTreeMap<String, Vec<i32>>,
     ) -> Result<(Vec<SetRecord>, Option<String>), String> {
         let mut sets = Vec::new();
         let mut failed = None;
@@ -421,7 +624,10 @@ impl Judge {
                     .map(|image| format!("{image} of set {of_set}")),
             );
             match self.score_set(&set) {
-                Ok(record) => sets.extend(record),
+                Ok(record) => {
+                    shapes.insert(of_set.to_string(), sketch(set.images.total()));
+                    sets.extend(record);
+                }
                 Err(reason) => failed = failed.take().or(Some(reason)),
             }
         })?;
@@ -519,6 +725,7 @@ struct Scored {
     contents: Contents,
     sets: Vec<SetRecord>,
     doubt: Option<String>,
+    shapes: BTreeMap<String, Vec<i32>>,
 }
 
 /// Significance that the response to the shear needs, as for Q cal.
@@ -571,17 +778,26 @@ fn reason_of(path: &Path, message: &str, sending: &Sending) -> String {
     }
 }
 
-/// Team of an entry: its folder in the inbox, or as its manifest states (`entry`), or the name of the file.
-fn team_of(sending: &Sending, entry: Option<&Team>) -> String {
-    let stated = entry.map(|entry| entry.team.clone());
-    let file = || {
-        let name = sending.path.file_name().unwrap_or_default();
-        let name = name.to_string_lossy();
-        let endings = [".tar.gz", ".tgz"];
-        let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
-        stem.unwrap_or(&name).to_owned()
-    };
-    sending.team.clone().or(stated).unwrap_or_else(file)
+/// Team of an entry: its folder in the inbox, or as its receipt or its manifest (`entry`) states, or the name of the file.
+fn team_of(sending: &Sending, entry: Option<&Team>, receipt: Option<&Receipt>) -> String {
+    let folder = sending.team.clone();
+    folder
+        .or_else(|| receipt.map(|receipt| receipt.team.clone()))
+        .or_else(|| entry.map(|entry| entry.team.clone()))
+        .unwrap_or_else(|| stem(&sending.path))
+}
+
+fn file_name(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default();
+    name.to_string_lossy().into_owned()
+}
+
+/// The name of a file without the ending of an archive.
+fn stem(path: &Path) -> String {
+    let name = file_name(path);
+    let endings = [".tar.gz", ".tgz"];
+    let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
+    stem.map_or_else(|| name.clone(), str::to_owned)
 }
 
 /// The first 100 bytes of a name.
@@ -590,91 +806,6 @@ fn short(name: &str) -> String {
         .rev()
         .find(|end| name.is_char_boundary(*end));
     name[..end.unwrap_or(0)].to_owned()
-}
-
-/// The entries that must be scored. Known entries are counted; unreadable entries and copies are refused.
-fn candidates(
-    sendings: &[(Sending, bool)],
-    known: &[Entry],
-    threads: usize,
-    round: &mut Round,
-) -> Result<Vec<Candidate>, PipelineError> {
-    let earlier: BTreeSet<&str> = known
-        .iter()
-        .map(|entry| entry.info.sha256.as_str())
-        .collect();
-    let mut identified = Vec::new();
-    engine::ordered(
-        threads,
-        |feeder| {
-            for (sending, reference) in sendings {
-                if !feeder.push((sending.clone(), *reference)) {
-                    break;
-                }
-            }
-            Ok(())
-        },
-        || (),
-        |(), (sending, reference): (Sending, bool)| {
-            let found = identify(&sending).and_then(|identity| {
-                let content = match earlier.contains(identity.sha256.as_str()) {
-                    true => None,
-                    false => Some(content(&sending)?),
-                };
-                Ok((identity, content))
-            });
-            Ok((sending, reference, found))
-        },
-        |(sending, reference, found)| {
-            match found {
-                Ok((identity, content)) => identified.push((sending, reference, identity, content)),
-                Err(error) => {
-                    let reason = reason_of(&error.path, &error.message, &sending);
-                    round.refused.push(Refused {
-                        team: team_of(&sending, None),
-                        path: sending.path,
-                        reason,
-                    });
-                }
-            }
-            Ok(())
-        },
-    )?;
-    identified.sort_by(|a, b| (&a.2.received, &a.0).cmp(&(&b.2.received, &b.0)));
-    let mut contents: BTreeMap<String, String> = BTreeMap::new();
-    for Entry { info, .. } in known {
-        let name = format!("the entry of {} of {}", info.team, info.received);
-        contents.entry(info.content.clone()).or_insert(name);
-    }
-    let mut archives: BTreeMap<String, PathBuf> = BTreeMap::new();
-    let mut candidates = Vec::new();
-    for (sending, reference, identity, content) in identified {
-        let entry = content.as_ref().and_then(|content| content.entry.as_ref());
-        let team = team_of(&sending, entry);
-        let path = sending.path.clone();
-        let refuse = |reason| round.refused.push(Refused { path, team, reason });
-        if let Some(first) = archives.get(&identity.sha256) {
-            refuse(format!("identical content as {}", first.display()));
-            continue;
-        }
-        archives.insert(identity.sha256.clone(), sending.path.clone());
-        let Some(content) = content else {
-            round.known += 1;
-            continue;
-        };
-        if let Some(first) = contents.get(&content.sha256) {
-            refuse(format!("identical content as {first}"));
-            continue;
-        }
-        contents.insert(content.sha256.clone(), sending.path.display().to_string());
-        candidates.push(Candidate {
-            sending,
-            reference,
-            identity,
-            content,
-        });
-    }
-    Ok(candidates)
 }
 
 #[cfg(test)]

@@ -5,19 +5,24 @@
 //! * [`create`] writes the public and the private folder; [`seal`] ties them together.
 //! * [`constant`] has m and c of sets with one shear each.
 //! * [`shapes`] compares an entry with the public images, without the true shear.
-//! * [`inbox`] finds entries, [`judge`] checks and scores them, and [`ranking`] ranks them.
+//! * [`inbox`] finds entries, [`receipt`] signs their arrival, [`judge`] checks and scores them, [`copies`] compares them,
+//!   and [`ranking`] ranks them.
+//! * [`organiser`] reads what organisers decide about a board.
 //! * [`page`] makes the leaderboard.
 #![forbid(unsafe_code)]
 
 pub mod constant;
+pub mod copies;
 pub mod create;
-pub mod date;
+pub mod deadline;
 pub mod inbox;
 pub mod judge;
 pub mod kind;
+pub mod organiser;
 pub mod page;
 pub mod ranking;
 mod readme;
+pub mod receipt;
 pub mod seal;
 pub mod shapes;
 pub mod terms;

@@ -11,10 +11,12 @@ use shearq_results::submit::manifest::Contents;
 use shearq_results::views::comparison::q_heat_map;
 use shearq_results::views::metrics::metric_cell;
 
-use crate::date::day_of;
+use crate::constant::ConstantShears;
+use crate::copies::NearCopy;
 use crate::judge::{EntryInfo, Refused};
 use crate::kind::RankBy;
-use crate::ranking::{Leaderboard, Standing, better};
+use crate::ranking::{Board, Leaderboard, Standing, better, rounded};
+use crate::readme;
 use crate::seal::Expected;
 use crate::terms::Challenge;
 
@@ -43,6 +45,10 @@ pub struct View<'a> {
     pub refused: &'a [Refused],
     /// Mean Q of an entry of zeros; `None` for constant shears.
     pub zero_shear: Option<f64>,
+    /// The true shears of sets with one shear each.
+    pub constant: Option<&'a ConstantShears>,
+    /// Entries that are nearly those of others.
+    pub copies: &'a [NearCopy<'a>],
     /// Q that a perfect method can expect, if known.
     pub expected: Option<&'a Expected>,
     /// How much is published.
@@ -73,12 +79,6 @@ fn files(contents: Contents) -> &'static str {
     }
 }
 
-/// The nearest number with so many decimals.
-fn rounded(value: f64, digits: usize) -> f64 {
-    // Printing rounds exactly; a product with a power of ten does not.
-    format!("{value:.digits$}").parse().unwrap_or(value)
-}
-
 /// The next larger number with so many decimals, so that no error becomes zero.
 fn rounded_up(error: f64, digits: usize) -> f64 {
     let least = 0.5 * 10f64.powi(-(digits as i32));
@@ -88,9 +88,9 @@ fn rounded_up(error: f64, digits: usize) -> f64 {
     }
 }
 
-/// Day of an entry.
-fn day(info: &EntryInfo) -> String {
-    day_of(&info.received).map_or_else(String::new, |day| day.to_string())
+/// Time of arrival of an entry, in UTC.
+fn received(info: &EntryInfo) -> String {
+    info.received.strftime("%Y-%m-%d %H:%M").to_string()
 }
 
 /// Title of an entry, with a mark for references.
@@ -107,16 +107,30 @@ impl View<'_> {
         self.challenge.rules.metric
     }
 
-    /// The leaderboard: one row per team and reference.
+    /// All boards in one table: one row per team and reference.
     pub fn table(&self) -> Table {
+        self.table_of(&[Board::Main, Board::Late, Board::Partial])
+    }
+
+    /// The standings of some boards.
+    fn table_of(&self, boards: &[Board]) -> Table {
         let (metric, digits) = (self.metric(), self.disclosure.digits);
+        let all = self.challenge.data.sets.len();
+        let others: Vec<RankBy> = [RankBy::QCalibrated, RankBy::M, RankBy::C]
+            .into_iter()
+            .filter(|other| *other != metric && other.suits(self.constant.is_some()))
+            .collect();
+        let filled = |board: &Board| self.board.of(*board).next().is_some();
+        let named = boards
+            .iter()
+            .any(|board| *board != Board::Main && filled(board));
         let row = |standing: &Standing<'_>| {
             let info = standing.best.info();
             let rank = standing
                 .rank
                 .map_or(Cell::Empty, |rank| Cell::number(rank as f64, 0));
             let (value, error) = (standing.best.value, standing.best.error);
-            vec![
+            let mut row = vec![
                 rank,
                 Cell::text(&info.team),
                 Cell::text(&info.method),
@@ -125,50 +139,95 @@ impl View<'_> {
                 // One cell would give the error two digits, and the value as many decimals.
                 Cell::number(rounded(value, digits), digits),
                 Cell::number(rounded_up(error, digits), digits),
-                Cell::text(day(info)),
+            ];
+            row.extend(others.iter().map(|other| {
+                // No more decimals than the organiser's, where he chose fewer than the metric's.
+                let fewer = metric.decimals().saturating_sub(digits);
+                let digits = other.decimals().saturating_sub(fewer);
+                Cell::number(
+                    rounded(other.of(&standing.best.entry.sets, self.constant).0, digits),
+                    digits,
+                )
+            }));
+            row.extend([
+                Cell::text(received(info)),
                 Cell::number(standing.entries.len() as f64, 0),
-            ]
+            ]);
+            if named {
+                row.push(Cell::text(match standing.board {
+                    Board::Main => "main".to_owned(),
+                    Board::Late => "late".to_owned(),
+                    Board::Partial => format!("{} of {all} sets", standing.best.entry.sets.len()),
+                }));
+            }
+            row
         };
         let mut notes = vec![metric.meaning().to_owned()];
-        notes.push("Each team is ranked by its best entry. Teams share a rank if their difference is below its error.".into());
+        notes.push("Each team is ranked by its best entry. Teams share a rank if their difference is below its error or not printed.".into());
         notes.extend(self.zero_note());
         notes.extend(self.expected_note());
-        let zero = metric.of_zero_shear(self.zero_shear.unwrap_or(f64::NAN));
-        let standings = &self.board.standings;
-        let mut rows: Vec<Vec<Cell>> = standings.iter().map(row).collect();
-        let behind = |standing: &Standing<'_>| better(metric, zero, standing.best.value);
-        let place = standings.iter().position(behind).unwrap_or(rows.len());
-        let text = |text: &str| Cell::text(text);
-        let title = "reference: an entry of zeros";
-        rows.insert(
-            place,
-            vec![
-                Cell::Empty,
-                text(ZERO_SHEAR),
-                text("no image"),
-                text(title),
-                Cell::Empty,
-                Cell::number(rounded(zero, digits), digits),
-                Cell::Empty,
-                Cell::Empty,
-                Cell::Empty,
-            ],
+        let standings = || boards.iter().flat_map(|board| self.board.of(*board));
+        let mut rows: Vec<Vec<Cell>> = standings().map(row).collect();
+        if boards.contains(&Board::Main) {
+            let zero = metric.of_zero_shear(self.zero_shear.unwrap_or(f64::NAN));
+            let behind = |standing: &Standing<'_>| {
+                standing.board != Board::Main || better(metric, zero, standing.best.value)
+            };
+            let mut zeros = vec![Cell::Empty; 7 + others.len() + 2 + usize::from(named)];
+            zeros[1] = Cell::text(ZERO_SHEAR);
+            zeros[2] = Cell::text("no image");
+            zeros[3] = Cell::text("reference: an entry of zeros");
+            zeros[5] = Cell::number(rounded(zero, digits), digits);
+            rows.insert(standings().position(behind).unwrap_or(rows.len()), zeros);
+        }
+        let mut headings = vec![
+            Heading::new("rank", "rank"),
+            Heading::new("team", "team"),
+            Heading::new("method", "method"),
+            Heading::new("title", "title"),
+            Heading::new("files", "files"),
+            Heading::new(key(metric).0, metric.label()),
+            Heading::new(key(metric).1, "± error"),
+        ];
+        headings.extend(
+            others
+                .iter()
+                .map(|other| Heading::new(key(*other).0, other.label())),
         );
+        headings.extend([
+            Heading::new("received", "received (UTC)"),
+            Heading::new("entries", "entries"),
+        ]);
+        if named {
+            headings.push(Heading::new("board", "board"));
+        }
         Table {
             title: format!("Leaderboard of {}", self.challenge.name),
-            headings: vec![
-                Heading::new("rank", "rank"),
-                Heading::new("team", "team"),
-                Heading::new("method", "method"),
-                Heading::new("title", "title"),
-                Heading::new("files", "files"),
-                Heading::new(key(metric).0, metric.label()),
-                Heading::new(key(metric).1, "± error"),
-                Heading::new("received", "received"),
-                Heading::new("entries", "entries"),
-            ],
+            headings,
             rows,
             notes,
+        }
+    }
+
+    /// Entries that share files or shapes with an earlier one.
+    fn copies(&self) -> Table {
+        let row = |copy: &NearCopy<'_>| {
+            let name = |info: &EntryInfo| format!("{}: {}", info.team, info.method);
+            vec![
+                Cell::text(name(copy.entry)),
+                Cell::text(name(copy.earlier)),
+                Cell::text(copy.reason()),
+            ]
+        };
+        Table {
+            title: "Near copies".into(),
+            headings: vec![
+                Heading::new("entry", "entry"),
+                Heading::new("earlier", "earlier entry"),
+                Heading::new("reason", "reason"),
+            ],
+            rows: self.copies.iter().map(row).collect(),
+            notes: Vec::new(),
         }
     }
 
@@ -248,8 +307,7 @@ impl View<'_> {
         let metric = self.metric();
         let plotted: Vec<&Standing<'_>> = self
             .board
-            .standings
-            .iter()
+            .of(Board::Main)
             .filter(|standing| standing.rank.is_some())
             .take(PLOTTED)
             .collect();
@@ -301,8 +359,7 @@ impl View<'_> {
     /// # Errors
     /// If a figure cannot be drawn.
     pub fn report(&self) -> Result<Report, FigureError> {
-        let mut blocks = vec![Block::Filtered(self.table())];
-        let failures = self.failures();
+        let mut blocks = vec![Block::Filtered(self.table_of(&[Board::Main]))];
         if !self.board.standings.is_empty() {
             let caption = format!(
                 "{} of each entry, with its error, for the first {PLOTTED} teams at most.",
@@ -315,13 +372,24 @@ impl View<'_> {
         if self.disclosure.detail {
             sections.push(self.detail()?);
         }
-        if !failures.rows.is_empty() {
-            sections.push(Section::new(
-                "failures",
-                "Entries without a rank",
-                vec![Block::Filtered(failures)],
-            ));
+        let of_board = |board, title: &str| Table {
+            title: title.into(),
+            notes: Vec::new(),
+            ..self.table_of(&[board])
+        };
+        for (id, table) in [
+            ("late", of_board(Board::Late, "Late entries")),
+            ("partial", of_board(Board::Partial, "Entries of some sets")),
+            ("copies", self.copies()),
+            ("failures", self.failures()),
+        ] {
+            if !table.rows.is_empty() {
+                let title = table.title.clone();
+                sections.push(Section::new(id, title, vec![Block::Filtered(table)]));
+            }
         }
+        let rules = Block::Text(readme::rules(self.challenge).join("\n\n"));
+        sections.push(Section::new("rules", "Rules", vec![rules]));
         let Challenge {
             name,
             version,

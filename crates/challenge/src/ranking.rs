@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use shearq_results::compare::difference;
 
 use crate::constant::ConstantShears;
-use crate::date::day_of;
+use crate::deadline::Deadline;
 use crate::judge::{Entry, EntryInfo};
 use crate::kind::RankBy;
-use crate::terms::Rules;
+use crate::terms::Challenge;
 
 /// An entry with its metric.
 #[derive(Debug, Clone)]
@@ -33,7 +33,9 @@ impl Result<'_> {
 /// A team, or a reference of the organiser.
 #[derive(Debug, Clone)]
 pub struct Standing<'a> {
-    /// Rank of a team, from 1. References have none.
+    /// The table it belongs to.
+    pub board: Board,
+    /// Rank of a team, from 1. References and partial entries have none.
     pub rank: Option<usize>,
     /// The best entry.
     pub best: Result<'a>,
@@ -41,57 +43,99 @@ pub struct Standing<'a> {
     pub entries: Vec<Result<'a>>,
 }
 
+/// A table of standings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Board {
+    /// Entries in time that cover all sets, and references.
+    Main,
+    /// Entries after the deadline. The truth may have become known.
+    Late,
+    /// Entries of some sets. They have no rank, because means over other sets, of which some are easier, do not compare.
+    Partial,
+}
+
 /// The ranked teams.
 #[derive(Debug, Default)]
 pub struct Leaderboard<'a> {
-    /// Teams and references, the best first.
+    /// Teams and references, the best first, board by board.
     pub standings: Vec<Standing<'a>>,
     /// Scored entries that do not count, with the reason.
     pub excluded: Vec<(&'a EntryInfo, String)>,
 }
 
-/// Ranks entries, which are in order of arrival. Each team has the rank of its best entry. A team shares the rank of a
-/// better team if the difference of both is below its error. `constant` has the true shears of sets with one shear each.
+impl<'a> Leaderboard<'a> {
+    /// Standings of one board.
+    pub fn of(&self, board: Board) -> impl Iterator<Item = &Standing<'a>> {
+        let own = move |standing: &&Standing<'a>| standing.board == board;
+        self.standings.iter().filter(own)
+    }
+}
+
+/// Ranks entries, which are in order of arrival. On each board, a team has the rank of its best entry. A team shares the
+/// rank of a better team if the difference of both is below its error, or if both values have the same `digits` decimals.
+/// `constant` has the true shears of sets with one shear each.
 pub fn rank<'a>(
     entries: &'a [Entry],
-    rules: &Rules,
+    challenge: &Challenge,
     constant: Option<&ConstantShears>,
+    digits: usize,
 ) -> Leaderboard<'a> {
+    let rules = &challenge.rules;
     let metric = rules.metric;
-    let mut board = Leaderboard::default();
-    let mut teams: BTreeMap<(bool, &str), Vec<Result<'a>>> = BTreeMap::new();
+    let mut leaderboard = Leaderboard::default();
+    let mut teams: BTreeMap<(Board, bool, &str), Vec<Result<'a>>> = BTreeMap::new();
     let mut numbers: BTreeMap<&str, usize> = BTreeMap::new();
     for entry in entries {
         let info = &entry.info;
         let (value, error) = metric.of(&entry.sets, constant);
-        if info.reference {
-            // Each reference has its own line.
-            let own = teams.entry((true, info.sha256.as_str())).or_default();
-            own.push(Result {
-                entry,
-                number: 1,
-                value,
-                error,
-            });
-            continue;
-        }
-        let count = numbers.entry(&info.team).or_default();
-        if let Some(reason) = excluded(info, *count + 1, rules) {
-            board.excluded.push((info, reason));
-            continue;
-        }
-        *count += 1;
-        let team = teams.entry((false, info.team.as_str())).or_default();
-        team.push(Result {
+        let mut result = Result {
             entry,
-            number: *count,
+            number: 1,
             value,
             error,
-        });
+        };
+        if info.reference && entry.withdrawn.is_none() {
+            // Each reference has its own line.
+            let own = teams.entry((Board::Main, true, info.sha256.as_str()));
+            own.or_default().push(result);
+            continue;
+        }
+        let early = rules
+            .opens
+            .as_ref()
+            .filter(|opens| info.received < opens.first);
+        if let Some(opens) = early {
+            let reason = format!("received before the challenge opened, {opens}");
+            leaderboard.excluded.push((info, reason));
+            continue;
+        }
+        // Withdrawn and late entries were scored as well, so they count towards the limit, which protects the truth.
+        let count = numbers.entry(&info.team).or_default();
+        *count += 1;
+        result.number = *count;
+        let most = rules
+            .entries_per_team
+            .filter(|most| *count > *most as usize);
+        let reason = match (&entry.withdrawn, most) {
+            (Some(reason), _) => format!("withdrawn: {reason}"),
+            (None, Some(most)) => format!("the team has {most} entries already"),
+            (None, None) => {
+                let late = |closes: &Deadline| info.received > closes.last;
+                let board = match rules.closes.as_ref().is_some_and(late) {
+                    _ if entry.sets.len() < challenge.data.sets.len() => Board::Partial,
+                    true => Board::Late,
+                    false => Board::Main,
+                };
+                let team = teams.entry((board, false, info.team.as_str()));
+                team.or_default().push(result);
+                continue;
+            }
+        };
+        leaderboard.excluded.push((info, reason));
     }
-    board.standings = teams
+    leaderboard.standings = teams
         .into_iter()
-        .filter_map(|((reference, _), entries)| {
+        .filter_map(|((board, reference, _), entries)| {
             // Of equal entries, the first counts.
             let best = entries.iter().reduce(|best, other| {
                 match better(metric, other.value, best.value) {
@@ -100,46 +144,61 @@ pub fn rank<'a>(
                 }
             })?;
             Some(Standing {
-                rank: (!reference).then_some(0),
+                board,
+                rank: (!reference && board != Board::Partial).then_some(0),
                 best: best.clone(),
                 entries,
             })
         })
         .collect();
-    let ahead = |a: &Standing<'_>, b: &Standing<'_>| match metric.larger_is_better() {
-        true => b.best.value.total_cmp(&a.best.value),
-        false => a.best.value.total_cmp(&b.best.value),
+    // Of equal printed values the earlier entry leads, not the copy with a better seventh digit.
+    let ahead = |a: &Standing<'_>, b: &Standing<'_>| {
+        let [of_a, of_b] = [a, b].map(|standing| rounded(standing.best.value, digits));
+        let by_value = match metric.larger_is_better() {
+            true => of_b.total_cmp(&of_a),
+            false => of_a.total_cmp(&of_b),
+        };
+        let by_arrival = a.best.info().received.cmp(&b.best.info().received);
+        a.board.cmp(&b.board).then(by_value).then(by_arrival)
     };
-    board.standings.sort_by(ahead);
-    let mut leader: Option<(usize, Result<'a>)> = None;
+    leaderboard.standings.sort_by(ahead);
+    for of_board in leaderboard
+        .standings
+        .chunk_by_mut(|a, b| a.board == b.board)
+    {
+        number(of_board, metric, digits);
+    }
+    leaderboard
+}
+
+/// Ranks the standings of a board, which are in order of their values.
+fn number(standings: &mut [Standing<'_>], metric: RankBy, digits: usize) {
+    let mut leader: Option<(usize, Result<'_>)> = None;
+    let mut printed = None;
     let mut place = 0;
-    for standing in &mut board.standings {
+    for standing in standings {
         let Some(rank) = &mut standing.rank else {
             continue;
         };
         place += 1;
+        let own = Some(rounded(standing.best.value, digits));
         match &leader {
-            Some((first, best)) if equal(metric, best, &standing.best) => *rank = *first,
+            Some((first, best)) if own == printed || equal(metric, best, &standing.best) => {
+                *rank = *first;
+            }
             _ => {
                 *rank = place;
                 leader = Some((place, standing.best.clone()));
             }
         }
+        printed = own;
     }
-    board
 }
 
-/// Why an entry does not count.
-fn excluded(info: &EntryInfo, number: usize, rules: &Rules) -> Option<String> {
-    let day = day_of(&info.received)?;
-    if let Some(opens) = rules.opens.filter(|opens| day < *opens) {
-        return Some(format!("received before the first day, {opens}"));
-    }
-    if let Some(closes) = rules.closes.filter(|closes| day > *closes) {
-        return Some(format!("received after the last day, {closes}"));
-    }
-    let most = rules.entries_per_team?;
-    (number > most as usize).then(|| format!("the team has {most} entries already"))
+/// The nearest number with so many decimals.
+pub(crate) fn rounded(value: f64, digits: usize) -> f64 {
+    // Printing rounds exactly; a product with a power of ten does not.
+    format!("{value:.digits$}").parse().unwrap_or(value)
 }
 
 pub(crate) fn better(metric: RankBy, a: f64, b: f64) -> bool {
@@ -169,6 +228,8 @@ fn equal(metric: RankBy, best: &Result<'_>, other: &Result<'_>) -> bool {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::kind::GREAT10;
+    use crate::terms::{Data, Rules};
     use shearq_results::row::SetRecord;
     use shearq_results::submit::manifest::Contents;
     use shearq_scoring::Metrics;
@@ -194,6 +255,8 @@ pub(crate) mod tests {
         }
     }
 
+    const DAY: &str = "2026-11-24T10:00:00Z";
+
     fn entry(team: &str, received: &str, q: f64, replicates: &[f64]) -> Entry {
         Entry {
             info: EntryInfo {
@@ -202,24 +265,53 @@ pub(crate) mod tests {
                 method: "M".into(),
                 title: String::new(),
                 contact: String::new(),
-                received: received.into(),
+                received: received.parse().unwrap(),
+                receipt: false,
+                file: String::new(),
                 sha256: format!("{team}{received}"),
                 content: format!("{team}{received}"),
+                files: Vec::new(),
+                shapes: BTreeMap::new(),
                 contents: Contents::Catalogues,
                 reference: team.starts_with("our"),
             },
             sets: vec![record(2, q, replicates)],
+            withdrawn: None,
         }
     }
 
-    fn rules() -> Rules {
-        Rules {
-            metric: RankBy::Q,
-            contents: vec![Contents::Catalogues],
-            entries_per_team: Some(2),
-            opens: None,
-            closes: "2026-11-30".parse().ok(),
+    /// A challenge of one set, with two entries per team until the last second of a day.
+    fn challenge() -> Challenge {
+        Challenge {
+            name: "c".into(),
+            version: 1,
+            kind: &GREAT10,
+            contact: String::new(),
+            address: String::new(),
+            seal: String::new(),
+            data: Data {
+                sets: vec![2],
+                images: 10,
+                grid: 8,
+                stamp: 48,
+                field_degrees: 10.0,
+            },
+            conventions: BTreeMap::new(),
+            rules: Rules {
+                metric: RankBy::Q,
+                contents: vec![Contents::Catalogues],
+                entries_per_team: Some(2),
+                opens: None,
+                closes: "2026-11-30".parse().ok(),
+                partial: true,
+            },
         }
+    }
+
+    /// Board, rank and team of each standing.
+    fn found(leaderboard: &Leaderboard<'_>) -> Vec<(Board, Option<usize>, String)> {
+        let of = |s: &Standing<'_>| (s.board, s.rank, s.best.info().team.clone());
+        leaderboard.standings.iter().map(of).collect()
     }
 
     #[test]
@@ -232,20 +324,18 @@ pub(crate) mod tests {
                 .map(|k| q + 10.0 * noise(k) + own * third(k))
                 .collect()
         };
-        let day = "2026-11-24 10:00:00";
         let entries = [
-            entry("A", "2026-11-20 10:00:00", 90.0, &common(90.0, 0.0)),
-            entry("A", "2026-11-21 10:00:00", 100.0, &common(100.0, 0.0)),
-            entry("A", "2026-11-22 10:00:00", 500.0, &common(500.0, 0.0)),
-            entry("B", day, 99.9, &common(99.9, 1.0)),
-            entry("C", day, 99.0, &common(99.0, 0.0)),
-            entry("D", "2026-12-01 00:00:00", 200.0, &common(200.0, 0.0)),
-            entry("ours", day, 99.5, &common(99.5, 0.0)),
+            entry("A", "2026-11-20T10:00:00Z", 90.0, &common(90.0, 0.0)),
+            entry("A", "2026-11-21T10:00:00Z", 100.0, &common(100.0, 0.0)),
+            entry("A", "2026-11-22T10:00:00Z", 500.0, &common(500.0, 0.0)),
+            entry("B", DAY, 99.9, &common(99.9, 1.0)),
+            entry("C", DAY, 99.0, &common(99.0, 0.0)),
+            entry("D", "2026-12-01T00:00:00Z", 200.0, &common(200.0, 0.0)),
+            entry("ours", DAY, 99.5, &common(99.5, 0.0)),
         ];
-        let board = rank(&entries, &rules(), None);
+        let board = rank(&entries, &challenge(), None, 1);
         let found: Vec<(Option<usize>, &str, f64, usize)> = board
-            .standings
-            .iter()
+            .of(Board::Main)
             .map(|s| {
                 (
                     s.rank,
@@ -264,19 +354,15 @@ pub(crate) mod tests {
         ];
         assert_eq!(found, expected);
         let reasons: Vec<&str> = board.excluded.iter().map(|e| e.1.as_str()).collect();
-        assert_eq!(
-            reasons,
-            [
-                "the team has 2 entries already",
-                "received after the last day, 2026-11-30"
-            ]
-        );
+        assert_eq!(reasons, ["the team has 2 entries already"]);
+        let late: Vec<_> = board.of(Board::Late).collect();
+        assert_eq!((late.len(), late[0].rank), (1, Some(1)));
     }
 
     #[test]
     fn without_errors_values_rank() {
-        let entries = [entry("A", "x", 2.0, &[2.0]), entry("B", "x", 1.0, &[1.0])];
-        let board = rank(&entries, &rules(), None);
+        let entries = [entry("A", DAY, 2.0, &[2.0]), entry("B", DAY, 1.0, &[1.0])];
+        let board = rank(&entries, &challenge(), None, 1);
         let ranks: Vec<_> = board.standings.iter().map(|s| s.rank).collect();
         assert_eq!(ranks, [Some(1), Some(2)]);
     }
@@ -285,25 +371,92 @@ pub(crate) mod tests {
     fn an_error_of_its_own_does_not_buy_a_rank() {
         // Found with shapes in one image and noise in seven: replicates of 3 to 900.
         let (mut cheat, mut honest) = (
-            entry("A", "x", 171.8, &[900.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0]),
+            entry("A", DAY, 171.8, &[900.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0]),
             entry(
                 "B",
-                "x",
+                DAY,
                 17.9,
                 &[18.0, 17.0, 18.0, 17.0, 18.0, 17.0, 18.0, 17.0],
             ),
         );
         (cheat.sets[0].errors.q, honest.sets[0].errors.q) = (20.7, 1.7);
         let ranks = |entries: &[Entry]| -> Vec<Option<usize>> {
-            let board = rank(entries, &rules(), None);
+            let board = rank(entries, &challenge(), None, 1);
             board.standings.iter().map(|s| s.rank).collect()
         };
         assert_eq!(ranks(&[cheat, honest.clone()]), [Some(1), Some(2)]);
         // An entry with much noise does not share the first rank, one within the errors does.
-        let mut noisy = entry("C", "x", 10.0, &[10.0]);
+        let mut noisy = entry("C", DAY, 10.0, &[10.0]);
         noisy.sets[0].errors.q = 15.0;
-        let mut near = entry("D", "x", 16.0, &[16.0]);
+        let mut near = entry("D", DAY, 16.0, &[16.0]);
         near.sets[0].errors.q = 1.7;
         assert_eq!(ranks(&[honest, noisy, near]), [Some(1), Some(1), Some(3)]);
+    }
+
+    #[test]
+    fn equal_printed_values_share_a_rank() {
+        let of = |team: &str, q: f64| entry(team, DAY, q, &[q]);
+        let entries = [of("A", 2.04), of("B", 1.96), of("C", 1.94), of("D", 1.94)];
+        let ranks = |digits| -> Vec<_> {
+            let board = rank(&entries, &challenge(), None, digits);
+            board.standings.iter().map(|s| s.rank.unwrap()).collect()
+        };
+        assert_eq!(ranks(1), [1, 1, 3, 3]);
+        assert_eq!(ranks(2), [1, 2, 3, 3]);
+    }
+
+    #[test]
+    fn deadlines_hold_to_the_second_and_in_far_years() {
+        let entries = [
+            entry("in time", "2026-11-30T23:59:59Z", 3.0, &[3.0]),
+            entry("late", "2026-12-01T00:00:00Z", 4.0, &[4.0]),
+            entry("far", "9999-12-30T00:00:00Z", 5.0, &[5.0]),
+            entry("early", "2026-10-31T23:59:59Z", 6.0, &[6.0]),
+        ];
+        let mut challenge = challenge();
+        challenge.rules.opens = "2026-11-01".parse().ok();
+        let board = rank(&entries, &challenge, None, 1);
+        let expected = [
+            (Board::Main, Some(1), "in time".to_owned()),
+            (Board::Late, Some(1), "far".to_owned()),
+            (Board::Late, Some(2), "late".to_owned()),
+        ];
+        assert_eq!(found(&board), expected);
+        assert_eq!(
+            board.excluded[0].1,
+            "received before the challenge opened, 2026-11-01 (UTC)"
+        );
+    }
+
+    #[test]
+    fn partial_entries_have_no_rank_and_withdrawn_ones_count() {
+        let mut entries = [
+            entry("A", "2026-11-20T10:00:00Z", 3.0, &[3.0]),
+            entry("A", "2026-11-21T10:00:00Z", 2.0, &[2.0]),
+            entry("A", "2026-11-22T10:00:00Z", 9.0, &[9.0]),
+            entry("B", "2026-11-23T10:00:00Z", 1.0, &[1.0]),
+            entry("C", "2026-11-24T10:00:00Z", 8.0, &[8.0]),
+        ];
+        let mut challenge = challenge();
+        challenge.data.sets = vec![2, 3];
+        for entry in &mut entries[..4] {
+            let mut more = entry.sets[0].clone();
+            more.set = 3;
+            entry.sets.push(more);
+        }
+        entries[0].withdrawn = Some("a mistake".into());
+        let board = rank(&entries, &challenge, None, 1);
+        let expected = [
+            (Board::Main, Some(1), "A".to_owned()),
+            (Board::Main, Some(2), "B".to_owned()),
+            (Board::Partial, None, "C".to_owned()),
+        ];
+        assert_eq!(found(&board), expected);
+        assert_eq!(board.standings[0].best.value, 2.0);
+        let reasons: Vec<&str> = board.excluded.iter().map(|e| e.1.as_str()).collect();
+        assert_eq!(
+            reasons,
+            ["withdrawn: a mistake", "the team has 2 entries already"]
+        );
     }
 }

@@ -4,16 +4,56 @@ use shearq_results::submit::challenge::Kind as FileKind;
 
 use crate::terms::Challenge;
 
+/// Rules of a challenge, one paragraph each.
+pub(crate) fn rules(challenge: &Challenge) -> Vec<String> {
+    let Challenge {
+        kind,
+        contact,
+        address,
+        rules,
+        ..
+    } = challenge;
+    let mut all: Vec<String> = kind.rules.iter().map(|&rule| rule.to_owned()).collect();
+    if rules.partial {
+        all.push("An entry may cover some sets only. It is listed without a rank.".into());
+    }
+    all.push(format!(
+        "Entries are ranked by {}, over all sets. {}",
+        rules.metric.label(),
+        rules.metric.meaning()
+    ));
+    all.push("The shapes of every image must agree with the image, with one scale in all images of a set, and their response to the shear must be at least 3σ from zero.".into());
+    all.push("Entries whose difference is below its error share a rank.".into());
+    all.push("Symbolic links are not accepted. Entries that share files or shapes with an earlier entry are listed.".into());
+    if let Some(most) = rules.entries_per_team {
+        all.push(format!("Each team may send at most {most} entries."));
+    }
+    if let Some(opens) = &rules.opens {
+        all.push(format!("Entries are accepted from {opens}."));
+    }
+    if let Some(closes) = &rules.closes {
+        all.push(format!(
+            "Entries are accepted until {closes}. Later entries have their own board."
+        ));
+    }
+    for (what, place) in [("Data and rules", address), ("Contact", contact)] {
+        if !place.is_empty() {
+            all.push(format!("{what}: {place}"));
+        }
+    }
+    all
+}
+
 /// The page, as Markdown.
 pub(crate) fn text(challenge: &Challenge) -> String {
     let Challenge {
         name,
         version,
         kind,
-        contact,
         data,
         conventions,
         rules,
+        ..
     } = challenge;
     let sets: Vec<String> = data.sets.iter().map(u32::to_string).collect();
     let first = data.sets.first().copied().unwrap_or(1);
@@ -58,26 +98,8 @@ pub(crate) fn text(challenge: &Challenge) -> String {
         "Put the files of an entry into one `.tar.gz` without folders. [shearq](https://github.com/shearq/shearq) does it for its own catalogues, and for yours if you describe them (`--foreign`):\n\n```sh\nshearq measure --data . --submission 48/linear/star --out ../catalogues\nshearq pack --measured ../catalogues --challenge \"{}\" --team TEAM --out ../entry.tar.gz\nshearq challenge check ../entry.tar.gz --challenge .\n```\n\nThe last command checks any entry, and needs no true shear. It finds missing and duplicate galaxies, swapped or flipped components, shapes that do not agree with their images, and distortions that are given as shear.\n\n## Rules\n\n",
         name.replace(['"', '\\', '$', '`'], "")
     ));
-    for rule in kind.rules {
+    for rule in self::rules(challenge) {
         text.push_str(&format!("* {rule}\n"));
-    }
-    text.push_str(&format!(
-        "* Entries are ranked by {}, over all sets. {}\n* The shapes of every image must agree with the image, with one scale in all images of a set, and their response to the shear must be at least 3σ from zero.\n",
-        rules.metric.label(),
-        rules.metric.meaning()
-    ));
-    text.push_str("* Entries whose difference is below its error share a rank.\n");
-    if let Some(most) = rules.entries_per_team {
-        text.push_str(&format!("* Each team may send at most {most} entries.\n"));
-    }
-    if let Some(opens) = rules.opens {
-        text.push_str(&format!("* First day: {opens} (UTC).\n"));
-    }
-    if let Some(closes) = rules.closes {
-        text.push_str(&format!("* Last day: {closes} (UTC).\n"));
-    }
-    if !contact.is_empty() {
-        text.push_str(&format!("\nContact: {contact}\n"));
     }
     text
 }

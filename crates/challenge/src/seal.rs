@@ -1,19 +1,29 @@
-//! Checksums of the public folder, and the private key that belongs to them.
+//! Checksums of both folders of a challenge, and the private key that belongs to them.
+//!
+//! `key.toml` contains the checksums of all private files and of the list of public checksums. The public description
+//! contains a keyed hash of the private checksums, so that even the organiser cannot change the truth and its checksums
+//! after participants have the public folder.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use hmac::{Hmac, KeyInit, Mac};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_files::{FileError, atomic, open};
 use shearq_pipeline::{PipelineError, engine};
 use shearq_results::submit::manifest::FileSum;
 
-use crate::terms::CHALLENGE_FILE;
+use crate::organiser::BOARD_FILE;
+use crate::terms::{CHALLENGE_FILE, Challenge};
 
 /// Checksums of the public files, in the format of `sha256sum`.
 pub const SUMS_FILE: &str = "SHA256SUMS";
 /// The private record.
 pub const KEY_FILE: &str = "key.toml";
+
+/// SHA-256 of files by their names below a folder, with `/` between folders.
+pub type Sums = BTreeMap<String, String>;
 
 /// The private record of a challenge.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,12 +36,17 @@ pub struct Key {
     /// Seed as text, because TOML has no 64-bit unsigned numbers; absent for images of another simulator.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seed: Option<String>,
+    /// 256 random bits in hexadecimal digits, which sign receipts and the private checksums.
+    pub secret: String,
     /// SHA-256 of [`SUMS_FILE`] in the public folder; absent until that folder is complete.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub public: Option<String>,
     /// Q that a perfect method can expect, if it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expected: Option<Expected>,
+    /// Checksums of the other private files.
+    #[serde(default)]
+    pub files: Sums,
 }
 
 /// Mean Q over sets of a perfect method with the smallest possible noise.
@@ -48,6 +63,19 @@ pub struct Expected {
 }
 
 impl Key {
+    /// A key with a new secret.
+    pub fn new(name: &str, version: u32, seed: Option<u64>) -> Self {
+        Key {
+            name: name.into(),
+            version,
+            seed: seed.map(|seed| seed.to_string()),
+            secret: hexadecimal(&rand::random::<[u8; 32]>()),
+            public: None,
+            expected: None,
+            files: Sums::new(),
+        }
+    }
+
     /// Reads the record of a private folder; `None` if there is none.
     ///
     /// # Errors
@@ -74,97 +102,227 @@ impl Key {
             toml::to_string(self).map_err(FileError::doing(&path, "cannot write the key"))?;
         atomic::write(&path, text.as_bytes())
     }
+
+    /// HMAC-SHA256 of `parts` with the secret, in hexadecimal digits. `purpose` keeps signatures of one use from
+    /// another.
+    pub fn sign(&self, purpose: &str, parts: &[&str]) -> String {
+        let mut mac = Hmac::<Sha256>::new_from_slice(self.secret.as_bytes())
+            .expect("HMAC takes keys of any length");
+        for part in [&["shearq", purpose][..], parts].concat() {
+            mac.update(part.as_bytes());
+            mac.update(&[0]);
+        }
+        hexadecimal(&mac.finalize().into_bytes())
+    }
+
+    /// Signature of the private checksums, for the public description.
+    pub fn seal(&self) -> String {
+        self.sign("truth", &[&sums_text(&self.files)])
+    }
+}
+
+fn hexadecimal(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// SHA-256 of some bytes, in hexadecimal digits.
 pub fn sha256(bytes: &[u8]) -> String {
-    let digest = Sha256::digest(bytes);
-    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+    hexadecimal(&Sha256::digest(bytes))
 }
 
-/// Writes the checksums of all files below `public` and returns the SHA-256 of their list.
+/// Gives the private folder and its files to their owner alone. Does nothing on systems without file modes.
 ///
 /// # Errors
-/// If a file cannot be read, or the list cannot be written.
-pub fn seal(public: &Path, threads: usize) -> Result<String, PipelineError> {
-    let mut files = Vec::new();
-    list(public, &mut files)?;
-    files.retain(|path| path.file_name().is_some_and(|name| name != SUMS_FILE));
-    files.sort();
-    let mut text = String::new();
+/// If a mode cannot be set.
+pub fn close(path: &Path) -> Result<(), FileError> {
+    let folder = path.is_dir();
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        let mode = if folder { 0o700 } else { 0o600 };
+        std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode))
+            .map_err(FileError::doing(path, "cannot set the mode"))?;
+    }
+    match folder {
+        true => entries(path)?.iter().try_for_each(|inside| close(inside)),
+        false => Ok(()),
+    }
+}
+
+/// Whether other users of the system may look into a folder.
+pub fn is_open_to_others(folder: &Path) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        folder
+            .metadata()
+            .is_ok_and(|about| about.permissions().mode() & 0o077 != 0)
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = folder;
+        false
+    }
+}
+
+fn entries(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
+    std::fs::read_dir(folder)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
+        .map_err(FileError::doing(folder, "cannot list the folder"))
+}
+
+/// Names of all files below a folder, without those that change after a challenge is complete.
+pub(crate) fn names(folder: &Path) -> Result<Vec<String>, FileError> {
+    let (mut folders, mut names) = (vec![folder.to_owned()], Vec::new());
+    while let Some(next) = folders.pop() {
+        for path in entries(&next)? {
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let name = path.strip_prefix(folder).unwrap_or(&path);
+            let parts: Vec<_> = name.iter().map(|part| part.to_string_lossy()).collect();
+            let name = parts.join("/");
+            if ![SUMS_FILE, KEY_FILE, BOARD_FILE].contains(&name.as_str()) {
+                names.push(name);
+            }
+        }
+    }
+    Ok(names)
+}
+
+/// Checksums of the files `names` below a folder.
+pub(crate) fn sums(
+    folder: &Path,
+    names: Vec<String>,
+    threads: usize,
+) -> Result<Sums, PipelineError> {
+    let mut sums = Sums::new();
     engine::ordered(
         threads,
         |feeder| {
-            for path in files {
-                if !feeder.push(path) {
+            for name in names {
+                if !feeder.push(name) {
                     break;
                 }
             }
             Ok(())
         },
         || (),
-        |(), path: PathBuf| {
-            let sum = FileSum::of(&path)?;
-            Ok((path, sum))
+        |(), name: String| {
+            let sum = FileSum::of(&folder.join(&name))?.sha256;
+            Ok((name, sum))
         },
-        |(path, sum)| {
-            let name = path.strip_prefix(public).unwrap_or(&path);
-            let parts: Vec<_> = name.iter().map(|part| part.to_string_lossy()).collect();
-            text.push_str(&format!("{}  {}\n", sum.sha256, parts.join("/")));
+        |(name, sum)| {
+            sums.insert(name, sum);
             Ok(())
         },
     )?;
+    Ok(sums)
+}
+
+/// Checksums in the format of `sha256sum`.
+fn sums_text(sums: &Sums) -> String {
+    sums.iter()
+        .map(|(name, sum)| format!("{sum}  {name}\n"))
+        .collect()
+}
+
+/// Writes the checksums of all files below `public` and returns the SHA-256 of their list.
+///
+/// # Errors
+/// If a file cannot be read, or the list cannot be written.
+pub fn seal_public(public: &Path, threads: usize) -> Result<String, PipelineError> {
+    let text = sums_text(&sums(public, names(public)?, threads)?);
     atomic::write(public.join(SUMS_FILE), text.as_bytes())?;
     Ok(sha256(text.as_bytes()))
 }
 
-/// All files below a folder.
-pub(crate) fn list(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), FileError> {
-    let entries = std::fs::read_dir(folder)
-        .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
-        .map_err(FileError::doing(folder, "cannot list the folder"))?;
-    for entry in entries {
-        let path = entry.path();
-        match path.is_dir() {
-            true => list(&path, found)?,
-            false => found.push(path),
+fn read_sums(public: &Path) -> Result<(Sums, String), FileError> {
+    let path = public.join(SUMS_FILE);
+    let bytes = open::read(&path, open::DATA).map_err(FileError::doing(&path, "cannot read it"))?;
+    let text = String::from_utf8_lossy(&bytes);
+    let sums = text
+        .lines()
+        .filter_map(|line| line.split_once("  "))
+        .map(|(sum, name)| (name.to_owned(), sum.to_owned()))
+        .collect();
+    Ok((sums, sha256(&bytes)))
+}
+
+/// Compares files below `folder` with their checksums in `list`.
+fn unchanged(
+    folder: &Path,
+    names: Vec<String>,
+    expected: &Sums,
+    list: &str,
+    threads: usize,
+) -> Result<(), PipelineError> {
+    for (name, found) in sums(folder, names, threads)? {
+        let expected = expected.get(&name).map_or("no such file", String::as_str);
+        if found != expected {
+            let message = format!(
+                "the file was changed (found SHA-256 {found}, expected {expected} of {list})"
+            );
+            return Err(FileError::new(folder.join(name), message).into());
         }
     }
     Ok(())
 }
 
-/// Checks that the description in `public` and the key in `private` belong together. Returns the key and the SHA-256
-/// that identifies the challenge.
+/// Checks the public files that are there against [`SUMS_FILE`]. A participant may have downloaded some sets only.
 ///
 /// # Errors
-/// If one of them is incomplete or was changed.
-pub fn verify(public: &Path, private: &Path) -> Result<(Key, String), FileError> {
+/// If a file was changed, with its name.
+pub fn verify_public(public: &Path, threads: usize) -> Result<(), PipelineError> {
+    let (expected, _) = read_sums(public)?;
+    let is_there = |name: &&String| open::is_there(&public.join(name));
+    let names = expected.keys().filter(is_there).cloned().collect();
+    unchanged(public, names, &expected, SUMS_FILE, threads)
+}
+
+/// Checks that the description in `public` and the key in `private` belong together, and that no private file was changed.
+/// Returns the key and the SHA-256 that identifies the challenge.
+///
+/// # Errors
+/// If one of them is incomplete or was changed, with the name of the file.
+pub fn verify(
+    public: &Path,
+    private: &Path,
+    challenge: &Challenge,
+    threads: usize,
+) -> Result<(Key, String), PipelineError> {
     let key = Key::read(private)?.ok_or_else(|| {
         let message = format!(
             "there is no {KEY_FILE}; expected the private folder that `shearq challenge new` wrote"
         );
         FileError::new(private, message)
     })?;
-    let path = public.join(SUMS_FILE);
-    let sums = open::read(&path, open::DATA).map_err(FileError::doing(&path, "cannot read it"))?;
-    let found = sha256(&sums);
-    if key.public.as_ref() != Some(&found) {
+    let (sums, id) = read_sums(public)?;
+    if key.public.as_ref() != Some(&id) {
         let expected = key.public.as_deref().unwrap_or("a complete challenge");
         let message = format!(
-            "the public folder does not belong to {} (found SHA-256 {found}, expected {expected})",
+            "the public folder does not belong to {} (found SHA-256 {id}, expected {expected})",
             private.display()
         );
-        return Err(FileError::new(&path, message));
+        return Err(FileError::new(public.join(SUMS_FILE), message).into());
     }
-    let description = public.join(CHALLENGE_FILE);
-    let sum = FileSum::of(&description)?.sha256;
-    let line = format!("{sum}  {CHALLENGE_FILE}");
-    if !String::from_utf8_lossy(&sums)
-        .lines()
-        .any(|own| own == line)
-    {
-        let message = format!("the file was changed (found SHA-256 {sum}, expected {SUMS_FILE}'s)");
-        return Err(FileError::new(&description, message));
+    unchanged(
+        public,
+        vec![CHALLENGE_FILE.into()],
+        &sums,
+        SUMS_FILE,
+        threads,
+    )?;
+    if challenge.seal != key.seal() {
+        let message = format!(
+            "the checksums are not those of the challenge (found seal {}, expected {} of {CHALLENGE_FILE})",
+            key.seal(),
+            challenge.seal
+        );
+        return Err(FileError::new(private.join(KEY_FILE), message).into());
     }
-    Ok((key, found))
+    let names = key.files.keys().cloned().collect();
+    unchanged(private, names, &key.files, KEY_FILE, threads)?;
+    Ok((key, id))
 }

@@ -12,7 +12,7 @@ use shearq_results::submit::packed::{Packed, Submission};
 use shearq_scoring::Grid;
 use shearq_submissions::{check_name, checked_name};
 
-use crate::date::Date;
+use crate::deadline::Deadline;
 use crate::kind::{Kind, RankBy, by_name};
 
 /// Name of the description in the public folder.
@@ -33,6 +33,12 @@ pub struct Challenge {
     /// Address of the organiser; may be empty.
     #[serde(default)]
     pub contact: String,
+    /// Where the data and the rules are published; may be empty.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub address: String,
+    /// [`Key::seal`](crate::seal::Key::seal) of the private files; empty until they are complete.
+    #[serde(default)]
+    pub seal: String,
     /// What the data are.
     pub data: Data,
     /// Conventions, by name.
@@ -87,12 +93,15 @@ pub struct Rules {
     /// Most entries of a team.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub entries_per_team: Option<u32>,
-    /// First day of entries, in UTC.
+    /// First day or moment of entries.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub opens: Option<Date>,
-    /// Last day of entries, in UTC.
+    pub opens: Option<Deadline>,
+    /// Last day or moment of entries.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub closes: Option<Date>,
+    pub closes: Option<Deadline>,
+    /// Whether entries may cover some sets only. They have no rank.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub partial: bool,
 }
 
 /// Entries that determine m and c of both components: one, and a shift and a stretch of each (tests/extraction.rs).
@@ -170,6 +179,7 @@ impl Challenge {
             secret_truth: BTreeMap::new(),
             images: Some(*images),
             sets: sets.clone(),
+            partial: self.rules.partial,
         })
     }
 

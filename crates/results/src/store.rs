@@ -103,13 +103,11 @@ fn read_run(path: &Path) -> Result<RunRecord, FileError> {
     RunRecord::from_table(&table, path)
 }
 
-/// All runs of a store, sorted by configuration and id, and warnings about them.
-///
-/// If several files contain one set of one run, the set with most images is used.
+/// The run of each file of a store, in order of the names.
 ///
 /// # Errors
 /// If the folder does not exist, or a Parquet file in it does not belong to a store.
-pub fn read(store: &Path) -> Result<(Vec<RunRecord>, Vec<String>), FileError> {
+pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
     let entries = std::fs::read_dir(store)
         .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
         .map_err(FileError::doing(store, "cannot read the results store"))?;
@@ -124,10 +122,22 @@ pub fn read(store: &Path) -> Result<(Vec<RunRecord>, Vec<String>), FileError> {
         })
         .collect();
     paths.sort();
+    paths
+        .into_iter()
+        .map(|path| Ok((path.clone(), read_run(&path)?)))
+        .collect()
+}
+
+/// All runs of a store, sorted by configuration and id, and warnings about them.
+///
+/// If several files contain one set of one run, the set with most images is used.
+///
+/// # Errors
+/// As [`files`].
+pub fn read(store: &Path) -> Result<(Vec<RunRecord>, Vec<String>), FileError> {
     let mut runs: BTreeMap<(String, String), RunRecord> = BTreeMap::new();
     let mut notes = Vec::new();
-    for path in paths {
-        let run = read_run(&path)?;
+    for (path, run) in files(store)? {
         match runs.entry((run.configuration.clone(), run.id())) {
             Entry::Vacant(place) => {
                 place.insert(run);

@@ -56,6 +56,8 @@ pub struct Expected {
     pub images: Option<u32>,
     /// Sets that a submission must contain; it must contain no other sets. Empty if unknown.
     pub sets: Vec<u32>,
+    /// Whether `sets` may be absent, with a warning.
+    pub partial: bool,
 }
 
 /// Largest accepted distance of a position from the centre of its cell, in cells.
@@ -211,12 +213,24 @@ fn check_sets(path: &Path, found: &BTreeSet<u32>, expected: &Expected, report: &
         return;
     }
     let wanted: BTreeSet<u32> = expected.sets.iter().copied().collect();
-    for (sets, what) in [
-        (&wanted - found, "is missing, but the challenge contains it"),
-        (found - &wanted, "does not belong to the challenge"),
+    let absent = match expected.partial {
+        true => Severity::Warning,
+        false => Severity::Error,
+    };
+    for (sets, severity, what) in [
+        (
+            &wanted - found,
+            absent,
+            "is missing, but the challenge contains it",
+        ),
+        (
+            found - &wanted,
+            Severity::Error,
+            "does not belong to the challenge",
+        ),
     ] {
         for set in sets {
-            report.error(path, "sets", format!("set {set} {what}"));
+            report.add(path, severity, "sets", format!("set {set} {what}"));
         }
     }
 }
@@ -656,6 +670,7 @@ mod tests {
             secret_truth: BTreeMap::new(),
             images: None,
             sets: Vec::new(),
+            partial: false,
         };
         let findings = check(&path, &expected);
         findings.iter().map(|finding| finding.check).collect()
