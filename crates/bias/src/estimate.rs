@@ -57,6 +57,8 @@ pub const QUANTITIES: [Quantity; ESTIMATES] = [
     quantity("m21", "m21", "change of the estimate of g2 with g1"),
     quantity("r1", "⟨R11⟩", "mean response of component 1"),
     quantity("r2", "⟨R22⟩", "mean response of component 2"),
+    quantity("r12", "⟨R12⟩", "mean response of e1 to g2"),
+    quantity("r21", "⟨R21⟩", "mean response of e2 to g1"),
 ];
 
 /// How errors are determined.

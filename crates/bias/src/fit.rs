@@ -15,8 +15,10 @@ pub(crate) const SIZE_LEAKAGE: usize = 11;
 pub(crate) const QUADRATIC: [usize; 2] = [12, 13];
 pub(crate) const CROSS: [usize; 2] = [14, 15];
 pub(crate) const RESPONSE: [usize; 2] = [16, 17];
+/// R12 and R21.
+pub(crate) const OTHER_RESPONSE: [usize; 2] = [18, 19];
 /// Number of estimates.
-pub(crate) const ESTIMATES: usize = 18;
+pub(crate) const ESTIMATES: usize = 20;
 
 /// Estimates; NaN for those that the data do not determine.
 pub(crate) type Estimates = [f64; ESTIMATES];
@@ -50,7 +52,7 @@ pub(crate) struct Plan {
 impl Plan {
     /// Of the sums of all units, with a known true shear or not.
     pub(crate) fn new(layout: Layout, sums: &[f64], truth: bool) -> Self {
-        let extra = extra(layout, sums);
+        let extra = layout.extra(sums).own;
         let mut plan = Plan {
             layout,
             truth,
@@ -96,41 +98,81 @@ impl Plan {
         terms
     }
 
+    /// The terms that determine m and c.
+    fn main_terms(&self, k: usize) -> &'static [usize] {
+        match self.known[k] {
+            Known::Both => &[ONE, OWN],
+            Known::OnlyM => &[OWN],
+            Known::OnlyC => &[ONE],
+        }
+    }
+
+    /// The unknowns of component `k` with its `terms`. With a response matrix, the other component of its pair is fitted
+    /// with the terms `others` at the same time.
+    fn solve(&self, sums: &[f64], k: usize, terms: &[usize], others: &[usize]) -> Option<Solution> {
+        match self.layout.matrix {
+            true => solve_both(self.layout, sums, k, [terms, others]),
+            false => solve(
+                &self.layout.of(sums, k),
+                terms,
+                self.layout.extra(sums).own[k],
+            ),
+        }
+    }
+
     /// The estimates of sums.
     pub(crate) fn estimates(&self, sums: &[f64]) -> Estimates {
         let layout = self.layout;
-        let extra = extra(layout, sums);
+        let extra = layout.extra(sums);
         let mut found = [f64::NAN; ESTIMATES];
         for k in 0..layout.components() {
+            let terms = self.main_terms(k);
             let of = layout.of(sums, k);
-            let extra = extra[k];
+            let own = extra.own[k];
+            let solved = match (layout.matrix, self.known[k]) {
+                (true, _) | (false, Known::Both) => {
+                    self.solve(sums, k, terms, self.main_terms(k ^ 1))
+                }
+                // One unknown is a ratio.
+                (false, Known::OnlyM | Known::OnlyC) => {
+                    let mut x = [0.0; MOST];
+                    x[0] = of.with_e[terms[0]] / of.slope(terms[0], terms[0], own);
+                    Some(x)
+                }
+            };
+            let Some([first, second, ..]) = solved else {
+                continue;
+            };
             match self.known[k] {
-                Known::Both => {
-                    if let Some([c, slope, ..]) = solve(&of, &[ONE, OWN], extra) {
-                        (found[M[k]], found[C[k]]) = (slope - 1.0, c);
-                    }
-                }
-                Known::OnlyM => {
-                    found[M[k]] = of.with_e[OWN] / of.slope(OWN, OWN, extra) - 1.0;
-                }
-                Known::OnlyC => found[C[k]] = of.with_e[ONE] / of.slope(ONE, ONE, extra),
+                Known::Both => (found[M[k]], found[C[k]]) = (second - 1.0, first),
+                Known::OnlyM => found[M[k]] = first - 1.0,
+                Known::OnlyC => found[C[k]] = first,
             }
         }
         for k in 0..2 {
             let of = layout.of(sums, k);
-            found[RESPONSE[k]] = of.slope(ONE, ONE, extra[k]) / sums[WEIGHT];
-            let last = |terms: &[usize]| {
-                let solved = solve(&of, terms, extra[k]);
+            found[RESPONSE[k]] = of.slope(ONE, ONE, extra.own[k]) / sums[WEIGHT];
+            if let Some(mixed) = layout.mixed(sums, k) {
+                found[OTHER_RESPONSE[k]] = mixed.slope(ONE, ONE, extra.other[k]) / sums[WEIGHT];
+            }
+            let last = |terms: &[usize], others: &[usize]| {
+                let solved = self.solve(sums, k, terms, others);
                 solved.map_or(f64::NAN, |x| x[terms.len() - 1])
             };
-            if self.quadratic[k] {
-                found[QUADRATIC[k]] = last(&[ONE, OWN, SQUARE]);
-            }
-            if self.cross[k] {
-                found[CROSS[k]] = last(&[ONE, OWN, OTHER]);
+            for (determined, places, terms) in [
+                (self.quadratic, QUADRATIC, [ONE, OWN, SQUARE]),
+                (self.cross, CROSS, [ONE, OWN, OTHER]),
+            ] {
+                let others = match determined[k ^ 1] {
+                    true => &terms,
+                    false => self.main_terms(k ^ 1),
+                };
+                if determined[k] {
+                    found[places[k]] = last(&terms, others);
+                }
             }
             if self.leakage {
-                found[LEAKAGE_OF[k]] = last(&self.with(k, &[PSF]));
+                found[LEAKAGE_OF[k]] = last(&self.with(k, &[PSF]), &self.with(k ^ 1, &[PSF]));
             }
         }
         if self.leakage {
@@ -147,20 +189,27 @@ impl Plan {
     /// difference of m, and of c for each component.
     pub(crate) fn shifted(&self, sums: &[f64], own: &[f64], change: (f64, [f64; 4])) -> Estimates {
         let mut changed = sums.to_vec();
-        self.layout
-            .shift(&mut changed, own, extra(self.layout, sums), change);
+        let extra = self.layout.extra(sums);
+        self.layout.shift(&mut changed, own, extra, change);
         self.estimates(&changed)
     }
 
     /// The last of `more` terms, from both components: the mean weighted by what each component contributes.
     fn joint(&self, sums: &[f64], more: &[usize]) -> f64 {
         let (mut sum, mut weight) = (0.0, 0.0);
-        for (k, extra) in extra(self.layout, sums).into_iter().take(2).enumerate() {
-            let of = self.layout.of(sums, k);
-            if let Some((x, pivot)) = last_of(&of, &self.with(k, more), extra) {
-                sum += x * pivot;
-                weight += pivot;
+        let extra = self.layout.extra(sums).own;
+        for k in 0..2 {
+            let terms = self.with(k, more);
+            let alone = last_of(&self.layout.of(sums, k), &terms, extra[k]);
+            let Some((mut x, pivot)) = alone else {
+                continue;
+            };
+            if self.layout.matrix {
+                let both = self.solve(sums, k, &terms, &self.with(k ^ 1, more));
+                x = both.map_or(f64::NAN, |x| x[terms.len() - 1]);
             }
+            sum += x * pivot;
+            weight += pivot;
         }
         sum / weight
     }
@@ -169,17 +218,6 @@ impl Plan {
 /// Number of rows.
 pub(crate) fn count(sums: &[f64]) -> f64 {
     sums[COUNT]
-}
-
-/// Mean response from sheared versions, per component.
-fn extra(layout: Layout, sums: &[f64]) -> [f64; 4] {
-    if !layout.versions {
-        return [0.0; 4];
-    }
-    let difference =
-        |k: usize| layout.version_mean(sums, 2 * k) - layout.version_mean(sums, 2 * k + 1);
-    let [a, b] = [difference(0), difference(1)];
-    [a, b, (a + b) / 2.0, (a + b) / 2.0]
 }
 
 type Solution = [f64; MOST];
@@ -222,4 +260,53 @@ fn eliminate(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(Solutio
         *x /= scale;
     }
     Some((x, pivot))
+}
+
+/// Solves Σ_t x_kt Σ w R_kk z_ks z_kt + Σ_t x_jt Σ w R_kj z_ks z_jt = Σ w e_k z_ks, and the same with k and j exchanged, for
+/// the component `k` and the other one `j` of its pair. Returns the unknowns of `k`.
+fn solve_both(
+    layout: Layout,
+    sums: &[f64],
+    k: usize,
+    [terms, others]: [&[usize]; 2],
+) -> Option<Solution> {
+    let extra = layout.extra(sums);
+    let unknowns = || {
+        let own = terms.iter().map(|t| (k, *t));
+        own.chain(others.iter().map(|t| (k ^ 1, *t)))
+    };
+    let [own, other] = [k, k ^ 1].map(|k| (k, layout.of(sums, k), layout.mixed(sums, k)));
+    let of = |component: usize| if component == k { &own } else { &other };
+    let slope = |(a, s): (usize, usize), (b, t): (usize, usize)| {
+        let (_, alone, mixed) = of(a);
+        match (a == b, mixed) {
+            (true, _) => alone.slope(s, t, extra.own[a]),
+            (false, Some(mixed)) => mixed.slope(s, t, extra.other[a]),
+            (false, None) => 0.0,
+        }
+    };
+    let n = terms.len() + others.len();
+    let mut scale = [0.0; 2 * MOST];
+    for (scale, unknown) in scale.iter_mut().zip(unknowns()) {
+        *scale = slope(unknown, unknown).abs().sqrt();
+        if !(*scale > 0.0 && scale.is_finite()) {
+            return None;
+        }
+    }
+    let mut rows = [[0.0; 2 * MOST + 1]; 2 * MOST];
+    for ((row, equation), own) in rows.iter_mut().zip(unknowns()).zip(scale) {
+        for ((value, unknown), other) in row.iter_mut().zip(unknowns()).zip(scale) {
+            *value = slope(equation, unknown) / (own * other);
+        }
+        row[n] = of(equation.0).1.with_e[equation.1] / own;
+    }
+    if !linear::eliminate(&mut rows[..n], Pivots::Largest, SMALLEST) {
+        return None;
+    }
+    let mut x = [0.0; 2 * MOST];
+    substitute(&rows[..n], &mut x);
+    Some(std::array::from_fn(|at| match at < terms.len() {
+        true => x[at] / scale[at],
+        false => 0.0,
+    }))
 }

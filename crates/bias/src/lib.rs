@@ -17,6 +17,10 @@
 //! this is (⟨e⟩₊/⟨R⟩₊ − ⟨e⟩₋/⟨R⟩₋)/2γ − 1. Weights enter both sides. If the weight depends on the shear, w R is
 //! replaced by d(w e)/dg = w R + e dw/dg.
 //!
+//! With R12 and R21 ([`Layout::matrix`]) e_k also contains R_kj times the shear that the fit gives to the other component j,
+//! and Σ_t x_jt Σ w R_kj z_ks z_jt adds to the left side. Both components are then solved together, so that for m and c
+//! the mean ellipticities are multiplied by the inverse of the mean 2 × 2 response.
+//!
 //! * [`Row`] and [`Layout`]: one galaxy, and the terms that are summed.
 //! * [`UnitSums`]: sums per unit and bin, in bounded memory; they merge.
 //! * [`Design`]: how catalogues belong together, recognised from their true shears.

@@ -11,6 +11,8 @@ pub struct Row {
     pub weight: f64,
     /// Derivatives of w e1 with g1 and of w e2 with g2: w R + e dw/dg.
     pub slope: [f64; 2],
+    /// Derivatives of w e1 with g2 and of w e2 with g1, if [`Layout::matrix`].
+    pub cross: [f64; 2],
     /// True shear.
     pub g: [f64; 2],
     /// Ellipticity of the PSF.
@@ -67,6 +69,9 @@ pub struct Layout {
     pub psf: bool,
     /// Whether a mean response from sheared versions adds to the responses of the rows.
     pub versions: bool,
+    /// Whether rows have the responses R12 of e1 to g2 and R21 of e2 to g1. Then both components are fitted together.
+    #[serde(default)]
+    pub matrix: bool,
 }
 
 impl Layout {
@@ -87,7 +92,31 @@ impl Layout {
 
     /// Numbers per unit and bin.
     pub fn len(self) -> usize {
+        self.matrix_start() + self.of_other_components() + self.components() / 2 * self.of_pair()
+    }
+
+    /// Where the sums of a response matrix start: after all others, so that layouts without it stay as they are.
+    fn matrix_start(self) -> usize {
         HEAD + self.components() * self.of_component()
+    }
+
+    /// Per version, weights times the ellipticity in the component that this version does not shear.
+    fn of_other_components(self) -> usize {
+        if self.matrix && self.versions {
+            VERSIONS.len()
+        } else {
+            0
+        }
+    }
+
+    /// Of a pair of components: sums w R12 z z', w R21 z' z, then w z z' if they are needed; none without a matrix.
+    fn of_pair(self) -> usize {
+        let n = self.terms();
+        match (self.matrix, self.versions) {
+            (false, _) => 0,
+            (true, false) => 2 * n * n,
+            (true, true) => 3 * n * n,
+        }
     }
 
     /// Never: there is always a count.
@@ -104,21 +133,15 @@ impl Layout {
         sums[WEIGHT] += row.weight;
         sums[WEIGHT2] += row.weight * row.weight;
         sums[SIZE] += row.weight * row.psf_size;
-        let of_component = self.of_component();
-        let mut components = sums[HEAD..].chunks_exact_mut(of_component);
-        for k in 0..2 {
-            if let Some(sums) = components.next() {
-                let (g, other, p) = (row.g[k], row.g[1 - k], row.psf[k]);
-                self.component(
-                    sums,
-                    row.e[k],
-                    row.slope[k],
-                    row.weight,
-                    [g, other, p],
-                    row.psf_size,
-                );
-            }
-        }
+        let [r11, r22] = row.slope;
+        let [r12, r21] = if self.matrix { row.cross } else { [0.0; 2] };
+        let [p1, p2] = row.psf;
+        self.add_pair(
+            sums,
+            0,
+            row,
+            (row.e, [[r11, r12], [r21, r22]], row.g, [p1, p2]),
+        );
         if !self.psf {
             return;
         }
@@ -131,37 +154,63 @@ impl Layout {
         };
         let rotated = |[a, b]: [f64; 2]| [a * cos + b * sin, b * cos - a * sin];
         let (e, g) = (rotated(row.e), rotated(row.g));
-        let [r1, r2] = row.slope;
+        // U R Uᵀ with the rotation U. Without R12 and R21 the added zeros change no bit.
+        let shared = cos * sin * (r12 + r21);
+        let rest = cos * sin * (r22 - r11);
         let slopes = [
-            r1 * cos * cos + r2 * sin * sin,
-            r1 * sin * sin + r2 * cos * cos,
+            [
+                r11 * cos * cos + r22 * sin * sin + shared,
+                r12 * cos * cos - r21 * sin * sin + rest,
+            ],
+            [
+                r21 * cos * cos - r12 * sin * sin + rest,
+                r11 * sin * sin + r22 * cos * cos - shared,
+            ],
         ];
-        for k in 0..2 {
-            if let Some(sums) = components.next() {
-                let p = if k == 0 { modulus } else { 0.0 };
-                self.component(
-                    sums,
-                    e[k],
-                    slopes[k],
-                    row.weight,
-                    [g[k], g[1 - k], p],
-                    row.psf_size,
-                );
+        self.add_pair(sums, 1, row, (e, slopes, g, [modulus, 0.0]));
+    }
+
+    /// Adds a galaxy to the sums of the components 1 and 2 (pair 0), or of those along and across the PSF (pair 1).
+    fn add_pair(
+        self,
+        sums: &mut [f64],
+        pair: usize,
+        row: &Row,
+        (e, slopes, g, psf): ([f64; 2], [[f64; 2]; 2], [f64; 2], [f64; 2]),
+    ) {
+        let terms = |k: usize| -> [f64; MOST] {
+            let (g, other, p) = (g[k], g[1 - k], psf[k]);
+            [1.0, g, other, g * g, p, p * row.psf_size]
+        };
+        let z = [terms(0), terms(1)];
+        let length = self.of_component();
+        let start = HEAD + 2 * pair * length;
+        let components = sums[start..].chunks_exact_mut(length);
+        for (k, sums) in components.take(2).enumerate() {
+            self.component(sums, e[k], slopes[k][k], row.weight, &z[k]);
+        }
+        let n = self.terms();
+        let start = self.matrix_start() + self.of_other_components() + pair * self.of_pair();
+        let mut matrices = sums[start..start + self.of_pair()].chunks_exact_mut(n * n);
+        for (factor, [a, b]) in [
+            (slopes[0][1], [0, 1]),
+            (slopes[1][0], [1, 0]),
+            (row.weight, [0, 1]),
+        ] {
+            let Some(sums) = matrices.next() else {
+                break;
+            };
+            for (sums, z_s) in sums.chunks_exact_mut(n).zip(z[a]) {
+                let scaled = factor * z_s;
+                for (sum, z_t) in sums.iter_mut().zip(z[b]) {
+                    *sum += scaled * z_t;
+                }
             }
         }
     }
 
-    fn component(
-        self,
-        sums: &mut [f64],
-        e: f64,
-        slope: f64,
-        weight: f64,
-        [g, other, p]: [f64; 3],
-        size: f64,
-    ) {
+    fn component(self, sums: &mut [f64], e: f64, slope: f64, weight: f64, z: &[f64; MOST]) {
         let n = self.terms();
-        let z: [f64; MOST] = [1.0, g, other, g * g, p, p * size];
         let (with_e, matrices) = sums.split_at_mut(n);
         let (with_slope, with_weight) = matrices.split_at_mut(triangle(n));
         let mut at = 0;
@@ -190,6 +239,9 @@ impl Layout {
         let (_, which) = VERSIONS[version];
         sums[VERSION + 2 * version] += weight * e[which.component];
         sums[VERSION + 2 * version + 1] += weight;
+        if self.of_other_components() > 0 {
+            sums[self.matrix_start() + version] += weight * e[1 - which.component];
+        }
     }
 
     /// Mean ellipticity.
@@ -197,9 +249,32 @@ impl Layout {
         [0, 1].map(|k| self.of(sums, k).with_e[ONE] / sums[WEIGHT])
     }
 
-    /// Mean ellipticity of a version, in its component of shear.
-    pub(crate) fn version_mean(self, sums: &[f64], version: usize) -> f64 {
-        sums[VERSION + 2 * version] / sums[VERSION + 2 * version + 1]
+    /// Mean response from sheared versions; zero without them.
+    pub(crate) fn extra(self, sums: &[f64]) -> Extra {
+        if !self.versions {
+            return Extra::default();
+        }
+        let mean = |version: usize, at: usize| sums[at] / sums[VERSION + 2 * version + 1];
+        let own = |k: usize| {
+            let of = |version: usize| mean(version, VERSION + 2 * version);
+            of(2 * k) - of(2 * k + 1)
+        };
+        let [a, b] = [own(0), own(1)];
+        let mut extra = Extra {
+            own: [a, b, (a + b) / 2.0, (a + b) / 2.0],
+            other: [0.0; 4],
+        };
+        if self.matrix {
+            // Versions of component 2 give the response of e1 to g2.
+            let other = |k: usize| {
+                let of = |version: usize| mean(version, self.matrix_start() + version);
+                of(2 - 2 * k) - of(3 - 2 * k)
+            };
+            let [a, b] = [other(0), other(1)];
+            // In a frame of random directions only the antisymmetric part is left.
+            extra.other = [a, b, (a - b) / 2.0, (b - a) / 2.0];
+        }
+        extra
     }
 
     /// Changes `sums` as if some of their galaxies, which have the sums `own`, had a larger m and c: e becomes
@@ -208,16 +283,40 @@ impl Layout {
         self,
         sums: &mut [f64],
         own: &[f64],
-        extra: [f64; 4],
+        extra: Extra,
         (m, c): (f64, [f64; 4]),
     ) {
         for k in 0..self.components() {
             let of = self.of(own, k);
+            let mixed = self.mixed(own, k);
             let start = HEAD + k * self.of_component();
             for (s, with_e) in sums[start..][..self.terms()].iter_mut().enumerate() {
-                *with_e += m * of.slope(s, OWN, extra[k]) + c[k] * of.slope(s, ONE, extra[k]);
+                let by = extra.own[k];
+                *with_e += m * of.slope(s, OWN, by) + c[k] * of.slope(s, ONE, by);
+                if let Some(mixed) = &mixed {
+                    let (by, other) = (extra.other[k], k ^ 1);
+                    *with_e += m * mixed.slope(s, OWN, by) + c[other] * mixed.slope(s, ONE, by);
+                }
             }
         }
+    }
+
+    /// The sums that mix a component with the other one of its pair; `None` without a response matrix.
+    pub(crate) fn mixed(self, sums: &[f64], component: usize) -> Option<Mixed<'_>> {
+        if !self.matrix {
+            return None;
+        }
+        let n = self.terms();
+        let (pair, transposed) = (component / 2, component % 2 == 1);
+        let start = self.matrix_start() + self.of_other_components() + pair * self.of_pair();
+        let (slopes, weights) = sums[start..start + self.of_pair()].split_at(2 * n * n);
+        let (first, second) = slopes.split_at(n * n);
+        Some(Mixed {
+            with_slope: if transposed { second } else { first },
+            with_weight: weights,
+            terms: n,
+            transposed,
+        })
     }
 
     /// The sums of a component.
@@ -232,6 +331,38 @@ impl Layout {
             with_slope,
             with_weight,
         }
+    }
+}
+
+/// Mean responses from sheared versions of the four components: to the own component of shear, and to the other one of the
+/// pair.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Extra {
+    pub(crate) own: [f64; 4],
+    pub(crate) other: [f64; 4],
+}
+
+/// Sums of a component k and the other one j of its pair.
+pub(crate) struct Mixed<'a> {
+    /// Σ w R_kj z_k z_j by rows.
+    with_slope: &'a [f64],
+    /// Σ w z z of the first with the second component of the pair by rows, if there is such a sum.
+    with_weight: &'a [f64],
+    terms: usize,
+    /// Whether k is the second component.
+    transposed: bool,
+}
+
+impl Mixed<'_> {
+    /// Σ w (R_kj + extra) z_ks z_jt.
+    pub(crate) fn slope(&self, s: usize, t: usize, extra: f64) -> f64 {
+        let at = if self.transposed {
+            t * self.terms + s
+        } else {
+            s * self.terms + t
+        };
+        let more = self.with_weight.get(at).map_or(0.0, |w| extra * w);
+        self.with_slope[s * self.terms + t] + more
     }
 }
 

@@ -70,6 +70,7 @@ impl Galaxies {
             g,
             psf,
             psf_size: 1.0,
+            ..Row::default()
         }
     }
 }
@@ -468,6 +469,7 @@ fn behind_stars(
                 g,
                 psf: [0.02, 0.01],
                 psf_size: 1.0,
+                ..Row::default()
             };
             sums.add(number as u32, key, 0, &row);
         }

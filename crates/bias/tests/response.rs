@@ -1,0 +1,447 @@
+//! Estimates of small catalogues against the equations of the crate, written as plain loops, and against the numbers that went
+//! into galaxies without noise.
+
+#![allow(clippy::unwrap_used, reason = "a failed test stops at the cause")]
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use shearq_bias::{Catalogue, Design, Errors, Layout, Range, Row, StarNoise, UnitSums, group};
+use shearq_bias::{Estimate, estimate};
+
+type Matrix = [[f64; 2]; 2];
+
+/// Terms of the fit, named as in the crate's description.
+#[derive(Clone, Copy, PartialEq)]
+enum Term {
+    One,
+    Own,
+    Other,
+    Square,
+    Psf,
+    PsfSize,
+}
+use Term::{One, Other, Own, Psf, PsfSize, Square};
+
+/// Galaxies, and (e, weight) in each sheared version; e is already divided by twice the artificial shear.
+#[derive(Default)]
+struct Sample {
+    rows: Vec<Row>,
+    versions: Vec<[([f64; 2], f64); 4]>,
+}
+
+/// Arbitrary numbers: shears, PSFs, sizes, weights and responses are all different.
+fn sample(seed: u64, versions: bool, matrix: bool) -> Sample {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut sample = Sample::default();
+    for _ in 0..60 {
+        let mut within = |low: f64, high: f64| rng.random_range(low..high);
+        let weight = within(0.5, 2.0);
+        sample.rows.push(Row {
+            e: [within(-0.4, 0.5), within(-0.3, 0.4)],
+            weight,
+            slope: [weight * within(0.2, 0.9), weight * within(0.3, 1.1)],
+            cross: match matrix {
+                true => [weight * within(-0.2, 0.4), weight * within(-0.4, 0.1)],
+                false => [0.0; 2],
+            },
+            g: [within(-0.06, 0.05), within(-0.04, 0.07)],
+            psf: [within(-0.1, 0.2), within(-0.2, 0.1)],
+            psf_size: within(1.0, 3.0),
+        });
+        if versions {
+            // Differences of 0.3 and 0.5, and of −0.1 and 0.2 in the other component.
+            let mean = [[0.15, -0.05], [-0.15, 0.05], [0.1, 0.25], [-0.1, -0.25]];
+            sample.versions.push(mean.map(|mean| {
+                let e = mean.map(|mean| mean + within(-0.1, 0.1));
+                (e, within(0.5, 2.0))
+            }));
+        }
+    }
+    sample
+}
+
+impl Sample {
+    fn sums(&self, layout: Layout) -> UnitSums {
+        let mut sums = UnitSums::new(layout, 1, 1);
+        for (key, row) in (0..).zip(&self.rows) {
+            sums.add(0, key, 0, row);
+        }
+        for (key, versions) in (0..).zip(&self.versions) {
+            for (version, (e, weight)) in versions.iter().enumerate() {
+                sums.add_version(0, key, 0, version, (*e, *weight));
+            }
+        }
+        sums.by_key()
+    }
+
+    /// ⟨e_i⟩ of the version of component j with positive shear, minus that with negative shear.
+    fn extra(&self) -> Matrix {
+        let mean = |version: usize, i: usize| {
+            let all = || self.versions.iter().map(|versions| versions[version]);
+            let weights: f64 = all().map(|(_, weight)| weight).sum();
+            all().map(|(e, weight)| weight * e[i]).sum::<f64>() / weights
+        };
+        if self.versions.is_empty() {
+            return [[0.0; 2]; 2];
+        }
+        [0, 1].map(|i| [0, 1].map(|j| mean(2 * j, i) - mean(2 * j + 1, i)))
+    }
+
+    /// The coefficients of the terms of both components, in pixel axes or along and across the PSF, and the pivot of the
+    /// last term of each component alone.
+    fn solved(&self, terms: [&[Term]; 2], along_psf: bool, matrix: bool) -> [(Vec<f64>, f64); 2] {
+        let places: Vec<(usize, Term)> = (0..2)
+            .flat_map(|k| terms[k].iter().map(move |term| (k, *term)))
+            .collect();
+        let n = places.len();
+        let mut a = vec![vec![0.0; n + 1]; n];
+        let [[x11, x12], [x21, x22]] = self.extra();
+        let extra = match along_psf {
+            true => {
+                let (half, turn) = ((x11 + x22) / 2.0, (x12 - x21) / 2.0);
+                [[half, turn], [-turn, half]]
+            }
+            false => [[x11, x12], [x21, x22]],
+        };
+        for row in &self.rows {
+            let angle = match along_psf {
+                true => row.psf[1].atan2(row.psf[0]),
+                false => 0.0,
+            };
+            let turn = [[angle.cos(), angle.sin()], [-angle.sin(), angle.cos()]];
+            let turned = |v: [f64; 2]| [0, 1].map(|i| turn[i][0] * v[0] + turn[i][1] * v[1]);
+            let (e, g, psf) = (turned(row.e), turned(row.g), turned(row.psf));
+            let response = [[row.slope[0], row.cross[0]], [row.cross[1], row.slope[1]]];
+            let mut slope = [[0.0; 2]; 2];
+            for (i, j) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                slope[i][j] = row.weight * extra[i][j];
+                for (k, l) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                    slope[i][j] += turn[i][k] * response[k][l] * turn[j][l];
+                }
+            }
+            let z = |(k, term): (usize, Term)| match term {
+                One => 1.0,
+                Own => g[k],
+                Other => g[1 - k],
+                Square => g[k] * g[k],
+                Psf => psf[k],
+                PsfSize => psf[k] * row.psf_size,
+            };
+            for (equation, s) in a.iter_mut().zip(&places) {
+                for (value, t) in equation.iter_mut().zip(&places) {
+                    if s.0 == t.0 || matrix {
+                        *value += slope[s.0][t.0] * z(*s) * z(*t);
+                    }
+                }
+                equation[n] += row.weight * e[s.0] * z(*s);
+            }
+        }
+        let first = terms[0].len();
+        let blocks = [0..first, first..n];
+        let x = gauss(&a);
+        blocks.map(|block| {
+            // The inverse of the last element of the inverse of a component's own block.
+            let mut own: Vec<Vec<f64>> = a[block.clone()]
+                .iter()
+                .map(|row| row[block.clone()].to_vec())
+                .collect();
+            let last = own.len() - 1;
+            for (i, row) in own.iter_mut().enumerate() {
+                row.push(f64::from(i == last));
+            }
+            (x[block].to_vec(), 1.0 / gauss(&own)[last])
+        })
+    }
+}
+
+/// Gauss's elimination with the largest pivots.
+fn gauss(a: &[Vec<f64>]) -> Vec<f64> {
+    let (mut a, n) = (a.to_vec(), a.len());
+    for k in 0..n {
+        let largest = (k..n).max_by(|i, j| a[*i][k].abs().total_cmp(&a[*j][k].abs()));
+        a.swap(k, largest.unwrap());
+        for i in (0..n).filter(|i| *i != k) {
+            let factor = a[i][k] / a[k][k];
+            for j in k..=n {
+                a[i][j] -= factor * a[k][j];
+            }
+        }
+    }
+    (0..n).map(|k| a[k][n] / a[k][k]).collect()
+}
+
+fn of(sums: &UnitSums, truth: bool) -> Estimate {
+    estimate(sums, 0, truth, Errors::Jackknife).unwrap()
+}
+
+fn layouts() -> impl Iterator<Item = Layout> {
+    let all = [(false, false), (true, false), (false, true), (true, true)];
+    all.into_iter().map(|(versions, matrix)| Layout {
+        psf: true,
+        versions,
+        matrix,
+    })
+}
+
+/// Rounding errors of sums of sixty numbers, with the condition of six terms.
+const ROUNDING: f64 = 1e-9;
+
+#[test]
+fn every_estimate_solves_the_equations_of_the_crate() {
+    for layout in layouts() {
+        let sample = sample(3, layout.versions, layout.matrix);
+        let found = of(&sample.sums(layout), true);
+        let check = |key: &str, expected: f64| {
+            let value = found.value(key).unwrap().value;
+            assert!(
+                (value - expected).abs() < ROUNDING * expected.abs().max(1.0),
+                "{layout:?} {key}: {value}, expected {expected}"
+            );
+        };
+        let solved = |terms, along_psf| sample.solved(terms, along_psf, layout.matrix);
+        let main: &[Term] = &[One, Own];
+        for (along_psf, m, c) in [
+            (false, ["m1", "m2"], ["c1", "c2"]),
+            (true, ["m_plus", "m_cross"], ["c_plus", "c_cross"]),
+        ] {
+            for (k, (x, _)) in solved([main, main], along_psf).into_iter().enumerate() {
+                check(c[k], x[0]);
+                check(m[k], x[1] - 1.0);
+            }
+        }
+        let longer: [(_, &[Term]); 2] = [
+            (["q1", "q2"], &[One, Own, Square]),
+            (["m12", "m21"], &[One, Own, Other]),
+        ];
+        for (keys, more) in longer {
+            for (key, (x, _)) in keys.into_iter().zip(solved([more; 2], false)) {
+                check(key, x[2]);
+            }
+        }
+        let leakage: &[Term] = &[One, Own, Psf];
+        let [(x1, weight1), (x2, weight2)] = solved([leakage; 2], false);
+        check("alpha1", x1[2]);
+        check("alpha2", x2[2]);
+        check(
+            "alpha",
+            (x1[2] * weight1 + x2[2] * weight2) / (weight1 + weight2),
+        );
+        let with_size: &[Term] = &[One, Own, Psf, PsfSize];
+        let [(x1, weight1), (x2, weight2)] = solved([with_size; 2], false);
+        let weights: f64 = sample.rows.iter().map(|row| row.weight).sum();
+        let sizes = sample.rows.iter().map(|row| row.weight * row.psf_size);
+        let size = sizes.sum::<f64>() / weights;
+        check(
+            "alpha_size",
+            (x1[3] * weight1 + x2[3] * weight2) / (weight1 + weight2) * size,
+        );
+        let mean = |of: fn(&Row) -> f64| sample.rows.iter().map(of).sum::<f64>() / weights;
+        let extra = sample.extra();
+        check("r1", mean(|row| row.slope[0]) + extra[0][0]);
+        check("r2", mean(|row| row.slope[1]) + extra[1][1]);
+        if layout.matrix {
+            check("r12", mean(|row| row.cross[0]) + extra[0][1]);
+            check("r21", mean(|row| row.cross[1]) + extra[1][0]);
+        } else {
+            assert!(found.value("r12").is_none());
+        }
+    }
+}
+
+#[test]
+fn without_truth_or_with_one_shear_a_single_term_is_solved() {
+    for layout in layouts() {
+        let mut sample = sample(5, layout.versions, layout.matrix);
+        let solved = |sample: &Sample, terms| sample.solved([terms; 2], false, layout.matrix);
+        let null = of(&sample.sums(layout), false);
+        let leakage = [One, Psf];
+        for k in 0..2 {
+            let value = |key: &str| null.value(&format!("{key}{}", k + 1));
+            let expected = solved(&sample, &[One])[k].0[0];
+            assert!((value("c").unwrap().value - expected).abs() < ROUNDING);
+            let expected = solved(&sample, &leakage)[k].0[1];
+            assert!((value("alpha").unwrap().value - expected).abs() < ROUNDING);
+            assert!(value("m").is_none());
+        }
+        for row in &mut sample.rows {
+            row.g = [0.03, -0.02];
+        }
+        let single = of(&sample.sums(layout), true);
+        assert_eq!(single.assumes_no_c, [true; 2]);
+        for k in 0..2 {
+            let m = single.value(["m1", "m2"][k]).unwrap().value;
+            let expected = solved(&sample, &[Own])[k].0[0] - 1.0;
+            assert!((m - expected).abs() < ROUNDING * expected.abs().max(1.0));
+            let alpha = single.value(["alpha1", "alpha2"][k]).unwrap().value;
+            let expected = solved(&sample, &leakage)[k].0[1];
+            assert!((alpha - expected).abs() < ROUNDING);
+        }
+    }
+}
+
+#[test]
+fn equal_psfs_determine_no_leakage_and_equal_sizes_no_change_of_it() {
+    for layout in layouts() {
+        let mut sample = sample(4, layout.versions, layout.matrix);
+        for row in &mut sample.rows {
+            row.psf_size = 2.0;
+        }
+        let found = of(&sample.sums(layout), true);
+        assert!(found.value("alpha").is_some() && found.value("alpha_size").is_none());
+        for row in &mut sample.rows {
+            row.psf = [0.05, -0.02];
+        }
+        // A size that varies makes p times size vary, but not p.
+        sample.rows[7].psf_size = 3.0;
+        let found = of(&sample.sums(layout), true);
+        for key in ["alpha", "alpha1", "alpha2", "alpha_size"] {
+            assert!(found.value(key).is_none(), "{key}");
+        }
+    }
+}
+
+/// Galaxies without noise, e = R s, with the shear s of each component from g and the PSF.
+fn exact(layout: Layout, shear: impl Fn(&Row) -> [f64; 2]) -> Sample {
+    let mut sample = sample(8, layout.versions, layout.matrix);
+    // Equal galaxies in each version, so that no unit changes the response from versions.
+    if let Some(first) = sample.versions.first().copied() {
+        sample.versions.fill(first);
+    }
+    let extra = sample.extra();
+    for row in &mut sample.rows {
+        let (w, [s1, s2]) = (row.weight, shear(row));
+        let other = |k: usize| match layout.matrix {
+            true => row.cross[k] / w + extra[k][1 - k],
+            false => 0.0,
+        };
+        row.e = [
+            (row.slope[0] / w + extra[0][0]) * s1 + other(0) * s2,
+            other(1) * s1 + (row.slope[1] / w + extra[1][1]) * s2,
+        ];
+    }
+    sample
+}
+
+#[test]
+fn galaxies_without_noise_give_the_bias_that_they_have() {
+    type Shear = fn(&Row) -> [f64; 2];
+    let cases: [(Shear, &[(&str, f64)]); 5] = [
+        (
+            |row| [1.03 * row.g[0] + 2e-3, 0.95 * row.g[1] - 3e-3],
+            &[("m1", 0.03), ("m2", -0.05), ("c1", 2e-3), ("c2", -3e-3)],
+        ),
+        (
+            |row| row.g.map(|g| 1.03 * g + 0.7 * g * g + 1e-3),
+            &[("q1", 0.7), ("q2", 0.7)],
+        ),
+        (
+            |row| {
+                let [g1, g2] = row.g;
+                [1.03 * g1 + 0.2 * g2 + 1e-3, 0.95 * g2 - 0.1 * g1]
+            },
+            &[("m12", 0.2), ("m21", -0.1)],
+        ),
+        (
+            |row| [0, 1].map(|k| 1.03 * row.g[k] + 0.08 * row.psf[k] - 1e-3),
+            &[("alpha", 0.08), ("alpha1", 0.08), ("alpha2", 0.08)],
+        ),
+        (
+            |row| [0, 1].map(|k| row.g[k] + (0.08 + 0.05 * row.psf_size) * row.psf[k]),
+            &[],
+        ),
+    ];
+    for layout in layouts() {
+        for (shear, expected) in cases {
+            let sample = exact(layout, shear);
+            let found = of(&sample.sums(layout), true);
+            for (key, expected) in expected {
+                let measured = found.value(key).unwrap();
+                assert!(
+                    (measured.value - expected).abs() < ROUNDING && measured.error < ROUNDING,
+                    "{layout:?} {key}: {measured:?}, expected {expected}"
+                );
+            }
+            if expected.is_empty() {
+                let weights: f64 = sample.rows.iter().map(|row| row.weight).sum();
+                let sizes = sample.rows.iter().map(|row| row.weight * row.psf_size);
+                let expected = 0.05 * sizes.sum::<f64>() / weights;
+                let value = found.value("alpha_size").unwrap().value;
+                assert!((value - expected).abs() < ROUNDING, "{value}, {expected}");
+            }
+        }
+    }
+}
+
+#[test]
+fn equal_shears_of_both_components_have_no_bias_with_the_matrix() {
+    // R12 = R21 = 0.1 adds 0.1/0.8 and 0.1/0.7 to m if only the diagonal is used.
+    let sums = |matrix: bool| {
+        let layout = Layout {
+            matrix,
+            ..Layout::default()
+        };
+        let mut sums = UnitSums::new(layout, 1, 2);
+        for (catalogue, g) in [(0, 0.02), (1, -0.02)] {
+            for key in 0..10 {
+                let w = 1.0 + key as f64;
+                let row = Row {
+                    e: [0.8 * g + 0.1 * g, 0.1 * g + 0.7 * g],
+                    weight: w,
+                    slope: [0.8 * w, 0.7 * w],
+                    cross: [0.1 * w; 2],
+                    g: [g; 2],
+                    ..Row::default()
+                };
+                sums.add(catalogue, key, 0, &row);
+            }
+        }
+        sums.by_key()
+    };
+    let m = |matrix| ["m1", "m2"].map(|key| of(&sums(matrix), true).value(key).unwrap().value);
+    for (k, expected) in [0.1 / 0.8, 0.1 / 0.7].into_iter().enumerate() {
+        assert!(m(true)[k].abs() < 1e-14, "{:?}", m(true));
+        assert!((m(false)[k] - expected).abs() < 1e-14);
+    }
+}
+
+#[test]
+fn the_noise_of_a_star_changes_shear_before_the_response() {
+    // One star for all galaxies: the errors are those of its m and c, whatever the response is.
+    for layout in layouts() {
+        let sample = exact(layout, |row| row.g);
+        let constant = |value: f64| Range {
+            low: value,
+            high: value,
+        };
+        let mut sums = UnitSums::new(layout, 1, 2);
+        for (key, row) in (0..).zip(&sample.rows) {
+            for catalogue in 0..2 {
+                sums.add(catalogue, key, 0, row);
+            }
+        }
+        for (key, versions) in (0..).zip(&sample.versions) {
+            for (version, (e, weight)) in versions.iter().enumerate() {
+                for catalogue in 0..2 {
+                    sums.add_version(catalogue, key, 0, version, (*e, *weight));
+                }
+            }
+        }
+        let catalogue = Catalogue {
+            rows: 60,
+            shear: [constant(0.0); 2],
+            star: Some(StarNoise {
+                star: "one".into(),
+                m: 0.06,
+                c: 4e-3,
+            }),
+            ..Catalogue::default()
+        };
+        let catalogues = [catalogue.clone(), catalogue];
+        let grouping = group(sums, &catalogues, Design::Galaxies, Some(true), true);
+        let found = grouping.estimate(0, true, Errors::Jackknife).unwrap();
+        for (key, expected) in [("m1", 0.06), ("m2", 0.06), ("c1", 4e-3), ("c2", 4e-3)] {
+            let error = found.value(key).unwrap().error;
+            assert!((error - expected).abs() < 1e-9, "{layout:?} {key}: {error}");
+        }
+    }
+}
