@@ -9,7 +9,7 @@ use shearq_bias::{Design, Errors};
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 use shearq_render::table::TableFormat;
-use shearq_results::bias::columns::Names;
+use shearq_results::bias::columns::{Names, Shapes};
 use shearq_results::bias::folders::expand;
 use shearq_results::bias::truth::Truth;
 use shearq_results::bias::{
@@ -41,6 +41,17 @@ fn design_of(name: &str) -> PyResult<Design> {
         let names = ALL.map(Design::name).join(", ");
         PyValueError::new_err(format!("design: found {name:?}; expected one of {names}"))
     })
+}
+
+fn shapes_of(name: &str) -> PyResult<Shapes> {
+    match name {
+        "shear" => Ok(Shapes::Shear),
+        "distortion" => Ok(Shapes::Converted),
+        "responsivity" => Ok(Shapes::Responsivity),
+        _ => Err(PyValueError::new_err(format!(
+            "ellipticity: found {name:?}; expected 'shear', 'distortion' or 'responsivity'"
+        ))),
+    }
 }
 
 /// A table in memory: numbers or text by name.
@@ -138,7 +149,7 @@ pub(crate) fn bias_sums(
     catalogues: Vec<Given<'_>>,
     columns: Vec<String>,
     truth: Option<GivenTruth>,
-    distortion: Option<bool>,
+    ellipticity: Option<&str>,
     flip_g2: bool,
     bins: Option<(String, Option<usize>, Vec<f64>)>,
     select: Option<&str>,
@@ -205,7 +216,7 @@ pub(crate) fn bias_sums(
         catalogues: inputs,
         names,
         truth,
-        distortion,
+        shapes: ellipticity.map(shapes_of).transpose()?,
         flip_g2,
         bins,
         select: select

@@ -494,18 +494,17 @@ fn catalogue<'py>(
     Ok(columns)
 }
 
-/// The mean shear: g1 and g2, their covariance, the mean responses, and the number of galaxies.
-type Mean = ([f64; 2], [[f64; 2]; 2], [f64; 2], usize);
+/// The mean shear: g1 and g2, their covariance, the mean responses R11 and R22, R12 and R21, and the number of galaxies.
+type Mean = ([f64; 2], [[f64; 2]; 2], [f64; 2], [f64; 2], usize);
 
-/// The mean shear of galaxies without flags from columns e1, e2, R11, R22 and weights of one length. The covariance contains
-/// the noise of `stars`, which are numbers with the scatter of m and of c; `places` has the place of each galaxy's star among
-/// them.
+/// The mean shear of galaxies without flags from columns e1, e2, (R11, R22, R12, R21) and weights of one length. The covariance
+/// contains the noise of `stars`, which are numbers with the scatter of m and of c; `places` has the place of each galaxy's
+/// star among them.
 #[pyfunction]
 pub(crate) fn mean_shear(
     e1: PyReadonlyArray1<'_, f64>,
     e2: PyReadonlyArray1<'_, f64>,
-    r11: PyReadonlyArray1<'_, f64>,
-    r22: PyReadonlyArray1<'_, f64>,
+    responses: [PyReadonlyArray1<'_, f64>; 4],
     weights: PyReadonlyArray1<'_, f64>,
     stars: Vec<[f64; 3]>,
     places: PyReadonlyArray1<'_, i64>,
@@ -513,10 +512,14 @@ pub(crate) fn mean_shear(
     let mut sum = ShearSum::default();
     let mut shares = vec![[0.0; 2]; stars.len()];
     let e = e1.as_slice()?.iter().zip(e2.as_slice()?);
-    let responses = r11.as_slice()?.iter().zip(r22.as_slice()?);
     let weighted = weights.as_slice()?.iter().zip(places.as_slice()?);
-    for (((&e1, &e2), (&r11, &r22)), (&weight, &place)) in e.zip(responses).zip(weighted) {
-        sum.add([e1, e2], [r11, r22], weight);
+    let [r11, r22, r12, r21] = &responses;
+    let own = r11.as_slice()?.iter().zip(r22.as_slice()?);
+    let other = r12.as_slice()?.iter().zip(r21.as_slice()?);
+    for (((&e1, &e2), ((&r11, &r22), (&r12, &r21))), (&weight, &place)) in
+        e.zip(own.zip(other)).zip(weighted)
+    {
+        sum.add([e1, e2], [[r11, r12], [r21, r22]], weight);
         shares[place as usize][0] += weight * r11;
         shares[place as usize][1] += weight * r22;
     }
@@ -529,11 +532,13 @@ pub(crate) fn mean_shear(
         shear,
         mut covariance,
         response,
+        cross_response,
         galaxies,
         ..
     } = sum.mean().map_err(|error| {
         let argument = match error {
             MeanShearError::Response { component, .. } => format!("R{component}{component}"),
+            MeanShearError::Singular { .. } => "R11, R22, R12, R21".into(),
             _ => "weights".into(),
         };
         PyValueError::new_err(format!("{argument}: {error}"))
@@ -541,7 +546,7 @@ pub(crate) fn mean_shear(
     for (k, error) in noise.errors(shear).into_iter().enumerate() {
         covariance[k][k] += error * error;
     }
-    Ok((shear, covariance, response, galaxies))
+    Ok((shear, covariance, response, cross_response, galaxies))
 }
 
 /// Names, bits and meanings of the flags.

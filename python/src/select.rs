@@ -10,8 +10,8 @@ use pyo3::prelude::*;
 use shearq_files::FileError;
 use shearq_results::select::{Weighted, selection};
 
-/// Columns of a catalogue after a selection: e1, e2, R11 and R22 before calibration, and the weight.
-type Selected<'py> = [Bound<'py, PyArray1<f64>>; 5];
+/// Columns of a catalogue after a selection: e1, e2, R11, R22, R12 and R21 before calibration, and the weight.
+type Selected<'py> = [Bound<'py, PyArray1<f64>>; 7];
 
 /// Applies cuts and a weight to the columns of a catalogue.
 #[pyfunction]
@@ -42,8 +42,9 @@ pub(crate) fn select<'py>(
     let Weighted {
         e: [e1, e2],
         response: [r11, r22],
+        cross: [r12, r21],
         weight,
         ..
     } = weighted.map_err(|error| fault(&error))?;
-    Ok([e1, e2, r11, r22, weight].map(|values| values.into_pyarray(py)))
+    Ok([e1, e2, r11, r22, r12, r21, weight].map(|values| values.into_pyarray(py)))
 }

@@ -12,7 +12,7 @@ use crate::{Findings, tell};
 use shearq_files::{atomic, open};
 use shearq_pipeline::images::Shard;
 use shearq_render::figure::{Figure, PictureFormat};
-use shearq_results::bias::columns::Names;
+use shearq_results::bias::columns::{Names, Shapes, role_names};
 use shearq_results::bias::folders;
 use shearq_results::bias::truth::Truth;
 use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, sum};
@@ -22,7 +22,6 @@ use shearq_results::views::bias::{
     Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, junit, of_design,
     section,
 };
-use shearq_submissions::EllipticityType;
 
 /// Multiplicative and additive bias (m and c) of any program's catalogues.
 ///
@@ -57,15 +56,16 @@ pub(crate) struct Arguments {
     /// g1 and g2 of the catalogues, or the true shear of the data of a folder].
     #[arg(long, value_name = "FILE", conflicts_with = "merge")]
     truth: Option<PathBuf>,
-    /// Names of columns, such as `e1=g_1,e2=g_2,w=weight`; `ROLE=none` ignores a column that would be recognised.
+    // The roles are appended to this text.
     #[arg(
         long,
+        help = columns_help(),
         value_name = "ROLE=COLUMN",
         value_delimiter = ',',
         conflicts_with = "merge"
     )]
     columns: Vec<String>,
-    /// Type of the ellipticities [default: distortion for columns of HSM that are distortions, else shear].
+    /// Type of the ellipticities [default: responsivity for columns of HSM that are distortions, else shear].
     #[arg(long, value_enum, conflicts_with = "merge")]
     ellipticity: Option<TypeArgument>,
     /// Use minus the true g2.
@@ -136,13 +136,32 @@ pub(crate) struct Arguments {
 /// Artificial shear of metacalibration in ngmix and metadetect.
 const DEFAULT_STEP: f64 = 0.01;
 
+fn columns_help() -> String {
+    format!(
+        "Names of columns, such as `e1=g_1,e2=g_2,w=weight` or `e1=g1,e2=g2,e1_1p=g1_1p,e1_1m=g1_1m,e2_2p=g2_2p,e2_2m=g2_2m`; `ROLE=none` ignores a column that would be recognised. Roles: {}",
+        role_names()
+    )
+}
+
 /// Type of ellipticities on the command line.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum TypeArgument {
     /// (1 − q)/(1 + q) for an axis ratio q.
     Shear,
-    /// (1 − q²)/(1 + q²) for an axis ratio q.
+    /// (1 − q²)/(1 + q²) for an axis ratio q, each converted to a shear.
     Distortion,
+    /// The same, but the mean is divided by the responsivity 2(1 − e_rms²), as surveys do.
+    Responsivity,
+}
+
+impl From<TypeArgument> for Shapes {
+    fn from(given: TypeArgument) -> Self {
+        match given {
+            TypeArgument::Shear => Shapes::Shear,
+            TypeArgument::Distortion => Shapes::Converted,
+            TypeArgument::Responsivity => Shapes::Responsivity,
+        }
+    }
 }
 
 /// Designs on the command line.
@@ -239,20 +258,24 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         result => result?,
     };
-    let warnings = of_design(&result).into_iter();
-    for warning in warnings.chain(chosen_by_measurement(&result)) {
-        tell(format_args!("warning: {warning}"));
-    }
+    let warn = || {
+        let warnings = of_design(&result).into_iter();
+        for warning in warnings.chain(chosen_by_measurement(&result)) {
+            tell(format_args!("warning: {warning}"));
+        }
+    };
     if !arguments.against.is_empty() {
         let other = of_catalogues(arguments, &arguments.against)?;
         let difference = summed.difference(&other)?;
         let other = other.result(errors)?;
+        warn();
         if let Some(chosen) = chosen_by_measurement(&other) {
             tell(format_args!("warning: --against: {chosen}"));
         }
         let table = compared_table(&result, &other, &difference);
         return arguments.printing.print(&table);
     }
+    warn();
     let table = bias_table(&result);
     arguments.printing.check(&table)?;
     if let Some(plot) = &arguments.plot {
@@ -374,10 +397,6 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         }
         (None, None) => Truth::Columns,
     };
-    let types = arguments.ellipticity.map(|given| match given {
-        TypeArgument::Shear => EllipticityType::Shear,
-        TypeArgument::Distortion => EllipticityType::Distortion,
-    });
     let shard = arguments.shard.unwrap_or(Shard::WHOLE);
     if let (Some(_), Some(Edges::Equal(_))) = (
         arguments.shard,
@@ -392,7 +411,7 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         catalogues,
         names,
         truth,
-        distortion: types.map(|given| given == EllipticityType::Distortion),
+        shapes: arguments.ellipticity.map(Shapes::from),
         flip_g2: arguments.flip_g2,
         bins: arguments.bins.clone(),
         select: arguments.select.clone(),

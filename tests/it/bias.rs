@@ -793,3 +793,265 @@ fn differences_of_two_programs_have_paired_errors() {
     let message = fail(&["bias", &first, "--against", &second, "--bins", "e1:3"]);
     assert!(message.contains("truth or bins differ"), "{message}");
 }
+
+/// Catalogues under ±0.02 in both components with R = [[0.8, 0.1], [0.1, 0.7]], weights and two halves of `snr`.
+fn with_matrix(folder: &Path, names: [&str; 6]) -> [PathBuf; 2] {
+    [("plus", 0.02), ("minus", -0.02)].map(|(name, g)| {
+        let mut rng = ChaCha8Rng::seed_from_u64(12);
+        let mut text = format!("id,w,snr,{}\n", names.join(","));
+        for id in 0..200 {
+            let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+            let s = [0; 2].map(|_| 0.2 * normal() + g);
+            let (e1, e2) = (0.8 * s[0] + 0.1 * s[1], 0.1 * s[0] + 0.7 * s[1]);
+            writeln!(text, "{id},{},{id},{e1},{e2},0.8,0.7,0.1,0.1", 1 + id % 3).unwrap();
+        }
+        let path = folder.join(format!("{}-{name}.csv", names[2]));
+        fs::write(&path, text).unwrap();
+        path
+    })
+}
+
+#[test]
+fn a_response_matrix_is_used_in_bins_sums_and_differences() {
+    let folder = tempfile::tempdir().unwrap();
+    let truth = folder.path().join("truth.csv");
+    fs::write(
+        &truth,
+        "catalogue,g1,g2\nR11-plus.csv,0.02,0.02\nR11-minus.csv,-0.02,-0.02\nde1_dg1-plus.csv,0.02,0.02\nde1_dg1-minus.csv,-0.02,-0.02\n",
+    )
+    .unwrap();
+    let truth = text(&truth);
+    let zero = |row: &Value| {
+        for key in ["m1", "m2"] {
+            // The shapes are equal under both shears, so only rounding is left.
+            assert!(number(row, key).abs() < 1e-12, "{row}");
+        }
+    };
+    let files = with_matrix(folder.path(), ["e1", "e2", "R11", "R22", "R12", "R21"]);
+    let [plus, minus] = [text(&files[0]), text(&files[1])];
+    let options = ["--truth", truth, "--bins", "snr:2"];
+    let found = rows(&[&[plus, minus], &options[..]].concat());
+    assert_eq!(found.len(), 3);
+    found.iter().for_each(zero);
+    assert!((number(&found[0], "r12") - 0.1).abs() < 1e-12);
+    // Without R12 and R21 the error of the issue: 0.1/0.8 and 0.1/0.7.
+    let diagonal = rows(&[
+        plus,
+        minus,
+        "--truth",
+        truth,
+        "--columns",
+        "R12=none,R21=none",
+    ]);
+    assert!(
+        (number(&diagonal[0], "m1") - 0.125).abs() < 0.02,
+        "{diagonal:?}"
+    );
+    let sums = folder.path().join("sums");
+    succeed(&["bias", plus, minus, "--truth", truth, "--sums", text(&sums)]);
+    zero(&rows(&["--merge", text(&sums)])[0]);
+    let others = with_matrix(
+        folder.path(),
+        ["e1", "e2", "de1_dg1", "de2_dg2", "de1_dg2", "de2_dg1"],
+    );
+    let against = [text(&others[0]), text(&others[1])];
+    let compared = rows(&[
+        plus,
+        minus,
+        "--truth",
+        truth,
+        "--against",
+        against[0],
+        against[1],
+    ]);
+    compared.iter().for_each(zero);
+}
+
+/// REGAUSS distortions of galaxies under ±0.03, some with moduli above 1, with weights and HSC's columns.
+fn regauss(folder: &Path, columns: [&str; 4]) -> [PathBuf; 2] {
+    [("plus", 0.03), ("minus", -0.03)].map(|(name, g)| {
+        let mut rng = ChaCha8Rng::seed_from_u64(23);
+        let mut text = format!("{},g1,g2\n", columns.join(","));
+        for id in 0..GALAXIES {
+            let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+            let shape = shearq_quantities::Shear::new(0.2 * normal(), 0.2 * normal());
+            let chi = shape
+                .sheared_by(shearq_quantities::Shear::new(g, -g))
+                .to_distortion();
+            let noise = [0.3 * normal(), 0.3 * normal()];
+            let (weight, rms) = (1 + id % 4, 0.36 + 0.01 * (id % 4) as f64);
+            let (e1, e2) = (chi.e1 + noise[0], chi.e2 + noise[1]);
+            writeln!(text, "{e1},{e2},{weight},{rms},{g},{}", -g).unwrap();
+        }
+        let path = folder.join(format!("{name}.csv"));
+        fs::write(&path, text).unwrap();
+        path
+    })
+}
+
+/// A text without its line breaks.
+fn words(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+#[test]
+fn mean_distortions_are_divided_by_the_responsivity() {
+    let folder = tempfile::tempdir().unwrap();
+    let files = regauss(
+        folder.path(),
+        [
+            "i_hsmshaperegauss_e1",
+            "i_hsmshaperegauss_e2",
+            "i_hsmshaperegauss_derived_weight",
+            "i_hsmshaperegauss_derived_rms_e",
+        ],
+    );
+    let [plus, minus] = [text(&files[0]), text(&files[1])];
+    // ⟨w χ⟩/(2 ⟨w⟩ (1 − ⟨w e_rms²⟩/⟨w⟩)) by plain loops.
+    let (mut e, mut response, mut noisy) = ([[0.0; 2]; 2], [0.0; 2], [0.0; 2]);
+    for (place, path) in files.iter().enumerate() {
+        for line in fs::read_to_string(path).unwrap().lines().skip(1) {
+            let values: Vec<f64> = line.split(',').map(|own| own.parse().unwrap()).collect();
+            let [e1, e2, w, rms, ..] = values[..] else {
+                panic!("{line}")
+            };
+            e[place][0] += w * e1;
+            e[place][1] += w * e2;
+            response[place] += 2.0 * w * (1.0 - rms * rms);
+            noisy[place] += 2.0 * w * (1.0 - 0.5 * (e1 * e1 + e2 * e2) + 0.09);
+        }
+    }
+    let expected = |response: [f64; 2]| {
+        [0.03, -0.03].map(|g| {
+            let k = usize::from(g < 0.0);
+            (e[0][k] / response[0] - e[1][k] / response[1]) / (2.0 * g) - 1.0
+        })
+    };
+    // The first is a ratio for each catalogue, the estimate one of both: the difference is of second order.
+    let check = |row: &Value, expected: [f64; 2]| {
+        for (key, expected) in ["m1", "m2"].into_iter().zip(expected) {
+            let value = number(row, key);
+            assert!(
+                (value - expected).abs() < 1e-3,
+                "{key}: {value}, {expected}"
+            );
+        }
+    };
+    check(&rows(&[plus, minus])[0], expected(response));
+    let printed = succeed(&["bias", plus, minus]);
+    for part in [
+        "Columns: HSC Y3.",
+        "rms_e=i_hsmshaperegauss_derived_rms_e",
+        "e_rms from i_hsmshaperegauss_derived_rms_e",
+    ] {
+        assert!(words(&printed).contains(part), "{part}: {printed}");
+    }
+    assert!(!printed.contains("Left out"), "{printed}");
+    // Without the column, the scatter of the catalogue less its noise.
+    let lines = files.each_ref().map(|path| {
+        let text = fs::read_to_string(path).unwrap();
+        let text = text.replace(",0.36,", ",0.3,").replace(",0.37,", ",0.3,");
+        let text = text.replace(",0.38,", ",0.3,").replace(",0.39,", ",0.3,");
+        fs::write(path, text).unwrap();
+        path
+    });
+    let sigma = "rms_e=none,sigma_e=i_hsmshaperegauss_derived_rms_e";
+    let found = rows(&[text(lines[0]), text(lines[1]), "--columns", sigma]);
+    check(&found[0], expected(noisy));
+}
+
+#[test]
+fn shears_of_ksb_replace_distortions_of_minus_ten() {
+    let folder = tempfile::tempdir().unwrap();
+    let mean = |lines: &str| {
+        let path = folder.path().join("hsm.csv");
+        let head = "corrected_e1,corrected_e2,corrected_g1,corrected_g2\n";
+        fs::write(&path, format!("{head}{lines}")).unwrap();
+        let row = &rows(&[text(&path)])[0];
+        [number(row, "c1"), number(row, "c2")]
+    };
+    let ksb = mean("-10,-10,0.1,0.2\n-10,-10,0.3,-0.1\n-10,-10,0.2,-0.1\n");
+    assert!(
+        (ksb[0] - 0.2).abs() < 1e-12 && ksb[1].abs() < 1e-12,
+        "{ksb:?}"
+    );
+    // A distortion of 0.2 and 0.1 has a response of 2 (1 − 0.025).
+    let both = mean(&"-10,-10,0.1,0.2\n0.2,0.1,-10,-10\n".repeat(20));
+    assert!((both[0] - 0.3 / 2.95).abs() < 1e-12, "{both:?}");
+}
+
+#[test]
+fn a_selection_without_its_response_is_always_noted() {
+    let folder = tempfile::tempdir().unwrap();
+    let [plus, minus] = pair(folder.path());
+    let said = |select: &str| {
+        let output = shearq(&["bias", text(&plus), text(&minus), "--select", select]);
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let warning = said("snr > 20");
+    for part in ["a choice by `snr`", "−0.11", "snr_1p"] {
+        assert!(warning.contains(part), "{part}: {warning}");
+    }
+    assert_eq!(said("id > 20"), "");
+}
+
+#[test]
+fn sizes_of_versions_give_the_response_of_a_selection() {
+    // As DES Y1: responses of galaxies, and only the selected quantity in sheared versions.
+    let folder = tempfile::tempdir().unwrap();
+    let files = [("plus", 0.02), ("minus", -0.02)].map(|(name, g)| {
+        let mut rng = ChaCha8Rng::seed_from_u64(31);
+        let mut text = String::from("id,e1,e2,R11,R22,T,T_1p,T_1m,T_2p,T_2m,g1,g2\n");
+        for id in 0..20_000 {
+            let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+            let shape = [0; 2].map(|_| 0.2 * normal());
+            let size = (0.4 * normal()).exp();
+            let e = shape.map(|shape| shape + g);
+            let of = |h: [f64; 2]| {
+                let along: f64 = (0..2).map(|k| shape[k] * (g + h[k])).sum();
+                size * (1.0 + 2.0 * along)
+            };
+            let versions = [
+                [0.0; 2],
+                [0.01, 0.0],
+                [-0.01, 0.0],
+                [0.0, 0.01],
+                [0.0, -0.01],
+            ];
+            let sizes = versions.map(|h| of(h).to_string()).join(",");
+            writeln!(text, "{id},{},{},1,1,{sizes},{g},{g}", e[0], e[1]).unwrap();
+        }
+        let path = folder.path().join(format!("{name}.csv"));
+        fs::write(&path, text).unwrap();
+        path
+    });
+    let [plus, minus] = [text(&files[0]), text(&files[1])];
+    let found = &rows(&[plus, minus, "--select", "T > 1"])[0];
+    for key in ["m1", "m2"] {
+        let (m, error) = (number(found, key), number(found, &format!("{key}_error")));
+        assert!(
+            m.abs() < 4.0 * error && error < 0.02,
+            "{key}: {m} ± {error}"
+        );
+    }
+    // The response of the selection is about 2 σ² times the density of ln T at the cut over the share: 0.16.
+    assert!(number(found, "r1") > 1.1, "{found}");
+    let printed = shearq(&["bias", plus, minus, "--select", "T > 1"]);
+    assert!(printed.stderr.is_empty());
+}
+
+#[test]
+fn an_unused_weight_of_zero_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("c.csv");
+    fs::write(&path, "e1,e2,my_weight\n0.1,0.2,1\n0.2,0.1,0\n0.3,0.3,2\n").unwrap();
+    let error = fail(&["bias", text(&path)]);
+    assert!(
+        error.contains("row 2: `my_weight` looks like a weight"),
+        "{error}"
+    );
+    let used = rows(&[text(&path), "--columns", "w=my_weight"]);
+    assert_eq!(number(&used[0], "n"), 2.0);
+    let declined = rows(&[text(&path), "--columns", "w=none"]);
+    assert_eq!(number(&declined[0], "n"), 3.0);
+}

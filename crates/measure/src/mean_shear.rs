@@ -2,17 +2,19 @@
 
 use thiserror::Error;
 
+use crate::measurement::ResponseMatrix;
+
 /// The mean shear of many galaxies.
 ///
-/// For the component k with weights w, ellipticities e and responses R,
+/// For weights w, ellipticities e = (e1, e2) and 2 × 2 responses R,
 ///
 /// ```text
-/// g_k      = Σ w e_k / Σ w R_kk
-/// cov(k,l) = n/(n − 1) · Σ w² (e_k − g_k R_kk)(e_l − g_l R_ll) / (Σ w R_kk · Σ w R_ll)
+/// g   = (Σ w R)⁻¹ Σ w e
+/// cov = n/(n − 1) · (Σ w R)⁻¹ [Σ w² (e − R g)(e − R g)ᵀ] (Σ w R)⁻ᵀ
 /// ```
 ///
 /// This is the covariance of a ratio of two means to first order (Cochran 1977, Sampling Techniques, §6.3). The
-/// residual e − gR contains the scatter of the responses, so the error includes the error of the mean response. A
+/// residual e − R g contains the scatter of the responses, so the error includes the error of the mean response. A
 /// common factor on ellipticities and responses changes nothing. The galaxies must be independent: pairs that are
 /// rotated by 90° make the error too large, and copies make it too small.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,6 +26,8 @@ pub struct MeanShear {
     pub covariance: [[f64; 2]; 2],
     /// Weighted mean responses R11 and R22.
     pub response: [f64; 2],
+    /// Weighted mean responses R12 of e1 to g2 and R21 of e2 to g1.
+    pub cross_response: [f64; 2],
     /// Galaxies with a positive weight.
     pub galaxies: usize,
 }
@@ -50,6 +54,12 @@ pub enum MeanShearError {
         /// The mean response.
         found: f64,
     },
+    /// The mean response matrix has no positive determinant.
+    #[error("the determinant of the mean response is {found} (expected a positive number)")]
+    Singular {
+        /// R11 R22 − R12 R21 of the mean responses.
+        found: f64,
+    },
 }
 
 /// Weighted sums over galaxies, from which [`MeanShear`] follows. Galaxies are added one by one.
@@ -57,28 +67,31 @@ pub enum MeanShearError {
 pub struct ShearSum {
     weight: f64,
     e: [f64; 2],
-    response: [f64; 2],
-    /// Sums of squared weights times products of (e1, e2, R11, R22).
-    products: [[f64; 4]; 4],
+    response: ResponseMatrix,
+    /// Sums of squared weights times products of (e1, e2, R11, R22, R12, R21).
+    products: [[f64; 6]; 6],
     galaxies: usize,
 }
 
 impl ShearSum {
-    /// Adds a galaxy without a flag, with its responses (R11, R22) and a weight.
+    /// Adds a galaxy without a flag, with its response and a weight.
     ///
-    /// Ellipticity and response must both be divided by the mean response, or neither. The response is 1 for
+    /// Ellipticity and response must both be divided by the mean response, or neither. The response is the unit matrix for
     /// ellipticities without calibration. A weight of zero adds nothing. The weight must not depend on the measured
     /// ellipticity.
-    pub fn add(&mut self, e: [f64; 2], response: [f64; 2], weight: f64) {
+    pub fn add(&mut self, e: [f64; 2], response: ResponseMatrix, weight: f64) {
         if weight == 0.0 {
             return;
         }
         self.galaxies += 1;
         self.weight += weight;
-        let values = [e[0], e[1], response[0], response[1]];
+        let [[r11, r12], [r21, r22]] = response;
+        let values = [e[0], e[1], r11, r22, r12, r21];
         for k in 0..2 {
             self.e[k] += weight * e[k];
-            self.response[k] += weight * response[k];
+            for j in 0..2 {
+                self.response[k][j] += weight * response[k][j];
+            }
         }
         for (row, a) in self.products.iter_mut().zip(values) {
             for (sum, b) in row.iter_mut().zip(values) {
@@ -95,33 +108,70 @@ impl ShearSum {
         if self.galaxies == 0 {
             return Err(MeanShearError::NoGalaxies);
         }
-        let response = self.response.map(|sum| sum / self.weight);
+        let [[r11, r12], [r21, r22]] = self.response;
+        let response = [r11, r22].map(|sum| sum / self.weight);
         for (k, &found) in response.iter().enumerate() {
             if !(found > 0.0 && found.is_finite()) {
                 let component = k + 1;
                 return Err(MeanShearError::Response { component, found });
             }
         }
-        let shear = [0, 1].map(|k| self.e[k] / self.response[k]);
+        let determinant = r11 * r22 - r12 * r21;
+        if determinant <= 0.0 {
+            return Err(MeanShearError::Singular {
+                found: determinant / (self.weight * self.weight),
+            });
+        }
+        // A quotient has fewer roundings than an inverse.
+        let diagonal = r12 == 0.0 && r21 == 0.0;
+        let [e1, e2] = self.e;
+        let shear = match diagonal {
+            true => [e1 / r11, e2 / r22],
+            false => [r22 * e1 - r12 * e2, r11 * e2 - r21 * e1].map(|sum| sum / determinant),
+        };
         let n = self.galaxies as f64;
-        let covariance = [0, 1].map(|k| {
+        let squares = [0, 1].map(|k| {
             [0, 1].map(|l| {
+                // e_k − g_k R_kk − g_j R_kj as coefficients of (e1, e2, R11, R22, R12, R21).
                 let [ee, er] = [self.products[k][l], self.products[k][2 + l]];
                 let [re, rr] = [self.products[2 + k][l], self.products[2 + k][2 + l]];
-                let residuals = ee - shear[l] * er - shear[k] * re + shear[k] * shear[l] * rr;
+                let (k_other, l_other) = (shear[1 - k], shear[1 - l]);
+                let mut residuals = ee - shear[l] * er - shear[k] * re + shear[k] * shear[l] * rr;
+                if !diagonal {
+                    let [ex, rx] = [self.products[k][4 + l], self.products[2 + k][4 + l]];
+                    let [xe, xr] = [self.products[4 + k][l], self.products[4 + k][2 + l]];
+                    residuals -= l_other * (ex - shear[k] * rx) + k_other * (xe - shear[l] * xr);
+                    residuals += k_other * l_other * self.products[4 + k][4 + l];
+                }
                 // Rounding may leave a sum of squares below zero.
                 let residuals = if k == l {
                     residuals.max(0.0)
                 } else {
                     residuals
                 };
-                n / (n - 1.0) * residuals / (self.response[k] * self.response[l])
+                n / (n - 1.0) * residuals
             })
         });
+        let covariance = match diagonal {
+            true => [0, 1].map(|k| {
+                [0, 1].map(|l| squares[k][l] / (self.response[k][k] * self.response[l][l]))
+            }),
+            false => {
+                let inverse = [[r22, -r12], [-r21, r11]].map(|row| row.map(|r| r / determinant));
+                [0, 1].map(|k| {
+                    [0, 1].map(|l| {
+                        let row = [0, 1]
+                            .map(|j| inverse[k][0] * squares[0][j] + inverse[k][1] * squares[1][j]);
+                        row[0] * inverse[l][0] + row[1] * inverse[l][1]
+                    })
+                })
+            }
+        };
         Ok(MeanShear {
             shear,
             covariance,
             response,
+            cross_response: [r12, r21].map(|sum| sum / self.weight),
             galaxies: self.galaxies,
         })
     }
@@ -136,6 +186,60 @@ mod tests {
     use super::*;
 
     const TRUE_SHEAR: [f64; 2] = [0.08, -0.05];
+
+    fn diagonal([r11, r22]: [f64; 2]) -> ResponseMatrix {
+        [[r11, 0.0], [0.0, r22]]
+    }
+
+    #[test]
+    fn a_response_matrix_in_other_axes_gives_the_same_shear_and_error() {
+        // Axes that make every response diagonal give the values of two quotients.
+        let (cos, sin) = (0.8, 0.6);
+        let turned = |[a, b]: [f64; 2]| [cos * a - sin * b, sin * a + cos * b];
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let [mut plain, mut other] = [ShearSum::default(); 2];
+        for _ in 0..50 {
+            let (e, [r1, r2], weight) = galaxy(&mut rng, true);
+            plain.add(e, diagonal([r1, r2]), weight);
+            let mixed = cos * sin * (r1 - r2);
+            let response = [
+                [cos * cos * r1 + sin * sin * r2, mixed],
+                [mixed, sin * sin * r1 + cos * cos * r2],
+            ];
+            other.add(turned(e), response, weight);
+        }
+        let (plain, other) = (plain.mean().unwrap(), other.mean().unwrap());
+        let [[a, b], [_, d]] = plain.covariance;
+        let covariance = [
+            cos * cos * a - 2.0 * cos * sin * b + sin * sin * d,
+            sin * sin * a + 2.0 * cos * sin * b + cos * cos * d,
+        ];
+        for (k, expected) in turned(plain.shear).into_iter().enumerate() {
+            assert!((other.shear[k] - expected).abs() < 1e-13);
+            assert!((other.covariance[k][k] - covariance[k]).abs() < 1e-13);
+        }
+        let b = cos * sin * (a - d) + (cos * cos - sin * sin) * b;
+        assert!((other.covariance[0][1] - b).abs() < 1e-13 && b != 0.0);
+        let r = cos * sin * (plain.response[0] - plain.response[1]);
+        assert!(other.cross_response.iter().all(|x| (x - r).abs() < 1e-13));
+    }
+
+    #[test]
+    fn equal_shears_need_the_responses_to_the_other_component() {
+        let mut sum = ShearSum::default();
+        for _ in 0..2 {
+            sum.add([0.9 * 0.02, 0.8 * 0.02], [[0.8, 0.1], [0.1, 0.7]], 1.5);
+        }
+        let mean = sum.mean().unwrap();
+        assert!(mean.shear.iter().all(|g| (g - 0.02).abs() < 1e-15));
+        assert!(mean.error().iter().all(|error| *error < 1e-8));
+        let mut singular = ShearSum::default();
+        singular.add([0.1; 2], [[0.5; 2]; 2], 1.0);
+        assert_eq!(
+            singular.mean(),
+            Err(MeanShearError::Singular { found: 0.0 })
+        );
+    }
 
     /// A galaxy whose ellipticity responds to shear by its response, or by the mean response only.
     fn galaxy(rng: &mut ChaCha8Rng, own_response: bool) -> ([f64; 2], [f64; 2], f64) {
@@ -162,7 +266,7 @@ mod tests {
             let mut moments = [0.0; 3];
             for _ in 0..GALAXIES {
                 let (e, response, weight) = galaxy(&mut rng, own_response);
-                sum.add(e, response, weight);
+                sum.add(e, diagonal(response), weight);
                 for (moment, power) in moments.iter_mut().zip(0..) {
                     *moment += e[0].powi(power);
                 }
@@ -222,10 +326,11 @@ mod tests {
         let [mut one, mut other] = [ShearSum::default(); 2];
         for _ in 0..50 {
             let (e, response, weight) = galaxy(&mut rng, true);
-            one.add(e, response, weight);
+            one.add(e, diagonal(response), weight);
             // Powers of two scale without rounding.
             let response = [4.0 * response[0], 0.5 * response[1]];
-            other.add([4.0 * e[0], 0.5 * e[1]], response, 8.0 * weight);
+            let e = [4.0 * e[0], 0.5 * e[1]];
+            other.add(e, diagonal(response), 8.0 * weight);
         }
         let (one, other) = (one.mean().unwrap(), other.mean().unwrap());
         assert_eq!(one.shear, other.shear);
@@ -237,14 +342,14 @@ mod tests {
     fn weights_of_zero_do_not_count() {
         let mut sum = ShearSum::default();
         assert_eq!(sum.mean(), Err(MeanShearError::NoGalaxies));
-        sum.add([f64::MAX; 2], [1.0; 2], 0.0);
+        sum.add([f64::MAX; 2], diagonal([1.0; 2]), 0.0);
         assert_eq!(sum.mean(), Err(MeanShearError::NoGalaxies));
-        sum.add([0.1, 0.2], [0.5, 2.0], 3.0);
+        sum.add([0.1, 0.2], diagonal([0.5, 2.0]), 3.0);
         let mean = sum.mean().unwrap();
         assert_eq!(mean.galaxies, 1);
         assert!((mean.shear[0] - 0.2).abs() < 1e-15 && (mean.shear[1] - 0.1).abs() < 1e-15);
         assert!(mean.error()[0].is_nan());
-        sum.add([0.1, 0.2], [-5.0, 2.0], 3.0);
+        sum.add([0.1, 0.2], diagonal([-5.0, 2.0]), 3.0);
         let error = sum.mean().unwrap_err();
         assert!(
             matches!(error, MeanShearError::Response { component: 1, .. }),

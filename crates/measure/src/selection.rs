@@ -110,8 +110,8 @@ impl fmt::Debug for Selection {
 pub struct Selected {
     /// Weighted ellipticity, before calibration.
     pub e: [f64; 2],
-    /// Diagonal of its response to shear.
-    pub response: [f64; 2],
+    /// Its response to shear. Changes with noise are corrected on the diagonal; off it they vanish in the mean.
+    pub response: ResponseMatrix,
     /// The weight; zero for galaxies that are cut.
     pub weight: f64,
 }
@@ -216,10 +216,12 @@ impl Selection {
                 + w_f * t_ef
                 + w_s * t_es
                 + 0.5 * e[k] * (curved(t_ff, t_fs, t_ss) + w_s * t_s);
-            selected.response[k] = w.value * response[k][k]
-                + e[k] * (w_f * galaxy.flux_response[k] + w_s * galaxy.size_response[k])
-                - 2.0 * (w_f * e_f + w_s * e_s)
-                - e[k] * curved(ff, fs, ss);
+            for j in 0..2 {
+                selected.response[k][j] = w.value * response[k][j]
+                    + e[k] * (w_f * galaxy.flux_response[j] + w_s * galaxy.size_response[j]);
+            }
+            selected.response[k][k] -= 2.0 * (w_f * e_f + w_s * e_s);
+            selected.response[k][k] -= e[k] * curved(ff, fs, ss);
         }
         selected
     }
@@ -397,7 +399,7 @@ mod tests {
         let e = [0.1, -0.2];
         let all: Selection = "snr > 5".parse().unwrap();
         let kept = all.apply(e, RESPONSE, &galaxy());
-        assert_eq!((kept.e, kept.response, kept.weight), (e, [0.4, 0.3], 1.0));
+        assert_eq!((kept.e, kept.response, kept.weight), (e, RESPONSE, 1.0));
         let none: Selection = "snr < 5".parse().unwrap();
         assert_eq!(none.apply(e, RESPONSE, &galaxy()), Selected::default());
     }
@@ -420,7 +422,14 @@ mod tests {
         // Rounding of second differences.
         let close = |a: f64, b: f64| (a - b).abs() < 1e-6;
         assert!(
-            close(found.response[0], first) && close(found.response[1], second),
+            close(found.response[0][0], first) && close(found.response[1][1], second),
+            "{found:?}"
+        );
+        // To the other component, flux and size respond as they do to this component.
+        let first = w * RESPONSE[0][1] + 0.1 * (-w_f + w_s * 0.4);
+        let second = w * RESPONSE[1][0] - 0.2 * (w_f * 3.0 + w_s * 0.2);
+        assert!(
+            close(found.response[0][1], first) && close(found.response[1][0], second),
             "{found:?}"
         );
         assert!(close(found.e[0], e1) && close(found.e[1], e2), "{found:?}");

@@ -9,7 +9,6 @@ pub mod positions;
 mod read;
 pub mod truth;
 
-use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -23,7 +22,7 @@ use thiserror::Error;
 
 use crate::expression::Expression;
 use crate::select::StatedSelection;
-use columns::{Names, Preset, Role};
+use columns::{Names, Preset, Role, Shapes};
 use read::{Reading, Source};
 use truth::Truth;
 
@@ -98,8 +97,8 @@ pub struct Request {
     pub names: Names,
     /// True shear.
     pub truth: Truth,
-    /// Whether ellipticities are distortions; `None` if the names of the columns decide.
-    pub distortion: Option<bool>,
+    /// How ellipticities become shears; `None` if the names of the columns decide.
+    pub shapes: Option<Shapes>,
     /// Whether the true g2 has the opposite sign.
     pub flip_g2: bool,
     /// Bins.
@@ -144,6 +143,9 @@ pub struct Summed {
     measured: Vec<String>,
     /// Which rows count, and their weights, in words of the options.
     selection: Option<String>,
+    /// Which columns are used as what, and which look as if they should be.
+    #[serde(default)]
+    columns: Vec<String>,
 }
 
 /// Sums whose units are joined.
@@ -191,11 +193,12 @@ pub struct BiasResult {
     pub catalogues: Vec<Catalogue>,
     /// The program that wrote them.
     pub program: String,
-    /// Columns of `--select` or `--bins` that were measured on the galaxies of shearq's catalogues: m contains how shear
-    /// changes this choice.
+    /// Columns of `--select` or `--bins` without sheared versions: m contains how shear changes this choice.
     pub measured: Vec<String>,
     /// The texts of the options that select and weight rows, such as `select: snr > 10`.
     pub selection: Option<String>,
+    /// Which columns are used as what, and which look as if they should be, a line each.
+    pub columns: Vec<String>,
 }
 
 impl BiasResult {
@@ -232,7 +235,7 @@ impl Request {
         Ok(Reading {
             names: self.names.clone(),
             truth: self.truth.of_paths(paths)?,
-            distortion: self.distortion,
+            shapes: self.shapes,
             flip_g2: self.flip_g2,
             select: self.select.clone(),
             selection: self
@@ -269,18 +272,13 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let layout = Layout {
         psf: first.has_psf(),
         versions: first.has_version_rows() || first.selects_versions(&reading),
+        matrix: first.has_matrix(&reading),
     };
-    let expressions = [
-        request.select.as_ref(),
-        request.bins.as_ref().map(|bins| &bins.of),
-    ];
-    let by = expressions.into_iter().flatten();
-    let measured = by
-        .flat_map(|by| first.measured(by))
-        .collect::<BTreeSet<_>>();
-    let measured = measured.into_iter().collect();
-    let (truth, response) = (known(&request.truth, first), has_response(first));
-    check_columns(request, &all)?;
+    let measured = first.unanswered().to_vec();
+    let truth = known(&request.truth, first);
+    let response = has_response(first) || first.shapes(&reading) != Shapes::Shear;
+    let described = first.described(&reading);
+    check_columns(request, &reading, &all)?;
     let edges = match &request.bins {
         None => Vec::new(),
         Some(bins) => match &bins.edges {
@@ -330,9 +328,9 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         version: env!("CARGO_PKG_VERSION").into(),
         sums,
         catalogues,
-        program: first.columns.preset.name().into(),
+        program: first.columns.program().into(),
         truth,
-        response: response || request.distortion.is_some(),
+        response: response || request.shapes.is_some(),
         response_column: first.columns.have(&[Role::R11]),
         matched: named_unit || first.columns.of(Role::Id).is_some(),
         unit_column: first.unit_column.clone().filter(|_| !named_unit),
@@ -349,16 +347,22 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         edges,
         measured,
         selection: request.stated_selection(),
+        columns: described,
     })
 }
 
 /// Refuses catalogues with other columns than the first one.
-fn check_columns(request: &Request, all: &[Vec<Source>]) -> Result<(), BiasFailure> {
+fn check_columns(
+    request: &Request,
+    reading: &Reading,
+    all: &[Vec<Source>],
+) -> Result<(), BiasFailure> {
     let kind = |source: &Source| {
         (
             known(&request.truth, source),
             has_response(source),
             source.has_psf(),
+            source.has_matrix(reading),
             source.columns.preset,
         )
     };
@@ -563,6 +567,7 @@ impl Summed {
             program: self.program.clone(),
             measured: self.measured.clone(),
             selection: self.selection.clone(),
+            columns: self.columns.clone(),
         })
     }
 
@@ -631,6 +636,7 @@ impl Summed {
             program: format!("{} minus {}", self.program, other.program),
             measured: Vec::new(),
             selection: self.selection.clone(),
+            columns: self.columns.clone(),
         })
     }
 

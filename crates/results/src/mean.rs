@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
-use shearq_measure::{Flag, Flags, MeanShear, Selection, ShearSum, Warning};
+use shearq_measure::{Flag, Flags, MeanShear, ResponseMatrix, Selection, ShearSum, Warning};
 use shearq_pipeline::data::run::Run;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
@@ -130,7 +130,7 @@ fn mean_of(
             sum.add(e, response, 1.0);
             for k in 0..2 {
                 moments[k].add(e[k]);
-                share[k] += response[k];
+                share[k] += response[k][k];
             }
         }
         stars.add(of_catalogue(path, format)?, share);
@@ -163,8 +163,8 @@ struct Rows {
     /// Before calibration.
     e: [Vec<f64>; 2],
     flags: Vec<f64>,
-    /// R11 and R22 of configurations with a calibration.
-    response: Option<[Vec<f64>; 2]>,
+    /// R11 and R22, and R12 and R21, of configurations with a calibration.
+    response: Option<[[Vec<f64>; 2]; 2]>,
     /// Whether a selection leaves the galaxy out.
     cut: Vec<bool>,
 }
@@ -173,7 +173,7 @@ impl Rows {
     fn read(path: &Path, calibrated: bool) -> Result<Self, FileError> {
         let mut names = vec!["e1", "e2", "flags"];
         if calibrated {
-            names.extend(["R11", "R22", "divisor1", "divisor2"]);
+            names.extend(["R11", "R22", "R12", "R21", "divisor1", "divisor2"]);
         }
         let read = table::read(path, Some(&names), table::MAX_ROWS)?;
         let column = |name| table::numbers(&read, name, path).map(Cow::into_owned);
@@ -181,7 +181,10 @@ impl Rows {
         let mut e = [column("e1")?, column("e2")?];
         let mut response = None;
         if calibrated {
-            response = Some([column("R11")?, column("R22")?]);
+            response = Some([
+                [column("R11")?, column("R22")?],
+                [column("R12")?, column("R21")?],
+            ]);
             for (e, name) in e.iter_mut().zip(["divisor1", "divisor2"]) {
                 for (e, divisor) in e.iter_mut().zip(column(name)?) {
                     *e *= divisor;
@@ -204,7 +207,7 @@ impl Rows {
             cut: cut.collect(),
             e: weighted.e,
             flags,
-            response: Some(weighted.response),
+            response: Some([weighted.response, weighted.cross]),
         })
     }
 
@@ -216,10 +219,12 @@ impl Rows {
         self.e(row).iter().all(|e| e.is_finite())
     }
 
-    /// R11 and R22; 1 for ellipticities without calibration.
-    fn response(&self, row: usize) -> [f64; 2] {
-        let response = self.response.as_ref();
-        response.map_or([1.0; 2], |all| [0, 1].map(|k| all[k][row]))
+    /// The unit matrix for ellipticities without calibration.
+    fn response(&self, row: usize) -> ResponseMatrix {
+        let Some([[r11, r22], [r12, r21]]) = &self.response else {
+            return [[1.0, 0.0], [0.0, 1.0]];
+        };
+        [[r11[row], r12[row]], [r21[row], r22[row]]]
     }
 }
 
@@ -243,6 +248,8 @@ mod tests {
             column(flags, [0.0, 0.0, 4.0]),
             column(r11, [0.4, 0.6, f64::NAN]),
             column(r22, [0.4, 0.6, f64::NAN]),
+            column("R12", [0.0, 0.0, f64::NAN]),
+            column("R21", [0.0, 0.0, f64::NAN]),
             column("divisor1", [0.5, 0.5, f64::NAN]),
             column("divisor2", [0.5, 0.5, f64::NAN]),
         ]);
@@ -294,6 +301,8 @@ mod tests {
             column("flags", 0.0),
             column("R11", 1e-3),
             column("R22", 1e-3),
+            column("R12", 0.0),
+            column("R21", 0.0),
             column("divisor1", 1e-3),
             column("divisor2", 1e-3),
         ]);

@@ -177,8 +177,10 @@ pub(crate) fn require_responses<'a>(
 pub struct Weighted {
     /// Weighted ellipticities before calibration; NaN in rows with a flag.
     pub e: [Vec<f64>; 2],
-    /// Their responses; NaN in rows with a flag.
+    /// Their responses R11 and R22; NaN in rows with a flag.
     pub response: [Vec<f64>; 2],
+    /// R12 of e1 to g2 and R21 of e2 to g1; NaN in rows with a flag.
+    pub cross: [Vec<f64>; 2],
     /// Weights; zero in rows with a flag.
     pub weight: Vec<f64>,
 }
@@ -210,6 +212,7 @@ impl Weighted {
         let mut weighted = Weighted {
             e: [nothing(), nothing()],
             response: [nothing(), nothing()],
+            cross: [nothing(), nothing()],
             weight: vec![0.0; count],
         };
         for row in 0..count {
@@ -232,7 +235,8 @@ impl Weighted {
             }
             for k in 0..2 {
                 weighted.e[k][row] = selected.e[k];
-                weighted.response[k][row] = selected.response[k];
+                weighted.response[k][row] = selected.response[k][k];
+                weighted.cross[k][row] = selected.response[k][1 - k];
             }
             weighted.weight[row] = selected.weight;
         }
@@ -296,6 +300,8 @@ impl Weighted {
             "e2" => Some(e(1)),
             "R11" => Some(self.response[0].clone()),
             "R22" => Some(self.response[1].clone()),
+            "R12" => Some(self.cross[0].clone()),
+            "R21" => Some(self.cross[1].clone()),
             "divisor1" => Some(divisor(0)),
             "divisor2" => Some(divisor(1)),
             _ => None,

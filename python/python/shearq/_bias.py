@@ -120,7 +120,7 @@ def bias(
     g2: float | Sequence[float] | None = None,
     truth: str | os.PathLike[str] | None = None,
     columns: Mapping[str, str] | None = None,
-    ellipticity: Literal["shear", "distortion"] | None = None,
+    ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
     flip_g2: bool = False,
     bins: Bins | None = None,
     select: str | None = None,
@@ -148,8 +148,9 @@ def bias(
         Table of true shears with the columns id, g1, g2 or x, y, g1, g2.
     columns : mapping
         Names of columns by role, such as ``{"e1": "g_1", "w": "weight"}``; ``"none"`` ignores a column.
-    ellipticity : {'shear', 'distortion'}
-        Type of e1 and e2; recognised by default.
+    ellipticity : {'shear', 'distortion', 'responsivity'}
+        Type of e1 and e2; recognised by default. ``'distortion'`` converts each to a shear, ``'responsivity'`` divides the
+        mean distortion by 2(1 − e_rms²).
     flip_g2 : bool
         Use minus the true g2.
     bins : (str, int or sequence of float)
@@ -204,7 +205,7 @@ def bias_sums(
     g2: float | Sequence[float] | None = None,
     truth: str | os.PathLike[str] | None = None,
     columns: Mapping[str, str] | None = None,
-    ellipticity: Literal["shear", "distortion"] | None = None,
+    ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
     flip_g2: bool = False,
     bins: Bins | None = None,
     select: str | None = None,
@@ -224,8 +225,6 @@ def bias_sums(
     >>> round(abs(shearq.BiasSums.merge([plus, minus]).result()["m1"]), 6)
     0.0
     """
-    if ellipticity not in (None, "shear", "distortion"):
-        raise ValueError(f"ellipticity: found {ellipticity!r}; expected 'shear' or 'distortion'")
     if not (np.isfinite(step) and step > 0):
         raise ValueError(f"step: found {step!r}; expected a positive number")
     given = [_catalogue(f"catalogue {number}", table) for number, table in enumerate(_several(catalogues), 1)]
@@ -236,7 +235,7 @@ def bias_sums(
             given,
             [f"{role}={column}" for role, column in (columns or {}).items()],
             _truth(g1, g2, truth, given),
-            None if ellipticity is None else ellipticity == "distortion",
+            ellipticity,
             flip_g2,
             _bins(bins),
             select,

@@ -243,7 +243,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
             )
         rows = np.atleast_1d(self).view(Catalogue)
         columns = {name: np.ascontiguousarray(rows[name], dtype=np.float64) for name in _schema.SELECTED}
-        e1, e2, r11, r22, weights = _shearq.select(columns, where, weight)
+        e1, e2, r11, r22, r12, r21, weights = _shearq.select(columns, where, weight)
         kept = weights > 0
         if not kept.any():
             raise ValueError(f"where: no galaxy is left of {int(rows.good.sum())} without a flag; expected one or more")
@@ -255,6 +255,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
             chosen[f"e{k}"] = e[kept] / mean
             chosen[f"R{k}{k}"] = response[kept]
             chosen[f"divisor{k}"] = mean
+        chosen["R12"], chosen["R21"] = r12[kept], r21[kept]
         # A second selection would need responses that the rows do not have.
         left = [name for name in chosen.dtype.names or () if name not in _schema.OBSERVED]
         found = concatenate([chosen[left]])
@@ -263,9 +264,11 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
     def mean_shear(
         self, weights: ArrayLike | None = None, *, where: str | None = None, weight: str | None = None
     ) -> MeanShear:
-        """The mean shear of the good galaxies: Σwe/ΣwR, with the ellipticities e before calibration.
+        """The mean shear of the good galaxies: g = (ΣwR)⁻¹ Σwe, with the ellipticities e before calibration and the 2 × 2
+        responses R.
 
-        The error is the error of this ratio to first order, √(Σw²(e − gR)² n/(n − 1)) / ΣwR. It assumes independent
+        The error is that of this ratio to first order: the covariance (ΣwR)⁻¹ [Σw²(e − Rg)(e − Rg)ᵀ n/(n − 1)] (ΣwR)⁻ᵀ.
+        Catalogues without R12 and R21 have a diagonal R. It assumes independent
         galaxies. If the columns ``psf_id``, ``psf_m`` and ``psf_c`` are there, the noise of stars adds to it: m·g and c
         in quadrature, times the share of the galaxies behind each star.
 
@@ -455,7 +458,7 @@ def concatenate(catalogues: Iterable[Catalogue]) -> Catalogue:
 
 
 def raw(rows: Catalogue) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-    """Ellipticities before calibration, and their responses; those of rows without calibration are 1."""
+    """Ellipticities before calibration, and their responses R11 and R22; those of rows without calibration are 1."""
     e, responses = [], []
     for k in "12":
         divisor = np.asarray(rows[f"divisor{k}"], dtype=np.float64)
@@ -464,6 +467,14 @@ def raw(rows: Catalogue) -> tuple[list[NDArray[np.float64]], list[NDArray[np.flo
         response = np.where(plain & (rows["flags"] == 0), 1.0, rows[f"R{k}{k}"])
         responses.append(np.ascontiguousarray(response, dtype=np.float64))
     return e, responses
+
+
+def _cross(rows: Catalogue) -> list[NDArray[np.float64]]:
+    """R12 and R21; 0 without the columns, and in rows without calibration."""
+    if not all(name in (rows.dtype.names or ()) for name in ("R12", "R21")):
+        return [np.zeros(len(rows)), np.zeros(len(rows))]
+    plain = (np.isnan(rows["divisor1"]) & (rows["flags"] == 0), np.isnan(rows["divisor2"]) & (rows["flags"] == 0))
+    return [np.where(plain[k], 0.0, np.asarray(rows[name], dtype=np.float64)) for k, name in enumerate(("R12", "R21"))]
 
 
 def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike | None = None) -> MeanShear:
@@ -495,7 +506,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
             raise ValueError(f"catalogue: no columns {', '.join(missing)}; expected {', '.join(_schema.NEEDED)}")
         rows = np.atleast_1d(rows).view(Catalogue)
         e, responses = raw(rows)
-        parts.append([*e, *responses])
+        parts.append([*e, *responses, *_cross(rows)])
         stars.append(_stars(rows))
         goods.append(rows.good)
         calibrated = calibrated or bool(np.isfinite(rows["divisor1"]).any())
@@ -510,15 +521,15 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         name = "catalogue" if weights is None else "weights"
         reason = "has a flag" if weights is None else "has a flag or a weight of zero"
         raise ValueError(f"{name}: each of the {len(good)} galaxies {reason}; expected one without")
-    e1, e2, r11, r22 = (np.concatenate([part[k] for part in parts])[counted] for k in range(4))
-    if not all(np.isfinite(column).all() for column in (e1, e2, r11, r22)):
+    e1, e2, *matrix = (np.ascontiguousarray(np.concatenate([part[k] for part in parts])[counted]) for k in range(6))
+    if not all(np.isfinite(column).all() for column in (e1, e2, *matrix)):
         raise ValueError("catalogue: an ellipticity or response without a flag is not finite; expected flags")
     # A common factor changes nothing, but squares of weights could overflow.
     factor = weight[counted] / weight[counted].max()
     firsts = np.cumsum([0, *(len(each) for each, _ in stars)])
     places = np.concatenate([first + place for first, (_, place) in zip(firsts, stars)])[counted]
     each = [star for of_part, _ in stars for star in of_part]
-    (g1, g2), (first, second), response, galaxies = _shearq.mean_shear(e1, e2, r11, r22, factor, each, places)
+    (g1, g2), (first, second), response, _, galaxies = _shearq.mean_shear(e1, e2, matrix, factor, each, places)
     errors = [float(np.sqrt(value)) for value in (first[0], second[1])]
     return MeanShear(
         g1,

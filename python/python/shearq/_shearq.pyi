@@ -63,12 +63,11 @@ def measure(
 def mean_shear(
     e1: _Doubles,
     e2: _Doubles,
-    r11: _Doubles,
-    r22: _Doubles,
+    responses: list[_Doubles],
     weights: _Doubles,
     stars: list[list[float]],
     places: NDArray[np.int64],
-) -> tuple[list[float], list[list[float]], list[float], int]: ...
+) -> tuple[list[float], list[list[float]], list[float], list[float], int]: ...
 def select(
     columns: dict[str, _Doubles], cuts: str | None, weight: str | None
 ) -> list[_Doubles]: ...
@@ -125,7 +124,7 @@ def bias_sums(
     catalogues: Sequence[str | tuple[str, list[tuple[str, Any]]]],
     columns: Sequence[str],
     truth: tuple[float, float] | Sequence[tuple[str, float, float]] | str | None,
-    distortion: bool | None,
+    ellipticity: str | None,
     flip_g2: bool,
     bins: tuple[str, int | None, Sequence[float]] | None,
     select: str | None,

@@ -5,6 +5,18 @@ use std::path::Path;
 
 use shearq_files::{FileError, names_of};
 
+/// How ellipticities become shears.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shapes {
+    /// They are shears (1 − q)/(1 + q).
+    Shear,
+    /// Distortions (1 − q²)/(1 + q²), each converted to a shear. Moduli above 1 have none and are left out.
+    Converted,
+    /// Distortions, whose mean is divided by 2ℛ. ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩ with the standard deviation e_rms of a component
+    /// (Bernstein & Jarvis 2002, equation 5.33; Mandelbaum et al. 2018, equation 10).
+    Responsivity,
+}
+
 /// What a column is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
@@ -18,6 +30,10 @@ pub enum Role {
     R11,
     /// Response of e2 to g2.
     R22,
+    /// Response of e1 to g2.
+    R12,
+    /// Response of e2 to g1.
+    R21,
     /// What e1 was divided by.
     Divisor1,
     /// What e2 was divided by.
@@ -26,6 +42,14 @@ pub enum Role {
     Dw1,
     /// Derivative of the weight with g2.
     Dw2,
+    /// Standard deviation of each component of the distortions of galaxies without measurement noise.
+    RmsE,
+    /// Measurement noise of each component of a distortion.
+    SigmaE,
+    /// Shear of rows that have no distortion, in GalSim's tables of HSM.
+    KsbE1,
+    /// The same of component 2.
+    KsbE2,
     /// Zero for good rows.
     Flag,
     /// True shear.
@@ -56,10 +80,18 @@ pub enum Role {
     E2p,
     /// e2 under an artificial shear of −g2.
     E2m,
+    /// e1 under an artificial shear of +g2.
+    E1Of2p,
+    /// e1 under an artificial shear of −g2.
+    E1Of2m,
+    /// e2 under an artificial shear of +g1.
+    E2Of1p,
+    /// e2 under an artificial shear of −g1.
+    E2Of1m,
 }
 
 /// The roles with their names in `--columns`, and names of columns that are recognised in any case, the first first.
-const ROLES: [(Role, &str, &[&str]); 24] = [
+const ROLES: [(Role, &str, &[&str]); 34] = [
     (
         Role::E1,
         "e1",
@@ -143,6 +175,32 @@ const ROLES: [(Role, &str, &[&str]); 24] = [
         ],
     ),
     (
+        Role::R12,
+        "R12",
+        &[
+            "r12",
+            "de1_dg2",
+            "e1_g2",
+            "fpfs_de1_dg2",
+            "fpfs1_de1_dg2",
+            "r_12",
+            "mcal_r12",
+        ],
+    ),
+    (
+        Role::R21,
+        "R21",
+        &[
+            "r21",
+            "de2_dg1",
+            "e2_g1",
+            "fpfs_de2_dg1",
+            "fpfs1_de2_dg1",
+            "r_21",
+            "mcal_r21",
+        ],
+    ),
+    (
         Role::Dw1,
         "dw1",
         &[
@@ -154,6 +212,7 @@ const ROLES: [(Role, &str, &[&str]); 24] = [
             "dwsel_dg1",
             "wsel_g1",
             "fpfs_dw_dg1",
+            "weight_dg1",
         ],
     ),
     (
@@ -168,8 +227,13 @@ const ROLES: [(Role, &str, &[&str]); 24] = [
             "dwsel_dg2",
             "wsel_g2",
             "fpfs_dw_dg2",
+            "weight_dg2",
         ],
     ),
+    (Role::RmsE, "rms_e", &["rms_e"]),
+    (Role::SigmaE, "sigma_e", &["sigma_e"]),
+    (Role::KsbE1, "ksb_e1", &["corrected_g1"]),
+    (Role::KsbE2, "ksb_e2", &["corrected_g2"]),
     (
         Role::Flag,
         "flag",
@@ -254,10 +318,24 @@ const ROLES: [(Role, &str, &[&str]); 24] = [
     (Role::E1m, "e1_1m", &["e1_1m", "g1_1m"]),
     (Role::E2p, "e2_2p", &["e2_2p", "g2_2p"]),
     (Role::E2m, "e2_2m", &["e2_2m", "g2_2m"]),
+    (Role::E1Of2p, "e1_2p", &["e1_2p", "g1_2p"]),
+    (Role::E1Of2m, "e1_2m", &["e1_2m", "g1_2m"]),
+    (Role::E2Of1p, "e2_1p", &["e2_1p", "g2_1p"]),
+    (Role::E2Of1m, "e2_1m", &["e2_1m", "g2_1m"]),
+];
+
+/// Roles of the responses of a component to the other one. Without those to the own component they are of no use.
+const OTHER_RESPONSES: [(Role, Role); 6] = [
+    (Role::R12, Role::R11),
+    (Role::R21, Role::R22),
+    (Role::E1Of2p, Role::E1p),
+    (Role::E1Of2m, Role::E1p),
+    (Role::E2Of1p, Role::E2p),
+    (Role::E2Of1m, Role::E2p),
 ];
 
 /// Pairs of columns that need each other.
-const PAIRS: [(Role, Role); 7] = [
+const PAIRS: [(Role, Role); 11] = [
     (Role::Divisor1, Role::Divisor2),
     (Role::E1, Role::E2),
     (Role::R11, Role::R22),
@@ -265,6 +343,16 @@ const PAIRS: [(Role, Role); 7] = [
     (Role::G1, Role::G2),
     (Role::E1p, Role::E1m),
     (Role::E2p, Role::E2m),
+    (Role::R12, Role::R21),
+    (Role::KsbE1, Role::KsbE2),
+    (Role::E1Of2p, Role::E1Of2m),
+    (Role::E2Of1p, Role::E2Of1m),
+];
+
+/// Ellipticities of sheared versions: of the own component, and of the other one.
+pub(super) const SHEARED: [[Role; 4]; 2] = [
+    [Role::E1p, Role::E1m, Role::E2p, Role::E2m],
+    [Role::E1Of2p, Role::E1Of2m, Role::E2Of1p, Role::E2Of1m],
 ];
 
 /// Names of ellipticities that are distortions.
@@ -274,9 +362,236 @@ const DISTORTIONS: [&str; 3] = [
     "ext_shapehsm_hsmshaperegauss_e1",
 ];
 
+/// A public catalogue or a program's output, whose columns are known by its documentation.
+struct Survey {
+    name: &'static str,
+    /// The columns by role, in any case. Those of e1 and e2 and those with a plus identify the catalogue; others may be
+    /// absent. `none` for a role that has no column although a general name is there.
+    columns: &'static str,
+    /// Whether ellipticities are distortions.
+    distortion: bool,
+}
+
+const fn survey(name: &'static str, columns: &'static str) -> Survey {
+    Survey {
+        name,
+        columns,
+        distortion: false,
+    }
+}
+
+/// Regauss of HSC and LSST: distortions. Their columns of a calibration of the shear bias (`derived_shear_bias_m`, `_c1`,
+/// `_c2`) have no role, because m and c are to be found before it.
+const fn distortions(name: &'static str, columns: &'static str) -> Survey {
+    Survey {
+        name,
+        columns,
+        distortion: true,
+    }
+}
+
+/// From the column lists in tests/data/columns. The first that fits is used.
+const SURVEYS: [Survey; 21] = [
+    survey(
+        "KiDS, internal",
+        "e1=autocal_e1_A e2=autocal_e2_A w=recal_weight_A psf_e1=PSF_e1 psf_e2=PSF_e2",
+    ),
+    survey(
+        "KV450",
+        "e1=bias_corrected_e1 e2=bias_corrected_e2 w=recal_weight psf_e1=PSF_e1 psf_e2=PSF_e2",
+    ),
+    survey(
+        "KiDS",
+        "e1=e1 e2=e2 +w=weight +model_SNratio psf_e1=PSF_e1 psf_e2=PSF_e2",
+    ),
+    distortions(
+        "HSC Y1",
+        "e1=ishape_hsm_regauss_e1 e2=ishape_hsm_regauss_e2 w=ishape_hsm_regauss_derived_shape_weight rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags",
+    ),
+    distortions(
+        "HSC Y1",
+        "e1=ishape_hsm_regauss_e1 e2=ishape_hsm_regauss_e2 w=ishape_hsm_regauss_derived_weight rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags",
+    ),
+    distortions(
+        "HSC Y3",
+        "e1=i_hsmshaperegauss_e1 e2=i_hsmshaperegauss_e2 +w=i_hsmshaperegauss_derived_weight rms_e=i_hsmshaperegauss_derived_rms_e flag=i_hsmshaperegauss_flag",
+    ),
+    distortions(
+        "LSST",
+        "e1=i_hsmShapeRegauss_e1 e2=i_hsmShapeRegauss_e2 flag=i_hsmShapeRegauss_flag",
+    ),
+    distortions(
+        "LSST",
+        "e1=r_hsmShapeRegauss_e1 e2=r_hsmShapeRegauss_e2 flag=r_hsmShapeRegauss_flag",
+    ),
+    distortions(
+        "LSST",
+        "e1=ext_shapeHSM_HsmShapeRegauss_e1 e2=ext_shapeHSM_HsmShapeRegauss_e2 flag=ext_shapeHSM_HsmShapeRegauss_flag",
+    ),
+    survey(
+        "DES Y1",
+        "e1=e1 e2=e2 +R11=R11 R22=R22 R12=R12 R21=R21 +flag=flags_select id=coadd_objects_id",
+    ),
+    survey(
+        "DES Y3",
+        "e1=e_1 e2=e_2 +R11=R11 R22=R22 R12=R12 R21=R21 w=weight flag=flags",
+    ),
+    survey(
+        "DES Y6",
+        "e1=gauss_g_1 e2=gauss_g_2 +version=mdet_step w=w flag=mdet_flags",
+    ),
+    survey(
+        "metadetect",
+        "e1=wmom_g_1 e2=wmom_g_2 +version=shear flag=wmom_flags psf_e1=psfrec_g_1 psf_e2=psfrec_g_2",
+    ),
+    // Already divided by the mean response.
+    survey(
+        "UNIONS",
+        "e1=e1 e2=e2 +w=w_des R11=none R22=none psf_e1=e1_PSF psf_e2=e2_PSF",
+    ),
+    survey(
+        "UNIONS, uncalibrated",
+        "e1=e1_uncal e2=e2_uncal R11=R_g11 R12=R_g12 R21=R_g21 R22=R_g22 w=w_des psf_e1=e1_PSF psf_e2=e2_PSF",
+    ),
+    survey(
+        "ShapePipe",
+        "e1=NGMIX_G1_NOSHEAR e2=NGMIX_G2_NOSHEAR flag=NGMIX_MCAL_FLAGS e1_1p=NGMIX_G1_1P e1_1m=NGMIX_G1_1M e2_2p=NGMIX_G2_2P e2_2m=NGMIX_G2_2M e1_2p=NGMIX_G1_2P e1_2m=NGMIX_G1_2M e2_1p=NGMIX_G2_1P e2_1m=NGMIX_G2_1M",
+    ),
+    survey(
+        "Euclid, LensMC",
+        "e1=SHE_LENSMC_E1 e2=SHE_LENSMC_E2 w=SHE_LENSMC_WEIGHT",
+    ),
+    survey(
+        "TXPipe",
+        "e1=mcal_g1 e2=mcal_g2 flag=mcal_flags psf_e1=mcal_psf_g1 psf_e2=mcal_psf_g2 e1_1p=mcal_g1_1p e1_1m=mcal_g1_1m e2_2p=mcal_g2_2p e2_2m=mcal_g2_2m e1_2p=mcal_g1_2p e1_2m=mcal_g1_2m e2_1p=mcal_g2_1p e2_1m=mcal_g2_1m",
+    ),
+    // Of a model by default. Those of FPFS have their own responses. The weight of the selection contains that of the
+    // detection.
+    survey(
+        "AnaCal task",
+        "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 +w=wsel dw1=dwsel_dg1 dw2=dwsel_dg2",
+    ),
+    survey(
+        "AnaCal task",
+        "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 w=wdet dw1=dwdet_dg1 dw2=dwdet_dg2",
+    ),
+    survey(
+        "AnaCal FPFS",
+        "e1=fpfs_e1 e2=fpfs_e2 R11=fpfs_de1_dg1 R12=fpfs_de1_dg2 R21=fpfs_de2_dg1 R22=fpfs_de2_dg2 +w=wsel dw1=dwsel_dg1 dw2=dwsel_dg2",
+    ),
+];
+
+impl Survey {
+    /// Each column with its role, and whether the catalogue must have it.
+    fn parts(&self) -> impl Iterator<Item = (Option<&'static str>, &'static str, bool)> {
+        self.columns.split(' ').map(|part| {
+            let required = part.strip_prefix('+');
+            let (role, column) = match required.unwrap_or(part).split_once('=') {
+                Some((role, column)) => (Some(role), column),
+                None => (None, required.unwrap_or(part)),
+            };
+            let shape = matches!(role, Some("e1" | "e2"));
+            (role, column, required.is_some() || shape)
+        })
+    }
+
+    /// The column of a role.
+    fn of(&self, key: &str) -> Option<&'static str> {
+        let mut parts = self.parts();
+        parts.find_map(|(role, column, _)| (role == Some(key)).then_some(column))
+    }
+
+    /// Whether the catalogue with the columns `found` is this one. Given names of e1 and e2 must be those of this one.
+    fn fits(&self, found: &[String], names: &Names) -> bool {
+        let there = |column: &str| found.iter().any(|own| own.eq_ignore_ascii_case(column));
+        self.parts().all(|(role, column, required)| {
+            let given = role.and_then(|role| names.0.get(role));
+            match given {
+                Some(given) if matches!(role, Some("e1" | "e2")) => {
+                    given.eq_ignore_ascii_case(column)
+                }
+                Some(_) => true,
+                None => !required || there(column),
+            }
+        })
+    }
+}
+
+/// Adds sheared versions by the names of e1 and e2: `foo_g1_1p` belongs to `foo_g1` or `foo_g1_noshear`.
+fn find_sheared(roles: &mut BTreeMap<Role, String>, found: &[String], names: &Names) {
+    let of = |shape: Role, sheared: [Role; 4], suffixes: [&str; 4]| {
+        let name = roles.get(&shape)?.to_ascii_lowercase();
+        let base = name.strip_suffix("_noshear").unwrap_or(&name).to_owned();
+        let mut all = Vec::new();
+        for (role, suffix) in sheared.into_iter().zip(suffixes) {
+            let wanted = format!("{base}_{suffix}");
+            let column = found.iter().find(|own| own.eq_ignore_ascii_case(&wanted))?;
+            all.push((role, column.clone()));
+        }
+        Some(all)
+    };
+    let [[p1, m1, p2, m2], [p12, m12, p21, m21]] = SHEARED;
+    let suffixes = ["1p", "1m", "2p", "2m"];
+    let all = [
+        of(Role::E1, [p1, m1, p12, m12], suffixes),
+        of(Role::E2, [p21, m21, p2, m2], suffixes),
+    ];
+    for (role, column) in all.into_iter().flatten().flatten() {
+        if !names.0.contains_key(key_of(role)) {
+            roles.entry(role).or_insert(column);
+        }
+    }
+}
+
+/// What the name of a column suggests that it is.
+fn suggested(name: &str) -> Option<&'static str> {
+    let name = name.to_ascii_lowercase();
+    let has = |parts: &[&str]| parts.iter().any(|part| name.contains(part));
+    let ends = |parts: &[&str]| parts.iter().any(|part| name.ends_with(part));
+    if ends(&["_dg1", "_dg2"]) {
+        return Some("a derivative");
+    }
+    if ends(&["_1p", "_1m", "_2p", "_2m"]) {
+        return Some("a sheared version");
+    }
+    if has(&["shear_bias"]) {
+        return Some("a calibration");
+    }
+    if is_weight(&name) {
+        return Some("a weight");
+    }
+    if has(&["flag", "mask"]) {
+        return Some("a flag");
+    }
+    let response = ["r11", "r12", "r21", "r22", "r_11", "r_12", "r_21", "r_22"];
+    if response.contains(&name.as_str())
+        || ends(&[
+            "_g11", "_g12", "_g21", "_g22", "_r11", "_r12", "_r21", "_r22",
+        ])
+        || has(&["response"])
+    {
+        return Some("a response");
+    }
+    if has(&["rms_e", "sigma_e", "regauss_sigma", "shape_err"]) {
+        return Some("noise of shapes");
+    }
+    None
+}
+
+/// Whether a name in small letters is that of a weight.
+fn is_weight(name: &str) -> bool {
+    let name = name.strip_suffix("_a").unwrap_or(name);
+    name == "w" || name == "wt" || name.starts_with("w_") || name.ends_with("weight")
+}
+
 /// Names for roles that were given: a column, or `none`.
 #[derive(Debug, Clone, Default)]
 pub struct Names(BTreeMap<&'static str, String>);
+
+/// The names of all roles.
+pub fn role_names() -> String {
+    ROLES.map(|(_, name, _)| name).join(", ")
+}
 
 impl Names {
     /// Adds `ROLE=COLUMN`.
@@ -284,7 +599,7 @@ impl Names {
     /// # Errors
     /// If there is no such role.
     pub fn add(&mut self, text: &str) -> Result<(), String> {
-        let known = || ROLES.map(|(_, name, _)| name).join(", ");
+        let known = role_names;
         let given = text
             .split_once('=')
             .filter(|(_, column)| !column.is_empty());
@@ -347,8 +662,14 @@ pub struct Columns {
     roles: BTreeMap<Role, String>,
     /// The program.
     pub preset: Preset,
+    /// The public catalogue or the output of a program that its columns are known from.
+    survey: Option<&'static str>,
     /// Whether the names say that ellipticities are distortions.
     pub distortion: bool,
+    /// A column that looks like a weight, if none has this role and it was not declined.
+    pub doubtful_weight: Option<String>,
+    /// Columns that look like a weight, flag, response, derivative or sheared version and have no role.
+    unused: Vec<String>,
 }
 
 impl Columns {
@@ -358,17 +679,31 @@ impl Columns {
     /// If a given column is absent, e1 or e2 cannot be found, or one of two columns that belong together is absent.
     pub fn find(path: &Path, found: &[String], names: &Names) -> Result<Self, FileError> {
         let mut roles = BTreeMap::new();
+        let survey = SURVEYS.iter().find(|survey| survey.fits(found, names));
         for (role, key, candidates) in ROLES {
-            let column = match names.0.get(key) {
-                Some(none) if none == "none" => None,
-                Some(given) if found.contains(given) => Some(given),
-                Some(given) => return Err(FileError::no_column(path, given, found)),
-                None => candidates
-                    .iter()
-                    .find_map(|name| found.iter().find(|own| own.eq_ignore_ascii_case(name))),
+            let by_survey = survey.and_then(|survey| survey.of(key));
+            let own = |name: &str| found.iter().find(|own| own.eq_ignore_ascii_case(name));
+            let column = match (names.0.get(key), by_survey) {
+                (Some(none), _) if none == "none" => None,
+                (Some(given), _) if found.contains(given) => Some(given),
+                (Some(given), _) => return Err(FileError::no_column(path, given, found)),
+                (None, Some(known)) => own(known),
+                (None, None) => candidates.iter().find_map(|name| own(name)),
             };
             if let Some(column) = column {
                 roles.insert(role, column.clone());
+            }
+        }
+        let shape = roles.get(&Role::E1).map(|e1| e1.to_ascii_lowercase());
+        if !shape.is_some_and(|e1| e1 == "corrected_e1") {
+            for role in [Role::KsbE1, Role::KsbE2] {
+                roles.remove(&role);
+            }
+        }
+        find_sheared(&mut roles, found, names);
+        for (other, own) in OTHER_RESPONSES {
+            if !roles.contains_key(&own) {
+                roles.remove(&other);
             }
         }
         if !roles.contains_key(&Role::E1) && !roles.contains_key(&Role::E2) {
@@ -396,7 +731,8 @@ impl Columns {
             }
         }
         let e1 = roles[&Role::E1].to_ascii_lowercase();
-        let distortion = DISTORTIONS.contains(&e1.as_str());
+        let distortion =
+            DISTORTIONS.contains(&e1.as_str()) || survey.is_some_and(|survey| survey.distortion);
         let preset = if roles.contains_key(&Role::Version) {
             Preset::Metadetect
         } else if roles.contains_key(&Role::Divisor1) && roles.contains_key(&Role::R11) {
@@ -413,12 +749,64 @@ impl Columns {
         let mut columns = Columns {
             roles,
             preset,
+            survey: survey.map(|survey| survey.name),
             distortion,
+            doubtful_weight: None,
+            unused: Vec::new(),
         };
         if preset == Preset::Metacal && !names.0.contains_key("e1") {
             columns.take_unsheared(found);
         }
+        columns.find_unused(found, names);
         Ok(columns)
+    }
+
+    /// Notes columns without a role whose names suggest one. All columns of shearq are known.
+    fn find_unused(&mut self, found: &[String], names: &Names) {
+        if self.preset == Preset::Shearq {
+            return;
+        }
+        let free = |name: &&String| !self.roles.values().any(|own| own == *name);
+        let unused = || found.iter().filter(free);
+        if self.of(Role::Weight).is_none() && !names.0.contains_key("w") {
+            let mut weights = unused().filter(|name| suggested(name) == Some("a weight"));
+            self.doubtful_weight = weights.next().cloned();
+        }
+        self.unused = unused()
+            .filter(|name| suggested(name).is_some())
+            .cloned()
+            .collect();
+    }
+
+    /// The public catalogue or the program that wrote it.
+    pub fn program(&self) -> &'static str {
+        self.survey.unwrap_or(self.preset.name())
+    }
+
+    /// Each column that is used, as in `--columns`. Roles that are not `read` are left out.
+    pub fn used(&self, read: impl Fn(Role) -> bool) -> String {
+        let named = ROLES.iter().filter_map(|(role, key, _)| {
+            let column = self.of(*role).filter(|_| read(*role))?;
+            Some(format!("{key}={column}"))
+        });
+        named.collect::<Vec<_>>().join(", ")
+    }
+
+    /// Columns that look like one of a role but have none, unless they are `read` for another reason.
+    pub fn unused(&self, read: &[String]) -> Option<String> {
+        let unused = self.unused.iter().filter(|name| !read.contains(name));
+        let unused: Vec<&String> = unused.collect();
+        let calibrates = |name: &&&String| suggested(name) == Some("a calibration");
+        let calibration = match unused.iter().find(calibrates) {
+            Some(name) => format!(" m and c are those before the calibration by `{name}`."),
+            None => String::new(),
+        };
+        (!unused.is_empty()).then(|| {
+            format!(
+                "Not used: {}. Try: --columns ROLE=NAME if the result needs one.{calibration}",
+                names_of(&unused)
+            )
+        })
     }
 
     /// Of a catalogue of shearq with sheared versions, takes these versions if a selection requires them, and otherwise the
@@ -431,7 +819,7 @@ impl Columns {
             self.preset = Preset::Versions;
             self.take_unsheared(found);
         } else {
-            for role in [Role::E1p, Role::E1m, Role::E2p, Role::E2m] {
+            for role in SHEARED.into_iter().flatten() {
                 self.roles.remove(&role);
             }
         }
@@ -529,5 +917,43 @@ mod tests {
             let error = found(columns, &given).unwrap_err();
             assert!(error.contains(expected), "{error}");
         }
+    }
+    /// Column lists of public catalogues as their documentation has them, a name per line, with the columns that must be used.
+    #[test]
+    fn public_catalogues_are_read_by_their_published_columns() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/columns");
+        let mut count = 0;
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            let text = std::fs::read_to_string(&path).unwrap();
+            let expected = text.lines().find_map(|line| line.strip_prefix("# used: "));
+            let given = text.lines().find_map(|line| line.strip_prefix("# given: "));
+            let names: Vec<&str> = text
+                .lines()
+                .filter(|line| !line.starts_with('#'))
+                .flat_map(str::split_whitespace)
+                .collect();
+            let given: Vec<&str> = given.into_iter().flat_map(|text| text.split(' ')).collect();
+            let columns = found(&names.join(" "), &given).unwrap();
+            let used = columns.used(|_| true);
+            let found = format!("Columns ({}): {used}.", columns.program());
+            assert_eq!(found, expected.unwrap(), "{}", path.display());
+            count += 1;
+        }
+        // The catalogues of the documentation.
+        assert!(count >= 17, "{count}");
+    }
+
+    #[test]
+    fn columns_that_look_like_a_role_are_named() {
+        let columns = found("e1 e2 my_weight BadFlag T_1p T R12 mag", &["R11=none"]).unwrap();
+        let unused = columns.unused(&[]).unwrap();
+        assert!(unused.contains("my_weight, BadFlag, T_1p, R12"), "{unused}");
+        let read = ["T_1p".to_owned()];
+        assert!(!columns.unused(&read).unwrap().contains("T_1p"));
+        assert_eq!(columns.doubtful_weight.as_deref(), Some("my_weight"));
+        let declined = found("e1 e2 my_weight", &["w=none"]).unwrap();
+        assert_eq!(declined.doubtful_weight, None);
+        assert!(found("e1 e2 w mag T", &[]).unwrap().unused(&[]).is_none());
     }
 }

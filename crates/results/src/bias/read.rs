@@ -16,7 +16,7 @@ use crate::select::{READ, Weighted, require_responses};
 use crate::star_noise;
 
 use super::Input;
-use super::columns::{Columns, Names, Preset, Role};
+use super::columns::{Columns, Names, Preset, Role, SHEARED, Shapes};
 use super::positions::{self, Positions};
 use super::truth::Truth;
 
@@ -25,7 +25,7 @@ use super::truth::Truth;
 pub(super) struct Reading {
     pub(super) names: Names,
     pub(super) truth: Truth,
-    pub(super) distortion: Option<bool>,
+    pub(super) shapes: Option<Shapes>,
     pub(super) flip_g2: bool,
     pub(super) select: Option<Expression>,
     /// Cuts and weights whose response to shear is known.
@@ -93,29 +93,82 @@ pub(super) struct Source {
     /// Places of the columns of expressions among them: of the rows, and under each version.
     selected: Vec<Option<Vec<usize>>>,
     binned: Vec<Option<Vec<usize>>>,
+    /// Columns of expressions that may change with shear and have no sheared versions.
+    unanswered: Vec<String>,
 }
 
 impl Source {
     /// Whether the selection is also known for each sheared version, so that its response follows.
     pub(super) fn selects_versions(&self, reading: &Reading) -> bool {
         let all = |places: &[Option<Vec<usize>>]| places.iter().all(Option::is_some);
-        matches!(self.columns.preset, Preset::Metacal | Preset::Versions)
-            && (reading.select.is_some() || reading.binned.is_some())
+        // Catalogues with responses of galaxies often have only the selected quantities in sheared versions.
+        let own = match self.columns.preset {
+            Preset::Metacal | Preset::Versions => true,
+            Preset::Shearq | Preset::Anacal | Preset::Metadetect => false,
+            Preset::Plain | Preset::Hsm => self.columns.have(&[Role::R11]),
+        };
+        own && (reading.select.is_some() || reading.binned.is_some())
             && all(&self.selected)
             && all(&self.binned)
     }
 
-    /// Columns of an expression that were measured on galaxies that shear has changed.
-    pub(super) fn measured(&self, expression: &Expression) -> Vec<String> {
-        let own = self.columns.preset == Preset::Shearq;
-        let columns = expression.columns().iter();
-        let columns = columns.filter(|name| own && is_measured(name));
-        columns.cloned().collect()
+    /// Columns of `--select` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
+    pub(super) fn unanswered(&self) -> &[String] {
+        match self.has_version_rows() {
+            // Each version is chosen by its own columns.
+            true => &[],
+            false => &self.unanswered,
+        }
+    }
+
+    /// How ellipticities become shears.
+    pub(super) fn shapes(&self, reading: &Reading) -> Shapes {
+        reading.shapes.unwrap_or(match self.columns.distortion {
+            true => Shapes::Responsivity,
+            false => Shapes::Shear,
+        })
+    }
+
+    /// What is used as what, and what is not used.
+    pub(super) fn described(&self, reading: &Reading) -> Vec<String> {
+        let read = |role: Role| match role {
+            Role::Unit => self.unit(reading).is_some(),
+            Role::R12 | Role::R21 => self.has_matrix(reading),
+            Role::RmsE | Role::SigmaE => self.shapes(reading) == Shapes::Responsivity,
+            role => !is_skipped(role, reading),
+        };
+        let mut lines = vec![format!("Used: {}.", self.columns.used(read))];
+        let doubtful = self.columns.doubtful_weight.as_ref();
+        let read = self.wanted.iter().filter(|name| Some(*name) != doubtful);
+        let read: Vec<String> = read.cloned().collect();
+        lines.extend(self.columns.unused(&read));
+        if self.shapes(reading) == Shapes::Responsivity {
+            let rms = match (self.columns.of(Role::RmsE), self.columns.of(Role::SigmaE)) {
+                (Some(rms), _) => format!("e_rms from {rms}"),
+                (None, Some(sigma)) => format!("e_rms² = ⟨χ²⟩/2 − {sigma}²"),
+                (None, None) => {
+                    "e_rms² = ⟨χ²⟩/2, with the measurement noise. Try: --columns rms_e=NAME or sigma_e=NAME".into()
+                }
+            };
+            lines.push(format!(
+                "Shears from distortions: ⟨χ⟩/2ℛ with ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩, {rms}. Moduli above 1 count. Try: --ellipticity distortion to convert each galaxy."
+            ));
+        }
+        lines
     }
 
     /// Whether rows belong to versions.
     pub(super) fn has_version_rows(&self) -> bool {
         self.version.is_some() || self.columns.of(Role::Version).is_some()
+    }
+
+    /// Whether the responses of each component to the other one are known.
+    pub(super) fn has_matrix(&self, reading: &Reading) -> bool {
+        let of_rows = match self.columns.preset {
+            Preset::Metacal | Preset::Versions => self.columns.have(&SHEARED[1]),
+            _ => self.columns.have(&[Role::R12, Role::R21]),
+        };
+        of_rows || reading.selection.is_some() || self.has_version_rows()
     }
 
     /// Whether rows have the ellipticity of the PSF.
@@ -235,19 +288,28 @@ fn source(
     if columns.have(&[Role::E1p]) && named.any(|name| has_versions(name)) {
         check_step(&place.path, reading.step)?;
     }
-    let skipped = |role: &Role| match role {
-        Role::G1 | Role::G2 => !matches!(reading.truth, Truth::Columns),
-        Role::Unit => true,
-        Role::X | Role::Y => !matches!(reading.truth, Truth::Positions(_) | Truth::Data(_)),
-        _ => false,
-    };
-    let all = columns.all().filter(|(role, _)| !skipped(role));
+    let all = columns
+        .all()
+        .filter(|(role, _)| *role != Role::Unit && !is_skipped(*role, reading));
     let mut wanted: Vec<String> = Vec::new();
     for (_, name) in all {
         if !wanted.iter().any(|own| own == name) {
             wanted.push(name.to_owned());
         }
     }
+    wanted.extend(columns.doubtful_weight.clone());
+    let expressions = [&reading.select, &reading.binned].into_iter().flatten();
+    let unanswered = expressions.flat_map(Expression::columns).filter(|name| {
+        let own = columns.preset == Preset::Shearq;
+        let changes = match own {
+            true => is_measured(name),
+            false => !is_fixed(name, &columns),
+        };
+        changes && !(has_versions(name) && columns.preset != Preset::Shearq)
+    });
+    let mut unanswered: Vec<String> = unanswered.cloned().collect();
+    unanswered.sort();
+    unanswered.dedup();
     let mut place_of = |name: &str| -> Option<usize> {
         if !names.iter().any(|own| own == name) {
             return None;
@@ -301,6 +363,7 @@ fn source(
         wanted: Vec::new(),
         selected,
         binned,
+        unanswered,
     };
     if let Some(unit) = source.unit(reading) {
         if !names.iter().any(|own| own == unit) {
@@ -312,6 +375,33 @@ fn source(
     }
     source.wanted = wanted;
     Ok(source)
+}
+
+/// Whether the column of a role is not needed.
+fn is_skipped(role: Role, reading: &Reading) -> bool {
+    match role {
+        Role::G1 | Role::G2 => !matches!(reading.truth, Truth::Columns),
+        Role::X | Role::Y => !matches!(reading.truth, Truth::Positions(_) | Truth::Data(_)),
+        _ => false,
+    }
+}
+
+/// Whether shear does not change a column, judged by its role and name.
+fn is_fixed(name: &str, columns: &Columns) -> bool {
+    use Role::{Flag, G1, G2, Id, Psf1, Psf2, PsfSize, Unit, X, Y};
+    let roles = [G1, G2, Id, Psf1, Psf2, PsfSize, Unit, X, Y, Flag];
+    let by_role = roles.iter().any(|role| columns.of(*role) == Some(name));
+    let name = name.to_ascii_lowercase();
+    let parts = [
+        "psf", "tile", "field", "patch", "seed", "true", "truth", "image", "ccd", "exp", "airmass",
+        "seeing", "depth", "zbin", "z_bin",
+    ];
+    by_role
+        || parts.iter().any(|part| name.contains(part))
+        || [
+            "ra", "dec", "x", "y", "z", "number", "row", "alpha", "delta", "set",
+        ]
+        .contains(&name.as_str())
 }
 
 /// The name of a column without the name of the unsheared version.
@@ -431,7 +521,7 @@ struct Part<'a> {
     versions: Option<Vec<Option<usize>>>,
     unit: Option<usize>,
     truth: OfRows<'a>,
-    distortion: bool,
+    shapes: Shapes,
 }
 
 /// Where the true shears of the rows of a catalogue are.
@@ -496,6 +586,14 @@ struct Places {
     psf_size: Option<usize>,
     id: Option<usize>,
     sheared: Option<[[usize; 2]; 2]>,
+    /// R12 and R21, and ellipticities under shears of the other component.
+    other_response: Option<[usize; 2]>,
+    other_sheared: Option<[[usize; 2]; 2]>,
+    rms_e: Option<usize>,
+    sigma_e: Option<usize>,
+    /// Shears of rows without a distortion.
+    ksb: Option<[usize; 2]>,
+    doubtful_weight: Option<usize>,
 }
 
 impl Places {
@@ -505,9 +603,8 @@ impl Places {
             source.wanted.iter().position(|own| own == name)
         };
         let pair = |a, b| Some([place(a)?, place(b)?]);
-        let sheared = || {
-            let (one, two) = (pair(Role::E1p, Role::E1m)?, pair(Role::E2p, Role::E2m)?);
-            Some([one, two])
+        let sheared = |[one_p, one_m, two_p, two_m]: [Role; 4]| {
+            Some([pair(one_p, one_m)?, pair(two_p, two_m)?])
         };
         Places {
             e: pair(Role::E1, Role::E2).unwrap_or_default(),
@@ -521,9 +618,26 @@ impl Places {
             psf: pair(Role::Psf1, Role::Psf2),
             psf_size: place(Role::PsfSize),
             id: place(Role::Id),
-            sheared: sheared(),
+            sheared: sheared(SHEARED[0]),
+            other_response: pair(Role::R12, Role::R21),
+            other_sheared: sheared(SHEARED[1]),
+            rms_e: place(Role::RmsE),
+            sigma_e: place(Role::SigmaE),
+            ksb: pair(Role::KsbE1, Role::KsbE2),
+            doubtful_weight: source
+                .columns
+                .doubtful_weight
+                .as_ref()
+                .and_then(|name| source.wanted.iter().position(|own| own == name)),
         }
     }
+}
+
+/// A galaxy's ellipticity, and the derivatives of the weighted one with its own and with the other component of shear.
+struct Shape {
+    e: [f64; 2],
+    slope: [f64; 2],
+    cross: [f64; 2],
 }
 
 impl<'a> Part<'a> {
@@ -561,7 +675,7 @@ impl<'a> Part<'a> {
             versions,
             unit: unit.and_then(|name| source.wanted.iter().position(|own| own == name)),
             truth,
-            distortion: reading.distortion.unwrap_or(source.columns.distortion),
+            shapes: source.shapes(reading),
         })
     }
 
@@ -604,6 +718,16 @@ impl<'a> Part<'a> {
             let row = number + 1;
             FileError::new(&self.source.place.path, format!("row {row}: {what}"))
         };
+        if let Some(doubtful) = places.doubtful_weight {
+            let value = self.value(doubtful, at);
+            let name = self.source.columns.doubtful_weight.as_deref();
+            if value.is_nan() || value <= 0.0 {
+                let name = name.unwrap_or_default();
+                return Err(fault(format!(
+                    "`{name}` looks like a weight but is not used, and is {value} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none"
+                )));
+            }
+        }
         let left_out = |weighted: &Weighted| weighted.weight[at] <= 0.0;
         if self.weighted.as_ref().is_some_and(left_out) {
             about.unselected += u64::from(own);
@@ -620,14 +744,15 @@ impl<'a> Part<'a> {
             Some(weighted) => weighted.weight[at],
             None => weight,
         };
-        let Some((e, slope)) = self.shape(at, weight) else {
+        let Some(Shape { e, slope, cross }) = self.shape(at, weight) else {
             // A distortion above 1 has no shear.
             about.flagged += u64::from(own);
             return Ok(());
         };
         let psf = places.psf.map_or([0.0; 2], |psf| self.pair(psf, at));
         let psf_size = places.psf_size.map_or(1.0, |size| self.value(size, at));
-        let (slopes, psfs) = (slope[0] + slope[1], psf[0] + psf[1] + psf_size);
+        let slopes = slope[0] + slope[1] + cross[0] + cross[1];
+        let psfs = psf[0] + psf[1] + psf_size;
         let expression = if binned[0].is_nan() { f64::NAN } else { 0.0 };
         // A sum is finite only if all of its terms are.
         if !(e[0] + e[1] + weight + slopes + psfs + expression).is_finite() {
@@ -673,6 +798,7 @@ impl<'a> Part<'a> {
                 e,
                 weight,
                 slope,
+                cross,
                 g,
                 psf,
                 psf_size,
@@ -681,43 +807,83 @@ impl<'a> Part<'a> {
         })
     }
 
-    /// The ellipticity, and the derivative of the weighted ellipticity with shear.
-    fn shape(&self, at: usize, weight: f64) -> Option<([f64; 2], [f64; 2])> {
+    /// The ellipticity, and the derivatives of the weighted ellipticity with shear.
+    fn shape(&self, at: usize, weight: f64) -> Option<Shape> {
         let places = &self.places;
         if let Some(weighted) = &self.weighted {
             // Both are of the weighted ellipticity.
-            let e = [0, 1].map(|k| weighted.e[k][at] / weight);
-            return Some((e, [0, 1].map(|k| weighted.response[k][at])));
+            return Some(Shape {
+                e: [0, 1].map(|k| weighted.e[k][at] / weight),
+                slope: [0, 1].map(|k| weighted.response[k][at]),
+                cross: [0, 1].map(|k| weighted.cross[k][at]),
+            });
         }
         let mut e = self.pair(places.e, at);
-        if self.distortion && e.iter().all(|e| e.is_finite()) {
-            let shear = Distortion::new(e[0], e[1]).to_shear()?;
-            e = [shear.e1, shear.e2];
+        let mut shapes = self.shapes;
+        // GalSim's HSM writes −10 into the columns that its method does not determine.
+        if let (Some(ksb), [-10.0, -10.0]) = (places.ksb, e) {
+            e = self.pair(ksb, at);
+            shapes = Shapes::Shear;
+        }
+        match shapes {
+            Shapes::Converted if e.iter().all(|e| e.is_finite()) => {
+                let shear = Distortion::new(e[0], e[1]).to_shear()?;
+                e = [shear.e1, shear.e2];
+            }
+            Shapes::Shear | Shapes::Converted => {}
+            Shapes::Responsivity => {
+                let value = |place: Option<usize>| place.map(|place| self.value(place, at));
+                let square = match (value(places.rms_e), value(places.sigma_e)) {
+                    (Some(rms), _) => rms * rms,
+                    (None, sigma) => {
+                        0.5 * (e[0] * e[0] + e[1] * e[1]) - sigma.map_or(0.0, |sigma| sigma * sigma)
+                    }
+                };
+                return Some(Shape {
+                    e,
+                    slope: [2.0 * weight * (1.0 - square); 2],
+                    cross: [0.0; 2],
+                });
+            }
         }
         if self.source.has_version_rows() {
             // The response follows from the versions.
-            return Some((e, [0.0; 2]));
+            return Some(Shape {
+                e,
+                slope: [0.0; 2],
+                cross: [0.0; 2],
+            });
         }
         let step = 2.0 * self.reading.step;
-        let response = if let Some(sheared) = places.sheared {
+        let differences = |sheared: [[usize; 2]; 2]| {
             sheared.map(|[plus, minus]| (self.value(plus, at) - self.value(minus, at)) / step)
-        } else if let (Some(response), Some(divisor)) = (places.response, places.divisor) {
-            // Configurations without a response have none, and no divisor.
+        };
+        // Configurations without a response have none, and no divisor.
+        let divided = |response: [usize; 2], divisor: [usize; 2], without: f64| {
             let (response, divisor) = (self.pair(response, at), self.pair(divisor, at));
             [0, 1].map(|k| match response[k] / divisor[k] {
-                ratio if ratio.is_nan() => 1.0,
+                ratio if ratio.is_nan() => without,
                 ratio => ratio,
             })
-        } else if let Some(response) = places.response {
-            self.pair(response, at)
-        } else {
-            [1.0; 2]
+        };
+        let response = match (places.sheared, places.response, places.divisor) {
+            (Some(sheared), ..) => differences(sheared),
+            (None, Some(response), Some(divisor)) => divided(response, divisor, 1.0),
+            (None, Some(response), None) => self.pair(response, at),
+            (None, None, _) => [1.0; 2],
+        };
+        let other = match (places.sheared, places.other_response, places.divisor) {
+            (Some(_), ..) => places.other_sheared.map_or([0.0; 2], differences),
+            (None, Some(response), Some(divisor)) => divided(response, divisor, 0.0),
+            (None, Some(response), None) => self.pair(response, at),
+            (None, None, _) => [0.0; 2],
         };
         let derivative = places.derivative.map_or([0.0; 2], |d| self.pair(d, at));
-        Some((
+        Some(Shape {
             e,
-            [0, 1].map(|k| weight * response[k] + e[k] * derivative[k]),
-        ))
+            slope: [0, 1].map(|k| weight * response[k] + e[k] * derivative[k]),
+            cross: [0, 1].map(|k| weight * other[k] + e[k] * derivative[1 - k]),
+        })
     }
 
     /// The binned quantity in the row, and under each version. Infinity if the row is not selected; NaN if a number is

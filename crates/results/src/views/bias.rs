@@ -138,8 +138,15 @@ fn label(result: &BiasResult, [low, high]: [f64; 2]) -> String {
 /// A warning if galaxies were selected or binned by what was measured on them.
 pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     let column = result.measured.first()?;
+    let remedy = match result.program.starts_with("shearq") {
+        true => {
+            "--where for cuts by snr, flux or size, or catalogues with shape.sheared_step".into()
+        }
+        false => format!("catalogues with {column}_1p, {column}_1m, {column}_2p and {column}_2m"),
+    };
+    // docs/limitations.md, selection after measuring.
     Some(format!(
-        "m contains the effect of shear on a choice by `{column}`, which was measured on the galaxies. Try: --where for cuts by snr, flux or size, or catalogues with shape.sheared_step"
+        "m contains the effect of shear on a choice by `{column}`, which has no response here. Known sizes: −0.02 (S/N 20) to −0.1 (S/N 7) if the lowest 30 % in size are removed, −0.11 for the lowest 50 % in flux. Try: {remedy}"
     ))
 }
 
@@ -251,6 +258,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
         ),
         format!("Errors are from {} units: {}.", all.units, result.unit),
     ];
+    notes.extend(result.columns.iter().cloned());
     match result.noisy_stars {
         0 => {}
         1 => notes.push("They include the noise of a star that several units share.".into()),
