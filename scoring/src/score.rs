@@ -249,6 +249,7 @@ impl SetScorer {
         let (m, a) = errors::of_biases(&self.bins, &truth, &covariance);
         Ok(SpectrumScore {
             quality: quality(&self.bins, &measured, &truth),
+            zero_quality: quality(&self.bins, &[0.0; BINS], &truth),
             quality_error: quality_error(&self.bins, &measured, &truth, &covariance),
             m_half: fit.cl.m_half,
             m_half_error: m / 2.0,

@@ -164,6 +164,8 @@ pub type SpectrumCovariance = [[f64; SCORED.end - SCORED.start]; SCORED.end - SC
 pub struct SpectrumScore {
     /// Q and σ_sys.
     pub quality: Quality,
+    /// Q and σ_sys of zero shear.
+    pub zero_quality: Quality,
     /// Standard error of Q.
     pub quality_error: f64,
     /// M/2.

@@ -27,6 +27,7 @@ use shearq_studies::bound::{cramer_rao, expected_qs};
 
 use crate::constant::ConstantShears;
 use crate::deadline::Deadline;
+use crate::judge::unscored;
 use crate::kind::{Kind, RankBy, response};
 use crate::readme;
 use crate::seal::{Expected, Key, close, names, seal_public, sums};
@@ -359,47 +360,16 @@ impl Plan {
     }
 }
 
-/// The metric of a challenge, if entries can be ranked by it. A reference measurement of the first image of each set gives
-/// the noise that entries will have.
-fn rankable(
-    plan: &Plan,
+/// Scores that entries with the noise of a reference measurement can expect, and the mean Q of zero shear. The noise of the
+/// first image of each set is scaled to all images.
+fn expected_scores(
     data: &Data,
     public: &DataFolder,
-    private: &DataFolder,
+    truths: Vec<(u32, TrueShear)>,
+    metric: RankBy,
     threads: usize,
-    progress: &mut dyn Progress,
-) -> Result<RankBy, PipelineError> {
-    let refuse = |message: String| Err(PipelineError::Request(message));
-    let unscored = |source| PipelineError::Scoring { set: None, source };
+) -> Result<(Vec<SetRecord>, f64), PipelineError> {
     let grid = data.grid().map_err(unscored)?;
-    let truths = data.sets.iter().map(|&set| {
-        let truth = private.read_truth(set, &grid)?;
-        Ok((set, truth))
-    });
-    let truths: Vec<(u32, TrueShear)> = truths.collect::<Result<_, PipelineError>>()?;
-    let constant = ConstantShears::of(truths.iter().map(|(set, truth)| (*set, truth)))
-        .map_err(PipelineError::Request)?;
-    let metric = plan.metric.unwrap_or(match &constant {
-        Some(_) => plan.kind.constant_metric,
-        None => plan.kind.metric,
-    });
-    if !metric.suits(constant.is_some()) {
-        let (kind, better) = match &constant {
-            Some(_) => ("is the same for all galaxies of a set", "qc, m or c"),
-            None => ("varies within the sets", "q-calibrated, m or c"),
-        };
-        return refuse(format!(
-            "the true shear {kind}, so {} is not defined. Try: --metric {better}",
-            metric.label()
-        ));
-    }
-    if plan.spectra && data.sets.len() < 2 {
-        return refuse("--spectra: the response of power spectra follows from differences between sets (found 1 set, expected at least 2)".into());
-    }
-    if metric == RankBy::Noise && data.images < 2 {
-        return refuse("noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8".into());
-    }
-    progress.note("measuring the first images");
     let first = data.sets.iter().map(|&set| ImageId { set, image: 1 });
     let first: Vec<ImageId> = first.collect();
     let references = References::measure(public, &first, grid, threads, &mut Quiet)?;
@@ -445,6 +415,50 @@ fn rankable(
         };
         scored.push(SetRecord::new(set, &scored_set, String::new()));
     }
+    Ok((scored, zero))
+}
+
+/// The metric of a challenge, if entries can be ranked by it.
+fn rankable(
+    plan: &Plan,
+    data: &Data,
+    public: &DataFolder,
+    private: &DataFolder,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<RankBy, PipelineError> {
+    let refuse = |message: String| Err(PipelineError::Request(message));
+    let grid = data.grid().map_err(unscored)?;
+    let truths = data.sets.iter().map(|&set| {
+        let truth = private.read_truth(set, &grid)?;
+        Ok((set, truth))
+    });
+    let truths: Vec<(u32, TrueShear)> = truths.collect::<Result<_, PipelineError>>()?;
+    let constant = ConstantShears::of(truths.iter().map(|(set, truth)| (*set, truth)))
+        .map_err(PipelineError::Request)?;
+    let metric = plan.metric.unwrap_or(match &constant {
+        Some(_) => plan.kind.constant_metric,
+        None => plan.kind.metric,
+    });
+    if !metric.suits(constant.is_some()) {
+        let (kind, better) = match &constant {
+            Some(_) => ("is the same for all galaxies of a set", "qc, m or c"),
+            None => ("varies within the sets", "q-calibrated, m or c"),
+        };
+        return refuse(format!(
+            "the true shear {kind}, so {} is not defined. Try: --metric {better}",
+            metric.label()
+        ));
+    }
+    if plan.spectra && data.sets.len() < 2 {
+        return refuse("--spectra: the response of power spectra follows from differences between sets (found 1 set, expected at least 2)".into());
+    }
+    if metric == RankBy::Noise && data.images < 2 {
+        return refuse("noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8".into());
+    }
+    progress.note("measuring the first images");
+    let (scored, zero) = expected_scores(data, public, truths, metric, threads)?;
+    let images = f64::from(data.images);
     let constant = constant.as_ref();
     let groups: Vec<&[SetRecord]> = match metric.needs_the_response_of_each_set() {
         true => scored.chunks(1).collect(),

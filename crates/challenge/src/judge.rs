@@ -215,7 +215,7 @@ impl Judge {
             let zero = truth
                 .scorer
                 .score_spectrum(&[0.0; SCORED.end - SCORED.start], None);
-            zero.map_or(f64::NAN, |score| score.quality.q)
+            zero.map_or(f64::NAN, |score| score.zero_quality.q)
         };
         let sum: f64 = self.truths.values().map(q).sum();
         Some(sum / self.truths.len() as f64)
@@ -733,7 +733,7 @@ const CLEAR_RESPONSE: f64 = 3.0;
 
 /// Whether a response is clearly above zero. An unknown error counts as small.
 fn is_measurable(response: f64, error: f64) -> bool {
-    response > 0.0 && !(response <= CLEAR_RESPONSE * error)
+    response > 0.0 && (error.is_nan() || response > CLEAR_RESPONSE * error)
 }
 
 /// True and sent bandpowers of a set.
@@ -766,7 +766,7 @@ fn slope_over_sets(sets: &[Powers]) -> (f64, f64) {
     (slope, (residual.max(0.0) / (number - 2.0) / square).sqrt())
 }
 
-fn unscored(source: ScoringError) -> PipelineError {
+pub(crate) fn unscored(source: ScoringError) -> PipelineError {
     PipelineError::Scoring { set: None, source }
 }
 

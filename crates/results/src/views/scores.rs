@@ -143,12 +143,16 @@ pub(super) fn zero_shear_note(scored: &[ScoredSet]) -> Option<String> {
     let varying = || scored.iter().filter(|set| set.score.constant.is_none());
     let count = varying().count() as f64;
     let mean = |q: fn(&SetScore) -> f64| varying().map(|set| q(&set.score)).sum::<f64>() / count;
-    let (zero, own) = (
+    zero_shear_line(
         mean(|score| score.zero_quality().q),
         mean(|score| score.metrics.q),
-    );
+    )
+}
+
+/// The note for mean Q of zero shear and of a measurement.
+fn zero_shear_line(zero: f64, own: f64) -> Option<String> {
     let verdict = match zero > own {
-        true => ", above the Q of these catalogues: noise dominates Q. Compare Q cal., m and noise",
+        true => ", above this Q: noise dominates Q. Compare Q cal., m and noise",
         false => "",
     };
     zero.is_finite()
@@ -350,6 +354,14 @@ pub fn spectra(
         true => "No errors, because no covariance of the bandpowers is known.",
         false => "Errors: from the covariance in the manifest, to first order.",
     };
+    let count = scored.len() as f64;
+    let mean = |q: fn(&SpectrumScore) -> f64| {
+        scored.iter().map(|(_, score)| q(score)).sum::<f64>() / count
+    };
+    let zero = zero_shear_line(
+        mean(|score| score.zero_quality.q),
+        mean(|score| score.quality.q),
+    );
     Table {
         title: title.to_owned(),
         headings,
@@ -357,7 +369,10 @@ pub fn spectra(
         notes: vec![format!(
             "Metrics: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian.{}",
             kinds_note(scored.iter().map(|(set, _)| set.and_then(&kind_of)))
-        )],
+        )]
+        .into_iter()
+        .chain(zero)
+        .collect(),
     }
 }
 
