@@ -1,5 +1,6 @@
 """The package as such: its help, its types, its documents and its examples."""
 
+import ast
 import doctest
 import inspect
 import pathlib
@@ -53,3 +54,20 @@ def test_scripts_of_the_gallery_end_in_a_plot(script, tmp_path):
     done = subprocess.run(arguments, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=300)
     assert done.returncode == 0 and "Warning" not in done.stderr, done.stderr
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_modules_import_each_other_in_one_direction():
+    folder = pathlib.Path(shearq.__file__).parent
+    needs = {}
+    for path in folder.glob("*.py"):
+        if path.stem in ("__init__", "__main__"):
+            continue
+        names = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level == 1:
+                names |= {node.module} if node.module else {alias.name for alias in node.names}
+        needs[path.stem] = names
+    while needs:
+        free = {name for name, others in needs.items() if not others & needs.keys()}
+        assert free, f"these modules import each other in a circle: {sorted(needs)}"
+        needs = {name: others for name, others in needs.items() if name not in free}

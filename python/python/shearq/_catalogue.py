@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import _distributed, _schema, _shearq
+from . import _display, _distributed, _schema, _shearq, _tables
 from ._arrays import double, shown
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Flag(enum.IntFlag):
     """Why a galaxy could not be measured: the bits of a catalogue's ``flags``."""
 
-    NotFinite = 1
+    NotFinite = _schema.NOT_FINITE
     """Pixels are missing."""
     BadPsf = 2
     """The PSF cannot be used."""
@@ -192,9 +192,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
     __str__ = __repr__
 
     def _repr_html_(self) -> str:
-        from ._display import html
-
-        return html(self)
+        return _display.html(self)
 
     def _ipython_key_completions_(self) -> list[str]:
         return list(self.dtype.names or ())
@@ -337,27 +335,19 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         ValueError
             If the ending is another.
         """
-        from ._files import write
-
-        write(self, path, overwrite)
+        _tables.write(self, path, overwrite)
 
     def to_astropy(self) -> astropy.table.Table:
         """An ``astropy.table.Table`` with units, and with ``attrs`` as ``meta`` by the keys of files."""
-        from ._tables import to_astropy
-
-        return to_astropy(self)
+        return _tables.to_astropy(self)
 
     def to_pandas(self) -> pandas.DataFrame:
         """A ``pandas.DataFrame`` with ``attrs``."""
-        from ._tables import to_pandas
-
-        return to_pandas(self)
+        return _tables.to_pandas(self)
 
     def to_polars(self) -> polars.DataFrame:
         """A ``polars.DataFrame``. It has no ``attrs``."""
-        from ._tables import to_polars
-
-        return to_polars(self)
+        return _tables.to_polars(self)
 
     @classmethod
     def from_table(cls, table: Any, columns: Mapping[str, str] | None = None) -> Catalogue:
@@ -380,9 +370,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         ValueError
             If a column is absent, columns have several lengths, or responses are there without divisors.
         """
-        from ._tables import from_table
-
-        return from_table(table, columns)
+        found: Catalogue = _tables.from_table(Catalogue, table, columns)
+        return found
 
     def plot(self, kind: Literal["histogram", "map"] = "histogram", ax: Any = None) -> Any:
         """Plot the good galaxies with matplotlib.
@@ -398,9 +387,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         -------
         matplotlib.axes.Axes
         """
-        from ._display import plot_catalogue
-
-        return plot_catalogue(self, kind, ax)
+        return _display.plot_catalogue(self, kind, ax)
 
 
 def _with_ids(catalogue: Catalogue, ids: NDArray[np.intp]) -> Catalogue:

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import html as escape
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from ._bias import Bias
-    from ._catalogue import Catalogue
-    from ._score import Score
 
 # Rows that are shown.
 _SHOWN = 8
@@ -22,7 +17,7 @@ def _number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
 
 
-def html(catalogue: Catalogue) -> str:
+def html(catalogue: Any) -> str:
     names = catalogue.dtype.names or ()
     if catalogue.ndim != 1:
         return f"<pre>{escape.escape(repr(catalogue))}</pre>"
@@ -47,7 +42,7 @@ def _axes(ax: Any) -> Any:
     return pyplot.subplots()[1]
 
 
-def plot_catalogue(catalogue: Catalogue, kind: Literal["histogram", "map"], ax: Any) -> Any:
+def plot_catalogue(catalogue: Any, kind: Literal["histogram", "map"], ax: Any) -> Any:
     good = catalogue[catalogue.good]
     if kind == "histogram":
         ax = _axes(ax)
@@ -89,7 +84,7 @@ def plot_catalogue(catalogue: Catalogue, kind: Literal["histogram", "map"], ax: 
     return ax
 
 
-def plot_score(score: Score, ax: Any) -> Any:
+def plot_score(score: Any, ax: Any) -> Any:
     ax = _axes(ax)
     table = score.spectrum
     chosen = table["modes"] > 0
@@ -111,7 +106,7 @@ def plot_score(score: Score, ax: Any) -> Any:
     return ax
 
 
-def bias_html(bias: Bias) -> str:
+def bias_html(bias: Any) -> str:
     keys = ("m1", "m2", "c1", "c2")
     head = "".join(f"<th>{key}</th>" for key in ("bin", "galaxies", *keys))
     rows = []
@@ -129,7 +124,7 @@ def bias_html(bias: Bias) -> str:
 _TOLERANCE = {"m": 2e-3, "c": 2e-4}
 
 
-def plot_bias(bias: Bias, quantity: Literal["m", "c"], limit: float | None, ax: Any) -> Any:
+def plot_bias(bias: Any, quantity: Literal["m", "c"], limit: float | None, ax: Any) -> Any:
     if quantity not in _TOLERANCE:
         raise ValueError(f"quantity: found {quantity!r}; expected 'm' or 'c'")
     ax = _axes(ax)

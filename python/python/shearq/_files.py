@@ -1,27 +1,15 @@
-"""Catalogues in files, the same as those of the command line."""
+"""Reading catalogues, the same as those of the command line."""
 
 from __future__ import annotations
 
 import os
 import pathlib
-import tempfile
 from typing import Any
 
 import numpy as np
 
 from . import _schema, _shearq, _tables
 from ._catalogue import Catalogue
-
-_FORMATS = {".parquet": "parquet", ".pq": "parquet", ".fits": "fits", ".fit": "fits", ".ecsv": "ecsv", ".npy": "npy"}
-
-
-def _format(path: pathlib.Path) -> str:
-    try:
-        return _FORMATS[path.suffix.lower()]
-    except KeyError:
-        raise ValueError(
-            f"path: found {path.name!r}; expected a name that ends in .parquet, .fits, .ecsv or .npy"
-        ) from None
 
 
 def read(path: str | os.PathLike[str]) -> Catalogue:
@@ -43,22 +31,22 @@ def read(path: str | os.PathLike[str]) -> Catalogue:
         If there is no such file, its ending is another, or it lacks a column.
     """
     file = pathlib.Path(path)
-    format = _format(file)
+    format = _tables.file_format(file)
     if not file.exists():
         raise FileNotFoundError(f"path: there is no file {file}")
     if format == "npy":
-        return _tables.from_table(np.load(file))
+        return _tables.from_table(Catalogue, np.load(file))
     if format == "ecsv":
         from astropy.table import Table  # type: ignore[import-untyped, unused-ignore]
 
-        return _tables.from_table(Table.read(file, format="ascii.ecsv"))
+        return _tables.from_table(Catalogue, Table.read(file, format="ascii.ecsv"))
     keys = [*_schema.KEYS, *_schema.OTHER_KEYS, _schema.STAR_KEY, _schema.PSF_KEY]
     columns, metadata = _shearq.read_table(str(file), format, keys)
     found = {name: np.asarray(column) for name, column in columns.items()}
     if "snr" in found and not any(name in found for name in _schema.STAR):
         found.update(_star(file, dict(metadata), len(found["snr"])))
     try:
-        return _tables.build(found, _schema.to_attrs(metadata))
+        return _tables.build(Catalogue, found, _schema.to_attrs(metadata))
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
 
@@ -109,39 +97,3 @@ def read_all(folder: str | os.PathLike[str], sets: int | list[int] | None = None
     if not found:
         raise FileNotFoundError(f"folder: there is no set*/catalogue-* in {os.fspath(folder)}; expected results of `shearq measure`")
     return [read(path) for path in found]
-
-
-def write(catalogue: Catalogue, path: str | os.PathLike[str], overwrite: bool) -> None:
-    file = pathlib.Path(path)
-    format = _format(file)
-    if file.exists() and not overwrite:
-        raise FileExistsError(f"path: there is a file {file}. Try: overwrite=True")
-    if format in ("parquet", "fits"):
-        columns: list[tuple[str, Any]] = []
-        for name in catalogue.dtype.names or ():
-            column = catalogue[name]
-            if column.dtype.kind in "iub":
-                columns.append((name, np.ascontiguousarray(column, dtype=np.int64)))
-            elif column.dtype.kind == "f":
-                columns.append((name, np.ascontiguousarray(column, dtype=np.float64)))
-            else:
-                raise ValueError(
-                    f"path: {file.suffix} files have columns of numbers (found words in {name}). Try: a name that ends in .ecsv"
-                )
-        metadata = _schema.to_keys(catalogue.attrs)
-        stars = [np.unique(catalogue[name]) for name in _schema.STAR if name in (catalogue.dtype.names or ())]
-        # As the command line states it, which does not read the columns.
-        if len(stars) == 3 and all(len(star) == 1 and star[0] > 0 for star in stars):
-            star, *effects = (float(values[0]) for values in stars)
-            metadata[_schema.STAR_KEY] = " ".join(f"{effect:.2e}" for effect in effects)
-            metadata[_schema.PSF_KEY] = f"{star:.0f}"
-        _shearq.write_table(str(file), format, columns, metadata)
-        return
-    # Completely or not at all.
-    with tempfile.TemporaryDirectory(dir=file.parent) as folder:
-        part = pathlib.Path(folder) / file.name
-        if format == "npy":
-            np.save(part, catalogue.view(np.ndarray))
-        else:
-            _tables.to_astropy(catalogue).write(part, format="ascii.ecsv")
-        os.replace(part, file)

@@ -6,6 +6,8 @@ import hashlib
 import re
 from typing import Any
 
+# The bit of ``flags`` of a galaxy whose ellipticity is missing.
+NOT_FINITE = 1
 # Whole numbers; the other columns of the schema are reals.
 WHOLE = ("flags", "iterations", "stop", "updated")
 # What the mean shear follows from.

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import _shearq
+from . import _display, _shearq
 from ._arrays import degrees, double, flat, real, shown, whole
 from ._submissions import submissions
 from ._warn import warn
@@ -125,9 +125,7 @@ class Score:
         -------
         matplotlib.axes.Axes
         """
-        from ._display import plot_score
-
-        return plot_score(self, ax)
+        return _display.plot_score(self, ax)
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{name} = {self[name]:.4g} ± {self.errors[name]:.2g}" for name in ("q", "m_cross"))

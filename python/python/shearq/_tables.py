@@ -1,14 +1,16 @@
-"""Catalogues as tables of other packages, and back."""
+"""Catalogues as tables of other packages and in files. The class of catalogues imports this module, and is passed to it."""
 
 from __future__ import annotations
 
+import os
+import pathlib
+import tempfile
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import _schema
-from ._catalogue import Catalogue, Flag
+from . import _schema, _shearq
 
 if TYPE_CHECKING:
     import astropy.table  # type: ignore[import-untyped, unused-ignore]
@@ -18,14 +20,15 @@ if TYPE_CHECKING:
 
 # Largest whole number up to which a double has all of them.
 _EXACT = 2**53
+_FORMATS = {".parquet": "parquet", ".pq": "parquet", ".fits": "fits", ".fit": "fits", ".ecsv": "ecsv", ".npy": "npy"}
 
 
-def _columns(catalogue: Catalogue) -> dict[str, Any]:
+def _columns(catalogue: Any) -> dict[str, Any]:
     """Columns by name, each in memory of its own."""
     return {name: np.ascontiguousarray(catalogue[name]) for name in catalogue.dtype.names or ()}
 
 
-def to_astropy(catalogue: Catalogue) -> astropy.table.Table:
+def to_astropy(catalogue: Any) -> astropy.table.Table:
     from astropy.table import Table
 
     meta = {key: _schema.in_header(value) for key, value in _schema.to_keys(catalogue.attrs).items()}
@@ -40,7 +43,7 @@ def to_astropy(catalogue: Catalogue) -> astropy.table.Table:
     return table
 
 
-def to_pandas(catalogue: Catalogue) -> pandas.DataFrame:
+def to_pandas(catalogue: Any) -> pandas.DataFrame:
     import pandas
 
     frame = pandas.DataFrame(_columns(catalogue))
@@ -48,7 +51,7 @@ def to_pandas(catalogue: Catalogue) -> pandas.DataFrame:
     return frame
 
 
-def to_polars(catalogue: Catalogue) -> polars.DataFrame:
+def to_polars(catalogue: Any) -> polars.DataFrame:
     import polars
 
     return polars.DataFrame(_columns(catalogue))
@@ -69,8 +72,8 @@ def _plain(name: str, column: Any) -> np.ndarray[Any, Any]:
     return np.asarray(array)
 
 
-def from_table(table: Any, columns: Mapping[str, str] | None = None) -> Catalogue:
-    if isinstance(table, Catalogue) and not columns:
+def from_table(cls: Any, table: Any, columns: Mapping[str, str] | None = None) -> Any:
+    if isinstance(table, cls) and not columns:
         return table.copy()
     if isinstance(table, np.ndarray):
         if table.dtype.names is None:
@@ -91,10 +94,10 @@ def from_table(table: Any, columns: Mapping[str, str] | None = None) -> Catalogu
         for name in names
         if name in taken or str(name) not in given.values()
     }
-    return build(found, _schema.to_attrs(metadata))
+    return build(cls, found, _schema.to_attrs(metadata))
 
 
-def build(found: dict[str, Any], attrs: dict[str, Any]) -> Catalogue:
+def build(cls: Any, found: dict[str, Any], attrs: dict[str, Any]) -> Any:
     """The catalogue of columns, of which those of the schema get their types."""
     missing = [name for name in ("e1", "e2") if name not in found]
     if missing:
@@ -125,9 +128,54 @@ def build(found: dict[str, Any], attrs: dict[str, Any]) -> Catalogue:
         raise ValueError(f"table: {error}; expected numbers") from None
     if "flags" not in arrays:
         finite = np.isfinite(arrays["e1"]) & np.isfinite(arrays["e2"])
-        arrays["flags"] = np.where(finite, 0, int(Flag.NotFinite)).astype(np.int32)
-    catalogue = np.empty(rows, dtype=[(name, array.dtype) for name, array in arrays.items()]).view(Catalogue)
+        arrays["flags"] = np.where(finite, 0, _schema.NOT_FINITE).astype(np.int32)
+    catalogue = np.empty(rows, dtype=[(name, array.dtype) for name, array in arrays.items()]).view(cls)
     for name, array in arrays.items():
         catalogue[name] = array
     catalogue.attrs = attrs
     return catalogue
+
+
+def file_format(path: pathlib.Path) -> str:
+    try:
+        return _FORMATS[path.suffix.lower()]
+    except KeyError:
+        raise ValueError(
+            f"path: found {path.name!r}; expected a name that ends in .parquet, .fits, .ecsv or .npy"
+        ) from None
+
+
+def write(catalogue: Any, path: str | os.PathLike[str], overwrite: bool) -> None:
+    file = pathlib.Path(path)
+    format = file_format(file)
+    if file.exists() and not overwrite:
+        raise FileExistsError(f"path: there is a file {file}. Try: overwrite=True")
+    if format in ("parquet", "fits"):
+        columns: list[tuple[str, Any]] = []
+        for name in catalogue.dtype.names or ():
+            column = catalogue[name]
+            if column.dtype.kind in "iub":
+                columns.append((name, np.ascontiguousarray(column, dtype=np.int64)))
+            elif column.dtype.kind == "f":
+                columns.append((name, np.ascontiguousarray(column, dtype=np.float64)))
+            else:
+                raise ValueError(
+                    f"path: {file.suffix} files have columns of numbers (found words in {name}). Try: a name that ends in .ecsv"
+                )
+        metadata = _schema.to_keys(catalogue.attrs)
+        stars = [np.unique(catalogue[name]) for name in _schema.STAR if name in (catalogue.dtype.names or ())]
+        # As the command line states it, which does not read the columns.
+        if len(stars) == 3 and all(len(star) == 1 and star[0] > 0 for star in stars):
+            star, *effects = (float(values[0]) for values in stars)
+            metadata[_schema.STAR_KEY] = " ".join(f"{effect:.2e}" for effect in effects)
+            metadata[_schema.PSF_KEY] = f"{star:.0f}"
+        _shearq.write_table(str(file), format, columns, metadata)
+        return
+    # Completely or not at all.
+    with tempfile.TemporaryDirectory(dir=file.parent) as folder:
+        part = pathlib.Path(folder) / file.name
+        if format == "npy":
+            np.save(part, catalogue.view(np.ndarray))
+        else:
+            to_astropy(catalogue).write(part, format="ascii.ecsv")
+        os.replace(part, file)
