@@ -7,15 +7,17 @@ use clap::Args;
 use crate::{count, tell};
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::pattern::{MAX_IMAGE, MAX_SET};
-use shearq_pipeline::gather::{Content, Files, Gathered, Gathering, Stamps, Table, gather};
+use shearq_pipeline::gather::{
+    Content, Files, Gathered, Gathering, Masks, Square, Stamps, Table, gather,
+};
 use shearq_pipeline::images::ImageId;
 
 /// Gather your stamps and PSFs into a data folder for `measure`.
 ///
 /// Subtract the sky first. Stamps come from FITS files of one stamp, a cube or several extensions each. Or they are cut
-/// out of an exposure around positions.
+/// out of an exposure around positions. Stamps smaller than the largest get missing pixels around them.
 ///
-/// Pixels are missing if they are outside the exposure, not finite, or not zero in a mask. A linear configuration
+/// Pixels are missing if they are outside the exposure, not finite, −1e30, or not zero in a mask. A linear configuration
 /// fills a few from the opposite side of the galaxy; a network flags the galaxy.
 ///
 /// The PSF is one star stamp for all galaxies, or one per galaxy in the same order. It may also be a table of functional
@@ -36,6 +38,9 @@ pub(crate) struct Arguments {
     /// Masks of the stamps in the same order, or of the exposure. A pixel is missing if its mask is not zero.
     #[arg(long, value_name = "FILE", num_args = 1..)]
     mask: Vec<PathBuf>,
+    /// Bits of the masks, from 0 for the lowest: a pixel is missing if one of them is set [default: all].
+    #[arg(long, value_name = "BITS", value_delimiter = ',', num_args = 1, value_parser = clap::value_parser!(u8).range(0..=52))]
+    mask_bits: Option<Vec<u8>>,
     /// Use only masks of this name [default files: the stamps or the exposure].
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
@@ -73,6 +78,10 @@ pub(crate) struct Arguments {
     /// Pixels a side of the stamps that are cut out.
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure", conflicts_with = "stamps")]
     size: u16,
+    /// Make squares of stamps that are not: by their central square (crop), or by missing pixels around them (pad). A galaxy with
+    /// many missing pixels is flagged. PSFs are cropped [default: refuse].
+    #[arg(long, value_name = "HOW", value_parser = ["crop", "pad"], conflicts_with = "exposure")]
+    square: Option<String>,
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy.
     /// Several stars, at most half as many as galaxies, are averaged to one PSF.
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
@@ -101,11 +110,13 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         extension,
         mask,
         mask_extension,
+        mask_bits,
         positions,
         table,
         first_pixel,
         columns,
         size,
+        square,
         psf,
         psf_extension,
         noise,
@@ -130,6 +141,13 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         content: Content::Mask,
     };
     let masked = !mask.is_empty() || mask_extension.is_some();
+    anyhow::ensure!(
+        masked || mask_bits.is_none(),
+        "--mask-bits is given without a mask; expected --mask or --mask-extension"
+    );
+    let bits = mask_bits
+        .as_ref()
+        .map(|bits| bits.iter().fold(0, |all, bit| all | 1u64 << bit));
     let psfs = Files {
         paths: psf,
         extension: psf_extension.as_deref(),
@@ -158,7 +176,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     };
     let gathering = Gathering {
         stamps,
-        masks: masked.then_some(masks),
+        square: square.as_deref().map(|how| match how {
+            "crop" => Square::Crop,
+            _ => Square::Pad,
+        }),
+        masks: masked.then_some(Masks { files: masks, bits }),
         psfs,
         noise: *noise,
     };

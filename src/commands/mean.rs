@@ -6,6 +6,7 @@ use clap::Args;
 
 use crate::arguments::{Form, SetList, Threads};
 use crate::tell;
+use shearq_measure::Warning;
 use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::inputs;
 use shearq_results::mean::mean_shears;
@@ -84,6 +85,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         if let Some(flagged) = mean.mostly_flagged() {
             anyhow::ensure!(mean.galaxies > 0, "set {set:02}: {flagged}");
             tell(format_args!("warning: set {set:02}: {flagged}"));
+        }
+        if let Some(frame) = mean.frame {
+            let warning = Warning::PixelFrame(frame);
+            tell(format_args!("warning: set {set:02}: {warning}"));
         }
         if mean.is_constant() {
             tell(format_args!(

@@ -720,3 +720,238 @@ fn a_psf_with_other_pixels_or_wider_than_the_galaxies_is_reported() {
     );
     assert!(!small.at("wide/set01").exists());
 }
+
+#[test]
+fn stamps_become_squares_of_the_largest_side_on_request() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    fs::write(at("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
+    let value = |x: usize, y: usize| (100 * y + x) as f32;
+    let image = |name: &str, [columns, rows]: [usize; 2]| {
+        let pixels: Vec<f32> = (0..columns * rows)
+            .map(|at| value(at % columns, at / columns))
+            .collect();
+        let path = at(name);
+        let file = fits_image(-32, &[columns, rows], &[], &floats(&pixels));
+        fs::write(&path, file).unwrap();
+        path
+    };
+    // Column 0 and row 0 of the stamp are at `first` in the file.
+    let expected = |side: usize, [columns, rows]: [usize; 2], first: [i64; 2]| -> Vec<u32> {
+        let pixel = |at: usize| {
+            let (x, y) = ((at % side) as i64 + first[0], (at / side) as i64 + first[1]);
+            match (0..columns as i64).contains(&x) && (0..rows as i64).contains(&y) {
+                true => value(x as usize, y as usize).to_bits(),
+                false => f32::NAN.to_bits(),
+            }
+        };
+        (0..side * side).map(pixel).collect()
+    };
+    let bits = |stamp: &[f32]| -> Vec<u32> { stamp.iter().map(|value| value.to_bits()).collect() };
+    let (wide, small, large) = (
+        image("wide.fits", [24, 20]),
+        image("small.fits", [21, 21]),
+        image("large.fits", [24, 24]),
+    );
+    let (psf, none, said) = (at("psf.fits"), at("none"), at("said"));
+    let from = ["--stamps", text(&wide)];
+    let gather = ["gather", "--psf", text(&psf)];
+    let refused = fail(&[&gather[..], &from, &["--out", text(&none)]].concat());
+    assert!(
+        refused.contains("24 × 20") && refused.contains("--square crop"),
+        "{refused}"
+    );
+    let square = |how: &str, side| {
+        let found = gathered(root.path(), &[&from[..], &["--square", how]].concat(), side);
+        bits(&found[0])
+    };
+    assert_eq!(square("crop", 20), expected(20, [24, 20], [2, 0]));
+    assert_eq!(square("pad", 24), expected(24, [24, 20], [0, -2]));
+    // A mask has the shape of its stamp.
+    let mut mask = vec![0.0f32; 480];
+    mask[24 * 5 + 7] = 1.0;
+    let path = at("mask.fits");
+    fs::write(&path, fits_image(-32, &[24, 20], &[], &floats(&mask))).unwrap();
+    let masked = ["--square", "crop", "--mask", text(&path)];
+    let found = gathered(root.path(), &[&from[..], &masked].concat(), 20);
+    let lost: Vec<usize> = (0..400).filter(|at| found[0][*at].is_nan()).collect();
+    assert_eq!(lost, [20 * 5 + 5]);
+    // Without a request: these are squares.
+    let large = text(&large);
+    let both = ["--stamps", text(&small), large, large, large];
+    let found = gathered(root.path(), &both, 24);
+    assert_eq!(bits(&found[0]), expected(24, [21, 21], [-2, -2]));
+    assert_eq!(bits(&found[1]), expected(24, [24, 24], [0, 0]));
+    let done = shearq(&[&gather[..], &both, &["--out", text(&said)]].concat());
+    let said = String::from_utf8(done.stderr).unwrap();
+    let note = "the stamps have sides of 21 to 24 px";
+    assert!(said.contains(note), "{said}");
+}
+
+#[test]
+fn mask_bits_and_sextractors_blank_make_pixels_missing() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    fs::write(at("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
+    let mut stamp = vec![1.0f32; 400];
+    stamp[9] = -1e30;
+    // Large, but a value.
+    stamp[10] = -1e29;
+    let mut mask = vec![0i32; 400];
+    // Single precision has no 2^30 + 1.
+    mask[3] = (1 << 30) + 1;
+    mask[4] = 1 << 30;
+    mask[5] = 6;
+    // All bits but the lowest.
+    mask[6] = -2;
+    let bytes: Vec<u8> = mask.iter().flat_map(|value| value.to_be_bytes()).collect();
+    let mut half = vec![0.0f32; 400];
+    half[0] = 0.5;
+    let (stamps, mask, fraction) = (at("stamps.fits"), at("mask.fits"), at("half.fits"));
+    fs::write(&stamps, cube(&[stamp], 20)).unwrap();
+    fs::write(&mask, fits_image(32, &[20, 20], &[], &bytes)).unwrap();
+    fs::write(&fraction, cube(&[half], 20)).unwrap();
+    let from = ["--stamps", text(&stamps)];
+    let lost = |more: &[&str]| {
+        let found = gathered(root.path(), &[&from[..], more].concat(), 20);
+        let missing = (0..400).filter(|at| found[0][*at].is_nan());
+        missing.collect::<Vec<usize>>()
+    };
+    let masked = ["--mask", text(&mask)];
+    let some = |bits: &str| lost(&[&masked[..], &["--mask-bits", bits]].concat());
+    assert_eq!(lost(&[]), [9]);
+    assert_eq!(lost(&masked), [3, 4, 5, 6, 9]);
+    assert_eq!(some("0"), [3, 9]);
+    assert_eq!(some("1,30"), [3, 4, 5, 6, 9]);
+    let (psf, out) = (at("psf.fits"), at("none"));
+    let gather = ["gather", "--mask-bits", "2", "--psf", text(&psf)];
+    let gather = [&gather[..], &from, &["--out", text(&out)]].concat();
+    let message = fail(&[&gather[..], &["--mask", text(&fraction)]].concat());
+    assert!(message.contains("the mask has the value 0.5"), "{message}");
+    let message = fail(&gather);
+    assert!(message.contains("without a mask"), "{message}");
+}
+
+#[test]
+fn small_psfs_and_grids_of_stars_are_explained() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let profile = PsfProfile::Moffat { beta: 3.0 };
+    let psf = FunctionalPsf::new(profile, 3.4, Shear::new(0.0, 0.0)).unwrap();
+    let star = |side: usize| -> Vec<f32> { psf.stamp(side).iter().map(|v| *v as f32).collect() };
+    let one = star(48);
+    // As GREAT3 has them.
+    let nine: Vec<f32> = (0..144 * 144)
+        .map(|at| one[at / 144 % 48 * 48 + at % 144 % 48])
+        .collect();
+    for (name, stamps, side) in [
+        ("stamps.fits", vec![one.clone(); 4], 48),
+        ("three.fits", vec![one; 3], 48),
+        ("small.fits", vec![star(24)], 24),
+        ("nine.fits", vec![nine], 144),
+        ("large.fits", vec![star(144)], 144),
+    ] {
+        fs::write(at(name), cube(&stamps, side)).unwrap();
+    }
+    let (stamps, out) = (at("stamps.fits"), at("new/data"));
+    let said = |psf: &str| {
+        let psf = at(psf);
+        let gather = ["gather", "--stamps", text(&stamps), "--psf", text(&psf)];
+        let done = shearq(&[&gather[..], &["--out", text(&out)]].concat());
+        // A failure leaves no folder.
+        assert_eq!(at("new").exists(), done.status.success());
+        let _ = fs::remove_dir_all(at("new"));
+        String::from_utf8(done.stderr).unwrap()
+    };
+    for (psf, expected) in [
+        ("absent.fits", "absent.fits"),
+        ("three.fits", "at least twice as many stamps"),
+        ("small.fits", "24 × 24 px (expected 32 × 32"),
+        ("small.fits", "psf.size = 24"),
+        ("nine.fits", "the image has 3 × 3 stars"),
+        ("nine.fits", "a cube of 9 stamps of 48 × 48 px"),
+    ] {
+        let message = said(psf);
+        assert!(message.contains(expected), "{message}");
+    }
+    let message = said("large.fits");
+    let quiet = !message.contains("stars") && !message.contains("expected 32");
+    assert!(quiet, "{message}");
+}
+
+#[test]
+fn pixel_axes_that_are_not_the_skys_are_stated() {
+    let small = Small::new("2");
+    let set = small.at("data/set02");
+    let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
+    let (star, side) = pixels_of(&set.join("psf-001.fits"));
+    let header = |matrix: [f64; 4]| -> Vec<String> {
+        let names = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"].into_iter();
+        let mut cards: Vec<_> = names
+            .zip(matrix)
+            .map(|(name, value)| format!("{name:<8}= {:>20.6E}", value * 7.3e-5))
+            .collect();
+        cards.extend(["CTYPE1  = 'RA---TAN'", "CTYPE2  = 'DEC--TAN'"].map(str::to_owned));
+        cards
+    };
+    // DECam's x is to the south and its y to the east.
+    let [on_camera, on_sky] = [
+        ("camera", [0.0, 1.0, -1.0, 0.0]),
+        ("sky", [-1.0, 0.0, 0.0, 1.0]),
+    ]
+    .map(|(name, matrix)| {
+        let cards = header(matrix);
+        let cards: Vec<&str> = cards.iter().map(String::as_str).collect();
+        let write = |name: String, sides: &[usize], pixels: &[f32]| {
+            let path = small.at(&name);
+            fs::write(&path, fits_image(-32, sides, &cards, &floats(pixels))).unwrap();
+            path
+        };
+        let stack = [48, 48, galaxies.len()];
+        (
+            write(format!("{name}.fits"), &stack, &galaxies.concat()),
+            write(format!("{name}-psf.fits"), &[side; 2], &star),
+        )
+    });
+    let said = |arguments: &[&str]| {
+        let done = shearq(arguments);
+        let said = String::from_utf8(done.stderr).unwrap();
+        assert!(done.status.success(), "{said}");
+        said
+    };
+    let gather = |stamps: &[&str], psf: &Path, image: &str, out: &str| {
+        let out = small.at(out);
+        let rest = ["--psf", text(psf), "--image", image, "--out", text(&out)];
+        said(&[&["gather", "--stamps"][..], stamps, &rest].concat())
+    };
+    let measure = |data: &str| {
+        let (data, out) = (small.at(data), small.at(&format!("{data}-out")));
+        let measure = ["measure", "--submission", LINEAR, "--data", text(&data)];
+        said(&[&measure[..], &["--out", text(&out)]].concat())
+    };
+    let (camera, sky) = (text(&on_camera.0), text(&on_sky.0));
+    let message = gather(&[sky], &on_sky.1, "1", "both");
+    assert!(!message.contains("warning"), "{message}");
+    let out = small.at("camera-out");
+    let stated = "e1 and e2 are along the pixel axes, which are not the sky's (found +y at position angle 90.0°, mirrored, sheared by (+0.0000, +0.0000)";
+    for message in [
+        gather(&[camera], &on_camera.1, "1", "camera"),
+        measure("camera"),
+        said(&["mean", "--measured", text(&out)]),
+    ] {
+        assert!(message.contains(stated), "{message}");
+    }
+    gather(&[camera], &on_camera.1, "2", "both");
+    measure("both");
+    let out = small.at("both-out");
+    let message = fail(&["mean", "--measured", text(&out)]);
+    let expected = "the pixel axes of image 2 are not those of image 1";
+    assert!(message.contains(expected), "{message}");
+    let message = gather(&[sky], &on_camera.1, "1", "mixed");
+    let expected =
+        "the PSF image and the galaxy image have pixel axes of different orientation or shear";
+    assert!(message.contains(expected), "{message}");
+    let message = gather(&[sky, camera], &on_sky.1, "1", "two");
+    let expected = "camera.fits: image 1, plane 1: the header states other pixel axes";
+    assert!(message.contains(expected), "{message}");
+}

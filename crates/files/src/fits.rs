@@ -16,5 +16,7 @@ mod tiling;
 mod write;
 
 pub use header::Value;
-pub use read::{ImageReader, TableHead, read_table, read_table_keys, read_table_parts, tables};
+pub use read::{
+    ImageReader, Pixel, TableHead, read_table, read_table_keys, read_table_parts, tables,
+};
 pub use write::{ImageWriter, write_table};

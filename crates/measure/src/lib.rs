@@ -91,7 +91,7 @@ pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::{Sky, Subtraction};
 pub use steps::Steps;
 pub use versions::{Version, Versions};
-pub use warning::{Of, Warning};
+pub use warning::{Of, PixelFrame, Warning};
 pub use worker::{ImageNoise, ImageWorker, PsfWorker, Worker};
 
 /// The examples of README.md.

@@ -179,6 +179,15 @@ pub enum Warning {
         /// Set and image of the path.
         expected: [u32; 2],
     },
+    /// Ellipticities are along pixel axes that the header rotates, mirrors or shears against the sky's.
+    PixelFrame(PixelFrame),
+    /// The headers of the PSF image and of the galaxy image state pixel axes of different orientation or shear.
+    PsfFrame {
+        /// The pixel axes of the PSF image.
+        psf: PixelFrame,
+        /// The pixel axes of the galaxy image.
+        galaxies: PixelFrame,
+    },
     /// The configuration uses so little of the PSF that its wings are missing.
     PsfSize {
         /// Pixels a side that are used.
@@ -193,6 +202,38 @@ pub enum Warning {
         /// All galaxies.
         of: usize,
     },
+}
+
+/// The pixel axes of an image against the sky's: +x to the west, +y to the north.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct PixelFrame {
+    /// Position angle of +y in degrees, from north through east, without the shear.
+    pub angle: f64,
+    /// Whether +x is to the east where +y is to the north.
+    pub mirrored: bool,
+    /// Reduced shear that an object that is round on the sky has along the pixel axes.
+    pub shear: [f64; 2],
+}
+
+impl fmt::Display for PixelFrame {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let PixelFrame {
+            angle,
+            mirrored,
+            shear,
+        } = self;
+        let parity = if *mirrored {
+            "mirrored"
+        } else {
+            "not mirrored"
+        };
+        // Without the sign of a zero.
+        let [g1, g2] = shear.map(|g| (g * 1e4).round() / 1e4 + 0.0);
+        write!(
+            f,
+            "+y at position angle {angle:.1}°, {parity}, sheared by ({g1:+.4}, {g2:+.4})"
+        )
+    }
 }
 
 /// How many of the PSFs examined a warning is about.
@@ -295,6 +336,8 @@ impl Warning {
             Warning::PsfBroad { .. } => "psf-broad",
             Warning::PixelScale { .. } => "pixel-scale",
             Warning::OtherImage { .. } => "other-image",
+            Warning::PixelFrame(_) => "pixel-frame",
+            Warning::PsfFrame { .. } => "psf-frame",
             Warning::PsfSize { .. } => "psf-size",
             Warning::Flagged { .. } => "flagged",
         }
@@ -552,6 +595,14 @@ impl fmt::Display for Warning {
                 f,
                 "the header of the {of} states another image (found SET = {set} and IMAGE = {image}, expected {} and {}). With galaxies or a PSF of another image shears are wrong. Try: put the files back, or correct the header",
                 expected[0], expected[1]
+            ),
+            Warning::PixelFrame(frame) => write!(
+                f,
+                "e1 and e2 are along the pixel axes, which are not the sky's (found {frame}; expected 0°, not mirrored, no shear). Try: transform e1 and e2 with the WCS, or compare them with shears along the pixel axes"
+            ),
+            Warning::PsfFrame { psf, galaxies } => write!(
+                f,
+                "the PSF image and the galaxy image have pixel axes of different orientation or shear (found {psf}; expected {galaxies}). The PSF is deconvolved in the wrong orientation. Try: draw the PSF with the WCS of the galaxies, or correct its header"
             ),
             Warning::PsfSize { size } => write!(
                 f,

@@ -8,7 +8,7 @@ mod source;
 mod stamps;
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use shearq_measure::{Examination, Warning};
@@ -25,7 +25,7 @@ use super::images::ImageId;
 use super::measure::check_strip;
 use crate::data::layout::{DataFolder, MAX_STAMP};
 use crate::data::mosaic::Mosaic;
-use crate::pixel_scale;
+use crate::wcs::Wcs;
 use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_files::open::is_there;
@@ -35,6 +35,9 @@ use shearq_files::table;
 const MAX_STAMPS: usize = table::MAX_ROWS;
 /// Least pixels a side of a single stamp that looks like a mosaic or an exposure: four times the default stamp.
 const LARGE: usize = 192;
+/// Advice for stamps that are not square.
+const SQUARE: &str =
+    "--square crop, which takes the central square; --square pad, which adds missing pixels; or ";
 /// Advice for a mosaic or an exposure.
 const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
 /// Largest difference of an offset from a whole pixel.
@@ -44,7 +47,8 @@ const HALF: f64 = 0.5;
 #[derive(Debug, Clone, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Stamps<'a> {
-    /// FITS files, each with one stamp, a cube of them, or several extensions with either.
+    /// FITS files, each with one stamp, a cube of them, or several extensions with either. Stamps smaller than the largest get
+    /// missing pixels around them.
     Files(Files<'a>),
     /// Squares of an exposure around positions.
     Cutouts {
@@ -70,13 +74,37 @@ pub struct Gathered {
     pub messages: Vec<String>,
 }
 
+/// How stamps become squares.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Square {
+    /// By their central square.
+    Crop,
+    /// By missing pixels around them. PSFs, which may not lack pixels, are cropped.
+    Pad,
+}
+
+/// Masks, whose pixels are bad if they are not zero or have a bit that is asked for.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Masks<'a> {
+    /// Their files.
+    #[serde(flatten)]
+    pub files: Files<'a>,
+    /// Sum of the powers of two of the bits.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bits: Option<u64>,
+}
+
 /// The sources of an image.
 #[derive(Debug, Clone, Serialize)]
 pub struct Gathering<'a> {
     /// Its stamps.
     pub stamps: Stamps<'a>,
-    /// Masks with the sizes of the stamps or the exposure. A pixel is missing if its mask is not zero.
-    pub masks: Option<Files<'a>>,
+    /// What stamps and PSFs of files that are not square become; without it they are refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub square: Option<Square>,
+    /// Masks with the sizes of the stamps or the exposure.
+    pub masks: Option<Masks<'a>>,
     /// One PSF, one per stamp, or stars to average.
     pub psfs: Files<'a>,
     /// The image's NOISESIG.
@@ -105,15 +133,23 @@ pub fn gather(
 ) -> Result<Gathered, PipelineError> {
     let which = data.stamps(id.set, id.image);
     let folder = which.parent().unwrap_or(Path::new("."));
-    let (made, cannot) = (!folder.exists(), "cannot make the folder");
+    let cannot = "cannot make the folder";
+    let absent = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
+    let made: Vec<PathBuf> = folder
+        .ancestors()
+        .take_while(absent)
+        .map(Path::to_owned)
+        .collect();
     fs::create_dir_all(folder).map_err(FileError::doing(folder, cannot))?;
     let alone = fs::File::open(folder).map_err(FileError::doing(folder, cannot))?;
     // Not all file systems have locks.
     let _ = alone.lock();
     let gathered = gather_alone(data, id, gathering);
-    if made && gathered.is_err() {
-        // Fails if the folder is not empty.
-        let _ = fs::remove_dir(folder);
+    if gathered.is_err() {
+        for folder in made {
+            // Fails if the folder is not empty.
+            let _ = fs::remove_dir(folder);
+        }
     }
     gathered
 }
@@ -134,14 +170,15 @@ fn gather_alone(
         .map_err(FileError::doing(&which, "cannot write the record"))?;
     let Plan {
         positions,
-        stack: Stack { count, side, scale },
+        stack,
         mut messages,
-    } = Plan::of(&gathering.stamps)?;
+    } = Plan::of(&gathering.stamps, gathering.square)?;
+    let Stack { count, side, wcs } = stack;
     let mosaic = Mosaic::of(count, side);
     check_strip(&target, mosaic.columns, side)?;
-    let psfs = gather_psfs(data, id, gathering.psfs, &mosaic)?;
+    let psfs = gather_psfs(data, id, gathering.psfs, gathering.square, &mosaic)?;
     messages.extend_from_slice(&psfs.messages);
-    let mut writer = StampWriter::create(&target, mosaic, gathering.noise)?;
+    let mut writer = StampWriter::create(&target, mosaic, gathering.noise, &wcs)?;
     writer.copy(gathering, &positions)?;
     let mut warnings = writer.examination.warnings();
     warnings.extend(
@@ -150,7 +187,8 @@ fn gather_alone(
             .and_then(|sigma| writer.examination.given_noise(sigma)),
     );
     warnings.extend(width(&writer.examination, &psfs)?);
-    warnings.extend(pixel_scale::disagreement(psfs.scale, scale));
+    warnings.extend(Wcs::disagreements(&psfs.wcs, &wcs));
+    warnings.extend(wcs.frame());
     let ImageId { set, image } = id;
     messages.extend(warnings.iter().map(|warning| {
         let hint = one_pixel_off(&gathering.stamps, warning).unwrap_or_default();
@@ -204,9 +242,9 @@ struct Plan {
 impl Plan {
     /// # Errors
     /// If stamps or positions cannot be read or used.
-    fn of(stamps: &Stamps<'_>) -> Result<Self, FileError> {
+    fn of(stamps: &Stamps<'_>, square: Option<Square>) -> Result<Self, FileError> {
         match stamps {
-            Stamps::Files(files) => Plan::of_files(*files),
+            Stamps::Files(files) => Plan::of_files(*files, square),
             Stamps::Cutouts {
                 exposure,
                 positions,
@@ -216,10 +254,9 @@ impl Plan {
         }
     }
 
-    fn of_files(files: Files<'_>) -> Result<Self, FileError> {
-        let stack = Stack::of(files)?;
+    fn of_files(files: Files<'_>, square: Option<Square>) -> Result<Self, FileError> {
+        let (stack, mut messages) = Stack::of(files, square)?;
         let side = stack.side;
-        let mut messages = Vec::new();
         if stack.count == 1 && side >= LARGE {
             messages.push(format!(
                 "warning: {}: the only stamp is {side} × {side} px, which looks like a mosaic of stamps or an exposure. Try: {MOSAIC}",
@@ -253,7 +290,7 @@ impl Plan {
             stack: Stack {
                 count: positions.all.len(),
                 side,
-                scale: exposure.scale()?,
+                wcs: exposure.wcs()?,
             },
             positions: positions.all,
             messages,
@@ -266,21 +303,28 @@ struct Stack {
     count: usize,
     /// Pixels a side.
     side: usize,
-    /// Pixel scale in arcseconds, if the header of the first image states it.
-    scale: Option<f64>,
+    /// Of the first image.
+    wcs: Wcs,
 }
 
 impl Stack {
+    /// The stamps with notes and warnings.
+    ///
     /// # Errors
-    /// If a file cannot be read, or the stamps are not squares of one size.
-    fn of(files: Files<'_>) -> Result<Self, FileError> {
-        let (mut count, mut first) = (0usize, None);
+    /// If a file cannot be read, stamps are not square and may not be made so, or PSFs are of several sizes.
+    fn of(files: Files<'_>, square: Option<Square>) -> Result<(Self, Vec<String>), FileError> {
+        let (mut count, mut first, mut messages) = (0usize, None, Vec::new());
+        let mut sides = [0; 2];
         let mut images = Images::of(files);
         while let Some((origin, image)) = images.next()? {
             let (width, height) = (image.width(), image.height());
-            if width != height || width > MAX_STAMP {
+            if width.max(height) > MAX_STAMP || width != height && square.is_none() {
                 let advice = match files.content {
+                    Content::Sky if width.max(height) < LARGE => format!(". Try: {SQUARE}{MOSAIC}"),
                     Content::Sky => format!(". Try: {MOSAIC}"),
+                    Content::Psf if width.max(height) <= MAX_STAMP => {
+                        ". Try: --square crop, which takes the central square".to_owned()
+                    }
                     Content::Psf | Content::Mask => String::new(),
                 };
                 let message = format!(
@@ -288,12 +332,25 @@ impl Stack {
                 );
                 return Err(origin.fault(&message));
             }
-            let (side, _) = *first.get_or_insert_with(|| (width, pixel_scale::of_header(image)));
-            if width != side {
+            let side = match (files.content, square) {
+                (Content::Sky, Some(Square::Pad)) => width.max(height),
+                _ => width.min(height),
+            };
+            let wcs = Wcs::of_header(image);
+            let (expected, first_wcs) = *first.get_or_insert((side, wcs));
+            if side != expected && files.content == Content::Psf {
                 let message = format!(
-                    "the stamp is {width} × {height} pixels; the first has {side} × {side}"
+                    "the stamp is {width} × {height} pixels; the first has {expected} × {expected}"
                 );
                 return Err(origin.fault(&message));
+            }
+            sides = match sides {
+                [0, 0] => [side; 2],
+                [least, most] => [side.min(least), side.max(most)],
+            };
+            if messages.is_empty() && Wcs::disagreements(&wcs, &first_wcs).next().is_some() {
+                let message = "the header states other pixel axes or another pixel scale than that of the first image, so that ellipticities are not along the same axes. Try: one orientation per image (--image)";
+                messages.push(format!("warning: {}", origin.fault(message)));
             }
             count += image.planes();
             if count > MAX_STAMPS {
@@ -301,8 +358,15 @@ impl Stack {
             }
         }
         // No list of files is empty.
-        let (side, scale) = first.unwrap_or((1, None));
-        Ok(Stack { count, side, scale })
+        let (_, wcs) = first.unwrap_or_default();
+        let [least, side] = sides;
+        if least < side {
+            messages.push(format!(
+                "note: {}: the stamps have sides of {least} to {side} px. Smaller ones get missing pixels around them, to {side} px",
+                files.paths[0].display()
+            ));
+        }
+        Ok((Stack { count, side, wcs }, messages))
     }
 }
 

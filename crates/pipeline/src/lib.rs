@@ -12,11 +12,11 @@ pub mod grid;
 pub mod images;
 pub mod inputs;
 pub mod measure;
-mod pixel_scale;
 pub mod run;
 pub mod simulate;
 pub mod truth;
 mod warned;
+mod wcs;
 
 pub use engine::{Progress, Quiet};
 

@@ -17,7 +17,8 @@ use shearq_files::FileError;
 use shearq_measure::{Measurer, calibrate};
 
 pub use self::catalogue::{
-    COLUMNS, KEYS, PSF_NOISE, Summary, Value, all_flagged, more_columns, stated_psf_noise,
+    COLUMNS, KEYS, PSF_NOISE, Summary, Value, all_flagged, more_columns, stated_frame,
+    stated_psf_noise,
 };
 pub(crate) use self::catalogue::{Catalogues, metadata};
 pub(crate) use self::head::check_strip;

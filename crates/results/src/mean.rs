@@ -5,8 +5,11 @@ use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
-use shearq_measure::{Flag, Flags, MeanShear, ResponseMatrix, Selection, ShearSum, Warning};
+use shearq_measure::{
+    Flag, Flags, MeanShear, PixelFrame, ResponseMatrix, Selection, ShearSum, Warning,
+};
 use shearq_pipeline::data::run::Run;
+use shearq_pipeline::measure::stated_frame;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
@@ -38,6 +41,8 @@ pub struct SetMean {
     pub noisy_stars: usize,
     /// Standard deviation of e1 and of e2 of one galaxy.
     pub scatter: [f64; 2],
+    /// The pixel axes, if they are not the sky's.
+    pub frame: Option<PixelFrame>,
 }
 
 impl SetMean {
@@ -106,7 +111,21 @@ fn mean_of(
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
     let (mut flags, mut flagged, mut cut) = ([0; Flag::ALL.len()], 0, 0);
     let mut stars = Stars::default();
-    for (_, path) in catalogues {
+    let mut first = None;
+    for (image, path) in catalogues {
+        let frame = stated_frame(path, format)?;
+        let (before, expected) = *first.get_or_insert((*image, frame));
+        if !agree(frame, expected) {
+            let shown = |frame: Option<PixelFrame>| {
+                frame.map_or("those of the sky".into(), |frame| frame.to_string())
+            };
+            let message = format!(
+                "the pixel axes of image {image} are not those of image {before}, so that the ellipticities of set {set} have no common mean (found {}; expected {}). Try: images of one orientation per set (gather --set)",
+                shown(frame),
+                shown(expected)
+            );
+            return Err(FileError::new(path, message));
+        }
         let rows = match selection {
             Some(selection) => Rows::selected(path, selection)?,
             None => Rows::read(path, calibrated)?,
@@ -155,7 +174,17 @@ fn mean_of(
         psf_error,
         noisy_stars: stars.stated(),
         scatter: [0, 1].map(|k| moments[k].deviation() / response[k]),
+        frame: first.and_then(|(_, frame)| frame),
     })
+}
+
+/// Whether two images have one frame, to twice the rotation and ten times the shear that are not stated.
+fn agree(a: Option<PixelFrame>, b: Option<PixelFrame>) -> bool {
+    let [a, b] = [a, b].map(Option::unwrap_or_default);
+    // Ellipticities do not change by half a turn.
+    let turned = (a.angle - b.angle + 90.0).rem_euclid(180.0) - 90.0;
+    let [g1, g2] = [0, 1].map(|k| a.shear[k] - b.shear[k]);
+    a.mirrored == b.mirrored && turned.abs() < 2.0 && g1.hypot(g2) < 0.01
 }
 
 /// The columns of a catalogue from which a mean shear follows.

@@ -19,9 +19,33 @@ const FREE_NUMBERS: u64 = 1 << 22;
 // Numbers of cfitsio's interface, from its fitsio.h.
 const TLOGICAL: c_int = 14;
 const TFLOAT: c_int = 42;
+const TDOUBLE: c_int = 82;
 /// Type codes of columns that `ffgcvd` reads as one number a row: TBYTE, TSBYTE, TUSHORT, TSHORT,
 /// TUINT, TINT, TULONG, TLONG, TFLOAT, TULONGLONG, TLONGLONG, TDOUBLE.
 const NUMBERS: [c_int; 12] = [11, 12, 20, 21, 30, 31, 40, 41, 42, 80, 81, 82];
+
+/// Pixels of this value are missing: SExtractor writes it, in single precision.
+const MISSING: f32 = -1e30;
+
+/// A number that pixels are read as.
+pub trait Pixel: Copy + Default + Into<f64> {
+    /// Its code in cfitsio's interface.
+    #[doc(hidden)]
+    const CODE: c_int;
+    /// The value of missing pixels.
+    #[doc(hidden)]
+    const MISSING: Self;
+}
+
+impl Pixel for f32 {
+    const CODE: c_int = TFLOAT;
+    const MISSING: Self = f32::NAN;
+}
+
+impl Pixel for f64 {
+    const CODE: c_int = TDOUBLE;
+    const MISSING: Self = f64::NAN;
+}
 
 /// An image, or a cube of several of one size, open for reading.
 pub struct ImageReader {
@@ -216,16 +240,24 @@ impl ImageReader {
         self.next_row = (self.next_row + rows).min(self.rows());
     }
 
-    /// The next `rows` rows, or fewer at the end of the image. Pixels that are not finite or, in an
+    /// The next `rows` rows, or fewer at the end of the image. Pixels that are not finite, −1e30, or, in an
     /// image of integers, have the value of its key BLANK, are NaN.
     ///
     /// # Errors
     /// If the pixels cannot be read, as in a damaged file.
     pub fn read_rows(&mut self, rows: usize) -> Result<Vec<f32>, FileError> {
+        self.read_rows_as(rows)
+    }
+
+    /// The same in another precision: masks of more than 24 bits do not fit into `f32`.
+    ///
+    /// # Errors
+    /// As [`ImageReader::read_rows`].
+    pub fn read_rows_as<P: Pixel>(&mut self, rows: usize) -> Result<Vec<P>, FileError> {
         let first = self.next_row;
         let last = (first + rows).min(self.rows());
         self.need(last)?;
-        let mut pixels = vec![0f32; (last - first) * self.width];
+        let mut pixels = vec![P::default(); (last - first) * self.width];
         self.fill(first * self.width, &mut pixels)?;
         self.next_row = last;
         if self.last && last == self.rows() {
@@ -239,8 +271,13 @@ impl ImageReader {
     ///
     /// # Errors
     /// As [`ImageReader::read_rows`].
-    pub fn read_square(&mut self, x: i64, y: i64, side: usize) -> Result<Vec<f32>, FileError> {
-        let mut pixels = vec![f32::NAN; side * side];
+    pub fn read_square<P: Pixel>(
+        &mut self,
+        x: i64,
+        y: i64,
+        side: usize,
+    ) -> Result<Vec<P>, FileError> {
+        let mut pixels = vec![P::MISSING; side * side];
         let inside = |at: i64, most: usize| at.clamp(0, most as i64) as usize;
         let across = |first: i64, most| inside(first, most)..inside(first + side as i64, most);
         let (columns, rows) = (across(x, self.width), across(y, self.height));
@@ -266,9 +303,9 @@ impl ImageReader {
     }
 
     /// Reads as many pixels as there is room for, from the one at `first`, from 0.
-    fn fill(&mut self, first: usize, pixels: &mut [f32]) -> Result<(), FileError> {
+    fn fill<P: Pixel>(&mut self, first: usize, pixels: &mut [P]) -> Result<(), FileError> {
         // cfitsio always writes to the second.
-        let (mut blank, mut some_blank) = (f32::NAN, 0);
+        let (mut blank, mut some_blank) = (P::MISSING, 0);
         let start = (first + 1) as i64;
         let (width, rows) = (self.width, self.rows());
         let last = (first + pixels.len()).div_ceil(width);
@@ -278,7 +315,7 @@ impl ImageReader {
             |raw, status| unsafe {
                 sys::ffgpv(
                     raw,
-                    TFLOAT,
+                    P::CODE,
                     start,
                     pixels.len() as i64,
                     ptr::from_mut(&mut blank).cast(),
@@ -287,7 +324,13 @@ impl ImageReader {
                     status,
                 );
             },
-        )
+        )?;
+        for pixel in pixels {
+            if (*pixel).into() as f32 == MISSING {
+                *pixel = P::MISSING;
+            }
+        }
+        Ok(())
     }
 }
 

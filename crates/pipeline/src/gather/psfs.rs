@@ -7,17 +7,24 @@ use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_measure::{EXAMINED_PSFS, Examination, Psfs, Star, Warning, average_stars, star};
 use shearq_submissions::PsfCut;
+use shearq_submissions::limits::LEAST_PSF;
 
-use super::Stack;
 use super::rows::{Rows, first};
 use super::source::{Files, Planes};
+use super::stamps::central;
+use super::{Square, Stack};
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;
 use crate::data::psf_table;
 use crate::images::ImageId;
+use crate::wcs::Wcs;
 
 /// Pixels a side of a PSF that are examined: as many as configurations use.
 const EXAMINED_SIDE: usize = 48;
+/// Most stars a side of an image that is examined for several. GREAT3 has three.
+const MOST_STARS: usize = 10;
+/// Least pixels a side of such a star.
+const LEAST_CELL: usize = 16;
 /// Most pixels of stars that are averaged. All of them are in memory.
 const MOST_AVERAGED: usize = 1 << 24;
 
@@ -27,8 +34,7 @@ pub(super) struct GatheredPsfs {
     pub(super) examination: Examination,
     /// Notes and warnings.
     pub(super) messages: Vec<String>,
-    /// Pixel scale in arcseconds, if the header states it.
-    pub(super) scale: Option<f64>,
+    pub(super) wcs: Wcs,
     /// The first file of PSFs, for messages.
     pub(super) first: PathBuf,
 }
@@ -41,6 +47,7 @@ pub(super) fn gather_psfs(
     data: &DataFolder,
     id: ImageId,
     files: Files<'_>,
+    square: Option<Square>,
     mosaic: &Mosaic,
 ) -> Result<GatheredPsfs, FileError> {
     if let [table] = files.paths
@@ -50,17 +57,18 @@ pub(super) fn gather_psfs(
     {
         return functional(data.psf_functional(id.set, id.image), table, mosaic);
     }
-    let stack = Stack::of(files)?;
-    let Stack { count, side, .. } = stack;
+    let (stack, mut messages) = Stack::of(files, square)?;
+    let Stack { count, side, wcs } = stack;
+    messages.extend(small(&files.paths[0], side));
     let path = data.psf_star(id.set, id.image);
     // Stars of a field, not one star too few of one per galaxy.
     if count > 1 && 2 * count <= mosaic.galaxies {
-        return averaged(&path, files, &stack);
+        return averaged(&path, files, &stack, messages);
     }
     // No list of files is empty.
     check_count(&files.paths[0], count, mosaic)?;
     // One, or one per galaxy in the same places.
-    let mut image = Rows::create(&path, Mosaic::of(count, side), &[])?;
+    let mut image = Rows::create(&path, Mosaic::of(count, side), &wcs.keys())?;
     let mut planes = Planes::of(files);
     let mut examination = Examination::new(side, 0);
     if count > 1 {
@@ -68,6 +76,10 @@ pub(super) fn gather_psfs(
     }
     let mut dark = 0;
     while let Some((origin, pixels)) = planes.next()? {
+        let pixels = central(pixels, planes.sides(), side);
+        if count == 1 {
+            messages.extend(several_stars(&files.paths[0], &pixels, side));
+        }
         let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
         if !(light > 0.0 && light.is_finite()) {
             if count == 1 {
@@ -84,7 +96,7 @@ pub(super) fn gather_psfs(
         }
         image.add(&pixels)?;
     }
-    let mut messages = named(&examination, &files.paths[0]);
+    messages.extend(named(&examination, &files.paths[0]));
     if dark > 0 {
         messages.push(format!(
             "warning: {dark} of {count} PSFs have no positive sum of pixels. Their galaxies will be flagged"
@@ -94,9 +106,51 @@ pub(super) fn gather_psfs(
         file: PsfFile::Stars(Box::new(image)),
         examination,
         messages,
-        scale: stack.scale,
+        wcs,
         first: files.paths[0].clone(),
     })
+}
+
+/// A warning about PSF stamps that named configurations refuse.
+fn small(path: &Path, side: usize) -> Option<String> {
+    let shown = path.display();
+    (side < LEAST_PSF).then(|| {
+        format!(
+            "warning: {shown}: the PSF stamps are {side} × {side} px (expected {LEAST_PSF} × {LEAST_PSF} or more, which configurations of 48 px require). Try: larger PSF stamps; or, if no light is beyond them, --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  psf.size = {side}"
+        )
+    })
+}
+
+/// A warning about an image that is a grid of stars, as those of GREAT3.
+fn several_stars(path: &Path, pixels: &[f32], side: usize) -> Option<String> {
+    let brightest = |n: usize| {
+        let cell = side / n;
+        let square = move |k: usize| {
+            let places = (0..cell * cell).map(move |at| {
+                let (x, y) = (k % n * cell + at % cell, k / n * cell + at / cell);
+                (at, pixels[y * side + x])
+            });
+            places.max_by(|a, b| a.1.total_cmp(&b.1))
+        };
+        (0..n * n).filter_map(square).collect::<Vec<_>>()
+    };
+    let is_grid = |n: &usize| {
+        let cell = side / n;
+        let found = brightest(*n);
+        let most = found.iter().map(|(_, value)| *value).fold(0.0, f32::max);
+        let middle = |at: usize| (cell / 4..cell - cell / 4).contains(&at);
+        // Noise and wings beside one star are fainter than half of it.
+        let star = |&(at, value): &(usize, f32)| {
+            value > 0.5 * most && middle(at % cell) && middle(at / cell)
+        };
+        found.iter().all(star)
+    };
+    let mut grids = (2..=MOST_STARS).filter(|n| side.is_multiple_of(*n) && side / n >= LEAST_CELL);
+    let n = grids.find(is_grid)?;
+    let (shown, cell, stars) = (path.display(), side / n, n * n);
+    Some(format!(
+        "warning: {shown}: the image has {n} × {n} stars (found a peak in each square of {cell} × {cell} px; expected one star). The brightest is used. Try: a cube of {stars} stamps of {cell} × {cell} px, which are averaged to one PSF"
+    ))
 }
 
 /// Checks that there is one PSF, or one per galaxy.
@@ -105,7 +159,7 @@ fn check_count(path: &Path, found: usize, mosaic: &Mosaic) -> Result<(), FileErr
         return Ok(());
     }
     let message = format!(
-        "there are {found} PSFs; expected one, or one for each of the {} stamps",
+        "there are {found} PSFs; expected one, or one for each of the {} stamps. Several stars are averaged if there are at least twice as many stamps",
         mosaic.galaxies
     );
     Err(FileError::new(path, message))
@@ -137,7 +191,7 @@ fn functional(path: PathBuf, table: &Path, mosaic: &Mosaic) -> Result<GatheredPs
         file: PsfFile::Table(path, psf_table::text(&rows)),
         examination,
         messages: Vec::new(),
-        scale: None,
+        wcs: Wcs::default(),
         first: table.to_owned(),
     })
 }
@@ -146,7 +200,8 @@ fn functional(path: PathBuf, table: &Path, mosaic: &Mosaic) -> Result<GatheredPs
 fn averaged(
     path: &Path,
     files: Files<'_>,
-    &Stack { count, side, scale }: &Stack,
+    &Stack { count, side, wcs }: &Stack,
+    mut messages: Vec<String>,
 ) -> Result<GatheredPsfs, FileError> {
     let first = &files.paths[0];
     let pixels = count * side * side;
@@ -159,6 +214,7 @@ fn averaged(
     let mut all = Vec::with_capacity(pixels);
     let mut planes = Planes::of(files);
     while let Some((_, pixels)) = planes.next()? {
+        let pixels = central(pixels, planes.sides(), side);
         all.extend(pixels.iter().map(|&value| f64::from(value)));
     }
     let stars = ArrayView3::from_shape((count, side, side), &all)
@@ -166,20 +222,20 @@ fn averaged(
     let psf = average_stars(stars, examined_cut(side))
         .map_err(|(k, error)| FileError::new(first, format!("star {k}: {error}")))?;
     let shown = first.display();
-    let mut messages = vec![format!(
+    messages.push(format!(
         "note: {shown}: {count} stars were averaged to one PSF for all galaxies"
-    )];
+    ));
     let mut examination = Examination::new(side, 0);
     examination.add_psf(psf.view(), None);
     messages.extend(named(&examination, first));
-    let mut image = Rows::create(path, Mosaic::of(1, psf.nrows()), &[])?;
+    let mut image = Rows::create(path, Mosaic::of(1, psf.nrows()), &wcs.keys())?;
     let pixels: Vec<f32> = psf.iter().map(|&value| value as f32).collect();
     image.add(&pixels)?;
     Ok(GatheredPsfs {
         file: PsfFile::Stars(Box::new(image)),
         examination,
         messages,
-        scale,
+        wcs,
         first: first.clone(),
     })
 }

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use serde::{Serialize, Serializer};
 
 use shearq_files::FileError;
-use shearq_files::fits::ImageReader;
+use shearq_files::fits::{ImageReader, Pixel};
 
-use crate::pixel_scale;
+use crate::wcs::Wcs;
 
 /// Names of images that accompany an image of the sky. They are refused unless they are chosen.
 const COMPANIONS: [&str; 15] = [
@@ -215,7 +215,7 @@ impl<'a> Planes<'a> {
     ///
     /// # Errors
     /// As [`Images::next`], and if its pixels cannot be read.
-    pub(super) fn next(&mut self) -> Result<Option<(Origin<'a>, Vec<f32>)>, FileError> {
+    pub(super) fn next<P: Pixel>(&mut self) -> Result<Option<(Origin<'a>, Vec<P>)>, FileError> {
         let origin = match self.origin {
             Some(origin) if self.left > 0 => Origin {
                 plane: origin.plane + 1,
@@ -234,7 +234,7 @@ impl<'a> Planes<'a> {
         let Some(image) = self.images.now.as_mut() else {
             return Ok(None);
         };
-        let pixels = image.read_rows(image.height())?;
+        let pixels = image.read_rows_as(image.height())?;
         Ok(Some((origin, pixels)))
     }
 }
@@ -284,9 +284,8 @@ impl<'a> Exposure<'a> {
         Ok([reader.width(), reader.height()])
     }
 
-    /// Pixel scale in arcseconds, if the header states it.
-    pub(super) fn scale(&mut self) -> Result<Option<f64>, FileError> {
-        Ok(pixel_scale::of_header(self.reader()?))
+    pub(super) fn wcs(&mut self) -> Result<Wcs, FileError> {
+        Ok(Wcs::of_header(self.reader()?))
     }
 
     /// Refuses an image of another size than `other`.
@@ -304,11 +303,11 @@ impl<'a> Exposure<'a> {
 
     /// The square of `side` pixels a side whose centre is nearest to a position in FITS pixels; NaN beyond the
     /// image.
-    pub(super) fn square(
+    pub(super) fn square<P: Pixel>(
         &mut self,
         (x, y): (f64, f64),
         side: usize,
-    ) -> Result<Vec<f32>, FileError> {
+    ) -> Result<Vec<P>, FileError> {
         self.reader()?
             .read_square(first_pixel(x, side), first_pixel(y, side), side)
     }

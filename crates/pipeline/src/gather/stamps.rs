@@ -11,8 +11,9 @@ use shearq_measure::{Examination, examined_rows};
 
 use super::rows::Rows;
 use super::source::{Exposure, Files, Origin, Planes, off_middle};
-use super::{Gathering, Stamps};
+use super::{Gathering, Masks, Stamps};
 use crate::data::mosaic::Mosaic;
+use crate::wcs::Wcs;
 
 /// A row of the table of stamps.
 #[derive(Serialize)]
@@ -51,11 +52,13 @@ impl StampWriter {
         target: &Path,
         mosaic: Mosaic,
         noise: Option<f64>,
+        wcs: &Wcs,
     ) -> Result<Self, FileError> {
-        let noise = noise.map(|sigma| ("NOISESIG", Value::Real(sigma)));
+        let mut keys = wcs.keys();
+        keys.extend(noise.map(|sigma| ("NOISESIG", Value::Real(sigma))));
         let examined = examined_rows(mosaic.columns, mosaic.rows());
         Ok(StampWriter {
-            image: Rows::create(target, mosaic, noise.as_slice())?,
+            image: Rows::create(target, mosaic, &keys)?,
             examination: Examination::new(mosaic.stamp, examined.len() * mosaic.columns),
             incomplete: 0,
             examined,
@@ -80,28 +83,33 @@ impl StampWriter {
         }
     }
 
-    fn copy_files(&mut self, files: Files<'_>, masks: Option<Files<'_>>) -> Result<(), FileError> {
+    fn copy_files(&mut self, files: Files<'_>, masks: Option<Masks<'_>>) -> Result<(), FileError> {
         let side = self.image.mosaic.stamp;
-        let (mut planes, mut masks) = (Planes::of(files), masks.map(Planes::of));
-        while let Some((origin, mut pixels)) = planes.next()? {
-            if let Some(masks) = &mut masks {
-                let Some((place, mask)) = masks.next()? else {
+        let mut planes = Planes::of(files);
+        let mut masks = masks.map(|masks| (Planes::of(masks.files), masks.bits));
+        while let Some((origin, mut pixels)) = planes.next::<f32>()? {
+            let sides = planes.sides();
+            if let Some((masks, bits)) = &mut masks {
+                let Some((place, mask)) = masks.next::<f64>()? else {
                     return Err(origin.fault("there is no mask for this stamp"));
                 };
-                let sides = masks.sides();
-                if sides != [side; 2] {
+                if masks.sides() != sides {
+                    let [columns, rows] = masks.sides();
                     let message = format!(
-                        "the mask is {} × {} pixels; its stamp has {side} × {side}",
+                        "the mask is {columns} × {rows} pixels; its stamp has {} × {}",
                         sides[0], sides[1]
                     );
                     return Err(place.fault(&message));
                 }
                 another(&place, &origin)?;
-                lose(&mut pixels, &mask);
+                lose(&mut pixels, &mask, *bits).map_err(|fault| place.fault(&fault))?;
             }
-            self.add(&origin, &pixels)?;
+            self.add(&origin, &central(pixels, sides, side))?;
         }
-        match masks.as_mut().map_or(Ok(None), Planes::next)? {
+        let more = masks
+            .as_mut()
+            .map_or(Ok(None), |(masks, _)| masks.next::<f64>())?;
+        match more {
             Some((place, _)) => Err(place.fault("there is no stamp for this mask")),
             None => Ok(()),
         }
@@ -110,20 +118,22 @@ impl StampWriter {
     fn copy_cutouts(
         &mut self,
         exposure: Files<'_>,
-        masks: Option<Files<'_>>,
+        masks: Option<Masks<'_>>,
         positions: &[(f64, f64)],
     ) -> Result<(), FileError> {
         let side = self.image.mosaic.stamp;
         let mut exposure = Exposure::open(exposure)?;
-        let mut masks = masks.map(Exposure::open).transpose()?;
+        let bits = masks.and_then(|masks| masks.bits);
+        let mut masks = masks.map(|masks| Exposure::open(masks.files)).transpose()?;
         if let Some(mask) = &mut masks {
             mask.like(&mut exposure)?;
             another(&mask.origin, &exposure.origin)?;
         }
         for &(x, y) in positions {
-            let mut pixels = exposure.square((x, y), side)?;
+            let mut pixels = exposure.square::<f32>((x, y), side)?;
             if let Some(mask) = &mut masks {
-                lose(&mut pixels, &mask.square((x, y), side)?);
+                let square = mask.square::<f64>((x, y), side)?;
+                lose(&mut pixels, &square, bits).map_err(|fault| mask.origin.fault(&fault))?;
             }
             let origin = Origin {
                 position: Some((x, y)),
@@ -183,11 +193,45 @@ fn another(mask: &Origin<'_>, image: &Origin<'_>) -> Result<(), FileError> {
     Ok(())
 }
 
-/// Makes the pixels of a stamp missing whose `mask` is not zero.
-fn lose(pixels: &mut [f32], mask: &[f32]) {
+/// Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits.
+fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<(), String> {
     for (pixel, mask) in pixels.iter_mut().zip(mask) {
-        if *mask != 0.0 {
+        let bad = match bits {
+            Some(bits) if mask.is_finite() => {
+                if mask.fract() != 0.0 {
+                    return Err(format!(
+                        "the mask has the value {mask}; expected whole numbers, of which --mask-bits takes bits"
+                    ));
+                }
+                // Negative numbers are in two's complement, as in the file.
+                (*mask as i64) as u64 & bits != 0
+            }
+            _ => *mask != 0.0,
+        };
+        if bad {
             *pixel = f32::NAN;
         }
     }
+    Ok(())
+}
+
+/// The central `side` × `side` pixels of an image of some columns and rows; those beyond it are missing. Where the parities
+/// differ, the centre moves by half a pixel.
+pub(super) fn central(pixels: Vec<f32>, [columns, rows]: [usize; 2], side: usize) -> Vec<f32> {
+    if [columns, rows] == [side; 2] {
+        return pixels;
+    }
+    let first = |there: usize| (there as i64 - side as i64).div_euclid(2);
+    let mut square = vec![f32::NAN; side * side];
+    for (at, pixel) in square.iter_mut().enumerate() {
+        let x = usize::try_from(first(columns) + (at % side) as i64);
+        let y = usize::try_from(first(rows) + (at / side) as i64);
+        if let (Ok(x), Ok(y)) = (x, y)
+            && x < columns
+            && y < rows
+        {
+            *pixel = pixels[y * columns + x];
+        }
+    }
+    square
 }

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
-use shearq_files::table;
-use shearq_measure::{Flag, Flags, Measurement, Observables, Versions, Warning};
+use shearq_files::table::{self, FileFormat};
+use shearq_measure::{Flag, Flags, Measurement, Observables, PixelFrame, Versions, Warning};
 use shearq_submissions::{Configuration, EllipticityType};
 
 use super::row::{MeasuredRow, psf_noise, warnings};
@@ -121,12 +121,43 @@ const WARNINGS: &str = "warnings";
 /// Key of the metadata with the effect of the noise of an image's star on its mean shear: the standard deviations of m and c.
 /// A FITS key has eight characters.
 pub const PSF_NOISE: &str = "psfnoise";
+/// Key of the metadata with the pixel axes, if they are not the sky's: position angle of +y in degrees, parity (−1 for mirrored),
+/// and both components of the shear.
+const FRAME: &str = "frame";
 /// Effect on m below which the noise of a star, or of rounding, is not stated.
 const LEAST_PSF_NOISE: f64 = 1e-5;
 /// Keys of the metadata of catalogues, beside fingerprints.
-pub const KEYS: [&str; 8] = [
-    "creator", "submiss", "elltype", "set", "image", "settings", PSF_NOISE, WARNINGS,
+pub const KEYS: [&str; 9] = [
+    "creator", "submiss", "elltype", "set", "image", "settings", PSF_NOISE, WARNINGS, FRAME,
 ];
+
+/// The pixel axes of a catalogue's image; `None` if they are the sky's, or unknown.
+///
+/// # Errors
+/// If the metadata cannot be read.
+pub fn stated_frame(path: &Path, format: FileFormat) -> Result<Option<PixelFrame>, FileError> {
+    let keys = [FRAME.to_owned()];
+    let metadata = table::read_metadata(path, format, keys.iter())?;
+    let Some(text) = metadata.get(FRAME) else {
+        return Ok(None);
+    };
+    let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
+    match numbers.as_deref() {
+        Some(&[angle, parity, g1, g2]) if numbers.iter().flatten().all(|n| n.is_finite()) => {
+            Ok(Some(PixelFrame {
+                angle,
+                mirrored: parity < 0.0,
+                shear: [g1, g2],
+            }))
+        }
+        _ => {
+            let message = format!(
+                "the metadata `{FRAME}` are {text:?} (expected four numbers such as 90.00 -1 0.0100 0.0000)"
+            );
+            Err(FileError::new(path, message))
+        }
+    }
+}
 
 /// The effect of a star's noise on m and c, as a catalogue of this configuration states it: `None` unless it is known and
 /// matters.
@@ -339,6 +370,18 @@ impl<'a> Catalogues<'a> {
         if !found.is_empty() {
             let lines: Vec<String> = found.iter().map(Warning::to_string).collect();
             metadata.insert(WARNINGS.into(), lines.join("\n"));
+        }
+        for warning in &found {
+            if let Warning::PixelFrame(frame) = warning {
+                let PixelFrame {
+                    angle,
+                    mirrored,
+                    shear: [g1, g2],
+                } = frame;
+                let parity = if *mirrored { -1 } else { 1 };
+                let text = format!("{angle:.2} {parity} {g1:.4} {g2:.4}");
+                metadata.insert(FRAME.into(), text);
+            }
         }
         if let Some([m, c]) = stated_psf_noise(&self.run.configuration, psf_noise(rows)) {
             metadata.insert(PSF_NOISE.into(), format!("{m:.2e} {c:.2e}"));

@@ -24,7 +24,7 @@ use crate::data::mosaic::Mosaic;
 use crate::data::psf_table;
 use crate::grid::whole;
 use crate::images::ImageId;
-use crate::pixel_scale;
+use crate::wcs::Wcs;
 
 /// The PSFs of an image, read along its rows.
 pub(super) enum PsfSource {
@@ -116,8 +116,7 @@ pub(super) struct OpenPsfs {
     pub(super) source: PsfSource,
     /// Offset of the star for all galaxies in pixels, if it was moved to the centre of its stamp.
     pub(super) moved: Option<[f64; 2]>,
-    /// Pixel scale in arcseconds, if the header states it.
-    pub(super) scale: Option<f64>,
+    pub(super) wcs: Wcs,
     /// Set and image that the header states.
     pub(super) stated: Option<[u32; 2]>,
 }
@@ -139,7 +138,7 @@ pub(super) fn open_psf(
             Ok(OpenPsfs {
                 source: open_functional(&path, cut, mosaic)?,
                 moved: None,
-                scale: None,
+                wcs: Wcs::default(),
                 stated: None,
             })
         }
@@ -173,7 +172,7 @@ fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSourc
 fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, FileError> {
     let least = cut.least;
     let mut image = ImageReader::open(path)?;
-    let (scale, stated) = (pixel_scale::of_header(&image), stated_image(&image));
+    let (wcs, stated) = (Wcs::of_header(&image), stated_image(&image));
     let (width, height) = (image.width(), image.height());
     let (columns, rows) = (mosaic.columns, mosaic.rows());
     let side = match whole(&image, path, "STAMP", MAX_STAMP)? {
@@ -188,8 +187,9 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
         None => width,
     };
     if side < least {
-        let message =
-            format!("the PSF stamp has {side} pixels a side; the configuration requires {least}");
+        let message = format!(
+            "the PSF stamp has {side} pixels a side; the configuration requires {least}. Try: larger PSF stamps, or psf.size = {side} in a settings file"
+        );
         return Err(FileError::new(path, message));
     }
     let stars = whole(&image, path, "NSTAMPS", columns * rows)?;
@@ -207,7 +207,7 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
         return Ok(OpenPsfs {
             source: PsfSource::Stars { image, side },
             moved: None,
-            scale,
+            wcs,
             stated,
         });
     }
@@ -225,7 +225,7 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
     Ok(OpenPsfs {
         source: PsfSource::Shared(psf.into_shared()),
         moved,
-        scale,
+        wcs,
         stated,
     })
 }

@@ -18,7 +18,7 @@ use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;
 use crate::grid;
 use crate::images::ImageId;
-use crate::pixel_scale;
+use crate::wcs::Wcs;
 
 /// An open image with its PSFs, read row by row.
 pub struct ImageSource {
@@ -70,13 +70,14 @@ impl ImageSource {
         let OpenPsfs {
             source: psfs,
             moved,
-            scale,
+            wcs: psf_wcs,
             stated,
         } = open_psf(data, id, configuration, &mosaic)?;
         let mut warnings: Vec<Warning> = Warning::of_settings(configuration).into_iter().collect();
         warnings.extend(moved.map(Warning::of_moved));
-        let own_scale = pixel_scale::of_header(&image);
-        warnings.extend(pixel_scale::disagreement(scale, own_scale));
+        let wcs = Wcs::of_header(&image);
+        warnings.extend(Wcs::disagreements(&psf_wcs, &wcs));
+        warnings.extend(wcs.frame());
         for (of, stated) in [("galaxies", stated_image(&image)), ("PSF", stated)] {
             let expected = [id.set, id.image];
             let other = stated.filter(|stated| *stated != expected);
