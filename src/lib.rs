@@ -7,7 +7,6 @@ mod commands;
 #[cfg(test)]
 mod pairs;
 mod progress;
-mod renamed;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -173,13 +172,7 @@ fn fail_at_size_limits() {
 pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let cli = match Cli::try_parse_from(arguments) {
         Ok(cli) => cli,
-        Err(message) => match renamed::advice(&message) {
-            Some(advice) => {
-                tell(format_args!("error: {advice}"));
-                return MISUSED;
-            }
-            None => return usage(&message),
-        },
+        Err(message) => return usage(&message),
     };
     let result = match cli.command {
         Command::Quickstart(arguments) => quickstart::run(&arguments),

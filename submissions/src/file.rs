@@ -54,10 +54,8 @@ impl File {
         })
     }
 
-    /// What the file sets. Without `extends` it is to have all settings. Those that earlier versions did not have are as they
-    /// were then.
+    /// What the file sets.
     pub(crate) fn settings(self) -> PartialConfiguration {
-        let complete = self.extends.is_none();
         let File {
             name: _,
             description: _,
@@ -68,12 +66,9 @@ impl File {
             noise,
             denoise,
             deconvolution,
-            mut shape,
+            shape,
             published: _,
         } = self;
-        if complete {
-            shape.as_before();
-        }
         PartialConfiguration {
             method,
             stamp,

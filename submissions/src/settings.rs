@@ -290,14 +290,6 @@ partial! {
     }
 }
 
-impl PartialShape {
-    /// Sets what earlier versions, without these settings, did: no sheared versions, and neighbours flag galaxies.
-    pub(crate) fn as_before(&mut self) {
-        self.sheared_step.get_or_insert(0.0);
-        self.neighbours.get_or_insert(Neighbours::Flag);
-    }
-}
-
 section! {
     /// Shape from the autocorrelation of the deconvolved stamp, clipped at a radius (Sect. 3.2).
     ClippedShape, PartialShape, "shape" {

@@ -5,8 +5,6 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use crate::renamed;
-
 /// A file that cannot be used: its path, the place, the found and the expected value.
 #[derive(Debug, Error)]
 #[error("{}: {message}", path.display())]
@@ -49,10 +47,8 @@ impl FileError {
 
     /// About `path`, whose columns are `found`, without one named `wanted`.
     pub fn no_column(path: &Path, wanted: &str, found: &[impl AsRef<str>]) -> Self {
-        let hint = renamed::column_hint(wanted, found)
-            .map_or_else(String::new, |hint| format!(". {hint}"));
         let found = names_of(found);
-        let message = format!("there is no column `{wanted}`; columns found: {found}{hint}");
+        let message = format!("there is no column `{wanted}`; columns found: {found}");
         FileError {
             no_column: true,
             ..FileError::new(path, message)

@@ -11,7 +11,6 @@ pub mod frames;
 mod limits;
 pub mod open;
 pub mod parquet;
-pub mod renamed;
 pub mod table;
 pub mod text;
 

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use shearq_submissions::{Configuration, checked_name};
 
-use shearq_files::renamed::key_hint;
 use shearq_files::{FileError, atomic};
 use shearq_pipeline::data::run::Source;
 
@@ -145,13 +144,8 @@ impl Baseline {
     pub fn read(path: &Path) -> Result<Self, FileError> {
         let text = shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS)
             .map_err(FileError::doing(path, "cannot read the baseline"))?;
-        let baseline: Baseline = toml::from_str(&text).map_err(|error| {
-            let message = error.to_string().trim_end().to_owned();
-            match key_hint(&message, &text) {
-                Some(hint) => FileError::new(path, format!("{message}. {hint}")),
-                None => FileError::new(path, message),
-            }
-        })?;
+        let baseline: Baseline = toml::from_str(&text)
+            .map_err(|error| FileError::new(path, error.to_string().trim_end()))?;
         let wild = |set: &&BaselineSet| {
             let mut metrics = set.metrics.values();
             metrics.any(|[value, error]| value.is_infinite() || error.is_infinite() || *error < 0.0)
@@ -254,37 +248,5 @@ mod tests {
             "{message}"
         );
         assert_eq!(Baseline::read(&path).unwrap(), of(2));
-    }
-
-    #[test]
-    fn an_old_key_names_the_new_one() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = Baseline::path(folder.path(), "old");
-        let source = Source::Simulated(SimulationSettings::new(1, 8));
-        let set = BaselineSet {
-            set: 2,
-            data: "a".into(),
-            images: vec![1],
-            galaxies: 1,
-            flagged: 0,
-            metrics: BTreeMap::from([("q".to_owned(), [1.0, 0.1])]),
-        };
-        let configuration = BaselineConfiguration {
-            name: "mine".into(),
-            file: None,
-            settings: toml::Table::new(),
-            sets: vec![set],
-        };
-        Baseline::new(source, Vec::new(), vec![configuration])
-            .create(&path)
-            .unwrap();
-        let text = std::fs::read_to_string(&path).unwrap();
-        assert!(Baseline::read(&path).is_ok() && text.contains("metrics"));
-        std::fs::write(&path, text.replace("metrics", "figures")).unwrap();
-        let message = Baseline::read(&path).unwrap_err().to_string();
-        assert!(
-            message.ends_with(". The key `figures` is now called `metrics`. Try: write the file again with this version"),
-            "{message}"
-        );
     }
 }

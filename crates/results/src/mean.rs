@@ -267,16 +267,15 @@ mod tests {
     use super::*;
 
     /// Writes a catalogue of two good galaxies, of mean response 0.5, and one flagged. `e` is before calibration.
-    fn written(path: &Path, e: [f64; 2], names: [&str; 3], metadata: &[(&str, &str)]) {
+    fn written(path: &Path, e: [f64; 2], metadata: &[(&str, &str)]) {
         let column = |name: &str, values: [f64; 3]| Column::new(name.into(), values);
         let e = |sign: f64| [2.0 * sign * e[0], 2.0 * sign * e[1], f64::NAN];
-        let [flags, r11, r22] = names;
         let table = frame(vec![
             column("e1", e(1.0)),
             column("e2", e(-0.5)),
-            column(flags, [0.0, 0.0, 4.0]),
-            column(r11, [0.4, 0.6, f64::NAN]),
-            column(r22, [0.4, 0.6, f64::NAN]),
+            column("flags", [0.0, 0.0, 4.0]),
+            column("R11", [0.4, 0.6, f64::NAN]),
+            column("R22", [0.4, 0.6, f64::NAN]),
             column("R12", [0.0, 0.0, f64::NAN]),
             column("R21", [0.0, 0.0, f64::NAN]),
             column("divisor1", [0.5, 0.5, f64::NAN]),
@@ -294,13 +293,11 @@ mod tests {
         .unwrap();
     }
 
-    const NAMES: [&str; 3] = ["flags", "R11", "R22"];
-
     #[test]
     fn the_shear_is_a_ratio_of_means_and_its_error_that_of_a_ratio() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("catalogue-001.parquet");
-        written(&path, [0.05, 0.2], NAMES, &[]);
+        written(&path, [0.05, 0.2], &[]);
         let catalogues = [(1, path)];
         let mean = mean_of(7, &catalogues, FileFormat::Parquet, true, None).unwrap();
         assert_eq!((mean.galaxies, mean.flagged, mean.flags[2]), (2, 1, 1));
@@ -321,7 +318,7 @@ mod tests {
     fn images_weigh_by_their_responses() {
         let folder = tempfile::tempdir().unwrap();
         let path = |image: u32| folder.path().join(format!("{image}.parquet"));
-        written(&path(1), [0.05, 0.2], NAMES, &[]);
+        written(&path(1), [0.05, 0.2], &[]);
         // Galaxies of the other have hardly any response, and noise.
         let column = |name: &str, value: f64| Column::new(name.into(), [value; 2]);
         let table = frame(vec![
@@ -351,7 +348,7 @@ mod tests {
                 .zip(images)
                 .map(|(image, metadata)| {
                     let path = folder.path().join(format!("{image}.parquet"));
-                    written(&path, [0.05, 0.2], NAMES, metadata);
+                    written(&path, [0.05, 0.2], metadata);
                     (image, path)
                 })
                 .collect();
@@ -395,25 +392,6 @@ mod tests {
         ] {
             let error = mean(&[&[(PSF_NOISE, text)]]).unwrap_err().to_string();
             assert!(error.contains("psfnoise"), "{error}");
-        }
-    }
-
-    #[test]
-    fn an_old_catalogue_is_refused_with_the_new_names_of_its_columns() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("catalogue-001.parquet");
-        for (names, expected) in [
-            (["flag", "R11", "R22"], "`flag` is now called `flags`"),
-            (
-                ["flags", "response1", "response2"],
-                "`response1` is now called `R11`",
-            ),
-        ] {
-            written(&path, [0.05, 0.2], names, &[]);
-            let error = mean_of(7, &[(1, path.clone())], FileFormat::Parquet, true, None)
-                .unwrap_err()
-                .to_string();
-            assert!(error.contains(expected), "{error}");
         }
     }
 }

@@ -43,8 +43,8 @@ pub struct SetRecord {
     pub errors: Metrics,
     /// Q with each group of images left out in turn, for paired differences.
     pub q_replicates: Vec<f64>,
-    /// Calibrated Q with each group left out; empty in records of earlier versions.
-    #[serde(default, deserialize_with = "nan_for_null")]
+    /// Calibrated Q with each group left out.
+    #[serde(deserialize_with = "nan_for_null")]
     pub q_calibrated_replicates: Vec<f64>,
     /// Q of the leaderboard: the highest of the eight conventions.
     pub q_leaderboard: f64,
@@ -499,18 +499,10 @@ impl Rows<'_> {
             metrics: metrics(&str::to_owned)?,
             errors: metrics(&error_of)?,
             q_replicates: self.list("q_replicates", row)?,
-            // Earlier versions have no such column.
-            q_calibrated_replicates: match self.table.column("q_calibrated_replicates") {
-                Ok(_) => self.list("q_calibrated_replicates", row)?,
-                Err(_) => Vec::new(),
-            },
+            q_calibrated_replicates: self.list("q_calibrated_replicates", row)?,
             q_leaderboard: self.real("q_leaderboard", row)?,
             convention: self.count("convention", row)?,
-            // Earlier versions chose a convention per set.
-            convention_known: match self.table.column("convention_known") {
-                Ok(_) => self.count::<u8>("convention_known", row)? > 0,
-                Err(_) => self.text("choice", row)?.parse::<u8>().is_ok(),
-            },
+            convention_known: self.count::<u8>("convention_known", row)? > 0,
             convention_leaderboard: self.count("convention_leaderboard", row)?,
         })
     }

@@ -26,7 +26,6 @@ pub struct SetBiases {
     /// Standard error of the bound.
     pub bound_error: Option<f64>,
     /// Bound on the scatter of shears from elliptical galaxies with the best weights, if there is one.
-    #[serde(default)]
     pub ensemble_bound: Option<f64>,
     /// Expected Q for the images of the plan with a scatter at the bound.
     #[serde(rename = "limit")]

@@ -48,19 +48,14 @@ pub struct Response {
     /// calibrated ε.
     #[serde(deserialize_with = "nan_for_null")]
     pub scatter: [f64; 2],
-    /// Standard deviation of the ellipticity, with intrinsic shapes, divided by the slope. Not a number in records of
-    /// earlier versions.
-    #[serde(default = "unknown", deserialize_with = "nan_for_null")]
+    /// Standard deviation of the ellipticity, with intrinsic shapes, divided by the slope.
+    #[serde(deserialize_with = "nan_for_null")]
     pub total: [f64; 2],
 }
 
 /// Root mean square over the components.
 fn rms(values: [f64; 2]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / 2.0).sqrt()
-}
-
-fn unknown() -> [f64; 2] {
-    [f64::NAN; 2]
 }
 
 impl Regression {

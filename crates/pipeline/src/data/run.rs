@@ -12,8 +12,8 @@ use crate::data::listing::{self, Files};
 use crate::data::pattern::fill;
 use crate::data::relative;
 use shearq_files::FileError;
+use shearq_files::atomic;
 use shearq_files::table::FileFormat;
-use shearq_files::{atomic, renamed};
 use shearq_simulate::set::SimulationSettings;
 
 /// Name of the record in a folder of results.
@@ -233,14 +233,10 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
         Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),
     };
     serde_json::from_str(&text).map(Some).map_err(|error| {
-        let hint = renamed::key_hint(&error.to_string(), &text);
-        let hint = match hint {
-            Some(hint) => format!(". {hint}"),
-            // Valid JSON with other keys or types.
-            None if error.is_data() => {
-                "; the record belongs to another version. Try: another folder".into()
-            }
-            None => String::new(),
+        // Valid JSON with other keys or types.
+        let hint = match error.is_data() {
+            true => "; the record belongs to another version. Try: another folder",
+            false => "",
         };
         FileError::new(path, format!("not a record of this kind: {error}{hint}"))
     })
