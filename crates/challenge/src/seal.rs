@@ -11,6 +11,7 @@ use hmac::{Hmac, KeyInit, Mac};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_files::{FileError, atomic, open};
+use shearq_pipeline::data::fingerprint::hex;
 use shearq_pipeline::{PipelineError, engine};
 use shearq_results::submit::manifest::FileSum;
 
@@ -69,7 +70,7 @@ impl Key {
             name: name.into(),
             version,
             seed: seed.map(|seed| seed.to_string()),
-            secret: hexadecimal(&rand::random::<[u8; 32]>()),
+            secret: hex(&rand::random::<[u8; 32]>()),
             public: None,
             expected: None,
             files: Sums::new(),
@@ -112,7 +113,7 @@ impl Key {
             mac.update(part.as_bytes());
             mac.update(&[0]);
         }
-        hexadecimal(&mac.finalize().into_bytes())
+        hex(&mac.finalize().into_bytes())
     }
 
     /// Signature of the private checksums, for the public description.
@@ -121,13 +122,9 @@ impl Key {
     }
 }
 
-fn hexadecimal(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
 /// SHA-256 of some bytes, in hexadecimal digits.
 pub fn sha256(bytes: &[u8]) -> String {
-    hexadecimal(&Sha256::digest(bytes))
+    hex(&Sha256::digest(bytes))
 }
 
 /// Gives the private folder and its files to their owner alone. Does nothing on systems without file modes.

@@ -584,13 +584,10 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
     }
 }
 
-/// A number from the bits of the stamp's pixels: Fowler, Noll and Vo's hash.
+/// A number from the bits of the stamp's pixels.
 fn trace(pixels: &[f32]) -> u64 {
     // Noise makes a fifth of the pixels different for every stamp.
-    let some = pixels.iter().step_by(5);
-    some.fold(0xcbf2_9ce4_8422_2325, |hash, value| {
-        (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0100_0000_01b3)
-    })
+    pixel::hash(pixels.iter().step_by(5).map(|value| value.to_bits()))
 }
 
 /// Mean of the two in the middle of up to four numbers, without those that are none.

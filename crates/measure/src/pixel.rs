@@ -24,6 +24,13 @@ impl Pixel for f64 {
     }
 }
 
+/// A number from words such as the bits of pixels, the same on all machines: Fowler, Noll and Vo's hash.
+pub(crate) fn hash(words: impl Iterator<Item = u32>) -> u64 {
+    words.fold(0xcbf2_9ce4_8422_2325, |hash, word| {
+        (hash ^ u64::from(word)).wrapping_mul(0x0100_0000_01b3)
+    })
+}
+
 /// How many rows of pixels at the lower and upper edge, and columns at the left and right edge, are all equal.
 pub(crate) fn padding(pixels: &[f32], n: usize) -> [usize; 4] {
     [0, 1, 2, 3].map(|edge| {

@@ -33,6 +33,7 @@ use crate::deconvolve::{
 use crate::error::MeasureError;
 use crate::measurement::ResponseMatrix;
 use crate::noise::StampNoise;
+use crate::pixel::hash;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Breadth};
 use crate::surroundings::{Surroundings, centre, followed};
 use crate::versions::VersionSettings;
@@ -342,14 +343,11 @@ impl CutWorker for LinearWorker {
 /// else. Of pixels in steps of a sixteenth of the noise, so that another machine's rounding hardly ever
 /// gives another.
 fn seed_of(stamp: &[f32], noise: f32) -> u64 {
-    // Pixels along the middle: noise makes them different for every galaxy. Fowler, Noll and Vo's hash.
+    // Pixels along the middle: noise makes them different for every galaxy.
     let n = stamp.len().isqrt();
     let row = &stamp[n / 2 * n..][..n];
-    let hash = row.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, value| {
-        let step = (16.0 * value / noise).round() as i32;
-        (hash ^ u64::from(step.cast_unsigned())).wrapping_mul(0x0100_0000_01b3)
-    });
-    hash >> 16
+    let step = |value: &f32| ((16.0 * value / noise).round() as i32).cast_unsigned();
+    hash(row.iter().map(step)) >> 16
 }
 
 /// Gaussian numbers from a seed (Box and Muller 1958), other than the signs of the field of noise.

@@ -38,11 +38,13 @@ impl Fingerprint {
     /// The first 64 bits in hexadecimal. For a million contents, the probability that any two collide is 3·10⁻⁸.
     pub fn finish(self) -> String {
         let digest = self.0.finalize();
-        digest[..8]
-            .iter()
-            .map(|byte| format!("{byte:02x}"))
-            .collect()
+        hex(&digest[..8])
     }
+}
+
+/// Bytes in hexadecimal digits.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Fingerprint of some bytes.

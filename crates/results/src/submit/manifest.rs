@@ -12,6 +12,7 @@ use shearq_submissions::{check_name, checked_name};
 
 use crate::foreign::Foreign;
 use shearq_files::{FileError, open};
+use shearq_pipeline::data::fingerprint::hex;
 use shearq_pipeline::data::run::{Run, read_record};
 
 /// File name of the manifest.
@@ -119,10 +120,9 @@ impl FileSum {
             to.write_all(&buffer[..read])?;
             bytes += read as u64;
         }
-        let digits = |byte: &u8| format!("{byte:02x}");
         Ok(FileSum {
             bytes,
-            sha256: hasher.finalize().iter().map(digits).collect(),
+            sha256: hex(&hasher.finalize()),
         })
     }
 
