@@ -111,7 +111,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.figure(
         "study",
         &pages::contest(&table),
-        "Each configuration on each set, with errors. Dashed: the Cramér–Rao bound, the requirement |m| < 0.002, zero additive bias. The expected Q is for noise at the bound and a perfect spectrum. A method that loses shear together with noise can exceed it.",
+        "Each configuration on each set, with errors. Grey: the requirement |m| < 0.002. Dashed: the Cramér–Rao bound, zero additive bias. The expected Q is for noise at the bound and a perfect spectrum. A method that loses shear together with noise can exceed it.",
     )?;
     page.table("biases", &shapes)?;
     page.section("Spectra", "Quality on every kind of set, and cost.");

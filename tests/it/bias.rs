@@ -322,11 +322,13 @@ fn plots_and_reports_are_written() {
         "--report",
         text(&report),
     ]);
-    assert!(
-        fs::read_to_string(plot)
-            .unwrap()
-            .contains("Multiplicative bias")
-    );
+    let drawn = fs::read_to_string(plot).unwrap();
+    assert!(drawn.contains("Multiplicative bias"), "{drawn}");
+    // The legend has each symbol once, and the requirement is a band in both panels.
+    for label in ["m1, c1", "m2, c2", "requirement"] {
+        assert_eq!(drawn.matches(label).count(), 1, "{label}");
+    }
+    assert_eq!(drawn.matches("opacity=\"0.3\"").count(), 3, "{drawn}");
     let page = fs::read_to_string(report).unwrap();
     assert!(page.contains("Mandelbaum et al. 2014") && page.contains("plus.csv"));
     let wrong = fail(&["bias", plus, minus, "--plot", "m.pdf"]);

@@ -2,8 +2,8 @@
 
 use ndarray::{Array2, array};
 use shearq_render::figure::{
-    BarGroup, BarPlot, ColourMap, Figure, FigureError, HeatMap, ImageGrid, ImagePanel, ImageRow,
-    LinePlot, PanelGrid, PictureFormat, Scale, Series, Stretch, Style,
+    Band, ColourMap, Figure, FigureError, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot,
+    PanelGrid, PictureFormat, Series, Stretch, Style,
 };
 
 const HARD: [&[f64]; 9] = [
@@ -71,20 +71,18 @@ fn curves_of_any_data_are_drawn() {
 }
 
 #[test]
-fn bars_of_any_data_are_drawn() {
-    draw(&BarPlot::default());
+fn names_and_bands_of_any_data_are_drawn() {
     for values in HARD {
-        let group = |label: &str| BarGroup {
-            label: label.into(),
-            values: values.to_vec(),
-            errors: Some(values.iter().rev().copied().collect()),
-        };
-        draw(&BarPlot {
-            categories: (0..values.len())
-                .map(|number| format!("category {number}"))
-                .collect(),
-            groups: vec![group("a"), group("b")],
-            ..BarPlot::default()
+        let x: Vec<f64> = (0..values.len()).map(|i| i as f64).collect();
+        let bands = values.iter().map(|&value| Band {
+            label: "allowed".into(),
+            low: value,
+            high: 1.0,
+        });
+        draw(&LinePlot {
+            x_names: (0..values.len()).map(|i| format!("<name {i}>")).collect(),
+            bands: bands.collect(),
+            ..lines(&x, values, false)
         });
     }
 }
@@ -102,26 +100,21 @@ fn tables_and_images_of_any_data_are_drawn() {
             decimals: 3,
             ..HeatMap::default()
         });
-        let maps = [ColourMap::Viridis, ColourMap::Grey, ColourMap::Diverging];
+        let maps = [ColourMap::Viridis, ColourMap::Diverging];
         let panel = |map| ImagePanel {
             image: image.clone(),
             map,
             stretch: Stretch::Asinh,
-            limits: Some((f64::NAN, 1.0)),
             ..ImagePanel::default()
         };
         let row = ImageRow {
             label: "hard".into(),
             panels: maps.map(panel).into(),
         };
-        for scale in [Scale::Own, Scale::Row, Scale::Column] {
-            let rows = vec![row.clone(), ImageRow::default()];
-            draw(&ImageGrid {
-                title: String::new(),
-                rows,
-                scale,
-            });
-        }
+        draw(&ImageGrid {
+            title: String::new(),
+            rows: vec![row, ImageRow::default()],
+        });
     }
 }
 
@@ -129,7 +122,6 @@ fn tables_and_images_of_any_data_are_drawn() {
 fn the_first_row_of_an_image_is_at_the_bottom() {
     let panel = ImagePanel {
         image: array![[0.0, 0.0], [1.0, 1.0]],
-        map: ColourMap::Grey,
         ..ImagePanel::default()
     };
     let rows = vec![ImageRow {
@@ -139,7 +131,6 @@ fn the_first_row_of_an_image_is_at_the_bottom() {
     let grid = ImageGrid {
         title: String::new(),
         rows,
-        scale: Scale::Own,
     };
     let svg = String::from_utf8(grid.render(PictureFormat::Svg).expect("SVG")).expect("UTF-8");
     // The two rows are the first rectangles after the background.
@@ -158,7 +149,7 @@ fn the_first_row_of_an_image_is_at_the_bottom() {
         .skip(1)
         .take(2)
         .collect();
-    assert!(rectangles[0].contains("#000000") && rectangles[1].contains("#FFFFFF"));
+    assert!(rectangles[0].contains("#440154") && rectangles[1].contains("#FDE725"));
     assert!(top(rectangles[0]) > top(rectangles[1]), "{rectangles:?}");
 }
 

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use shearq_files::{FileError, atomic};
-use shearq_render::figure::{Figure, FigureError, LinePlot, PictureFormat, Series, Style};
+use shearq_render::figure::{Figure, FigureError, LinePlot, Series, Style};
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::page::PageError;
 use shearq_render::table::{Cell, Heading, Table, TableFormat};
@@ -100,6 +100,11 @@ fn title(info: &EntryInfo) -> String {
         (true, false) => format!("reference: {}", info.title),
         (false, _) => info.title.clone(),
     }
+}
+
+/// Shift of a team's points. First entries of equal quality would hide each other.
+fn aside(team: usize, teams: usize) -> f64 {
+    0.6 * ((team as f64 + 0.5) / teams as f64 - 0.5)
 }
 
 impl View<'_> {
@@ -333,7 +338,9 @@ impl View<'_> {
         }
         for (colour, standing) in plotted.iter().enumerate() {
             let entries = &standing.entries;
-            let x: Vec<f64> = entries.iter().map(|entry| entry.number as f64).collect();
+            let aside = aside(colour, plotted.len());
+            let x = entries.iter().map(|entry| entry.number as f64 + aside);
+            let x: Vec<f64> = x.collect();
             let y: Vec<f64> = entries.iter().map(|e| rounded(e.value, digits)).collect();
             let errors = entries
                 .iter()
@@ -365,7 +372,7 @@ impl View<'_> {
                 "{} of each entry, with its error, for the first {PLOTTED} teams at most.",
                 self.metric().label()
             );
-            let picture = Picture::draw(&self.history(), PictureFormat::Svg, "entries", caption)?;
+            let picture = Picture::draw(&self.history(), "entries", caption)?;
             blocks.push(Block::Figure(picture));
         }
         let mut sections = vec![Section::new("leaderboard", "Leaderboard", blocks)];
@@ -443,12 +450,7 @@ impl View<'_> {
         map.decimals = map.decimals.min(self.disclosure.digits);
         let caption =
             "Q of each set. Metrics of single sets reveal more of the true shear than their mean.";
-        let picture = Picture::draw(
-            &map as &dyn Figure,
-            PictureFormat::Svg,
-            "q-per-set",
-            caption,
-        )?;
+        let picture = Picture::draw(&map as &dyn Figure, "q-per-set", caption)?;
         Ok(Section::new(
             "sets",
             "Metric of each set",
@@ -478,6 +480,13 @@ impl View<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn six_teams_with_one_entry_are_six_points() {
+        let places: Vec<f64> = (0..6).map(|team| aside(team, 6)).collect();
+        assert!(places.windows(2).all(|pair| pair[1] - pair[0] > 0.09));
+        assert!(places[0] > -0.5 && places[5] < 0.5 && aside(0, 1) == 0.0);
+    }
 
     #[test]
     fn published_numbers_have_the_decimals_of_the_organiser() {

@@ -46,23 +46,6 @@ pub(super) fn csv(text: &str) -> String {
     format!("{}{text}", formula_mark(text))
 }
 
-/// Contents of an element of HTML or XML, or a value of an attribute in quotes.
-pub fn markup(text: &str) -> String {
-    let mut safe = String::with_capacity(text.len());
-    // Neither can hold control characters, written as entities or not.
-    for c in visible(text).chars() {
-        match c {
-            '&' => safe.push_str("&amp;"),
-            '<' => safe.push_str("&lt;"),
-            '>' => safe.push_str("&gt;"),
-            '"' => safe.push_str("&quot;"),
-            '\'' => safe.push_str("&#39;"),
-            c => safe.push(c),
-        }
-    }
-    safe
-}
-
 /// What a character becomes in LaTeX.
 enum Latex {
     Text(Cow<'static, str>),

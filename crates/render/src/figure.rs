@@ -1,9 +1,4 @@
-//! Figures for reports: curves, grids of panels, bars, tables in colour and images.
-//!
-//! Every kind implements [`Figure`], which writes it as PNG or SVG, by the file's extension, with
-//! one font and a palette that colour-blind readers can tell apart. Values that are not finite, and
-//! those that are not positive on a logarithmic axis, are left out; no data make a figure fail
-//! because of what they are, only lists that should be equally long and are not.
+//! Figures for reports: curves and points with errors, tables in colour, and images, drawn by `plotters`.
 //!
 //! ```
 //! # use shearq_render::figure::{Figure, PictureFormat, LinePlot, Series, Style};
@@ -20,29 +15,32 @@
 //! # Ok::<(), shearq_render::figure::FigureError>(())
 //! ```
 
-mod bar;
+mod axis;
 mod colour;
 mod heat;
 mod image;
-mod layout;
-mod legend;
-mod line;
-mod scene;
-mod style;
-mod ticks;
+mod plot;
 
 use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 
+use plotters::backend::DrawingBackend;
+use plotters::coord::Shift;
+use plotters::drawing::{DrawingArea, DrawingAreaErrorKind, IntoDrawingArea};
+use plotters::element::PathElement;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
+use plotters::style::{
+    Color, FontStyle, FontTransform, IntoFont, RGBColor, TextStyle, WHITE, register_font,
+};
+use plotters_bitmap::BitMapBackend;
+use plotters_svg::SVGBackend;
 use shearq_files::{FileError, atomic};
 
-pub use bar::{BarGroup, BarPlot};
+use crate::escape;
 pub use colour::ColourMap;
 pub use heat::HeatMap;
-pub use image::{ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
-pub use line::{LinePlot, PanelGrid, Series};
-pub(super) use scene::PIXELS_PER_POINT;
-pub use scene::Scene;
-pub use style::Style;
+pub use image::{ImageGrid, ImagePanel, ImageRow, Stretch};
+pub use plot::{Band, LinePlot, PanelGrid, Series, Style};
 
 /// The em of a figure's title, in points.
 const TITLE_SIZE: f64 = 15.0;
@@ -52,6 +50,19 @@ const LABEL_SIZE: f64 = 12.5;
 const TICK_SIZE: f64 = 11.0;
 /// The space between a figure's parts and around it, in points.
 const MARGIN: f64 = 12.0;
+/// Width of axes and frames, in points.
+const LINE: f64 = 1.0;
+
+/// Axes and their labels.
+const INK: RGBColor = RGBColor(38, 38, 38);
+
+/// Coordinates per point. `plotters` has whole coordinates; at four per point they are finer than a pixel of any screen.
+const UNITS: f64 = 4.0;
+/// Coordinates per side of a pixel of a PNG, which thus has 144 pixels per inch. `plotters` does not smooth the edges of
+/// lines, the mean over four coordinates does.
+const UNITS_PER_PIXEL: usize = 2;
+/// The largest figure in square points. A PNG takes 60 bytes per square point while it is drawn.
+const LARGEST: f64 = 5e6;
 
 /// Why a figure could not be drawn or written.
 #[derive(Debug, thiserror::Error)]
@@ -84,7 +95,7 @@ pub enum FigureError {
     },
     /// The figure has too many parts to draw into one picture.
     #[error(
-        "the figure would be {width:.0} × {height:.0} points, expected at most {largest:.0} \
+        "the figure would be {width:.0} × {height:.0} points, expected at most {LARGEST:.0} \
          square points: put fewer panels into it"
     )]
     TooLarge {
@@ -92,8 +103,6 @@ pub enum FigureError {
         width: f64,
         /// In points.
         height: f64,
-        /// In square points.
-        largest: f64,
     },
     /// The pixels could not be drawn.
     #[error("cannot draw the figure: {detail}")]
@@ -118,9 +127,7 @@ impl PictureFormat {
     /// # Errors
     /// [`FigureError::Extension`] if it is neither `png` nor `svg`.
     pub fn of(path: &Path) -> Result<Self, FigureError> {
-        let extension = path
-            .extension()
-            .map(|extension| extension.to_string_lossy());
+        let extension = path.extension().map(|e| e.to_string_lossy());
         match extension.as_deref().map(str::to_ascii_lowercase).as_deref() {
             Some("png") => Ok(Self::Png),
             Some("svg") => Ok(Self::Svg),
@@ -132,25 +139,16 @@ impl PictureFormat {
     }
 }
 
-/// A picture that can be drawn.
+/// A picture that can be drawn. Values that are not finite, or not positive on a logarithmic axis, are left out.
 pub trait Figure {
-    /// The shapes it consists of.
-    ///
-    /// # Errors
-    /// [`FigureError::Lengths`] if lists that belong together differ in length.
-    fn scene(&self) -> Result<Scene, FigureError>;
+    /// Width and height in points.
+    fn size(&self) -> (f64, f64);
 
-    /// The contents of a picture file.
+    /// The contents of a picture file. The same figure gives the same bytes.
     ///
     /// # Errors
-    /// Those of [`Figure::scene`], [`FigureError::TooLarge`] and [`FigureError::Drawing`].
-    fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError> {
-        let scene = self.scene()?;
-        match format {
-            PictureFormat::Svg => Ok(scene.to_svg()?.into_bytes()),
-            PictureFormat::Png => scene.to_png(),
-        }
-    }
+    /// [`FigureError::Lengths`], [`FigureError::TooLarge`] and [`FigureError::Drawing`].
+    fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError>;
 
     /// Writes the figure to `path`, as PNG or SVG by its extension; a file that is there is replaced
     /// at once or, on failure, not at all.
@@ -164,5 +162,212 @@ pub trait Figure {
         let path = path.as_ref();
         let bytes = self.render(PictureFormat::of(path)?)?;
         Ok(atomic::write(path, &bytes)?)
+    }
+}
+
+/// Where a figure is drawn, in [`UNITS`] from its upper left corner.
+type Canvas<B> = DrawingArea<B, Shift>;
+type Drawn<B> = Result<(), DrawingAreaErrorKind<<B as DrawingBackend>::ErrorType>>;
+
+/// What a kind of figure consists of; the two formats are common to all. A trait beside [`Figure`], because `dyn Figure`
+/// could not have a function that is generic in the backend.
+trait Drawing {
+    fn check(&self) -> Result<(), FigureError>;
+    fn extent(&self) -> (f64, f64);
+    fn draw<B: DrawingBackend>(&self, canvas: &Canvas<B>) -> Drawn<B>;
+}
+
+impl<D: Drawing> Figure for D {
+    fn size(&self) -> (f64, f64) {
+        let (width, height) = self.extent();
+        (width.max(1.0).ceil(), height.max(1.0).ceil())
+    }
+
+    fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError> {
+        self.check()?;
+        let (width, height) = self.size();
+        if width * height > LARGEST {
+            return Err(FigureError::TooLarge { width, height });
+        }
+        let size = (units(width) as u32, units(height) as u32);
+        match format {
+            PictureFormat::Svg => {
+                let mut svg = String::new();
+                draw(self, SVGBackend::with_string(&mut svg, size))?;
+                let (_, shapes) = svg.split_once(">\n").unwrap_or_default();
+                let shapes =
+                    shapes.replace("dy=\"0.5ex\"", &format!("dy=\"{CENTRE_TO_BASELINE}em\""));
+                // Smoothed edges would show as seams between the rectangles that are pixels of an image.
+                let head = format!(
+                    "<svg width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {} {}\" \
+                     xmlns=\"http://www.w3.org/2000/svg\">\n\
+                     <style>rect{{shape-rendering:crispEdges}}</style>\n",
+                    size.0, size.1
+                );
+                Ok((head + &shapes).into_bytes())
+            }
+            PictureFormat::Png => {
+                let mut rgb = vec![0; 3 * size.0 as usize * size.1 as usize];
+                draw(self, BitMapBackend::with_buffer(&mut rgb, size))?;
+                png(&rgb, size.0 as usize).map_err(failed)
+            }
+        }
+    }
+}
+
+fn draw<B: DrawingBackend>(figure: &impl Drawing, backend: B) -> Result<(), FigureError> {
+    let canvas = backend.into_drawing_area();
+    canvas.fill(&WHITE).map_err(failed)?;
+    figure.draw(&canvas).map_err(failed)?;
+    canvas.present().map_err(failed)
+}
+
+fn failed(error: impl std::fmt::Display) -> FigureError {
+    FigureError::Drawing {
+        detail: error.to_string(),
+    }
+}
+
+/// A PNG file of rows of `width` coordinates.
+fn png(rgb: &[u8], width: usize) -> Result<Vec<u8>, png::EncodingError> {
+    const SIDE: usize = UNITS_PER_PIXEL;
+    let across = width / SIDE;
+    let mut pixels = Vec::with_capacity(rgb.len() / (SIDE * SIDE));
+    for rows in rgb.chunks_exact(3 * SIDE * width) {
+        for at in (0..across).flat_map(|x| [0, 1, 2].map(|channel| 3 * SIDE * x + channel)) {
+            let square = (0..SIDE * SIDE).map(|k| 3 * (k / SIDE * width + k % SIDE) + at);
+            let sum: usize = square.map(|k| usize::from(rows[k])).sum();
+            pixels.push(((sum + SIDE * SIDE / 2) / (SIDE * SIDE)) as u8);
+        }
+    }
+    let mut file = Vec::new();
+    let down = pixels.len() / (3 * across);
+    let mut encoder = png::Encoder::new(&mut file, across as u32, down as u32);
+    encoder.set_color(png::ColorType::Rgb);
+    // 144 pixels per inch.
+    encoder.set_pixel_dims(Some(png::PixelDimensions {
+        xppu: 5669,
+        yppu: 5669,
+        unit: png::Unit::Meter,
+    }));
+    encoder.write_header()?.write_image_data(&pixels)?;
+    Ok(file)
+}
+
+/// Coordinates of a length in points.
+fn units(points: f64) -> i32 {
+    (points * UNITS).round() as i32
+}
+
+/// The place of a point.
+fn place((x, y): (f64, f64)) -> (i32, i32) {
+    (units(x), units(y))
+}
+
+/// In a PNG, `plotters` writes texts that are centred upwards with their baseline so many em below the place, and 0.27 em
+/// in an SVG.
+const CENTRE_TO_BASELINE: f64 = 0.12;
+/// Half the height of digits and capitals above that, in em.
+const TO_CENTRE: f64 = 0.36 - CENTRE_TO_BASELINE;
+
+/// Which part of a text stands at its place.
+const LEFT: Pos = pos(HPos::Left, VPos::Center);
+const RIGHT: Pos = pos(HPos::Right, VPos::Center);
+const MIDDLE: Pos = pos(HPos::Center, VPos::Center);
+
+const fn pos(h_pos: HPos, v_pos: VPos) -> Pos {
+    Pos { h_pos, v_pos }
+}
+
+/// A style of text with an em of `size` points.
+fn font(size: f64) -> TextStyle<'static> {
+    const FAMILY: &str = "sans-serif";
+    // Shipped, so that figures are the same on machines without fonts, and with ℓ, γ, σ and superscripts. An SVG file
+    // names only the family, and its viewer chooses a font.
+    static DEJAVU_SANS: LazyLock<bool> = LazyLock::new(|| {
+        let font = include_bytes!("../fonts/DejaVuSans.ttf");
+        register_font(FAMILY, FontStyle::Normal, font).is_ok()
+    });
+    LazyLock::force(&DEJAVU_SANS);
+    // `plotters` has the height of the line, 1.16 em in DejaVu Sans, in pictures, and 1.24 em in SVG.
+    TextStyle::from((FAMILY, 1.2 * size * UNITS).into_font()).color(&INK)
+}
+
+/// Width of a text in points.
+fn text_width(text: &str, size: f64) -> f64 {
+    let size = font(size).font.box_size(&escape::line(text));
+    f64::from(size.map_or(0, |size| size.0)) / UNITS
+}
+
+/// Width of the widest text in points.
+fn widest<'a>(texts: impl Iterator<Item = &'a str>, size: f64) -> f64 {
+    texts.map(|text| text_width(text, size)).fold(0.0, f64::max)
+}
+
+/// Writes a text with the middle of its digits at the height of `at`.
+fn write<B: DrawingBackend>(
+    canvas: &Canvas<B>,
+    text: &str,
+    size: f64,
+    anchor: Pos,
+    (x, y): (f64, f64),
+) -> Drawn<B> {
+    let at = place((x, y + TO_CENTRE * size));
+    write_in(canvas, text, &font(size).pos(anchor), at)
+}
+
+/// The same upwards.
+fn write_upwards<B: DrawingBackend>(
+    canvas: &Canvas<B>,
+    text: &str,
+    size: f64,
+    anchor: Pos,
+    (x, y): (f64, f64),
+) -> Drawn<B> {
+    let upwards = font(size).transform(FontTransform::Rotate270);
+    let at = place((x + TO_CENTRE * size, y));
+    write_in(canvas, text, &upwards.pos(anchor), at)
+}
+
+fn write_in<B: DrawingBackend>(
+    canvas: &Canvas<B>,
+    text: &str,
+    style: &TextStyle<'_>,
+    at: (i32, i32),
+) -> Drawn<B> {
+    match text {
+        "" => Ok(()),
+        text => canvas.draw_text(&escape::line(text), style, at),
+    }
+}
+
+/// A line through places in coordinates.
+fn line<B: DrawingBackend>(
+    canvas: &Canvas<B>,
+    through: Vec<(i32, i32)>,
+    colour: RGBColor,
+    width: f64,
+) -> Drawn<B> {
+    let style = colour.stroke_width(units(width) as u32);
+    canvas.draw(&PathElement::new(through, style))
+}
+
+/// The outline of a rectangle.
+fn frame<B: DrawingBackend>(
+    canvas: &Canvas<B>,
+    corner: (f64, f64),
+    opposite: (f64, f64),
+) -> Drawn<B> {
+    let ((x0, y0), (x1, y1)) = (place(corner), place(opposite));
+    // A closed path would not be filled where it overlaps itself.
+    line(canvas, vec![(x0, y1), (x0, y0), (x1, y0)], INK, LINE)?;
+    line(canvas, vec![(x1, y0), (x1, y1), (x0, y1)], INK, LINE)
+}
+
+/// Height of a text with the space beside it; zero for an empty text.
+fn room(text: &str, size: f64) -> f64 {
+    match text {
+        "" => 0.0,
+        _ => size + 8.0,
     }
 }

@@ -22,7 +22,7 @@ use base64::engine::general_purpose::STANDARD as BASE64;
 use maud::{DOCTYPE, Markup, PreEscaped, Render, html};
 
 use crate::escape::visible;
-use crate::figure::{Figure, FigureError, PIXELS_PER_POINT, PictureFormat};
+use crate::figure::{Figure, FigureError, PictureFormat};
 use crate::table::{Cell, Table, TableFormat};
 use shearq_files::{FileError, atomic};
 
@@ -92,8 +92,6 @@ pub enum Block {
     Filtered(Table),
     /// A figure.
     Figure(Picture),
-    /// Lines in a typewriter font, as they are.
-    Code(String),
 }
 
 impl Block {
@@ -106,17 +104,14 @@ impl Block {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Picture {
     /// File name without extension, for links to the figure.
-    pub stem: String,
-    /// What it shows, in words, for those who cannot see it; the caption stands in where it is empty.
-    pub alt: String,
-    /// Caption, with the markup of [`Block::Text`].
-    pub caption: String,
-    /// PictureFormat of `bytes`.
-    pub format: PictureFormat,
-    /// The picture file. SVG is small and sharp for curves and bars, PNG is smaller for images.
-    pub bytes: Vec<u8>,
-    /// Labels and paths, relative to the report, of the same figure and its data in other formats.
-    pub links: Vec<(String, String)>,
+    stem: String,
+    /// Caption, with the markup of [`Block::Text`]; without it, the description for those who cannot see the figure.
+    caption: String,
+    svg: Vec<u8>,
+    /// Width and height in points.
+    size: (f64, f64),
+    /// Labels and paths, relative to the report, of the same figure in other formats.
+    links: Vec<(String, String)>,
 }
 
 impl Picture {
@@ -126,56 +121,22 @@ impl Picture {
     /// Those of [`Figure::render`].
     pub fn draw(
         figure: &dyn Figure,
-        format: PictureFormat,
         stem: impl Into<String>,
         caption: impl Into<String>,
     ) -> Result<Self, FigureError> {
         Ok(Picture {
             stem: stem.into(),
-            alt: String::new(),
             caption: caption.into(),
-            format,
-            bytes: figure.render(format)?,
+            svg: figure.render(PictureFormat::Svg)?,
+            size: figure.size(),
             links: Vec::new(),
         })
-    }
-
-    /// The same with a description in words.
-    pub fn described(self, alt: impl Into<String>) -> Self {
-        Picture {
-            alt: alt.into(),
-            ..self
-        }
     }
 
     /// The same with one more link.
     pub fn link(mut self, label: impl Into<String>, path: impl Into<String>) -> Self {
         self.links.push((label.into(), path.into()));
         self
-    }
-
-    /// Width and height in points, where the file tells.
-    fn size(&self) -> Option<(f64, f64)> {
-        match self.format {
-            PictureFormat::Png => {
-                let number = |at: usize| {
-                    let bytes = self.bytes.get(at..at + 4)?.try_into().ok()?;
-                    Some(f64::from(u32::from_be_bytes(bytes)) / f64::from(PIXELS_PER_POINT))
-                };
-                self.bytes.starts_with(b"\x89PNG").then_some(())?;
-                Some((number(16)?, number(20)?))
-            }
-            PictureFormat::Svg => {
-                let text = str::from_utf8(&self.bytes).ok()?;
-                let (_, tag) = text.split_once("<svg")?;
-                let (tag, _) = tag.split_once('>')?;
-                let number = |name: &str| {
-                    let (_, rest) = tag.split_once(&format!(" {name}=\""))?;
-                    rest.split_once('"')?.0.parse::<f64>().ok()
-                };
-                Some((number("width")?, number("height")?))
-            }
-        }
     }
 }
 
@@ -442,28 +403,18 @@ impl Page {
             Block::Table(table) => self.table(table, false),
             Block::Filtered(table) => self.table(table, true),
             Block::Figure(picture) => self.figure(picture),
-            Block::Code(text) => code(text),
         }
     }
 
     fn figure(&mut self, picture: &Picture) -> Markup {
         self.figures += 1;
         let id = self.ids.give(&format!("figure-{}", picture.stem));
-        let mime = match picture.format {
-            PictureFormat::Png => "image/png",
-            PictureFormat::Svg => "image/svg+xml",
-        };
-        let size = picture.size().map(|(w, h)| (w.round(), h.round()));
-        let alt = match picture.alt.is_empty() {
-            true => plain(&picture.caption),
-            false => picture.alt.clone(),
-        };
         // As an image, and not as elements of the page, an SVG keeps its names and styles to itself.
         html! {
             figure id=(id) {
                 div.plate {
-                    img src={ "data:" (mime) ";base64," (BASE64.encode(&picture.bytes)) } alt=(Words(&alt))
-                        width=[size.map(|s| s.0)] height=[size.map(|s| s.1)];
+                    img src={ "data:image/svg+xml;base64," (BASE64.encode(&picture.svg)) }
+                        alt=(Words(&plain(&picture.caption))) width=(picture.size.0) height=(picture.size.1);
                 }
                 figcaption {
                     p {

@@ -1,14 +1,13 @@
 //! Tables, plots and HTML pages, independent of what they show.
 //!
 //! * [`table`]: rows and columns, as text for a terminal, Markdown, LaTeX, CSV or JSON; [`terminal`] fits them to a width.
-//! * [`figure`]: line plots, bars, heat maps and images, as SVG and PNG.
+//! * [`figure`]: curves, points with errors, heat maps and images, as SVG and PNG.
 //! * [`html`], [`page`]: pages that need no other file.
 //! * [`escape`]: text of unknown origin, made safe for each format.
 #![forbid(unsafe_code)]
 
 pub mod escape;
 pub mod figure;
-mod font;
 mod formats;
 pub mod html;
 pub mod page;

@@ -7,7 +7,7 @@ use shearq_files::frames::TableError;
 use shearq_files::{FileError, atomic, table};
 use thiserror::Error;
 
-use crate::figure::{Figure, FigureError, PictureFormat};
+use crate::figure::{Figure, FigureError};
 use crate::html::{Block, Picture, Report, Section};
 use crate::table::{Table, TableFormat};
 
@@ -85,7 +85,7 @@ impl<'a> Page<'a> {
         figure: &impl Figure,
         caption: &str,
     ) -> Result<(), PageError> {
-        let mut picture = Picture::draw(figure, PictureFormat::Svg, name, caption)?;
+        let mut picture = Picture::draw(figure, name, caption)?;
         for ending in ["png", "svg"] {
             let path = format!("figures/{name}.{ending}");
             figure.save(self.out.join(&path))?;

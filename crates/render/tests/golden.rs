@@ -7,8 +7,8 @@ use std::path::Path;
 
 use ndarray::Array2;
 use shearq_render::figure::{
-    BarGroup, BarPlot, ColourMap, Figure, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot,
-    PanelGrid, PictureFormat, Scale, Series, Style,
+    Band, ColourMap, Figure, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot, PanelGrid,
+    PictureFormat, Series, Style,
 };
 
 fn compare(name: &str, figure: &impl Figure) {
@@ -72,30 +72,49 @@ fn panels_share_their_labels_and_legend() {
     );
 }
 
-fn bars(categories: &[&str]) -> BarPlot {
-    let group = |label: &str, from: f64| BarGroup {
-        label: label.into(),
-        values: (0..categories.len()).map(|k| from - k as f64).collect(),
-        errors: Some(vec![0.5; categories.len()]),
+#[test]
+fn a_requirement_is_a_band() {
+    let points = |label: &str, aside: f64, colour| {
+        let x = vec![1.0 + aside, 2.0 + aside, 3.0 + aside];
+        Series::new(label, x, vec![2e-3, 1e-3, -3e-3], Style::Points, colour)
+            .with_errors(vec![1e-3; 3])
     };
-    BarPlot {
-        title: "Quality factor per set".into(),
+    let plot = LinePlot {
         x_label: "set".into(),
+        x_whole: true,
+        y_label: "m".into(),
+        bands: vec![Band {
+            label: "requirement".into(),
+            low: -2e-3,
+            high: 2e-3,
+        }],
+        series: vec![points("m1", -0.05, 0), points("m2", 0.05, 1)],
+        ..LinePlot::default()
+    };
+    compare("band", &plot);
+}
+
+#[test]
+fn long_names_stand_below_each_other() {
+    let names = [
+        "23/raw/star",
+        "48/linear/star",
+        "a rather long name of a configuration",
+    ];
+    let series = Series::new(
+        "",
+        vec![0.0, 1.0, 2.0],
+        vec![4.0, 3.0, 2.0],
+        Style::Points,
+        0,
+    );
+    let plot = LinePlot {
         y_label: "Q".into(),
-        categories: categories.iter().map(|name| (*name).to_owned()).collect(),
-        groups: vec![group("23/raw/star", 4.0), group("23/den/star", 1.0)],
-    }
-}
-
-#[test]
-fn a_bar_plot() {
-    compare("bar", &bars(&["2", "5", "8", "mean"]));
-}
-
-#[test]
-fn long_names_of_bars_run_upwards() {
-    let names = ["a rather long name of a category"; 6];
-    compare("bar-upright", &bars(&names));
+        x_names: names.map(String::from).into(),
+        series: vec![series.with_errors(vec![0.5; 3])],
+        ..LinePlot::default()
+    };
+    compare("names", &plot);
 }
 
 #[test]
@@ -132,11 +151,10 @@ fn images_in_a_grid() {
             rows: vec![ImageRow {
                 label: "S/N 20".into(),
                 panels: vec![
-                    panel("stamp", ColourMap::Grey),
+                    panel("residual", ColourMap::Diverging),
                     panel("deconvolved", ColourMap::Viridis),
                 ],
             }],
-            scale: Scale::Own,
         },
     );
 }

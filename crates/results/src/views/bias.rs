@@ -3,7 +3,7 @@
 use shearq_bias::{
     Catalogue, Design, Estimate, Measured, QUANTITIES, REQUIREMENTS, Verdict, student_t, verdict,
 };
-use shearq_render::figure::{FigureError, LinePlot, PanelGrid, PictureFormat, Series, Style};
+use shearq_render::figure::{Band, FigureError, LinePlot, PanelGrid, Series, Style};
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Heading, Table};
 
@@ -522,77 +522,68 @@ pub fn junit(checks: &[Checked]) -> String {
     document([("shear bias", cases.collect())])
 }
 
-/// Plots of m and c in bins, or of all galaxies, with the tightest published requirements as dashed lines.
+/// Plots of m and c in bins, or of all galaxies, with the tightest published requirement as a band.
 pub fn bias_plot(result: &BiasResult) -> PanelGrid {
-    let known = |of: char| {
-        let keys = [1, 2].map(|component| format!("{of}{component}"));
-        let mut found = result
-            .bins
-            .iter()
-            .filter_map(|bin| bin.estimate.as_ref().ok());
-        found.any(|found| keys.iter().any(|key| found.value(key).is_some()))
-    };
-    let places = result.bins.iter().filter(|bin| is_shown(result, bin.edges));
-    let (first, last) = places.fold((f64::MAX, f64::MIN), |(first, last), bin| {
+    let shown = || result.bins.iter().filter(|bin| is_shown(result, bin.edges));
+    let binned = shown().any(|bin| bin.edges.is_some());
+    let (first, last) = shown().fold((f64::MAX, f64::MIN), |(first, last), bin| {
         let at = middle(bin.edges);
         (first.min(at), last.max(at))
     });
     // Points of both components stand side by side.
     let apart = 0.012 * if last > first { last - first } else { 1.0 };
-    let plots = ['m', 'c'].into_iter().filter(|of| known(*of)).map(|of| {
-        let limits = REQUIREMENTS
-            .iter()
-            .filter(|requirement| requirement.of == of);
-        let limit = limits
-            .map(|requirement| requirement.limit)
-            .fold(f64::MAX, f64::min);
-        let mut series = Vec::new();
-        let (mut left, mut right) = (f64::MAX, f64::MIN);
+    let limit = |of: char| {
+        let limits = REQUIREMENTS.iter().filter(|own| own.of == of);
+        limits.map(|own| own.limit).fold(f64::MAX, f64::min)
+    };
+    let plots = ['m', 'c'].into_iter().filter_map(|of| {
+        let (mut series, mut names) = (Vec::new(), Vec::new());
         for (component, colour) in [(1, 0), (2, 1)] {
             let key = format!("{of}{component}");
             let (mut x, mut y, mut errors) = (Vec::new(), Vec::new(), Vec::new());
-            for bin in result.bins.iter().filter(|bin| is_shown(result, bin.edges)) {
-                let found = bin
-                    .estimate
-                    .as_ref()
-                    .ok()
-                    .and_then(|found| found.value(&key));
-                let (Some(Measured { value, error }), at) = (found, middle(bin.edges)) else {
-                    continue;
-                };
-                (left, right) = (left.min(at), right.max(at));
-                x.push(at + (f64::from(component) - 1.5) * apart);
-                y.push(value);
-                errors.push(error);
+            if !binned {
+                names.push(key.clone());
+            }
+            for bin in shown() {
+                let found = bin.estimate.as_ref().ok();
+                if let Some(Measured { value, error }) = found.and_then(|found| found.value(&key)) {
+                    x.push(match binned {
+                        true => middle(bin.edges) + (f64::from(component) - 1.5) * apart,
+                        false => f64::from(component) - 1.0,
+                    });
+                    y.push(value);
+                    errors.push(error);
+                }
             }
             if !x.is_empty() {
-                series.push(Series::new(&key, x, y, Style::Points, colour).with_errors(errors));
+                // One entry of the legend for both panels.
+                let label = match binned {
+                    true => format!("m{component}, c{component}"),
+                    false => String::new(),
+                };
+                series.push(Series::new(&label, x, y, Style::Points, colour).with_errors(errors));
             }
         }
-        if left > right {
-            (left, right) = (0.0, 1.0);
-        }
-        let margin = if left < right { 0.0 } else { 0.5 };
-        for (label, value) in [
-            (format!("requirement {limit:e}"), limit),
-            (String::new(), -limit),
-        ] {
-            let ends = vec![left - margin, right + margin];
-            series.push(Series::new(&label, ends, vec![value; 2], Style::Dashed, 7));
-        }
-        LinePlot {
+        (!series.is_empty()).then(|| LinePlot {
             title: match of {
                 'm' => "Multiplicative bias".into(),
                 _ => "Additive bias".into(),
             },
-            x_label: match result.binned.as_str() {
-                "" => "all galaxies".into(),
-                binned => binned.into(),
-            },
+            x_label: result.binned.clone(),
+            x_names: names,
             y_label: of.into(),
+            bands: vec![Band {
+                label: format!(
+                    "tightest requirement: |m| < {}, |c| < {}",
+                    limit('m'),
+                    limit('c')
+                ),
+                low: -limit(of),
+                high: limit(of),
+            }],
             series,
             ..LinePlot::default()
-        }
+        })
     });
     PanelGrid {
         title: "Shear bias".into(),
@@ -621,8 +612,8 @@ fn middle(edges: Option<[f64; 2]>) -> f64 {
 /// # Errors
 /// If the plot cannot be drawn.
 pub fn section(result: &BiasResult, table: Table) -> Result<Section, FigureError> {
-    let caption = "m and c with standard errors. Dashed: the tightest published requirements.";
-    let picture = Picture::draw(&bias_plot(result), PictureFormat::Svg, "bias", caption)?;
+    let caption = "m and c with standard errors. Grey: the tightest published requirement.";
+    let picture = Picture::draw(&bias_plot(result), "bias", caption)?;
     let mut blocks = Vec::new();
     let mut table = table;
     if let Ok(all) = result.all() {

@@ -6,9 +6,7 @@ use crate::score::ScoredSet;
 use crate::views::spectrum;
 use crate::views::verdict::take_verdict;
 use shearq_bias::QUANTITIES;
-use shearq_render::figure::{
-    BarGroup, BarPlot, FigureError, HeatMap, LinePlot, PanelGrid, PictureFormat, Series, Style,
-};
+use shearq_render::figure::{Band, FigureError, HeatMap, LinePlot, PanelGrid, Series, Style};
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::Metrics;
@@ -27,7 +25,6 @@ pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section,
         blocks.push(Block::Figure(
             Picture::draw(
                 &spectra(name, &with_power),
-                PictureFormat::Svg,
                 format!("spectra-{name}"),
                 "E-mode bandpowers of the scored bins. Q uses the measured bandpowers with their noise, Q_dn without. Without noise they are below the truth if shear is lost. Negative values are not plotted.",
             )?,
@@ -65,22 +62,12 @@ pub fn comparison(mut table: Table, map: &HeatMap) -> Result<Section, FigureErro
         ),
         ("m_cross", "Multiplicative bias: 0 for an unbiased method."),
     ] {
-        if let Some(bars) = bars(&table, key) {
-            blocks.push(Block::Figure(Picture::draw(
-                &bars,
-                PictureFormat::Svg,
-                key,
-                caption,
-            )?));
+        if let Some(plot) = metric_plot(&table, key) {
+            blocks.push(Block::Figure(Picture::draw(&plot, key, caption)?));
         }
     }
     let caption = "Q of each set in the convention of the table, and the mean.";
-    blocks.push(Block::Figure(Picture::draw(
-        map,
-        PictureFormat::Svg,
-        "q-per-set",
-        caption,
-    )?));
+    blocks.push(Block::Figure(Picture::draw(map, "q-per-set", caption)?));
     blocks.push(Block::Table(table));
     Ok(Section::new("comparison", "Comparison", blocks))
 }
@@ -250,12 +237,14 @@ pub fn contest(table: &Table) -> PanelGrid {
     };
     // Uncalibrated configurations would compress the others, so their points lie outside the plot.
     let near = |key: &str, label: &str| {
-        let plot = plot(
-            key,
-            label,
-            &format!("± {REQUIREMENT}"),
-            &[-REQUIREMENT, REQUIREMENT],
-        );
+        let plot = LinePlot {
+            bands: vec![Band {
+                label: format!("requirement |m| < {REQUIREMENT}×10⁻³"),
+                low: -REQUIREMENT,
+                high: REQUIREMENT,
+            }],
+            ..plot(key, label, "", &[])
+        };
         let beyond: Vec<bool> = rows
             .iter()
             .map(|(_, row)| number(row, key).0.abs() > LARGEST_M)
@@ -304,26 +293,25 @@ pub fn contest(table: &Table) -> PanelGrid {
     }
 }
 
-/// A column of the table as bars, one per row; `None` if no row has a value.
-fn bars(table: &Table, key: &str) -> Option<BarPlot> {
+/// A column of the table as a plot, one row per point; `None` if no row has a value.
+fn metric_plot(table: &Table, key: &str) -> Option<LinePlot> {
     let k = table.place(key)?;
-    let mut bars = BarGroup::default();
-    let (mut names, mut errors) = (Vec::new(), Vec::new());
+    let (mut names, mut values, mut errors) = (Vec::new(), Vec::new(), Vec::new());
     for row in &table.rows {
         if let (Cell::Text(name), Cell::Number { value, error, .. }) = (row.first()?, row.get(k)?)
             && value.is_finite()
         {
             names.push(name.clone());
-            bars.values.push(*value);
+            values.push(*value);
             errors.push(error.unwrap_or(f64::NAN));
         }
     }
-    bars.errors = Some(errors);
-    (!names.is_empty()).then(|| BarPlot {
-        title: table.headings[k].label.clone(),
-        x_label: String::new(),
+    let x = (0..names.len()).map(|row| row as f64).collect();
+    let series = Series::new("", x, values, Style::Points, 0).with_errors(errors);
+    (!names.is_empty()).then(|| LinePlot {
         y_label: table.headings[k].label.clone(),
-        categories: names,
-        groups: vec![bars],
+        x_names: names,
+        series: vec![series],
+        ..LinePlot::default()
     })
 }

@@ -3,7 +3,7 @@
 use ndarray::Array2;
 use shearq_measure::Steps;
 
-use shearq_render::figure::{ColourMap, ImageGrid, ImagePanel, ImageRow, Scale, Stretch};
+use shearq_render::figure::{ColourMap, ImageGrid, ImagePanel, ImageRow, Stretch};
 
 /// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, and the part of the ACF that is measured.
 pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
@@ -13,7 +13,6 @@ pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
         image,
         map,
         stretch,
-        limits: None,
     };
     ImageRow {
         label: label.into(),
@@ -33,6 +32,5 @@ pub fn steps_figure(title: &str, rows: Vec<ImageRow>) -> ImageGrid {
     ImageGrid {
         title: format!("{title} (shearq {})", shearq_pipeline::VERSION),
         rows,
-        scale: Scale::Own,
     }
 }

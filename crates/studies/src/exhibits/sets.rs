@@ -5,7 +5,7 @@ use shearq_submissions::{Configuration, PsfForm, Published};
 
 use crate::reproduce::SetResult;
 use crate::response::Response;
-use shearq_render::figure::{BarGroup, BarPlot, ColourMap, HeatMap, PanelGrid};
+use shearq_render::figure::{ColourMap, HeatMap, LinePlot, PanelGrid, Series, Style};
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_results::views::spectrum;
 use shearq_simulate::kinds::{ImageType, SetKind, shares};
@@ -278,27 +278,21 @@ pub fn bias_per_set(
     metric: fn(&Metrics) -> f64,
     title: &str,
     y_label: &str,
-) -> BarPlot {
-    let groups = places
-        .iter()
-        .map(|&(place, name)| {
-            let over = over_sets(results, place, metric);
-            BarGroup {
-                label: name.into(),
-                values: over.iter().map(|v| v.0).collect(),
-                errors: over
-                    .iter()
-                    .map(|v| v.1.is_finite().then_some(v.1))
-                    .collect(),
-            }
-        })
-        .collect();
-    BarPlot {
+) -> LinePlot {
+    let series = places.iter().enumerate().map(|(k, &(place, name))| {
+        let (y, errors) = over_sets(results, place, metric).into_iter().unzip();
+        // Shifted, so that points do not hide each other.
+        let aside = (k as f64 - 0.5 * (places.len() as f64 - 1.0)) * 0.12;
+        let x = results.iter().map(|set| f64::from(set.set) + aside);
+        Series::new(name, x.collect(), y, Style::Points, k).with_errors(errors)
+    });
+    LinePlot {
         title: title.into(),
         x_label: "set".into(),
+        x_whole: true,
         y_label: y_label.into(),
-        categories: set_labels(results),
-        groups,
+        series: series.collect(),
+        ..LinePlot::default()
     }
 }
 
