@@ -37,16 +37,6 @@ impl Column {
         }
     }
 
-    /// Width of the longest line.
-    fn natural(&self) -> usize {
-        let lines = self.cells.iter().flat_map(|cell| cell.lines());
-        lines
-            .chain([self.heading.as_str()])
-            .map(UnicodeWidthStr::width)
-            .max()
-            .unwrap_or(0)
-    }
-
     /// The least width: numbers stay whole, words are broken only where they are very long.
     fn least(&self) -> usize {
         let words = |text: &str| {
@@ -110,14 +100,6 @@ pub fn fitted(table: &Table, width: Option<usize>) -> String {
 
 /// Columns side by side.
 fn block(columns: &[&Column], width: usize) -> String {
-    // What the least widths leave goes to those that want more, the first ones first.
-    let mut widths: Vec<usize> = columns.iter().map(|column| column.least()).collect();
-    let mut left = width.saturating_sub(widths.iter().map(|w| w + PADDING).sum());
-    for (own, column) in widths.iter_mut().zip(columns) {
-        let more = (column.natural() - *own).min(left);
-        *own += more;
-        left -= more;
-    }
     let mut table = comfy_table::Table::new();
     table
         .load_preset(presets::UTF8_HORIZONTAL_ONLY)
@@ -126,7 +108,7 @@ fn block(columns: &[&Column], width: usize) -> String {
         .remove_style(TableComponent::LeftBorderIntersections)
         .remove_style(TableComponent::RightBorderIntersections)
         .set_content_arrangement(ContentArrangement::Dynamic)
-        .set_width(u16::MAX)
+        .set_width(u16::try_from(width).unwrap_or(u16::MAX))
         .set_header(columns.iter().map(|column| &column.heading));
     let rows = columns.iter().map(|column| column.cells.len()).max();
     for k in 0..rows.unwrap_or(0) {
@@ -136,10 +118,10 @@ fn block(columns: &[&Column], width: usize) -> String {
                 .map(|column| column.cells.get(k).map_or("", |c| c)),
         );
     }
-    for ((place, own), column) in table.column_iter_mut().zip(widths).zip(columns) {
-        let whole = u16::try_from(own + 1).unwrap_or(u16::MAX);
+    for (place, column) in table.column_iter_mut().zip(columns) {
+        let least = u16::try_from(column.least() + 1).unwrap_or(u16::MAX);
         place.set_padding((0, 1));
-        place.set_constraint(ColumnConstraint::Absolute(Width::Fixed(whole)));
+        place.set_constraint(ColumnConstraint::LowerBoundary(Width::Fixed(least)));
         if column.numbers {
             place.set_cell_alignment(CellAlignment::Right);
         }
