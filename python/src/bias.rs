@@ -131,11 +131,12 @@ impl BiasSums {
     ) -> PyResult<(String, String)> {
         let errors = bootstrap.map_or(Errors::Jackknife, |draws| Errors::Bootstrap { draws, seed });
         py.detach(|| {
-            let table = bias_table(&self.summed.clone().result(errors)?);
-            Ok((
-                table.render(TableFormat::Json),
-                table.narrow().render(TableFormat::Table),
-            ))
+            let result = self.summed.clone().result(errors)?;
+            let table = bias_table(&result);
+            let mut json = table.json();
+            // The label of an axis.
+            json["binned"] = result.binned.as_str().into();
+            Ok((json.to_string(), table.narrow().render(TableFormat::Table)))
         })
         .map_err(of_bias)
     }

@@ -144,6 +144,11 @@ def test_results_are_shown(pair):
     assert found._repr_html_().count("<tr>") == 5 and list(found.to_frame()["n"]) == [row["n"] for row in found.rows]
     pytest.importorskip("matplotlib").use("Agg")
     ax = found.plot()
-    assert len(ax.get_xticks()) == 4 and ax.get_ylabel().endswith("bias m")
+    assert ax.get_xlabel() == "snr" and ax.get_ylabel().endswith("bias m")
+    ax.figure.canvas.draw()
+    # A number per bin, and the labels inside of the figure.
+    places = ax.containers[0].lines[0].get_xdata()
+    assert len(places) == 3 and (np.diff(places) > 0).all() and places[0] > 5
+    assert ax.get_tightbbox().x0 >= 0 and shearq.bias(pair, g1=[0.02, -0.02], g2=[0.01, -0.01]).plot().get_xlabel() == "all galaxies"
     with pytest.raises(ValueError, match="expected 'm' or 'c'"):
         found.plot("q")

@@ -26,18 +26,22 @@ class Bias:
         JSON has them. None is a quantity that the data do not determine.
     notes : list of str
         Design, units of the errors, rows that do not count, and requirements that are met or not.
+    binned : str
+        The binned column or expression; empty without bins.
 
     ``bias["m1"]`` is the value of all galaxies.
     """
 
-    __slots__ = ("_text", "notes", "rows")
+    __slots__ = ("_text", "binned", "notes", "rows")
 
     rows: list[dict[str, Any]]
     notes: list[str]
+    binned: str
 
-    def __init__(self, rows: list[dict[str, Any]], notes: list[str], text: str) -> None:
+    def __init__(self, rows: list[dict[str, Any]], notes: list[str], text: str, binned: str = "") -> None:
         self.rows = rows
         self.notes = notes
+        self.binned = binned
         self._text = text
 
     def __getitem__(self, key: str) -> float:
@@ -106,7 +110,7 @@ class BiasSums:
         """The bias, with errors from a jackknife or from bootstrap draws of units."""
         text, shown = self._sums.result(bootstrap, seed)
         found = json.loads(text)
-        return Bias(found["rows"], found["notes"], shown)
+        return Bias(found["rows"], found["notes"], shown, found["binned"])
 
 
 def _restored(text: str) -> BiasSums:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html as escape
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import numpy as np
@@ -17,19 +18,34 @@ def _number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
 
 
+def _table(caption: str, headings: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    def line(cells: Iterable[str], kind: str) -> str:
+        return "<tr>" + "".join(f"<{kind}>{escape.escape(cell)}</{kind}>" for cell in cells) + "</tr>"
+
+    body = "".join(line(row, "td") for row in rows)
+    return f"<table><caption>{escape.escape(caption)}</caption>{line(headings, 'th')}{body}</table>"
+
+
 def html(catalogue: Any) -> str:
     names = catalogue.dtype.names or ()
     if catalogue.ndim != 1:
         return f"<pre>{escape.escape(repr(catalogue))}</pre>"
-    head = "".join(f"<th>{escape.escape(name)}</th>" for name in names)
-    rows = [
-        "<tr>" + "".join(f"<td>{escape.escape(_number(row[name]))}</td>" for name in names) + "</tr>"
-        for row in catalogue[:_SHOWN]
-    ]
     flagged = int((catalogue["flags"] != 0).sum()) if "flags" in names else 0
     more = f", the first {_SHOWN} shown" if len(catalogue) > _SHOWN else ""
     text = f"shearq.Catalogue of {len(catalogue)} galaxies, {flagged} flagged{more}"
-    return f"<table><caption>{text}</caption><tr>{head}</tr>{''.join(rows)}</table>"
+    return _table(text, names, ([_number(row[name]) for name in names] for row in catalogue[:_SHOWN]))
+
+
+def bias_html(bias: Any) -> str:
+    keys = ("m1", "m2", "c1", "c2")
+
+    def cell(row: dict[str, Any], key: str) -> str:
+        value, error = row.get(key), row.get(f"{key}_error")
+        return "" if value is None or error is None else f"{value:+.4f} ± {error:.4f}"
+
+    rows = ([str(row["bin"]), f"{row['n']:.0f}", *(cell(row, key) for key in keys)] for row in bias.rows)
+    notes = "".join(f"<li>{escape.escape(note)}</li>" for note in bias.notes)
+    return _table("Shear bias", ("bin", "galaxies", *keys), rows) + f"<ul>{notes}</ul>"
 
 
 def _axes(ax: Any) -> Any:
@@ -39,7 +55,18 @@ def _axes(ax: Any) -> Any:
         from matplotlib import pyplot
     except ImportError:
         raise ImportError("plots need matplotlib. Try: pip install matplotlib") from None
-    return pyplot.subplots()[1]
+    # Without this layout, long labels of axes are cut off.
+    return pyplot.subplots(layout="constrained")[1]
+
+
+def _log_axis(ax: Any, low: float, high: float) -> None:
+    """A logarithmic horizontal axis with 1, 2 and 5 times powers of ten as plain numbers."""
+    ax.set_xscale("log")
+    ticks = [factor * 10.0**power for power in range(-3, 7) for factor in (1, 2, 5)]
+    ticks = [tick for tick in ticks if low <= tick <= high]
+    if len(ticks) > 1:
+        ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        ax.set_xticks([], minor=True)
 
 
 def plot_catalogue(catalogue: Any, kind: Literal["histogram", "map"], ax: Any) -> Any:
@@ -53,8 +80,8 @@ def plot_catalogue(catalogue: Any, kind: Literal["histogram", "map"], ax: Any) -
             edge = float(np.quantile(np.abs(e), 0.99))
             ax.hist(e, bins=60, range=(-edge, edge), histtype="step", color=colour, label=f"e{k}")
             ax.axvline((mean.g1, mean.g2)[k - 1], color=colour, linestyle="--", linewidth=1)
-        ax.set(xlabel="ellipticity", ylabel="galaxies", title=str(mean))
-        ax.title.set_fontsize("small")
+        ax.set(xlabel="ellipticity", ylabel="galaxies")
+        ax.set_title(str(mean), fontsize="small", wrap=True)
         ax.legend()
         return ax
     if kind != "map":
@@ -93,31 +120,14 @@ def plot_score(score: Any, ax: Any) -> Any:
     ax.errorbar(l, table["ee"][chosen], error, fmt="o", markersize=4, label="EE")
     ax.plot(l, table["bb"][chosen], "x", markersize=4, label="BB")
     ax.plot(l, table["true_ee"][chosen], color="black", linewidth=1, label="true EE")
-    ax.set(xscale="log", xlabel="multipole ℓ", ylabel="ℓ²C(ℓ)/2π", title=repr(score).strip("<>"))
-    ax.title.set_fontsize("small")
-    ticks = [tick for power in range(5) for tick in (10**power, 2 * 10**power, 5 * 10**power) if l.min() <= tick <= l.max()]
-    if len(ticks) > 1:
-        ax.set_xticks(ticks, [str(tick) for tick in ticks])
-        ax.set_xticks([], minor=True)
+    ax.set(xlabel="multipole ℓ", ylabel="ℓ²C(ℓ)/2π")
+    ax.set_title(repr(score).strip("<>"), fontsize="small", wrap=True)
+    _log_axis(ax, l.min(), l.max())
     ax.set_yscale("symlog", linthresh=max(float(np.nanmax(np.abs(table["true_ee"]))) * 1e-2, 1e-12))
     if min(table["ee"][chosen].min(), table["bb"][chosen].min()) >= 0:
         ax.set_ylim(bottom=0)
     ax.legend()
     return ax
-
-
-def bias_html(bias: Any) -> str:
-    keys = ("m1", "m2", "c1", "c2")
-    head = "".join(f"<th>{key}</th>" for key in ("bin", "galaxies", *keys))
-    rows = []
-    for row in bias.rows:
-        cells = [f"<td>{escape.escape(str(row['bin']))}</td>", f"<td>{row['n']:.0f}</td>"]
-        for key in keys:
-            value, error = row.get(key), row.get(f"{key}_error")
-            cells.append("<td></td>" if value is None or error is None else f"<td>{value:+.4f} ± {error:.4f}</td>")
-        rows.append(f"<tr>{''.join(cells)}</tr>")
-    notes = "".join(f"<li>{escape.escape(note)}</li>" for note in bias.notes)
-    return f"<table><caption>Shear bias</caption><tr>{head}</tr>{''.join(rows)}</table><ul>{notes}</ul>"
 
 
 # GREAT3's tolerances (Mandelbaum et al. 2014, ApJS 212, 5).
@@ -131,21 +141,39 @@ def plot_bias(bias: Any, quantity: Literal["m", "c"], limit: float | None, ax: A
     limit = _TOLERANCE[quantity] if limit is None else limit
     ax.axhspan(-limit, limit, color="0.85", label=f"|{quantity}| < {limit:g}")
     ax.axhline(0, color="0.5", linewidth=0.8)
-    places = np.arange(len(bias.rows))
+    # The first row is of all galaxies.
+    rows = bias.rows[1:] or bias.rows
+    values = np.array([[np.nan if row.get(key) is None else row[key] for key in ("low", "high")] for row in rows], dtype=float)
+    known = np.unique(values[np.abs(values) < 1e300])
+    log = known.size > 0 and known[0] > 0 and known[-1] > 2 * known[0]
+    places = np.zeros(len(rows))
+    if known.size:
+        edges = np.log(np.abs(values)) if log else values
+        ends = np.log(known) if log else known
+        width = np.diff(ends).mean() if len(ends) > 1 else 0.2 * max(abs(ends[0]), 0.1)
+        # The outer bins have no end, and are drawn as wide as the others.
+        low = np.where(values[:, 0] > -1e300, edges[:, 0], ends[0] - width)
+        high = np.where(values[:, 1] < 1e300, edges[:, 1], ends[-1] + width)
+        places = 0.5 * (low + high)
+        for edge in known:
+            ax.axvline(edge, color="0.85", linewidth=0.8, zorder=0)
     for k, colour, marker in ((1, "C0", "o"), (2, "C1", "s")):
         key = f"{quantity}{k}"
         value, error = (
-            np.array([np.nan if row.get(name) is None else row[name] for row in bias.rows], dtype=float)
-            for name in (key, f"{key}_error")
+            np.array([np.nan if row.get(name) is None else row[name] for row in rows], dtype=float) for name in (key, f"{key}_error")
         )
         if np.isnan(value).all():
             continue
-        ax.errorbar(places + 0.12 * (k - 1.5), value, error, fmt=marker, color=colour, markersize=4, capsize=2, label=key)
-    many = len(places) > 3
-    labels = [str(row["bin"]) for row in bias.rows]
-    ax.set_xticks(places, labels, rotation=25 if many else 0, ha="right" if many else "center", rotation_mode="anchor")
+        # Side by side.
+        aside = places + (2 * k - 3) * 0.01 * max(np.ptp(places), 1.0)
+        ax.errorbar(np.exp(aside) if log else aside, value, error, fmt=marker, color=colour, markersize=4, capsize=2, label=key)
+    ax.margins(x=0.1)
+    if log:
+        _log_axis(ax, *ax.get_xlim())
+    if not known.size:
+        ax.set_xticks([])
+        ax.set_xlim(-0.5, 0.5)
     meaning = {"m": "multiplicative bias m", "c": "additive bias c"}[quantity]
-    ax.set(ylabel=meaning, title=f"{bias['n']:.0f} galaxies")
-    ax.margins(x=0.15)
+    ax.set(xlabel=bias.binned or "all galaxies", ylabel=meaning, title=f"{bias['n']:.0f} galaxies")
     ax.legend(fontsize="small")
     return ax
