@@ -14,6 +14,7 @@
 //! assert!(report.render().contains("<p><b>Q</b> as in <code>score</code>.</p>"));
 //! ```
 
+use std::borrow::Cow;
 use std::collections::HashSet;
 use std::path::Path;
 
@@ -612,60 +613,31 @@ fn paragraphs(text: &str) -> Vec<String> {
     paragraphs
 }
 
-/// A run of text of one kind.
-#[derive(Debug, PartialEq)]
-enum Run<'a> {
-    Plain(&'a str),
-    Bold(&'a str),
-    Code(&'a str),
-}
-
-/// Splits at `` `code` `` and `**bold**`; marks without a partner or with nothing between are text.
-fn runs(text: &str) -> Vec<Run<'_>> {
-    let mut runs = Vec::new();
-    let (mut start, mut at) = (0, 0);
-    while let Some(found) = text[at..].find(['`', '*']) {
-        let open = at + found;
-        let mark = if text[open..].starts_with('`') {
-            "`"
-        } else if text[open..].starts_with("**") {
-            "**"
-        } else {
-            at = open + 1;
-            continue;
-        };
-        let inner = open + mark.len();
-        match text[inner..].find(mark) {
-            Some(length) if length > 0 => {
-                if open > start {
-                    runs.push(Run::Plain(&text[start..open]));
-                }
-                let inside = &text[inner..inner + length];
-                runs.push(if mark == "`" {
-                    Run::Code(inside)
-                } else {
-                    Run::Bold(inside)
-                });
-                at = inner + length + mark.len();
-                start = at;
-            }
-            _ => at = inner,
-        }
+/// The parts of a text outside and inside of pairs of `mark`, in turn. Marks without a partner, or with nothing between,
+/// are text.
+fn marked<'a>(text: &'a str, mark: &str) -> Vec<(bool, Cow<'a, str>)> {
+    let mut parts: Vec<Cow<'_, str>> = text.split(mark).map(Cow::from).collect();
+    if parts.len().is_multiple_of(2)
+        && let (Some(last), Some(before)) = (parts.pop(), parts.last_mut())
+    {
+        *before = format!("{before}{mark}{last}").into();
     }
-    if start < text.len() {
-        runs.push(Run::Plain(&text[start..]));
-    }
-    runs
+    let parts = parts.into_iter().enumerate();
+    let part = |(k, part): (usize, Cow<'a, str>)| match (k % 2 == 1, part.is_empty()) {
+        (true, true) => (false, mark.repeat(2).into()),
+        (inside, _) => (inside, part),
+    };
+    parts.map(part).collect()
 }
 
 /// A paragraph with its markup as HTML.
 fn inline(text: &str) -> Markup {
     html! {
-        @for run in runs(text) {
-            @match run {
-                Run::Plain(words) => (Typeset(words)),
-                Run::Bold(words) => b { (Typeset(words)) },
-                Run::Code(words) => code { (Words(words)) },
+        @for (is_code, part) in marked(text, "`") {
+            @if is_code { code { (Words(&part)) } } @else {
+                @for (is_bold, part) in marked(&part, "**") {
+                    @if is_bold { b { (Typeset(&part)) } } @else { (Typeset(&part)) }
+                }
             }
         }
     }
@@ -674,12 +646,16 @@ fn inline(text: &str) -> Markup {
 /// A text without its markup.
 fn plain(text: &str) -> String {
     let text = paragraphs(text).join(" ");
-    runs(&text)
-        .into_iter()
-        .map(|run| match run {
-            Run::Plain(words) | Run::Bold(words) | Run::Code(words) => words,
-        })
-        .collect()
+    let outside = |part: &str| marked(part, "**").into_iter().map(|own| own.1).collect();
+    let parts = marked(&text, "`").into_iter();
+    let words = parts.map(|(code, part)| {
+        if code {
+            part.into_owned()
+        } else {
+            outside(&part)
+        }
+    });
+    words.collect()
 }
 
 /// A path as a URL that cannot be taken for anything but a path.
