@@ -310,7 +310,8 @@ pub(crate) fn spectrum<'py>(
     let definition = self::definition(definition)?;
     let rows = Rows::new(&e, positions.as_ref(), lengths);
     let (all, modes) = py.detach(|| {
-        let (images, ..) = rows.sum(&grid)?;
+        let mut images = SetImages::new(&grid);
+        rows.each(&grid, |image, _| images.add(image).map_err(of_scoring))?;
         let total = images.total();
         let scale = 1.0 / total.images.max(1) as f64;
         let standard = Convention::STANDARD;
