@@ -310,7 +310,7 @@ fn tables_of_fits_files_are_found_by_their_columns_or_named() {
         (
             "chips.fits",
             &["--columns", "X_IMAGE,Y_IMAGE"],
-            "2 tables have these columns (extensions 1 to 2); expected one",
+            "2 tables have these columns (1 `LDAC_OBJECTS`, 2 `LDAC_OBJECTS`); expected one",
         ),
         (
             "ldac.fits",
@@ -588,7 +588,7 @@ fn descriptions_of_catalogues_name_a_table() {
     assert_eq!(scored("table = \"2\""), named);
     assert_ne!(scored("table = 1"), named);
     for (table, expected) in [
-        ("", "2 tables have these columns (extensions 1 to 2)"),
+        ("", "2 tables have these columns (1 `ZERO`, 2 `SHAPES`)"),
         (
             "table = \"NONE\"",
             "there is no table `NONE` in this file; tables found: 1 `ZERO`, 2 `SHAPES`",

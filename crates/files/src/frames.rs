@@ -33,7 +33,7 @@ mod parquet;
 /// The data frames in use.
 pub use ::polars::prelude as polars;
 pub use error::TableError;
-pub use frame::{Metadata, frame, reals};
+pub use frame::{Metadata, element_name, element_of, frame, reals};
 pub use parquet::{
     panic_is_caught, parquet_columns, parquet_metadata, read_parquet, read_parquet_groups,
     write_parquet,

@@ -271,6 +271,7 @@ pub fn read_from(
     }
     let request = text::Request {
         wanted,
+        identities: &[],
         default_names: &text::CHALLENGE_COLUMNS,
         most_rows,
     };
@@ -288,14 +289,15 @@ pub const TRUTH_COLUMNS: [&str; 4] = ["x", "y", "g1", "g2"];
 const PART: usize = 1 << 17;
 
 /// Reads the columns `wanted` in parts, and gives each part to `take`: row groups of a Parquet file, a fixed number of
-/// rows of a FITS table, and all of a text table. So a table may have any number of rows. In Parquet, columns of text
-/// are read too.
+/// rows of a FITS table, and all of a text table. So a table may have any number of rows. Columns of text are read too, of a
+/// text table those in `identities`; 64-bit integers keep all digits.
 ///
 /// # Errors
 /// As [`read`], and those of `take`.
 pub fn read_parts(
     place: &Place,
     wanted: &[&str],
+    identities: &[&str],
     mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
 ) -> Result<(), FileError> {
     place.check()?;
@@ -303,7 +305,15 @@ pub fn read_parts(
     match Ending::of(path) {
         Ending::Parquet => parquet::read_groups(path, wanted, MAX_ROWS, take),
         Ending::Fits => fits::read_table_parts(path, wanted, place.table.as_deref(), PART, take),
-        Ending::Text => take(read_from(place, Some(wanted), MAX_ROWS)?),
+        Ending::Text => {
+            let request = text::Request {
+                wanted: Some(wanted),
+                identities,
+                default_names: &text::CHALLENGE_COLUMNS,
+                most_rows: MAX_ROWS,
+            };
+            take(text::read(path, &request)?)
+        }
     }
 }
 
@@ -365,6 +375,7 @@ fn check_positions(path: &Path, name: &str, values: &[f64]) -> Result<(), FileEr
 pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
     let request = text::Request {
         wanted: Some(names),
+        identities: &[],
         default_names: names,
         most_rows: MAX_ROWS,
     };

@@ -40,6 +40,9 @@ pub fn formula_mark(text: &str) -> &'static str {
 pub(super) struct Request<'a> {
     /// Columns to read; all, with NaN for what is not a number, if `None`.
     pub(super) wanted: Option<&'a [&'a str]>,
+    /// Wanted columns of texts or of integers of any length. They become columns of text if 64-bit floats do not contain
+    /// all values.
+    pub(super) identities: &'a [&'a str],
     /// Names of the columns of a table without a header.
     pub(super) default_names: &'a [&'a str],
     /// Most rows.
@@ -542,9 +545,44 @@ struct Rows<'a> {
     /// Of the columns read, by place in the row.
     slots: Vec<Option<usize>>,
     places: Vec<usize>,
-    columns: Vec<Vec<f64>>,
+    columns: Vec<Values>,
     rows: usize,
 }
+
+/// Values of a column.
+enum Values {
+    Numbers(Vec<f64>),
+    /// Numbers, and texts from the first one that a float does not contain.
+    Identities(Vec<f64>),
+    Texts(Vec<String>),
+}
+
+impl Values {
+    /// Adds a field; whether it fits.
+    fn add(&mut self, field: &str) -> bool {
+        let exact = |value: &f64| value.abs() <= FLOAT_INTEGERS;
+        match self {
+            Values::Numbers(values) => {
+                let value = number(field);
+                values.push(value.unwrap_or(f64::NAN));
+                return value.is_some();
+            }
+            Values::Identities(values) => match number(field).filter(exact) {
+                Some(value) => values.push(value),
+                None => {
+                    let mut texts: Vec<String> = values.iter().map(f64::to_string).collect();
+                    texts.push(field.trim().to_owned());
+                    *self = Values::Texts(texts);
+                }
+            },
+            Values::Texts(texts) => texts.push(field.trim().to_owned()),
+        }
+        true
+    }
+}
+
+/// Integers up to 2⁵³ are 64-bit floats.
+const FLOAT_INTEGERS: f64 = 9_007_199_254_740_992.0;
 
 impl<'a> Rows<'a> {
     fn new(path: &'a Path, request: &Request<'_>, names: &'a [String]) -> Result<Self, FileError> {
@@ -562,6 +600,10 @@ impl<'a> Rows<'a> {
                 return Err(FileError::new(path, message));
             }
         }
+        let values = |place: &usize| match request.identities.contains(&names[*place].as_str()) {
+            true => Values::Identities(Vec::new()),
+            false => Values::Numbers(Vec::new()),
+        };
         let slot = |column| places.iter().position(|&place| place == column);
         Ok(Rows {
             path,
@@ -569,7 +611,7 @@ impl<'a> Rows<'a> {
             strict: request.wanted.is_some(),
             most: request.most_rows,
             slots: (0..names.len()).map(slot).collect(),
-            columns: vec![Vec::new(); places.len()],
+            columns: places.iter().map(values).collect(),
             places,
             rows: 0,
         })
@@ -592,11 +634,9 @@ impl<'a> Rows<'a> {
             let Some(slot) = self.slots.get(column).copied().flatten() else {
                 continue;
             };
-            let value = match number(field) {
-                None if self.strict => return Err(self.not_a_number(line, column, field)),
-                value => value.unwrap_or(f64::NAN),
-            };
-            self.columns[slot].push(value);
+            if !self.columns[slot].add(field) && self.strict {
+                return Err(self.not_a_number(line, column, field));
+            }
         }
         let expected = self.names.len();
         if count == expected {
@@ -620,7 +660,15 @@ impl<'a> Rows<'a> {
             .places
             .iter()
             .zip(self.columns)
-            .map(|(&place, values)| Column::new(self.names[place].as_str().into(), values))
+            .map(|(&place, values)| {
+                let name = self.names[place].as_str().into();
+                match values {
+                    Values::Numbers(values) | Values::Identities(values) => {
+                        Column::new(name, values)
+                    }
+                    Values::Texts(texts) => Column::new(name, texts),
+                }
+            })
             .collect();
         crate::frames::frame(columns).map_err(|error| FileError::new(self.path, error.to_string()))
     }

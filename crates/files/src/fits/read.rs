@@ -2,14 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::ffi::{c_char, c_int};
+use std::ops::Range;
 use std::path::Path;
 use std::ptr;
 
 use fitsio::sys;
 
+use super::cfitsio::plain;
 use super::file::File;
 use super::tiles::Tiles;
 use crate::error::{FileError, names_of};
+use crate::frames::element_name;
 use crate::frames::polars::{Column, DataFrame};
 use crate::limits::{MAX_ROWS, MAX_SIDE};
 
@@ -23,6 +26,12 @@ const TDOUBLE: c_int = 82;
 /// Type codes of columns that `ffgcvd` reads as one number a row: TBYTE, TSBYTE, TUSHORT, TSHORT,
 /// TUINT, TINT, TULONG, TLONG, TFLOAT, TULONGLONG, TLONGLONG, TDOUBLE.
 const NUMBERS: [c_int; 12] = [11, 12, 20, 21, 30, 31, 40, 41, 42, 80, 81, 82];
+/// Longest vector whose numbers are columns with names of their own; longer ones are stamps.
+const MAX_VECTOR: i64 = 8;
+const TSTRING: c_int = 16;
+const TLONGLONG: c_int = 81;
+/// The offset by which FITS stores unsigned 64-bit integers as signed ones.
+const UNSIGNED: f64 = 9_223_372_036_854_775_808.0;
 
 /// Pixels of this value are missing: SExtractor writes it, in single precision.
 const MISSING: f32 = -1e30;
@@ -335,11 +344,40 @@ impl ImageReader {
 }
 
 /// A column of a table, by its number from 1.
+#[derive(Clone)]
 struct Description {
     number: c_int,
     name: String,
     kind: c_int,
     repeat: i64,
+    /// Place of a number in the vector that each row has.
+    element: i64,
+}
+
+impl Description {
+    fn is_number(&self) -> bool {
+        NUMBERS.contains(&self.kind) || self.kind == TLOGICAL
+    }
+
+    /// The names under which its numbers are read: `g[0]` and `g[1]` of a vector of two.
+    fn names(&self) -> Vec<String> {
+        match self.is_number() && (2..=MAX_VECTOR).contains(&self.repeat) {
+            true => (0..self.repeat)
+                .map(|k| element_name(&self.name, k))
+                .collect(),
+            false => vec![self.name.clone()],
+        }
+    }
+
+    /// The column of a name of [`Description::names`].
+    fn named(&self, name: &str) -> Option<Self> {
+        let element = self.names().iter().position(|own| own == name)?;
+        Some(Description {
+            name: name.to_owned(),
+            element: element as i64,
+            ..self.clone()
+        })
+    }
 }
 
 /// A table of a file.
@@ -356,11 +394,14 @@ pub struct TableHead {
 impl TableHead {
     /// The table that `file` is at.
     fn here(file: &File) -> Result<Self, FileError> {
-        let name = |number: c_int| file.text(&format!("TTYPE{number}"));
+        let mut columns = Vec::new();
+        for number in 1..=column_count(file)? {
+            columns.extend(describe_column(file, number)?.names());
+        }
         Ok(TableHead {
             number: file.number_of_extension(),
             name: file.text("EXTNAME"),
-            columns: (1..=column_count(file)?).map(name).collect(),
+            columns,
         })
     }
 
@@ -462,18 +503,18 @@ fn go_to_table(
         ([], Some(table)) => {
             return Err(no_table(file, table, &list_of(&tables)));
         }
-        ([first, .., last], _) => {
+        (_, _) => {
             let what = match table {
                 Some(table) => format!("tables are called `{table}`"),
                 None => "tables have these columns".into(),
             };
+            let chosen: Vec<TableHead> = chosen.iter().map(|head| (*head).clone()).collect();
             return Err(file.fault(format!(
-                "{} {what} (extensions {} to {}); expected one. Try: {}[{}]",
+                "{} {what} ({}); expected one. Try: {}[{}]",
                 chosen.len(),
-                first.number,
-                last.number,
+                list_of(&chosen),
                 file.path().display(),
-                first.number
+                chosen[0].number
             )));
         }
     };
@@ -493,7 +534,7 @@ pub fn read_table(
     let mut file = File::open(path, "table")?;
     go_to_table(&mut file, wanted, table)?;
     let rows = table_rows(&mut file, MAX_ROWS)?;
-    let chosen = choose_columns(&file, path, wanted)?;
+    let chosen = choose_columns(&file, path, wanted, false)?;
     let numbers = rows as u64 * chosen.len() as u64;
     let most = FREE_NUMBERS.max(file.disk_size());
     if numbers > most {
@@ -502,12 +543,13 @@ pub fn read_table(
             chosen.len()
         )));
     }
-    let table = read_part(&file, &chosen, 0, rows)?;
+    let table = read_part(&file, &chosen, 0..rows, false)?;
     file.check_end()?;
     Ok(table)
 }
 
 /// Reads the columns `wanted` of a table, as [`read_table`], in parts of at most `most_rows`, and gives each to `take`.
+/// Columns of text are read too, and 64-bit integers as such.
 ///
 /// # Errors
 /// As [`read_table`], and those of `take`.
@@ -521,61 +563,59 @@ pub fn read_table_parts(
     let mut file = File::open(path, "table")?;
     go_to_table(&mut file, Some(wanted), table)?;
     let rows = table_rows(&mut file, usize::MAX)?;
-    let chosen = choose_columns(&file, path, Some(wanted))?;
+    let chosen = choose_columns(&file, path, Some(wanted), true)?;
     for first in (0..rows).step_by(most_rows) {
-        take(read_part(
-            &file,
-            &chosen,
-            first,
-            most_rows.min(rows - first),
-        )?)?;
+        let last = rows.min(first + most_rows);
+        take(read_part(&file, &chosen, first..last, true)?)?;
     }
     file.check_end()
 }
 
-/// The descriptions of the columns `wanted`, or of all that are numbers.
+/// The descriptions of the columns `wanted`, or of all that are numbers. Wanted columns may be `texts`.
 fn choose_columns(
     file: &File,
     path: &Path,
     wanted: Option<&[&str]>,
+    texts: bool,
 ) -> Result<Vec<Description>, FileError> {
     let descriptions = describe_columns(file)?;
-    if let Some(missing) = wanted
-        .into_iter()
-        .flatten()
-        .find(|name| !descriptions.iter().any(|d| d.name == **name))
-    {
-        let names: Vec<&str> = descriptions.iter().map(|d| d.name.as_str()).collect();
-        return Err(FileError::no_column(path, missing, &names));
-    }
+    let Some(wanted) = wanted else {
+        let scalar = |own: &Description| own.is_number() && own.repeat == 1;
+        return Ok(descriptions.into_iter().filter(scalar).collect());
+    };
     let mut chosen = Vec::new();
-    for description in descriptions {
-        let name = description.name.as_str();
-        let number = description.repeat == 1
-            && (NUMBERS.contains(&description.kind) || description.kind == TLOGICAL);
-        match wanted {
-            Some(wanted) if !wanted.contains(&name) => continue,
-            None if !number => continue,
-            _ => {}
-        }
-        if !number {
+    for name in wanted {
+        let found = descriptions.iter().find_map(|own| own.named(name));
+        // A vector by its name alone has no single number.
+        let whole = || descriptions.iter().find(|own| own.name == *name).cloned();
+        let Some(found) = found.or_else(whole) else {
+            let names: Vec<String> = descriptions.iter().flat_map(Description::names).collect();
+            return Err(FileError::no_column(path, name, &names));
+        };
+        let text = texts && found.kind == TSTRING;
+        let number = found.is_number() && (found.repeat == 1 || found.name.ends_with(']'));
+        if !(number || text) {
             return Err(file.fault(format!("column `{name}` does not hold one number per row")));
         }
-        chosen.push(description);
+        chosen.push(found);
     }
     Ok(chosen)
 }
 
-/// Some rows of columns, counted from 0.
+/// Some rows of columns, counted from 0. If `exact`, 64-bit integers stay such.
 fn read_part(
     file: &File,
     columns: &[Description],
-    first: usize,
-    rows: usize,
+    rows: Range<usize>,
+    exact: bool,
 ) -> Result<DataFrame, FileError> {
     let columns = columns
         .iter()
-        .map(|column| read_column(file, column, first, rows))
+        .map(|column| match column.kind {
+            TSTRING => read_texts(file, column, &rows),
+            TLONGLONG if exact && column.repeat == 1 => read_integers(file, column, &rows),
+            _ => read_column(file, column, &rows),
+        })
         .collect::<Result<_, FileError>>()?;
     crate::frames::frame(columns).map_err(|error| file.fault(error.to_string()))
 }
@@ -634,17 +674,22 @@ fn column_count(file: &File) -> Result<c_int, FileError> {
 fn describe_columns(file: &File) -> Result<Vec<Description>, FileError> {
     (1..=column_count(file)?)
         .map(|number| {
-            let name = file.text(&format!("TTYPE{number}"));
-            let (kind, repeat) = file.column_type(number)?;
-            check_scale(file, number, &name)?;
-            Ok(Description {
-                number,
-                name,
-                kind,
-                repeat,
-            })
+            let found = describe_column(file, number)?;
+            check_scale(file, number, &found.name)?;
+            Ok(found)
         })
         .collect()
+}
+
+fn describe_column(file: &File, number: c_int) -> Result<Description, FileError> {
+    let (kind, repeat) = file.column_type(number)?;
+    Ok(Description {
+        number,
+        name: file.text(&format!("TTYPE{number}")),
+        kind,
+        repeat,
+        element: 0,
+    })
 }
 
 /// Refuses a column if its scale is zero, or if its scale or offset is not finite.
@@ -662,28 +707,29 @@ fn check_scale(file: &File, number: c_int, name: &str) -> Result<(), FileError> 
     Ok(())
 }
 
-/// Rows of a column, after the first `skipped`, as real numbers; missing ones are NaN, true is 1 and false 0.
+/// Rows of a column as real numbers; missing ones are NaN, true is 1 and false 0. Of a vector, the numbers of one place.
 fn read_column(
     file: &File,
     description: &Description,
-    skipped: usize,
-    rows: usize,
+    rows: &Range<usize>,
 ) -> Result<Column, FileError> {
-    let first = skipped as i64 + 1;
+    let first = rows.start as i64 + 1;
+    let repeat = description.repeat.max(1);
+    let count = rows.len() as i64 * repeat;
     let doing = || format!("cannot read column `{}`", description.name);
     let mut some_missing = 0;
-    if description.kind == TLOGICAL {
+    let values = if description.kind == TLOGICAL {
         // Neither true nor false is missing.
         let missing = 2;
-        let mut values = vec![0 as c_char; rows];
-        // SAFETY: the file is open, and there is room for all the rows.
+        let mut values = vec![0 as c_char; count as usize];
+        // SAFETY: the file is open, and there is room for all the values.
         file.call(doing, |raw, status| unsafe {
             sys::ffgcvl(
                 raw,
                 description.number,
                 first,
                 1,
-                rows as i64,
+                count,
                 missing,
                 values.as_mut_ptr(),
                 &mut some_missing,
@@ -697,23 +743,128 @@ fn read_column(
                 f64::from(value)
             }
         };
-        let values: Vec<f64> = values.into_iter().map(real).collect();
-        return Ok(Column::new(description.name.as_str().into(), values));
+        values.into_iter().map(real).collect()
+    } else {
+        let mut values = vec![0.0; count as usize];
+        // SAFETY: the file is open, and there is room for all the values.
+        file.call(doing, |raw, status| unsafe {
+            sys::ffgcvd(
+                raw,
+                description.number,
+                first,
+                1,
+                count,
+                f64::NAN,
+                values.as_mut_ptr(),
+                &mut some_missing,
+                status,
+            );
+        })?;
+        values
+    };
+    let own: Vec<f64> = match repeat {
+        1 => values,
+        _ => {
+            let own = values.into_iter().skip(description.element as usize);
+            own.step_by(repeat as usize).collect()
+        }
+    };
+    Ok(Column::new(description.name.as_str().into(), own))
+}
+
+/// Rows of a column of 64-bit integers as such, if it has neither a scale nor missing values.
+fn read_integers(
+    file: &File,
+    description: &Description,
+    rows: &Range<usize>,
+) -> Result<Column, FileError> {
+    let number = description.number;
+    let key = |name: &str| file.number(&format!("{name}{number}"));
+    let (scale, zero) = (key("TSCAL")?.unwrap_or(1.0), key("TZERO")?.unwrap_or(0.0));
+    let plain = scale == 1.0 && (zero == 0.0 || zero == UNSIGNED) && key("TNULL")?.is_none();
+    if !plain {
+        return read_column(file, description, rows);
     }
-    let mut values = vec![0.0; rows];
+    let (first, count) = (rows.start as i64 + 1, rows.len() as i64);
+    let doing = || format!("cannot read column `{}`", description.name);
+    let name = description.name.as_str().into();
+    let mut some_missing = 0;
+    if zero == UNSIGNED {
+        let mut values = vec![0_u64; rows.len()];
+        // SAFETY: the file is open, and there is room for all the rows.
+        file.call(doing, |raw, status| unsafe {
+            sys::ffgcvujj(
+                raw,
+                number,
+                first,
+                1,
+                count,
+                0,
+                values.as_mut_ptr().cast(),
+                &mut some_missing,
+                status,
+            );
+        })?;
+        return Ok(Column::new(name, values));
+    }
+    let mut values = vec![0_i64; rows.len()];
     // SAFETY: the file is open, and there is room for all the rows.
     file.call(doing, |raw, status| unsafe {
-        sys::ffgcvd(
+        sys::ffgcvjj(
             raw,
-            description.number,
+            number,
             first,
             1,
-            rows as i64,
-            f64::NAN,
-            values.as_mut_ptr(),
+            count,
+            0,
+            values.as_mut_ptr().cast(),
             &mut some_missing,
             status,
         );
     })?;
-    Ok(Column::new(description.name.as_str().into(), values))
+    Ok(Column::new(name, values))
+}
+
+/// Most bytes of a text.
+const MAX_TEXT: i64 = 1 << 10;
+
+/// Rows of a column of text, without blanks at the end.
+fn read_texts(
+    file: &File,
+    description: &Description,
+    rows: &Range<usize>,
+) -> Result<Column, FileError> {
+    let width = description.repeat;
+    if !(1..=MAX_TEXT).contains(&width) {
+        return Err(file.fault(format!(
+            "column `{}` has texts of {width} bytes; expected 1 to {MAX_TEXT}",
+            description.name
+        )));
+    }
+    let stride = width as usize + 1;
+    let mut bytes = vec![0 as c_char; stride * rows.len()];
+    let mut places: Vec<*mut c_char> = bytes
+        .chunks_mut(stride)
+        .map(<[c_char]>::as_mut_ptr)
+        .collect();
+    let mut some_missing = 0;
+    file.call(
+        || format!("cannot read column `{}`", description.name),
+        // SAFETY: the file is open, and each place has room for the width of the column and a zero.
+        |raw, status| unsafe {
+            sys::ffgcvs(
+                raw,
+                description.number,
+                rows.start as i64 + 1,
+                1,
+                rows.len() as i64,
+                ptr::null_mut(),
+                places.as_mut_ptr(),
+                &mut some_missing,
+                status,
+            );
+        },
+    )?;
+    let texts: Vec<String> = bytes.chunks(stride).map(plain).collect();
+    Ok(Column::new(description.name.as_str().into(), texts))
 }

@@ -62,6 +62,17 @@ pub fn reals(column: &Column) -> Option<Cow<'_, [f64]>> {
     values.map(Cow::Owned)
 }
 
+/// The name of the number at `place` of the vectors in a column.
+pub fn element_name(column: &str, place: impl std::fmt::Display) -> String {
+    format!("{column}[{place}]")
+}
+
+/// The column and the place that [`element_name`] named.
+pub fn element_of(name: &str) -> Option<(&str, usize)> {
+    let (column, place) = name.strip_suffix(']')?.rsplit_once('[')?;
+    Some((column, place.parse().ok()?))
+}
+
 fn list<T>(chunks: &ChunkedArray<T>, convert: impl Fn(T::Native) -> f64) -> Vec<f64>
 where
     T: PolarsNumericType,

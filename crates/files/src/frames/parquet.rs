@@ -16,7 +16,7 @@ use std::path::Path;
 
 use polars::prelude::{
     ArrowDataType, ArrowField, ChunkFillNullValue, ChunkedArray, Column, DataFrame, DataType,
-    FileMetadataRef, IntoSeries, KeyValueMetadata, ParquetCompression, ParquetReader,
+    FileMetadataRef, IntoSeries, KeyValueMetadata, NamedFrom, ParquetCompression, ParquetReader,
     ParquetWriter, PolarsError, PolarsNumericType, PolarsResult, SerReader, Series,
     StatisticsOptions,
 };
@@ -26,9 +26,10 @@ use polars_parquet::read::{
 };
 
 use super::attributes::arrow_schema;
-use super::frame;
-use super::{Metadata, TableError};
+use super::{Metadata, TableError, element_name, element_of, frame, reals};
 
+/// Longest vector whose numbers are columns with names of their own.
+const MAX_VECTOR: usize = 8;
 /// The key under which Parquet files keep the Arrow schema.
 const SCHEMA_KEY: &str = "ARROW:schema";
 
@@ -108,8 +109,9 @@ pub fn read_parquet(
 ) -> Result<DataFrame, TableError> {
     let path = path.as_ref();
     let mut source = Source::open(path)?;
+    let wanted_all = |fields: &[ArrowField]| fields.iter().cloned().map(Wanted::whole).collect();
     let fields = match wanted {
-        None => source.fields.clone(),
+        None => wanted_all(&source.fields),
         Some(names) => source.pick(names)?,
     };
     source.check_rows(most_rows)?;
@@ -133,7 +135,7 @@ pub fn read_parquet_groups<E: From<TableError>>(
 ) -> Result<(), E> {
     let mut source = Source::open(path)?;
     let fields = source.pick(wanted)?;
-    let fields: Vec<ArrowField> = fields
+    let fields: Vec<Wanted> = fields
         .iter()
         .map(|field| source.decoded(field))
         .collect::<Result<_, TableError>>()?;
@@ -165,6 +167,68 @@ pub fn parquet_columns(path: impl AsRef<Path>) -> Result<Vec<String>, TableError
 /// [`TableError::Io`] and [`TableError::Damaged`] if the file cannot be read.
 pub fn parquet_metadata(path: impl AsRef<Path>) -> Result<Metadata, TableError> {
     Ok(Source::open(path.as_ref())?.key_values())
+}
+
+/// A column, or the numbers at one place of a column of vectors.
+struct Wanted {
+    field: ArrowField,
+    element: Option<usize>,
+}
+
+impl Wanted {
+    fn whole(field: ArrowField) -> Self {
+        Wanted {
+            field,
+            element: None,
+        }
+    }
+
+    /// The numbers at its place.
+    fn taken(&self, vectors: Series) -> Result<Series, String> {
+        let Some(place) = self.element else {
+            return Ok(vectors);
+        };
+        let mut numbers = Vec::with_capacity(vectors.len());
+        for chunk in vectors
+            .list()
+            .map_err(|error| error.to_string())?
+            .downcast_iter()
+        {
+            let inner = Series::try_from((self.field.name.clone(), chunk.values().clone()));
+            let inner = Column::from(inner.map_err(|error| error.to_string())?);
+            let inner = reals(&inner).ok_or("found vectors of no numbers")?;
+            for row in 0..chunk.len() {
+                let (start, end) = chunk.offsets().start_end(row);
+                let missing = chunk.validity().is_some_and(|valid| !valid.get_bit(row));
+                if start + place >= end && !missing {
+                    let length = end - start;
+                    return Err(format!(
+                        "found a vector of {length} numbers, expected more than {place}"
+                    ));
+                }
+                numbers.push(if missing {
+                    f64::NAN
+                } else {
+                    inner[start + place]
+                });
+            }
+        }
+        let name = element_name(&self.field.name, place);
+        Ok(Series::new(name.into(), numbers))
+    }
+}
+
+/// The names under which a column is read: `g[0]` and `g[1]` of vectors of two.
+fn names_in(field: &ArrowField) -> Vec<String> {
+    let length = match &field.dtype {
+        ArrowDataType::FixedSizeList(_, length) => (*length).min(MAX_VECTOR),
+        ArrowDataType::List(_) | ArrowDataType::LargeList(_) => 2,
+        _ => 0,
+    };
+    match decoded_vector(&field.dtype) {
+        Some(_) => (0..length).map(|k| element_name(&field.name, k)).collect(),
+        None => vec![field.name.to_string()],
+    }
 }
 
 /// An open file with its parsed footer.
@@ -261,14 +325,11 @@ impl<'a> Source<'a> {
     }
 
     fn names(&self) -> Vec<String> {
-        self.fields
-            .iter()
-            .map(|field| field.name.to_string())
-            .collect()
+        self.fields.iter().flat_map(names_in).collect()
     }
 
     /// The fields called `names`, in that order.
-    fn pick(&self, names: &[&str]) -> Result<Vec<ArrowField>, TableError> {
+    fn pick(&self, names: &[&str]) -> Result<Vec<Wanted>, TableError> {
         let mut seen = BTreeSet::new();
         names
             .iter()
@@ -276,12 +337,24 @@ impl<'a> Source<'a> {
                 if !seen.insert(name) {
                     return Err(TableError::DuplicateColumn { name: name.into() });
                 }
-                let field = self.fields.iter().find(|field| field.name == name);
-                field.cloned().ok_or_else(|| TableError::MissingColumn {
-                    path: self.path.into(),
-                    wanted: name.into(),
-                    present: self.names(),
-                })
+                let called = |name| self.fields.iter().find(move |field| field.name == name);
+                let whole = || called(name).cloned().map(Wanted::whole);
+                let element = || {
+                    let (column, place) = element_of(name)?;
+                    let field = called(column).filter(|field| names_in(field).len() > place)?;
+                    decoded_vector(&field.dtype)?;
+                    Some(Wanted {
+                        field: field.clone(),
+                        element: Some(place),
+                    })
+                };
+                whole()
+                    .or_else(element)
+                    .ok_or_else(|| TableError::MissingColumn {
+                        path: self.path.into(),
+                        wanted: name.into(),
+                        present: self.names(),
+                    })
             })
             .collect()
     }
@@ -296,11 +369,18 @@ impl<'a> Source<'a> {
     }
 
     /// All rows of one column.
-    fn read_column(&mut self, field: &ArrowField) -> Result<Column, TableError> {
-        let field = self.decoded(field)?;
-        let mut column = Series::new_empty(field.name.clone(), &DataType::from_arrow_field(&field));
+    fn read_column(&mut self, wanted: &Wanted) -> Result<Column, TableError> {
+        let wanted = self.decoded(wanted)?;
+        let field = &wanted.field;
+        let mut column = match wanted.element {
+            None => Series::new_empty(field.name.clone(), &DataType::from_arrow_field(field)),
+            Some(place) => {
+                let name = element_name(&field.name, place);
+                Series::new_empty(name.into(), &DataType::Float64)
+            }
+        };
         for number in 0..self.footer.row_groups.len() {
-            let series = self.read_chunk(&field, number)?;
+            let series = self.read_chunk(&wanted, number)?;
             column = match number {
                 0 => series,
                 _ => {
@@ -318,21 +398,26 @@ impl<'a> Source<'a> {
     }
 
     /// The field with the type into which it is decoded.
-    fn decoded(&self, field: &ArrowField) -> Result<ArrowField, TableError> {
-        let decoded = decoded_type(&field.dtype).ok_or_else(|| TableError::UnsupportedType {
+    fn decoded(&self, wanted: &Wanted) -> Result<Wanted, TableError> {
+        let Wanted { field, element } = wanted;
+        let decoded = match element {
+            Some(_) => decoded_vector(&field.dtype),
+            None => decoded_type(&field.dtype),
+        };
+        let decoded = decoded.ok_or_else(|| TableError::UnsupportedType {
             path: self.path.into(),
             column: field.name.to_string(),
             found: format!("{:?}", field.dtype),
         })?;
-        Ok(ArrowField::new(
-            field.name.clone(),
-            decoded,
-            field.is_nullable,
-        ))
+        Ok(Wanted {
+            field: ArrowField::new(field.name.clone(), decoded, field.is_nullable),
+            element: *element,
+        })
     }
 
     /// The rows of a decoded column in one row group.
-    fn read_chunk(&mut self, field: &ArrowField, number: usize) -> Result<Series, TableError> {
+    fn read_chunk(&mut self, wanted: &Wanted, number: usize) -> Result<Series, TableError> {
+        let field = &wanted.field;
         let (path, name) = (self.path, field.name.as_str());
         let footer = self.footer.clone();
         let group = &footer.row_groups[number];
@@ -347,9 +432,14 @@ impl<'a> Source<'a> {
         let Some((1, Some(chunk))) = found else {
             return Err(damaged("found no single column chunk".into()));
         };
-        if usize::try_from(chunk.num_values()) != Ok(group.num_rows()) {
+        let values = usize::try_from(chunk.num_values()).unwrap_or(usize::MAX);
+        let most_values = match wanted.element {
+            None => group.num_rows(),
+            Some(_) => group.num_rows().saturating_mul(MAX_VECTOR),
+        };
+        if values > most_values || values < most_values && wanted.element.is_none() {
             return Err(damaged(format!(
-                "found {} values, expected {} as the row group has rows",
+                "found {} values, expected {most_values} as the row group has {} rows",
                 chunk.num_values(),
                 group.num_rows()
             )));
@@ -360,7 +450,7 @@ impl<'a> Source<'a> {
         let bytes = self
             .read_bytes(start, chunk.compressed_size())
             .map_err(damaged)?;
-        let most = unpacked_bytes(self.length).max(number_bytes(&field.dtype, group.num_rows()));
+        let most = unpacked_bytes(self.length).max(number_bytes(&field.dtype, most_values));
         let series = guarded(path, &place, || decode(chunk, bytes, field, most))?;
         if series.len() != group.num_rows() {
             return Err(damaged(format!(
@@ -371,7 +461,7 @@ impl<'a> Source<'a> {
         }
         let left = self.text_left.checked_sub(text_bytes(&series));
         self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
-        Ok(series)
+        wanted.taken(series).map_err(damaged)
     }
 
     /// The bytes from `start`, as many as `size`, after checking that the file has them.
@@ -576,6 +666,19 @@ fn decoded_type(declared: &ArrowDataType) -> Option<ArrowDataType> {
         Type::Dictionary(_, value, _) => {
             matches!(**value, Type::Utf8 | Type::LargeUtf8 | Type::Utf8View)
                 .then_some(Type::Utf8View)
+        }
+        _ => None,
+    }
+}
+
+/// The type into which a column of vectors of numbers is decoded; `None` if it has no vectors. Lists of a fixed length are
+/// stored like others.
+fn decoded_vector(declared: &ArrowDataType) -> Option<ArrowDataType> {
+    use ArrowDataType as Type;
+    match declared {
+        Type::List(inner) | Type::LargeList(inner) | Type::FixedSizeList(inner, _) => {
+            let number = matches!(inner.dtype, Type::Float32 | Type::Float64);
+            number.then(|| Type::LargeList(inner.clone()))
         }
         _ => None,
     }

@@ -13,6 +13,7 @@ fn table_of(bytes: &[u8], wanted: Option<&[&str]>) -> Result<DataFrame, String> 
     let path = folder.path().join("t.csv");
     std::fs::write(&path, bytes).unwrap();
     let request = Request {
+        identities: &[],
         wanted,
         default_names: &CHALLENGE_COLUMNS,
         most_rows: 10,
