@@ -147,7 +147,7 @@ WRONG = [
     (dict(positions=(FIELD, FIELD[0]), stamp=48), r"positions: found arrays of shapes \(16, 16\) and \(16,\)"),
     (dict(positions=FIELD, stamp=48), "positions: found ndarray; expected two arrays"),
     (dict(positions=(FIELD, FIELD), stamp=48), "images: not given; expected the number of images"),
-    (dict(e1=FIELD - 99), "256 rows have a whole number as ellipticity"),
+    (dict(e1=FIELD - 99), "256 rows have a number that no measurement"),
     (dict(definition="mine"), 'definition: "mine"; expected "leaderboard" or "corrected"'),
     (dict(convention=9), 'convention: "9"; expected "matched", "best" or a number'),
     (dict(field_degrees=0), "field_degrees: found 0.0; expected a positive number, at most 360"),

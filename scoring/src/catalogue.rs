@@ -3,6 +3,7 @@
 use ndarray::Array2;
 #[cfg(feature = "serde")]
 use serde::Serialize;
+use shearq_quantities::MeasuredRange;
 
 use crate::error::ScoringError;
 use crate::grid::Grid;
@@ -47,9 +48,9 @@ pub struct RowCounts {
     pub absurd: usize,
     /// The first of the absurd rows.
     pub first_absurd: Option<OddRow>,
-    /// Absurd rows with a whole number in an absurd component, such as -99 for "not measured".
+    /// Rows with a number that stands for a failed measurement ([`MeasuredRange`]), such as -99.
     pub sentinels: usize,
-    /// The first of the rows with such a number.
+    /// The first of these rows.
     pub first_sentinel: Option<OddRow>,
 }
 
@@ -72,7 +73,7 @@ impl std::ops::AddAssign for RowCounts {
 /// Why the rows of a catalogue are probably not ellipticities on the grid.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum RowFault {
-    /// Whole numbers with modulus above [`RowCounts::ABSURD`]: they probably mean "not measured".
+    /// Numbers outside of [`MeasuredRange::ELLIPTICITY`]: they probably mean "not measured".
     Sentinels {
         /// Rows with such a number.
         rows: usize,
@@ -182,8 +183,8 @@ impl FieldSum {
                 counts.absurd += 1;
                 let found = (place + 1, row.e1, row.e2);
                 counts.first_absurd.get_or_insert(found);
-                let whole = |e: f64| e.abs() > RowCounts::ABSURD && e.fract() == 0.0;
-                if whole(row.e1) || whole(row.e2) {
+                let range = MeasuredRange::ELLIPTICITY;
+                if range.excludes(row.e1) || range.excludes(row.e2) {
                     counts.sentinels += 1;
                     counts.first_sentinel.get_or_insert(found);
                 }

@@ -88,6 +88,10 @@ pub(crate) struct Arguments {
     /// Value of e1 or e2 that marks a galaxy as not measured, such as -99; for --truth.
     #[arg(long, value_name = "VALUE", allow_negative_numbers = true, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     missing: Option<f64>,
+    /// Treat galaxies with numbers that stand for a failed measurement, such as -10, -99 or 1e30, as not measured; for
+    /// --truth.
+    #[arg(long, requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    drop_missing: bool,
     /// Treat galaxies with a larger |e| as not measured; for --truth [default: no limit].
     #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
@@ -520,6 +524,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     })?;
     let screen = Screen {
         missing: arguments.missing,
+        drop_missing: arguments.drop_missing,
         max_modulus: arguments.max_modulus,
         distortion: arguments.ellipticity == Some(EllipticityType::Distortion),
     };

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde_json::Value;
 use shearq_files::frames::frame;
-use shearq_files::frames::polars::Column;
+use shearq_files::frames::polars::{Column, NamedFrom, Series};
 use shearq_files::table::{self, FileFormat};
 
 use crate::support::{fail, shearq, succeed};
@@ -458,6 +458,123 @@ fn missing_numbers_can_be_left_out() {
     check(found, [0.02, 0.01]);
 }
 
+/// One in a hundred rows has a number for a failure in both catalogues.
+#[test]
+fn numbers_for_failures_are_refused_and_can_be_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let written = |column: &str, failure: f64| {
+        [("plus", 0.02), ("minus", -0.02)].map(|(name, g)| {
+            let path = folder.path().join(format!("{name}.csv"));
+            let mut columns = complete(galaxies(1, [g; 2]), [g; 2]);
+            for part in ["psf_e1", "psf_e2", "psf_size"] {
+                let value =
+                    |k: usize| if part == "psf_size" { 3.1 } else { 0.1 } + 1e-3 * (k % 97) as f64;
+                columns.push((part, (0..GALAXIES).map(value).collect()));
+            }
+            for (_, values) in columns.iter_mut().filter(|(own, _)| *own == column) {
+                values
+                    .iter_mut()
+                    .skip(50)
+                    .step_by(100)
+                    .for_each(|own| *own = failure);
+            }
+            csv(&path, &columns);
+            path
+        })
+    };
+    for (column, failure, shown) in [
+        ("e1", -10.0, "-10"),
+        ("e2", -99.0, "-99"),
+        ("e1", -9999.0, "-9999"),
+        ("e2", 1e20, "1e20"),
+        ("e1", -1e30, "-1e30"),
+        ("R11", -99.0, "-99"),
+        ("R22", 1e30, "1e30"),
+        ("w", 1e30, "1e30"),
+        ("psf_e1", -10.0, "-10"),
+        ("psf_size", -1.0, "-1"),
+        ("psf_size", 0.0, "0"),
+    ] {
+        let [plus, minus] = written(column, failure);
+        let files = [text(&plus), text(&minus)];
+        let error = fail(&["bias", files[0], files[1]]);
+        let expected = format!("plus.csv: row 51: column `{column}` is {shown} in a row without");
+        assert!(
+            error.contains(&expected) && error.contains("--drop-missing"),
+            "{error}"
+        );
+        let found = &rows(&[files[0], files[1], "--drop-missing"])[0];
+        assert_eq!(number(found, "n"), 2.0 * 1960.0);
+        check(found, [0.02, 0.01]);
+        let printed = succeed(&["bias", files[0], files[1], "--drop-missing"]);
+        assert!(
+            printed.contains("40 rows with numbers that stand for failed"),
+            "{printed}"
+        );
+    }
+    // Numbers that may be measured count, and are reported if rows share them.
+    for (column, value, reported) in [
+        ("e1", 21.6099, ""),
+        ("R11", 0.0, ""),
+        ("e1", 0.0, ""),
+        (
+            "both",
+            0.0,
+            "`e1` and `e2` are exactly 0 and 0 in 40 of 4000 rows",
+        ),
+    ] {
+        let [plus, minus] = match column {
+            "both" => {
+                let mut files = written("e1", value);
+                for file in &mut files {
+                    let lines = fs::read_to_string(&*file).unwrap();
+                    let zero = |(k, line): (usize, &str)| match k % 100 == 51 {
+                        true => {
+                            let mut fields: Vec<&str> = line.split(',').collect();
+                            fields[2] = "-0";
+                            fields.join(",") + "\n"
+                        }
+                        false => format!("{line}\n"),
+                    };
+                    let lines: String = lines.lines().enumerate().map(zero).collect();
+                    fs::write(&*file, lines).unwrap();
+                }
+                files
+            }
+            column => written(column, value),
+        };
+        let printed = succeed(&["bias", text(&plus), text(&minus)]);
+        match reported {
+            "" => assert!(!printed.contains("are exactly"), "{printed}"),
+            line => assert!(printed.contains(line), "{printed}"),
+        }
+    }
+}
+
+/// Measured shears that are also the true ones would have m = 0.
+#[test]
+fn measured_columns_are_not_the_true_shear() {
+    let folder = tempfile::tempdir().unwrap();
+    let [plus, minus] = pair(folder.path());
+    let files = [text(&plus), text(&minus)];
+    let error = fail(&["bias", files[0], files[1], "--columns", "e1=g1,e2=g2"]);
+    assert!(
+        error.contains("`g1` is given as e1, so the true shear is unknown"),
+        "{error}"
+    );
+    let error = fail(&[
+        "bias",
+        files[0],
+        files[1],
+        "--columns",
+        "e1=g1,e2=g2,g1=g1,g2=g2",
+    ]);
+    assert!(
+        error.contains("column `g1` is given as e1 and as g1"),
+        "{error}"
+    );
+}
+
 #[test]
 fn distortions_are_noticed_and_converted() {
     let folder = tempfile::tempdir().unwrap();
@@ -485,6 +602,20 @@ fn distortions_are_noticed_and_converted() {
     // The mean of sheared ellipticities is the shear for any intrinsic distribution, up to noise of the pairs.
     let (m, error) = (number(converted, "m1"), number(converted, "m1_error"));
     assert!(m.abs() < 4.0 * error && error < 2e-3, "{m} ± {error}");
+    // Noise moves distortions above 1.
+    for file in &files {
+        let lines = fs::read_to_string(file).unwrap();
+        fs::write(file, lines + "7000,0.9,0.8,0.05,0.05\n").unwrap();
+    }
+    let printed = succeed(&["bias", plus, minus, "--ellipticity", "distortion"]);
+    assert!(
+        printed.contains("Left out: 2 rows with a distortion above 1, which noise makes"),
+        "{printed}"
+    );
+    let failed = fs::read_to_string(plus).unwrap() + "7001,-10,-10,0.05,0.05\n";
+    fs::write(plus, failed).unwrap();
+    let error = fail(&["bias", plus, minus, "--ellipticity", "distortion"]);
+    assert!(error.contains("row 2002: column `e1` is -10"), "{error}");
 }
 
 /// The true shear of galaxies is found by their positions, whatever their order.
@@ -1056,4 +1187,241 @@ fn an_unused_weight_of_zero_is_refused() {
     assert_eq!(number(&used[0], "n"), 2.0);
     let declined = rows(&[text(&path), "--columns", "w=none"]);
     assert_eq!(number(&declined[0], "n"), 3.0);
+
+/// A FITS file of binary tables: of each its name, its columns with their formats, and the bytes of its rows.
+fn fits(path: &Path, tables: &[(&str, &[(&str, &str)], Vec<Vec<u8>>)]) {
+    fn padded(mut bytes: Vec<u8>, fill: u8) -> Vec<u8> {
+        bytes.resize(bytes.len().next_multiple_of(2880), fill);
+        bytes
+    }
+    let header = |cards: Vec<(String, String)>| {
+        let mut text: String = cards
+            .iter()
+            .map(|(key, value)| format!("{:<80}", format!("{key:<8}= {value:>20}")))
+            .collect();
+        text += &format!("{:<80}", "END");
+        padded(text.into_bytes(), b' ')
+    };
+    let card = |key: &str, value: &str| (key.to_owned(), value.to_owned());
+    let text = |key: String, value: &str| (key, format!("'{value:<8}'"));
+    let primary = [
+        ("SIMPLE", "T"),
+        ("BITPIX", "8"),
+        ("NAXIS", "0"),
+        ("EXTEND", "T"),
+    ];
+    let mut file = header(primary.map(|(key, value)| card(key, value)).into());
+    for (name, columns, rows) in tables {
+        let mut cards = vec![text("XTENSION".into(), "BINTABLE")];
+        for (key, value) in [
+            ("BITPIX", "8".to_owned()),
+            ("NAXIS", "2".into()),
+            ("NAXIS1", rows[0].len().to_string()),
+            ("NAXIS2", rows.len().to_string()),
+            ("PCOUNT", "0".into()),
+            ("GCOUNT", "1".into()),
+            ("TFIELDS", columns.len().to_string()),
+        ] {
+            cards.push(card(key, &value));
+        }
+        for (k, (column, format)) in columns.iter().enumerate() {
+            cards.push(text(format!("TTYPE{}", k + 1), column));
+            cards.push(text(format!("TFORM{}", k + 1), format));
+        }
+        cards.push(text("EXTNAME".into(), name));
+        file.extend(header(cards));
+        file.extend(padded(rows.concat(), 0));
+    }
+    fs::write(path, file).unwrap();
+}
+
+/// Rows of metadetect as its own examples write them: the version as text, the ellipticity as a vector of two, and an
+/// identifier above 2⁵³.
+#[test]
+fn vectors_texts_and_long_integers_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let versions = [
+        ("noshear", [0.0, 0.0]),
+        ("1p", [0.01, 0.0]),
+        ("1m", [-0.01, 0.0]),
+        ("2p", [0.0, 0.01]),
+        ("2m", [0.0, -0.01]),
+    ];
+    let first = 1_000_000_000_000_000_000_i64;
+    let (mut scalar, mut fits_files, mut parquet) = (Vec::new(), Vec::new(), Vec::new());
+    for (name, g) in [("plus", 0.02), ("minus", -0.02)] {
+        let base = galaxies(1, [g; 2]);
+        let (mut rows, mut vectors, mut ids, mut names) = (vec![], vec![], vec![], vec![]);
+        let mut flat = String::from("shear_type,id,wmom_g_1,wmom_g_2,g1,g2\n");
+        for (version, shear) in versions {
+            for k in 0..GALAXIES {
+                let e = [0, 1].map(|j| base[j + 1].1[k] + 0.8 * shear[j]);
+                let mut row = format!("{version:<7}").into_bytes();
+                row.extend((first + k as i64).to_be_bytes());
+                for value in e.into_iter().chain([g, g]) {
+                    row.extend(f64::to_be_bytes(value));
+                }
+                rows.push(row);
+                vectors.push(e);
+                ids.push(first + k as i64);
+                names.push(version);
+                writeln!(
+                    flat,
+                    "{version},{},{},{},{g},{g}",
+                    first + k as i64,
+                    e[0],
+                    e[1]
+                )
+                .unwrap();
+            }
+        }
+        let file = path(&format!("{name}.csv"));
+        fs::write(&file, flat).unwrap();
+        scalar.push(file);
+        let file = path(&format!("{name}.fits"));
+        let columns: &[(&str, &str)] = &[
+            ("shear_type", "7A"),
+            ("ID", "K"),
+            ("g", "2D"),
+            ("g1", "D"),
+            ("g2", "D"),
+        ];
+        fits(&file, &[("metadetect", columns, rows)]);
+        fits_files.push(file);
+        let lists: Vec<Series> = vectors
+            .iter()
+            .map(|e| Series::new("".into(), e.as_slice()))
+            .collect();
+        let count = names.len();
+        let table = frame(vec![
+            Column::new("mdet_step".into(), names),
+            Column::new("id".into(), ids),
+            Column::new("wmom_g".into(), lists),
+            Column::new("g1".into(), vec![g; count]),
+            Column::new("g2".into(), vec![g; count]),
+        ])
+        .unwrap();
+        let file = path(&format!("{name}.parquet"));
+        table::write(&file, FileFormat::Parquet, &table, &Default::default()).unwrap();
+        parquet.push(file);
+    }
+    let found = [scalar, fits_files, parquet].map(|files| {
+        let printed = succeed(&["bias", text(&files[0]), text(&files[1])]);
+        assert!(
+            printed.contains("galaxies with the same identifier"),
+            "{printed}"
+        );
+        rows(&[text(&files[0]), text(&files[1])])
+    });
+    // Only rounding is left of shapes and responses.
+    assert!(
+        (number(&found[0][0], "m1") - M[0]).abs() < 1e-9,
+        "{}",
+        found[0][0]
+    );
+    assert!((number(&found[0][0], "r1") - 0.8).abs() < 1e-9);
+    assert_eq!(number(&found[0][0], "n"), 2.0 * GALAXIES as f64);
+    // Identifiers that are rounded would make 16 units.
+    assert!(number(&found[0][0], "units") > 500.0, "{}", found[0][0]);
+    assert_eq!(found[1], found[0]);
+    assert_eq!(found[2], found[0]);
+}
+
+/// Identifiers of any type join a table of true shears.
+#[test]
+fn long_and_textual_identifiers_join_the_truth() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let base = galaxies(3, [0.0; 2]);
+    let shear = |k: usize| 0.04 * ((k % 11) as f64 / 5.0 - 1.0);
+    let of = |id: &dyn Fn(usize) -> String| {
+        let (mut catalogue, mut truth) = (String::from("ID,e1,e2\n"), String::from("g2,Id,g1\n"));
+        for k in 0..GALAXIES {
+            let e = [0, 1].map(|j| base[j + 1].1[k] / 10.0 + shear(k));
+            writeln!(catalogue, "{},{},{}", id(k), e[0], e[1]).unwrap();
+            let other = GALAXIES - 1 - k;
+            writeln!(truth, "{},{},{}", shear(other), id(other), shear(other)).unwrap();
+        }
+        fs::write(path("c.csv"), catalogue).unwrap();
+        fs::write(path("t.csv"), truth).unwrap();
+        rows(&[text(&path("c.csv")), "--truth", text(&path("t.csv"))])
+    };
+    let small = of(&|k| k.to_string());
+    // Shapes of 0.02 and shears of 0.025 leave 0.02/0.025/√2000.
+    assert!(number(&small[0], "m1").abs() < 0.08, "{}", small[0]);
+    for found in [
+        of(&|k| (1_000_000_000_000_000_000 + k).to_string()),
+        of(&|k| (9_223_372_036_854_775_808_u64 + k as u64).to_string()),
+        of(&|k| format!("J{k:06}")),
+    ] {
+        // Sums in the order of other keys differ by rounding.
+        assert!((number(&found[0], "m1") - number(&small[0], "m1")).abs() < 1e-9);
+    }
+    let lines = fs::read_to_string(path("t.csv"))
+        .unwrap()
+        .replace("J000007", "J000008");
+    fs::write(path("t.csv"), lines).unwrap();
+    let error = fail(&[
+        "bias",
+        text(&path("c.csv")),
+        "--truth",
+        text(&path("t.csv")),
+    ]);
+    assert!(
+        error.contains("the identifier J000008 occurs twice"),
+        "{error}"
+    );
+}
+
+/// A file with tables of galaxies and of stars has two ellipticities.
+#[test]
+fn one_of_several_tables_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let columns: &[(&str, &str)] = &[("e1", "D"), ("e2", "D"), ("g1", "D"), ("g2", "D")];
+    let files = [("plus", 0.02), ("minus", -0.02)].map(|(name, g)| {
+        let file = folder.path().join(format!("{name}.fits"));
+        let base = galaxies(1, [g; 2]);
+        let row = |k: usize| -> Vec<u8> {
+            let e = [0, 1].map(|j| base[j + 1].1[k] / 0.8);
+            e.into_iter()
+                .chain([g, g])
+                .flat_map(f64::to_be_bytes)
+                .collect()
+        };
+        let stars = |k: usize| -> Vec<u8> {
+            [0.05 + 1e-4 * k as f64, 0.0, g, g]
+                .into_iter()
+                .flat_map(f64::to_be_bytes)
+                .collect()
+        };
+        fits(
+            &file,
+            &[
+                ("STARS", columns, (0..300).map(stars).collect()),
+                ("GALAXIES", columns, (0..GALAXIES).map(row).collect()),
+            ],
+        );
+        text(&file).to_owned()
+    });
+    let error = fail(&["bias", &files[0], &files[1]]);
+    assert!(
+        error.contains("several tables") && error.contains("1 `STARS`, 2 `GALAXIES`"),
+        "{error}"
+    );
+    assert!(error.contains("plus.fits[STARS]"), "{error}");
+    let named = files.clone().map(|file| format!("{file}[GALAXIES]"));
+    let found = rows(&[&named[0], &named[1]]);
+    assert_eq!(number(&found[0], "n"), 2.0 * GALAXIES as f64);
+    // The table of true shears names files.
+    let truth = folder.path().join("truth.csv");
+    fs::write(
+        &truth,
+        "catalogue,g1,g2\nplus.fits,0.02,0.02\nminus.fits,-0.02,-0.02\n",
+    )
+    .unwrap();
+    assert_eq!(
+        rows(&[&named[0], &named[1], "--truth", text(&truth)]),
+        found
+    );
 }

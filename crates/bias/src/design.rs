@@ -38,6 +38,17 @@ impl Range {
     }
 }
 
+/// Numbers of two columns that many rows share exactly, such as zeros for failed measurements.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Repeated {
+    /// The columns.
+    pub columns: [String; 2],
+    /// The numbers.
+    pub values: [f64; 2],
+    /// The rows that have them and count.
+    pub rows: u64,
+}
+
 /// What is known of a catalogue.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Catalogue {
@@ -53,6 +64,15 @@ pub struct Catalogue {
     pub unselected: u64,
     /// Rows with a missing value, if those are left out.
     pub missing: u64,
+    /// Rows with a number that stands for a failed measurement, such as −99, if those are left out.
+    #[serde(default)]
+    pub failed: u64,
+    /// Rows with a distortion above 1, to which no shear belongs. Noise makes them.
+    #[serde(default)]
+    pub above_one: u64,
+    /// Pairs of numbers that many rows share exactly.
+    #[serde(default)]
+    pub repeated: Vec<Repeated>,
     /// True shears g1 and g2.
     pub shear: [Range; 2],
     /// Ellipticities e1 and e2.

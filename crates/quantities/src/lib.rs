@@ -20,12 +20,14 @@ pub mod linear;
 pub mod product;
 mod psf;
 pub mod radial;
+mod range;
 pub mod real;
 pub mod statistics;
 pub mod units;
 
 pub use ellipticity::{Distortion, Shear};
 pub use psf::{FunctionalPsf, ProfileError, PsfProfile, PsfTransform, TransformedPsf};
+pub use range::MeasuredRange;
 
 /// The examples of README.md.
 #[cfg(doctest)]

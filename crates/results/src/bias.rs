@@ -5,6 +5,7 @@
 
 pub mod columns;
 pub mod folders;
+mod identity;
 pub mod positions;
 mod read;
 pub mod truth;
@@ -646,10 +647,12 @@ impl Summed {
         let rows = total(|c| c.rows);
         let (flagged, unweighted) = (total(|c| c.flagged), total(|c| c.unweighted));
         let (unselected, missing) = (total(|c| c.unselected), total(|c| c.missing));
-        let used = rows.saturating_sub(flagged + unweighted + unselected + missing);
+        let (failed, above_one) = (total(|c| c.failed), total(|c| c.above_one));
+        let used =
+            rows.saturating_sub(flagged + unweighted + unselected + missing + failed + above_one);
         if used == 0 {
             return Err(BiasFailure::Data(format!(
-                "no galaxy can be used (found {rows} rows: {flagged} with a flag, {unweighted} with a weight of zero or less, {unselected} not selected, {missing} with missing numbers)"
+                "no galaxy can be used (found {rows} rows: {flagged} with a flag, {unweighted} with a weight of zero or less, {unselected} not selected, {missing} with missing numbers, {failed} with failed measurements, {above_one} with a distortion above 1)"
             )));
         }
         for k in 0..2 {

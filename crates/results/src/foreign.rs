@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
-use shearq_quantities::{Distortion, Shear};
+use shearq_quantities::{Distortion, MeasuredRange, Shear};
 use shearq_scoring::{FieldSum, Grid, Row, RowCounts};
 use shearq_submissions::{EllipticityType, checked_name};
 
@@ -198,6 +198,10 @@ impl Foreign {
     }
 
     fn convert(&self, e1: f64, e2: f64) -> Option<(f64, f64)> {
+        if is_failure(e1, e2) {
+            // Refused with the sum, although no shear belongs to such a distortion.
+            return Some((e1, e2));
+        }
         match (self.ellipticity, self.report) {
             (EllipticityType::Distortion, EllipticityType::Shear) => {
                 let shear = Distortion::new(e1, e2).to_shear()?;
@@ -212,6 +216,12 @@ impl Foreign {
     }
 }
 
+/// Whether one component stands for a failed measurement.
+fn is_failure(e1: f64, e2: f64) -> bool {
+    let range = MeasuredRange::ELLIPTICITY;
+    range.excludes(e1) || range.excludes(e2)
+}
+
 /// Which ellipticities of other programs mark a galaxy as not measured, and their type.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Deserialize)]
 pub struct Screen {
@@ -219,6 +229,9 @@ pub struct Screen {
     pub missing: Option<f64>,
     /// The largest valid |e|, after conversion.
     pub max_modulus: Option<f64>,
+    /// Whether numbers that stand for a failed measurement mark it.
+    #[serde(default)]
+    pub drop_missing: bool,
     /// Whether to convert the ellipticities from distortions to shear-type ellipticities.
     #[serde(default)]
     pub distortion: bool,
@@ -227,8 +240,10 @@ pub struct Screen {
 impl Screen {
     /// The row with a shear-type ellipticity, or NaN if the galaxy was not measured.
     pub fn apply(&self, row: Row) -> Row {
-        let missing = self.missing.is_some_and(|m| row.e1 == m || row.e2 == m);
-        let shape = match (missing, self.distortion) {
+        let failed = is_failure(row.e1, row.e2);
+        let missing =
+            self.missing.is_some_and(|m| row.e1 == m || row.e2 == m) || failed && self.drop_missing;
+        let shape = match (missing, self.distortion && !failed) {
             (true, _) => None,
             (false, true) => Distortion::new(row.e1, row.e2).to_shear(),
             (false, false) => Some(Shear::new(row.e1, row.e2)),
@@ -303,6 +318,7 @@ mod tests {
         let screen = Screen {
             missing: Some(-99.0),
             max_modulus: Some(0.5),
+            drop_missing: false,
             distortion: true,
         };
         let apply = |e1| {
@@ -312,5 +328,15 @@ mod tests {
         assert!((apply(0.6) - 1.0 / 3.0).abs() < 1e-15);
         // A distortion of 0.9 is a shear of 0.63.
         assert!(apply(-99.0).is_nan() && apply(0.9).is_nan());
+        // No shear belongs to −10, but only a request makes it missing.
+        let (x, y, e1, e2) = (1.0, 1.0, -10.0, 0.0);
+        for drop_missing in [false, true] {
+            let screen = Screen {
+                drop_missing,
+                distortion: true,
+                ..Screen::default()
+            };
+            assert_eq!(screen.apply(Row { x, y, e1, e2 }).e1.is_nan(), drop_missing);
+        }
     }
 }

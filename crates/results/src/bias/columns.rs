@@ -100,6 +100,8 @@ const ROLES: [(Role, &str, &[&str]); 34] = [
             "e_1",
             "e1_noshear",
             "g1_noshear",
+            "g[0]",
+            "ngmix_ell_noshear[0]",
             "wmom_g_1",
             "gauss_g_1",
             "pgauss_g_1",
@@ -121,6 +123,8 @@ const ROLES: [(Role, &str, &[&str]); 34] = [
             "e_2",
             "e2_noshear",
             "g2_noshear",
+            "g[1]",
+            "ngmix_ell_noshear[1]",
             "wmom_g_2",
             "gauss_g_2",
             "pgauss_g_2",
@@ -312,16 +316,32 @@ const ROLES: [(Role, &str, &[&str]); 34] = [
     (
         Role::Version,
         "version",
-        &["mdet_step", "shear_type", "metacal_step"],
+        &["mdet_step", "shear_type", "metacal_step", "shear"],
     ),
-    (Role::E1p, "e1_1p", &["e1_1p", "g1_1p"]),
-    (Role::E1m, "e1_1m", &["e1_1m", "g1_1m"]),
-    (Role::E2p, "e2_2p", &["e2_2p", "g2_2p"]),
-    (Role::E2m, "e2_2m", &["e2_2m", "g2_2m"]),
-    (Role::E1Of2p, "e1_2p", &["e1_2p", "g1_2p"]),
-    (Role::E1Of2m, "e1_2m", &["e1_2m", "g1_2m"]),
-    (Role::E2Of1p, "e2_1p", &["e2_1p", "g2_1p"]),
-    (Role::E2Of1m, "e2_1m", &["e2_1m", "g2_1m"]),
+    (Role::E1p, "e1_1p", &["e1_1p", "g1_1p", "ngmix_ell_1p[0]"]),
+    (Role::E1m, "e1_1m", &["e1_1m", "g1_1m", "ngmix_ell_1m[0]"]),
+    (Role::E2p, "e2_2p", &["e2_2p", "g2_2p", "ngmix_ell_2p[1]"]),
+    (Role::E2m, "e2_2m", &["e2_2m", "g2_2m", "ngmix_ell_2m[1]"]),
+    (
+        Role::E1Of2p,
+        "e1_2p",
+        &["e1_2p", "g1_2p", "ngmix_ell_2p[0]"],
+    ),
+    (
+        Role::E1Of2m,
+        "e1_2m",
+        &["e1_2m", "g1_2m", "ngmix_ell_2m[0]"],
+    ),
+    (
+        Role::E2Of1p,
+        "e2_1p",
+        &["e2_1p", "g2_1p", "ngmix_ell_1p[1]"],
+    ),
+    (
+        Role::E2Of1m,
+        "e2_1m",
+        &["e2_1m", "g2_1m", "ngmix_ell_1m[1]"],
+    ),
 ];
 
 /// Roles of the responses of a component to the other one. Without those to the own component they are of no use.
@@ -620,7 +640,60 @@ impl Names {
         }
         Ok(())
     }
+
+    /// The role for which a column is given.
+    pub fn role_of(&self, column: &str) -> Option<&'static str> {
+        let mut given = self.0.iter();
+        given.find_map(|(role, own)| (own == column && own != "none").then_some(*role))
+    }
+
+    /// Refuses a column with two roles: measured shears that are also the true ones have m = 0.
+    fn check_single_roles(&self, path: &Path) -> Result<(), FileError> {
+        for (role, column) in &self.0 {
+            let first = self.role_of(column).unwrap_or(role);
+            if first != *role && !SHARED.contains(&[first, role]) {
+                return Err(FileError::new(
+                    path,
+                    format!(
+                        "column `{column}` is given as {first} and as {role} (expected one role). Try: --columns {role}=NAME, or {role}=none"
+                    ),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Refuses columns with names of true shears that are given as something else, if nothing else states the true shear.
+    ///
+    /// # Errors
+    /// If there are such columns and `--columns` contains no g1.
+    pub fn check_true_shear(&self, path: &Path) -> Result<(), FileError> {
+        if self.0.contains_key("g1") || self.0.contains_key("g2") {
+            return Ok(());
+        }
+        let names = ROLES
+            .iter()
+            .filter(|(role, _, _)| matches!(role, Role::G1 | Role::G2));
+        let mut names = names.flat_map(|(_, _, names)| names.iter().copied());
+        let taken = |name: &&str| {
+            let mut given = self.0.values();
+            given.any(|own| own.eq_ignore_ascii_case(name))
+        };
+        match names.find(taken) {
+            None => Ok(()),
+            Some(name) => Err(FileError::new(
+                path,
+                format!(
+                    "`{name}` is given as {}, so the true shear is unknown. Try: --truth FILE, --columns g1=NAME,g2=NAME, or g1=none,g2=none for c alone",
+                    self.role_of(name).unwrap_or("another role")
+                ),
+            )),
+        }
+    }
 }
+
+/// Roles that one column may have together: a scalar response of both components, and identifiers of units.
+const SHARED: [[&str; 2]; 3] = [["R11", "R22"], ["divisor1", "divisor2"], ["id", "unit"]];
 
 /// Which program wrote a catalogue, recognised by its columns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -676,13 +749,28 @@ impl Columns {
     /// Finds the columns of the catalogue `path`, which has the columns `found`.
     ///
     /// # Errors
-    /// If a given column is absent, e1 or e2 cannot be found, or one of two columns that belong together is absent.
+    /// If a given column is absent or has two roles, e1 or e2 cannot be found, or one of two columns that belong together
+    /// is absent.
     pub fn find(path: &Path, found: &[String], names: &Names) -> Result<Self, FileError> {
+        names.check_single_roles(path)?;
         let mut roles = BTreeMap::new();
         let survey = SURVEYS.iter().find(|survey| survey.fits(found, names));
         for (role, key, candidates) in ROLES {
             let by_survey = survey.and_then(|survey| survey.of(key));
-            let own = |name: &str| found.iter().find(|own| own.eq_ignore_ascii_case(name));
+            // A column called g1 that is given as e1 is not the true shear, too.
+            let own = |name: &str| {
+                let vector = in_vector(name);
+                let is_named = |own: &&String| {
+                    own.eq_ignore_ascii_case(name)
+                        || vector
+                            .as_ref()
+                            .is_some_and(|name| own.eq_ignore_ascii_case(name))
+                };
+                found
+                    .iter()
+                    .filter(is_named)
+                    .find(|own| names.role_of(own).is_none())
+            };
             let column = match (names.0.get(key), by_survey) {
                 (Some(none), _) if none == "none" => None,
                 (Some(given), _) if found.contains(given) => Some(given),
@@ -850,6 +938,18 @@ impl Columns {
     }
 }
 
+/// Names of columns of a role, in any case.
+pub(super) fn names_of_role(role: Role) -> &'static [&'static str] {
+    let found = ROLES.iter().find(|(other, _, _)| *other == role);
+    found.map_or(&[], |(_, _, names)| names)
+}
+
+/// The name of a component of a vector, `g[0]` for `g_1`.
+fn in_vector(name: &str) -> Option<String> {
+    let first = name.strip_suffix("_1").map(|vector| format!("{vector}[0]"));
+    first.or_else(|| name.strip_suffix("_2").map(|vector| format!("{vector}[1]")))
+}
+
 /// Name of a role in `--columns`.
 fn key_of(role: Role) -> &'static str {
     let found = ROLES.iter().find(|(other, _, _)| *other == role);
@@ -906,6 +1006,24 @@ mod tests {
     }
 
     #[test]
+    fn a_column_has_one_role() {
+        let own = found("g1 g2", &["e1=g1", "e2=g2"]).unwrap();
+        assert_eq!((own.of(Role::E1), own.of(Role::G1)), (Some("g1"), None));
+        let own = found(
+            "g1 g2 g1_true g2_true",
+            &["e1=g1", "e2=g2", "g1=g1_true", "g2=g2_true"],
+        );
+        assert_eq!(own.unwrap().of(Role::G1), Some("g1_true"));
+        let own = found("wmom_g[0] wmom_g[1] mdet_step", &[]).unwrap();
+        assert_eq!(own.of(Role::E2), Some("wmom_g[1]"));
+        let own = found("e1 e2 R", &["R11=R", "R22=R"]).unwrap();
+        assert_eq!(
+            (own.of(Role::R11), own.of(Role::R22)),
+            (Some("R"), Some("R"))
+        );
+    }
+
+    #[test]
     fn columns_that_are_absent_are_named() {
         for (columns, given, expected) in [
             ("a b", vec![], "expected e1 and e2). Try: --columns"),
@@ -913,6 +1031,11 @@ mod tests {
             ("e1 e2", vec!["w=weight"], "there is no column `weight`"),
             ("e1 e2", vec!["q=weight"], "unknown role (found `q`"),
             ("e1 e2", vec!["w"], "expected ROLE=COLUMN"),
+            (
+                "g1 g2",
+                vec!["e1=g1", "e2=g2", "g1=g1", "g2=g2"],
+                "column `g1` is given as e1 and as g1",
+            ),
         ] {
             let error = found(columns, &given).unwrap_err();
             assert!(error.contains(expected), "{error}");

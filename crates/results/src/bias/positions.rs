@@ -43,8 +43,14 @@ impl Positions {
     /// If the file cannot be read, or a number is no position or no shear.
     pub fn read(path: &Path, sign: TruthSign) -> Result<Self, FileError> {
         let place = Place::of(path);
-        let read = table::read_from(&place, Some(&TRUTH_COLUMNS), MAX_ROWS)?;
-        let column = |k: usize| table::numbers(&read, TRUTH_COLUMNS[k], path);
+        let found = table::columns(&place)?;
+        let names = TRUTH_COLUMNS.map(|name| {
+            let mut all = found.named.iter().flat_map(|list| &list.names);
+            let own = all.find(|own| own.eq_ignore_ascii_case(name));
+            own.map_or(name, String::as_str)
+        });
+        let read = table::read_from(&place, Some(&names), MAX_ROWS)?;
+        let column = |k: usize| table::numbers(&read, names[k], path);
         let [xs, ys, g1, g2] = [column(0)?, column(1)?, column(2)?, column(3)?];
         let factor = match stated_sign(&place.path)?.unwrap_or(sign) {
             TruthSign::Standard => 1.0,

@@ -1,22 +1,24 @@
 //! Rows of catalogues, as the sums need them.
 
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-use shearq_bias::{Catalogue, Row, VERSIONS};
+use shearq_bias::{Catalogue, Repeated, Row, VERSIONS};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, FileFormat, Place};
 use shearq_measure::{Observables, Selection};
-use shearq_quantities::Distortion;
+use shearq_quantities::{Distortion, MeasuredRange};
 
 use crate::expression::Expression;
 use crate::select::{READ, Weighted, require_responses};
 use crate::star_noise;
+use crate::views::rows::shown;
 
 use super::Input;
 use super::columns::{Columns, Names, Preset, Role, SHEARED, Shapes};
+use super::identity;
 use super::positions::{self, Positions};
 use super::truth::Truth;
 
@@ -179,13 +181,29 @@ impl Source {
     /// Gives the wanted columns to `take`, in parts.
     fn parts(
         &self,
+        reading: &Reading,
         mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
     ) -> Result<(), FileError> {
         let wanted: Vec<&str> = self.wanted.iter().map(String::as_str).collect();
         match &self.frame {
             Some(frame) => take(frame.clone()),
-            None => table::read_parts(&self.place, &wanted, take),
+            None => table::read_parts(&self.place, &wanted, &self.texts(reading), take),
         }
+    }
+
+    /// Columns of identifiers and versions, which may be texts.
+    fn texts<'a>(&'a self, reading: &'a Reading) -> Vec<&'a str> {
+        let roles = [Role::Id, Role::Version].map(|role| self.columns.of(role));
+        let named = roles.into_iter().flatten().chain(self.unit(reading));
+        // Expressions need numbers.
+        let selected = self.selected.iter().chain(&self.binned).flatten().flatten();
+        let expressions: Vec<usize> = selected.copied().collect();
+        named
+            .filter(|name| {
+                let place = self.wanted.iter().position(|own| own == name);
+                place.is_some_and(|place| !expressions.contains(&place))
+            })
+            .collect()
     }
 
     /// Column that names the unit.
@@ -245,10 +263,31 @@ pub(super) fn sources(input: &Input, reading: &Reading) -> Result<Vec<Source>, F
             .iter()
             .filter(|list| !list.doubtful || found.named.len() == 1)
     };
-    let one = lists()
-        .find(|list| Columns::find(path, &list.names, &reading.names).is_ok())
-        .or_else(|| lists().next());
-    let Some(list) = one else {
+    let good: Vec<_> = lists()
+        .filter(|list| Columns::find(path, &list.names, &reading.names).is_ok())
+        .collect();
+    let tables: Vec<&str> = good
+        .iter()
+        .filter_map(|list| Some(list.table.as_ref()?.1.as_str()))
+        .collect();
+    if let [first, _, ..] = tables[..] {
+        // Tables of chips share a name.
+        let name = |shown: &&str| shown.split('`').nth(1).unwrap_or_default().to_owned();
+        let own = name(&first);
+        let unique =
+            !own.is_empty() && tables.iter().filter(|other| name(other) == own).count() == 1;
+        let number = first.split(' ').next().unwrap_or_default();
+        return Err(FileError::new(
+            path,
+            format!(
+                "several tables have columns of ellipticities (found {}, expected one). Try: {}[{}]",
+                shearq_files::names_of(&tables),
+                path.display(),
+                if unique { &own } else { number }
+            ),
+        ));
+    }
+    let Some(list) = good.first().copied().or_else(|| lists().next()) else {
         return Err(FileError::new(
             path,
             format!(
@@ -274,6 +313,9 @@ fn source(
     reading: &Reading,
 ) -> Result<Source, FileError> {
     let mut columns = Columns::find(&place.path, names, &reading.names)?;
+    if matches!(reading.truth, Truth::Columns) && !columns.have(&[Role::G1]) {
+        reading.names.check_true_shear(&place.path)?;
+    }
     let has_versions = |name: &str| names.contains(&format!("{}_1p", base(name)));
     let expressions = [&reading.select, &reading.binned].into_iter().flatten();
     let mut named = expressions.flat_map(Expression::columns);
@@ -493,20 +535,121 @@ pub(super) fn rows(
     }
     // Rows of each version so far.
     let mut counts = [0u64; COUNT];
+    let mut shared = Shared::default();
     for source in sources {
-        let mut first = 0;
-        source.parts(|frame| {
-            let part = Part::new(source, reading, &frame, path)?;
+        let (mut first, mut ranges) = (0, None::<Ranges>);
+        source.parts(reading, |frame| {
+            let mut part = Part::new(source, reading, &frame, path)?;
+            // The units of all parts are those of the first.
+            part.ranges = *ranges.get_or_insert_with(|| part.ranges());
+            shared.look_for(&part);
             for at in 0..part.rows {
-                part.row(at, first + at, &mut counts, &mut about, &mut take)?;
+                part.row(at, first + at, &mut counts, &mut about, &mut |item| {
+                    if item.version.is_none() {
+                        shared.add(&part, at);
+                    }
+                    take(item)
+                })?;
             }
             first += part.rows;
             Ok(())
         })?;
     }
     about.rows = counts[0];
+    about.repeated = sources
+        .first()
+        .map_or_else(Vec::new, |first| shared.found(first));
     Ok(about)
 }
+
+/// Rows of a part that are searched for ellipticities that occur several times.
+const SEARCHED: usize = 4096;
+
+/// Pairs of numbers that several rows share exactly, with numbers of rows. Of a part with more than [`SEARCHED`] rows,
+/// ellipticities that one row in a thousand has are found.
+#[derive(Default)]
+struct Shared {
+    ellipticities: HashMap<[u64; 2], u64>,
+    no_response: u64,
+    no_psf: u64,
+    used: u64,
+}
+
+impl Shared {
+    fn look_for(&mut self, part: &Part<'_>) {
+        let stride = part.rows.div_ceil(SEARCHED).max(1);
+        let mut seen = HashSet::new();
+        for at in (0..part.rows).step_by(stride) {
+            let e = part.pair(part.places.e, at);
+            if e.iter().all(|e| e.is_finite()) && !seen.insert(Self::key(e)) {
+                self.ellipticities.entry(Self::key(e)).or_default();
+            }
+        }
+    }
+
+    /// Zeros with either sign are equal.
+    fn key(e: [f64; 2]) -> [u64; 2] {
+        e.map(|e| (e + 0.0).to_bits())
+    }
+
+    fn add(&mut self, part: &Part<'_>, at: usize) {
+        let Places {
+            e, response, psf, ..
+        } = part.places;
+        self.used += 1;
+        let is_zero =
+            |columns: Option<[usize; 2]>| columns.is_some_and(|own| part.pair(own, at) == [0.0; 2]);
+        self.no_response += u64::from(is_zero(response));
+        self.no_psf += u64::from(is_zero(psf));
+        if !self.ellipticities.is_empty()
+            && let Some(count) = self.ellipticities.get_mut(&Self::key(part.pair(e, at)))
+        {
+            *count += 1;
+        }
+    }
+
+    /// The ellipticity that most rows share, if it is no coincidence of numbers with few digits (with two digits, 10⁴
+    /// galaxies share one in ten rows at most), and zeros of responses and PSFs that not all rows have.
+    fn found(&self, source: &Source) -> Vec<Repeated> {
+        let most = self.ellipticities.iter();
+        let most = most.max_by_key(|(e, count)| (**count, **e));
+        let most = most.filter(|(_, count)| **count >= 3.max(self.used.div_ceil(1000)));
+        let most = most.map(|(e, count)| (e.map(f64::from_bits), *count));
+        let some = |zeros: u64| {
+            let some = zeros >= 3 && zeros < self.used;
+            some.then_some(([0.0; 2], zeros))
+        };
+        let all = [
+            (most, [Role::E1, Role::E2]),
+            (some(self.no_response), [Role::R11, Role::R22]),
+            (some(self.no_psf), [Role::Psf1, Role::Psf2]),
+        ];
+        let repeated = |(found, roles): (Option<([f64; 2], u64)>, [Role; 2])| {
+            let (values, rows) = found?;
+            let columns = roles.map(|role| source.columns.of(role).unwrap_or_default().to_owned());
+            Some(Repeated {
+                columns,
+                values,
+                rows,
+            })
+        };
+        all.into_iter().filter_map(repeated).collect()
+    }
+}
+
+/// Ranges of the measured quantities of a catalogue.
+#[derive(Clone, Copy, Default)]
+struct Ranges {
+    e: MeasuredRange,
+    response: MeasuredRange,
+    derivative: MeasuredRange,
+    psf_size: MeasuredRange,
+}
+
+/// Weights in any unit are smaller; programs write 1e20, 1e30 or the largest number for a failure.
+const HUGE: f64 = 1e20;
+/// Values from which a range is determined.
+const SAMPLED: usize = 1 << 16;
 
 /// Columns of some rows.
 struct Part<'a> {
@@ -519,9 +662,13 @@ struct Part<'a> {
     /// Places of the columns of roles.
     places: Places,
     versions: Option<Vec<Option<usize>>>,
-    unit: Option<usize>,
+    frame: &'a DataFrame,
+    /// Keys of the identifiers of galaxies and of units.
+    ids: Option<Vec<u64>>,
+    units: Option<Vec<u64>>,
     truth: OfRows<'a>,
     shapes: Shapes,
+    ranges: Ranges,
 }
 
 /// Where the true shears of the rows of a catalogue are.
@@ -529,8 +676,8 @@ struct Part<'a> {
 enum OfRows<'a> {
     /// One shear.
     Constant([f64; 2]),
-    /// By the identifier in a column.
-    Identifiers(&'a HashMap<u64, [f64; 2]>, usize),
+    /// By identifier.
+    Identifiers(&'a HashMap<u64, [f64; 2]>),
     /// By the position in two columns.
     Positions(&'a Positions, [usize; 2]),
     /// In two columns.
@@ -555,8 +702,8 @@ impl<'a> OfRows<'a> {
             return Ok(OfRows::Positions(positions, position));
         }
         if let Truth::Galaxies(galaxies) = truth {
-            let id = places.id.ok_or_else(|| absent("identifier", "id=NAME"))?;
-            return Ok(OfRows::Identifiers(galaxies, id));
+            places.id.ok_or_else(|| absent("identifier", "id=NAME"))?;
+            return Ok(OfRows::Identifiers(galaxies));
         }
         Ok(match (truth.of_catalogue(path), places.shear) {
             (Some(shear), _) => OfRows::Constant(shear),
@@ -651,21 +798,25 @@ impl<'a> Part<'a> {
         let places = Places::of(source);
         let truth = OfRows::new(catalogue, &places, &reading.truth)?;
         let version = source.columns.of(Role::Version);
+        let texts = source.texts(reading);
         let mut columns = Vec::new();
         for name in &source.wanted {
-            columns.push(match Some(name.as_str()) == version {
+            columns.push(match texts.contains(&name.as_str()) {
                 true => Cow::Borrowed(&[][..]),
                 false => table::numbers(frame, name, path)?,
             });
         }
+        let keys = |name: &str| identity::keys(frame, name, path);
+        let ids = source.columns.of(Role::Id).map(keys).transpose()?;
+        let units = source.unit(reading).map(keys).transpose()?;
         let versions = version
             .map(|name| versions(frame, name, path))
             .transpose()?;
-        let unit = source.unit(reading);
         let weighted = reading.selection.as_ref().map(|selection| {
             Weighted::of(path, selection, |name| table::numbers(frame, name, path))
         });
         Ok(Part {
+            ranges: Ranges::default(),
             weighted: weighted.transpose()?,
             source,
             reading,
@@ -673,7 +824,9 @@ impl<'a> Part<'a> {
             columns,
             places,
             versions,
-            unit: unit.and_then(|name| source.wanted.iter().position(|own| own == name)),
+            frame,
+            ids,
+            units,
             truth,
             shapes: source.shapes(reading),
         })
@@ -681,6 +834,84 @@ impl<'a> Part<'a> {
 
     fn value(&self, column: usize, at: usize) -> f64 {
         self.columns[column][at]
+    }
+
+    /// The ranges of the quantities in these rows.
+    fn ranges(&self) -> Ranges {
+        let places = &self.places;
+        let of = |columns: &[usize]| {
+            let stride = (columns.len() * self.rows).div_ceil(SAMPLED).max(1);
+            let values = columns
+                .iter()
+                .flat_map(|column| self.columns[*column].iter().step_by(stride).copied());
+            MeasuredRange::from_values(&values.collect::<Vec<_>>())
+        };
+        let pair = |columns: Option<[usize; 2]>| match columns {
+            Some(columns) => of(&columns),
+            None => MeasuredRange::ELLIPTICITY,
+        };
+        // Ellipticities with a response may have any unit.
+        let any_unit =
+            places.response.is_some() || places.sheared.is_some() || self.source.has_version_rows();
+        Ranges {
+            e: pair(Some(places.e).filter(|_| any_unit)),
+            response: pair(places.response),
+            derivative: pair(places.derivative),
+            psf_size: pair(places.psf_size.map(|size| [size; 2])),
+        }
+    }
+
+    /// The columns of the ellipticity of a row. GalSim's HSM writes −10 into those that its method does not determine.
+    fn shape_columns(&self, at: usize) -> [usize; 2] {
+        match (self.places.ksb, self.pair(self.places.e, at)) {
+            (Some(ksb), [-10.0, -10.0]) => ksb,
+            _ => self.places.e,
+        }
+    }
+
+    /// A number of a row that stands for a failed measurement: its column and what was expected.
+    fn failure(&self, at: usize) -> Option<(usize, &'static str)> {
+        let (places, ranges) = (&self.places, &self.ranges);
+        let outside = |columns: Option<[usize; 2]>, range: MeasuredRange| {
+            let mut columns = columns.into_iter().flatten();
+            columns.find(|column| range.excludes(self.value(*column, at)))
+        };
+        let e = || {
+            let sheared = [places.sheared, places.other_sheared];
+            let mut all = std::iter::once(self.shape_columns(at))
+                .chain(sheared.into_iter().flatten().flatten());
+            all.find_map(|columns| outside(Some(columns), ranges.e))
+        };
+        let no_psf = || {
+            let mut columns = places.psf.into_iter().flatten();
+            columns.find(|column| self.value(*column, at).abs() >= 1.0)
+        };
+        let no_size = || {
+            let size = places.psf_size?;
+            let value = self.value(size, at);
+            (value <= 0.0 || ranges.psf_size.excludes(value)).then_some(size)
+        };
+        let named = |found: Option<usize>, what| found.map(|column| (column, what));
+        named(e(), "an ellipticity")
+            .or_else(|| named(outside(places.response, ranges.response), "a response"))
+            .or_else(|| {
+                named(
+                    outside(places.other_response, ranges.response),
+                    "a response",
+                )
+            })
+            .or_else(|| {
+                named(
+                    outside(places.derivative, ranges.derivative),
+                    "a derivative",
+                )
+            })
+            .or_else(|| named(no_psf(), "an ellipticity of a PSF, below 1"))
+            .or_else(|| named(no_size(), "a size of a PSF, above 0"))
+            .or_else(|| {
+                let huge = |weight: &usize| self.value(*weight, at) >= HUGE;
+                named(places.weight.filter(huge), "a weight")
+            })
     }
 
     fn pair(&self, columns: [usize; 2], at: usize) -> [f64; 2] {
@@ -744,9 +975,20 @@ impl<'a> Part<'a> {
             Some(weighted) => weighted.weight[at],
             None => weight,
         };
+        if let Some((column, expected)) = self.failure(at) {
+            if self.reading.drop_missing {
+                about.failed += u64::from(own);
+                return Ok(());
+            }
+            return Err(fault(format!(
+                "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {expected}). Try: --drop-missing",
+                self.source.wanted[column],
+                shown(self.value(column, at))
+            )));
+        }
         let Some(Shape { e, slope, cross }) = self.shape(at, weight) else {
             // A distortion above 1 has no shear.
-            about.flagged += u64::from(own);
+            about.above_one += u64::from(own);
             return Ok(());
         };
         let psf = places.psf.map_or([0.0; 2], |psf| self.pair(psf, at));
@@ -818,14 +1060,13 @@ impl<'a> Part<'a> {
                 cross: [0, 1].map(|k| weighted.cross[k][at]),
             });
         }
-        let mut e = self.pair(places.e, at);
-        let mut shapes = self.shapes;
-        // GalSim's HSM writes −10 into the columns that its method does not determine.
-        if let (Some(ksb), [-10.0, -10.0]) = (places.ksb, e) {
-            e = self.pair(ksb, at);
-            shapes = Shapes::Shear;
-        }
-        match shapes {
+        let columns = self.shape_columns(at);
+        let mut e = self.pair(columns, at);
+        match if columns == places.e {
+            self.shapes
+        } else {
+            Shapes::Shear
+        } {
             Shapes::Converted if e.iter().all(|e| e.is_finite()) => {
                 let shear = Distortion::new(e[0], e[1]).to_shear()?;
                 e = [shear.e1, shear.e2];
@@ -912,9 +1153,11 @@ impl<'a> Part<'a> {
     fn truth(&self, at: usize) -> Result<[f64; 2], String> {
         match self.truth {
             OfRows::Constant(shear) => Ok(shear),
-            OfRows::Identifiers(galaxies, column) => {
-                let id = self.value(column, at);
-                galaxies.get(&id.to_bits()).copied().ok_or_else(|| {
+            OfRows::Identifiers(galaxies) => {
+                let key = self.ids.as_ref().and_then(|ids| galaxies.get(&ids[at]));
+                key.copied().ok_or_else(|| {
+                    let name = self.source.columns.of(Role::Id).unwrap_or_default();
+                    let id = identity::shown(self.frame, name, at);
                     format!("the table of true shears does not contain the identifier {id}")
                 })
             }
@@ -926,22 +1169,12 @@ impl<'a> Part<'a> {
 
     /// The key of the unit of a row, the `index`-th of its version.
     fn key(&self, at: usize, index: u64) -> u64 {
-        if let Some(unit) = self.unit {
-            return hash(self.value(unit, at));
-        }
-        match self.places.id {
-            Some(id) if !self.reading.neighbours => hash(self.value(id, at)),
+        match (&self.units, &self.ids) {
+            (Some(units), _) => units[at],
+            (None, Some(ids)) if !self.reading.neighbours => ids[at],
             _ => index >> u32::from(self.reading.neighbours),
         }
     }
-}
-
-/// A number with evenly distributed bits (the finaliser of SplitMix64).
-fn hash(value: f64) -> u64 {
-    let mut bits = value.to_bits().wrapping_add(0x9e37_79b9_7f4a_7c15);
-    bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    bits ^ (bits >> 31)
 }
 
 /// The versions that a column of text names.
@@ -950,7 +1183,7 @@ fn versions(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<Option<usi
         FileError::new(
             path,
             format!(
-                "column `{name}`: unknown version (found {found}, expected noshear, 1p, 1m, 2p or 2m)"
+                "column `{name}`: unknown version (found {found}, expected noshear, 1p, 1m, 2p or 2m). Try: --columns version=none"
             ),
         )
     };

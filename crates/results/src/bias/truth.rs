@@ -6,9 +6,12 @@ use std::sync::Arc;
 
 use shearq_files::FileError;
 use shearq_files::open::{SETTINGS, read_to_string};
-use shearq_files::table::{self, MAX_ROWS, Place};
+use shearq_files::table::{self, Place};
+use shearq_pipeline::data::layout::stated_sign;
 use shearq_scoring::TruthSign;
 
+use super::columns::{Role, names_of_role};
+use super::identity;
 use super::positions::{Positions, check};
 
 /// Where the true shear comes from.
@@ -21,7 +24,7 @@ pub enum Truth {
     Constant([f64; 2]),
     /// A shear per catalogue, by its path or parts of it: the name of its file or of a folder above.
     Catalogues(BTreeMap<String, [f64; 2]>),
-    /// A shear per galaxy, by the bits of its identifier.
+    /// A shear per galaxy, by the key of its identifier.
     Galaxies(Arc<HashMap<u64, [f64; 2]>>),
     /// A shear per galaxy, by its position.
     Positions(Arc<Positions>),
@@ -41,19 +44,25 @@ impl Truth {
     pub fn read(path: &Path) -> Result<Self, FileError> {
         let place = Place::of(path);
         let columns = table::columns(&place)?;
+        // Names in any case: FITS writers like capitals.
         let named = |name: &str| {
-            let mut lists = columns.named.iter();
-            lists.any(|list| list.names.iter().any(|own| own == name))
+            let mut names = columns.named.iter().flat_map(|list| &list.names);
+            names
+                .find(|own| own.eq_ignore_ascii_case(name))
+                .map(String::as_str)
         };
-        if CATALOGUE.iter().any(|name| named(name)) {
+        if CATALOGUE.iter().any(|name| named(name).is_some()) {
             return of_catalogues(path);
         }
-        let shears = named("g1") && named("g2");
-        if shears && !named("id") && named("x") && named("y") {
+        let shears = named("g1").zip(named("g2"));
+        let positions = named("x").zip(named("y"));
+        let other = || names_of_role(Role::Id).iter().find_map(|name| named(name));
+        let id = named("id").or_else(|| other().filter(|_| positions.is_none()));
+        if let (Some(_), None, Some(_)) = (shears, id, positions) {
             let positions = Positions::read(path, TruthSign::Standard)?;
             return Ok(Truth::Positions(Arc::new(positions)));
         }
-        if !(shears && named("id")) {
+        let (Some((name1, name2)), Some(id)) = (shears, id) else {
             let found: Vec<&String> = columns.named.iter().flat_map(|list| &list.names).collect();
             return Err(FileError::new(
                 path,
@@ -62,20 +71,30 @@ impl Truth {
                     shearq_files::names_of(&found)
                 ),
             ));
-        }
-        let read = table::read_from(&place, Some(&["id", "g1", "g2"]), MAX_ROWS)?;
-        let column = |name| table::numbers(&read, name, path);
-        let (ids, g1, g2) = (column("id")?, column("g1")?, column("g2")?);
-        let mut galaxies = HashMap::with_capacity(ids.len());
-        for (row, id) in ids.iter().enumerate() {
-            let shear = [g1[row], g2[row]];
-            check(shear)
-                .map_err(|fault| FileError::new(path, format!("row {}: {fault}", row + 1)))?;
-            if galaxies.insert(id.to_bits(), shear).is_some() {
-                let message = format!("row {}: the identifier {id} occurs twice", row + 1);
-                return Err(FileError::new(path, message));
+        };
+        let sign = match stated_sign(&place.path)? {
+            Some(TruthSign::Challenge) => -1.0,
+            Some(TruthSign::Standard) | None => 1.0,
+        };
+        let mut galaxies = HashMap::new();
+        table::read_parts(&place, &[id, name1, name2], &[id], |part| {
+            let column = |name| table::numbers(&part, name, path);
+            let (g1, g2) = (column(name1)?, column(name2)?);
+            for (row, key) in identity::keys(&part, id, path)?.into_iter().enumerate() {
+                let shear = [g1[row], sign * g2[row]];
+                check(shear)
+                    .map_err(|fault| FileError::new(path, format!("row {}: {fault}", row + 1)))?;
+                if galaxies.insert(key, shear).is_some() {
+                    let message = format!(
+                        "row {}: the identifier {} occurs twice",
+                        row + 1,
+                        identity::shown(&part, id, row)
+                    );
+                    return Err(FileError::new(path, message));
+                }
             }
-        }
+            Ok(())
+        })?;
         Ok(Truth::Galaxies(Arc::new(galaxies)))
     }
 
@@ -139,13 +158,17 @@ fn row_of<'n>(
     names: impl IntoIterator<Item = &'n String>,
     path: &Path,
 ) -> Result<&'n String, FileError> {
-    let parts: Vec<_> = path.components().collect();
+    // `FILE[TABLE]` is also meant by the name of the file.
+    let whole = Place::of(path).path;
+    let same: Vec<Vec<_>> = [path, &whole]
+        .map(|path| path.components().collect())
+        .into();
     let (mut best, mut length, mut all) = (Vec::new(), 0, Vec::new());
     for name in names {
         all.push(name);
         let own: Vec<_> = Path::new(name).components().collect();
-        if own.is_empty() || own.len() < length || !parts.windows(own.len()).any(|some| some == own)
-        {
+        let part = |parts: &Vec<_>| parts.windows(own.len()).any(|some| some == own);
+        if own.is_empty() || own.len() < length || !same.iter().any(part) {
             continue;
         }
         if own.len() > length {

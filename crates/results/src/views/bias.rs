@@ -1,13 +1,15 @@
 //! Shear bias as tables, plots, verdicts and JUnit.
 
 use shearq_bias::{
-    Catalogue, Design, Estimate, Measured, QUANTITIES, REQUIREMENTS, Verdict, student_t, verdict,
+    Catalogue, Design, Estimate, Measured, QUANTITIES, REQUIREMENTS, Repeated, Verdict, student_t,
+    verdict,
 };
 use shearq_render::figure::{Band, FigureError, LinePlot, PanelGrid, Series, Style};
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Heading, Table};
 
 use super::junit::{Case, document};
+use super::rows::shown;
 use crate::bias::BiasResult;
 
 /// Units above which Student's t differs from a normal distribution by less than 5 %.
@@ -284,11 +286,20 @@ fn notes(result: &BiasResult) -> Vec<String> {
         (total(|c| c.unweighted), "with a weight of zero or less"),
         (total(|c| c.unselected), "that --select or --where excludes"),
         (total(|c| c.missing), "with missing numbers"),
+        (
+            total(|c| c.failed),
+            "with numbers that stand for failed measurements",
+        ),
+        (
+            total(|c| c.above_one),
+            "with a distortion above 1, which noise makes and to which no shear belongs",
+        ),
     ] {
         if count > 0 {
             notes.push(format!("Left out: {count} rows {what}."));
         }
     }
+    notes.extend(repeated(&result.catalogues));
     notes.extend(chosen_by_measurement(result));
     for (k, assumes) in (1..).zip(all.assumes_no_c) {
         if assumes {
@@ -312,6 +323,28 @@ fn sentence(line: &str) -> String {
     let first = letters.next().into_iter().flat_map(char::to_uppercase);
     let line: String = first.chain(letters).collect();
     line + "."
+}
+
+/// Lines about numbers that several rows share exactly, such as zeros for failed measurements.
+fn repeated(catalogues: &[Catalogue]) -> Vec<String> {
+    let mut all: Vec<Repeated> = Vec::new();
+    for own in catalogues.iter().flat_map(|own| &own.repeated) {
+        let known = all.iter().position(|other| other.columns == own.columns);
+        match known.map(|place| &mut all[place]) {
+            Some(other) if other.values == own.values => other.rows += own.rows,
+            Some(_) => {}
+            None => all.push(own.clone()),
+        }
+    }
+    let rows: u64 = catalogues.iter().map(|own| own.rows).sum();
+    let line = |own: &Repeated| {
+        let ([a, b], [first, second]) = (&own.columns, own.values.map(shown));
+        format!(
+            "`{a}` and `{b}` are exactly {first} and {second} in {} of {rows} rows, which count. If this stands for a failure, try: --select '{a} != {first}'",
+            own.rows
+        )
+    };
+    all.iter().map(line).collect()
 }
 
 /// A quantity compared with the requirements that have one limit.

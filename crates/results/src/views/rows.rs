@@ -10,7 +10,9 @@ pub fn fault(counts: &RowCounts, grid: &Grid) -> Option<String> {
             rows,
             first: (row, e1, e2),
         } => format!(
-            "{rows} rows have a whole number as ellipticity, the first of them row {row} with ({e1}, {e2}): if it stands for \"not measured\", name it as missing; otherwise set a largest |e|"
+            "{rows} rows have a number that no measurement of an ellipticity gives, the first of them row {row} with ({}, {}): if it stands for \"not measured\", try --drop-missing or name it as missing; otherwise set a largest |e|",
+            shown(e1),
+            shown(e2)
         ),
         RowFault::Absurd {
             rows,
@@ -24,6 +26,14 @@ pub fn fault(counts: &RowCounts, grid: &Grid) -> Option<String> {
             grid.stamp.0, grid.n
         ),
     })
+}
+
+/// A number in few characters.
+pub fn shown(value: f64) -> String {
+    match value.abs() >= 1e7 {
+        true => format!("{value:e}"),
+        false => value.to_string(),
+    }
 }
 
 /// A line for each kind of odd row in the catalogues of `whose`: how many there are, and how they are scored.
@@ -59,7 +69,7 @@ pub fn oddities(counts: &RowCounts, whose: &str) -> Vec<String> {
     }
     if counts.not_finite > 0 {
         lines.push(format!(
-            "note: {} of {} galaxies of {whose} have no ellipticity and count as missing.",
+            "note: {} of {} galaxies of {whose} have no ellipticity (NaN, flagged, marked as missing, or a distortion above 1, which noise makes) and count as missing.",
             counts.not_finite,
             counts.not_finite + counts.used
         ));
@@ -104,7 +114,7 @@ mod tests {
         let expected: [(RowCounts, &[&str]); 3] = [
             (
                 sentinel,
-                &["3 rows have a whole number", "row 7 with (-99, 99)"],
+                &["3 rows have a number that no", "row 7 with (-99, 99)"],
             ),
             (
                 absurd,

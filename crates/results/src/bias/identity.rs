@@ -1,0 +1,139 @@
+//! Identifiers of galaxies and of units, which are numbers or texts.
+
+use std::collections::hash_map::DefaultHasher;
+use std::hash::{Hash, Hasher};
+use std::path::Path;
+
+use shearq_files::FileError;
+use shearq_files::frames::polars::{DataFrame, DataType};
+use shearq_files::table;
+
+/// Integers that floats do not contain have other bits than the float with the same ones.
+const INTEGER: u64 = 0x5bd1_e995_9d1b_58d3;
+
+/// Keys of the identifiers in a column: equal for equal numbers of any type, and for a text that is such a number.
+///
+/// # Errors
+/// If there is no such column.
+pub(super) fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, FileError> {
+    let series = frame.column(name).map(|own| own.as_materialized_series());
+    match series.as_ref().map(|own| own.dtype()) {
+        Ok(DataType::String) => {
+            let texts = series.as_ref().ok().and_then(|own| own.str().ok());
+            let texts = texts.into_iter().flat_map(|texts| texts.iter());
+            Ok(texts
+                .map(|text| of_text(text.unwrap_or_default()))
+                .collect())
+        }
+        Ok(DataType::Int64) => {
+            let all = series.as_ref().ok().and_then(|own| own.i64().ok());
+            let all = all.into_iter().flat_map(|all| all.iter());
+            Ok(all
+                .map(|own| own.map_or(0, |own| of_integer(own.into())))
+                .collect())
+        }
+        Ok(DataType::UInt64) => {
+            let all = series.as_ref().ok().and_then(|own| own.u64().ok());
+            let all = all.into_iter().flat_map(|all| all.iter());
+            Ok(all
+                .map(|own| own.map_or(0, |own| of_integer(own.into())))
+                .collect())
+        }
+        _ => {
+            let numbers = table::numbers(frame, name, path)?;
+            Ok(numbers.iter().map(|own| hash(own.to_bits())).collect())
+        }
+    }
+}
+
+/// An identifier as messages show it.
+pub(super) fn shown(frame: &DataFrame, name: &str, at: usize) -> String {
+    let value = frame.column(name).and_then(|own| own.get(at));
+    value.map_or_else(
+        |_| String::new(),
+        |value| {
+            value
+                .to_string()
+                .trim_matches('"')
+                .trim_end_matches(".0")
+                .to_owned()
+        },
+    )
+}
+
+fn of_integer(integer: i128) -> u64 {
+    let float = integer as f64;
+    match float as i128 == integer {
+        true => hash(float.to_bits()),
+        false => hash(integer as u64 ^ INTEGER),
+    }
+}
+
+fn of_text(text: &str) -> u64 {
+    // `007` is no number: it differs from `7`.
+    if let Some(integer) = text
+        .parse::<i128>()
+        .ok()
+        .filter(|own| own.to_string() == text)
+    {
+        return of_integer(integer);
+    }
+    if let Some(float) = text
+        .parse::<f64>()
+        .ok()
+        .filter(|own| own.to_string() == text)
+    {
+        return hash(float.to_bits());
+    }
+    let mut hasher = DefaultHasher::new();
+    text.hash(&mut hasher);
+    hasher.finish()
+}
+
+/// A number with evenly distributed bits (the finaliser of SplitMix64).
+fn hash(bits: u64) -> u64 {
+    let mut bits = bits.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    bits ^ (bits >> 31)
+}
+
+#[cfg(test)]
+mod tests {
+    use shearq_files::frames::frame;
+    use shearq_files::frames::polars::{Column, NamedFrom, Series};
+
+    use super::*;
+
+    #[test]
+    fn equal_identifiers_of_any_type_have_equal_keys() {
+        let of = |column: Series| {
+            let table = frame(vec![Column::from(column)]).unwrap();
+            keys(&table, "id", Path::new("t")).unwrap()
+        };
+        let name = || "id".into();
+        let small = of(Series::new(name(), [7.0, 8.0]));
+        assert_eq!(of(Series::new(name(), [7_i64, 8])), small);
+        assert_eq!(of(Series::new(name(), [7_u64, 8])), small);
+        assert_eq!(of(Series::new(name(), ["7", "8"])), small);
+        assert_ne!(of(Series::new(name(), ["007", "8"])), small);
+        let large = 1_000_000_000_000_000_000_i64;
+        let long = of(Series::new(name(), [large, large + 1]));
+        assert_ne!(long[0], long[1]);
+        assert_eq!(
+            of(Series::new(
+                name(),
+                ["1000000000000000000", "1000000000000000001"]
+            )),
+            long
+        );
+        let all = of(Series::new(
+            name(),
+            (0..4000).map(|k| (1_u64 << 63) + k).collect::<Vec<_>>(),
+        ));
+        assert_eq!(
+            all.iter().collect::<std::collections::HashSet<_>>().len(),
+            4000
+        );
+    }
+}
