@@ -265,6 +265,11 @@ def _catalogue(name: str, table: Any) -> str | tuple[str, list[tuple[str, Any]]]
     """A path, or a name with columns of float64 or of text."""
     if isinstance(table, (str, os.PathLike)):
         return os.fspath(table)
+    if type(table).__name__ == "LazyFrame":
+        table = table.collect()
+    if any(name is not None for name in getattr(getattr(table, "index", None), "names", ())):
+        # An index with a name is a column, such as the identifier of the galaxy.
+        table = table.reset_index()
     if isinstance(table, Mapping):
         names = list(table)
     elif isinstance(table, np.ndarray):
@@ -278,16 +283,35 @@ def _catalogue(name: str, table: Any) -> str | tuple[str, list[tuple[str, Any]]]
         names = [str(column) for column in getattr(table, "colnames", getattr(table, "columns", ()))]
     columns = []
     for column in names:
-        values = _values(table[column])
-        if values is not None:
-            columns.append((str(column), values))
+        for label, own in _components(str(column), table[column]):
+            values = _values(own)
+            if values is not None:
+                columns.append((label, values))
     if not columns:
         raise ValueError(f"{name}: found {type(table).__name__} without columns of numbers; expected a table with e1 and e2")
     return name, columns
 
 
+# Longest vector whose numbers are columns; longer ones are stamps.
+_MAX_VECTOR = 8
+
+
+def _components(name: str, column: Any) -> list[tuple[str, Any]]:
+    """The columns ``g[0]`` and ``g[1]`` of a vector ``g``, or the column itself."""
+    array = column if isinstance(column, np.ma.MaskedArray) else np.asarray(column)
+    if array.ndim == 1 and array.dtype.kind == "O" and len(array) and np.ndim(array[0]) == 1 and not isinstance(array[0], str):
+        # Lists of Arrow, pandas and polars.
+        lengths = {np.size(value) for value in array}
+        if len(lengths) == 1:
+            array = np.stack([np.asarray(value) for value in array])
+    if array.ndim == 2 and 2 <= array.shape[1] <= _MAX_VECTOR:
+        return [(f"{name}[{k}]", array[:, k]) for k in range(array.shape[1])]
+    return [(name, column)]
+
+
 def _values(column: ArrayLike) -> Any:
-    """A contiguous column of float64, a list of text, or None for anything else."""
+    """A contiguous column of float64, a list of text, or None for anything else. Integers that float64 does not contain,
+    such as identifiers of Rubin, become text."""
     if isinstance(column, np.ma.MaskedArray):
         if column.dtype.kind not in "fiub" or column.ndim != 1:
             return None
@@ -295,6 +319,8 @@ def _values(column: ArrayLike) -> Any:
     array = np.asarray(column)
     if array.ndim != 1:
         return None
+    if array.dtype.kind in "iu" and array.size and max(int(array.max()), -int(array.min())) > 2**53:
+        return [str(value) for value in array.tolist()]
     if array.dtype.kind in "fiub":
         return np.ascontiguousarray(array, dtype=np.float64)
     if array.dtype.kind in "US" or (array.dtype.kind == "O" and all(isinstance(value, str) for value in array)):
@@ -310,6 +336,8 @@ def _values(column: ArrayLike) -> Any:
 def _truth(g1: Any, g2: Any, truth: Any, given: list[Any]) -> Any:
     if (g1 is None) != (g2 is None):
         raise ValueError("g1, g2: found only one; expected both or none")
+    if any(np.ma.is_masked(g) for g in (g1, g2)):
+        raise ValueError("g1, g2: found masked values; expected a true shear for each catalogue")
     if truth is not None:
         if g1 is not None:
             raise ValueError("truth: found with g1 and g2; expected one of them")
