@@ -1187,6 +1187,7 @@ fn an_unused_weight_of_zero_is_refused() {
     assert_eq!(number(&used[0], "n"), 2.0);
     let declined = rows(&[text(&path), "--columns", "w=none"]);
     assert_eq!(number(&declined[0], "n"), 3.0);
+}
 
 /// A FITS file of binary tables: of each its name, its columns with their formats, and the bytes of its rows.
 fn fits(path: &Path, tables: &[(&str, &[(&str, &str)], Vec<Vec<u8>>)]) {
