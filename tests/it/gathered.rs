@@ -176,39 +176,71 @@ fn the_mean_of_a_field_is_that_of_its_catalogue() {
     let table: Value = serde_json::from_str(&succeed(&mean)).unwrap();
     let row = &table["rows"][0];
     let value = |key: &str| row[key].as_f64().unwrap();
-    let (mut all, mut pairs) = (Vec::new(), Vec::new());
+    let (mut flagged, mut galaxies) = (0, Vec::new());
     for image in ["001", "002"] {
         let from = out.join(format!("set02/catalogue-{image}.parquet"));
         fs::rename(&from, out.join("set02/catalogue-001.parquet")).unwrap();
-        let (e, r) = (small.measured("02", "e2"), small.measured("02", "R22"));
-        let good: Vec<(f64, f64)> = e
-            .iter()
-            .copied()
-            .zip(r)
-            .filter(|(e, _)| e.is_finite())
+        let columns =
+            ["e1", "e2", "R11", "R12", "R21", "R22"].map(|name| small.measured("02", name));
+        let good: Vec<usize> = (0..columns[0].len())
+            .filter(|k| columns[0][*k].is_finite())
             .collect();
-        // The ellipticities of an image are divided by its mean response.
-        let mean = good.iter().map(|(_, r)| r).sum::<f64>() / good.len() as f64;
-        pairs.extend(good.iter().map(|(e, r)| (e * mean, *r)));
-        all.extend(e);
+        flagged += columns[0].len() - good.len();
+        // The ellipticities of an image are divided by its mean responses.
+        let mean = |column: usize| {
+            good.iter().map(|k| columns[column][*k]).sum::<f64>() / good.len() as f64
+        };
+        let divisors = [mean(2), mean(5)];
+        galaxies.extend(good.iter().map(|k| {
+            let row: [f64; 6] = std::array::from_fn(|column| columns[column][*k]);
+            (
+                [row[0] * divisors[0], row[1] * divisors[1]],
+                [[row[2], row[3]], [row[4], row[5]]],
+            )
+        }));
     }
-    let n = pairs.len() as f64;
-    let [sum, response] = pairs
-        .iter()
-        .fold([0.0; 2], |[e, r], pair| [e + pair.0, r + pair.1]);
-    let expected = sum / response;
+    let n = galaxies.len() as f64;
+    let mut e = [0.0; 2];
+    let mut r = [[0.0; 2]; 2];
+    for (own, response) in &galaxies {
+        for k in 0..2 {
+            e[k] += own[k] / n;
+            for j in 0..2 {
+                r[k][j] += response[k][j] / n;
+            }
+        }
+    }
+    let determinant = r[0][0] * r[1][1] - r[0][1] * r[1][0];
+    let solved = |e: [f64; 2]| {
+        [
+            (r[1][1] * e[0] - r[0][1] * e[1]) / determinant,
+            (r[0][0] * e[1] - r[1][0] * e[0]) / determinant,
+        ]
+    };
+    let shear = solved(e);
     // Sums in another order.
     let near = |found: f64, expected: f64| (found - expected).abs() < 1e-12;
-    assert!(near(value("g2"), expected));
+    assert!(near(value("g1"), shear[0]) && near(value("g2"), shear[1]));
     // The error of a ratio of means contains the scatter of the responses.
-    let residual: f64 = pairs.iter().map(|(e, r)| (e - expected * r).powi(2)).sum();
-    let error = (residual * n / (n - 1.0)).sqrt() / response;
-    assert!(near(value("g2_error"), error));
-    let square: f64 = pairs.iter().map(|(e, _)| (e - sum / n).powi(2)).sum();
-    let scatter = (square / (n - 1.0)).sqrt() * n / response;
-    assert!(near(value("scatter2"), scatter));
+    let squares: f64 = galaxies
+        .iter()
+        .map(|(own, response)| {
+            let residual =
+                [0, 1].map(|k| own[k] - response[k][0] * shear[0] - response[k][1] * shear[1]);
+            solved(residual)[1].powi(2)
+        })
+        .sum();
+    assert!(near(value("g2_error"), (squares / (n * (n - 1.0))).sqrt()));
+    let square: f64 = galaxies
+        .iter()
+        .map(|(own, _)| (own[1] - e[1]).powi(2))
+        .sum();
+    assert!(near(
+        value("scatter2"),
+        (square / (n - 1.0)).sqrt() / r[1][1]
+    ));
     assert_eq!(value("galaxies"), n);
-    assert_eq!(value("flagged"), all.len() as f64 - n);
+    assert_eq!(value("flagged"), flagged as f64);
 }
 
 #[test]
