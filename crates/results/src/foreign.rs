@@ -28,6 +28,7 @@ use shearq_pipeline::data::pattern::{IMAGE_PLACEHOLDERS, check_pattern};
 /// e2 = "e2"
 /// flag = "flag"                   # rows with another value than 0 have no ellipticity
 /// missing = -99                   # rows with this value in e1 or e2 have none [default: no such value]
+/// drop_missing = true             # rows with a number that no measurement gives, such as -99, have none [default: refused]
 /// max_modulus = 1.0               # rows with a larger |e| (as reported) have none [default: no limit]
 /// position_offset = 0.0           # added to x and y to make them FITS pixels (1 for 0-based positions)
 /// e2_sign = 1                     # -1 if e2 is positive along x = -y
@@ -58,6 +59,9 @@ pub struct Foreign {
     e2: String,
     flag: Option<String>,
     missing: Option<f64>,
+    // Left out of what is written unless set, so that descriptions of packed results stay the same.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    drop_missing: bool,
     max_modulus: Option<f64>,
     #[serde(default)]
     position_offset: f64,
@@ -200,7 +204,7 @@ impl Foreign {
     fn convert(&self, e1: f64, e2: f64) -> Option<(f64, f64)> {
         if is_failure(e1, e2) {
             // Refused with the sum, although no shear belongs to such a distortion.
-            return Some((e1, e2));
+            return (!self.drop_missing).then_some((e1, e2));
         }
         match (self.ellipticity, self.report) {
             (EllipticityType::Distortion, EllipticityType::Shear) => {
@@ -315,6 +319,9 @@ mod tests {
         let lines = "1,1,0.1,0.2,0\n1,1,0.1,0.2,4\n1,1,-99,0.2,0\n1,1,0.4,0.4,0\n";
         let measured: Vec<bool> = rows(keys, lines).iter().map(|r| r.e1.is_finite()).collect();
         assert_eq!(measured, [true, false, false, false]);
+        let failed = |keys| rows(keys, "1,1,-10,0.2,0\n")[0].e1;
+        assert_eq!(failed("ellipticity = \"shear\""), -10.0);
+        assert!(failed("ellipticity = \"shear\"\ndrop_missing = true").is_nan());
         let screen = Screen {
             missing: Some(-99.0),
             max_modulus: Some(0.5),
