@@ -99,3 +99,20 @@ def test_missing_pixels_in_a_corner_are_no_reason_to_doubt_the_noise(image):
 def test_too_small_psfs_are_refused_with_the_size(image):
     with pytest.raises(ValueError, match="psf: a PSF stamp of 31 × 31 pixels; expected at least 32 × 32"):
         shearq.measure(image.stamps, star(31))
+
+
+@pytest.mark.parametrize("kind", ["f4", ">f4", "f8", "f4 as f8"])
+def test_pixels_of_minus_1e30_are_missing_as_in_files(image, kind):
+    mask = np.random.default_rng(1).random(image.stamps.shape) < 0.002
+    filled = np.where(mask, np.float32(-1e30), image.stamps)
+    given = {"f8": np.where(mask, -1e30, image.stamps.astype("f8")), "f4 as f8": filled.astype("f8")}.get(kind)
+    given = filled.astype(kind) if given is None else given
+    expected = shearq.measure(image.stamps, image.psf, mask=mask, noise=image.noise)
+    before = given.copy()
+    assert same_bits(shearq.measure(given, image.psf, noise=image.noise), expected)
+    (block,) = shearq.measure_blocks(given, image.psf, noise=image.noise)
+    assert same_bits(block, expected) and same_bits(given, before)
+    psf = image.psf.copy()
+    psf[3, 3] = -1e30
+    with pytest.raises(ValueError, match="psf: "):
+        shearq.measure(image.stamps, psf, noise=image.noise)

@@ -58,6 +58,24 @@ def with_missing(name: str, value: Any, mask: Any) -> Any:
     return filled
 
 
+# Missing pixels in survey images, as SExtractor writes them; in double precision, too, and rounded to single before.
+_MISSING_PIXELS = (-1e30, float(np.float32(-1e30)))
+# Stamps tested at once, which bounds the memory of the comparison.
+_TESTED = 256
+
+
+def without_sentinels(value: NDArray[Any]) -> NDArray[Any]:
+    """An array with NaN for pixels of −1e30, as files are read; the array itself if there are none."""
+    if value.dtype.kind != "f" or value.dtype.itemsize < 4:
+        return value
+    missing = _MISSING_PIXELS[1:] if value.dtype.itemsize == 4 else _MISSING_PIXELS
+    size = _TESTED if value.ndim == 3 else max(len(value), 1)
+    parts = (value[start : start + size] for start in range(0, len(value), size))
+    if not any((part == pixel).any() for part in parts for pixel in missing):
+        return value
+    return np.where(np.isin(value, missing), value.dtype.type(np.nan), value)
+
+
 def shaped(name: str, value: Any, expected: str, *, axes: int) -> NDArray[Any]:
     """The same with so many axes, which ``expected`` describes."""
     array = numeric(name, value)

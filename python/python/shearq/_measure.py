@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _galsim, _schema, _shearq
-from ._arrays import callback, double, numeric, real, shaped, shown, whole, with_missing
+from ._arrays import callback, double, numeric, real, shaped, shown, whole, with_missing, without_sentinels
 from ._catalogue import Catalogue
 from ._galsim import GalSimImage, GalSimProfile
 from ._submissions import Configuration, SubmissionLike, submission as resolve
@@ -127,7 +127,7 @@ def measure(
         Square postage stamps in any unit, of even or odd size, at least as large as the configuration requires (48
         pixels by default). Each has its galaxy near the middle. The sky must be subtracted. float32 and float64 are
         read without a copy, memory maps included; other types are converted in pieces. Lists of 2-D arrays or GalSim
-        images are accepted. Pixels that are masked or not finite are missing: the network flags such a galaxy, the
+        images are accepted. Pixels that are masked, not finite or −1e30 are missing: the network flags such a galaxy, the
         linear method flags it if many are missing.
     psf : array of shape (py, px) or (n, py, px), FunctionalPsf, or GalSim image or profile
         One PSF for all galaxies or one per galaxy, centred like the stamps, of even or odd size, and at least as large
@@ -286,6 +286,7 @@ def _measure(
     """Measure arrays."""
     stamps = with_missing("stamps", stamps, mask)
     stamps = shaped("stamps", stamps, "(n, ny, nx), of one stamp stamps[np.newaxis]", axes=3)
+    stamps = without_sentinels(stamps)
     count, rows, sides = stamps.shape
     if rows != sides:
         raise ValueError(f"stamps: found an array of shape {shown(stamps.shape)}; expected squares, ny = nx")
@@ -295,6 +296,7 @@ def _measure(
         formulas = psf._rows
     else:
         psf = numeric("psf", psf)
+        psf = without_sentinels(psf) if psf.ndim in (2, 3) else psf
         if psf.ndim == 2:
             star = double("psf", psf)
         elif psf.ndim == 3 and len(psf) == count:
