@@ -36,26 +36,34 @@ def two():
 
 
 def expected(rows):
-    """Σe/ΣR of rows without flags, with e before calibration."""
+    """(ΣR)⁻¹Σe of rows without flags, with e before calibration and the 2 × 2 responses R."""
     good = rows[rows["flags"] == 0]
-    return [float((good[f"e{k}"] * good[f"divisor{k}"]).sum() / good[f"R{k}{k}"].sum()) for k in (1, 2)]
+    response = [[good[f"R{j}{k}"].sum() for k in (1, 2)] for j in (1, 2)]
+    return np.linalg.solve(response, [(good[f"e{k}"] * good[f"divisor{k}"]).sum() for k in (1, 2)]).tolist()
 
 
 def test_joined_tables_have_the_mean_shear_of_all_rows(two):
     table = pytest.importorskip("astropy.table", reason="tables of astropy need it")
     a, b = two
     assert abs(a["divisor1"][0] / b["divisor1"][0] - 1) > 0.01
-    raw = [sum((c.columns("anacal")[name][c.good]).sum() for c in two) for name in ("e1", "de1_dg1")]
+    whole = expected(np.concatenate([part.view(np.ndarray) for part in two]))
     stacked = shearq.Catalogue.from_table(table.vstack([a.to_astropy(), b.to_astropy()]))
     joined = shearq.concatenate([a, b])
     for both in (stacked, joined, np.concatenate([a, b]), np.hstack([a, b]), np.append(a, b)):
         assert type(both) is shearq.Catalogue
         shear = both.mean_shear()
-        assert shear.g1 == pytest.approx(raw[0] / raw[1], rel=1e-12) and shear.galaxies == 126 and shear.flagged == 2
-        columns = both.columns("anacal")
-        assert columns["e1"][both.good].sum() / columns["de1_dg1"][both.good].sum() == pytest.approx(shear.g1, rel=1e-12)
-        ngmix = both.columns("ngmix")
-        assert ngmix["g"][both.good, 1].sum() / ngmix["R22"][both.good].sum() == pytest.approx(shear.g2, rel=1e-12)
+        assert list(shear) == pytest.approx(whole, rel=1e-12) and shear.galaxies == 126 and shear.flagged == 2
+        sums = {name: column[both.good].sum(axis=0) for name, column in {**both.columns("anacal"), **both.columns("ngmix")}.items()}
+        for e, responses in (
+            ([sums["e1"], sums["e2"]], ("de1_dg1", "de1_dg2", "de2_dg1", "de2_dg2")),
+            (sums["g"], ("R11", "R12", "R21", "R22")),
+        ):
+            matrix = np.reshape([sums[name] for name in responses], (2, 2))
+            assert np.linalg.solve(matrix, e).tolist() == pytest.approx(whole, rel=1e-12)
+        # The estimate of Rust: c without a true shear is the mean shear. Its sums are in another order.
+        for names in ("anacal", "ngmix"):
+            found = shearq.bias(both.columns(names), g1=0.0, g2=0.0)
+            assert [found["c1"], found["c2"]] == pytest.approx(whole, rel=1e-9), names
     assert str(shearq.mean_shear(iter(two))) == str(joined.mean_shear())
     weights = np.arange(128.0)
     assert shearq.mean_shear(two, weights).g1 == pytest.approx(joined.mean_shear(weights).g1, rel=1e-12)
@@ -84,8 +92,12 @@ def test_calibrated_rows_and_rows_without_calibration_can_be_joined(two):
     plain = two[0][list(network.dtype.names)]
     both = shearq.concatenate([plain, network])
     good = plain[plain.good]
-    e = (good["e1"] * good["divisor1"]).sum() + network["e1"][network.good].sum()
-    assert both.mean_shear().g1 == pytest.approx(e / (good["R11"].sum() + network.good.sum()), rel=1e-12)
+    # Rows without calibration have the unit matrix as their response.
+    e = [(good[f"e{k}"] * good[f"divisor{k}"]).sum() + network[f"e{k}"][network.good].sum() for k in (1, 2)]
+    response = [[good[f"R{j}{k}"].sum() + (j == k) * network.good.sum() for k in (1, 2)] for j in (1, 2)]
+    assert list(both.mean_shear()) == pytest.approx(np.linalg.solve(response, e).tolist(), rel=1e-12)
+    columns = both.columns("ngmix")
+    assert (columns["R12"][both.good][-network.good.sum() :] == 0).all()
 
 
 @pytest.mark.parametrize("ending", FILES)
@@ -176,6 +188,7 @@ def test_tables_of_other_codes_are_taken_by_their_names():
         ({"e1": [0.1], "e2": [0.1, 0.2]}, "expected columns of one length"),
         ({"e1": [0.1], "e2": [0.1], "R11": [1.0], "R22": [1.0]}, "Set divisor1 and divisor2"),
         ({"e1": ["a"], "e2": [0.1]}, "expected numbers"),
+        ({"e1": [0.1, 0.1, 0.2], "e2": [0.1, -10, -10]}, r"row 1 \(from 0\) has e2 = -10, which stands for a failed.*2 rows"),
     ):
         with pytest.raises(ValueError, match=message):
             shearq.Catalogue.from_table(wrong)
@@ -183,6 +196,20 @@ def test_tables_of_other_codes_are_taken_by_their_names():
         shearq.Catalogue.from_table(table, columns={"e1": "g"})
     with pytest.raises(TypeError, match="without fields"):
         shearq.Catalogue.from_table(np.zeros(3))
+
+
+def test_vectors_indices_and_lazy_frames_become_catalogues():
+    pandas, polars, pyarrow = (pytest.importorskip(name) for name in ("pandas", "polars", "pyarrow"))
+    g, ids = np.array([[0.1, 0.2], [0.3, 0.4]]), [2**60 + 1, 2**60 + 2]
+    rows = {"id": ids, "g": g.tolist()}
+    structured = np.array(list(zip(ids, g)), dtype=[("id", "i8"), ("g", "f8", 2)])
+    tables = [structured, pyarrow.table(rows), polars.DataFrame(rows), polars.LazyFrame(rows)]
+    for table in [*tables, pandas.DataFrame(rows), pandas.DataFrame(rows).set_index("id")]:
+        found = shearq.Catalogue.from_table(table, columns={"e1": "g[0]", "e2": "g[1]"})
+        assert found["e1"].tolist() == [0.1, 0.3] and found["e2"].tolist() == [0.2, 0.4], type(table)
+        assert found["id"].tolist() == ids and found["id"].dtype == np.int64, type(table)
+    nullable = pandas.DataFrame({"e1": pandas.array([0.1, None], dtype="Float64"), "e2": [0.1, 0.2]})
+    assert shearq.Catalogue.from_table(nullable)["flags"].tolist() == [0, shearq.Flag.NotFinite]
 
 
 def test_damaged_files_raise_and_print_nothing(two, tmp_path, capfd):

@@ -299,9 +299,10 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         Parameters
         ----------
         names : {'shearq', 'anacal', 'ngmix'}
-            ``'anacal'``: ``e1``, ``de1_dg1``, ``e2``, ``de2_dg2`` and ``flags``; ``'ngmix'``: ``g`` of shape (n, 2),
-            ``R11``, ``R22``, ``R12``, ``R21`` and ``flags``. In both, ellipticities are those before calibration: the
-            sum of ellipticities over the sum of responses is the shear. ``'shearq'``: all columns of the catalogue.
+            ``'anacal'``: ``e1``, ``e2``, responses ``de1_dg1``, ``de2_dg2``, ``de1_dg2``, ``de2_dg1`` and ``flags``;
+            ``'ngmix'``: ``g`` of shape (n, 2), ``R11``, ``R22``, ``R12``, ``R21`` and ``flags``. In both, ellipticities
+            are those before calibration: the shear is the inverse of the summed 2 × 2 responses times the summed
+            ellipticities. ``'shearq'``: all columns of the catalogue.
 
         Returns
         -------
@@ -310,11 +311,14 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         if names == "shearq":
             return {name: self[name] for name in self.dtype.names or ()}
         (e1, e2), (r11, r22) = raw(self)
+        known = all(name in (self.dtype.names or ()) for name in ("R12", "R21"))
+        cross = _cross(self) if known else []
         if names == "anacal":
-            return {"e1": e1, "de1_dg1": r11, "e2": e2, "de2_dg2": r22, "flags": self["flags"]}
+            responses = {"de1_dg1": r11, "de2_dg2": r22, **dict(zip(("de1_dg2", "de2_dg1"), cross))}
+            return {"e1": e1, "e2": e2, **responses, "flags": self["flags"]}
         if names == "ngmix":
-            cross: dict[str, NDArray[Any]] = {name: self[name] for name in ("R12", "R21") if name in (self.dtype.names or ())}
-            return {"g": np.stack([e1, e2], axis=-1), "R11": r11, "R22": r22, **cross, "flags": self["flags"]}
+            responses = {"R11": r11, "R22": r22, **dict(zip(("R12", "R21"), cross))}
+            return {"g": np.stack([e1, e2], axis=-1), **responses, "flags": self["flags"]}
         raise ValueError(f"names: found {names!r}; expected 'shearq', 'anacal' or 'ngmix'")
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -355,9 +359,10 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
 
         Parameters
         ----------
-        table : astropy, pandas or polars table, structured array, or mapping of names to arrays
+        table : astropy, pandas, polars or Arrow table, structured array, or mapping of names to arrays
             With at least e1 and e2. Without ``flags``, rows whose ellipticity is not finite are flagged. Without
-            ``R11`` and ``R22``, the ellipticities are treated as shears. Other columns are kept.
+            ``R11`` and ``R22``, the ellipticities are treated as shears. Other columns are kept, and an index of pandas
+            with a name. A vector ``g`` of two becomes the columns ``g[0]`` and ``g[1]``.
         columns : mapping of str to str, optional
             Names in the table of columns of the catalogue: ``{"e1": "g1_meas"}``.
 
@@ -368,7 +373,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         Raises
         ------
         ValueError
-            If a column is absent, columns have several lengths, or responses are there without divisors.
+            If a column is absent, columns have several lengths, responses are there without divisors, or an ellipticity
+            without ``flags`` stands for a failed measurement (−10, −99, 1e30).
         """
         found: Catalogue = _tables.from_table(Catalogue, table, columns)
         return found
