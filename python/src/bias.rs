@@ -18,8 +18,10 @@ use shearq_results::bias::{
 use shearq_results::expression::Expression;
 use shearq_results::views::bias::bias_table;
 
+use crate::errors::in_python;
+
 fn of_bias(error: BiasFailure) -> PyErr {
-    let message = error.to_string();
+    let message = in_python(&error.to_string());
     match message.contains("No such file or directory") {
         true => PyFileNotFoundError::new_err(message),
         false => PyValueError::new_err(message),
@@ -132,7 +134,10 @@ impl BiasSums {
         let errors = bootstrap.map_or(Errors::Jackknife, |draws| Errors::Bootstrap { draws, seed });
         py.detach(|| {
             let result = self.summed.clone().result(errors)?;
-            let table = bias_table(&result);
+            let mut table = bias_table(&result);
+            for note in &mut table.notes {
+                *note = in_python(note);
+            }
             let mut json = table.json();
             // The label of an axis.
             json["binned"] = result.binned.as_str().into();
@@ -168,7 +173,7 @@ pub(crate) fn bias_sums(
     for text in &columns {
         names
             .add(text)
-            .map_err(|fault| PyValueError::new_err(fault.replace("--columns", "columns")))?;
+            .map_err(|fault| PyValueError::new_err(in_python(&fault)))?;
     }
     let bins = match bins {
         None => None,

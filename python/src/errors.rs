@@ -47,6 +47,23 @@ pub(crate) fn of_pipeline(error: PipelineError) -> PyErr {
     }
 }
 
+/// Options of the command line whose arguments in Python have other names or values.
+const OPTIONS: [(&str, &str); 4] = [
+    ("--drop-missing", "drop_missing=True"),
+    ("--flip-g2", "flip_g2=True"),
+    ("--truth-sign ", "truth_sign="),
+    // Arguments of the same name. Paths may contain hyphens.
+    (" --", " "),
+];
+
+/// A message of the command line with the arguments of Python for its options.
+pub(crate) fn in_python(message: &str) -> String {
+    let options = OPTIONS.iter();
+    options.fold(message.to_owned(), |text, (option, argument)| {
+        text.replace(option, argument)
+    })
+}
+
 /// A failed allocation.
 pub(crate) fn no_memory(what: &str) -> PyErr {
     PyMemoryError::new_err(format!("there is no memory for {what}"))

@@ -1,10 +1,11 @@
 //! Ellipticities on a grid into spectra and metrics of merit.
 
 use ndarray::{Array2, ArrayView1};
-use numpy::{IntoPyArray, PyReadonlyArray1, ToPyArray};
+use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1, ToPyArray};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use shearq_quantities::MeasuredRange;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::views::metrics::FORMATS;
 use shearq_results::views::{diagnosis, rows};
@@ -16,7 +17,7 @@ use shearq_scoring::{
     sign_by_correlation, sign_by_modes,
 };
 
-use crate::errors::of_scoring;
+use crate::errors::{in_python, of_scoring};
 
 /// Names, headings and meanings of the metrics.
 #[pyfunction]
@@ -124,6 +125,27 @@ impl<'a> Rows<'a> {
     }
 }
 
+/// Rows that cannot be ellipticities.
+fn of_rows(fault: &str) -> PyErr {
+    // Arrays have NaN for what is missing.
+    let fault = fault.replace(
+        "name it as missing; otherwise set a largest |e|",
+        "set it to NaN",
+    );
+    PyValueError::new_err(format!("e1, e2: {}", in_python(&fault)))
+}
+
+/// Which values stand for a failed measurement of an ellipticity.
+#[pyfunction]
+pub(crate) fn failed<'py>(
+    py: Python<'py>,
+    values: PyReadonlyArray1<'py, f64>,
+) -> Bound<'py, PyArray1<bool>> {
+    let range = MeasuredRange::ELLIPTICITY;
+    let failed = values.as_array().mapv(|value| range.excludes(value));
+    failed.into_pyarray(py)
+}
+
 /// Scores images of `n` × `n` galaxies against their true shear, both in the order of the grid, x running
 /// fastest, or the images at positions. Returns all metrics, spectra and counts by name.
 #[pyfunction]
@@ -178,7 +200,7 @@ pub(crate) fn score<'py>(
             )));
         }
         if let Some(fault) = rows::fault(&counts, &grid) {
-            return Err(PyValueError::new_err(format!("e1, e2: {fault}")));
+            return Err(of_rows(&fault));
         }
         let mut warnings = rows::oddities(&counts, "e1, e2");
         let by_modes = sign_by_modes(&grid, &truth).map_err(of_scoring)?;
@@ -308,10 +330,19 @@ pub(crate) fn spectrum<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let grid = grid(n, stamp, field_degrees)?;
     let definition = self::definition(definition)?;
-    let rows = Rows::new(&e, positions.as_ref(), lengths);
+    let catalogue = Rows::new(&e, positions.as_ref(), lengths);
     let (all, modes) = py.detach(|| {
         let mut images = SetImages::new(&grid);
-        rows.each(&grid, |image, _| images.add(image).map_err(of_scoring))?;
+        let mut counts = RowCounts::default();
+        catalogue.each(&grid, |image, rows| {
+            counts += rows;
+            images.add(image).map_err(of_scoring)
+        })?;
+        // Any field has a spectrum, but not numbers for failures.
+        let failed = (counts.sentinels > 0).then(|| rows::fault(&counts, &grid));
+        if let Some(fault) = failed.flatten() {
+            return Err(of_rows(&fault));
+        }
         let total = images.total();
         let scale = 1.0 / total.images.max(1) as f64;
         let standard = Convention::STANDARD;

@@ -113,7 +113,8 @@ def test_measured_catalogues_are_calibrated_by_their_divisors(image):
         ({"design": "pair"}, "design: found \"pair\""),
         ({"columns": {"e1": "shape"}}, "there is no column `shape`"),
         ({"columns": {"e9": "shape"}}, "unknown role"),
-        ({"ellipticity": "e"}, "ellipticity: found 'e'"),
+        ({"ellipticity": "e"}, 'ellipticity: found "e"'),
+        ({"columns": {"e1": "g1", "e2": "g2"}}, "there is no column `g1`"),
         ({"truth": "absent.csv"}, "expected one of them"),
         ({"flip_g2": True}, "follows minus the true g2"),
     ],
@@ -136,6 +137,166 @@ def test_odd_tables_are_refused():
     with pytest.raises(ValueError, match="row 6: e1 is NaN"):
         shearq.bias(table, g1=0.02, g2=0.01)
     assert shearq.bias(table, g1=0.02, g2=0.01, drop_missing=True)["n"] == 1999
+
+
+def vectors(table):
+    """The ellipticities as one column of vectors of two."""
+    rest = {name: column for name, column in table.items() if name not in ("e1", "e2")}
+    return {**rest, "g": np.stack([table["e1"], table["e2"]], axis=1)}
+
+
+def test_vectors_of_two_are_ellipticities_in_any_table(pair):
+    shears = {"g1": [0.02, -0.02], "g2": [0.01, -0.01]}
+    expected = shearq.bias(pair, **shears).rows
+
+    def structured(table):
+        kinds = [(name, column.dtype, column.shape[1:]) for name, column in table.items()]
+        found = np.empty(len(table["id"]), dtype=kinds)
+        for name, column in table.items():
+            found[name] = column
+        return found
+
+    def with_list(make):
+        return lambda table: make({**table, "g": table["g"].tolist()})
+
+    def fixed(table):
+        flat = pyarrow.array(table["g"].ravel())
+        return pyarrow.table({**table, "g": pyarrow.FixedSizeListArray.from_arrays(flat, 2)})
+
+    lists = (pandas.DataFrame, polars.DataFrame, polars.LazyFrame, pyarrow.table, pyarrow.RecordBatch.from_pydict)
+    for make in (dict, Table, lambda t: Table(t, masked=True), structured, polars.DataFrame, fixed, *map(with_list, lists)):
+        tables = [make(vectors(table)) for table in pair]
+        assert shearq.bias(tables, **shears).rows == expected, make
+        assert shearq.bias(tables, columns={"e1": "g[0]", "e2": "g[1]"}, **shears).rows == expected, make
+    renamed = [{("v" if name == "g" else name): column for name, column in vectors(table).items()} for table in pair]
+    assert shearq.bias(renamed, columns={"e1": "v[0]", "e2": "v[1]"}, **shears).rows == expected
+
+
+LONG = 10**18
+
+
+@pytest.mark.parametrize("first", [LONG, 2**63], ids=["int64", "uint64"])
+def test_long_identifiers_and_texts_are_units(first):
+    # Ten rows for each of 200 galaxies that share their noise: merged galaxies would make the errors too small.
+    random = np.random.default_rng(5)
+    own = np.repeat(np.arange(200), 10)
+    e = random.normal(0, 0.1, (2, 200))[:, own]
+    table = {"e1": e[0] + 0.02, "e2": e[1] + 0.01}
+
+    def error(units, make=dict):
+        found = shearq.bias(make({**table, "unit": units}), g1=0.02, g2=0.01, units="unit")
+        # Units in another order have other rounding errors, 10⁻¹⁶ times the number of additions.
+        return found.rows[0]["units"], pytest.approx(found["m1_error"], rel=1e-12)
+
+    expected = error(own)
+    assert expected == (200, pytest.approx(0.1 / np.sqrt(200) / 0.02, rel=0.2))
+    expected = (200, expected[1].expected)
+    long = np.array([first + int(k) for k in own], dtype=np.int64 if first < 2**63 else np.uint64)
+    for make in (dict, Table, pandas.DataFrame, polars.DataFrame, polars.LazyFrame, pyarrow.table):
+        assert error(long, make) == expected, make
+    masked = np.ma.masked_array(long, mask=np.zeros(len(long), dtype=bool))
+    assert error(masked) == error(masked, Table) == expected
+    nullable = "Int64" if first < 2**63 else "UInt64"
+    assert error(pandas.array(long, dtype=nullable), pandas.DataFrame) == expected
+    names = np.array([f"tile {k}" for k in own])
+    for texts in (names, names.astype("S"), names.astype(object), np.ma.masked_array(names, mask=False)):
+        assert error(texts) == expected
+    for make in (Table, pandas.DataFrame, polars.DataFrame, pyarrow.table):
+        assert error(names, make) == expected
+    assert error(pandas.array(names, dtype="string"), pandas.DataFrame) == error(pandas.Categorical(names), pandas.DataFrame) == expected
+
+
+def test_missing_values_of_all_packages_do_not_count(pair):
+    table = pair[0]
+    shear = {"g1": 0.02, "g2": 0.01}
+    gone = table["id"] == 5
+    values = [None if missing else value for missing, value in zip(gone, table["e1"].tolist())]
+    # Integers with missing ones must not become floats, which merge the other identifiers.
+    long = [None if missing else LONG + k for k, missing in enumerate(gone)]
+    for make in (
+        polars.DataFrame,
+        pyarrow.table,
+        lambda columns: pandas.DataFrame({**columns, "e1": pandas.array(columns["e1"], dtype="Float64"), "id": pandas.array(long, dtype="Int64")}),
+    ):
+        odd = make({**table, "e1": values, "id": long})
+        with pytest.raises(ValueError, match="row 6: e1 is NaN.*Try: drop_missing=True"):
+            shearq.bias(odd, **shear)
+        found = shearq.bias(odd, drop_missing=True, **shear)
+        assert found["n"] == found["units"] == 1999
+        assert "Left out: 1 rows with missing numbers." in found.notes
+
+
+def test_an_index_with_a_name_is_a_column():
+    table = {**catalogue((0.02, 0.01)), "g1": np.full(2000, 0.02), "g2": np.full(2000, 0.01)}
+    expected = shearq.bias(table, units="id").rows
+    frame = pandas.DataFrame(table)
+    for indexed in (frame.set_index("id"), frame.set_index(["id", "w"]), frame.set_index("id", drop=False)):
+        assert shearq.bias(indexed, units="id").rows == expected
+
+
+def test_masked_true_shears_are_refused():
+    table = {**catalogue((0.02, 0.01)), "g2": np.full(2000, 0.01)}
+    masked = np.ma.masked_array(np.full(2000, 0.02), mask=np.arange(2000) == 7)
+    with pytest.raises(ValueError, match=r"row 8: this is no shear \(found g1 NaN"):
+        shearq.bias(Table({**table, "g1": masked}))
+    with pytest.raises(ValueError, match="found masked values"):
+        shearq.bias([table, table], g1=masked[7:9], g2=[0.01, 0.01])
+
+
+@pytest.mark.parametrize("column, value", [("e1", -10.0), ("e2", -99.0), ("e1", 1e30), ("R11", -9999.0), ("w", 1e30)])
+def test_failure_values_are_refused_or_dropped_and_counted(column, value):
+    table = catalogue((0.02, 0.01))
+    shears = {"g1": 0.02, "g2": 0.01}
+    wrong = {**table, column: np.where(np.isin(table["id"], (5, 9)), value, table[column])}
+    with pytest.raises(ValueError, match=f"row 6: column `{column}` is .* failed measurement .*Try: drop_missing=True"):
+        shearq.bias(wrong, **shears)
+    found = shearq.bias(wrong, drop_missing=True, **shears)
+    good = {name: values[~np.isin(table["id"], (5, 9))] for name, values in table.items()}
+    expected = shearq.bias(good, **shears)
+    same_values = {key: value for key, value in found.rows[0].items() if key != "bin"}
+    assert same_values == {key: expected.rows[0][key] for key in same_values}
+    assert "Left out: 2 rows with numbers that stand for failed measurements." in found.notes
+
+
+def test_a_column_has_one_role():
+    table = {**catalogue((0.02, 0.01)), "g1": np.full(2000, 0.02), "g2": np.full(2000, 0.01)}
+    with pytest.raises(ValueError, match="`g1`") as raised:
+        shearq.bias(table, columns={"e1": "g1", "e2": "g2"})
+    assert "--" not in str(raised.value)
+
+
+def test_the_response_is_a_matrix_and_the_mean_shear_agrees():
+    # (ΣwR)⁻¹Σwe, solved by numpy; with R11 and R22 alone, the true m of 0 would be 0.1/0.8 = 0.125.
+    random = np.random.default_rng(8)
+    w = random.uniform(0.5, 1.5, 2000)
+    matrix = np.array([[0.8, 0.1], [0.1, 0.7]]) + 0.05 * random.normal(size=(2000, 2, 2))
+    e = matrix @ [0.02, 0.02] + random.normal(0, 1e-4, (2000, 2))
+    shear = np.linalg.solve(np.einsum("i,ijk->jk", w, matrix), w @ e)
+    table = {"e1": e[:, 0], "e2": e[:, 1], "w": w, "a": matrix[:, 0, 1], "b": matrix[:, 1, 0]}
+    table |= {"R11": matrix[:, 0, 0], "R22": matrix[:, 1, 1]}
+    found = shearq.bias(table, g1=0.0, g2=0.0, columns={"R12": "a", "R21": "b"})
+    # Sums of 2000 numbers in another order.
+    assert [found["c1"], found["c2"]] == pytest.approx(shear.tolist(), rel=1e-11)
+    known = shearq.bias(table, g1=0.02, g2=0.02, columns={"R12": "a", "R21": "b"})
+    assert abs(known["m1"]) < 1e-3 and shearq.bias(table, g1=0.02, g2=0.02, columns={"R12": "none", "R21": "none"})["m1"] > 0.1
+    own = {"R12": table["a"], "R21": table["b"], "flags": np.zeros(2000), "divisor1": np.ones(2000), "divisor2": np.ones(2000)}
+    rows = shearq.Catalogue.from_table({**{name: table[name] for name in ("e1", "e2", "R11", "R22")}, **own})
+    assert list(rows.mean_shear(w)) == pytest.approx(shear.tolist(), rel=1e-12)
+
+
+@pytest.mark.parametrize("role", ["rms_e", "sigma_e"])
+def test_responsivity_uses_its_columns(role):
+    # Mandelbaum et al. 2018, equation 10: ⟨χ⟩/2ℛ with ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩ and e_rms² = ⟨χ²⟩/2 without the noise.
+    random = np.random.default_rng(2)
+    w, scatter = random.uniform(0.5, 1.5, 4000), random.uniform(0.3, 0.4, 4000)
+    e = random.normal(0.02, 0.1, (2, 4000))
+    table = {"e1": e[0], "e2": e[1], "w": w, "scatter": scatter}
+    found = shearq.bias(table, g1=0.0, g2=0.0, ellipticity="responsivity", columns={role: "scatter"})
+    squares = scatter**2 if role == "rms_e" else (e**2).sum(axis=0) / 2 - scatter**2
+    expected = e @ w / (2 * (w @ (1 - squares)))
+    # Sums of 4000 numbers in another order.
+    assert [found["c1"], found["c2"]] == pytest.approx(expected.tolist(), rel=1e-11)
+    assert any("scatter" in note and "ℛ" in note for note in found.notes)
 
 
 def test_results_are_shown(pair):

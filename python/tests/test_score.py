@@ -125,6 +125,28 @@ def test_missing_galaxies_are_warned_of(wave):
         assert shearq.score(e1, g2, g1, g2)["m_cross"] < 0
 
 
+@pytest.mark.parametrize("value", [-10.0, -99.0, 1e20, 1e30])
+def test_failure_values_are_refused_or_dropped_and_counted(wave, value):
+    g1, g2 = wave
+    e1 = np.stack([g1, g1])
+    e1[1, 3, 8] = value
+    images = (e1, np.stack([g2, g2]))
+    for function, more in ((shearq.score, (g1, g2)), (shearq.power_spectrum, ())):
+        with pytest.raises(ValueError, match=r"1 rows have a number that no .* row 57 with .*try drop_missing=True or set it to NaN"):
+            function(*images, *more)
+    missing = np.where(e1 == value, np.nan, e1)
+    with pytest.warns(UserWarning, match="1 of 512 galaxies of e1, e2 have no ellipticity"):
+        expected = shearq.score(missing, images[1], g1, g2)
+        found = shearq.score(*images, g1, g2, drop_missing=True)
+    assert same_bits(list(found.metrics.values()), list(expected.metrics.values()))
+    assert (found.dropped, expected.dropped) == (1, 0)
+    assert found.notes[-1] == "note: 1 of 512 rows stand for a failed measurement; they count as missing."
+    spectra = shearq.power_spectrum(*images, drop_missing=True), shearq.power_spectrum(missing, images[1])
+    assert same_bits(*spectra)
+    with pytest.raises(ValueError, match="truth_g1: found masked values"):
+        shearq.score(g1, g2, np.ma.masked_array(g1, mask=g1 > 0.01), g2)
+
+
 def test_a_constant_shear_gives_means():
     constant = np.full((12, 12), 0.02)
     e1 = constant + np.random.default_rng(1).normal(0, 0.1, (12, 12))

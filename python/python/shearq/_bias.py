@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, Union
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from . import _display, _shearq
+from ._tables import _EXACT, is_missing, named_columns
 
 Design = Literal["single", "pairs", "arms", "fields", "galaxies", "rotated"]
 Bins = tuple[str, Union[int, Sequence[float]]]
@@ -151,10 +151,20 @@ def bias(
     truth : path
         Table of true shears with the columns id, g1, g2 or x, y, g1, g2.
     columns : mapping
-        Names of columns by role, such as ``{"e1": "g_1", "w": "weight"}``; ``"none"`` ignores a column.
+        Names of columns by role, such as ``{"e1": "g_1", "w": "weight"}``; ``"none"`` ignores a column, and ``"g[0]"`` is
+        the first number of a vector. No column may have two roles. Roles:
+
+        * ``e1 e2`` ellipticity, ``w`` weight, ``flag`` (0 for good rows), ``id`` of the galaxy, ``unit`` of the errors;
+        * ``R11 R22 R12 R21`` response, R12 that of e1 to g2; ``dw1 dw2`` derivatives of the weight; ``divisor1 divisor2``
+          what e1 and e2 were divided by;
+        * ``rms_e sigma_e`` standard deviation of a distortion without noise, and its noise, for ``'responsivity'``;
+          ``ksb_e1 ksb_e2`` shears of rows without a distortion;
+        * ``g1 g2`` true shear, ``x y`` position (px), ``psf_e1 psf_e2 psf_size`` of the PSF;
+        * ``version`` (noshear, 1p, 1m, 2p, 2m), or ``e1_1p e1_1m e2_2p e2_2m e1_2p e1_2m e2_1p e2_1m`` under artificial
+          shears.
     ellipticity : {'shear', 'distortion', 'responsivity'}
         Type of e1 and e2; recognised by default. ``'distortion'`` converts each to a shear, ``'responsivity'`` divides the
-        mean distortion by 2(1 − e_rms²).
+        mean distortion by 2(1 − ⟨e_rms²⟩), with e_rms in ``rms_e``, or else e_rms² = ⟨χ²⟩/2 − ⟨σ²⟩ with σ in ``sigma_e``.
     flip_g2 : bool
         Use minus the true g2.
     bins : (str, int or sequence of float)
@@ -170,7 +180,8 @@ def bias(
     units : str
         Independent units of the errors: ``"rows"``, ``"catalogues"`` or a column.
     drop_missing : bool
-        Leave out rows with missing numbers or without a true shear.
+        Leave out rows with missing numbers, with numbers that stand for a failed measurement (−10, −99, 1e30), or without
+        a true shear. The notes count them.
     step : float
         Artificial shear of metacalibration.
     bootstrap, seed : int
@@ -179,7 +190,8 @@ def bias(
     Raises
     ------
     ValueError
-        If a column is absent, a number is missing in a row without a flag, the ellipticities do not follow the true shear,
+        If a column is absent or has two roles, a number is missing or stands for a failed measurement in a row without a
+        flag, the ellipticities do not follow the true shear,
         or a mean response has less than five standard errors.
     """
     sums = bias_sums(
@@ -253,10 +265,10 @@ def bias_sums(
 
 
 def _several(catalogues: Any) -> Iterable[Any]:
-    if isinstance(catalogues, (str, os.PathLike, Mapping, np.ndarray)) or hasattr(catalogues, "columns"):
+    if isinstance(catalogues, (str, os.PathLike, Mapping, np.ndarray)) or not isinstance(catalogues, Iterable):
         return [catalogues]
-    if hasattr(catalogues, "schema") or not isinstance(catalogues, Iterable):
-        # Arrow tables and record batches.
+    # Of the class, because a LazyFrame warns if it is asked for its columns.
+    if any(hasattr(type(catalogues), name) for name in ("columns", "colnames", "schema")):
         return [catalogues]
     return catalogues
 
@@ -265,71 +277,47 @@ def _catalogue(name: str, table: Any) -> str | tuple[str, list[tuple[str, Any]]]
     """A path, or a name with columns of float64 or of text."""
     if isinstance(table, (str, os.PathLike)):
         return os.fspath(table)
-    if type(table).__name__ == "LazyFrame":
-        table = table.collect()
-    if any(name is not None for name in getattr(getattr(table, "index", None), "names", ())):
-        # An index with a name is a column, such as the identifier of the galaxy.
-        table = table.reset_index()
-    if isinstance(table, Mapping):
-        names = list(table)
-    elif isinstance(table, np.ndarray):
-        names = list(table.dtype.names or ())
-    elif hasattr(table, "schema") and hasattr(table.schema, "names") and not hasattr(table, "with_columns"):
-        names = list(table.schema.names)
-        table = {column: table.column(column).to_numpy(zero_copy_only=False) for column in names} if hasattr(
-            table, "num_columns"
-        ) else table
-    else:
-        names = [str(column) for column in getattr(table, "colnames", getattr(table, "columns", ()))]
-    columns = []
-    for column in names:
-        for label, own in _components(str(column), table[column]):
-            values = _values(own)
-            if values is not None:
-                columns.append((label, values))
+    try:
+        given = named_columns(table)
+    except TypeError:
+        given = []
+    columns = [(label, values) for label, own in given if (values := _values(own)) is not None]
     if not columns:
         raise ValueError(f"{name}: found {type(table).__name__} without columns of numbers; expected a table with e1 and e2")
     return name, columns
 
 
-# Longest vector whose numbers are columns; longer ones are stamps.
-_MAX_VECTOR = 8
-
-
-def _components(name: str, column: Any) -> list[tuple[str, Any]]:
-    """The columns ``g[0]`` and ``g[1]`` of a vector ``g``, or the column itself."""
-    array = column if isinstance(column, np.ma.MaskedArray) else np.asarray(column)
-    if array.ndim == 1 and array.dtype.kind == "O" and len(array) and np.ndim(array[0]) == 1 and not isinstance(array[0], str):
-        # Lists of Arrow, pandas and polars.
-        lengths = {np.size(value) for value in array}
-        if len(lengths) == 1:
-            array = np.stack([np.asarray(value) for value in array])
-    if array.ndim == 2 and 2 <= array.shape[1] <= _MAX_VECTOR:
-        return [(f"{name}[{k}]", array[:, k]) for k in range(array.shape[1])]
-    return [(name, column)]
-
-
-def _values(column: ArrayLike) -> Any:
-    """A contiguous column of float64, a list of text, or None for anything else. Integers that float64 does not contain,
-    such as identifiers of Rubin, become text."""
-    if isinstance(column, np.ma.MaskedArray):
-        if column.dtype.kind not in "fiub" or column.ndim != 1:
-            return None
-        return np.ascontiguousarray(np.ma.filled(column.astype(np.float64), np.nan))
-    array = np.asarray(column)
-    if array.ndim != 1:
+def _values(column: Any) -> Any:
+    """A contiguous column of float64 with NaN for missing numbers, a list of text, or None for anything else. Integers
+    that float64 does not contain, such as identifiers of Rubin, become text; missing texts are empty."""
+    if column.ndim != 1:
         return None
-    if array.dtype.kind in "iu" and array.size and max(int(array.max()), -int(array.min())) > 2**53:
-        return [str(value) for value in array.tolist()]
-    if array.dtype.kind in "fiub":
-        return np.ascontiguousarray(array, dtype=np.float64)
-    if array.dtype.kind in "US" or (array.dtype.kind == "O" and all(isinstance(value, str) for value in array)):
-        return [value.decode() if isinstance(value, bytes) else str(value) for value in array]
+    missing = np.zeros(len(column), dtype=bool)
+    if isinstance(column, np.ma.MaskedArray):
+        missing = np.ma.getmaskarray(column)
+        column = column.data
+    array = np.asarray(column)
     if array.dtype.kind == "O":
-        try:
-            return np.ascontiguousarray(array, dtype=np.float64)
-        except (TypeError, ValueError):
-            return None
+        missing = missing | np.array([is_missing(value) for value in array], dtype=bool)
+        present = array[~missing]
+        if all(isinstance(value, (int, np.integer)) for value in present):
+            filled = [0 if gone else int(value) for gone, value in zip(missing, array)]
+            array = np.array(filled, dtype=object if max(map(abs, filled), default=0) > _EXACT else np.float64)
+        elif not all(isinstance(value, (str, bytes)) for value in present):
+            try:
+                array = np.array([np.nan if gone else value for gone, value in zip(missing, array)], dtype=np.float64)
+            except (TypeError, ValueError):
+                return None
+    if array.dtype.kind in "iu" and array.size:
+        known = array[~missing] if missing.any() else array
+        if known.size and max(int(known.max()), -int(known.min())) > _EXACT:
+            array = array.astype(object)
+    if array.dtype.kind in "fiub":
+        reals = np.ascontiguousarray(array, dtype=np.float64)
+        return np.where(missing, np.nan, reals) if missing.any() else reals
+    if array.dtype.kind in "USO":
+        texts = (value.decode() if isinstance(value, bytes) else str(value) for value in array.tolist())
+        return ["" if gone else text for gone, text in zip(missing, texts)]
     return None
 
 

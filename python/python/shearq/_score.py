@@ -44,6 +44,8 @@ class Score:
         ``true_ee``, ``true_bb``, ``noise`` (NaN where unknown), and ``to_c_l``, by which they become C_ℓ in steradian.
     images : int
         Images averaged over.
+    dropped : int
+        Rows with a number that stands for a failed measurement, which drop_missing left out.
     noise_variance : float or None
         Variance of the ellipticities' noise per component, galaxy and image.
     convention : int
@@ -62,11 +64,12 @@ class Score:
         What was odd about the rows.
     """
 
-    def __init__(self, found: dict[str, Any]) -> None:
+    def __init__(self, found: dict[str, Any], dropped: int = 0) -> None:
         self.metrics: dict[str, float] = found["metrics"]
         self.errors: dict[str, float] = found["errors"]
         self.spectrum: NDArray[np.void] = _table(found["spectrum"])
         self.images: int = found["images"]
+        self.dropped = dropped
         self.noise_variance: float | None = found["noise_variance"]
         self.convention: int = found["convention"]
         self.q_leaderboard: float = found["q_leaderboard"]
@@ -146,6 +149,7 @@ def score(
     convention: int | Literal["matched", "best"] = 5,
     noise_variance: float | None = None,
     truth_sign: Literal["standard", "challenge"] | None = None,
+    drop_missing: bool = False,
 ) -> Score:
     """Score ellipticities against the true shear.
 
@@ -177,6 +181,9 @@ def score(
         `simulate` writes has the standard sign. By default it is determined like on the command line: by the sign in
         which the shear is an E-mode field, or else by the sign with which e2 correlates. If both are unclear, it is
         the standard sign.
+    drop_missing : bool
+        Count galaxies with a number that stands for a failed measurement as missing: whole numbers beyond ±5, such as
+        −10 or −99, and any beyond ±5000.
 
     Returns
     -------
@@ -186,7 +193,7 @@ def score(
     ------
     ValueError, TypeError
         If shapes do not fit, the truth is not finite or |g| ≥ 1, no galaxy has an ellipticity, or ellipticities are
-        other quantities.
+        other quantities or stand for a failed measurement.
 
     Warns
     -----
@@ -203,6 +210,7 @@ def score(
             raise ValueError(f"{name}: found an array of shape {shown(shape)}; expected (n, n) or (n²,)")
     n = _side("truth_g1", g1.size)
     cell, rows, where, lengths = _rows(e1, e2, n, images, positions, stamp)
+    rows, dropped = _without_failures(rows) if drop_missing else (rows, 0)
     if truth_sign not in (None, "standard", "challenge"):
         raise ValueError(f"truth_sign: found {truth_sign!r}; expected 'standard', 'challenge' or None")
     found = Score(
@@ -220,12 +228,15 @@ def score(
             None
             if noise_variance is None
             else real("noise_variance", noise_variance, "a finite number, zero or more", least=0.0),
-        )
+        ),
+        dropped,
     )
     for note in found.notes:
         # A constant shear is no fault; the note is kept.
         if found.mean is None or not note.startswith("note: the true shear"):
             warn(note, UserWarning)
+    if dropped:
+        found.notes.append(f"note: {dropped} of {rows[0].size} rows stand for a failed measurement; they count as missing.")
     return found
 
 
@@ -239,12 +250,13 @@ def power_spectrum(
     stamp: float | None = None,
     cells: int | None = None,
     definition: Definition = "leaderboard",
+    drop_missing: bool = False,
 ) -> NDArray[np.void]:
     """E, B and EB bandpowers of the mean of images.
 
     Parameters
     ----------
-    e1, e2, field_degrees, images, positions, stamp, definition
+    e1, e2, field_degrees, images, positions, stamp, definition, drop_missing
         As for :func:`score`. Galaxies without an ellipticity count as zero.
     cells : int, optional
         Cells a side of the grid, where the shapes of e1 and e2 do not tell it.
@@ -257,6 +269,7 @@ def power_spectrum(
     """
     n = _cells(np.shape(e1), images, positions) if cells is None else whole("cells", cells, 1, 1 << 16)
     cell, rows, where, lengths = _rows(e1, e2, n, images, positions, stamp)
+    rows = _without_failures(rows)[0] if drop_missing else rows
     return _table(_shearq.spectrum(n, cell, degrees(field_degrees), rows, where, lengths, _text("definition", definition)))
 
 
@@ -400,6 +413,12 @@ def _cells(shape: tuple[int, ...], images: Any, positions: Any) -> int:
 
 
 _Pair = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def _without_failures(rows: _Pair) -> tuple[_Pair, int]:
+    """The rows with NaN for those that stand for a failed measurement, and their number."""
+    failed = _shearq.failed(rows[0]) | _shearq.failed(rows[1])
+    return (np.where(failed, np.nan, rows[0]), np.where(failed, np.nan, rows[1])), int(failed.sum())
 
 
 def _rows(

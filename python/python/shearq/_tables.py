@@ -57,6 +57,86 @@ def to_polars(catalogue: Any) -> polars.DataFrame:
     return polars.DataFrame(_columns(catalogue))
 
 
+# Longest vector whose numbers are columns; longer ones are stamps.
+_MAX_VECTOR = 8
+
+
+def named_columns(table: Any) -> list[tuple[str, Any]]:
+    """The columns of a table of any package by name, and ``g[0]`` and ``g[1]`` of a vector ``g``.
+
+    Raises TypeError for anything that is no table.
+    """
+    found: list[tuple[Any, Any]] = []
+    if type(table).__name__ == "LazyFrame":
+        table = table.collect()
+    if isinstance(table, np.ndarray):
+        if table.dtype.names is None:
+            raise TypeError("table: found an array without fields; expected a structured array")
+        found = [(name, table[name]) for name in table.dtype.names]
+    elif isinstance(table, Mapping):
+        found = list(table.items())
+    elif hasattr(table, "num_columns") and hasattr(table, "schema"):
+        # Tables and record batches of Arrow.
+        found = [(name, table.column(name)) for name in table.schema.names]
+    else:
+        # pandas and polars have `columns`, and astropy has `colnames`.
+        names = getattr(table, "colnames", getattr(table, "columns", None))
+        if names is None:
+            raise TypeError(f"table: found {type(table).__name__}; expected a table with columns")
+        # An index of pandas with a name is a column, such as the identifier of the galaxy.
+        index = getattr(table, "index", None)
+        own = [name for name in getattr(index, "names", ()) if name is not None and name not in names]
+        found = [(name, index.get_level_values(name)) for name in own]
+        found += [(name, table[name]) for name in names]
+    return [part for name, column in found for part in _components(str(name), _in_memory(column))]
+
+
+def _in_memory(column: Any) -> Any:
+    """A masked array or an array; of integers with missing ones an array of objects, because numpy would make floats,
+    which merge identifiers above 2^53."""
+    if isinstance(column, np.ma.MaskedArray):
+        return column
+    kind = str(getattr(column, "type", getattr(column, "dtype", ""))).lower()
+    if kind.startswith(("int", "uint")) and _has_missing(column):
+        values = column.to_pylist() if hasattr(column, "to_pylist") else column.to_list()
+        return np.array([None, *values], dtype=object)[1:]
+    if hasattr(column, "num_chunks") or hasattr(column, "to_pylist"):
+        return column.to_numpy(zero_copy_only=False)
+    return np.asarray(column)
+
+
+def _has_missing(column: Any) -> bool:
+    if hasattr(column, "isna"):
+        return bool(column.isna().any())
+    # An attribute in Arrow, and a method in polars.
+    count = getattr(column, "null_count", 0)
+    return bool(count() if callable(count) else count)
+
+
+def _components(name: str, array: Any) -> list[tuple[str, Any]]:
+    """The columns ``g[0]`` and ``g[1]`` of a vector ``g``, or the column itself."""
+    if array.ndim == 1 and array.dtype.kind == "O":
+        # Lists of Arrow, pandas and polars.
+        first = next((value for value in array if not is_missing(value)), "")
+        if not isinstance(first, (str, bytes)) and np.ndim(first) == 1:
+            rows = [np.full(len(first), np.nan) if is_missing(value) else np.asarray(value) for value in array]
+            if all(row.shape == rows[0].shape for row in rows):
+                array = np.stack(rows)
+    if array.ndim == 2 and 2 <= array.shape[1] <= _MAX_VECTOR:
+        return [(f"{name}[{k}]", array[:, k]) for k in range(array.shape[1])]
+    return [(name, array)]
+
+
+def is_missing(value: Any) -> bool:
+    """Whether an object stands for a missing value: None, NaN, and those of numpy and pandas."""
+    return (
+        value is None
+        or value is np.ma.masked
+        or type(value).__name__ in ("NAType", "NaTType")
+        or (isinstance(value, (float, np.floating)) and bool(np.isnan(value)))
+    )
+
+
 def _plain(name: str, column: Any) -> np.ndarray[Any, Any]:
     """A column as an array; missing reals are NaN."""
     if isinstance(column, np.ma.MaskedArray):
@@ -65,34 +145,36 @@ def _plain(name: str, column: Any) -> np.ndarray[Any, Any]:
         if column.dtype.kind != "f":
             raise ValueError(f"table: values of {name} are missing; expected all")
         return np.asarray(column.filled(np.nan))
-    array = column.to_numpy() if hasattr(column, "to_numpy") else np.asarray(column)
-    if array.dtype.kind == "O":
-        # Words.
-        array = np.array([str(value) for value in array], dtype=np.str_)
-    return np.asarray(array)
+    array = np.asarray(column)
+    if array.dtype.kind == "O" and array.ndim == 1:
+        missing = [is_missing(value) for value in array]
+        if any(missing):
+            # Reals with missing ones, of pandas' own types.
+            try:
+                return np.array([np.nan if gone else value for gone, value in zip(missing, array)], dtype=np.float64)
+            except (TypeError, ValueError):
+                raise ValueError(f"table: values of {name} are missing; expected all") from None
+        whole = all(isinstance(value, (int, np.integer)) for value in array)
+        # Words, or whole numbers of pandas' own types.
+        return np.array(array.tolist()) if whole else np.array([str(value) for value in array], dtype=np.str_)
+    return array
 
 
 def from_table(cls: Any, table: Any, columns: Mapping[str, str] | None = None) -> Any:
     if isinstance(table, cls) and not columns:
         return table.copy()
-    if isinstance(table, np.ndarray):
-        if table.dtype.names is None:
-            raise TypeError("table: found an array without fields; expected a structured array")
-        names = list(table.dtype.names)
-    else:
-        # pandas and polars have `columns`, and astropy has `colnames`.
-        names = list(getattr(table, "colnames", getattr(table, "columns", table)))
+    all_columns = dict(named_columns(table))
     metadata = getattr(table, "attrs", getattr(table, "meta", {}))
-    absent = [name for name in (columns or {}).values() if name not in names]
+    absent = [name for name in (columns or {}).values() if name not in all_columns]
     if absent:
-        raise ValueError(f"columns: no {', '.join(absent)} in the table; expected some of {', '.join(map(str, names))}")
+        raise ValueError(f"columns: no {', '.join(absent)} in the table; expected some of {', '.join(all_columns)}")
     # The names of the catalogue for those of the table.
     given = {found: own for own, found in (columns or {}).items()}
     taken = set(given)
     found = {
-        given.get(name, str(name)): _plain(str(name), table[name])
-        for name in names
-        if name in taken or str(name) not in given.values()
+        given.get(name, name): _plain(name, column)
+        for name, column in all_columns.items()
+        if name in taken or name not in given.values()
     }
     return build(cls, found, _schema.to_attrs(metadata))
 
@@ -127,6 +209,14 @@ def build(cls: Any, found: dict[str, Any], attrs: dict[str, Any]) -> Any:
     except (TypeError, ValueError) as error:
         raise ValueError(f"table: {error}; expected numbers") from None
     if "flags" not in arrays:
+        for name in ("e1", "e2"):
+            failed = _shearq.failed(np.ascontiguousarray(arrays[name]))
+            if failed.any():
+                row = int(failed.argmax())
+                raise ValueError(
+                    f"table: row {row} (from 0) has {name} = {arrays[name][row]:g}, which stands for a failed measurement, as"
+                    f" {int(failed.sum())} rows have; expected ellipticities. Try: NaN for them, or a column flags"
+                )
         finite = np.isfinite(arrays["e1"]) & np.isfinite(arrays["e2"])
         arrays["flags"] = np.where(finite, 0, _schema.NOT_FINITE).astype(np.int32)
     catalogue = np.empty(rows, dtype=[(name, array.dtype) for name, array in arrays.items()]).view(cls)
