@@ -11,7 +11,8 @@ use shearq_submissions::ConfigurationError;
 pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
     let argument = match error {
         MeasureError::Configuration(error) => return of_submission(error),
-        MeasureError::Noise(_) => "noise",
+        MeasureError::Memory(_) => return PyMemoryError::new_err(error.to_string()),
+        MeasureError::Noise(_) | MeasureError::NoBorders { .. } => "noise",
         MeasureError::Data(Warning::Brightness { .. }) => "stamps",
         MeasureError::Shape { what, .. } | MeasureError::NotFinite { what, .. }
             if !what.contains("PSF") =>

@@ -1,10 +1,13 @@
-//! Stamps of Python: viewed without a copy if possible, otherwise converted in pieces.
+//! Stamps of Python: viewed without a copy if possible, otherwise converted row by row.
 
-use ndarray::{Array3, ArrayView3, s};
+use std::ops::Range;
+
+use ndarray::{ArrayView3, Ix3};
 use numpy::{PyArray3, PyArrayMethods, PyReadonlyArray3, PyUntypedArray, PyUntypedArrayMethods};
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::PySlice;
+use shearq_measure::Pixels;
 
 /// A borrowed array `(n, ny, nx)`.
 pub(crate) enum Borrowed<'py> {
@@ -65,27 +68,23 @@ pub(crate) enum Stamps<'a> {
     Other(Py<PyAny>),
 }
 
-/// Some of them.
-pub(crate) enum Piece<'a> {
-    Single(ArrayView3<'a, f32>),
-    Double(ArrayView3<'a, f64>),
-    Copied(Array3<f64>),
-}
-
 impl<'a> Stamps<'a> {
-    /// The stamps from `start` to before `end`. Converting them requires the interpreter.
-    pub(crate) fn piece(&self, start: usize, end: usize) -> PyResult<Piece<'a>> {
+    /// Some of the stamps. Converting them requires the interpreter.
+    ///
+    /// # Errors
+    /// An exception of the conversion.
+    pub(crate) fn slice(&self, range: Range<usize>) -> PyResult<Pixels<'a, Ix3>> {
         // Copies of the views live longer than this borrow.
         Ok(match self {
-            Stamps::Single(all) => Piece::Single((*all).slice_move(s![start..end, .., ..])),
-            Stamps::Double(all) => Piece::Double((*all).slice_move(s![start..end, .., ..])),
-            Stamps::Other(all) => Piece::Copied(Python::attach(|py| {
-                let range = PySlice::new(py, start as isize, end as isize, 1);
+            Stamps::Single(all) => Pixels::from(*all).into_slice(range),
+            Stamps::Double(all) => Pixels::from(*all).into_slice(range),
+            Stamps::Other(all) => Python::attach(|py| {
+                let range = PySlice::new(py, range.start as isize, range.end as isize, 1);
                 let part = all.bind(py).get_item(range)?;
                 let copy = part.call_method1("astype", ("=f8",))?;
                 let copy = copy.cast::<PyArray3<f64>>()?;
-                PyResult::Ok(copy.try_readonly()?.as_array().to_owned())
-            })?),
+                PyResult::Ok(copy.try_readonly()?.as_array().to_owned().into())
+            })?,
         })
     }
 }

@@ -31,7 +31,7 @@ impl Failure {
     }
 
     /// The result of the work, or the exception that stopped it.
-    pub(crate) fn or(self, result: Result<(), PipelineError>) -> PyResult<()> {
+    pub(crate) fn or<T>(self, result: Result<T, PipelineError>) -> PyResult<T> {
         match self.0.into_inner().unwrap_or_else(PoisonError::into_inner) {
             Some(error) => Err(error),
             None => result.map_err(of_pipeline),

@@ -14,14 +14,14 @@ SHEAR = 0.02
 
 @pytest.fixture(scope="session")
 def command():
-    """Runs the command line as ``python -m shearq`` and returns what it printed."""
+    """Runs the command line as ``python -m shearq`` and returns what it printed, or said on standard error."""
 
-    def run(*arguments, status=0):
+    def run(*arguments, status=0, stream="stdout"):
         done = subprocess.run(
             [sys.executable, "-m", "shearq", *map(str, arguments)], capture_output=True, text=True, check=False
         )
         assert done.returncode == status, done.stderr
-        return done.stdout
+        return getattr(done, stream)
 
     return run
 

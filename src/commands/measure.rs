@@ -9,7 +9,7 @@ use shearq_measure::Flag;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::run::{Run, Source, open_data};
 use shearq_pipeline::images::{self, ImageId};
-use shearq_pipeline::measure::{Session, Summary, all_flagged};
+use shearq_pipeline::measure::{FolderMeasurement, Summary, all_flagged};
 use shearq_submissions::Registry;
 
 use crate::arguments::{SetList, Sharding, Threads};
@@ -96,10 +96,10 @@ pub(super) fn measure(
     images: &[ImageId],
     threads: usize,
 ) -> anyhow::Result<()> {
-    let session = Session::open(run, data, out, images)?;
-    let mut bar = Bar::new("measuring", session.galaxies());
+    let work = FolderMeasurement::open(run, data, out, images)?;
+    let mut bar = Bar::new("measuring", work.galaxies());
     let start = Instant::now();
-    let summary = session.measure(threads, &mut bar)?;
+    let summary = work.measure(threads, &mut bar)?;
     drop(bar);
     report(run, &summary, start.elapsed(), threads, out)
 }

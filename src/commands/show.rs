@@ -6,13 +6,13 @@ use std::str::FromStr;
 use anyhow::Context;
 use clap::Args;
 use ndarray::Axis;
-use shearq_measure::{Measurement, Measurer, Stop, strip};
+use shearq_measure::{Measurement, Measurer, Pixels, StampSource, Stop};
 use shearq_submissions::Registry;
 
 use crate::{print, tell};
 use shearq_pipeline::data::mosaic::Mosaic;
 use shearq_pipeline::data::run::open_data;
-use shearq_pipeline::engine;
+use shearq_pipeline::engine::Pool;
 use shearq_pipeline::images::ImageId;
 use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
@@ -75,21 +75,21 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     PictureFormat::of(out)?;
     let submission = Registry::embedded()?.get(submission)?.configuration;
     let data = open_data(data)?;
-    let threads = engine::pool(0)?;
+    let threads = Pool::new(0)?;
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
-        let measurer = Measurer::new(&submission, source.head().mosaic.stamp)?;
+        let measurer = Measurer::new(&submission, source.mosaic().stamp)?;
         if measurer.configuration() != &submission {
             // Stamps of the other parity require other pixels of the PSFs.
             source = ImageSource::open(&data, image, measurer.configuration())?;
         }
-        source.survey(&data, &measurer, &threads)?;
+        let session = source.session(&measurer, &threads)?;
         let Mosaic {
             columns,
             galaxies,
             stamp: side,
-        } = source.head().mosaic;
+        } = source.mosaic();
         anyhow::ensure!(
             index <= galaxies,
             "--galaxy {}/{}/{index}: no such galaxy (found {index}, expected 1 to {galaxies})",
@@ -97,22 +97,18 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             image.image
         );
         let (ix, iy) = ((index - 1) % columns, (index - 1) / columns);
-        let row = loop {
-            let row = source
-                .next_row()?
-                .context("the image ended before the galaxy")?;
-            if row.iy == iy {
-                break row;
-            }
-        };
-        let psf = row.psfs.at(ix, submission.psf_cut(), side);
-        let psf = psf
-            .map(|star| star.psf)
-            .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
+        let psf = source
+            .psfs(iy)?
+            .at(ix, submission.psf_cut(), side)
+            .map(|star| star.psf);
+        let psf = psf.with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
         let mut worker = measurer.worker();
-        let mut worker = row.head.prepare(&mut worker);
+        let mut worker = session.image(&mut worker);
         let mut worker = worker.psf(psf.view())?;
-        let stamps = strip(&row.pixels, columns, side)?;
+        let stamps = source.stamps(iy)?;
+        let Pixels::Single(stamps) = &*stamps else {
+            anyhow::bail!("the image is not in single precision");
+        };
         let stamp = stamps.index_axis(Axis(0), ix);
         let measured = worker.measure(stamp)?;
         anyhow::ensure!(

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use shearq_files::table;
+use shearq_measure::StampSource;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::run::Run;
 use shearq_pipeline::images::ImageId;
@@ -316,13 +317,7 @@ fn read_image(folder: &DataFolder, submission: &Configuration) -> bool {
     let Ok(mut source) = ImageSource::open(folder, id, submission) else {
         return false;
     };
-    loop {
-        match source.next_row() {
-            Ok(Some(_)) => {}
-            Ok(None) => return true,
-            Err(_) => return false,
-        }
-    }
+    (0..source.rows().len()).all(|row| source.stamps(row).is_ok() && source.psfs(row).is_ok())
 }
 
 /// Through the readers of everything else.

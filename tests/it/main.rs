@@ -32,6 +32,7 @@ mod limits;
 mod noisy_stars;
 mod odd_files;
 mod odd_images;
+mod one_session;
 mod orientation;
 mod own_images;
 mod packed;

@@ -3,8 +3,8 @@
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_measure::ndarray::Array3;
-use shearq_measure::{ImageNoise, Measurer, Psfs, strip};
+use shearq_measure::ndarray::{Array3, Axis};
+use shearq_measure::{ArraySource, KnownNoise, Measurer, OneThread, Psfs, Session, strip};
 
 use crate::support::{Small, fits_image, floats, pixels_of, succeed, text};
 
@@ -66,20 +66,21 @@ fn files_and_arrays_with_a_noisy_star_per_galaxy_give_the_same() {
     let (stamps, stars) = (rows(&tiled, full), rows(&mosaic, side));
     let measurer = Measurer::named("48/linear/star", full).unwrap();
     let psfs = Psfs::stars(stars.view());
-    let (survey, common) = (
-        measurer.survey(stamps.view()).unwrap(),
-        measurer.stars(&psfs),
-    );
-    assert!(common.is_some());
     let mut worker = measurer.worker();
-    let mut responses = |common| {
-        let noise = ImageNoise::of(survey.as_ref(), None);
-        let mut image = worker.image_with_stars(noise, common);
+    let mut responses = |known: &Psfs<'_>| {
+        let mut source = ArraySource::new(&measurer, stamps.view(), known).unwrap();
+        let session = Session::open(&measurer, &mut source, KnownNoise::Unknown, &OneThread);
+        let session = session.unwrap();
+        let mut image = session.image(&mut worker);
         let galaxies = image.measure_each(stamps.view(), &psfs).unwrap();
         let first = galaxies.iter().map(|one| one.response_diagonal()[0]);
         first.collect::<Vec<f64>>()
     };
     let of_files = small.measured("02", "R11");
-    assert_eq!(of_files, responses(common.as_ref()));
-    assert_ne!(of_files, responses(None));
+    assert_eq!(of_files, responses(&psfs));
+    // One star for all has nothing in common with others.
+    assert_ne!(
+        of_files,
+        responses(&Psfs::star(stars.index_axis(Axis(0), 0)))
+    );
 }

@@ -2,36 +2,19 @@
 
 use std::sync::Arc;
 
-use ndarray::{ArrayView2, ArrayView3, Axis};
-use shearq_submissions::{Configuration, NoiseSource};
+use ndarray::{ArrayView2, ArrayView3};
+use shearq_submissions::NoiseSource;
 
 use crate::brightness::is_level;
-use crate::calibrate::calibrate;
 use crate::error::{MeasureError, length};
-use crate::examine::{EXAMINED_PSFS, Examination, examined_stamps};
 use crate::flag::Flag;
 use crate::galaxy::Measurer;
 use crate::measurement::Measurement;
-use crate::noise::{NoiseSurvey, Survey};
 use crate::pixel::Pixel;
 use crate::psf::star_psf;
 use crate::psfs::Psfs;
-use crate::sky::Subtraction;
-use crate::warning::Warning;
+use crate::session::{ArraySource, Batch, KnownNoise, OneThread, Session};
 use crate::worker::ImageNoise;
-
-/// A batch of galaxies, measured.
-#[derive(Debug, Clone)]
-pub struct Batch {
-    /// One per stamp. Ellipticities are calibrated; responses are the galaxies' own.
-    pub galaxies: Vec<Measurement>,
-    /// The mean response of e1 to γ1 and of e2 to γ2 that ellipticities were divided by; `None` where
-    /// the submission asks for no calibration, or (then all galaxies are flagged) where it is not
-    /// positive.
-    pub response: Option<[f64; 2]>,
-    /// What is wrong with the stamps, as far as they can be measured all the same.
-    pub warnings: Vec<Warning>,
-}
 
 impl Measurer {
     /// Measures one stamp with its star stamp and noise level, which may be `None` where the submission
@@ -50,13 +33,16 @@ impl Measurer {
         psf: ArrayView2<'_, P>,
         noise: Option<f64>,
     ) -> Result<Measurement, MeasureError> {
-        check(self.configuration(), noise)?;
-        if noise.is_none() && self.noise_plan().is_some() {
-            return Err(MeasureError::Noise("not given".into()));
+        match noise {
+            Some(level) if !is_level(level) => return Err(MeasureError::Noise(level.to_string())),
+            None if !matches!(self.configuration().noise, NoiseSource::Border { .. }) => {
+                return Err(MeasureError::Noise("not given".into()));
+            }
+            _ => {}
         }
         let psf = star_psf(psf, self.configuration().psf_cut())?;
         let mut worker = self.worker();
-        let mut image = worker.image(ImageNoise::of(None, noise));
+        let mut image = worker.image(noise.map_or(ImageNoise::Unknown, ImageNoise::Level));
         let found = image.psf(psf.view())?.measure(stamp)?;
         if found.flags.contains(Flag::NotFinite) {
             let finite = |pixel: T| pixel.to_f32().is_finite();
@@ -87,77 +73,17 @@ impl Measurer {
         psfs: &Psfs<'_>,
         noise: Option<f64>,
     ) -> Result<Batch, MeasureError> {
-        check(self.configuration(), noise)?;
-        let survey = match noise {
-            None => self.survey(stamps)?,
-            Some(_) => None,
-        };
+        let mut source = ArraySource::new(self, stamps, psfs)?;
+        let noise = noise.map_or(KnownNoise::Unknown, KnownNoise::Given);
+        let session = Session::open(self, &mut source, noise, &OneThread)?;
+        let session = Arc::new(session);
+        let mut image = Arc::clone(&session).begin()?;
         let mut worker = self.worker();
-        let stars = self.stars(psfs);
-        let noise_of_image = ImageNoise::of(survey.as_ref(), noise);
-        let mut image = worker.image_with_stars(noise_of_image, stars.as_ref());
-        let mut galaxies = [image.measure_each(stamps, psfs)?];
-        let response = calibrate(self.configuration(), &mut galaxies);
-        let mut examination = examine(stamps, self.subtraction(survey.as_deref()))?;
-        examination.add_psfs(psfs, self.configuration().psf_cut(), EXAMINED_PSFS);
-        let mut warnings = examination.warnings();
-        warnings.extend(noise.and_then(|noise| examination.given_noise(noise)));
-        warnings.extend(Warning::of_settings(self.configuration()));
-        warnings.extend(Warning::of_galaxies(&galaxies));
-        if let Some(fatal) = warnings.iter().position(Warning::is_fatal) {
-            return Err(MeasureError::Data(warnings.swap_remove(fatal)));
+        for row in 0..session.rows().len() {
+            image.add(session.read(&mut source, row)?.measure(&mut worker)?);
         }
-        let [galaxies] = galaxies;
-        Ok(Batch {
-            galaxies,
-            response,
-            warnings,
-        })
+        image.finish().checked()
     }
-
-    /// What `stamps`, one each along the first axis, tell of their image, where the submission asks for noise to be
-    /// measured on them.
-    ///
-    /// # Errors
-    /// Where there is no stamp, stamps have other sizes than planned, or too few of them have a frame of noise
-    /// alone.
-    pub fn survey<T: Pixel>(
-        &self,
-        stamps: ArrayView3<'_, T>,
-    ) -> Result<Option<Arc<Survey>>, MeasureError> {
-        let count = stamps.len_of(Axis(0));
-        let Some(plan) = self.noise_plan() else {
-            return Ok(None);
-        };
-        if count == 0 {
-            return Err(MeasureError::Noise("not given".into()));
-        }
-        let look = |mut survey: NoiseSurvey| {
-            for at in plan.stamps(count) {
-                survey.add(stamps.index_axis(Axis(0), at))?;
-            }
-            Ok::<_, MeasureError>(survey)
-        };
-        let mut survey = look(plan.survey())?;
-        if let Some(again) = survey.without_sky() {
-            survey = look(again)?;
-        }
-        survey.shared()
-    }
-}
-
-/// Examines as many of the stamps, one each along the first axis, as are enough.
-fn examine<T: Pixel>(
-    stamps: ArrayView3<'_, T>,
-    subtraction: Subtraction,
-) -> Result<Examination, MeasureError> {
-    let (count, side, _) = stamps.dim();
-    let chosen = examined_stamps(count);
-    let mut examination = Examination::new(side, chosen.len()).without(subtraction);
-    for at in chosen {
-        examination.add(stamps.index_axis(Axis(0), at))?;
-    }
-    Ok(examination)
 }
 
 /// Views an image of `count` stamps of `side` pixels next to each other, row-major, as stamps one each along
@@ -176,19 +102,6 @@ pub fn strip<T>(
     Ok(rows.permuted_axes([1, 0, 2]))
 }
 
-/// Checks the noise level that is given, or whether there must be one.
-fn check(configuration: &Configuration, noise: Option<f64>) -> Result<(), MeasureError> {
-    let given = match (noise, configuration.noise) {
-        (Some(sigma), _) => (!is_level(sigma)).then(|| sigma.to_string()),
-        (None, NoiseSource::Header) => Some("not given".to_owned()),
-        (None, NoiseSource::Border { .. } | NoiseSource::Image { .. }) => None,
-    };
-    if let Some(found) = given {
-        return Err(MeasureError::Noise(found));
-    }
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use ndarray::{Array3, s};
@@ -196,6 +109,7 @@ mod tests {
 
     use super::*;
     use crate::flag::Flag;
+    use crate::worker::ImageWorker;
 
     fn moffat(e1: f64) -> FunctionalPsf {
         let profile = PsfProfile::Moffat { beta: 3.0 };
@@ -291,20 +205,19 @@ mod tests {
             Array3::from_shape_fn((count, 48, 48), |(_, y, x)| psf[(y, x)] + sigma * noise());
         let (stamps, psfs) = (stamps(count, 48), Psfs::stars(stars.view()));
         let batch = measurer.batch(stamps.view(), &psfs, Some(0.5)).unwrap();
-        let common = measurer.stars(&psfs);
-        assert!(common.is_some());
         let mut worker = measurer.worker();
-        let mut responses = |stars| {
-            let mut image = worker.image_with_stars(ImageNoise::Level(0.5), stars);
+        let of = |mut image: ImageWorker<'_>| {
             let found = image.measure_each(stamps.view(), &psfs).unwrap();
             found.iter().map(|one| one.response).collect::<Vec<_>>()
         };
         let of_batch: Vec<_> = batch.galaxies.iter().map(|one| one.response).collect();
-        assert_eq!(responses(common.as_ref()), of_batch);
+        let session = |measurer: &Measurer| {
+            let mut source = ArraySource::new(measurer, stamps.view(), &psfs).unwrap();
+            Session::open(measurer, &mut source, KnownNoise::Given(0.5), &OneThread).unwrap()
+        };
+        assert_eq!(of(session(&measurer).image(&mut worker)), of_batch);
         // The next image knows nothing of it.
-        assert_ne!(responses(None), of_batch);
-        let network = Measurer::named("23/raw/star", 48).unwrap();
-        assert_eq!(network.stars(&psfs), None);
+        assert_ne!(of(worker.image(ImageNoise::Level(0.5))), of_batch);
     }
 
     #[test]

@@ -34,6 +34,20 @@ pub enum MeasureError {
     /// A noise level that is missing or not one.
     #[error("the noise level is {0}; expected a finite number of image units, not negative")]
     Noise(String),
+    /// Stamps on whose borders the noise cannot be measured.
+    #[error(
+        "cannot measure the noise on the borders of {examined} stamp(s){} (expected two or more complete borders with pixels that differ by noise). Try: noise.source = \"border\", or \"header\" if NOISESIG is right",
+        match incomplete { 0 => String::new(), count => format!(", {count} of them with missing pixels") }
+    )]
+    NoBorders {
+        /// Stamps examined.
+        examined: usize,
+        /// Stamps with missing pixels among them.
+        incomplete: usize,
+    },
+    /// More galaxies than fit into memory.
+    #[error("there is no memory for {0} galaxies")]
+    Memory(usize),
     /// No light to normalise a PSF by.
     #[error("the pixels of the PSF stamp sum to {0}; expected a positive sum")]
     DarkPsf(f64),

@@ -67,15 +67,12 @@ pub fn examined_rows(columns: usize, rows: usize) -> Vec<usize> {
     const STEP: f64 = 0.618_033_988_749_895;
     let count = enough(columns, rows);
     let place = |k: usize| (k as f64 + (STEP * k as f64).fract()) * rows as f64 / count as f64;
-    (0..count)
+    let mut chosen: Vec<usize> = (0..count)
         .map(|k| (place(k) as usize).min(rows - 1))
-        .collect()
-}
-
-/// Which of `count` stamps are examined: those of [`examined_rows`] in the arrangement nearest to a square, in which
-/// images of stamps have them.
-pub fn examined_stamps(count: usize) -> Vec<usize> {
-    in_rows(count, examined_rows)
+        .collect();
+    // Of a few rows more than are enough, two places may be in one. A row that counted twice would be taken for copies.
+    chosen.dedup();
+    chosen
 }
 
 /// How many of `rows` rows of `columns` stamps are enough.
@@ -87,15 +84,6 @@ pub(crate) fn enough(columns: usize, rows: usize) -> usize {
 pub fn columns_of(count: usize) -> usize {
     let root = count.isqrt();
     (root + usize::from(root * root < count)).max(1)
-}
-
-/// The stamps of the rows that `choose` chooses by the numbers of columns and rows, of `count` stamps in the arrangement
-/// nearest to a square.
-pub(crate) fn in_rows(count: usize, choose: impl Fn(usize, usize) -> Vec<usize>) -> Vec<usize> {
-    let columns = columns_of(count);
-    let row = |row: usize| row * columns..((row + 1) * columns).min(count);
-    let rows = choose(columns, count.div_ceil(columns));
-    rows.into_iter().flat_map(row).collect()
 }
 
 /// What one stamp shows.

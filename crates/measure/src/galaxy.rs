@@ -7,12 +7,10 @@ use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registr
 
 use crate::denoise::WaveletWiener;
 use crate::error::MeasureError;
-use crate::examine::examined_stamps;
 use crate::method::MethodPlan;
 use crate::noise::{NoisePlan, Survey};
 use crate::plan::Plan;
-use crate::psf::{CommonProfile, StarLooker, StarSurvey};
-use crate::psfs::Psfs;
+use crate::psf::StarLooker;
 use crate::sky::Subtraction;
 use crate::worker::Worker;
 
@@ -94,35 +92,20 @@ impl Measurer {
     }
 
     /// The plan for measuring the noise of an image on its stamps, if the configuration requires that.
-    pub fn noise_plan(&self) -> Option<&NoisePlan> {
+    pub(crate) fn noise_plan(&self) -> Option<&NoisePlan> {
         self.plan.noise.as_ref()
     }
 
     /// What is subtracted from stamps of an image with this survey.
-    pub fn subtraction(&self, survey: Option<&Survey>) -> Subtraction {
+    pub(crate) fn subtraction(&self, survey: Option<&Survey>) -> Subtraction {
         self.plan.subtraction(survey)
     }
 
-    /// Looks at the stars of an image with one per galaxy, for a [`StarSurvey`]; `None` if the configuration uses stars as
-    /// they are.
-    pub fn star_looker(&self) -> Option<StarLooker> {
+    /// Buffers to examine the stars of an image with one per galaxy; `None` if the configuration uses stars as they are.
+    pub(crate) fn star_looker(&self) -> Option<StarLooker> {
         let configuration = self.configuration();
         configuration.linear()?;
         Some(StarLooker::new(configuration.psf_cut(), self.full()))
-    }
-
-    /// What noisy stars, one per galaxy, have in common, from [`examined_stamps`]. `None` if there are no noisy stars,
-    /// or too few, or the configuration uses them as they are.
-    pub fn stars(&self, psfs: &Psfs<'_>) -> Option<Arc<CommonProfile>> {
-        let mut looker = self.star_looker()?;
-        let mut survey = StarSurvey::default();
-        for at in examined_stamps(psfs.count()?) {
-            survey.add(looker.look(psfs, at));
-            if survey.is_over() {
-                break;
-            }
-        }
-        survey.common()
     }
 
     /// Pixels a side of the full stamps.

@@ -24,8 +24,11 @@
 //! # A stream
 //!
 //! A [`Measurer`] serves all threads. Each thread has a [`Worker`] with its own buffers; measuring a galaxy allocates
-//! nothing. The types fix the order: worker, image, PSF, galaxy. [`calibrate`] divides by the mean response when an
-//! image is complete.
+//! nothing. A [`Session`] measures one image of any [`StampSource`]: it surveys noise, sky and stars, measures rows in the
+//! caller's threads, calibrates and warns.
+//!
+//! For galaxies without an image, the types fix the order: worker, image, PSF, galaxy. [`calibrate`] divides by their mean
+//! response.
 //!
 //! # Conventions
 //!
@@ -58,6 +61,7 @@ mod plan;
 mod psf;
 mod psfs;
 mod selection;
+mod session;
 mod shape;
 mod sizes;
 mod sky;
@@ -67,28 +71,30 @@ mod versions;
 mod warning;
 mod worker;
 
-pub use batch::{Batch, strip};
+pub use batch::strip;
 pub use calibrate::calibrate;
 pub use deconvolve::{Descent, Stop};
 pub use error::MeasureError;
-pub use examine::{EXAMINED_PSFS, Examination, columns_of, examined_rows, examined_stamps};
+pub use examine::{EXAMINED_PSFS, Examination, columns_of, examined_rows};
 pub use flag::{Flag, Flags};
 pub use galaxy::Measurer;
 pub use mean_shear::{MeanShear, MeanShearError, ShearSum};
 pub use measurement::{Measurement, ResponseMatrix};
 pub use method::AdaptedSettings;
 pub use ndarray;
-pub use noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
+pub use noise::{StampNoise, Survey};
 pub use observables::{Coupling, Observables};
-pub use pixel::Pixel;
-pub use psf::{
-    CommonProfile, Star, StarLook, StarLooker, StarSurvey, average_stars, star, star_psf,
-};
-pub use psfs::{Psfs, StarPixels};
+pub use pixel::{Pixel, Pixels};
+pub use psf::{Star, average_stars, star, star_psf};
+pub use psfs::Psfs;
 pub use selection::{Cut, Quantity, Selected, Selection, SelectionError};
+pub use session::{
+    ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,
+    RowJob, Session, StampRows, StampSource, Threads,
+};
 pub use shearq_quantities::{Distortion, FunctionalPsf, PsfProfile, Shear};
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
-pub use sky::{Sky, Subtraction};
+pub use sky::Sky;
 pub use steps::Steps;
 pub use versions::{Version, Versions};
 pub use warning::{Of, PixelFrame, Warning};

@@ -23,6 +23,7 @@ mod survey;
 #[cfg(test)]
 mod tests;
 
-pub use plan::NoisePlan;
+pub(crate) use plan::NoisePlan;
 pub use stamp_noise::StampNoise;
-pub use survey::{NoiseSurvey, Survey};
+pub(crate) use survey::NoiseSurvey;
+pub use survey::Survey;

@@ -1,13 +1,22 @@
 //! Pixels of either precision.
 
 use std::borrow::Cow;
+use std::ops::Range;
 
-use ndarray::{ArrayView1, ArrayView2};
+use ndarray::{
+    Array, Array3, ArrayView, ArrayView1, ArrayView2, ArrayView3, Axis, CowArray, Dimension, Ix3,
+    RemoveAxis, Slice,
+};
+
+use crate::error::{MeasureError, length};
 
 /// `f32` or `f64`.
-pub trait Pixel: Copy + Into<f64> + private::Sealed {
+pub trait Pixel: Copy + Send + Sync + Into<f64> + private::Sealed {
     /// Rounded to single precision, in which stamps are measured.
     fn to_f32(self) -> f32;
+
+    /// Stamps of this precision.
+    fn pixels(stamps: ArrayView3<'_, Self>) -> Pixels<'_, Ix3>;
 }
 
 impl Pixel for f32 {
@@ -15,12 +24,96 @@ impl Pixel for f32 {
     fn to_f32(self) -> f32 {
         self
     }
+
+    fn pixels(stamps: ArrayView3<'_, Self>) -> Pixels<'_, Ix3> {
+        stamps.into()
+    }
 }
 
 impl Pixel for f64 {
     #[inline(always)]
     fn to_f32(self) -> f32 {
         self as f32
+    }
+
+    fn pixels(stamps: ArrayView3<'_, Self>) -> Pixels<'_, Ix3> {
+        stamps.into()
+    }
+}
+
+/// Pixels of stamps in single or double precision, borrowed or owned.
+#[derive(Debug, Clone)]
+pub enum Pixels<'a, D: Dimension> {
+    /// `f32`.
+    Single(CowArray<'a, f32, D>),
+    /// `f64`.
+    Double(CowArray<'a, f64, D>),
+}
+
+impl<'a, D: Dimension> From<ArrayView<'a, f32, D>> for Pixels<'a, D> {
+    fn from(pixels: ArrayView<'a, f32, D>) -> Self {
+        Pixels::Single(pixels.into())
+    }
+}
+
+impl<'a, D: Dimension> From<ArrayView<'a, f64, D>> for Pixels<'a, D> {
+    fn from(pixels: ArrayView<'a, f64, D>) -> Self {
+        Pixels::Double(pixels.into())
+    }
+}
+
+impl<D: Dimension> From<Array<f32, D>> for Pixels<'_, D> {
+    fn from(pixels: Array<f32, D>) -> Self {
+        Pixels::Single(pixels.into())
+    }
+}
+
+impl<D: Dimension> From<Array<f64, D>> for Pixels<'_, D> {
+    fn from(pixels: Array<f64, D>) -> Self {
+        Pixels::Double(pixels.into())
+    }
+}
+
+impl<D: Dimension> Pixels<'_, D> {
+    /// Lengths of the axes.
+    pub fn dim(&self) -> D::Pattern {
+        match self {
+            Pixels::Single(pixels) => pixels.dim(),
+            Pixels::Double(pixels) => pixels.dim(),
+        }
+    }
+
+    /// A view of the same pixels.
+    pub fn view(&self) -> Pixels<'_, D> {
+        match self {
+            Pixels::Single(pixels) => pixels.view().into(),
+            Pixels::Double(pixels) => pixels.view().into(),
+        }
+    }
+}
+
+impl<D: RemoveAxis> Pixels<'_, D> {
+    /// Some of the stamps along the first axis, without a copy.
+    #[must_use]
+    pub fn into_slice(mut self, range: Range<usize>) -> Self {
+        match &mut self {
+            Pixels::Single(stamps) => stamps.slice_axis_inplace(Axis(0), Slice::from(range)),
+            Pixels::Double(stamps) => stamps.slice_axis_inplace(Axis(0), Slice::from(range)),
+        }
+        self
+    }
+}
+
+impl Pixels<'_, Ix3> {
+    /// Stamps of an image of `count` stamps of `side` pixels next to each other, row-major.
+    ///
+    /// # Errors
+    /// If the image has another number of pixels.
+    pub fn strip(pixels: Vec<f32>, count: usize, side: usize) -> Result<Self, MeasureError> {
+        length("a strip of stamps", pixels.len(), count * side * side)?;
+        let rows = Array3::from_shape_vec((side, count, side), pixels);
+        let rows = rows.map_err(|error| MeasureError::strip(count, side, &error))?;
+        Ok(rows.permuted_axes([1, 0, 2]).into())
     }
 }
 

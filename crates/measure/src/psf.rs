@@ -15,7 +15,7 @@ mod survey;
 mod test_stars;
 
 pub use average::average_stars;
-pub use common::CommonProfile;
+pub(crate) use common::CommonProfile;
 pub(crate) use star::cut_start;
 pub use star::{Star, star, star_psf};
-pub use survey::{StarLook, StarLooker, StarSurvey};
+pub(crate) use survey::{StarLooker, StarSurvey};

@@ -581,7 +581,7 @@ mod tests {
             })
             .collect();
         let plan = NoisePlan::new(N, 1).unwrap().with_sky(SkySource::Image);
-        let look = |mut survey: crate::NoiseSurvey| {
+        let look = |mut survey: crate::noise::NoiseSurvey| {
             stamps
                 .iter()
                 .for_each(|stamp| survey.add(stamp.view()).unwrap());

@@ -273,33 +273,37 @@ impl Warning {
         }
     }
 
-    /// A warning if more than half of the galaxies of an image, given in parts such as rows, are flagged.
-    pub fn of_flags<P: AsRef<[Measurement]>>(parts: &[P]) -> Option<Warning> {
-        let galaxies = || parts.iter().flat_map(AsRef::as_ref);
-        let of = galaxies().count();
-        let count = galaxies().filter(|g| !g.flags.is_empty()).count();
-        let with = |flag: Flag| galaxies().filter(|g| g.flags.contains(flag)).count();
-        Warning::of_counts(with, count, of)
+    /// A warning about a level that the data state, which is used.
+    pub(crate) fn of_stated(warning: Warning) -> Warning {
+        match warning {
+            Warning::GivenNoise { given, measured } => Warning::NoiseLevel {
+                given,
+                measured,
+                used: false,
+            },
+            other => other,
+        }
     }
 
-    /// Warnings about what was found on the galaxies of an image, given in parts such as rows.
-    pub fn of_galaxies<P: AsRef<[Measurement]>>(parts: &[P]) -> impl Iterator<Item = Warning> {
-        let flags = Warning::of_flags(parts).into_iter();
-        flags.chain(Warning::of_idle(parts))
+    /// Warnings about what was found on the galaxies of an image.
+    pub(crate) fn of_galaxies(galaxies: &[Measurement]) -> impl Iterator<Item = Warning> {
+        let flagged = galaxies.iter().filter(|g| !g.flags.is_empty()).count();
+        let with = |flag: Flag| galaxies.iter().filter(|g| g.flags.contains(flag)).count();
+        let flags = Warning::of_counts(with, flagged, galaxies.len());
+        flags.into_iter().chain(Warning::of_idle(galaxies))
     }
 
     /// A warning if the network made no iteration on more than half of the galaxies that it ran on.
-    fn of_idle<P: AsRef<[Measurement]>>(parts: &[P]) -> Option<Warning> {
-        let galaxies = parts.iter().flat_map(AsRef::as_ref);
+    fn of_idle(galaxies: &[Measurement]) -> Option<Warning> {
         let (mut count, mut of) = (0, 0);
-        for descent in galaxies.filter_map(|galaxy| galaxy.descent.as_ref()) {
+        for descent in galaxies.iter().filter_map(|galaxy| galaxy.descent.as_ref()) {
             count += usize::from(descent.iterations == 0);
             of += 1;
         }
         (2 * count > of).then_some(Warning::Idle { count, of })
     }
 
-    /// The same as [`Warning::of_flags`] if `count` galaxies of so many are flagged, each number of them `with` a flag.
+    /// A warning if more than half of the galaxies are flagged: `count` of so many, each number of them `with` a flag.
     pub fn of_counts(with: impl Fn(Flag) -> usize, count: usize, of: usize) -> Option<Warning> {
         // Galaxies without a usable mean response have this flag together with the one that explains it.
         let explains = |flag: &Flag| *flag != Flag::NoResponse && 2 * with(*flag) > of;

@@ -6,13 +6,13 @@
 use std::fmt;
 use std::sync::Arc;
 
-use ndarray::{ArrayView2, ArrayView3, Axis};
+use ndarray::{ArrayView2, ArrayView3};
 use shearq_submissions::{Configuration, Method, NoiseSource};
 
 use crate::brightness::{PEAKS, all_finite, highest, is_level};
 use crate::denoise::{DenoiseScratch, border_noise};
 use crate::ellipticity::{observables, report, sheared_versions};
-use crate::error::{MeasureError, length};
+use crate::error::MeasureError;
 use crate::flag::{Flag, Flags};
 use crate::measurement::Measurement;
 use crate::method::{AdaptedSettings, CutWorker};
@@ -28,7 +28,7 @@ use crate::surroundings::Missing;
 #[derive(Debug, Clone, Copy, Default)]
 pub enum ImageNoise<'a> {
     /// Level and correlation as measured on the stamps of the image, with the size of its galaxies.
-    Survey(&'a Arc<Survey>),
+    Survey(&'a Survey),
     /// White noise of this standard deviation per pixel.
     Level(f64),
     /// Nothing. A configuration that does not measure the noise on each stamp flags the galaxies.
@@ -37,16 +37,7 @@ pub enum ImageNoise<'a> {
 }
 
 impl<'a> ImageNoise<'a> {
-    /// A survey if there is one, otherwise a level if there is one.
-    pub fn of(survey: Option<&'a Arc<Survey>>, level: Option<f64>) -> Self {
-        match (survey, level) {
-            (Some(survey), _) => ImageNoise::Survey(survey),
-            (None, Some(level)) => ImageNoise::Level(level),
-            (None, None) => ImageNoise::Unknown,
-        }
-    }
-
-    fn survey(self) -> Option<&'a Arc<Survey>> {
+    fn survey(self) -> Option<&'a Survey> {
         match self {
             ImageNoise::Survey(survey) => Some(survey),
             ImageNoise::Level(_) | ImageNoise::Unknown => None,
@@ -75,8 +66,6 @@ pub struct Worker {
     missing: Missing,
     cells: Cells,
     subtraction: Subtraction,
-    /// The survey that the method was set to.
-    survey: Option<Arc<Survey>>,
 }
 
 /// A worker for the galaxies of one image.
@@ -99,7 +88,6 @@ impl fmt::Debug for Worker {
             .field("configuration", &self.plan.configuration.name)
             .field("full", &self.plan.full)
             .field("subtraction", &self.subtraction)
-            .field("survey", &self.survey)
             .finish_non_exhaustive()
     }
 }
@@ -116,7 +104,6 @@ impl Worker {
             missing: Missing::new(n),
             cells: Cells::new(full),
             subtraction: Subtraction::Nothing,
-            survey: None,
             plan,
         }
     }
@@ -126,40 +113,29 @@ impl Worker {
         &self.plan.configuration
     }
 
-    /// What is subtracted from stamps of the image that the worker was prepared for.
-    pub fn subtraction(&self) -> Subtraction {
-        self.subtraction
-    }
-
     /// Prepares for the galaxies of an image with this noise.
     ///
     /// Noise of a survey is treated as white if its correlation is not significant. Without a survey, noise is white, and
-    /// the window is the configuration's own. The same survey as before costs nothing.
+    /// the window is the configuration's own. [`Session::image`](crate::Session::image) prepares for an image that was
+    /// surveyed.
     pub fn image(&mut self, noise: ImageNoise<'_>) -> ImageWorker<'_> {
         self.image_with_stars(noise, None)
     }
 
-    /// The same for an image whose noisy stars, one per galaxy, have this in common: [`Measurer::stars`](crate::Measurer::stars)
-    /// or [`StarSurvey::common`](crate::StarSurvey::common).
-    pub fn image_with_stars(
+    /// The same for an image whose noisy stars, one per galaxy, have this in common.
+    pub(crate) fn image_with_stars(
         &mut self,
         noise: ImageNoise<'_>,
         stars: Option<&Arc<CommonProfile>>,
     ) -> ImageWorker<'_> {
-        self.method.set_stars(stars);
-        let survey = noise.survey();
-        self.subtraction = self.plan.subtraction(survey.map(Arc::as_ref));
-        if self.survey.as_ref() != survey {
-            self.survey = survey.cloned();
-            self.method
-                .set_extent(survey.and_then(|survey| survey.extent));
-            match survey {
-                Some(survey) if survey.noise.is_correlated() => {
-                    self.method.set_noise(&survey.noise);
-                }
-                Some(_) | None => self.method.set_noise(&StampNoise::white(1.0)),
-            }
-        }
+        let (white, survey) = (StampNoise::white(1.0), noise.survey());
+        self.subtraction = self.plan.subtraction(survey);
+        let correlated = survey
+            .map(|survey| &survey.noise)
+            .filter(|noise| noise.is_correlated());
+        let extent = survey.and_then(|survey| survey.extent);
+        let of_modes = correlated.unwrap_or(&white);
+        self.method.set_image(of_modes, extent, stars);
         ImageWorker {
             worker: self,
             level: noise.level(),
@@ -294,7 +270,7 @@ impl ImageWorker<'_> {
         })
     }
 
-    /// Measures stamps, one per galaxy along the first axis, without calibration.
+    /// Measures stamps, one per galaxy along the first axis, without calibration, in the noise of the image.
     ///
     /// # Errors
     /// If sizes or numbers do not fit, or a PSF for all galaxies cannot be used. A galaxy whose own PSF cannot be used is
@@ -304,60 +280,42 @@ impl ImageWorker<'_> {
         stamps: ArrayView3<'_, T>,
         psfs: &Psfs<'_>,
     ) -> Result<Vec<Measurement>, MeasureError> {
-        self.each(stamps, psfs, |image, _| image.level)
+        self.measure_in_noise(stamps, psfs, None)
     }
 
-    /// The same for white noise with one level per stamp.
-    ///
-    /// # Errors
-    /// As [`ImageWorker::measure_each`], or if there is not one level per stamp.
-    pub fn measure_each_with_noise<T: Pixel>(
+    /// The same for white noise with one level per stamp, if there are any.
+    pub(crate) fn measure_in_noise<T: Pixel>(
         &mut self,
         stamps: ArrayView3<'_, T>,
         psfs: &Psfs<'_>,
-        levels: &[f64],
-    ) -> Result<Vec<Measurement>, MeasureError> {
-        length("noise levels", levels.len(), stamps.len_of(Axis(0)))?;
-        self.each(stamps, psfs, |_, k| levels[k])
-    }
-
-    fn each<T: Pixel>(
-        &mut self,
-        stamps: ArrayView3<'_, T>,
-        psfs: &Psfs<'_>,
-        level: impl Fn(&Self, usize) -> f64,
+        levels: Option<&[f64]>,
     ) -> Result<Vec<Measurement>, MeasureError> {
         let cut = self.configuration().psf_cut();
         let (count, full, _) = stamps.dim();
-        let Some(given) = psfs.count() else {
-            match psfs {
-                Psfs::Prepared(psf) => self.worker.method.set_psf(psf.view())?,
-                _ => self
-                    .worker
-                    .method
-                    .set_psf(psfs.at(0, cut, full)?.psf.view())?,
+        let given = psfs.count();
+        match given {
+            Some(given) if given != count => {
+                return Err(MeasureError::Shape {
+                    what: "PSFs",
+                    found: format!("{given} galaxies"),
+                    expected: format!("{count}, one each"),
+                });
             }
-            let stamps = stamps.outer_iter().enumerate();
-            return stamps
-                .map(|(k, stamp)| {
-                    let level = level(self, k);
-                    self.worker.measure(stamp, level, true)
-                })
-                .collect();
-        };
-        if given != count {
-            return Err(MeasureError::Shape {
-                what: "PSFs",
-                found: format!("{given} galaxies"),
-                expected: format!("{count}, one each"),
-            });
+            Some(_) => {}
+            None => self
+                .worker
+                .method
+                .set_psf(psfs.at(0, cut, full)?.psf.view())?,
         }
         let stamps = stamps.outer_iter().enumerate();
         let measured = stamps.map(|(k, stamp)| {
-            let psf = psfs.at(k, cut, full);
-            let set = psf.and_then(|own| self.worker.method.set_psf(own.psf.view()));
-            let level = level(self, k);
-            self.worker.measure(stamp, level, set.is_ok())
+            let mut set = || {
+                let psf = psfs.at(k, cut, full)?;
+                self.worker.method.set_psf(psf.psf.view())
+            };
+            let usable_psf = given.is_none() || set().is_ok();
+            let level = levels.map_or(self.level, |levels| levels[k]);
+            self.worker.measure(stamp, level, usable_psf)
         });
         measured.collect()
     }
@@ -384,17 +342,5 @@ impl PsfWorker<'_> {
         stamp: ArrayView2<'_, T>,
     ) -> Result<Measurement, MeasureError> {
         self.worker.measure(stamp, self.level, true)
-    }
-
-    /// The same in white noise of a level of its own.
-    ///
-    /// # Errors
-    /// As [`PsfWorker::measure`].
-    pub fn measure_with_noise<T: Pixel>(
-        &mut self,
-        stamp: ArrayView2<'_, T>,
-        level: f64,
-    ) -> Result<Measurement, MeasureError> {
-        self.worker.measure(stamp, level, true)
     }
 }

@@ -11,6 +11,7 @@ use std::sync::{Mutex, PoisonError};
 
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use rayon::{ThreadPool, ThreadPoolBuilder};
+use shearq_measure::Threads;
 
 use super::PipelineError;
 
@@ -48,7 +49,7 @@ pub struct Feeder<'a, I> {
     permits: &'a Receiver<()>,
     next: u64,
     /// Threads for work before items are handed over.
-    ahead: &'a ThreadPool,
+    ahead: &'a Pool,
 }
 
 impl<I> Feeder<'_, I> {
@@ -63,30 +64,38 @@ impl<I> Feeder<'_, I> {
     }
 
     /// Threads for work before items are handed over.
-    pub fn ahead(&self) -> &ThreadPool {
+    pub fn ahead(&self) -> &Pool {
         self.ahead
     }
+}
 
-    /// Maps values on several threads, in order, before items are handed over.
-    pub fn each<T, R>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R>
-    where
-        T: Send,
-        R: Send,
-    {
-        self.ahead.install(|| of.into_par_iter().map(map).collect())
+/// Threads for values that are mapped in order.
+#[derive(Debug)]
+pub struct Pool(ThreadPool);
+
+impl Pool {
+    /// `threads`, or one per core for 0.
+    ///
+    /// # Errors
+    /// If threads cannot be started.
+    pub fn new(threads: usize) -> Result<Self, PipelineError> {
+        let pool = ThreadPoolBuilder::new().num_threads(threads).build()?;
+        Ok(Pool(pool))
+    }
+}
+
+impl Threads for Pool {
+    fn count(&self) -> usize {
+        self.0.current_num_threads()
+    }
+
+    fn map<T: Send, R: Send>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R> {
+        self.0.install(|| of.into_par_iter().map(map).collect())
     }
 }
 
 /// Result of an item; a panic is passed to the calling thread.
 type Done<O> = Result<Result<O, PipelineError>, Box<dyn Any + Send>>;
-
-/// A pool of `threads`, or of one per core for 0.
-///
-/// # Errors
-/// If threads cannot be started.
-pub fn pool(threads: usize) -> Result<ThreadPool, PipelineError> {
-    Ok(ThreadPoolBuilder::new().num_threads(threads).build()?)
-}
 
 /// Runs `read` on one thread, `work` on `threads` workers with one scratch each, and `write` on the calling thread in
 /// the order of reading.
@@ -107,7 +116,7 @@ where
     I: Send,
     O: Send,
 {
-    let (pool, ahead) = (pool(threads)?, pool(threads)?);
+    let (Pool(pool), ahead) = (Pool::new(threads)?, Pool::new(threads)?);
     let capacity = IN_FLIGHT * threads;
     let (item_sender, item_receiver) = sync_channel::<(u64, I)>(capacity);
     let (result_sender, result_receiver) = sync_channel::<(u64, Done<O>)>(capacity);
@@ -228,7 +237,7 @@ mod tests {
             3,
             |feeder| {
                 for k in 0..5usize {
-                    let ahead = feeder.each((0..40).collect(), |i| i * k);
+                    let ahead = feeder.ahead().map((0..40).collect(), |i| i * k);
                     assert_eq!(ahead, (0..40).map(|i| i * k).collect::<Vec<_>>());
                     let _ = feeder.push(ahead[39]);
                 }

@@ -1,31 +1,25 @@
-//! Measuring a data folder: rows of stamps in, one catalogue per image out.
+//! Measuring images: rows of stamps in, one catalogue per image out.
 //!
-//! A [`Session`] opens an image, surveys its noise, and reads its rows of stamps. Workers measure the rows. The
-//! catalogue is written when all rows of an image are measured.
+//! [`measure_images`] runs the sessions of images in threads, from files, simulations or arrays. [`FolderMeasurement`]
+//! measures the images of a data folder, and writes a catalogue when all rows of an image are measured.
 
 mod catalogue;
-mod head;
-mod noise;
 mod psfs;
-mod row;
-mod some_rows;
 mod source;
 
+use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 use shearq_files::FileError;
-use shearq_measure::{Measurer, calibrate};
+use shearq_measure::{Batch, MeasuredImage, Measurer, RowJob, Warning};
 
 pub use self::catalogue::{
     COLUMNS, KEYS, PSF_NOISE, Summary, Value, all_flagged, more_columns, stated_frame,
-    stated_psf_noise,
 };
 pub(crate) use self::catalogue::{Catalogues, metadata};
-pub(crate) use self::head::check_strip;
-pub use self::head::{ImageHead, StampRow};
-pub use self::row::{MeasuredRow, measure_row};
 pub use self::source::ImageSource;
-pub(crate) use self::source::open_galaxies;
+pub(crate) use self::source::{check_strip, open_galaxies};
 use crate::PipelineError;
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;
@@ -34,9 +28,83 @@ use crate::engine::{self, Feeder, Progress};
 use crate::images::ImageId;
 use crate::inputs::Inputs;
 
+/// What the catalogue of an image contains beside its galaxies.
+#[derive(Debug, Clone)]
+pub struct ImageHead {
+    /// The image.
+    pub id: ImageId,
+    /// How its stamps lie.
+    pub mosaic: Mosaic,
+    /// Warnings about all images of the run, which were examined on this image.
+    pub run_warnings: Vec<Warning>,
+    /// Fingerprints of the files that the image is measured from.
+    pub prints: BTreeMap<String, String>,
+}
+
+/// A row of stamps of an image, to be measured by each of several measurers.
+#[derive(Debug)]
+pub struct ImageRow<'n, H> {
+    /// What the caller knows the image by.
+    pub head: Arc<H>,
+    /// One per measurer.
+    pub jobs: Vec<RowJob<'n>>,
+}
+
+/// What happened in [`measure_images`].
+#[derive(Debug)]
+pub enum Measured<'a, H> {
+    /// So many galaxies of a row were measured.
+    Galaxies(usize),
+    /// All rows of an image were measured, and calibrated by each measurer.
+    Image(&'a H, Vec<Batch>),
+}
+
+/// Measures the rows that `read` hands over, image by image and in order, by each of `measurers`. `done` is told on the
+/// calling thread.
+///
+/// # Errors
+/// As `read` and `done`, or if a row cannot be measured.
+pub fn measure_images<'n, H: Send + Sync>(
+    threads: usize,
+    measurers: &[Measurer],
+    read: impl FnOnce(&mut Feeder<'_, ImageRow<'n, H>>) -> Result<(), PipelineError> + Send,
+    mut done: impl FnMut(Measured<'_, H>) -> Result<(), PipelineError>,
+) -> Result<(), PipelineError> {
+    let mut images: Vec<MeasuredImage<'n>> = Vec::new();
+    engine::ordered(
+        threads,
+        read,
+        || measurers.iter().map(Measurer::worker).collect::<Vec<_>>(),
+        |workers, row: ImageRow<'n, H>| {
+            let jobs = row.jobs.iter().zip(workers);
+            let rows = jobs.map(|(job, worker)| {
+                let measured = job.measure(worker)?;
+                Ok((Arc::clone(job.session()), measured))
+            });
+            Ok((row.head, rows.collect::<Result<Vec<_>, PipelineError>>()?))
+        },
+        |(head, rows)| {
+            if images.is_empty() {
+                let sessions = rows.iter().map(|(session, _)| Arc::clone(session).begin());
+                images = sessions.collect::<Result<_, _>>()?;
+            }
+            let count = rows.first().map_or(0, |(_, row)| row.galaxies.len());
+            for (image, (_, row)) in images.iter_mut().zip(rows) {
+                image.add(row);
+            }
+            done(Measured::Galaxies(count))?;
+            if images.iter().all(MeasuredImage::is_complete) {
+                let batches = images.drain(..).map(MeasuredImage::finish).collect();
+                done(Measured::Image(&head, batches))?;
+            }
+            Ok(())
+        },
+    )
+}
+
 /// The measurement of images of a data folder.
 #[derive(Debug)]
-pub struct Session<'a> {
+pub struct FolderMeasurement<'a> {
     run: &'a Run,
     data: &'a DataFolder,
     out: &'a Path,
@@ -45,9 +113,9 @@ pub struct Session<'a> {
     todo: Option<(usize, Mosaic)>,
 }
 
-impl<'a> Session<'a> {
+impl<'a> FolderMeasurement<'a> {
     /// Plans the measurement of `images` of the run's data into catalogues in `out`. Catalogues of the same settings
-    /// that are there already are kept. Only [`Session::measure`] writes.
+    /// that are there already are kept. Only [`FolderMeasurement::measure`] writes.
     ///
     /// # Errors
     /// If the first image or its PSF cannot be used.
@@ -60,9 +128,9 @@ impl<'a> Session<'a> {
         let (todo, _) = catalogue::to_do(run, out, images);
         let first = todo.first().map(|&id| {
             let source = ImageSource::open(data, id, &run.configuration)?;
-            Ok::<_, PipelineError>((todo.len(), source.head().mosaic))
+            Ok::<_, PipelineError>((todo.len(), source.mosaic()))
         });
-        Ok(Session {
+        Ok(FolderMeasurement {
             run,
             data,
             out,
@@ -92,23 +160,20 @@ impl<'a> Session<'a> {
         let Some((_, mosaic)) = self.todo else {
             return catalogues.finish(progress);
         };
-        let configuration = &self.run.configuration;
-        let measurer = Measurer::new(configuration, mosaic.stamp)?;
+        let measurer = Measurer::new(&self.run.configuration, mosaic.stamp)?;
         let todo = std::mem::take(&mut catalogues.todo);
-        let mut rows = Vec::new();
-        engine::ordered(
+        measure_images(
             threads,
+            std::slice::from_ref(&measurer),
             |feeder| self.read(&todo, &measurer, &inputs, feeder),
-            || measurer.worker(),
-            |worker, row: StampRow| measure_row(worker, &row),
-            |row: MeasuredRow| {
-                progress.advance(row.galaxies.len() as u64);
-                let count = row.head.mosaic.rows();
-                rows.push(row);
-                if rows.len() == count {
-                    calibrate(configuration, &mut rows);
-                    catalogues.add(&rows, progress)?;
-                    rows.clear();
+            |measured| {
+                match measured {
+                    Measured::Galaxies(count) => progress.advance(count as u64),
+                    Measured::Image(head, batches) => {
+                        for batch in batches {
+                            catalogues.add(head, &batch, progress)?;
+                        }
+                    }
                 }
                 Ok(())
             },
@@ -123,25 +188,36 @@ impl<'a> Session<'a> {
         todo: &[ImageId],
         measurer: &Measurer,
         inputs: &Inputs<'_>,
-        feeder: &mut Feeder<'_, StampRow>,
+        feeder: &mut Feeder<'_, ImageRow<'static, ImageHead>>,
     ) -> Result<(), PipelineError> {
         for (k, &id) in todo.iter().enumerate() {
             let prints = inputs.prints(id)?;
             let mut source = ImageSource::open(self.data, id, measurer.configuration())?;
-            let (found, stamp) = (source.head().mosaic.stamp, measurer.full());
-            if found != stamp {
+            let (mosaic, stamp) = (source.mosaic(), measurer.full());
+            if mosaic.stamp != stamp {
                 let path = self.data.galaxies(id.set, id.image);
                 let message = format!(
-                    "the stamps have {found} pixels a side; the stamps of earlier images have {stamp}"
+                    "the stamps have {} pixels a side; the stamps of earlier images have {stamp}",
+                    mosaic.stamp
                 );
                 return Err(FileError::new(path, message).into());
             }
-            source.head_mut().prints = prints;
-            source.survey(self.data, measurer, feeder.ahead())?;
-            if k == 0 {
-                source.check_correlation(self.data, measurer)?;
-            }
-            while let Some(row) = source.next_row()? {
+            let session = Arc::new(source.session(measurer, feeder.ahead())?);
+            let correlated = match k {
+                0 => source.correlated_noise(&session, feeder.ahead())?,
+                _ => None,
+            };
+            let head = Arc::new(ImageHead {
+                id,
+                mosaic,
+                run_warnings: correlated.into_iter().collect(),
+                prints,
+            });
+            for row in 0..mosaic.rows() {
+                let row = ImageRow {
+                    head: Arc::clone(&head),
+                    jobs: vec![session.read(&mut source, row)?],
+                };
                 if !feeder.push(row) {
                     return Ok(());
                 }
@@ -151,10 +227,10 @@ impl<'a> Session<'a> {
     }
 }
 
-/// Measures `images` of the run's data into catalogues in `out`: a [`Session`] from beginning to end.
+/// Measures `images` of the run's data into catalogues in `out`: a [`FolderMeasurement`] from beginning to end.
 ///
 /// # Errors
-/// As [`Session::open`] and [`Session::measure`].
+/// As [`FolderMeasurement::open`] and [`FolderMeasurement::measure`].
 pub fn measure_folder(
     run: &Run,
     data: &DataFolder,
@@ -163,5 +239,5 @@ pub fn measure_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    Session::open(run, data, out, images)?.measure(threads, progress)
+    FolderMeasurement::open(run, data, out, images)?.measure(threads, progress)
 }

@@ -1,21 +1,21 @@
 //! Simulating and measuring in memory: no image is stored.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
-use std::fmt;
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
-use ndarray::{Array2, ArrayView2, Axis};
+use ndarray::{ArcArray2, Array2, ArrayView2, Axis, Ix3};
 use shearq_measure::{
-    ImageNoise, Measurer, NoisePlan, NoiseSurvey, Psfs, Steps, Survey, Warning, Worker, calibrate,
-    star_psf, strip,
+    Batch, ImageNoise, KnownNoise, Lazy, LazyStamps, Measurement, Measurer, Pixels, Psfs, Session,
+    StampRows, StampSource, Steps, Threads, Worker, star_psf, strip,
 };
 use shearq_quantities::Shear;
 use shearq_submissions::{Configuration, PsfForm};
 
-use super::engine::{self, Feeder, Progress};
+use super::engine::Progress;
 use super::images::ImageId;
-use super::measure::{Catalogues, ImageHead, MeasuredRow, StampRow, Summary, measure_row};
+use super::measure::{Catalogues, ImageHead, ImageRow, Measured, Summary, measure_images};
 use super::{PipelineError, simulate};
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;
@@ -25,53 +25,169 @@ use shearq_simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
 };
 
-/// One row of stamps to draw and measure.
-pub struct RowJob {
-    /// The image's fields of PSF and ellipticity.
-    pub fields: Arc<ImageFields>,
-    /// Row of the mosaic, from 0.
-    pub iy: usize,
-    /// What the rows of the image share, one per measurer.
-    pub heads: Arc<[Arc<ImageHead>]>,
-    /// The row as it is, if it was drawn for the survey of the image.
-    drawn: Option<DrawnRow>,
+/// A simulated image as a source of stamps, for a configuration.
+#[derive(Debug)]
+pub struct SimulatedSource<'s> {
+    set: &'s SetSimulator,
+    fields: Arc<ImageFields>,
+    form: PsfForm,
+    /// The PSF of all galaxies, if there is one.
+    shared: Option<ArcArray2<f64>>,
+    /// Rows that are measured by several measurers, or were drawn for a survey and will be measured.
+    drawn: Arc<Mutex<BTreeMap<usize, LazyStamps<'s>>>>,
 }
 
-/// A row of drawn stamps, and the ellipticities after lensing.
-type DrawnRow = (Vec<f32>, Vec<Shear>);
-type DrawnRows = BTreeMap<usize, DrawnRow>;
+impl<'s> SimulatedSource<'s> {
+    fn psf_of_all(fields: &ImageFields, configuration: &Configuration) -> Option<ArcArray2<f64>> {
+        let PsfField::One(psf) = &fields.psf else {
+            return None;
+        };
+        let cut = configuration.psf_cut();
+        let psf = match configuration.psf.form {
+            PsfForm::Functional => psf.stamp_beside(cut.size, STAMP),
+            PsfForm::Star => {
+                let star = simulate::star(psf, STAMP);
+                let psf = ArrayView2::from_shape((STAMP, STAMP), &star)
+                    .ok()
+                    .and_then(|star| star_psf(star, cut).ok());
+                // A simulated star without noise can always be cut.
+                psf.unwrap_or_else(|| {
+                    Array2::zeros((configuration.psf.size, configuration.psf.size))
+                })
+            }
+        };
+        Some(psf.into_shared())
+    }
 
-impl fmt::Debug for RowJob {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("RowJob")
-            .field("iy", &self.iy)
-            .field("heads", &self.heads)
-            .finish_non_exhaustive()
+    /// The PSFs of a row in the form that the configuration uses.
+    fn row_psfs(&self, row: usize) -> Lazy<'s, Psfs<'s>> {
+        if let Some(psf) = &self.shared {
+            return Psfs::Prepared(psf.clone()).into();
+        }
+        let (set, fields, form) = (self.set, Arc::clone(&self.fields), self.form);
+        Lazy::new(move || {
+            let n = set.grid().n;
+            match form {
+                PsfForm::Functional => {
+                    Psfs::functional((0..n).map(|ix| *fields.psf.at(ix, row)).collect::<Vec<_>>())
+                }
+                PsfForm::Star => {
+                    let stars = simulate::draw_stars(set, &fields, row);
+                    Psfs::Stars(Pixels::strip(stars, n, STAMP).expect("as many pixels as drawn"))
+                }
+            }
+        })
     }
 }
 
-/// A row of stamps, measured by each measurer.
-struct MeasuredJob {
-    /// Ellipticities after lensing.
-    observed: Vec<Shear>,
-    rows: Vec<MeasuredRow>,
+impl<'s> StampSource<'s> for SimulatedSource<'s> {
+    type Error = PipelineError;
+
+    fn rows(&self) -> StampRows {
+        let n = self.set.grid().n;
+        StampRows {
+            columns: n,
+            count: n * n,
+        }
+    }
+
+    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'s>, PipelineError> {
+        let (set, fields) = (self.set, Arc::clone(&self.fields));
+        let mut drawn = self.drawn.lock().unwrap_or_else(PoisonError::into_inner);
+        let stamps = drawn
+            .entry(row)
+            .or_insert_with(|| Lazy::new(move || draw(set, &fields, row)));
+        Ok(stamps.clone())
+    }
+
+    fn psfs(&mut self, row: usize) -> Result<Lazy<'s, Psfs<'s>>, PipelineError> {
+        Ok(self.row_psfs(row))
+    }
 }
 
-/// A simulated image, measured.
+/// Draws a row of stamps.
+fn draw<'s>(set: &SetSimulator, fields: &ImageFields, row: usize) -> Pixels<'s, Ix3> {
+    thread_local! {
+        /// Rows of an image often share the transfer function of their PSF, which is kept here.
+        static SCRATCH: RefCell<RenderScratch> = RefCell::default();
+    }
+    let pixels =
+        SCRATCH.with_borrow_mut(|scratch| simulate::draw_stamps(set, fields, row, scratch));
+    Pixels::strip(pixels, set.grid().n, STAMP).expect("as many pixels as drawn")
+}
+
+/// A simulated image that is being measured by several measurers.
 #[derive(Debug)]
-pub struct SimulatedImage<'a> {
-    /// Its number.
-    pub image: u32,
-    /// True ellipticities of the galaxies as lensed, row by row.
-    pub observed: &'a [Shear],
-    /// Rows of each measurer.
-    pub rows: &'a [Vec<MeasuredRow>],
+pub struct SimulatedSessions<'s> {
+    /// The image's fields of PSF and ellipticity.
+    pub fields: Arc<ImageFields>,
+    /// The sessions of the measurers, with their sources.
+    sessions: Vec<(Arc<Session<'s>>, SimulatedSource<'s>)>,
 }
 
-/// One thread's buffers.
-struct Scratch {
-    render: RenderScratch,
-    workers: Vec<Worker>,
+impl<'s> SimulatedSessions<'s> {
+    /// Opens a session of each measurer. Rows that are surveyed are drawn once.
+    ///
+    /// # Errors
+    /// If a measurer is for stamps of another size.
+    pub fn new(
+        set: &'s SetSimulator,
+        image: u32,
+        measurers: &[Measurer],
+        threads: &impl Threads,
+    ) -> Result<Self, PipelineError> {
+        let (fields, drawn) = (Arc::new(set.image_fields(image)), Arc::default());
+        let sessions = measurers.iter().map(|measurer| {
+            let mut source = SimulatedSource {
+                set,
+                fields: Arc::clone(&fields),
+                form: measurer.configuration().psf.form,
+                shared: SimulatedSource::psf_of_all(&fields, measurer.configuration()),
+                drawn: Arc::clone(&drawn),
+            };
+            let noise = KnownNoise::Stated(NOISE_SIGMA);
+            let session = Session::open(measurer, &mut source, noise, threads)?;
+            Ok((Arc::new(session), source))
+        });
+        Ok(SimulatedSessions {
+            sessions: sessions.collect::<Result<_, PipelineError>>()?,
+            fields,
+        })
+    }
+
+    /// Reads a row for all measurers, which is drawn once.
+    fn read(&mut self, row: usize) -> Result<ImageRow<'s, ImageFields>, PipelineError> {
+        let each = self.sessions.iter_mut();
+        let jobs = each.map(|(session, source)| session.read(source, row));
+        let jobs = jobs.collect::<Result<_, _>>()?;
+        if let Some((_, source)) = self.sessions.first() {
+            let mut drawn = source.drawn.lock().unwrap_or_else(PoisonError::into_inner);
+            drawn.remove(&row);
+        }
+        Ok(ImageRow {
+            head: Arc::clone(&self.fields),
+            jobs,
+        })
+    }
+
+    /// Measures a strip of stamps in the place of a row, before calibration.
+    ///
+    /// # Errors
+    /// If the stamps have other sizes than planned.
+    pub fn measure(
+        &self,
+        workers: &mut [Worker],
+        row: usize,
+        pixels: Vec<f32>,
+    ) -> Result<Vec<Vec<Measurement>>, PipelineError> {
+        let stamps = Pixels::strip(pixels, self.fields.intrinsic.nrows(), STAMP)?;
+        let each = self.sessions.iter().zip(workers);
+        let measured = each.map(|((session, source), worker)| {
+            let psfs = source.row_psfs(row);
+            Ok(session.measure(worker, row, &stamps, &psfs)?.galaxies)
+        });
+        measured.collect()
+    }
 }
 
 /// Plans the measurement of simulated stamps by each of `configurations`.
@@ -115,11 +231,33 @@ pub fn run_folder(
             &measurers,
             threads,
             progress,
-            |image, progress| catalogues.add(&image.rows[0], progress),
+            |image, progress| {
+                let head = ImageHead {
+                    id: ImageId {
+                        set,
+                        image: image.image,
+                    },
+                    mosaic: Mosaic::square(settings.grid, STAMP),
+                    run_warnings: Vec::new(),
+                    prints: BTreeMap::new(),
+                };
+                catalogues.add(&head, &image.batches[0], progress)
+            },
         )
         .map_err(|error| catalogues.explain(error))?;
     }
     catalogues.finish(progress)
+}
+
+/// A simulated image, measured.
+#[derive(Debug)]
+pub struct SimulatedImage<'a> {
+    /// Its number.
+    pub image: u32,
+    /// True ellipticities of the galaxies as lensed, row by row.
+    pub observed: &'a [Shear],
+    /// The galaxies as each measurer has measured them.
+    pub batches: &'a [Batch],
 }
 
 /// Simulates images of a set and measures each galaxy by all `measurers`. `done` gets the images in order.
@@ -138,152 +276,37 @@ pub fn run_set(
     mut done: impl FnMut(&SimulatedImage<'_>, &mut dyn Progress) -> Result<(), PipelineError>,
 ) -> Result<(), PipelineError> {
     let n = set.grid().n;
-    let mut rows: Vec<Vec<MeasuredRow>> = measurers.iter().map(|_| Vec::new()).collect();
-    let mut observed = Vec::with_capacity(n * n);
-    engine::ordered(
+    measure_images(
         threads,
-        |feeder| feed(set, images, measurers, feeder),
-        || Scratch {
-            render: RenderScratch::new(),
-            workers: measurers.iter().map(Measurer::worker).collect(),
-        },
-        |scratch, job| draw_and_measure(set, scratch, job),
-        |measured: MeasuredJob| {
-            progress.advance(n as u64);
-            let (image, iy) = (measured.rows[0].head.id.image, measured.rows[0].iy);
-            observed.extend(measured.observed);
-            for (rows, row) in rows.iter_mut().zip(measured.rows) {
-                rows.push(row);
-            }
-            if iy + 1 == n {
-                for (rows, measurer) in rows.iter_mut().zip(measurers) {
-                    calibrate(measurer.configuration(), rows);
+        measurers,
+        |feeder| {
+            for &image in images {
+                let mut open = SimulatedSessions::new(set, image, measurers, feeder.ahead())?;
+                for row in 0..n {
+                    if !feeder.push(open.read(row)?) {
+                        return Ok(());
+                    }
                 }
-                let image = SimulatedImage {
-                    image,
-                    observed: &observed,
-                    rows: &rows,
-                };
-                done(&image, progress)?;
-                rows.iter_mut().for_each(Vec::clear);
-                observed.clear();
             }
             Ok(())
         },
-    )
-}
-
-/// Hands out the rows of images of a set, in order, with the noise that each of `measurers` measures on them.
-///
-/// # Errors
-/// If a measurer is for stamps of another size.
-pub fn feed(
-    set: &SetSimulator,
-    images: &[u32],
-    measurers: &[Measurer],
-    feeder: &mut Feeder<'_, RowJob>,
-) -> Result<(), PipelineError> {
-    for &image in images {
-        let fields = Arc::new(set.image_fields(image));
-        let (surveys, mut drawn) = surveys(set, &fields, measurers, feeder)?;
-        let heads = heads(set, image, measurers, surveys);
-        for iy in 0..set.grid().n {
-            let job = RowJob {
-                fields: Arc::clone(&fields),
-                iy,
-                heads: Arc::clone(&heads),
-                drawn: drawn.remove(&iy),
+        |measured| {
+            let (fields, batches) = match measured {
+                Measured::Galaxies(count) => {
+                    progress.advance(count as u64);
+                    return Ok(());
+                }
+                Measured::Image(fields, batches) => (fields, batches),
             };
-            if !feeder.push(job) {
-                return Ok(());
-            }
-        }
-    }
-    Ok(())
-}
-
-/// What the rows of a simulated image share, one per measurer.
-fn heads(
-    set: &SetSimulator,
-    image: u32,
-    measurers: &[Measurer],
-    surveys: Surveys,
-) -> Arc<[Arc<ImageHead>]> {
-    let head = |(measurer, survey): (&Measurer, Option<Arc<Survey>>)| {
-        let warnings = Warning::of_settings(measurer.configuration());
-        Arc::new(ImageHead {
-            id: ImageId {
-                set: set.kind().set,
-                image,
-            },
-            mosaic: Mosaic::square(set.grid().n, STAMP),
-            noise: Some(NOISE_SIGMA),
-            stated_noise: None,
-            survey,
-            stars: None,
-            warnings: warnings.into_iter().collect(),
-            run_warnings: Vec::new(),
-            prints: BTreeMap::new(),
-        })
-    };
-    measurers.iter().zip(surveys).map(head).collect()
-}
-
-/// Noise and galaxy sizes of an image, for each measurer that measures them.
-type Surveys = Vec<Option<Arc<Survey>>>;
-
-/// The surveys of a simulated image, and the rows that were drawn for them by their place.
-fn surveys(
-    set: &SetSimulator,
-    fields: &ImageFields,
-    measurers: &[Measurer],
-    feeder: &Feeder<'_, RowJob>,
-) -> Result<(Surveys, DrawnRows), PipelineError> {
-    let n = set.grid().n;
-    let empty = || -> Vec<Option<NoiseSurvey>> {
-        let plans = measurers.iter().map(Measurer::noise_plan);
-        plans.map(|plan| plan.map(NoisePlan::survey)).collect()
-    };
-    let Some(plan) = measurers.iter().find_map(Measurer::noise_plan) else {
-        return Ok((measurers.iter().map(|_| None).collect(), BTreeMap::new()));
-    };
-    // Plans differ only in their lags.
-    let rows = feeder.each(plan.rows(n, n), |iy| {
-        let drawn = simulate::draw_stamps(set, fields, iy, &mut RenderScratch::new());
-        let mut surveys = empty();
-        for stamp in strip(&drawn.0, n, STAMP)?.outer_iter() {
-            for survey in surveys.iter_mut().flatten() {
-                survey.add(stamp)?;
-            }
-        }
-        Ok::<_, PipelineError>((surveys, (iy, drawn)))
-    });
-    let mut surveys = empty();
-    let mut drawn = BTreeMap::new();
-    for row in rows {
-        let (found, (iy, row)) = row?;
-        drawn.insert(iy, row);
-        for (survey, more) in surveys.iter_mut().flatten().zip(found.iter().flatten()) {
-            survey.join(more)?;
-        }
-    }
-    let found = surveys
-        .iter()
-        .map(|survey| survey.as_ref()?.found().map(Arc::new));
-    Ok((found.collect(), drawn))
-}
-
-fn draw_and_measure(
-    set: &SetSimulator,
-    scratch: &mut Scratch,
-    mut job: RowJob,
-) -> Result<MeasuredJob, PipelineError> {
-    let (pixels, observed) = job
-        .drawn
-        .take()
-        .unwrap_or_else(|| simulate::draw_stamps(set, &job.fields, job.iy, &mut scratch.render));
-    let rows = measure_strip(set, &job, pixels, &mut scratch.workers)?;
-    Ok(MeasuredJob { observed, rows })
+            let places = (0..n * n).map(|at| set.observed(fields, at % n, at / n));
+            let image = SimulatedImage {
+                image: fields.image,
+                observed: &places.collect::<Vec<_>>(),
+                batches: &batches,
+            };
+            done(&image, progress)
+        },
+    )
 }
 
 /// Simulates galaxy `(ix, iy)` of an image and measures it with all intermediate steps. Returns them with the PSF,
@@ -313,63 +336,6 @@ pub fn simulated_steps(
     }
     let steps = worker.steps(stamp, psf.view(), &measured)?;
     Ok(Some((psf, steps)))
-}
-
-/// Measures a strip of simulated stamps in the place of a job's by each worker, with the noise that was measured, or
-/// else with the true noise.
-///
-/// # Errors
-/// If the stamps have other sizes than planned.
-pub fn measure_strip(
-    set: &SetSimulator,
-    job: &RowJob,
-    pixels: Vec<f32>,
-    workers: &mut [Worker],
-) -> Result<Vec<MeasuredRow>, PipelineError> {
-    let mut measured = Vec::with_capacity(workers.len());
-    let mut pixels = pixels;
-    for (worker, head) in workers.iter_mut().zip(job.heads.iter()) {
-        let row = StampRow {
-            head: Arc::clone(head),
-            iy: job.iy,
-            pixels,
-            psfs: row_psfs(set, &job.fields, job.iy, worker.configuration())?,
-        };
-        measured.push(measure_row(worker, &row)?);
-        pixels = row.pixels;
-    }
-    Ok(measured)
-}
-
-/// The PSFs of a row in the form that a configuration uses.
-fn row_psfs(
-    set: &SetSimulator,
-    fields: &ImageFields,
-    iy: usize,
-    configuration: &Configuration,
-) -> Result<Psfs<'static>, PipelineError> {
-    let n = set.grid().n;
-    let (size, cut) = (configuration.psf.size, configuration.psf_cut());
-    Ok(match (&fields.psf, configuration.psf.form) {
-        (PsfField::One(psf), PsfForm::Functional) => {
-            Psfs::Prepared(psf.stamp_beside(cut.size, STAMP).into_shared())
-        }
-        (PsfField::One(psf), PsfForm::Star) => {
-            let star = simulate::star(psf, STAMP);
-            let psf = ArrayView2::from_shape((STAMP, STAMP), &star)
-                .ok()
-                .and_then(|star| star_psf(star, cut).ok());
-            // A simulated star without noise can always be cut.
-            let psf = psf.unwrap_or_else(|| Array2::zeros((size, size)));
-            Psfs::Prepared(psf.into_shared())
-        }
-        (PsfField::PerGalaxy(_), PsfForm::Functional) => {
-            Psfs::functional((0..n).map(|ix| *fields.psf.at(ix, iy)).collect::<Vec<_>>())
-        }
-        (PsfField::PerGalaxy(_), PsfForm::Star) => {
-            Psfs::strip(simulate::draw_stars(set, fields, iy), n, STAMP)?
-        }
-    })
 }
 
 #[cfg(test)]

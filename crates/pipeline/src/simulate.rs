@@ -5,7 +5,6 @@ use std::sync::Arc;
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 use shearq_quantities::FunctionalPsf;
-use shearq_quantities::Shear;
 
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
@@ -61,7 +60,6 @@ struct DrawnRow {
     pixels: Vec<f32>,
     /// Strip of star stamps, if there is one PSF per galaxy.
     stars: Option<Vec<f32>>,
-    observed: Vec<Shear>,
 }
 
 /// Prepares what all images of a set share.
@@ -167,7 +165,7 @@ fn simulate_into(
         RenderScratch::new,
         |scratch, job| Ok(draw_row(scratch, job)),
         |row: DrawnRow| {
-            progress.advance(row.observed.len() as u64);
+            progress.advance(row.job.set.grid().n as u64);
             let mut image = match open.take() {
                 Some(image) => image,
                 None => {
@@ -211,33 +209,27 @@ fn feed(simulators: &[(Arc<SetSimulator>, &[ImageId])], feeder: &mut Feeder<'_, 
 }
 
 fn draw_row(scratch: &mut RenderScratch, job: RowJob) -> DrawnRow {
-    let (pixels, observed) = draw_stamps(&job.set, &job.fields, job.iy, scratch);
+    let pixels = draw_stamps(&job.set, &job.fields, job.iy, scratch);
     let stars = matches!(job.fields.psf, PsfField::PerGalaxy(_))
         .then(|| draw_stars(&job.set, &job.fields, job.iy));
-    DrawnRow {
-        job,
-        pixels,
-        stars,
-        observed,
-    }
+    DrawnRow { job, pixels, stars }
 }
 
-/// A strip of noisy stamps, and the galaxies' ellipticities after lensing.
+/// A strip of noisy stamps.
 pub(super) fn draw_stamps(
     set: &SetSimulator,
     fields: &ImageFields,
     iy: usize,
     scratch: &mut RenderScratch,
-) -> (Vec<f32>, Vec<Shear>) {
+) -> Vec<f32> {
     let n = set.grid().n;
     let mut pixels = vec![0.0; n * STAMP * STAMP];
     let mut stamp = vec![0.0; STAMP * STAMP];
-    let mut observed = Vec::with_capacity(n);
     for ix in 0..n {
-        observed.push(set.draw(fields, ix, iy, scratch, &mut stamp));
+        set.draw(fields, ix, iy, scratch, &mut stamp);
         place(&stamp, STAMP, ix, n, &mut pixels);
     }
-    (pixels, observed)
+    pixels
 }
 
 /// A strip of star stamps, one per galaxy.
@@ -360,10 +352,11 @@ impl OpenImage {
         if let (Some(writer), Some(strip)) = (&mut self.stars, &row.stars) {
             writer.write_rows(strip)?;
         }
-        let iy = row.job.iy;
-        for (ix, observed) in row.observed.iter().enumerate() {
-            let (x, y) = self.job.set.grid().centre(ix, iy);
-            let e = self.job.fields.intrinsic[(ix, iy)];
+        let RowJob { set, fields, iy } = row.job;
+        for ix in 0..set.grid().n {
+            let (x, y) = set.grid().centre(ix, iy);
+            let e = fields.intrinsic[(ix, iy)];
+            let observed = set.observed(&fields, ix, iy);
             let numbers = [x, y, e.re, e.im, observed.e1, observed.e2];
             let _ = self
                 .intrinsic

@@ -11,11 +11,13 @@ use std::error::Error;
 use std::f64::consts::{PI, TAU};
 use std::path::Path;
 
-use ndarray::{Array2, Array3, ArrayView2, s};
+use ndarray::{Array2, Array3, ArrayView2};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_measure::{ImageNoise, Measurement, Measurer, PsfWorker};
+use shearq_measure::{
+    ArraySource, KnownNoise, Measurement, Measurer, OneThread, PsfWorker, Psfs, Session,
+};
 use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Shear, TransformedPsf};
 use shearq_render::figure::{Figure, LinePlot, PanelGrid, PictureFormat, Series, Style};
 use shearq_simulate::galaxy::Galaxy;
@@ -343,11 +345,13 @@ fn main() -> Result<(), Box<dyn Error>> {
         let (stamps, _) = drawing.central(Profile::drawn(&mut rng), at)?;
         stamp.assign(&(&stamps[0][0] + &noise(&mut rng)));
     }
-    let survey = measurer.survey(survey.slice(s![.., .., ..]))?;
-    let mut worker = measurer.worker();
-    let mut image = worker.image(ImageNoise::of(survey.as_ref(), Some(1.0)));
     let star =
         shearq_measure::star_psf(psf.stamp(SIDE).view(), measurer.configuration().psf_cut())?;
+    let psfs = Psfs::prepared(star.view());
+    let mut source = ArraySource::new(&measurer, survey.view(), &psfs)?;
+    let session = Session::open(&measurer, &mut source, KnownNoise::Stated(1.0), &OneThread)?;
+    let mut worker = measurer.worker();
+    let mut image = session.image(&mut worker);
     let mut worker = image.psf(star.view())?;
 
     for _ in 0..scenes {

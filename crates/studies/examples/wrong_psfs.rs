@@ -13,7 +13,10 @@ use ndarray::{Array2, Array3, ArrayView3, Axis};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_measure::{Examination, FunctionalPsf, ImageNoise, Measurer, Psfs, Warning, star_psf};
+use shearq_measure::{
+    ArraySource, Examination, FunctionalPsf, KnownNoise, Measurer, OneThread, Psfs, Session,
+    Warning, star_psf,
+};
 use shearq_quantities::Shear;
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::render::RenderScratch;
@@ -78,19 +81,20 @@ fn measured_with(
     psfs: &Psfs<'_>,
 ) -> Result<[f64; 5], Box<dyn Error>> {
     let side = |stamps: ArrayView3<'_, f32>| -> Result<_, Box<dyn Error>> {
+        let mut source = ArraySource::new(measurer, stamps, psfs)?;
+        let noise = KnownNoise::Stated(NOISE_SIGMA);
+        let session = Session::open(measurer, &mut source, noise, &OneThread)?;
         let mut worker = measurer.worker();
-        let survey = measurer.survey(stamps)?;
-        let mut image = worker.image(ImageNoise::of(survey.as_ref(), Some(NOISE_SIGMA)));
-        Ok(image.measure_each(stamps, psfs)?)
+        Ok(session.image(&mut worker).measure_each(stamps, psfs)?)
     };
-    let mut sides = [
-        side(galaxies.sides[0].view())?,
-        side(galaxies.sides[1].view())?,
-    ];
-    shearq_measure::calibrate(measurer.configuration(), &mut sides);
+    let mut both = side(galaxies.sides[0].view())?;
+    let half = both.len();
+    both.extend(side(galaxies.sides[1].view())?);
+    shearq_measure::calibrate(measurer.configuration(), &mut both);
+    let sides = both.split_at(half);
     // Galaxies count with all of their versions or not at all.
     let (mut sums, mut count, mut lost) = ([[0.0; 2]; 2], 0.0, 0.0);
-    for (plus, minus) in sides[0].chunks(4).zip(sides[1].chunks(4)) {
+    for (plus, minus) in sides.0.chunks(4).zip(sides.1.chunks(4)) {
         let whole = plus.iter().chain(minus).all(|g| g.flags.is_empty());
         if !whole {
             lost += 1.0;

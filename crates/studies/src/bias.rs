@@ -13,6 +13,8 @@
 //!
 //! As in the simulated sets, lensing does not change the flux of a galaxy.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
 use shearq_bias::{BiasError, Errors, Estimate, Layout, Row, UnitSums, estimate};
 use shearq_measure::{Measurement, Measurer, Worker};
@@ -22,7 +24,7 @@ use shearq_submissions::Calibration;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::run::nan_for_null;
 use shearq_pipeline::engine::{self, Progress};
-use shearq_pipeline::run::{RowJob, feed, measure_strip};
+use shearq_pipeline::run::SimulatedSessions;
 use shearq_pipeline::simulate::place;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{ImageFields, STAMP, SetSimulator, Version};
@@ -93,26 +95,35 @@ pub fn biases(
     engine::ordered(
         threads,
         |feeder| {
-            // All versions have the size and noise of the galaxies of the set.
-            feed(set, images, measurers, feeder)
+            for &image in images {
+                // All versions have the size and noise of the galaxies of the set.
+                let opened = SimulatedSessions::new(set, image, measurers, feeder.ahead())?;
+                let opened = Arc::new(opened);
+                for iy in 0..n {
+                    if !feeder.push((Arc::clone(&opened), iy)) {
+                        return Ok(());
+                    }
+                }
+            }
+            Ok(())
         },
         || {
             let workers: Vec<Worker> = measurers.iter().map(Measurer::worker).collect();
             (RenderScratch::new(), workers)
         },
-        |(render, workers), job| {
-            let RowJob { fields, iy, .. } = &job;
+        |(render, workers), (image, iy)| {
+            let fields = &image.fields;
             let mut versions = Vec::with_capacity(VERSIONS.len());
             for version in VERSIONS {
-                let strip = draw(set, fields, *iy, version, render);
-                versions.push(measure_strip(set, &job, strip, workers)?);
+                let strip = draw(set, fields, iy, version, render);
+                versions.push(image.measure(workers, iy, strip)?);
             }
             let mut found = empty();
             for (k, sums) in found.iter_mut().enumerate() {
                 for ix in 0..n {
-                    let psf = fields.psf.at(ix, *iy).shape;
-                    let galaxy = std::array::from_fn(|v| &versions[v][k].galaxies[ix]);
-                    sums.add((fields.image, (*iy * n + ix) as u64), galaxy, psf);
+                    let psf = fields.psf.at(ix, iy).shape;
+                    let galaxy = std::array::from_fn(|v| &versions[v][k][ix]);
+                    sums.add((fields.image, (iy * n + ix) as u64), galaxy, psf);
                 }
             }
             Ok(found)

@@ -12,18 +12,18 @@ use shearq_submissions::{Configuration, checked_name};
 
 use super::response::{Regression, Response};
 use shearq_files::FileError;
-use shearq_measure::Measurer;
+use shearq_measure::{Measurement, Measurer};
 use shearq_pipeline::PipelineError;
+use shearq_pipeline::data::mosaic::Mosaic;
 use shearq_pipeline::data::run::{Claim, claim, nan_for_null, read_record, write_record};
 use shearq_pipeline::engine::Progress;
-use shearq_pipeline::measure::MeasuredRow;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
 use shearq_pipeline::truth::SignBasis;
 use shearq_results::row::SetRecord;
 use shearq_results::score::{Basis, OWN, OddImages, ScoredSet};
 use shearq_simulate::kinds::SetKind;
-use shearq_simulate::set::SimulationSettings;
+use shearq_simulate::set::{STAMP, SimulationSettings};
 
 /// The settings of a study.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -193,13 +193,12 @@ fn measure_set(
         threads,
         progress,
         |image, _| {
-            let each = sums.iter_mut().zip(&mut regressions).zip(image.rows);
-            for (((sum, counts), regression), rows) in each {
-                let (field, used) = field_sum(&grid, rows);
+            let each = sums.iter_mut().zip(&mut regressions).zip(image.batches);
+            for (((sum, counts), regression), batch) in each {
+                let (field, used) = field_sum(&grid, &batch.galaxies);
                 sum.add(&field).map_err(scoring)?;
                 *counts += used;
-                let measured = rows.iter().flat_map(|row| &row.galaxies);
-                regression.add(image.observed.iter().copied().zip(measured));
+                regression.add(image.observed.iter().copied().zip(&batch.galaxies));
             }
             Ok(())
         },
@@ -295,20 +294,19 @@ fn distinct(submissions: &[Configuration]) -> (Vec<Configuration>, Vec<usize>) {
 }
 
 /// The measurements of one image on the grid, and how the rows were used. Flagged galaxies count as missing.
-fn field_sum(grid: &Grid, rows: &[MeasuredRow]) -> (FieldSum, RowCounts) {
+fn field_sum(grid: &Grid, galaxies: &[Measurement]) -> (FieldSum, RowCounts) {
     let mut sum = FieldSum::new(grid);
-    let galaxies = rows.iter().flat_map(|row| {
-        row.galaxies.iter().enumerate().map(|(ix, galaxy)| {
-            let (x, y) = row.head.mosaic.centre(ix, row.iy);
-            Row {
-                x,
-                y,
-                e1: galaxy.e1,
-                e2: galaxy.e2,
-            }
-        })
+    let mosaic = Mosaic::square(grid.n, STAMP);
+    let rows = galaxies.iter().enumerate().map(|(place, galaxy)| {
+        let (x, y) = mosaic.position(place);
+        Row {
+            x,
+            y,
+            e1: galaxy.e1,
+            e2: galaxy.e2,
+        }
     });
-    let counts = sum.add_image(grid, galaxies);
+    let counts = sum.add_image(grid, rows);
     (sum, counts)
 }
 

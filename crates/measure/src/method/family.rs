@@ -128,19 +128,21 @@ struct FamilyWorker {
 }
 
 impl CutWorker for FamilyWorker {
-    fn set_noise(&mut self, noise: &StampNoise) {
-        self.noise = noise.clone();
-        for (_, member) in &mut self.members {
-            member.set_noise(noise);
-        }
-    }
-
-    fn set_extent(&mut self, extent: Option<f64>) {
+    fn set_image(
+        &mut self,
+        noise: &StampNoise,
+        extent: Option<f64>,
+        stars: Option<&Arc<CommonProfile>>,
+    ) {
+        self.shrinker.set_common(stars);
         self.extent = extent;
-    }
-
-    fn set_stars(&mut self, common: Option<&Arc<CommonProfile>>) {
-        self.shrinker.set_common(common);
+        // The noise of each mode takes as long as several galaxies, and rows of an image have the same.
+        if self.noise != *noise {
+            self.noise = noise.clone();
+            for (_, member) in &mut self.members {
+                member.set_noise(noise);
+            }
+        }
     }
 
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {

@@ -15,17 +15,17 @@ use crate::versions::VersionSettings;
 
 /// The plan, PSF and buffers of a method in one thread.
 pub(crate) trait CutWorker: Send {
-    /// Sets the noise of the galaxies that follow, in units of its level; white at first. Call `set_psf` after it.
-    fn set_noise(&mut self, _noise: &StampNoise) {}
+    /// Sets what an image is known by: its noise in units of the level, the mean square radius per axis of its galaxies
+    /// with the PSF in px², and what its noisy stars have in common. At first the noise is white and nothing else is known.
+    fn set_image(
+        &mut self,
+        _noise: &StampNoise,
+        _extent: Option<f64>,
+        _stars: Option<&Arc<CommonProfile>>,
+    ) {
+    }
 
-    /// Sets the mean square radius per axis of the galaxies that follow, with the PSF, in px², if it is known. Call
-    /// `set_psf` after it.
-    fn set_extent(&mut self, _extent: Option<f64>) {}
-
-    /// Sets what the noisy stars of the image have in common, if that is known. Call `set_psf` after it.
-    fn set_stars(&mut self, _common: Option<&Arc<CommonProfile>>) {}
-
-    /// Sets the PSF.
+    /// Sets a PSF of the image.
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;
 
     /// The settings that were adapted to PSF and galaxies, if the method adapts any.

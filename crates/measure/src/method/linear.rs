@@ -153,6 +153,12 @@ impl LinearWorker {
         }
     }
 
+    /// Sets the noise of an image in units of its level. A PSF is set after it.
+    pub(super) fn set_noise(&mut self, noise: &StampNoise) {
+        self.noise = self.plan.spectral.noise(noise);
+        self.grain = noise.power([0.0; 2]).0.sqrt() as f32;
+    }
+
     /// Response of `shape` to a change of the autocorrelation by `lags.shear1` and `lags.shear2`.
     fn response(
         plan: &LinearPlan,
@@ -250,11 +256,6 @@ impl LinearWorker {
 }
 
 impl CutWorker for LinearWorker {
-    fn set_noise(&mut self, noise: &StampNoise) {
-        self.noise = self.plan.spectral.noise(noise);
-        self.grain = noise.power([0.0; 2]).0.sqrt() as f32;
-    }
-
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
         self.plan
             .spectral

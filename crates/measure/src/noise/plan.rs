@@ -8,7 +8,7 @@ use shearq_submissions::SkySource;
 use super::blocks::{BLOCK, PIXELS, POLYNOMIALS, frame, polynomials};
 use super::covariance::{lags, matrix};
 use crate::error::MeasureError;
-use crate::examine::{enough, in_rows};
+use crate::examine::enough;
 
 /// Side of the smallest stamps whose border is free of the galaxy. See docs/constants.md.
 const LEAST_STAMP: usize = 24;
@@ -75,11 +75,5 @@ impl NoisePlan {
         (0..count)
             .map(|k| (2 * k + 1) * rows / (2 * count))
             .collect()
-    }
-
-    /// Which of `count` stamps are looked at: those of [`NoisePlan::rows`] in the arrangement nearest to a square, in which
-    /// images of stamps have them.
-    pub fn stamps(&self, count: usize) -> Vec<usize> {
-        in_rows(count, |columns, rows| self.rows(columns, rows))
     }
 }

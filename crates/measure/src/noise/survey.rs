@@ -231,18 +231,8 @@ impl NoiseSurvey {
         self.typical.extend(median(&mut self.over_noise));
     }
 
-    /// How many stamps were looked at.
-    pub fn looked_at(&self) -> usize {
-        self.counts[0]
-    }
-
-    /// How many of the stamps looked at have missing pixels.
-    pub fn incomplete(&self) -> usize {
-        self.counts[1]
-    }
-
     /// Whether there is no stamp that is not left out: galaxies on them cannot be measured.
-    pub fn is_blind(&self) -> bool {
+    pub(super) fn is_blind(&self) -> bool {
         self.counts[0] == self.counts[2]
     }
 
@@ -258,8 +248,7 @@ impl NoiseSurvey {
         })
     }
 
-    /// The same for [`Worker::image`](crate::Worker::image); `None` if all stamps are such that their galaxies
-    /// will be flagged.
+    /// The same for the threads of a session; `None` if all stamps are such that their galaxies will be flagged.
     ///
     /// # Errors
     /// Where they do not tell the noise.
@@ -272,9 +261,10 @@ impl NoiseSurvey {
                     peak: f64::from(self.peak),
                 }))
             }
-            None => Err(MeasureError::Noise(
-                "not to be seen on the stamps' frames".into(),
-            )),
+            None => Err(MeasureError::NoBorders {
+                examined: self.counts[0],
+                incomplete: self.counts[1],
+            }),
         }
     }
 

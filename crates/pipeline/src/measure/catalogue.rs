@@ -7,10 +7,10 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
 use shearq_files::table::{self, FileFormat};
-use shearq_measure::{Flag, Flags, Measurement, Observables, PixelFrame, Versions, Warning};
+use shearq_measure::{Batch, Flag, Flags, Measurement, Observables, PixelFrame, Versions, Warning};
 use shearq_submissions::{Configuration, EllipticityType};
 
-use super::row::{MeasuredRow, psf_noise, warnings};
+use super::ImageHead;
 use crate::PipelineError;
 use crate::data::run::{Claim, RUN_FILE, Run, claim};
 use crate::engine::Progress;
@@ -69,7 +69,7 @@ pub const COLUMNS: [(&str, Value); 18] = [
 /// these; then sheared versions, if the configuration asks for them. NaN for galaxies that could not be measured.
 pub fn more_columns(
     configuration: &Configuration,
-    galaxies: &[&Measurement],
+    galaxies: &[Measurement],
 ) -> Vec<(String, Vec<f64>)> {
     let Some(linear) = configuration.linear() else {
         return Vec::new();
@@ -93,10 +93,10 @@ pub fn more_columns(
 }
 
 /// Each quantity of each sheared version.
-fn versions(galaxies: &[&Measurement]) -> Vec<(String, Vec<f64>)> {
+fn versions(galaxies: &[Measurement]) -> Vec<(String, Vec<f64>)> {
     const COUNT: usize = Versions::QUANTITIES.len();
     let of = |at: usize| {
-        let value = move |galaxy: &&Measurement| {
+        let value = move |galaxy: &Measurement| {
             let all = galaxy.versions.as_ref();
             all.map_or(f64::NAN, |all| all.values(at / COUNT)[at % COUNT])
         };
@@ -124,8 +124,6 @@ pub const PSF_NOISE: &str = "psfnoise";
 /// Key of the metadata with the pixel axes, if they are not the sky's: position angle of +y in degrees, parity (−1 for mirrored),
 /// and both components of the shear.
 const FRAME: &str = "frame";
-/// Effect on m below which the noise of a star, or of rounding, is not stated.
-const LEAST_PSF_NOISE: f64 = 1e-5;
 /// Keys of the metadata of catalogues, beside fingerprints.
 pub const KEYS: [&str; 9] = [
     "creator", "submiss", "elltype", "set", "image", "settings", PSF_NOISE, WARNINGS, FRAME,
@@ -159,39 +157,29 @@ pub fn stated_frame(path: &Path, format: FileFormat) -> Result<Option<PixelFrame
     }
 }
 
-/// The effect of a star's noise on m and c, as a catalogue of this configuration states it: `None` unless it is known and
-/// matters.
-pub fn stated_psf_noise(
-    configuration: &Configuration,
-    effect: Option<[f64; 2]>,
-) -> Option<[f64; 2]> {
-    effect.filter(|effect| configuration.linear().is_some() && effect[0] > LEAST_PSF_NOISE)
-}
-
-/// Catalogue of one image from its rows of stamps, in order.
+/// Catalogue of one image.
 ///
 /// # Errors
 /// If polars cannot make the table.
-fn catalogue(rows: &[MeasuredRow], configuration: &Configuration) -> Result<DataFrame, TableError> {
-    let galaxies = || rows.iter().flat_map(|row| &row.galaxies);
-    let positions = rows.iter().flat_map(|row| {
-        let mosaic = row.head.mosaic;
-        (0..row.galaxies.len()).map(move |ix| mosaic.centre(ix, row.iy))
-    });
+fn catalogue(
+    head: &ImageHead,
+    galaxies: &[Measurement],
+    configuration: &Configuration,
+) -> Result<DataFrame, TableError> {
+    let positions = (0..galaxies.len()).map(|place| head.mosaic.position(place));
     let (x, y): (Vec<f64>, Vec<f64>) = positions.unzip();
     let mut columns = vec![Column::new("x".into(), x), Column::new("y".into(), y)];
     columns.extend(COLUMNS.iter().map(|(name, value)| match value {
         Value::Real(of) => {
-            let values: Vec<f64> = galaxies().map(of).collect();
+            let values: Vec<f64> = galaxies.iter().map(of).collect();
             Column::new((*name).into(), values)
         }
         Value::Whole(of) => {
-            let values: Vec<i64> = galaxies().map(|g| i64::from(of(g))).collect();
+            let values: Vec<i64> = galaxies.iter().map(|g| i64::from(of(g))).collect();
             Column::new((*name).into(), values)
         }
     }));
-    let galaxies: Vec<&Measurement> = galaxies().collect();
-    let more = more_columns(configuration, &galaxies).into_iter();
+    let more = more_columns(configuration, galaxies).into_iter();
     columns.extend(more.map(|(name, values)| Column::new(name.into(), values)));
     frame(columns)
 }
@@ -281,11 +269,9 @@ impl Summary {
     }
 
     /// Counts one image.
-    fn count(&mut self, rows: &[MeasuredRow]) {
+    fn count(&mut self, galaxies: &[Measurement]) {
         self.images += 1;
-        for galaxy in rows.iter().flat_map(|row| &row.galaxies) {
-            self.add(galaxy.flags);
-        }
+        galaxies.iter().for_each(|galaxy| self.add(galaxy.flags));
     }
 
     /// Counts a galaxy.
@@ -347,31 +333,31 @@ impl<'a> Catalogues<'a> {
         })
     }
 
-    /// Shows the warnings of an image whose rows are all measured and calibrated, and writes its catalogue.
+    /// Shows the warnings of an image, and writes its catalogue.
     ///
     /// # Errors
     /// If a warning is fatal, or the catalogue cannot be written.
     pub(crate) fn add(
         &mut self,
-        rows: &[MeasuredRow],
+        head: &ImageHead,
+        batch: &Batch,
         progress: &mut dyn Progress,
     ) -> Result<(), PipelineError> {
-        let head = &rows[0].head;
         let ImageId { set, image } = head.id;
-        let found = warnings(rows);
+        let found = &batch.warnings;
         self.warned
             .add(head.id, found.iter().chain(&head.run_warnings), progress)?;
         // Writing would make the folder again, without the earlier catalogues.
         self.claim.check()?;
         let path = self.run.catalogue(self.out, set, image);
-        let table = catalogue(rows, &self.run.configuration)
+        let table = catalogue(head, &batch.galaxies, &self.run.configuration)
             .map_err(|error| FileError::new(&path, error.to_string()))?;
         let mut metadata = metadata(self.run, head.id, head.prints.clone())?;
         if !found.is_empty() {
             let lines: Vec<String> = found.iter().map(Warning::to_string).collect();
             metadata.insert(WARNINGS.into(), lines.join("\n"));
         }
-        for warning in &found {
+        for warning in found {
             if let Warning::PixelFrame(frame) = warning {
                 let PixelFrame {
                     angle,
@@ -383,11 +369,11 @@ impl<'a> Catalogues<'a> {
                 metadata.insert(FRAME.into(), text);
             }
         }
-        if let Some([m, c]) = stated_psf_noise(&self.run.configuration, psf_noise(rows)) {
+        if let Some([m, c]) = batch.psf_noise {
             metadata.insert(PSF_NOISE.into(), format!("{m:.2e} {c:.2e}"));
         }
         table::write(&path, self.run.format, &table, &metadata)?;
-        self.summary.count(rows);
+        self.summary.count(&batch.galaxies);
         progress.note(&format!("set {set:02} image {image:03}"));
         Ok(())
     }

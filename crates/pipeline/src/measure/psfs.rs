@@ -1,23 +1,14 @@
 //! The PSFs of an image: one for all galaxies, or one per galaxy along the rows of stamps.
 
-use std::ops::ControlFlow;
 use std::path::Path;
-use std::sync::Arc;
 
 use ndarray::{ArcArray2, ArrayView2};
-use rayon::ThreadPool;
-use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
-use shearq_measure::{
-    CommonProfile, FunctionalPsf, Measurer, Psfs, Star, StarLook, StarLooker, StarSurvey,
-    examined_rows, star,
-};
+use shearq_measure::{FunctionalPsf, Psfs, Star, star};
 use shearq_submissions::{Configuration, PsfCut, PsfForm};
 
-use super::head::check_strip;
-use super::some_rows;
-use super::source::stated_image;
+use super::source::{check_strip, read_row, stated_image};
 use crate::PipelineError;
 use crate::data::layout::{DataFolder, MAX_STAMP};
 use crate::data::mosaic::Mosaic;
@@ -26,7 +17,7 @@ use crate::grid::whole;
 use crate::images::ImageId;
 use crate::wcs::Wcs;
 
-/// The PSFs of an image, read along its rows.
+/// The PSFs of an image.
 pub(super) enum PsfSource {
     Shared(ArcArray2<f64>),
     Stars {
@@ -37,78 +28,24 @@ pub(super) enum PsfSource {
 }
 
 impl PsfSource {
-    /// The PSFs of row `iy`; rows are read in order.
+    /// The PSFs of a row.
     ///
     /// # Errors
     /// If star stamps cannot be read.
-    pub(super) fn next_row(
+    pub(super) fn row(
         &mut self,
         mosaic: Mosaic,
-        iy: usize,
+        row: usize,
     ) -> Result<Psfs<'static>, PipelineError> {
         Ok(match self {
             PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
-            PsfSource::Stars { image, side } => stars(image.read_rows(*side)?, *side, mosaic, iy)?,
+            PsfSource::Stars { image, side } => Psfs::Stars(read_row(image, mosaic, *side, row)?),
             PsfSource::Functional(field) => {
-                let first = iy * mosaic.columns;
-                Psfs::functional(field[first..first + mosaic.of_row(iy)].to_vec())
+                let first = row * mosaic.columns;
+                Psfs::functional(field[first..first + mosaic.of_row(row)].to_vec())
             }
         })
     }
-
-    /// What stars of the image have in common, from some of its rows. Goes back to the first row. `threads` look at the stars
-    /// of a row together.
-    ///
-    /// # Errors
-    /// If star stamps cannot be read.
-    pub(super) fn survey(
-        &mut self,
-        mosaic: Mosaic,
-        measurer: &Measurer,
-        threads: &ThreadPool,
-    ) -> Result<Option<Arc<CommonProfile>>, PipelineError> {
-        let PsfSource::Stars { image, side } = self else {
-            return Ok(None);
-        };
-        if measurer.star_looker().is_none() {
-            return Ok(None);
-        }
-        let mut survey = StarSurvey::default();
-        let rows = examined_rows(mosaic.columns, mosaic.rows());
-        some_rows::read(image, *side, rows, |iy, pixels| {
-            let row = stars(pixels, *side, mosaic, iy)?;
-            let looks: Vec<StarLook> = threads.install(|| {
-                let stars = (0..mosaic.of_row(iy)).into_par_iter();
-                let look =
-                    |looker: &mut Option<StarLooker>, k| Some(looker.as_mut()?.look(&row, k));
-                stars
-                    .map_init(|| measurer.star_looker(), look)
-                    .flatten()
-                    .collect()
-            });
-            for look in looks {
-                survey.add(look);
-                if survey.is_over() {
-                    return Ok(ControlFlow::Break(()));
-                }
-            }
-            Ok(ControlFlow::Continue(()))
-        })?;
-        Ok(survey.common())
-    }
-}
-
-/// The star stamps of row `iy`.
-fn stars(
-    pixels: Vec<f32>,
-    side: usize,
-    mosaic: Mosaic,
-    iy: usize,
-) -> Result<Psfs<'static>, PipelineError> {
-    let mut stars = Psfs::strip(pixels, mosaic.columns, side)?;
-    // The last row may be shorter.
-    stars.truncate(mosaic.of_row(iy));
-    Ok(stars)
 }
 
 /// The PSFs of an image, and what is known about their file.

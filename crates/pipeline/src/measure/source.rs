@@ -1,17 +1,17 @@
-//! Images of a data folder as a stream of rows of stamps.
+//! Images of a data folder as sources of stamps.
 
-use std::collections::BTreeMap;
 use std::fmt;
-use std::sync::Arc;
+use std::path::{Path, PathBuf};
 
-use rayon::ThreadPool;
+use ndarray::Ix3;
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
-use shearq_measure::{Measurer, Warning};
+use shearq_measure::{
+    KnownNoise, Lazy, LazyStamps, Measurer, Pixels, Psfs, Session, StampRows, StampSource, Threads,
+    Warning,
+};
 use shearq_submissions::{Configuration, NoiseSource};
 
-use super::head::{ImageHead, StampRow, check_strip};
-use super::noise;
 use super::psfs::{OpenPsfs, PsfSource, open_psf};
 use crate::PipelineError;
 use crate::data::layout::DataFolder;
@@ -20,19 +20,24 @@ use crate::grid;
 use crate::images::ImageId;
 use crate::wcs::Wcs;
 
-/// An open image with its PSFs, read row by row.
+/// Most pixels of a row of stamps. Several rows are in memory at a time.
+const MAX_STRIP: usize = 1 << 24;
+
+/// An open image with its PSFs.
 pub struct ImageSource {
-    head: Arc<ImageHead>,
+    path: PathBuf,
+    mosaic: Mosaic,
     image: ImageReader,
     psfs: PsfSource,
-    next: usize,
+    noise: KnownNoise<'static>,
+    warnings: Vec<Warning>,
 }
 
 impl fmt::Debug for ImageSource {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("ImageSource")
-            .field("head", &self.head)
-            .field("next", &self.next)
+            .field("path", &self.path)
+            .field("mosaic", &self.mosaic)
             .finish_non_exhaustive()
     }
 }
@@ -53,10 +58,10 @@ impl ImageSource {
         if stamp < configuration.stamp.size {
             return Err(FileError::new(path, too_small(stamp, configuration)).into());
         }
-        let header_noise = image.number("NOISESIG")?;
+        let stated = image.number("NOISESIG")?;
         let uses_header = configuration.noise == NoiseSource::Header;
-        if uses_header && !header_noise.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite()) {
-            let found = header_noise.map_or("absent".into(), |sigma| sigma.to_string());
+        if uses_header && !stated.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite()) {
+            let found = stated.map_or("absent".into(), |sigma| sigma.to_string());
             let other = match configuration.linear() {
                 Some(_) => "image",
                 None => "border",
@@ -71,14 +76,13 @@ impl ImageSource {
             source: psfs,
             moved,
             wcs: psf_wcs,
-            stated,
+            stated: of_psf,
         } = open_psf(data, id, configuration, &mosaic)?;
-        let mut warnings: Vec<Warning> = Warning::of_settings(configuration).into_iter().collect();
-        warnings.extend(moved.map(Warning::of_moved));
+        let mut warnings: Vec<Warning> = moved.map(Warning::of_moved).into_iter().collect();
         let wcs = Wcs::of_header(&image);
         warnings.extend(Wcs::disagreements(&psf_wcs, &wcs));
         warnings.extend(wcs.frame());
-        for (of, stated) in [("galaxies", stated_image(&image)), ("PSF", stated)] {
+        for (of, stated) in [("galaxies", stated_image(&image)), ("PSF", of_psf)] {
             let expected = [id.set, id.image];
             let other = stated.filter(|stated| *stated != expected);
             warnings.extend(other.map(|stated| Warning::OtherImage {
@@ -87,104 +91,102 @@ impl ImageSource {
                 expected,
             }));
         }
-        let head = ImageHead {
-            id,
-            mosaic,
-            noise: header_noise,
-            stated_noise: header_noise.filter(|_| uses_header),
-            survey: None,
-            stars: None,
-            warnings,
-            run_warnings: Vec::new(),
-            prints: BTreeMap::new(),
-        };
         Ok(ImageSource {
-            head: Arc::new(head),
+            path,
+            mosaic,
             image,
             psfs,
-            next: 0,
+            noise: stated.map_or(KnownNoise::Unknown, KnownNoise::Stated),
+            warnings,
         })
     }
 
-    /// What all rows of the image share.
-    pub fn head(&self) -> &ImageHead {
-        &self.head
+    /// How the stamps lie.
+    pub fn mosaic(&self) -> Mosaic {
+        self.mosaic
     }
 
-    /// The same, to be changed before the first row is read.
-    pub(super) fn head_mut(&mut self) -> &mut ImageHead {
-        Arc::make_mut(&mut self.head)
-    }
-
-    /// Measures noise and galaxy sizes on the stamps, if the configuration of `measurer` requires it, and looks at noisy stars
-    /// if there is one for each galaxy, on `threads`. If all stamps have too many missing pixels, the galaxies are flagged: NOISESIG does
-    /// not replace the measurement.
+    /// The session of the image, for a measurer of the configuration that the image was opened for.
     ///
     /// # Errors
     /// If stamps or stars cannot be read, or stamps have no border of noise.
-    pub fn survey(
+    pub fn session(
         &mut self,
-        data: &DataFolder,
         measurer: &Measurer,
-        threads: &ThreadPool,
-    ) -> Result<(), PipelineError> {
-        let mosaic = self.head.mosaic;
-        self.head_mut().stars = self.psfs.survey(mosaic, measurer, threads)?;
-        let Some(plan) = measurer.noise_plan() else {
-            return Ok(());
-        };
-        let id = self.head.id;
-        let path = data.galaxies(id.set, id.image);
-        let found = noise::survey(&mut self.image, &path, mosaic, plan)?;
-        let head = self.head_mut();
-        match &found {
-            Some(survey) => {
-                let stated = head.noise;
-                head.warnings.extend(noise::disagreement(stated, survey));
-            }
-            None => {
-                head.noise = None;
-                head.warnings.push(Warning::NoNoise);
-            }
-        }
-        head.survey = found;
-        Ok(())
+        threads: &impl Threads,
+    ) -> Result<Session<'static>, PipelineError> {
+        let session = Session::open(measurer, self, self.noise, threads);
+        session.map_err(|error| self.named(error))
     }
 
-    /// Checks whether noise is correlated that the configuration treats as white.
+    /// A warning if noise is correlated that the configuration treats as white.
     ///
     /// # Errors
-    /// If stamps cannot be read, or have no border of noise although the configuration requires it.
-    pub(super) fn check_correlation(
+    /// As [`ImageSource::session`].
+    pub(super) fn correlated_noise(
         &mut self,
-        data: &DataFolder,
-        measurer: &Measurer,
-    ) -> Result<(), PipelineError> {
-        let id = self.head.id;
-        let path = data.galaxies(id.set, id.image);
-        let found = noise::correlation(&mut self.image, &path, &self.head, measurer)?;
-        self.head_mut().run_warnings.extend(found);
-        Ok(())
+        session: &Session<'static>,
+        threads: &impl Threads,
+    ) -> Result<Option<Warning>, PipelineError> {
+        let found = session.correlated_noise(self, threads);
+        found.map_err(|error| self.named(error))
     }
 
-    /// The next row of stamps, `None` after the last.
-    ///
-    /// # Errors
-    /// If it cannot be read.
-    pub fn next_row(&mut self) -> Result<Option<StampRow>, PipelineError> {
-        let mosaic = self.head.mosaic;
-        if self.next == mosaic.rows() {
-            return Ok(None);
+    /// The error with the name of the image.
+    fn named(&self, error: PipelineError) -> PipelineError {
+        match error {
+            PipelineError::Measure(error) => FileError::new(&self.path, error).into(),
+            other => other,
         }
-        let iy = self.next;
-        self.next += 1;
-        Ok(Some(StampRow {
-            head: Arc::clone(&self.head),
-            iy,
-            pixels: self.image.read_rows(mosaic.stamp)?,
-            psfs: self.psfs.next_row(mosaic, iy)?,
-        }))
     }
+}
+
+impl StampSource<'static> for ImageSource {
+    type Error = PipelineError;
+
+    fn rows(&self) -> StampRows {
+        StampRows {
+            columns: self.mosaic.columns,
+            count: self.mosaic.galaxies,
+        }
+    }
+
+    fn warnings(&self) -> Vec<Warning> {
+        self.warnings.clone()
+    }
+
+    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'static>, PipelineError> {
+        Ok(read_row(&mut self.image, self.mosaic, self.mosaic.stamp, row)?.into())
+    }
+
+    fn psfs(&mut self, row: usize) -> Result<Lazy<'static, Psfs<'static>>, PipelineError> {
+        Ok(self.psfs.row(self.mosaic, row)?.into())
+    }
+}
+
+/// Reads a row of stamps of `side` pixels. The last row may be shorter.
+pub(super) fn read_row(
+    image: &mut ImageReader,
+    mosaic: Mosaic,
+    side: usize,
+    row: usize,
+) -> Result<Pixels<'static, Ix3>, PipelineError> {
+    image.rewind();
+    image.skip_rows(row * side);
+    let stamps = Pixels::strip(image.read_rows(side)?, mosaic.columns, side)?;
+    Ok(stamps.into_slice(0..mosaic.of_row(row)))
+}
+
+/// Checks that a row of `n` stamps of `side` pixels a side fits into memory.
+pub(crate) fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), FileError> {
+    let pixels = n * side * side;
+    if pixels <= MAX_STRIP {
+        return Ok(());
+    }
+    let message = format!(
+        "a row of {n} stamps of {side} pixels a side has {pixels} pixels; expected at most {MAX_STRIP}"
+    );
+    Err(FileError::new(path, message))
 }
 
 /// Set and image that the header of a simulated image states. Headers of other programs may have one of these keys with

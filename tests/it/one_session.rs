@@ -1,0 +1,307 @@
+//! Files, simulations in memory and arrays are measured alike, on data that take each way through a session.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use shearq_files::table;
+use shearq_measure::ndarray::{Array3, Axis, s};
+use shearq_measure::{
+    ArraySource, Batch, KnownNoise, Measurement, Measurer, OneThread, Psfs, Session,
+};
+
+use crate::support::{contents, fits_image, floats, pixels_of, shearq, succeed, text};
+
+/// Galaxies along a side: more than are surveyed.
+const GRID: usize = 33;
+const STAMP: usize = 48;
+
+/// An image and its star, or a star of each galaxy.
+struct Data {
+    stamps: Array3<f32>,
+    stars: Array3<f32>,
+    noise: Option<f64>,
+}
+
+/// Uniform numbers of variance one, from a linear congruential generator: enough to be noise.
+fn noise(state: &mut u64) -> f32 {
+    *state = state
+        .wrapping_mul(6_364_136_223_846_793_005)
+        .wrapping_add(1_442_695_040_888_963_407);
+    12f32.sqrt() * ((*state >> 40) as f32 / (1u64 << 24) as f32 - 0.5)
+}
+
+/// The stamps of a mosaic.
+fn cube(path: &Path) -> Array3<f32> {
+    let ((pixels, width), side) = (pixels_of(path), STAMP);
+    let n = width / side;
+    let rows = pixels.len() / width / side;
+    Array3::from_shape_fn((n * rows, side, side), |(k, y, x)| {
+        pixels[(k / n * side + y) * width + k % n * side + x]
+    })
+}
+
+/// A mosaic of stamps in rows of `n`.
+fn mosaic(stamps: &Array3<f32>, n: usize) -> Vec<f32> {
+    let (count, side, _) = stamps.dim();
+    let (width, height) = (n * side, count / n * side);
+    let at = |at: usize| {
+        let (x, y) = (at % width, at / width);
+        stamps[(y / side * n + x / side, y % side, x % side)]
+    };
+    (0..width * height).map(at).collect()
+}
+
+impl Data {
+    fn write(&self, folder: &Path) {
+        let side = GRID * STAMP;
+        let mut cards = vec![format!("STAMP   = {STAMP:>20}")];
+        cards.extend(self.noise.map(|noise| format!("NOISESIG= {noise:>20?}")));
+        let cards: Vec<&str> = cards.iter().map(String::as_str).collect();
+        let pixels = floats(&mosaic(&self.stamps, GRID));
+        let image = fits_image(-32, &[side; 2], &cards, &pixels);
+        std::fs::write(folder.join("set02/galaxies-001.fits"), image).unwrap();
+        let along = if self.stars.dim().0 == 1 { 1 } else { GRID };
+        let stars = floats(&mosaic(&self.stars, along));
+        let image = fits_image(-32, &[along * STAMP; 2], &cards[..1], &stars);
+        std::fs::write(folder.join("set02/psf-001.fits"), image).unwrap();
+    }
+
+    /// What the library makes of the arrays.
+    fn batch(&self, measurer: &Measurer) -> Result<Batch, String> {
+        let psfs = match self.stars.dim().0 {
+            1 => Psfs::star(self.stars.index_axis(Axis(0), 0)),
+            _ => Psfs::stars(self.stars.view()),
+        };
+        let mut source = ArraySource::new(measurer, self.stamps.view(), &psfs).unwrap();
+        let noise = self.noise.map_or(KnownNoise::Unknown, KnownNoise::Stated);
+        let session = Session::open(measurer, &mut source, noise, &OneThread);
+        let session = Arc::new(session.map_err(|error| error.to_string())?);
+        let mut worker = measurer.worker();
+        let mut image = Arc::clone(&session).begin().unwrap();
+        for row in 0..session.rows().len() {
+            let row = session.read(&mut source, row).unwrap();
+            image.add(row.measure(&mut worker).unwrap());
+        }
+        Ok(image.finish())
+    }
+}
+
+type Spoil = fn(&mut Data);
+
+/// Name, configuration, what is done to the data, and words of a warning or an error.
+const CASES: [(&str, &str, Spoil, &str); 10] = [
+    ("as simulated", "48/linear/star", |_| {}, ""),
+    ("a network", "23/raw/star", |_| {}, ""),
+    (
+        "sky",
+        "48/linear/star",
+        |data| sky(data),
+        "It was subtracted from all stamps",
+    ),
+    (
+        "noisy stars",
+        "48/linear/star",
+        |data| noisy_stars(data),
+        "the PSF is noisy",
+    ),
+    (
+        "noisy stars and sky",
+        "48/linear/star",
+        |data| {
+            sky(data);
+            noisy_stars(data);
+        },
+        "It was subtracted from all stamps",
+    ),
+    (
+        "missing pixels",
+        "48/linear/star",
+        |data| {
+            for (k, mut stamp) in data.stamps.outer_iter_mut().enumerate().step_by(3) {
+                stamp.slice_mut(s![k % 40..k % 40 + 3, ..4]).fill(f32::NAN);
+            }
+            data.stamps.index_axis_mut(Axis(0), 5).fill(f32::NAN);
+        },
+        "",
+    ),
+    (
+        "no stamp to survey",
+        "48/linear/star",
+        |data| data.stamps.fill(f32::NAN),
+        "cannot measure the noise: no stamp has enough pixels that differ",
+    ),
+    (
+        "no stamp to survey for a network",
+        "23/raw/star",
+        |data| data.stamps.fill(f32::NAN),
+        "pixels are missing",
+    ),
+    (
+        "borders without noise",
+        "48/linear/star",
+        |data| {
+            data.stamps
+                .indexed_iter_mut()
+                .for_each(|((_, y, x), value)| {
+                    if y.min(x) < 12 || y.max(x) >= 36 {
+                        *value = 0.0;
+                    }
+                });
+        },
+        "expected two or more complete borders",
+    ),
+    (
+        "a stated noise that is wrong",
+        "48/linear/star",
+        |data| data.noise = Some(1.3),
+        "NOISESIG disagrees with the measured noise",
+    ),
+];
+
+fn sky(data: &mut Data) {
+    for ((_, y, x), value) in data.stamps.indexed_iter_mut() {
+        *value += 0.5 + 0.01 * x as f32 - 0.02 * y as f32;
+    }
+}
+
+/// A star of S/N 80 for each galaxy.
+fn noisy_stars(data: &mut Data) {
+    let star = data.stars.index_axis(Axis(0), 0).to_owned();
+    let sigma = star.iter().map(|v| v * v).sum::<f32>().sqrt() / 80.0;
+    let mut state = 7;
+    let count = data.stamps.dim().0;
+    data.stars = Array3::from_shape_fn((count, STAMP, STAMP), |(_, y, x)| {
+        star[(y, x)] + sigma * noise(&mut state)
+    });
+}
+
+#[test]
+fn files_and_arrays_take_the_same_way_through_a_session() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let folder = at("data");
+    let (grid, data) = (GRID.to_string(), text(&folder));
+    let simulate = ["simulate", "--sets", "2", "--images", "1", "--grid", &grid];
+    succeed(&[&simulate[..], &["--out", data]].concat());
+    let plain = Data {
+        stamps: cube(&folder.join("set02/galaxies-001.fits")),
+        stars: cube(&folder.join("set02/psf-001.fits")),
+        noise: Some(1.0),
+    };
+    for (name, configuration, spoil, expected) in CASES {
+        let mut data = Data {
+            stamps: plain.stamps.clone(),
+            stars: plain.stars.clone(),
+            ..plain
+        };
+        spoil(&mut data);
+        data.write(&folder);
+        let measurer = Measurer::named(configuration, STAMP).unwrap();
+        let batch = data.batch(&measurer);
+        let outs = [("measure", "1"), ("measure", "3"), ("run", "2")].map(|(command, threads)| {
+            let out = at(&format!("{command}-{threads}"));
+            let _ = std::fs::remove_dir_all(&out);
+            let measure = [
+                command,
+                "--data",
+                text(&folder),
+                "--submission",
+                configuration,
+            ];
+            let output =
+                shearq(&[&measure[..], &["--threads", threads, "--out", text(&out)]].concat());
+            (out, String::from_utf8(output.stderr).unwrap())
+        });
+        let Ok(batch) = batch else {
+            let error = batch.unwrap_err();
+            assert!(error.contains(expected), "{name}: {error}");
+            for (_, said) in &outs {
+                assert!(said.contains(&error), "{name}: {said}");
+            }
+            continue;
+        };
+        let warnings: Vec<String> = batch.warnings.iter().map(ToString::to_string).collect();
+        assert_eq!(
+            warnings.is_empty(),
+            expected.is_empty(),
+            "{name}: {warnings:?}"
+        );
+        assert!(
+            warnings.join("\n").contains(expected),
+            "{name}: {warnings:?}"
+        );
+        for (out, said) in &outs {
+            for warning in &warnings {
+                assert!(said.contains(warning), "{name}: {said}\n{warning}");
+            }
+            let path = out.join("set02/catalogue-001.parquet");
+            let read = table::read(&path, None, table::MAX_ROWS).unwrap();
+            let column = |name: &str| table::numbers(&read, name, &path).unwrap().into_owned();
+            let bits = |values: Vec<f64>| {
+                values
+                    .into_iter()
+                    .map(|value| match value.is_nan() {
+                        true => u64::MAX,
+                        false => value.to_bits(),
+                    })
+                    .collect::<Vec<_>>()
+            };
+            let of =
+                |value: fn(&Measurement) -> f64| bits(batch.galaxies.iter().map(value).collect());
+            assert_eq!(bits(column("e1")), of(|g| g.e1), "{name}");
+            assert_eq!(bits(column("e2")), of(|g| g.e2), "{name}");
+            assert_eq!(bits(column("noise")), of(|g| g.noise), "{name}");
+            assert_eq!(
+                bits(column("R12")),
+                of(|g| g.response.map_or(f64::NAN, |r| r[0][1])),
+                "{name}"
+            );
+            assert_eq!(
+                bits(column("flags")),
+                of(|g| f64::from(g.flags.bits())),
+                "{name}"
+            );
+        }
+    }
+}
+
+#[test]
+fn simulated_images_are_measured_like_their_files() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let data = at("data");
+    let settings = ["--images", "2", "--grid", "34"];
+    let simulate = ["simulate", "--sets", "2,19", "--out", text(&data)];
+    succeed(&[&simulate[..], &settings].concat());
+    for name in ["48/linear/star", "48/linear/func", "23/den/star"] {
+        let (files, memory) = (at("files"), at("memory"));
+        for out in [&files, &memory] {
+            let _ = std::fs::remove_dir_all(out);
+        }
+        let measure = ["measure", "--data", text(&data), "--submission", name];
+        succeed(&[&measure[..], &["--out", text(&files)]].concat());
+        let run = ["run", "--simulate", "--sets", "2,19", "--submission", name];
+        succeed(&[&run[..], &["--out", text(&memory)], &settings].concat());
+        let catalogues = |folder: &Path| -> Vec<Vec<f64>> {
+            let all = contents(folder).into_iter();
+            let all = all.filter(|(path, _)| path.ends_with(".parquet"));
+            let values = all.flat_map(|(path, _)| {
+                let path = folder.join(path);
+                let read = table::read(&path, None, table::MAX_ROWS).unwrap();
+                ["e1", "e2", "R11", "noise", "flags"].map(|name| {
+                    let column = table::numbers(&read, name, &path).unwrap();
+                    assert_eq!(column.len(), 34 * 34);
+                    // NaN is not equal to itself.
+                    column
+                        .iter()
+                        .map(|v| if v.is_nan() { -9.0 } else { *v })
+                        .collect()
+                })
+            });
+            values.collect()
+        };
+        let (files, memory) = (catalogues(&files), catalogues(&memory));
+        assert_eq!(files.len(), 4 * 5);
+        assert!(files == memory, "{name}");
+    }
+}
