@@ -91,5 +91,6 @@ def test_arrays_are_measured_like_their_files(name, command, tmp_path):
     said = command(*arguments, stream="stderr")
     assert all(message in said for message in messages) and said.count("warning: set") == len(messages), said
     of_files = shearq.read(next(out.glob("set02/*")))
-    for column in ("e1", "e2", "noise", "flags", "R11", "R12", "snr", "size"):
+    names = ("e1", "e2", "noise", "flags", "R11", "R12", "snr", "size")
+    for column in (name for name in names if name in found.dtype.names):
         assert same_bits(found[column], of_files[column]), column
