@@ -131,6 +131,10 @@ def test_odd_tables_are_refused():
         shearq.bias({"name": [["a"]]}, g1=0, g2=0)
     with pytest.raises(ValueError, match="found none"):
         shearq.bias([], g1=0, g2=0)
+    twice = pandas.DataFrame(np.zeros((9, 3)), columns=["e1", "e2", "e1"])
+    for function in (shearq.Catalogue.from_table, lambda table: shearq.bias(table, g1=0, g2=0)):
+        with pytest.raises(ValueError, match="column e1 is there several times"):
+            function(twice)
     with pytest.raises(FileNotFoundError, match="absent.fits"):
         shearq.bias("absent.fits", g1=0, g2=0)
     table["e1"] = np.ma.masked_array(table["e1"], mask=table["id"] == 5)
@@ -199,7 +203,8 @@ def test_long_identifiers_and_texts_are_units(first):
     nullable = "Int64" if first < 2**63 else "UInt64"
     assert error(pandas.array(long, dtype=nullable), pandas.DataFrame) == expected
     names = np.array([f"tile {k}" for k in own])
-    for texts in (names, names.astype("S"), names.astype(object), np.ma.masked_array(names, mask=False)):
+    latin = np.array([b"\xe9 %d" % k for k in own])
+    for texts in (names, names.astype("S"), latin, names.astype(object), np.ma.masked_array(names, mask=False)):
         assert error(texts) == expected
     for make in (Table, pandas.DataFrame, polars.DataFrame, pyarrow.table):
         assert error(names, make) == expected

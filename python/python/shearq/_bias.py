@@ -316,7 +316,7 @@ def _values(column: Any) -> Any:
         reals = np.ascontiguousarray(array, dtype=np.float64)
         return np.where(missing, np.nan, reals) if missing.any() else reals
     if array.dtype.kind in "USO":
-        texts = (value.decode() if isinstance(value, bytes) else str(value) for value in array.tolist())
+        texts = (value.decode(errors="backslashreplace") if isinstance(value, bytes) else str(value) for value in array.tolist())
         return ["" if gone else text for gone, text in zip(missing, texts)]
     return None
 

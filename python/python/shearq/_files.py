@@ -34,21 +34,25 @@ def read(path: str | os.PathLike[str]) -> Catalogue:
     format = _tables.file_format(file)
     if not file.exists():
         raise FileNotFoundError(f"path: there is no file {file}")
+    catalogue: Catalogue
     if format == "npy":
-        return _tables.from_table(Catalogue, np.load(file))
+        catalogue = _tables.from_table(Catalogue, np.load(file))
+        return catalogue
     if format == "ecsv":
         from astropy.table import Table  # type: ignore[import-untyped, unused-ignore]
 
-        return _tables.from_table(Catalogue, Table.read(file, format="ascii.ecsv"))
+        catalogue = _tables.from_table(Catalogue, Table.read(file, format="ascii.ecsv"))
+        return catalogue
     keys = [*_schema.KEYS, *_schema.OTHER_KEYS, _schema.STAR_KEY, _schema.PSF_KEY]
     columns, metadata = _shearq.read_table(str(file), format, keys)
     found = {name: np.asarray(column) for name, column in columns.items()}
     if "snr" in found and not any(name in found for name in _schema.STAR):
         found.update(_star(file, dict(metadata), len(found["snr"])))
     try:
-        return _tables.build(Catalogue, found, _schema.to_attrs(metadata))
+        catalogue = _tables.build(Catalogue, found, _schema.to_attrs(metadata))
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
+    return catalogue
 
 
 def _star(file: pathlib.Path, metadata: dict[str, str], count: int) -> dict[str, Any]:

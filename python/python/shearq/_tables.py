@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import os
 import pathlib
 import tempfile
@@ -83,8 +84,11 @@ def named_columns(table: Any) -> list[tuple[str, Any]]:
         names = getattr(table, "colnames", getattr(table, "columns", None))
         if names is None:
             raise TypeError(f"table: found {type(table).__name__}; expected a table with columns")
+        repeated = [name for name, count in collections.Counter(map(str, names)).items() if count > 1]
+        if repeated:
+            raise ValueError(f"table: column {repeated[0]} is there several times; expected every name once")
         # An index of pandas with a name is a column, such as the identifier of the galaxy.
-        index = getattr(table, "index", None)
+        index: Any = getattr(table, "index", None)
         own = [name for name in getattr(index, "names", ()) if name is not None and name not in names]
         found = [(name, index.get_level_values(name)) for name in own]
         found += [(name, table[name]) for name in names]
