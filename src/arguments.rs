@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::{Args, ValueEnum};
-use shearq_scoring::{Choice, Convention, Definition};
+use shearq_scoring::{Choice, Convention, Definition, TruthSign};
 
 use crate::choices::named;
 use crate::{print, print_table, tell};
@@ -376,6 +376,24 @@ fn parse_choice(text: &str) -> Result<Choice, String> {
             .and_then(|number: u8| Convention::try_from(number).ok())
             .map(Choice::Insist)
             .ok_or_else(|| "expected `matched`, `best` or a number from 1 to 8".into()),
+    }
+}
+
+/// Sign of g2 on the command line.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(crate) enum SignArgument {
+    /// Minus the standard g2, as in the challenge's truth files.
+    Challenge,
+    /// Positive along x = y.
+    Standard,
+}
+
+impl From<SignArgument> for TruthSign {
+    fn from(sign: SignArgument) -> Self {
+        match sign {
+            SignArgument::Challenge => TruthSign::Challenge,
+            SignArgument::Standard => TruthSign::Standard,
+        }
     }
 }
 

@@ -8,17 +8,30 @@ use pyo3::prelude::*;
 use shearq_bias::{Design, Errors};
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
+use shearq_pipeline::truth::word;
 use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::{Names, Shapes};
 use shearq_results::bias::folders::expand;
-use shearq_results::bias::truth::Truth;
+use shearq_results::bias::truth::{TrueSign, Truth};
 use shearq_results::bias::{
     BiasFailure, Binning, Edges, Input, MOST_BINS, Request, Summed, Units, sum,
 };
 use shearq_results::expression::Expression;
 use shearq_results::views::bias::bias_table;
+use shearq_scoring::TruthSign;
 
 use crate::errors::in_python;
+
+/// The sign of g2 of a name.
+pub(crate) fn sign_of(name: &str) -> PyResult<TruthSign> {
+    let signs = [TruthSign::Standard, TruthSign::Challenge];
+    let found = signs.into_iter().find(|sign| word(*sign) == name);
+    found.ok_or_else(|| {
+        PyValueError::new_err(format!(
+            "truth_sign: found '{name}'; expected 'standard' or 'challenge'"
+        ))
+    })
+}
 
 fn of_bias(error: BiasFailure) -> PyErr {
     let message = in_python(&error.to_string());
@@ -156,7 +169,7 @@ pub(crate) fn bias_sums(
     columns: Vec<String>,
     truth: Option<GivenTruth>,
     ellipticity: Option<&str>,
-    flip_g2: bool,
+    truth_sign: Option<&str>,
     bins: Option<(String, Option<usize>, Vec<f64>)>,
     select: Option<&str>,
     selection: [Option<String>; 2],
@@ -195,6 +208,8 @@ pub(crate) fn bias_sums(
             Some(Binning { of, edges })
         }
     };
+    let specified = truth_sign.map(sign_of).transpose()?;
+    let mut sign = TrueSign::or_standard(specified);
     let truth = match truth {
         None => Truth::Columns,
         Some(GivenTruth::Constant((g1, g2))) => Truth::Constant([g1, g2]),
@@ -204,7 +219,10 @@ pub(crate) fn bias_sums(
                 .collect(),
         ),
         Some(GivenTruth::File(path)) => {
-            Truth::read(&path).map_err(|error| of_bias(error.into()))?
+            let (truth, own) =
+                Truth::read(&path, specified).map_err(|error| of_bias(error.into()))?;
+            sign = own;
+            truth
         }
     };
     let (mut inputs, mut truth) = (Vec::new(), truth);
@@ -223,7 +241,7 @@ pub(crate) fn bias_sums(
         names,
         truth,
         shapes: ellipticity.map(shapes_of).transpose()?,
-        flip_g2,
+        sign,
         bins,
         select: select
             .map(Expression::parse)

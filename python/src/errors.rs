@@ -49,10 +49,11 @@ pub(crate) fn of_pipeline(error: PipelineError) -> PyErr {
 }
 
 /// Options of the command line whose arguments in Python have other names or values.
-const OPTIONS: [(&str, &str); 4] = [
+const OPTIONS: [(&str, &str); 5] = [
     ("--drop-missing", "drop_missing=True"),
-    ("--flip-g2", "flip_g2=True"),
-    ("--truth-sign ", "truth_sign="),
+    ("--truth-sign standard", "truth_sign=\"standard\""),
+    ("--truth-sign challenge", "truth_sign=\"challenge\""),
+    ("--truth-sign", "truth_sign"),
     // Arguments of the same name. Paths may contain hyphens.
     (" --", " "),
 ];

@@ -5,6 +5,7 @@ use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1, ToPyArray};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use shearq_pipeline::truth::{Sign, word};
 use shearq_quantities::MeasuredRange;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::views::metrics::FORMATS;
@@ -17,6 +18,7 @@ use shearq_scoring::{
     sign_by_correlation, sign_by_modes,
 };
 
+use crate::bias::sign_of;
 use crate::errors::{in_python, of_scoring};
 
 /// Names, headings and meanings of the metrics.
@@ -160,7 +162,7 @@ pub(crate) fn score<'py>(
     stamp: f64,
     field_degrees: f64,
     truth: Pair<'py>,
-    challenge_sign: Option<bool>,
+    truth_sign: Option<&str>,
     e: Pair<'py>,
     positions: Option<Pair<'py>>,
     lengths: Vec<usize>,
@@ -175,6 +177,7 @@ pub(crate) fn score<'py>(
         choice: choice(convention)?,
     };
     let (g1, g2) = (truth.0.as_array(), truth.1.as_array());
+    let given = truth_sign.map(sign_of).transpose()?;
     let catalogue = Rows::new(&e, positions.as_ref(), lengths);
     let (scored, mut warnings, challenge) = py.detach(|| {
         let truth = g1.iter().zip(&g2).take(grid.cells() + 1).enumerate();
@@ -182,12 +185,7 @@ pub(crate) fn score<'py>(
             let (x, y) = grid.centre(k % n, k / n);
             Row { x, y, e1, e2 }
         });
-        let given = challenge_sign.map(|challenge| match challenge {
-            true => TruthSign::Challenge,
-            false => TruthSign::Standard,
-        });
-        let sign = given.unwrap_or(TruthSign::Standard);
-        let mut truth = TrueShear::from_rows(&grid, sign, truth).map_err(of_scoring)?;
+        let standard = TrueShear::from_rows(&grid, TruthSign::Standard, truth).map_err(of_scoring)?;
         let (mut images, mut counts) = (SetImages::new(&grid), RowCounts::default());
         catalogue.each(&grid, |image, rows| {
             counts += rows;
@@ -203,23 +201,29 @@ pub(crate) fn score<'py>(
             return Err(of_rows(&fault));
         }
         let mut warnings = rows::oddities(&counts, "e1, e2");
-        let by_modes = sign_by_modes(&grid, &truth).map_err(of_scoring)?;
-        let mut challenge = sign == TruthSign::Challenge;
-        if given.is_none() {
-            let found = match by_modes {
-                Some(sign) => Some(sign),
-                None => sign_by_correlation(&truth, images.total()).map_err(of_scoring)?,
-            };
-            if found == Some(TruthSign::Challenge) {
-                truth = truth.flipped();
-                challenge = true;
+        let by_modes = sign_by_modes(&grid, &standard).map_err(of_scoring)?;
+        let refused = |fault: String| {
+            PyValueError::new_err(format!("truth_g2: {}", in_python(&fault)))
+        };
+        let sign = match Sign::of_truth(None, given, || by_modes).map_err(refused)? {
+            Some(sign) => sign,
+            None if standard.g2.iter().all(|g2| *g2 == 0.0) => Sign::ZERO,
+            None => {
+                let found = sign_by_correlation(&standard, images.total()).map_err(of_scoring)?;
+                Sign::of_catalogues(found).map_err(refused)?
             }
-        } else if by_modes == Some(TruthSign::Challenge) {
-            let other = if challenge { "standard" } else { "challenge" };
+        };
+        if let Some(other) = by_modes.filter(|other| *other != sign.of) {
             warnings.push(format!(
-                "warning: truth_g2 seems to have the other sign: with it the shear is an E-mode field. Try: truth_sign=\"{other}\""
+                "warning: truth_g2 seems to have the other sign: with it the shear is an E-mode field. Try: truth_sign=\"{}\"",
+                word(other)
             ));
         }
+        let challenge = sign.of == TruthSign::Challenge;
+        let truth = match challenge {
+            true => standard.flipped(),
+            false => standard,
+        };
         let scorer = SetScorer::new(grid, truth, options).map_err(of_scoring)?;
         let scored = scorer.score(&images).map_err(of_scoring)?;
         let mut faults = ImageFaults::default();

@@ -116,7 +116,7 @@ def test_measured_catalogues_are_calibrated_by_their_divisors(image):
         ({"ellipticity": "e"}, 'ellipticity: found "e"'),
         ({"columns": {"e1": "g1", "e2": "g2"}}, "there is no column `g1`"),
         ({"truth": "absent.csv"}, "expected one of them"),
-        ({"flip_g2": True}, "follows minus the true g2"),
+        ({"truth_sign": "challenge"}, "follows minus the true g2"),
     ],
 )
 def test_what_cannot_be_estimated_is_named(pair, change, message):
@@ -318,3 +318,27 @@ def test_results_are_shown(pair):
     assert ax.get_tightbbox().x0 >= 0 and shearq.bias(pair, g1=[0.02, -0.02], g2=[0.01, -0.01]).plot().get_xlabel() == "all galaxies"
     with pytest.raises(ValueError, match="expected 'm' or 'c'"):
         found.plot("q")
+
+
+def test_the_sign_of_g2_in_a_table_is_stated_significant_or_refused(tmp_path):
+    random = np.random.default_rng(4)
+    g = random.normal(0, 0.03, (2, 400))
+    truth = tmp_path / "truth.csv"
+
+    def bias(noise, comment="", **options):
+        # The table has the challenge's sign.
+        rows = "".join(f"{k},{a},{-b}\n" for k, (a, b) in enumerate(g.T))
+        truth.write_text(f"id,g1,g2\n{comment}{rows}")
+        e = g + random.normal(0, noise, g.shape)
+        return shearq.bias({"id": np.arange(400.0), "e1": e[0], "e2": e[1]}, truth=truth, **options)
+
+    for noise, comment, options, why in (
+        (0.01, "", {}, "challenge, which e2 of the catalogues follows"),
+        (0.3, "", {"truth_sign": "challenge"}, "challenge, as specified"),
+        (0.3, "# g2sign: challenge\n", {}, "challenge, as the file states"),
+    ):
+        assert any(why in note for note in bias(noise, comment, **options).notes), why
+    with pytest.raises(ValueError, match='cannot determine the sign of g2.*Try: truth_sign="standard"'):
+        bias(0.3)
+    with pytest.raises(ValueError, match="truth_sign: found 'other'"):
+        bias(0.3, truth_sign="other")

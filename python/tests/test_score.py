@@ -103,6 +103,11 @@ def test_axes_and_signs_are_those_told(wave):
     found = shearq.score(*_field(), *_field(sign=-1))
     assert (found.truth_sign, found.convention, found.notes) == ("challenge", 5, [])
     assert shearq.score(*_field(), *_field()).truth_sign == "standard"
+    random = np.random.default_rng(5)
+    (e1, e2), (mixed1, mixed2) = random.normal(0, 0.1, (2, 2, 16, 16))
+    with pytest.raises(ValueError, match='truth_g2: cannot determine the sign of g2.*truth_sign="standard"'):
+        shearq.score(e1, e2, mixed1, mixed2)
+    assert shearq.score(mixed1, mixed2, mixed1, -mixed2).truth_sign == "challenge"
     assert shearq.score(g1, diagonal, g1, diagonal)["m_cross"] == pytest.approx(0, abs=1e-12)
 
 
@@ -150,7 +155,10 @@ def test_failure_values_are_refused_or_dropped_and_counted(wave, value):
 def test_a_constant_shear_gives_means():
     constant = np.full((12, 12), 0.02)
     e1 = constant + np.random.default_rng(1).normal(0, 0.1, (12, 12))
-    mean = shearq.score(e1, e1, constant, constant).mean
+    # 0.02 is 2.4 errors of the mean: too few for the sign of g2.
+    with pytest.raises(ValueError, match="cannot determine the sign of g2"):
+        shearq.score(e1, e1, constant, constant)
+    mean = shearq.score(e1, e1, constant, constant, truth_sign="standard").mean
     assert mean["e"][0] == pytest.approx(e1.mean()) and mean["truth"] == (0.02, 0.02)
     assert mean["error"][0] == pytest.approx(0.1 / 12, rel=0.3)
 

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::f64::consts::PI;
 use std::hash::{DefaultHasher, Hash, Hasher};
 
-use ndarray::Array2;
+use ndarray::{Array2, Zip};
 use shearq_fourier::Complex64;
 
 use crate::bandpower::{Bins, SCORED};
@@ -42,8 +42,6 @@ const SIGMA_OF_MAD: f64 = 1.4826;
 /// Difference of the shares of B modes that determines the sign of g₂. A pure E-mode field has a share of 0 in
 /// the right sign and of about one half in the other.
 const SHARES_APART: f64 = 0.2;
-/// Standard deviations at which a correlation of e₂ with g₂ determines the sign of g₂.
-const SIGN_CLEAR: f64 = 4.0;
 
 /// A probable fault of a set's ellipticities, or of its true shear.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -446,7 +444,7 @@ impl Fault {
 }
 
 /// The sign of g₂ in a truth that was read as `standard`: the sign in which its power is in E modes. `None` if both
-/// signs have similar shares of B modes.
+/// signs have similar shares of B modes, or if so few modes contain the power that they have E ≫ B by chance.
 ///
 /// # Errors
 /// If the shape of the truth differs from the grid.
@@ -455,13 +453,25 @@ pub fn sign_by_modes(grid: &Grid, standard: &TrueShear) -> Result<Option<TruthSi
     check_shape("g2 of the truth", &standard.g2, grid.n)?;
     let decomposer = Decomposer::new(*grid);
     let bins = Bins::new(grid, crate::Definition::Leaderboard);
-    let share = |truth: &TrueShear| {
-        let Modes { e, b } = decomposer.modes_of(Convention::STANDARD.field(&truth.g1, &truth.g2));
-        let (e, b) = (bins.scored_product(&e, &e), bins.scored_product(&b, &b));
-        b / (e + b)
+    let modes =
+        |truth: &TrueShear| decomposer.modes_of(Convention::STANDARD.field(&truth.g1, &truth.g2));
+    let powers = |Modes { e, b }: &Modes| (bins.scored_product(e, e), bins.scored_product(b, b));
+    let own = modes(standard);
+    let [(e, b), (other_e, other_b)] = [powers(&own), powers(&modes(&standard.flipped()))];
+    let difference = other_b / (other_e + other_b) - b / (e + b);
+    let found = sign_where(difference, SHARES_APART);
+    // E and B of equal power: ln(E/B) of N modes has the variance 2/N (Fisher's z). Modes k and -k are conjugate, so
+    // that N is half the participation number (Σ p)²/Σ p² of their powers p.
+    let power = Zip::from(&own.e)
+        .and(&own.b)
+        .map_collect(|e, b| Complex64::from(e.norm_sqr() + b.norm_sqr()));
+    let number = 0.5 * (e + b).powi(2) / bins.scored_product(&power, &power);
+    let clear = CLEAR * (2.0 / number).sqrt();
+    let ratio = match found {
+        Some(TruthSign::Challenge) => other_e / other_b,
+        _ => e / b,
     };
-    let difference = share(&standard.flipped()) - share(standard);
-    Ok(sign_where(difference, SHARES_APART))
+    Ok(found.filter(|_| ratio.ln() >= clear))
 }
 
 /// The sign of g₂ in a truth that was read as `standard`: the sign with which e₂ of the images correlates. `None` if
@@ -477,7 +487,7 @@ pub fn sign_by_correlation(
     let product = |a: &Array2<f64>, b: &Array2<f64>| (a * b).sum();
     let (g, e) = (&standard.g2, &sum.e2);
     let correlation = product(g, e) / (product(g, g) * product(e, e)).sqrt();
-    let clear = SIGN_CLEAR / (g.len() as f64).sqrt();
+    let clear = CLEAR / (g.len() as f64).sqrt();
     Ok(sign_where(correlation, clear))
 }
 

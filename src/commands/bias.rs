@@ -7,14 +7,14 @@ use clap::builder::PossibleValue;
 use clap::{Args, ValueEnum};
 use shearq_bias::{Design, Errors};
 
-use crate::arguments::{Printing, ReportFile, positive};
+use crate::arguments::{Printing, ReportFile, SignArgument, positive};
 use crate::{Findings, tell};
 use shearq_files::{atomic, open};
 use shearq_pipeline::images::Shard;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::bias::columns::{Names, Shapes, role_names};
 use shearq_results::bias::folders;
-use shearq_results::bias::truth::Truth;
+use shearq_results::bias::truth::{TrueSign, Truth};
 use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, sum};
 use shearq_results::expression::Expression;
 use shearq_results::select::selection;
@@ -68,9 +68,11 @@ pub(crate) struct Arguments {
     /// Type of the ellipticities [default: responsivity for columns of HSM that are distortions, else shear].
     #[arg(long, value_enum, conflicts_with = "merge")]
     ellipticity: Option<TypeArgument>,
-    /// Use minus the true g2.
-    #[arg(long, conflicts_with = "merge")]
-    flip_g2: bool,
+    /// Sign of the true g2 [default: as the file of --truth states; else, for x, y, g1, g2, the sign in which the shear is
+    /// an E-mode field; else the sign that e2 follows; required if these are unclear. Shears of options, of columns of
+    /// the catalogues and of tables with the column catalogue: standard].
+    #[arg(long, value_enum, conflicts_with = "merge")]
+    truth_sign: Option<SignArgument>,
     /// Also estimate in bins of a column or expression: `snr:5` has five bins with equally many galaxies,
     /// `flux/flux_error:5,10,20` has these edges.
     #[arg(long, value_name = "EXPRESSION:BINS", value_parser = parse_bins, conflicts_with = "merge")]
@@ -356,7 +358,14 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
         ("Design", shown(design)),
         ("Units", arguments.units.clone()),
         ("Ellipticities", shown(ellipticity)),
-        ("Minus the true g2", yes(arguments.flip_g2)),
+        (
+            "Sign of the true g2",
+            shown(
+                arguments
+                    .truth_sign
+                    .and_then(|sign| sign.to_possible_value()),
+            ),
+        ),
         ("Bins", bins),
         (
             "Rows with missing numbers are left out",
@@ -386,8 +395,14 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
     for text in &arguments.columns {
         names.add(text).map_err(anyhow::Error::msg)?;
     }
+    let specified = arguments.truth_sign.map(Into::into);
+    let mut sign = TrueSign::or_standard(specified);
     let truth = match (&arguments.truth, arguments.g1.zip(arguments.g2)) {
-        (Some(path), _) => Truth::read(path)?,
+        (Some(path), _) => {
+            let (truth, own) = Truth::read(path, specified)?;
+            sign = own;
+            truth
+        }
         (None, Some((g1, g2))) => {
             anyhow::ensure!(
                 g1.hypot(g2) < 1.0,
@@ -412,7 +427,7 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         names,
         truth,
         shapes: arguments.ellipticity.map(Shapes::from),
-        flip_g2: arguments.flip_g2,
+        sign,
         bins: arguments.bins.clone(),
         select: arguments.select.clone(),
         selection: selection(arguments.cuts.as_deref(), arguments.weight.as_deref())?,

@@ -4,19 +4,21 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use clap::{ArgGroup, Args, ValueEnum};
+use clap::{ArgGroup, Args};
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore, TruthSign};
+use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore};
 use shearq_submissions::EllipticityType;
 
-use crate::arguments::{Printing, ReportFile, ScoreSettings, SetList, Threads, positive};
+use crate::arguments::{
+    Printing, ReportFile, ScoreSettings, SetList, SignArgument, Threads, positive,
+};
 use crate::{print, tell, tell_unread};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::data::fingerprint;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::run::{Run, Source, way};
 use shearq_pipeline::simulate::kind_of;
-use shearq_pipeline::truth::{ReadTruth, Reading, read_truth, reading_of};
+use shearq_pipeline::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_render::table::TableFormat;
 use shearq_results::foreign::{Foreign, Screen, folder_of, plain_columns};
 use shearq_results::row::{Measured, RunRecord, SetRecord};
@@ -25,8 +27,8 @@ use shearq_results::store;
 use shearq_results::submit::challenge::{Kind, read_bandpowers};
 use shearq_results::submit::manifest::Manifest;
 use shearq_results::submit::packed::{Packed, PackedCatalogues, Sent, Submission};
+use shearq_results::views::pages;
 use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra, verdict_line};
-use shearq_results::{views::diagnosis, views::pages};
 use shearq_simulate::kinds::SetKind;
 
 /// Score ellipticities against a known shear field: Q, Q_dn, M/2, √A and more.
@@ -68,7 +70,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "V", allow_negative_numbers = true)]
     noise_var: Option<f64>,
     /// Sign of g2 in the file of --truth; data folders state it in layout.toml [default: as the file states, else
-    /// as the data determine, else the challenge's].
+    /// the sign in which the shear is an E-mode field, else the sign that e2 follows; required if these are unclear].
     #[arg(long, value_enum, requires = "truth", conflicts_with_all = FOLDERS)]
     truth_sign: Option<SignArgument>,
     /// Pixels per side of a stamp, for --truth [default: 48].
@@ -120,24 +122,6 @@ fn parse_ellipticity(text: &str) -> Result<EllipticityType, String> {
         "shear" => Ok(EllipticityType::Shear),
         "distortion" => Ok(EllipticityType::Distortion),
         _ => Err("expected `shear` or `distortion`".into()),
-    }
-}
-
-/// Sign of g2 on the command line.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum SignArgument {
-    /// Minus the standard g2, as in the challenge's truth files.
-    Challenge,
-    /// Positive along x = y.
-    Standard,
-}
-
-impl From<SignArgument> for TruthSign {
-    fn from(sign: SignArgument) -> Self {
-        match sign {
-            SignArgument::Challenge => TruthSign::Challenge,
-            SignArgument::Standard => TruthSign::Standard,
-        }
     }
 }
 
@@ -460,16 +444,22 @@ fn score_spectra(
 
 fn spectrum_file(
     arguments: &Arguments,
-    truth: &Path,
+    path: &Path,
     spectrum: &Path,
     options: Options,
 ) -> anyhow::Result<()> {
-    let truth = read_truth(truth, &plain_reading(arguments))?;
-    if let Some(line) = diagnosis::sign(truth.basis) {
-        tell(format_args!("{line}"));
+    let truth = read_truth(path, &plain_reading(arguments))?;
+    // Power spectra do not contain the sign of e2.
+    if truth.sign.is_none() {
+        let unknown = Sign::of_catalogues(None).map_err(anyhow::Error::msg);
+        unknown.with_context(|| path.display().to_string())?;
     }
     let manifest = Manifest::read(folder_of(spectrum))?;
+    let line = truth.sign.and_then(Sign::line);
     let score = score_spectrum(truth, spectrum, manifest.as_ref(), options)?;
+    if let Some(line) = line {
+        tell(format_args!("{line}"));
+    }
     let scored = [(None, score)];
     print_spectra(arguments, &scored, |_| None, spectrum, options)
 }

@@ -215,11 +215,17 @@ fn the_sign_of_the_true_g2_is_stated_determined_or_asked_for() {
     let q = |printed: &str| printed.split("══ ").nth(1).unwrap()[..24].to_owned();
     let stated = case.truth("stated.csv", standard, &shear);
     let right = case.score(&stated, &catalogues, &[]);
-    assert!(!right.contains("sign of g2"), "{right}");
+    assert!(
+        right.contains("truth: standard, as the file states"),
+        "{right}"
+    );
     let unstated = case.score(&case.truth("plain.csv", "", &shear), &catalogues, &[]);
-    assert!(unstated.contains("used the standard sign"), "{unstated}");
+    assert!(unstated.contains("truth: standard, in which"), "{unstated}");
     let challenge = case.score(&case.truth("challenge.csv", "", &flipped), &catalogues, &[]);
-    assert!(!challenge.contains("sign of g2"), "{challenge}");
+    assert!(
+        challenge.contains("truth: challenge, in which"),
+        "{challenge}"
+    );
     assert_eq!((q(&unstated), q(&challenge)), (q(&right), q(&right)));
     let message = fail(&[
         "score",
@@ -244,13 +250,13 @@ fn the_sign_of_the_true_g2_is_stated_determined_or_asked_for() {
     let measured = case.catalogues("both", &|cell, _| both(cell));
     let determined = case.score(&mixed, &measured[..1], &[]);
     assert!(
-        determined.contains("used the standard sign, with which e2 correlates"),
+        determined.contains("truth: standard, which e2 of the catalogues follows"),
         "{determined}"
     );
     let other = case.catalogues("other", &|cell, _| (noise(cell, 1, 0), noise(cell, 1, 1)));
-    let unknown = case.score(&mixed, &other[..1], &[]);
+    let unknown = fail(&["score", "--truth", text(&mixed), text(&other[0])]);
     assert!(
-        unknown.contains("warning: cannot determine the sign of g2"),
+        unknown.contains("cannot determine the sign of g2"),
         "{unknown}"
     );
     assert!(unknown.contains("Try: --truth-sign standard"), "{unknown}");

@@ -48,6 +48,7 @@ mod stored;
 mod submitted;
 mod support;
 mod terminal;
+mod truth_sign;
 mod unread_files;
 mod wrong_data;
 mod wrong_psfs;

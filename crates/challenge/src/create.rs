@@ -13,7 +13,7 @@ use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::images::{self, ImageId};
 use shearq_pipeline::simulate::{SimulationRecord, simulate_blind, simulator};
 use shearq_pipeline::truth::{
-    ReadTruth, Reading, SignBasis, grid_of_set, read_truth, reading_of, write_truth,
+    ReadTruth, Reading, grid_of_set, read_truth, reading_of, write_truth,
 };
 use shearq_pipeline::{PipelineError, Progress};
 use shearq_quantities::units::{Degrees, Pixels};
@@ -312,8 +312,8 @@ pub fn of_images(
             },
             None => reading_of(data, set)?,
         };
-        let ReadTruth { grid, shear, basis } = read_truth(&path, &reading)?;
-        if basis == SignBasis::Unknown {
+        let ReadTruth { grid, shear, sign } = read_truth(&path, &reading)?;
+        if sign.is_none() {
             let message = "cannot determine the sign of g2. Try: a line `# g2sign: standard` (g2 > 0 along x = y) or `# g2sign: challenge` (the other sign) in the file";
             return Err(FileError::new(&path, message).into());
         }
@@ -409,7 +409,7 @@ fn expected_scores(
             score,
             rows: RowCounts::default(),
             basis: Basis::Given,
-            sign: SignBasis::Specified,
+            sign: None,
             findings: Vec::new(),
             odd_images: OddImages::default(),
         };

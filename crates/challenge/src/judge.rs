@@ -11,7 +11,6 @@ use shearq_pipeline::data::fingerprint;
 use shearq_pipeline::data::layout::DataFolder;
 use shearq_pipeline::data::run::Source;
 use shearq_pipeline::simulate::kind_of;
-use shearq_pipeline::truth::SignBasis;
 use shearq_pipeline::{PipelineError, Progress, engine};
 use shearq_results::row::{RunRecord, SetRecord, definition_word};
 use shearq_results::score::{Basis, OddImages, ScoredSet};
@@ -711,7 +710,7 @@ impl Judge {
             score,
             rows: *rows,
             basis: Basis::Given,
-            sign: SignBasis::Specified,
+            sign: None,
             findings: Vec::new(),
             odd_images: OddImages::default(),
         };

@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
+use serde::{Deserialize, Serialize};
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_scoring::{Grid, TrueShear, TruthSign, sign_by_modes};
+use shearq_scoring::{Grid, Row, TrueShear, TruthSign, sign_by_modes};
 
 use super::grid;
 use crate::data::layout::{DataFolder, SIGN_KEY, stated_sign, truth_is_there, truth_rows};
@@ -22,16 +23,122 @@ pub struct Reading {
 }
 
 /// How the sign of g2 in a truth was determined.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum SignBasis {
-    /// It was specified, or the file states it.
+    /// The file states it.
+    Stated,
+    /// The user specified it.
     Specified,
     /// The true shear has (almost) no B modes with this sign, and many with the other.
-    Modes(TruthSign),
-    /// e2 of the catalogues correlates with the true g2 of this sign.
-    Correlation(TruthSign),
-    /// It is not known; the challenge's sign was assumed.
-    Unknown,
+    Modes,
+    /// e2 of the catalogues follows g2 of this sign.
+    Catalogues,
+    /// All g2 are zero, and have no sign.
+    Zero,
+}
+
+/// The sign of g2 in a truth. `score` and `bias` determine it in the same order: from the statement of the file or the
+/// user ([`Sign::of_truth`]), from the E modes of the true shear, and from the catalogues ([`Sign::of_catalogues`]).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Sign {
+    /// The sign.
+    pub of: TruthSign,
+    /// How it was determined.
+    pub basis: SignBasis,
+}
+
+impl Sign {
+    /// The sign of g2 that are all zero.
+    pub const ZERO: Sign = Sign {
+        of: TruthSign::Standard,
+        basis: SignBasis::Zero,
+    };
+
+    /// The sign that the file states, that the user specified, or in which the shear is an E-mode field; `None` if only
+    /// catalogues can determine it.
+    ///
+    /// # Errors
+    /// If the file states another sign than the user.
+    pub fn of_truth(
+        stated: Option<TruthSign>,
+        specified: Option<TruthSign>,
+        by_modes: impl FnOnce() -> Option<TruthSign>,
+    ) -> Result<Option<Self>, String> {
+        let (of, basis) = match (stated, specified) {
+            (Some(stated), Some(specified)) if stated != specified => {
+                return Err(format!(
+                    "the file states `{SIGN_KEY}: {}`, but `{}` was specified. Try: omit --truth-sign",
+                    word(stated),
+                    word(specified)
+                ));
+            }
+            (Some(sign), _) => (sign, SignBasis::Stated),
+            (None, Some(sign)) => (sign, SignBasis::Specified),
+            (None, None) => match by_modes() {
+                Some(sign) => (sign, SignBasis::Modes),
+                None => return Ok(None),
+            },
+        };
+        Ok(Some(Sign { of, basis }))
+    }
+
+    /// The sign that the catalogues determine.
+    ///
+    /// # Errors
+    /// If they do not: there is no default, because a wrong sign turns a bias of 0 into one of -2.
+    pub fn of_catalogues(found: Option<TruthSign>) -> Result<Self, String> {
+        let basis = SignBasis::Catalogues;
+        found.map(|of| Sign { of, basis }).ok_or_else(|| {
+            format!(
+                "cannot determine the sign of g2 in the truth (found no statement, no E-mode field, and no slope of e2 on g2 of 5σ; expected one of them). Try: --truth-sign standard (g2 > 0 along x = y), --truth-sign challenge (the other sign), or a line `# {SIGN_KEY}: standard` in the file"
+            )
+        })
+    }
+
+    /// Which sign is used and why; `None` if no g2 has a sign.
+    pub fn line(self) -> Option<String> {
+        let why = match self.basis {
+            SignBasis::Stated => "as the file states",
+            SignBasis::Specified => "as specified",
+            SignBasis::Modes => "in which the true shear is an E-mode field (not stated)",
+            SignBasis::Catalogues => "which e2 of the catalogues follows (not stated)",
+            SignBasis::Zero => return None,
+        };
+        Some(format!(
+            "Sign of g2 in the truth: {}, {why}.",
+            word(self.of)
+        ))
+    }
+}
+
+/// The name of a sign in files and options.
+pub fn word(sign: TruthSign) -> &'static str {
+    match sign {
+        TruthSign::Standard => "standard",
+        TruthSign::Challenge => "challenge",
+    }
+}
+
+/// The sign in which shears at any positions are an E-mode field; `None` if they do not fill a square grid.
+pub fn sign_on_any_grid(rows: &[Row]) -> Option<TruthSign> {
+    let side = rows.len().isqrt();
+    if side < 2 || side * side != rows.len() {
+        return None;
+    }
+    let least = |of: fn(&Row) -> f64| rows.iter().map(of).fold(f64::INFINITY, f64::min);
+    let (x, y) = (least(|row| row.x), least(|row| row.y));
+    let reach = rows.iter().map(|row| row.x - x).fold(0.0, f64::max);
+    let stamp = reach / (side - 1) as f64;
+    // The sign depends on neither the side of the field nor its place.
+    let grid = Grid::new(side, Pixels(stamp), Degrees(10.0)).ok()?;
+    let (first_x, first_y) = grid.centre(0, 0);
+    let moved = rows.iter().map(|row| Row {
+        x: row.x - x + first_x,
+        y: row.y - y + first_y,
+        ..*row
+    });
+    let standard = TrueShear::from_rows(&grid, TruthSign::Standard, moved).ok()?;
+    sign_by_modes(&grid, &standard).ok()?
 }
 
 /// A true shear on its grid.
@@ -39,10 +146,10 @@ pub enum SignBasis {
 pub struct ReadTruth {
     /// The grid.
     pub grid: Grid,
-    /// The shear, in the standard sign.
+    /// The shear, in the standard sign if `sign` is known, else as in the file.
     pub shear: TrueShear,
-    /// How its sign was determined.
-    pub basis: SignBasis,
+    /// The sign of g2 in the file; `None` if only catalogues can determine it.
+    pub sign: Option<Sign>,
 }
 
 /// The true shear of a file on its grid, whose side is the square root of the number of rows.
@@ -57,34 +164,17 @@ pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileErro
     let grid = Grid::new(side, reading.stamp, reading.field).map_err(bad)?;
     let standard = TrueShear::from_rows(&grid, TruthSign::Standard, rows).map_err(bad)?;
     drop(table);
-    let (sign, basis) = match (stated_sign(truth)?, reading.sign) {
-        (Some(stated), Some(specified)) if stated != specified => {
-            let word = |sign| match sign {
-                TruthSign::Standard => "standard",
-                TruthSign::Challenge => "challenge",
-            };
-            let message = format!(
-                "the file states `{SIGN_KEY}: {}`, but `{}` was specified. Try: omit --truth-sign",
-                word(stated),
-                word(specified)
-            );
-            return Err(FileError::new(truth, message));
-        }
-        (Some(sign), _) | (None, Some(sign)) => (sign, SignBasis::Specified),
-        (None, None) => match sign_by_modes(&grid, &standard).map_err(bad)? {
-            Some(sign) => (sign, SignBasis::Modes(sign)),
-            // Zero has no sign.
-            None if standard.g2.iter().all(|g2| *g2 == 0.0) => {
-                (TruthSign::Standard, SignBasis::Specified)
-            }
-            None => (TruthSign::Challenge, SignBasis::Unknown),
-        },
+    let by_modes = || sign_by_modes(&grid, &standard).ok().flatten();
+    let mut sign = Sign::of_truth(stated_sign(truth)?, reading.sign, by_modes)
+        .map_err(|fault| FileError::new(truth, fault))?;
+    if sign.is_none() && standard.g2.iter().all(|g2| *g2 == 0.0) {
+        sign = Some(Sign::ZERO);
+    }
+    let shear = match sign.map(|sign| sign.of) {
+        Some(TruthSign::Challenge) => standard.flipped(),
+        Some(TruthSign::Standard) | None => standard,
     };
-    let shear = match sign {
-        TruthSign::Standard => standard,
-        TruthSign::Challenge => standard.flipped(),
-    };
-    Ok(ReadTruth { grid, shear, basis })
+    Ok(ReadTruth { grid, shear, sign })
 }
 
 /// Writes a true shear in the standard sign.

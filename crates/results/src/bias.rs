@@ -10,7 +10,7 @@ pub mod positions;
 mod read;
 pub mod truth;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
@@ -19,13 +19,16 @@ use shearq_bias::{
 };
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
+use shearq_pipeline::data::layout::stated_sign;
+use shearq_pipeline::truth::{Sign, SignBasis, word};
+use shearq_scoring::TruthSign;
 use thiserror::Error;
 
 use crate::expression::Expression;
 use crate::select::StatedSelection;
 use columns::{Names, Preset, Role, Shapes};
 use read::{Reading, Source};
-use truth::Truth;
+use truth::{TrueSign, Truth};
 
 /// Why there is no result.
 #[derive(Debug, Error)]
@@ -100,8 +103,8 @@ pub struct Request {
     pub truth: Truth,
     /// How ellipticities become shears; `None` if the names of the columns decide.
     pub shapes: Option<Shapes>,
-    /// Whether the true g2 has the opposite sign.
-    pub flip_g2: bool,
+    /// Sign of the true g2.
+    pub sign: TrueSign,
     /// Bins.
     pub bins: Option<Binning>,
     /// Rows that count.
@@ -147,6 +150,9 @@ pub struct Summed {
     /// Which columns are used as what, and which look as if they should be.
     #[serde(default)]
     columns: Vec<String>,
+    /// The sign of the true g2; `None` if the truth needs none.
+    #[serde(default)]
+    sign: Option<Sign>,
 }
 
 /// Sums whose units are joined.
@@ -200,6 +206,8 @@ pub struct BiasResult {
     pub selection: Option<String>,
     /// Which columns are used as what, and which look as if they should be, a line each.
     pub columns: Vec<String>,
+    /// The sign of the true g2; `None` if the truth needs none.
+    pub sign: Option<Sign>,
 }
 
 impl BiasResult {
@@ -237,7 +245,7 @@ impl Request {
             names: self.names.clone(),
             truth: self.truth.of_paths(paths)?,
             shapes: self.shapes,
-            flip_g2: self.flip_g2,
+            flip_g2: false,
             select: self.select.clone(),
             selection: self
                 .selection
@@ -262,7 +270,7 @@ impl Request {
 /// If a catalogue cannot be read, lacks a column, or contains values that are not usable.
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     read::distinct(&request.catalogues)?;
-    let reading = request.reading()?;
+    let mut reading = request.reading()?;
     let mut all: Vec<Vec<Source>> = Vec::new();
     for input in &request.catalogues {
         all.push(read::sources(input, &reading)?);
@@ -287,45 +295,12 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
             Edges::Equal(count) => equal_edges(request, &reading, &all, *count)?,
         },
     };
-    // The last bin is of galaxies outside of the edges.
-    let bins = edges.len().max(1);
-    let mut sums = UnitSums::new(layout, bins, request.catalogues.len());
-    let mut catalogues = Vec::new();
-    for (number, (Input { name, .. }, sources)) in request.catalogues.iter().zip(&all).enumerate() {
-        if !part(number) {
-            catalogues.push(Catalogue {
-                name: name.display().to_string(),
-                ..Catalogue::default()
-            });
-            continue;
-        }
-        let selects = sources[0].selects_versions(&reading);
-        catalogues.push(read::rows(name, &reading, sources, |item| {
-            let number = number as u32;
-            let row = &item.row;
-            let scaled = row.e.map(|e| e / (2.0 * request.step));
-            if let Some(version) = item.version {
-                if let Some(bin) = bin_of(&edges, item.binned[0]) {
-                    sums.add_version(number, item.key, bin, version, (scaled, row.weight));
-                }
-                return Ok(());
-            }
-            if let Some(bin) = bin_of(&edges, item.binned[0]) {
-                sums.add(number, item.key, bin, row);
-            }
-            if selects {
-                for (version, value) in item.binned[1..].iter().enumerate() {
-                    if let Some(bin) = bin_of(&edges, *value) {
-                        sums.add_version(number, item.key, bin, version, (scaled, row.weight));
-                    }
-                }
-            }
-            Ok(())
-        })?);
-    }
+    let sign = known_sign(request, &all)?.filter(|_| truth);
+    reading.flip_g2 = sign.is_some_and(|sign| sign.of == TruthSign::Challenge);
+    let (sums, catalogues) = add_up(request, &reading, &all, (layout, &edges), part)?;
     let named_unit = matches!(request.units, Units::Column(_))
         || request.units == Units::Recognised && first.columns.of(Role::Unit).is_some();
-    Ok(Summed {
+    let mut summed = Summed {
         version: env!("CARGO_PKG_VERSION").into(),
         sums,
         catalogues,
@@ -349,7 +324,105 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         measured,
         selection: request.stated_selection(),
         columns: described,
-    })
+        sign,
+    };
+    if let TrueSign::OfCatalogues(truth) = &request.sign {
+        let sign = summed.sign_of_catalogues(truth)?;
+        if sign.of == TruthSign::Challenge {
+            reading.flip_g2 = true;
+            let (layout, edges) = (summed.sums.layout(), &summed.edges);
+            let found = add_up(request, &reading, &all, (layout, edges), part)?;
+            (summed.sums, summed.catalogues) = found;
+        }
+        summed.sign = Some(sign);
+    }
+    Ok(summed)
+}
+
+/// The sums of the catalogues for whose numbers `part` holds.
+fn add_up(
+    request: &Request,
+    reading: &Reading,
+    all: &[Vec<Source>],
+    (layout, edges): (Layout, &[f64]),
+    part: &dyn Fn(usize) -> bool,
+) -> Result<(UnitSums, Vec<Catalogue>), BiasFailure> {
+    // The last bin is of galaxies outside of the edges.
+    let bins = edges.len().max(1);
+    let mut sums = UnitSums::new(layout, bins, request.catalogues.len());
+    let mut catalogues = Vec::new();
+    for (number, (Input { name, .. }, sources)) in request.catalogues.iter().zip(all).enumerate() {
+        if !part(number) {
+            catalogues.push(Catalogue {
+                name: name.display().to_string(),
+                ..Catalogue::default()
+            });
+            continue;
+        }
+        let selects = sources[0].selects_versions(reading);
+        catalogues.push(read::rows(name, reading, sources, |item| {
+            let number = number as u32;
+            let row = &item.row;
+            let scaled = row.e.map(|e| e / (2.0 * request.step));
+            if let Some(version) = item.version {
+                if let Some(bin) = bin_of(edges, item.binned[0]) {
+                    sums.add_version(number, item.key, bin, version, (scaled, row.weight));
+                }
+                return Ok(());
+            }
+            if let Some(bin) = bin_of(edges, item.binned[0]) {
+                sums.add(number, item.key, bin, row);
+            }
+            if selects {
+                for (version, value) in item.binned[1..].iter().enumerate() {
+                    if let Some(bin) = bin_of(edges, *value) {
+                        sums.add_version(number, item.key, bin, version, (scaled, row.weight));
+                    }
+                }
+            }
+            Ok(())
+        })?);
+    }
+    Ok((sums, catalogues))
+}
+
+/// The sign of the true g2 that the user or files state; `None` if the truth needs no sign or the catalogues determine it.
+fn known_sign(request: &Request, all: &[Vec<Source>]) -> Result<Option<Sign>, BiasFailure> {
+    let specified = match &request.sign {
+        TrueSign::Known(sign) => Some(*sign),
+        TrueSign::Convention | TrueSign::OfCatalogues(_) => None,
+    };
+    match &request.truth {
+        Truth::Data(_) if specified.is_some() => Err(BiasFailure::Data(
+            "--truth-sign: the data of these folders state the sign of g2. Try: omit --truth-sign"
+                .into(),
+        )),
+        Truth::Columns => {
+            let mut found: Option<(&Input, Option<Sign>)> = None;
+            for (input, sources) in request.catalogues.iter().zip(all) {
+                let has_shear = sources
+                    .iter()
+                    .all(|own| own.columns.have(&[Role::G1, Role::G2]));
+                if input.frame.is_some() || !has_shear {
+                    return Ok(specified);
+                }
+                let path = sources[0].path();
+                let own =
+                    Sign::of_truth(stated_sign(path)?, specified.map(|sign| sign.of), || None)
+                        .map_err(|fault| FileError::new(path, fault))?;
+                let (first, sign) = *found.get_or_insert((input, own));
+                if sign.map(|sign| sign.of) != own.map(|sign| sign.of) {
+                    return Err(BiasFailure::Data(format!(
+                        "{}: it does not state the same sign of g2 as {}. Try: --truth-sign, or the same statement in all",
+                        input.name.display(),
+                        first.name.display()
+                    )));
+                }
+            }
+            Ok(found.and_then(|(_, sign)| sign))
+        }
+        _ => Ok(specified),
+    }
 }
 
 /// Refuses catalogues with other columns than the first one.
@@ -530,6 +603,9 @@ impl Summed {
         {
             return unlike("different options");
         }
+        if self.sign.map(|sign| sign.of) != other.sign.map(|sign| sign.of) {
+            return unlike("different signs of g2");
+        }
         Ok(())
     }
 
@@ -541,7 +617,7 @@ impl Summed {
     pub fn result(&self, errors: Errors) -> Result<BiasResult, BiasFailure> {
         let Grouped { grouping, design } = self.grouped()?;
         let all = grouping.all_bins().estimate(0, self.truth, errors)?;
-        check_slopes(&all, self.response, ratio(&self.catalogues))?;
+        self.check_slopes(&all)?;
         let mut bins = vec![BinResult {
             edges: None,
             estimate: Ok(all),
@@ -569,6 +645,7 @@ impl Summed {
             measured: self.measured.clone(),
             selection: self.selection.clone(),
             columns: self.columns.clone(),
+            sign: self.sign,
         })
     }
 
@@ -598,6 +675,15 @@ impl Summed {
                 "the catalogues cannot be compared: truth or bins differ. Try: bins with edges"
                     .into(),
             ));
+        }
+        if let (Some(own), Some(theirs)) = (self.sign, other.sign)
+            && own.of != theirs.of
+        {
+            return Err(BiasFailure::Data(format!(
+                "the catalogues cannot be compared: e2 of one follows the true g2 of sign {}, of the other {}. Try: --truth-sign",
+                word(own.of),
+                word(theirs.of)
+            )));
         }
         let (own, theirs) = (self.grouped()?, other.grouped()?);
         let units = [own.grouping.unit, theirs.grouping.unit];
@@ -638,7 +724,46 @@ impl Summed {
             measured: Vec::new(),
             selection: self.selection.clone(),
             columns: self.columns.clone(),
+            sign: self.sign,
         })
+    }
+
+    fn check_slopes(&self, all: &Estimate) -> Result<(), BiasFailure> {
+        check_slopes(all, self.response, ratio(&self.catalogues), self.sign)
+    }
+
+    /// The sign of g2 in the file `truth` that e2 follows, from sums for the standard sign.
+    fn sign_of_catalogues(&self, truth: &Path) -> Result<Sign, BiasFailure> {
+        let mut used = self.catalogues.iter().filter(|own| own.rows > 0);
+        if used.all(|own| own.shear[1].constant() == Some(0.0)) {
+            return Ok(Sign::ZERO);
+        }
+        let undetermined = |found| {
+            let sign = Sign::of_catalogues(found);
+            sign.map_err(|fault| FileError::new(truth, fault).into())
+        };
+        // A shard may be too small for an estimate that all catalogues have.
+        let estimate = self.grouped().and_then(|Grouped { grouping, .. }| {
+            Ok(grouping.all_bins().estimate(0, true, Errors::Jackknife)?)
+        });
+        let all = match estimate {
+            Err(_) if !self.absent().is_empty() => return undetermined(None),
+            found => found?,
+        };
+        let m = all.value("m2").filter(|m| m.error.is_finite());
+        let found = m.and_then(|m| {
+            let (slope, clear) = (1.0 + m.value, SIGNIFICANT * m.error);
+            match slope {
+                _ if slope >= clear => Some(TruthSign::Standard),
+                _ if slope <= -clear => Some(TruthSign::Challenge),
+                _ => None,
+            }
+        });
+        if found.is_none() {
+            // Exchanged components or wrong rows are the better remark.
+            self.check_slopes(&all)?;
+        }
+        undetermined(found)
     }
 
     /// Refuses catalogues without usable rows, and constant ellipticities.
@@ -672,7 +797,8 @@ impl Summed {
     }
 }
 
-/// Significance at which an implausible slope is refused.
+/// Significance at which an implausible slope is refused, and at which the slope of e2 determines the sign of g2: a slope
+/// of 0 exceeds it by chance in 6 of 10⁷ cases.
 const SIGNIFICANT: f64 = 5.0;
 
 /// g2/g1 of the true shears, if it is the same in all catalogues: slopes on g1 and g2 then do not tell e1 from e2.
@@ -718,9 +844,36 @@ fn are_exchanged(all: &Estimate, ratio: Option<f64>) -> bool {
     })
 }
 
+/// What to try if e2 follows minus the true g2.
+fn other_sign(sign: Option<Sign>) -> String {
+    match sign {
+        None
+        | Some(Sign {
+            basis: SignBasis::Zero,
+            ..
+        }) => "--truth-sign challenge (of folders: truth_sign in layout.toml of the data)".into(),
+        Some(sign) if sign.basis == SignBasis::Stated => format!(
+            "check the sign of e2, or the statement `{}` in the truth",
+            word(sign.of)
+        ),
+        Some(sign) => format!(
+            "check the sign of e2, or --truth-sign {}",
+            word(match sign.of {
+                TruthSign::Standard => TruthSign::Challenge,
+                TruthSign::Challenge => TruthSign::Standard,
+            })
+        ),
+    }
+}
+
 /// Refuses ellipticities that follow minus the true shear, or do not follow it, and distortions without responses. `ratio`
 /// is g2/g1 of the true shears, if it is constant.
-fn check_slopes(all: &Estimate, response: bool, ratio: Option<f64>) -> Result<(), BiasFailure> {
+fn check_slopes(
+    all: &Estimate,
+    response: bool,
+    ratio: Option<f64>,
+    sign: Option<Sign>,
+) -> Result<(), BiasFailure> {
     let slopes = ["m1", "m2"].map(|key| {
         let m = all.value(key).filter(|m| m.error.is_finite())?;
         Some((1.0 + m.value, SIGNIFICANT * m.error))
@@ -739,8 +892,9 @@ fn check_slopes(all: &Estimate, response: bool, ratio: Option<f64>) -> Result<()
         [false, false] => {}
         [false, true] => {
             return refused(format!(
-                "e2 follows minus the true g2 (found a slope of {:.3}, expected about 1). Try: --flip-g2",
-                shown(1)
+                "e2 follows minus the true g2 (found a slope of {:.3}, expected about 1). Try: {}",
+                shown(1),
+                other_sign(sign)
             ));
         }
         [true, _] => {

@@ -15,7 +15,7 @@ use shearq_pipeline::data::layout::{DataFolder, read_rows};
 use shearq_pipeline::data::pattern::MAX_SET;
 use shearq_pipeline::data::run::Run;
 use shearq_pipeline::simulate::kind_of;
-use shearq_pipeline::truth::{ReadTruth, Reading, SignBasis, read_truth, reading_of};
+use shearq_pipeline::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_pipeline::{PipelineError, engine, inputs};
 use shearq_simulate::kinds::SetKind;
 
@@ -40,8 +40,8 @@ pub struct ScoredSet {
     pub rows: RowCounts,
     /// How the convention was chosen.
     pub basis: Basis,
-    /// How the sign of the true g2 was determined.
-    pub sign: SignBasis,
+    /// The sign of the true g2 and how it was determined; `None` in data folders, which state it.
+    pub sign: Option<Sign>,
     /// Probable faults of the ellipticities or the truth.
     pub findings: Vec<Fault>,
     /// Probable faults of single images.
@@ -186,19 +186,21 @@ pub fn score_files(
     let ReadTruth {
         grid,
         mut shear,
-        mut basis,
+        sign,
     } = read_truth(truth, reading)?;
     let scoring = |source| PipelineError::Scoring { set: None, source };
     let mut added = add_up(&grid, catalogues, read, None, threads)?;
-    if basis == SignBasis::Unknown
-        && let Some(sign) =
-            sign_by_correlation(&shear.flipped(), added.images.total()).map_err(scoring)?
-    {
-        basis = SignBasis::Correlation(sign);
-        if sign == TruthSign::Standard {
-            shear = shear.flipped();
+    let sign = match sign {
+        Some(sign) => sign,
+        None => {
+            let found = sign_by_correlation(&shear, added.images.total()).map_err(scoring)?;
+            let sign = Sign::of_catalogues(found).map_err(|fault| FileError::new(truth, fault))?;
+            if sign.of == TruthSign::Challenge {
+                shear = shear.flipped();
+            }
+            sign
         }
-    }
+    };
     let scorer = SetScorer::new(grid, shear, options).map_err(scoring)?;
     let files = (catalogues, read);
     let (score, findings) = score_added(&scorer, &mut added, files, options.choice, threads)?;
@@ -207,7 +209,7 @@ pub fn score_files(
         kind: None,
         findings,
         odd_images: added.odd_images,
-        sign: basis,
+        sign: Some(sign),
         images: (1..=catalogues.len() as u32).collect(),
         basis: match options.choice {
             Choice::Matched => Basis::Matched(score.matching),
@@ -361,7 +363,7 @@ pub fn score_variants(
                 score,
                 rows: added.rows,
                 basis,
-                sign: SignBasis::Specified,
+                sign: None,
             });
         }
         scored.push(own);

@@ -19,7 +19,6 @@ use shearq_pipeline::data::run::{Claim, claim, nan_for_null, read_record, write_
 use shearq_pipeline::engine::Progress;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
-use shearq_pipeline::truth::SignBasis;
 use shearq_results::row::SetRecord;
 use shearq_results::score::{Basis, OWN, OddImages, ScoredSet};
 use shearq_simulate::kinds::SetKind;
@@ -221,7 +220,7 @@ fn measure_set(
                 score,
                 rows: *rows,
                 basis: Basis::Given,
-                sign: SignBasis::Specified,
+                sign: None,
                 findings: Vec::new(),
                 odd_images: OddImages::default(),
             },

@@ -125,7 +125,7 @@ def bias(
     truth: str | os.PathLike[str] | None = None,
     columns: Mapping[str, str] | None = None,
     ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
-    flip_g2: bool = False,
+    truth_sign: Literal["standard", "challenge"] | None = None,
     bins: Bins | None = None,
     select: str | None = None,
     where: str | None = None,
@@ -165,8 +165,10 @@ def bias(
     ellipticity : {'shear', 'distortion', 'responsivity'}
         Type of e1 and e2; recognised by default. ``'distortion'`` converts each to a shear, ``'responsivity'`` divides the
         mean distortion by 2(1 − ⟨e_rms²⟩), with e_rms in ``rms_e``, or else e_rms² = ⟨χ²⟩/2 − ⟨σ²⟩ with σ in ``sigma_e``.
-    flip_g2 : bool
-        Use minus the true g2.
+    truth_sign : {'standard', 'challenge'}, optional
+        Sign of the true g2. By default, for a table with a shear per galaxy: as the file states, else (for x, y, g1, g2)
+        the sign in which the shear is an E-mode field, else the sign that e2 follows by 5σ; required if these are unclear.
+        Other shears are standard.
     bins : (str, int or sequence of float)
         Also estimate in bins of a column or expression: ``("snr", 5)`` has five bins with equally many galaxies,
         ``("flux / flux_error", [5, 10, 20])`` has these edges. The response is that of each bin.
@@ -191,8 +193,8 @@ def bias(
     ------
     ValueError
         If a column is absent or has two roles, a number is missing or stands for a failed measurement in a row without a
-        flag, the ellipticities do not follow the true shear,
-        or a mean response has less than five standard errors.
+        flag, the ellipticities do not follow the true shear, the sign of g2 in the file of `truth` is unclear, or a mean
+        response has less than five standard errors.
     """
     sums = bias_sums(
         catalogues,
@@ -201,7 +203,7 @@ def bias(
         truth=truth,
         columns=columns,
         ellipticity=ellipticity,
-        flip_g2=flip_g2,
+        truth_sign=truth_sign,
         bins=bins,
         select=select,
         where=where,
@@ -222,7 +224,7 @@ def bias_sums(
     truth: str | os.PathLike[str] | None = None,
     columns: Mapping[str, str] | None = None,
     ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
-    flip_g2: bool = False,
+    truth_sign: Literal["standard", "challenge"] | None = None,
     bins: Bins | None = None,
     select: str | None = None,
     where: str | None = None,
@@ -252,7 +254,7 @@ def bias_sums(
             [f"{role}={column}" for role, column in (columns or {}).items()],
             _truth(g1, g2, truth, given),
             ellipticity,
-            flip_g2,
+            truth_sign,
             _bins(bins),
             select,
             [where, weight],

@@ -179,8 +179,8 @@ def score(
     truth_sign : {'standard', 'challenge'}, optional
         'challenge' if truth_g2 is minus the standard one, as in the challenge's files. The `truth.csv` that
         `simulate` writes has the standard sign. By default it is determined like on the command line: by the sign in
-        which the shear is an E-mode field, or else by the sign with which e2 correlates. If both are unclear, it is
-        the standard sign.
+        which the shear is an E-mode field, or else by the sign with which e2 correlates by 5σ; required if both are
+        unclear.
     drop_missing : bool
         Count galaxies with a number that stands for a failed measurement as missing: whole numbers beyond ±5, such as
         −10 or −99, and any beyond ±5000.
@@ -192,8 +192,8 @@ def score(
     Raises
     ------
     ValueError, TypeError
-        If shapes do not fit, the truth is not finite or |g| ≥ 1, no galaxy has an ellipticity, or ellipticities are
-        other quantities or stand for a failed measurement.
+        If shapes do not fit, the sign of truth_g2 is unclear, the truth is not finite or |g| ≥ 1, no galaxy has an
+        ellipticity, or ellipticities are other quantities or stand for a failed measurement.
 
     Warns
     -----
@@ -211,15 +211,13 @@ def score(
     n = _side("truth_g1", g1.size)
     cell, rows, where, lengths = _rows(e1, e2, n, images, positions, stamp)
     rows, dropped = _without_failures(rows) if drop_missing else (rows, 0)
-    if truth_sign not in (None, "standard", "challenge"):
-        raise ValueError(f"truth_sign: found {truth_sign!r}; expected 'standard', 'challenge' or None")
     found = Score(
         _shearq.score(
             n,
             cell,
             degrees(field_degrees),
             (g1, g2),
-            None if truth_sign is None else truth_sign == "challenge",
+            truth_sign,
             rows,
             where,
             lengths,

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use shearq_files::FileError;
 use shearq_files::table::{self, MAX_ROWS, Place, TRUTH_COLUMNS};
-use shearq_pipeline::data::layout::stated_sign;
-use shearq_scoring::TruthSign;
+use shearq_pipeline::truth::sign_on_any_grid;
+use shearq_scoring::{Row, TruthSign};
 
 /// Largest distance of a galaxy from its place in the truth, in pixels.
 pub const RADIUS: f64 = 1.0;
@@ -36,8 +36,7 @@ pub struct Positions {
 }
 
 impl Positions {
-    /// Reads a table with the columns x, y (pixels), g1 and g2. Minus g2 is used if the sign is `challenge`: the sign
-    /// that the file states, or else `sign`.
+    /// Reads a table with the columns x, y (pixels), g1 and g2 of this sign.
     ///
     /// # Errors
     /// If the file cannot be read, or a number is no position or no shear.
@@ -52,7 +51,7 @@ impl Positions {
         let read = table::read_from(&place, Some(&names), MAX_ROWS)?;
         let column = |k: usize| table::numbers(&read, names[k], path);
         let [xs, ys, g1, g2] = [column(0)?, column(1)?, column(2)?, column(3)?];
-        let factor = match stated_sign(&place.path)?.unwrap_or(sign) {
+        let factor = match sign {
             TruthSign::Standard => 1.0,
             TruthSign::Challenge => -1.0,
         };
@@ -87,6 +86,17 @@ impl Positions {
             ));
         }
         Ok(Positions { entries })
+    }
+
+    /// The sign of g2 in which the shears are an E-mode field; `None` if they do not fill a square grid.
+    pub(super) fn sign_by_modes(&self) -> Option<TruthSign> {
+        let rows = self.entries.iter().map(|entry| Row {
+            x: entry.x,
+            y: entry.y,
+            e1: entry.shear[0],
+            e2: entry.shear[1],
+        });
+        sign_on_any_grid(&rows.collect::<Vec<_>>())
     }
 
     /// The shear of the nearest place within [`RADIUS`].

@@ -28,6 +28,7 @@ pub(super) struct Reading {
     pub(super) names: Names,
     pub(super) truth: Truth,
     pub(super) shapes: Option<Shapes>,
+    /// Whether minus the true g2 is used.
     pub(super) flip_g2: bool,
     pub(super) select: Option<Expression>,
     /// Cuts and weights whose response to shear is known.
@@ -157,6 +158,11 @@ impl Source {
             ));
         }
         lines
+    }
+
+    /// The file, without the name of a table.
+    pub(super) fn path(&self) -> &Path {
+        &self.place.path
     }
 
     /// Whether rows belong to versions.

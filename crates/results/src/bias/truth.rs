@@ -8,6 +8,7 @@ use shearq_files::FileError;
 use shearq_files::open::{SETTINGS, read_to_string};
 use shearq_files::table::{self, Place};
 use shearq_pipeline::data::layout::stated_sign;
+use shearq_pipeline::truth::{Sign, SignBasis};
 use shearq_scoring::TruthSign;
 
 use super::columns::{Role, names_of_role};
@@ -32,18 +33,47 @@ pub enum Truth {
     Data(BTreeMap<PathBuf, Arc<Positions>>),
 }
 
+/// The sign of g2 in a [`Truth`].
+#[derive(Debug, Clone, Default, PartialEq)]
+pub enum TrueSign {
+    /// Shears that the user typed or keeps beside ellipticities, and data folders: standard.
+    #[default]
+    Convention,
+    /// It is known.
+    Known(Sign),
+    /// The catalogues must determine the sign of this file.
+    OfCatalogues(PathBuf),
+}
+
+impl TrueSign {
+    /// The sign that was specified, else the standard one.
+    pub fn or_standard(specified: Option<TruthSign>) -> Self {
+        let basis = SignBasis::Specified;
+        specified.map_or(TrueSign::Convention, |of| {
+            TrueSign::Known(Sign { of, basis })
+        })
+    }
+}
+
 /// Names of the column of catalogues in a table of true shears.
 const CATALOGUE: [&str; 3] = ["catalogue", "catalog", "file"];
 
 impl Truth {
-    /// Reads a table of true shears: columns `catalogue g1 g2` (text), or `id g1 g2` or
-    /// `x y g1 g2` in any format.
+    /// Reads a table of true shears: columns `catalogue g1 g2` (text), or `id g1 g2` or `x y g1 g2` in any format, with
+    /// the sign of its g2. The shears themselves are as in the file.
     ///
     /// # Errors
-    /// If the file cannot be read or has other columns, or names a catalogue or galaxy twice.
-    pub fn read(path: &Path) -> Result<Self, FileError> {
+    /// If the file cannot be read or has other columns, names a catalogue or galaxy twice, or states another sign than
+    /// `specified`.
+    pub fn read(path: &Path, specified: Option<TruthSign>) -> Result<(Self, TrueSign), FileError> {
         let place = Place::of(path);
         let columns = table::columns(&place)?;
+        // A table with a shear per catalogue is typed by the user, as --g1 and --g2 are; another one must have a sign.
+        let sign = |undetermined: Option<TrueSign>, by_modes: &dyn Fn() -> Option<TruthSign>| {
+            let found = Sign::of_truth(stated_sign(&place.path)?, specified, by_modes)
+                .map_err(|fault| FileError::new(path, fault))?;
+            Ok(found.map_or(undetermined.unwrap_or_default(), TrueSign::Known))
+        };
         // Names in any case: FITS writers like capitals.
         let named = |name: &str| {
             let mut names = columns.named.iter().flat_map(|list| &list.names);
@@ -52,15 +82,17 @@ impl Truth {
                 .map(String::as_str)
         };
         if CATALOGUE.iter().any(|name| named(name).is_some()) {
-            return of_catalogues(path);
+            return Ok((of_catalogues(path)?, sign(None, &|| None)?));
         }
+        let unclear = Some(TrueSign::OfCatalogues(path.to_owned()));
         let shears = named("g1").zip(named("g2"));
         let positions = named("x").zip(named("y"));
         let other = || names_of_role(Role::Id).iter().find_map(|name| named(name));
         let id = named("id").or_else(|| other().filter(|_| positions.is_none()));
         if let (Some(_), None, Some(_)) = (shears, id, positions) {
             let positions = Positions::read(path, TruthSign::Standard)?;
-            return Ok(Truth::Positions(Arc::new(positions)));
+            let sign = sign(unclear, &|| positions.sign_by_modes())?;
+            return Ok((Truth::Positions(Arc::new(positions)), sign));
         }
         let (Some((name1, name2)), Some(id)) = (shears, id) else {
             let found: Vec<&String> = columns.named.iter().flat_map(|list| &list.names).collect();
@@ -72,16 +104,12 @@ impl Truth {
                 ),
             ));
         };
-        let sign = match stated_sign(&place.path)? {
-            Some(TruthSign::Challenge) => -1.0,
-            Some(TruthSign::Standard) | None => 1.0,
-        };
         let mut galaxies = HashMap::new();
         table::read_parts(&place, &[id, name1, name2], &[id], |part| {
             let column = |name| table::numbers(&part, name, path);
             let (g1, g2) = (column(name1)?, column(name2)?);
             for (row, key) in identity::keys(&part, id, path)?.into_iter().enumerate() {
-                let shear = [g1[row], sign * g2[row]];
+                let shear = [g1[row], g2[row]];
                 check(shear)
                     .map_err(|fault| FileError::new(path, format!("row {}: {fault}", row + 1)))?;
                 if galaxies.insert(key, shear).is_some() {
@@ -95,7 +123,10 @@ impl Truth {
             }
             Ok(())
         })?;
-        Ok(Truth::Galaxies(Arc::new(galaxies)))
+        Ok((
+            Truth::Galaxies(Arc::new(galaxies)),
+            sign(unclear, &|| None)?,
+        ))
     }
 
     /// The same with the shear of each of `catalogues` by its path, if catalogues have a shear each.

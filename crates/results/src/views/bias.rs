@@ -4,6 +4,7 @@ use shearq_bias::{
     Catalogue, Design, Estimate, Measured, QUANTITIES, REQUIREMENTS, Repeated, Verdict, student_t,
     verdict,
 };
+use shearq_pipeline::truth::Sign;
 use shearq_render::figure::{Band, FigureError, LinePlot, PanelGrid, Series, Style};
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Heading, Table};
@@ -261,6 +262,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
         format!("Errors are from {} units: {}.", all.units, result.unit),
     ];
     notes.extend(result.columns.iter().cloned());
+    notes.extend(result.sign.and_then(Sign::line));
     match result.noisy_stars {
         0 => {}
         1 => notes.push("They include the noise of a star that several units share.".into()),

@@ -2,10 +2,9 @@
 
 use std::path::PathBuf;
 
-use shearq_scoring::{Fault, ImageFaults, OddResponse, TruthSign};
+use shearq_scoring::{Fault, ImageFaults, OddResponse};
 
 use crate::score::OddImages;
-use shearq_pipeline::truth::SignBasis;
 
 /// The message of a finding: what was found, what was expected, and what to do.
 pub fn words(finding: &Fault) -> String {
@@ -119,26 +118,6 @@ pub fn odd_response(odd: &OddResponse) -> String {
         "follows the true shear by {:.2} ± {:.2} (correlation {:.2}), the images of its set by {slope:.2} ({correlation:.2}). {cause}",
         response.slope, response.error, response.correlation
     )
-}
-
-/// A remark on the sign of the true g2, if the reader needs it.
-pub fn sign(basis: SignBasis) -> Option<String> {
-    match basis {
-        SignBasis::Unknown => Some(
-            "warning: cannot determine the sign of g2 in the truth; assumed the challenge's (g2 > 0 along x = -y). Try: --truth-sign standard, or a line `# g2sign: standard` in the file".into(),
-        ),
-        SignBasis::Modes(TruthSign::Standard) => Some(
-            "note: the truth does not state the sign of g2; used the standard sign, in which the shear is an E-mode field.".into(),
-        ),
-        SignBasis::Correlation(sign) => Some(format!(
-            "note: the truth does not state the sign of g2; used the {} sign, with which e2 correlates.",
-            match sign {
-                TruthSign::Standard => "standard",
-                TruthSign::Challenge => "challenge's",
-            }
-        )),
-        SignBasis::Specified | SignBasis::Modes(TruthSign::Challenge) => None,
-    }
 }
 
 /// Findings of several sets, one line per kind: the message of the first set, and the numbers of the other sets.

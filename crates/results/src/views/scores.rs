@@ -16,6 +16,7 @@ use crate::views::metrics::{FORMATS, metric_cells, metric_heading};
 use crate::views::rows::oddities;
 use crate::views::spectrum;
 use crate::views::verdict::verdict;
+use shearq_pipeline::truth::Sign;
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_simulate::kinds::SetKind;
 
@@ -76,7 +77,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
     let mut lines = vec![convention_note(scored)];
     let mut signs: Vec<String> = scored
         .iter()
-        .filter_map(|s| diagnosis::sign(s.sign))
+        .filter_map(|s| s.sign.and_then(Sign::line))
         .collect();
     signs.dedup();
     lines.extend(signs);
