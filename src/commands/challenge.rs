@@ -43,7 +43,7 @@ enum Command {
     #[command(
         after_help = "Examples:\n  shearq challenge new --name pilot --sets 2,8 --images 20 --public pilot --private truth\n  shearq challenge new --name theirs --data rendered --public theirs --private theirs-truth"
     )]
-    New(NewArguments),
+    New(Box<NewArguments>),
     #[command(after_help = "Example:\n  shearq challenge check entry.tar.gz --challenge pilot")]
     Check(CheckArguments),
     #[command(

@@ -103,7 +103,7 @@ pub(crate) struct Arguments {
     out: PathBuf,
 }
 
-pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
     let Arguments {
         stamps,
         exposure,
@@ -120,9 +120,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         psf,
         psf_extension,
         noise,
-        set,
-        image,
-        out,
+        set: _,
+        image: _,
+        out: _,
     } = arguments;
     if let Some(sigma) = noise {
         anyhow::ensure!(
@@ -174,7 +174,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         },
         None => Stamps::Files(images),
     };
-    let gathering = Gathering {
+    Ok(Gathering {
         stamps,
         square: square.as_deref().map(|how| match how {
             "crop" => Square::Crop,
@@ -183,15 +183,20 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         masks: masked.then_some(Masks { files: masks, bits }),
         psfs,
         noise: *noise,
-    };
+    })
+}
+
+pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let gathering = gathering(arguments)?;
+    let out = &arguments.out;
     let data = if out.is_dir() {
         DataFolder::open(out)?
     } else {
         DataFolder::new(out)
     };
     let id = ImageId {
-        set: *set,
-        image: *image,
+        set: arguments.set,
+        image: arguments.image,
     };
     let Gathered {
         mosaic,

@@ -1190,8 +1190,10 @@ fn an_unused_weight_of_zero_is_refused() {
     assert_eq!(number(&declined[0], "n"), 3.0);
 }
 
-/// A FITS file of binary tables: of each its name, its columns with their formats, and the bytes of its rows.
-fn fits(path: &Path, tables: &[(&str, &[(&str, &str)], Vec<Vec<u8>>)]) {
+/// A binary table: its name, its columns with their formats, and the bytes of its rows.
+type FitsTable<'a> = (&'a str, &'a [(&'a str, &'a str)], Vec<Vec<u8>>);
+
+fn fits(path: &Path, tables: &[FitsTable<'_>]) {
     fn padded(mut bytes: Vec<u8>, fill: u8) -> Vec<u8> {
         bytes.resize(bytes.len().next_multiple_of(2880), fill);
         bytes

@@ -197,10 +197,9 @@ impl Plan {
     /// The last of `more` terms, from both components: the mean weighted by what each component contributes.
     fn joint(&self, sums: &[f64], more: &[usize]) -> f64 {
         let (mut sum, mut weight) = (0.0, 0.0);
-        let extra = self.layout.extra(sums).own;
-        for k in 0..2 {
+        for (k, extra) in self.layout.extra(sums).own.into_iter().enumerate() {
             let terms = self.with(k, more);
-            let alone = last_of(&self.layout.of(sums, k), &terms, extra[k]);
+            let alone = last_of(&self.layout.of(sums, k), &terms, extra);
             let Some((mut x, pivot)) = alone else {
                 continue;
             };

@@ -160,10 +160,11 @@ fn gauss(a: &[Vec<f64>]) -> Vec<f64> {
     for k in 0..n {
         let largest = (k..n).max_by(|i, j| a[*i][k].abs().total_cmp(&a[*j][k].abs()));
         a.swap(k, largest.unwrap());
+        let pivot = a[k].clone();
         for i in (0..n).filter(|i| *i != k) {
-            let factor = a[i][k] / a[k][k];
-            for j in k..=n {
-                a[i][j] -= factor * a[k][j];
+            let factor = a[i][k] / pivot[k];
+            for (own, other) in a[i].iter_mut().zip(&pivot).skip(k) {
+                *own -= factor * other;
             }
         }
     }

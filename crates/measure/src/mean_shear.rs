@@ -89,8 +89,8 @@ impl ShearSum {
         let values = [e[0], e[1], r11, r22, r12, r21];
         for k in 0..2 {
             self.e[k] += weight * e[k];
-            for j in 0..2 {
-                self.response[k][j] += weight * response[k][j];
+            for (sum, response) in self.response[k].iter_mut().zip(response[k]) {
+                *sum += weight * response;
             }
         }
         for (row, a) in self.products.iter_mut().zip(values) {

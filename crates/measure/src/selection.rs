@@ -216,10 +216,10 @@ impl Selection {
                 + w_f * t_ef
                 + w_s * t_es
                 + 0.5 * e[k] * (curved(t_ff, t_fs, t_ss) + w_s * t_s);
-            for j in 0..2 {
-                selected.response[k][j] = w.value * response[k][j]
-                    + e[k] * (w_f * galaxy.flux_response[j] + w_s * galaxy.size_response[j]);
-            }
+            selected.response[k] = [0, 1].map(|j| {
+                w.value * response[k][j]
+                    + e[k] * (w_f * galaxy.flux_response[j] + w_s * galaxy.size_response[j])
+            });
             selected.response[k][k] -= 2.0 * (w_f * e_f + w_s * e_s);
             selected.response[k][k] -= e[k] * curved(ff, fs, ss);
         }

@@ -42,7 +42,7 @@ impl Wcs {
         let plane = kind == "LINEAR";
         let unit = match text("CUNIT1").as_str() {
             "ARCSEC" => 1.0,
-            "" if plane && text("GS_WCS") != "" => 1.0,
+            "" if plane && !text("GS_WCS").is_empty() => 1.0,
             "ARCMIN" => 60.0,
             "RAD" => 648_000.0 / std::f64::consts::PI,
             _ => 3600.0,

@@ -783,7 +783,7 @@ impl Columns {
             }
         }
         let shape = roles.get(&Role::E1).map(|e1| e1.to_ascii_lowercase());
-        if !shape.is_some_and(|e1| e1 == "corrected_e1") {
+        if shape.is_none_or(|e1| e1 != "corrected_e1") {
             for role in [Role::KsbE1, Role::KsbE2] {
                 roles.remove(&role);
             }

@@ -1,7 +1,7 @@
 //! Rows of catalogues, as the sums need them.
 
 use std::borrow::Cow;
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::Path;
 
 use shearq_bias::{Catalogue, Repeated, Row, VERSIONS};
@@ -312,6 +312,23 @@ pub(super) fn sources(input: &Input, reading: &Reading) -> Result<Vec<Source>, F
     Ok(vec![source(place, None, &list.names, reading)?])
 }
 
+/// Columns of expressions that shear changes by an unknown amount.
+fn unanswered(
+    reading: &Reading,
+    columns: &Columns,
+    has_versions: impl Fn(&str) -> bool,
+) -> Vec<String> {
+    let expressions = [&reading.select, &reading.binned].into_iter().flatten();
+    let names = expressions.flat_map(Expression::columns);
+    let names: BTreeSet<&String> = names
+        .filter(|name| match columns.preset {
+            Preset::Shearq => is_measured(name),
+            _ => !is_fixed(name, columns) && !has_versions(name),
+        })
+        .collect();
+    names.into_iter().cloned().collect()
+}
+
 fn source(
     place: Place,
     version: Option<Option<usize>>,
@@ -346,18 +363,7 @@ fn source(
         }
     }
     wanted.extend(columns.doubtful_weight.clone());
-    let expressions = [&reading.select, &reading.binned].into_iter().flatten();
-    let unanswered = expressions.flat_map(Expression::columns).filter(|name| {
-        let own = columns.preset == Preset::Shearq;
-        let changes = match own {
-            true => is_measured(name),
-            false => !is_fixed(name, &columns),
-        };
-        changes && !(has_versions(name) && columns.preset != Preset::Shearq)
-    });
-    let mut unanswered: Vec<String> = unanswered.cloned().collect();
-    unanswered.sort();
-    unanswered.dedup();
+    let unanswered = unanswered(reading, &columns, has_versions);
     let mut place_of = |name: &str| -> Option<usize> {
         if !names.iter().any(|own| own == name) {
             return None;
@@ -677,6 +683,16 @@ struct Part<'a> {
     ranges: Ranges,
 }
 
+/// Why a row without a flag does not count.
+enum LeftOut {
+    /// A number stands for a failed measurement.
+    Failed,
+    /// A distortion above 1 has no shear.
+    AboveOne,
+    /// NaN or infinity.
+    Missing,
+}
+
 /// Where the true shears of the rows of a catalogue are.
 #[derive(Clone, Copy)]
 enum OfRows<'a> {
@@ -924,6 +940,65 @@ impl<'a> Part<'a> {
         columns.map(|column| self.columns[column][at])
     }
 
+    /// A column that looks like a weight, is not used, and would leave out this row.
+    fn unused_weight(&self, at: usize) -> Option<(&str, f64)> {
+        let value = self.value(self.places.doubtful_weight?, at);
+        let name = self.source.columns.doubtful_weight.as_deref()?;
+        (value.is_nan() || value <= 0.0).then_some((name, value))
+    }
+
+    /// A row without its true shear, or why it is left out.
+    fn measured(
+        &self,
+        at: usize,
+        weight: f64,
+        binned: f64,
+    ) -> Result<Result<Row, LeftOut>, String> {
+        let places = &self.places;
+        if let Some((column, expected)) = self.failure(at) {
+            if self.reading.drop_missing {
+                return Ok(Err(LeftOut::Failed));
+            }
+            return Err(format!(
+                "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {expected}). Try: --drop-missing",
+                self.source.wanted[column],
+                shown(self.value(column, at))
+            ));
+        }
+        let Some(Shape { e, slope, cross }) = self.shape(at, weight) else {
+            return Ok(Err(LeftOut::AboveOne));
+        };
+        let psf = places.psf.map_or([0.0; 2], |psf| self.pair(psf, at));
+        let psf_size = places.psf_size.map_or(1.0, |size| self.value(size, at));
+        let expression = if binned.is_nan() { f64::NAN } else { 0.0 };
+        let checked = [
+            ("e1", e[0]),
+            ("e2", e[1]),
+            ("the weight", weight),
+            (
+                "the response or its derivative",
+                slope[0] + slope[1] + cross[0] + cross[1],
+            ),
+            ("the PSF's ellipticity or size", psf[0] + psf[1] + psf_size),
+            ("the expression of --select or --bins", expression),
+        ];
+        match checked.iter().find(|(_, value)| !value.is_finite()) {
+            Some(_) if self.reading.drop_missing => Ok(Err(LeftOut::Missing)),
+            Some((what, value)) => Err(format!(
+                "{what} is {value} in a row without a flag (expected a number). Try: --drop-missing"
+            )),
+            None => Ok(Ok(Row {
+                e,
+                weight,
+                slope,
+                cross,
+                g: [0.0; 2],
+                psf,
+                psf_size,
+            })),
+        }
+    }
+
     /// Gives a row to `take` if it counts. `number` counts rows of the table from 0.
     fn row(
         &self,
@@ -955,15 +1030,10 @@ impl<'a> Part<'a> {
             let row = number + 1;
             FileError::new(&self.source.place.path, format!("row {row}: {what}"))
         };
-        if let Some(doubtful) = places.doubtful_weight {
-            let value = self.value(doubtful, at);
-            let name = self.source.columns.doubtful_weight.as_deref();
-            if value.is_nan() || value <= 0.0 {
-                let name = name.unwrap_or_default();
-                return Err(fault(format!(
-                    "`{name}` looks like a weight but is not used, and is {value} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none"
-                )));
-            }
+        if let Some((name, value)) = self.unused_weight(at) {
+            return Err(fault(format!(
+                "`{name}` looks like a weight but is not used, and is {value} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none"
+            )));
         }
         let left_out = |weighted: &Weighted| weighted.weight[at] <= 0.0;
         if self.weighted.as_ref().is_some_and(left_out) {
@@ -981,76 +1051,39 @@ impl<'a> Part<'a> {
             Some(weighted) => weighted.weight[at],
             None => weight,
         };
-        if let Some((column, expected)) = self.failure(at) {
-            if self.reading.drop_missing {
-                about.failed += u64::from(own);
+        let mut row = match self.measured(at, weight, binned[0]).map_err(&fault)? {
+            Ok(row) => row,
+            Err(reason) => {
+                let count = match reason {
+                    LeftOut::Failed => &mut about.failed,
+                    LeftOut::AboveOne => &mut about.above_one,
+                    LeftOut::Missing => &mut about.missing,
+                };
+                *count += u64::from(own);
                 return Ok(());
             }
-            return Err(fault(format!(
-                "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {expected}). Try: --drop-missing",
-                self.source.wanted[column],
-                shown(self.value(column, at))
-            )));
-        }
-        let Some(Shape { e, slope, cross }) = self.shape(at, weight) else {
-            // A distortion above 1 has no shear.
-            about.above_one += u64::from(own);
-            return Ok(());
         };
-        let psf = places.psf.map_or([0.0; 2], |psf| self.pair(psf, at));
-        let psf_size = places.psf_size.map_or(1.0, |size| self.value(size, at));
-        let slopes = slope[0] + slope[1] + cross[0] + cross[1];
-        let psfs = psf[0] + psf[1] + psf_size;
-        let expression = if binned[0].is_nan() { f64::NAN } else { 0.0 };
-        // A sum is finite only if all of its terms are.
-        if !(e[0] + e[1] + weight + slopes + psfs + expression).is_finite() {
-            if self.reading.drop_missing {
-                about.missing += u64::from(own);
-                return Ok(());
-            }
-            let checked = [
-                ("e1", e[0]),
-                ("e2", e[1]),
-                ("the weight", weight),
-                ("the response or its derivative", slopes),
-                ("the PSF's ellipticity or size", psfs),
-                ("the expression of --select or --bins", expression),
-            ];
-            let found = checked.iter().find(|(_, value)| !value.is_finite());
-            let (what, value) = found.unwrap_or(&("a number", f64::NAN));
-            return Err(fault(format!(
-                "{what} is {value} in a row without a flag (expected a number). Try: --drop-missing"
-            )));
-        }
-        let mut g = match self.truth(at) {
+        row.g = match self.truth(at) {
             Err(_) if self.reading.drop_missing && self.truth.may_lack_rows() => {
                 about.missing += u64::from(own);
                 return Ok(());
             }
             found => found.map_err(&fault)?,
         };
-        positions::check(g).map_err(&fault)?;
+        positions::check(row.g).map_err(&fault)?;
         if self.reading.flip_g2 {
-            g[1] = -g[1];
+            row.g[1] = -row.g[1];
         }
         if own {
             for k in 0..2 {
-                about.shear[k].add(g[k]);
-                about.ellipticity[k].add(e[k]);
+                about.shear[k].add(row.g[k]);
+                about.ellipticity[k].add(row.e[k]);
             }
         }
         take(&Item {
             key: self.key(at, index),
             version,
-            row: Row {
-                e,
-                weight,
-                slope,
-                cross,
-                g,
-                psf,
-                psf_size,
-            },
+            row,
             binned,
         })
     }
