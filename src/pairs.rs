@@ -18,8 +18,8 @@ const WAYS: [(&str, &[&str]); 32] = [
     (
         "gather",
         &[
-            "stamps extension mask mask-extension psf psf-extension noise set image out",
-            "exposure positions table first-pixel columns size extension mask mask-extension psf psf-extension noise set image out",
+            "stamps extension mask mask-extension mask-bits square psf psf-extension noise set image out",
+            "exposure positions table first-pixel columns size extension mask mask-extension mask-bits psf psf-extension noise set image out",
         ],
     ),
     (
@@ -69,11 +69,14 @@ const WAYS: [(&str, &[&str]); 32] = [
     (
         "challenge new",
         &[
-            "name kind public private sets images grid amplitude tilt seed metric spectra entries-per-team opens closes contact data-version threads",
-            "name kind public private data truth-table metric spectra entries-per-team opens closes contact data-version threads",
+            "name kind public private sets images grid amplitude tilt seed metric spectra entries-per-team partial address opens closes contact data-version threads",
+            "name kind public private data truth-table metric spectra entries-per-team partial address opens closes contact data-version threads",
         ],
     ),
-    ("challenge check", &["ENTRY challenge json threads"]),
+    (
+        "challenge check",
+        &["ENTRY challenge truth team json threads"],
+    ),
     (
         "challenge rank",
         &["INBOX challenge truth store reference report digits detail format threads"],
