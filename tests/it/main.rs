@@ -47,6 +47,7 @@ mod shards;
 mod stored;
 mod submitted;
 mod support;
+mod survey_tables;
 mod terminal;
 mod truth_sign;
 mod unread_files;

@@ -278,6 +278,9 @@ const OTHER_FORMATS: [(&str, &str); 2] = [
     ("<VOTABLE", "a VOTable"),
 ];
 
+/// The first bytes of HDF5.
+const HDF5: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
+
 /// Refuses a first line of another format.
 fn check_format(path: &Path, line: &str) -> Result<(), FileError> {
     match OTHER_FORMATS.iter().find(|(start, _)| {
@@ -296,6 +299,14 @@ fn check_format(path: &Path, line: &str) -> Result<(), FileError> {
 }
 
 fn not_text(path: &Path, line: u64) -> FileError {
+    let mut start = [0; HDF5.len()];
+    let read = std::fs::File::open(path).and_then(|mut file| file.read_exact(&mut start));
+    if read.is_ok() && start == HDF5 {
+        return FileError::new(
+            path,
+            "the file is HDF5, which is not read; expected a text, FITS or Parquet table. Try: pandas or astropy to write Parquet or FITS",
+        );
+    }
     FileError::new(
         path,
         format!("this is not a text table: line {line} is not UTF-8"),

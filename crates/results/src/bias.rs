@@ -376,7 +376,8 @@ fn add_up(
             if selects {
                 for (version, value) in item.binned[1..].iter().enumerate() {
                     if let Some(bin) = bin_of(edges, *value) {
-                        sums.add_version(number, item.key, bin, version, (scaled, row.weight));
+                        let weight = item.weights[version];
+                        sums.add_version(number, item.key, bin, version, (scaled, weight));
                     }
                 }
             }
@@ -437,6 +438,7 @@ fn check_columns(
             has_response(source),
             source.has_psf(),
             source.has_matrix(reading),
+            source.selects_versions(reading),
             source.columns.preset,
         )
     };
@@ -616,7 +618,14 @@ impl Summed {
     /// not follow the true shear.
     pub fn result(&self, errors: Errors) -> Result<BiasResult, BiasFailure> {
         let Grouped { grouping, design } = self.grouped()?;
-        let all = grouping.all_bins().estimate(0, self.truth, errors)?;
+        let all = grouping.all_bins().estimate(0, self.truth, errors);
+        let all = all.map_err(|error| match error {
+            // All rows have the same patch or tile.
+            BiasError::FewUnits { .. } if self.by_key == Some(true) => {
+                BiasFailure::Data(format!("{error}. Try: --units rows"))
+            }
+            error => error.into(),
+        })?;
         self.check_slopes(&all)?;
         let mut bins = vec![BinResult {
             edges: None,

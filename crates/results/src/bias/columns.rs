@@ -103,6 +103,9 @@ const ROLES: [(Role, &str, &[&str]); 34] = [
             "g[0]",
             "ngmix_ell_noshear[0]",
             "wmom_g_1",
+            "wmom_g1",
+            "gauss_g1",
+            "pgauss_g1",
             "gauss_g_1",
             "pgauss_g_1",
             "mdet_g_1",
@@ -126,6 +129,9 @@ const ROLES: [(Role, &str, &[&str]); 34] = [
             "g[1]",
             "ngmix_ell_noshear[1]",
             "wmom_g_2",
+            "wmom_g2",
+            "gauss_g2",
+            "pgauss_g2",
             "gauss_g_2",
             "pgauss_g_2",
             "mdet_g_2",
@@ -244,6 +250,7 @@ const ROLES: [(Role, &str, &[&str]); 34] = [
         &[
             "flag",
             "flags",
+            "flags_select",
             "wmom_flags",
             "mdet_flags",
             "ext_shapehsm_hsmshaperegauss_flag",
@@ -304,6 +311,9 @@ const ROLES: [(Role, &str, &[&str]); 34] = [
             "galaxy_id",
             "gal_id",
             "object_id",
+            "objectid",
+            "coadd_object_id",
+            "coadd_objects_id",
             "source_id",
             "number",
         ],
@@ -316,7 +326,13 @@ const ROLES: [(Role, &str, &[&str]); 34] = [
     (
         Role::Version,
         "version",
-        &["mdet_step", "shear_type", "metacal_step", "shear"],
+        &[
+            "mdet_step",
+            "metastep",
+            "shear_type",
+            "metacal_step",
+            "shear",
+        ],
     ),
     (Role::E1p, "e1_1p", &["e1_1p", "g1_1p", "ngmix_ell_1p[0]"]),
     (Role::E1m, "e1_1m", &["e1_1m", "g1_1m", "ngmix_ell_1m[0]"]),
@@ -411,7 +427,7 @@ const fn distortions(name: &'static str, columns: &'static str) -> Survey {
 }
 
 /// From the column lists in tests/data/columns. The first that fits is used.
-const SURVEYS: [Survey; 21] = [
+const SURVEYS: [Survey; 22] = [
     survey(
         "KiDS, internal",
         "e1=autocal_e1_A e2=autocal_e2_A w=recal_weight_A psf_e1=PSF_e1 psf_e2=PSF_e2",
@@ -468,6 +484,10 @@ const SURVEYS: [Survey; 21] = [
     survey(
         "UNIONS",
         "e1=e1 e2=e2 +w=w_des R11=none R22=none psf_e1=e1_PSF psf_e2=e2_PSF",
+    ),
+    survey(
+        "UNIONS",
+        "e1=e1 e2=e2 +w=w_iv R11=none R22=none psf_e1=e1_PSF psf_e2=e2_PSF",
     ),
     survey(
         "UNIONS, uncalibrated",
@@ -563,9 +583,73 @@ fn find_sheared(roles: &mut BTreeMap<Role, String>, found: &[String], names: &Na
     }
 }
 
+/// Columns that say which rows count, and whether those of value 1 do. Rows of the overlap of tiles are there twice; of
+/// blends that were not separated, and of stars, the shapes are not those of a galaxy.
+const CHOICES: [(&str, bool); 7] = [
+    ("is_primary", true),
+    ("is_inner", true),
+    ("primary", true),
+    ("inner", true),
+    ("detect_isprimary", true),
+    ("deblend_failed", false),
+    ("refextendedness", true),
+];
+
+/// Columns of flags. A row counts if all are zero: DES has the failures in `flags` and the cuts in `flags_select`, and
+/// metadetection one flag per kind of shape.
+fn find_flags(
+    path: &Path,
+    found: &[String],
+    names: &Names,
+    survey: Option<&Survey>,
+    e1: Option<&String>,
+) -> Result<Vec<String>, FileError> {
+    match names.0.get("flag") {
+        None => {}
+        Some(none) if none == "none" => return Ok(Vec::new()),
+        Some(given) if found.contains(given) => return Ok(vec![given.clone()]),
+        Some(given) => {
+            let flags = given.split('+').map(str::to_owned);
+            let known = |name: String| match found.contains(&name) {
+                true => Ok(name),
+                false => Err(FileError::no_column(path, &name, found)),
+            };
+            return flags.map(known).collect();
+        }
+    }
+    let own = |name: &str| {
+        let mut found = found.iter();
+        found.find(|own| own.eq_ignore_ascii_case(name) && names.role_of(own).is_none())
+    };
+    let mut flags: Vec<String> = Vec::new();
+    let first = match survey.and_then(|survey| survey.of("flag")) {
+        Some(known) => own(known),
+        None => names_of_role(Role::Flag).iter().find_map(|name| own(name)),
+    };
+    let e1 = e1.map_or_else(String::new, |e1| e1.to_ascii_lowercase());
+    let e1 = e1.strip_suffix("_noshear").unwrap_or(&e1);
+    let mut endings = ["_g_1", "_g1", "_g[0]", "_e_1", "_e1", "_e[0]"].into_iter();
+    let kind = endings.find_map(|ending| e1.strip_suffix(ending));
+    let of_kind = |ending: &str| own(&format!("{}_{ending}", kind?));
+    let by_cuts = own("flags_select");
+    let failures = own("flags").filter(|_| by_cuts.is_some());
+    let of_ngmix = own("ngmix_mcal_flags").filter(|_| e1.starts_with("ngmix"));
+    let of_kind = [of_kind("flags"), of_kind("flag"), of_ngmix];
+    let all = [first, failures, by_cuts].into_iter().chain(of_kind);
+    for name in all.flatten() {
+        if !flags.contains(name) {
+            flags.push(name.clone());
+        }
+    }
+    Ok(flags)
+}
+
 /// What the name of a column suggests that it is.
 fn suggested(name: &str) -> Option<&'static str> {
     let name = name.to_ascii_lowercase();
+    if CHOICES.iter().any(|(known, _)| *known == name) {
+        return Some("a choice");
+    }
     let has = |parts: &[&str]| parts.iter().any(|part| name.contains(part));
     let ends = |parts: &[&str]| parts.iter().any(|part| name.ends_with(part));
     if ends(&["_dg1", "_dg2"]) {
@@ -645,6 +729,11 @@ impl Names {
     pub fn role_of(&self, column: &str) -> Option<&'static str> {
         let mut given = self.0.iter();
         given.find_map(|(role, own)| (own == column && own != "none").then_some(*role))
+    }
+
+    /// Whether a role has a column by option.
+    pub fn is_given(&self, role: &str) -> bool {
+        self.0.contains_key(role)
     }
 
     /// Refuses a column with two roles: measured shears that are also the true ones have m = 0.
@@ -743,6 +832,12 @@ pub struct Columns {
     pub doubtful_weight: Option<String>,
     /// Columns that look like a weight, flag, response, derivative or sheared version and have no role.
     unused: Vec<String>,
+    /// All columns of flags; the first is that of the role.
+    pub flags: Vec<String>,
+    /// Columns of [`CHOICES`], with whether rows of value 1 count.
+    pub choices: Vec<(String, bool)>,
+    /// Columns that may hold names of versions, if no column has this role and it was not declined.
+    pub steps: Vec<String>,
 }
 
 impl Columns {
@@ -756,6 +851,9 @@ impl Columns {
         let mut roles = BTreeMap::new();
         let survey = SURVEYS.iter().find(|survey| survey.fits(found, names));
         for (role, key, candidates) in ROLES {
+            if role == Role::Flag {
+                continue;
+            }
             let by_survey = survey.and_then(|survey| survey.of(key));
             // A column called g1 that is given as e1 is not the true shear, too.
             let own = |name: &str| {
@@ -788,6 +886,8 @@ impl Columns {
                 roles.remove(&role);
             }
         }
+        let flags = find_flags(path, found, names, survey, roles.get(&Role::E1))?;
+        roles.extend(flags.first().map(|first| (Role::Flag, first.clone())));
         find_sheared(&mut roles, found, names);
         for (other, own) in OTHER_RESPONSES {
             if !roles.contains_key(&own) {
@@ -841,6 +941,9 @@ impl Columns {
             distortion,
             doubtful_weight: None,
             unused: Vec::new(),
+            flags,
+            choices: Vec::new(),
+            steps: Vec::new(),
         };
         if preset == Preset::Metacal && !names.0.contains_key("e1") {
             columns.take_unsheared(found);
@@ -854,8 +957,22 @@ impl Columns {
         if self.preset == Preset::Shearq {
             return;
         }
-        let free = |name: &&String| !self.roles.values().any(|own| own == *name);
-        let unused = || found.iter().filter(free);
+        let taken = self.roles.values().chain(&self.flags).cloned();
+        let taken: Vec<String> = taken.collect();
+        let unused = || found.iter().filter(|name| !taken.contains(name));
+        let choice = |name: &String| {
+            let mut known = CHOICES.iter();
+            let known = known.find(|(known, _)| known.eq_ignore_ascii_case(name))?;
+            Some((name.clone(), known.1))
+        };
+        self.choices = unused().filter_map(choice).collect();
+        if self.of(Role::Version).is_none() && !names.0.contains_key("version") {
+            let is_step = |name: &&String| {
+                let name = name.to_ascii_lowercase();
+                name.contains("step") || name.contains("shear_type") || name == "shear"
+            };
+            self.steps = unused().filter(is_step).cloned().collect();
+        }
         if self.of(Role::Weight).is_none() && !names.0.contains_key("w") {
             let mut weights = unused().filter(|name| suggested(name) == Some("a weight"));
             self.doubtful_weight = weights.next().cloned();
@@ -875,7 +992,10 @@ impl Columns {
     pub fn used(&self, read: impl Fn(Role) -> bool) -> String {
         let named = ROLES.iter().filter_map(|(role, key, _)| {
             let column = self.of(*role).filter(|_| read(*role))?;
-            Some(format!("{key}={column}"))
+            Some(match role {
+                Role::Flag => format!("{key}={}", self.flags.join("+")),
+                _ => format!("{key}={column}"),
+            })
         });
         named.collect::<Vec<_>>().join(", ")
     }

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use shearq_bias::{Catalogue, Repeated, Row, VERSIONS};
 use shearq_files::FileError;
-use shearq_files::frames::polars::DataFrame;
+use shearq_files::frames::polars::{DataFrame, DataType};
 use shearq_files::table::{self, FileFormat, Place};
 use shearq_measure::{Observables, Selection};
 use shearq_quantities::{Distortion, MeasuredRange};
@@ -79,6 +79,8 @@ pub(super) struct Item {
     pub(super) row: Row,
     /// The binned quantity in the row, and under each version that has it; NaN if the row is not selected.
     pub(super) binned: [f64; COUNT],
+    /// Its weight under each version.
+    pub(super) weights: [f64; VERSIONS.len()],
 }
 
 /// A table of a catalogue with its columns.
@@ -98,19 +100,34 @@ pub(super) struct Source {
     binned: Vec<Option<Vec<usize>>>,
     /// Columns of expressions that may change with shear and have no sheared versions.
     unanswered: Vec<String>,
+    /// Places of the flags, and of flags and weights under each version, from which the response of the choice and of the
+    /// weights follows.
+    flags: Vec<usize>,
+    flag_versions: Option<[Vec<usize>; VERSIONS.len()]>,
+    weight_versions: Option<[usize; VERSIONS.len()]>,
+    /// Places of flags of failed measurements of versions.
+    failed_versions: Vec<usize>,
+    /// Places of columns that say which rows count and are not used, with whether rows of value 1 do.
+    choices: Vec<(usize, bool)>,
+}
+
+/// Whether a choice among the galaxies of a catalogue can have a response from columns of its versions.
+fn answers(columns: &Columns) -> bool {
+    // Catalogues with responses of galaxies often have only the selected quantities in sheared versions.
+    match columns.preset {
+        Preset::Metacal | Preset::Versions => true,
+        Preset::Shearq | Preset::Anacal | Preset::Metadetect => false,
+        Preset::Plain | Preset::Hsm => columns.have(&[Role::R11]),
+    }
 }
 
 impl Source {
     /// Whether the selection is also known for each sheared version, so that its response follows.
     pub(super) fn selects_versions(&self, reading: &Reading) -> bool {
         let all = |places: &[Option<Vec<usize>>]| places.iter().all(Option::is_some);
-        // Catalogues with responses of galaxies often have only the selected quantities in sheared versions.
-        let own = match self.columns.preset {
-            Preset::Metacal | Preset::Versions => true,
-            Preset::Shearq | Preset::Anacal | Preset::Metadetect => false,
-            Preset::Plain | Preset::Hsm => self.columns.have(&[Role::R11]),
-        };
-        own && (reading.select.is_some() || reading.binned.is_some())
+        let chosen = reading.select.is_some() || reading.binned.is_some();
+        answers(&self.columns)
+            && (chosen || self.flag_versions.is_some() || self.weight_versions.is_some())
             && all(&self.selected)
             && all(&self.binned)
     }
@@ -145,6 +162,16 @@ impl Source {
         let read = self.wanted.iter().filter(|name| Some(*name) != doubtful);
         let read: Vec<String> = read.cloned().collect();
         lines.extend(self.columns.unused(&read));
+        let flags = self.flag_versions.as_ref().map(|own| own[0].clone());
+        let weight = self.weight_versions.map(|own| own[0]);
+        let versions = flags.into_iter().flatten().chain(weight);
+        let versions: Vec<&str> = versions.map(|place| self.wanted[place].as_str()).collect();
+        if !versions.is_empty() {
+            lines.push(format!(
+                "Response of the choice and the weights: from {} and the other versions.",
+                versions.join(", ")
+            ));
+        }
         if self.shapes(reading) == Shapes::Responsivity {
             let rms = match (self.columns.of(Role::RmsE), self.columns.of(Role::SigmaE)) {
                 (Some(rms), _) => format!("e_rms from {rms}"),
@@ -200,7 +227,12 @@ impl Source {
     /// Columns of identifiers and versions, which may be texts.
     fn texts<'a>(&'a self, reading: &'a Reading) -> Vec<&'a str> {
         let roles = [Role::Id, Role::Version].map(|role| self.columns.of(role));
-        let named = roles.into_iter().flatten().chain(self.unit(reading));
+        let steps = self.columns.steps.iter().map(String::as_str);
+        let named = roles
+            .into_iter()
+            .flatten()
+            .chain(self.unit(reading))
+            .chain(steps);
         // Expressions need numbers.
         let selected = self.selected.iter().chain(&self.binned).flatten().flatten();
         let expressions: Vec<usize> = selected.copied().collect();
@@ -238,21 +270,13 @@ pub(super) fn sources(input: &Input, reading: &Reading) -> Result<Vec<Source>, F
     }
     let place = Place::of(path);
     let found = table::columns(&place)?;
-    let version = |name: &str| {
-        let sheared = VERSIONS.iter().position(|(known, _)| *known == name);
-        match (name, sheared) {
-            ("noshear", _) => Some(None),
-            (_, Some(number)) => Some(Some(number)),
-            _ => None,
-        }
-    };
     let mut tables = Vec::new();
     for list in &found.named {
         let Some((number, shown)) = list.table.as_ref().filter(|_| place.table.is_none()) else {
             continue;
         };
         let name = shown.split('`').nth(1).unwrap_or_default();
-        if let Some(version) = version(&name.to_ascii_lowercase()) {
+        if let Some(version) = version_named(name) {
             let place = Place {
                 path: place.path.clone(),
                 table: Some(number.to_string()),
@@ -280,8 +304,9 @@ pub(super) fn sources(input: &Input, reading: &Reading) -> Result<Vec<Source>, F
         // Tables of chips share a name.
         let name = |shown: &&str| shown.split('`').nth(1).unwrap_or_default().to_owned();
         let own = name(&first);
-        let unique =
-            !own.is_empty() && tables.iter().filter(|other| name(other) == own).count() == 1;
+        let unique = !own.is_empty()
+            && own.parse::<u64>().is_err()
+            && tables.iter().filter(|other| name(other) == own).count() == 1;
         let number = first.split(' ').next().unwrap_or_default();
         return Err(FileError::new(
             path,
@@ -341,7 +366,7 @@ fn source(
     }
     let has_versions = |name: &str| names.contains(&format!("{}_1p", base(name)));
     let expressions = [&reading.select, &reading.binned].into_iter().flatten();
-    let mut named = expressions.flat_map(Expression::columns);
+    let mut named = expressions.clone().flat_map(Expression::columns);
     // Also if one of them is named.
     let by_versions = named
         .clone()
@@ -363,6 +388,25 @@ fn source(
         }
     }
     wanted.extend(columns.doubtful_weight.clone());
+    let answers = answers(&columns);
+    // Without versions of a flag or weight, they are the same in all.
+    let version_names = |name: &str, version: &str| -> Option<String> {
+        let wanted = format!("{}_{version}", base(name));
+        let mut names = names.iter();
+        names.find(|own| own.eq_ignore_ascii_case(&wanted)).cloned()
+    };
+    let all_versions = |name: &&str| {
+        let mut versions = VERSIONS.iter();
+        answers && versions.all(|(version, _)| version_names(name, version).is_some())
+    };
+    // Other flags of metacalibration with versions are those of failed measurements.
+    let is_cut = |name: &str| {
+        columns.preset != Preset::Metacal || name.to_ascii_lowercase().contains("select")
+    };
+    let flags: Vec<&str> = columns.flags.iter().map(String::as_str).collect();
+    let cuts = flags.iter().any(|name| is_cut(name) && all_versions(name));
+    let sheared_weight = columns.of(Role::Weight).filter(all_versions);
+    let by_versions = by_versions || cuts || sheared_weight.is_some();
     let unanswered = unanswered(reading, &columns, has_versions);
     let mut place_of = |name: &str| -> Option<usize> {
         if !names.iter().any(|own| own == name) {
@@ -401,6 +445,38 @@ fn source(
             Ok(all)
         };
     let (selected, binned) = (places(&reading.select)?, places(&reading.binned)?);
+    let known = selected.iter().chain(&binned).all(Option::is_some);
+    let mut certain = |name: &str| place_of(name).unwrap_or_default();
+    let flag_places = flags.iter().map(|name| certain(name)).collect();
+    let flag_versions = (cuts && known).then(|| {
+        VERSIONS.map(|(version, _)| {
+            let of = |name: &&str| {
+                let sheared = Some(*name).filter(|name| is_cut(name) && all_versions(name));
+                let sheared = sheared.and_then(|name| version_names(name, version));
+                certain(sheared.as_deref().unwrap_or(name))
+            };
+            flags.iter().map(of).collect()
+        })
+    });
+    let weight_versions = sheared_weight.filter(|_| known).map(|name| {
+        VERSIONS.map(|(version, _)| certain(&version_names(name, version).unwrap_or_default()))
+    });
+    let is_failure = |name: &&String| {
+        let name = name.to_ascii_lowercase();
+        columns.preset == Preset::Metacal
+            && name.contains("flag")
+            && !name.contains("select")
+            && version_of(&name).is_some()
+    };
+    let failed_versions = names.iter().filter(is_failure);
+    let failed_versions = failed_versions.map(|name| certain(name)).collect();
+    let chosen: Vec<&String> = expressions.flat_map(Expression::columns).collect();
+    let choices = columns.choices.iter();
+    let choices = choices.filter(|(name, _)| !chosen.contains(&name));
+    let choices = choices.map(|(name, good)| (certain(name), *good)).collect();
+    for name in &columns.steps {
+        certain(name);
+    }
     if reading.selection.is_some() {
         require_responses(&place.path, names.iter().map(String::as_str))?;
         for name in READ.iter().chain(&Observables::COLUMNS) {
@@ -418,6 +494,11 @@ fn source(
         selected,
         binned,
         unanswered,
+        flags: flag_places,
+        flag_versions,
+        weight_versions,
+        failed_versions,
+        choices,
     };
     if let Some(unit) = source.unit(reading) {
         if !names.iter().any(|own| own == unit) {
@@ -448,9 +529,13 @@ fn is_fixed(name: &str, columns: &Columns) -> bool {
     let name = name.to_ascii_lowercase();
     let parts = [
         "psf", "tile", "field", "patch", "seed", "true", "truth", "image", "ccd", "exp", "airmass",
-        "seeing", "depth", "zbin", "z_bin",
+        "seeing", "depth", "zbin", "z_bin", "primary", "inner",
     ];
     by_role
+        || columns
+            .flags
+            .iter()
+            .any(|flag| flag.eq_ignore_ascii_case(&name))
         || parts.iter().any(|part| name.contains(part))
         || [
             "ra", "dec", "x", "y", "z", "number", "row", "alpha", "delta", "set",
@@ -557,7 +642,7 @@ pub(super) fn rows(
             shared.look_for(&part);
             for at in 0..part.rows {
                 part.row(at, first + at, &mut counts, &mut about, &mut |item| {
-                    if item.version.is_none() {
+                    if item.version.is_none() && item.binned[0].is_finite() {
                         shared.add(&part, at);
                     }
                     take(item)
@@ -568,6 +653,10 @@ pub(super) fn rows(
         })?;
     }
     about.rows = counts[0];
+    if let Some(first) = sources.first() {
+        check_share(path, first, reading, &about)?;
+        shared.check_choices(path, first)?;
+    }
     about.repeated = sources
         .first()
         .map_or_else(Vec::new, |first| shared.found(first));
@@ -585,7 +674,23 @@ struct Shared {
     no_response: u64,
     no_psf: u64,
     used: u64,
+    /// Rows that count although a column of [`Source::choices`] excludes them.
+    excluded: Vec<u64>,
+    columns: Vec<SharedColumn>,
 }
+
+/// Numbers of one column that several rows have, and how many different ones there are in the searched rows.
+struct SharedColumn {
+    column: usize,
+    /// Whether zeros are values like others: derivatives of a smooth cut far from it.
+    has_zeros: bool,
+    counts: HashMap<u64, u64>,
+    different: usize,
+}
+
+/// Numbers with few digits are shared by many rows, but the ten that most rows have are about equally frequent: around its
+/// maximum, a distribution is flat. One number that is so much more frequent than the tenth stands for something else.
+const FREQUENT: usize = 10;
 
 impl Shared {
     fn look_for(&mut self, part: &Part<'_>) {
@@ -597,6 +702,88 @@ impl Shared {
                 self.ellipticities.entry(Self::key(e)).or_default();
             }
         }
+        // Half of the failures in one of 1000 rows of a small catalogue are enough.
+        self.look_in_columns(part, part.rows.div_ceil(4 * SEARCHED).max(1));
+    }
+
+    fn look_in_columns(&mut self, part: &Part<'_>, stride: usize) {
+        let places = &part.places;
+        if self.columns.is_empty() {
+            let own = [Preset::Shearq, Preset::Versions].contains(&part.source.columns.preset);
+            let measured = [
+                Some(places.e).filter(|_| places.ksb.is_none()),
+                places.response,
+            ];
+            let sheared = [places.sheared, places.other_sheared]
+                .into_iter()
+                .flatten()
+                .flatten();
+            let measured = measured.into_iter().flatten().chain(sheared);
+            let no_rms = part.shapes == Shapes::Responsivity && places.rms_e.is_none();
+            let sigma = places.sigma_e.filter(|_| no_rms);
+            let measured = measured
+                .flatten()
+                .chain(sigma)
+                .map(|column| (column, false));
+            let derivatives = places.derivative.into_iter().flatten();
+            let all = measured.chain(derivatives.map(|column| (column, true)));
+            self.columns = all
+                .filter(|_| !own)
+                .map(|(column, has_zeros)| SharedColumn {
+                    column,
+                    has_zeros,
+                    counts: HashMap::new(),
+                    different: 0,
+                })
+                .collect();
+        }
+        for own in &mut self.columns {
+            let mut seen = HashSet::new();
+            for at in (0..part.rows).step_by(stride) {
+                let value = part.value(own.column, at);
+                let counts = value.is_finite() && !(own.has_zeros && value == 0.0);
+                if counts && !seen.insert((value + 0.0).to_bits()) {
+                    own.counts.entry((value + 0.0).to_bits()).or_default();
+                }
+            }
+            own.different = own.different.max(seen.len());
+        }
+    }
+
+    /// The number that stands out in a column.
+    fn standing_out(&self, own: &SharedColumn) -> Option<(f64, u64)> {
+        if own.different <= FREQUENT && !own.has_zeros {
+            return None;
+        }
+        let mut counts: Vec<(u64, u64)> = own.counts.iter().map(|(v, n)| (*n, *v)).collect();
+        counts.sort_unstable_by(|a, b| b.cmp(a));
+        let (most, value) = *counts.first()?;
+        let tenth = counts
+            .get(FREQUENT - 1)
+            .map_or(1, |(count, _)| (*count).max(1));
+        let stands_out = most > FREQUENT as u64 * tenth;
+        (stands_out && most < self.used).then_some((f64::from_bits(value), most))
+    }
+
+    /// Refuses rows of which an unused column says that they do not count, if other rows do.
+    fn check_choices(&self, path: &Path, source: &Source) -> Result<(), FileError> {
+        let found = self.excluded.iter().zip(&source.choices);
+        let mut found = found.filter(|(rows, _)| (1..self.used).contains(rows));
+        let Some((rows, (column, good))) = found.next() else {
+            return Ok(());
+        };
+        let name = &source.wanted[*column];
+        let choice = match good {
+            true => name.clone(),
+            false => format!("not({name})"),
+        };
+        Err(FileError::new(
+            path,
+            format!(
+                "`{name}` excludes {rows} of {} rows that would count (expected none). Try: --select '{choice}', or --select '{name} > -1' for all rows",
+                self.used
+            ),
+        ))
     }
 
     /// Zeros with either sign are equal.
@@ -609,6 +796,19 @@ impl Shared {
             e, response, psf, ..
         } = part.places;
         self.used += 1;
+        let choices = &part.source.choices;
+        self.excluded.resize(choices.len(), 0);
+        for (count, (column, good)) in self.excluded.iter_mut().zip(choices) {
+            *count += u64::from((part.value(*column, at) != 0.0) != *good);
+        }
+        for own in &mut self.columns {
+            if !own.counts.is_empty() {
+                let value = part.value(own.column, at) + 0.0;
+                if let Some(count) = own.counts.get_mut(&value.to_bits()) {
+                    *count += 1;
+                }
+            }
+        }
         let is_zero =
             |columns: Option<[usize; 2]>| columns.is_some_and(|own| part.pair(own, at) == [0.0; 2]);
         self.no_response += u64::from(is_zero(response));
@@ -645,7 +845,19 @@ impl Shared {
                 rows,
             })
         };
-        all.into_iter().filter_map(repeated).collect()
+        let mut found: Vec<Repeated> = all.into_iter().filter_map(repeated).collect();
+        for own in &self.columns {
+            let name = &source.wanted[own.column];
+            let known = found.iter().any(|pair| pair.columns.contains(name));
+            if let Some((value, rows)) = self.standing_out(own).filter(|_| !known) {
+                found.push(Repeated {
+                    columns: [name.clone(), name.clone()],
+                    values: [value; 2],
+                    rows,
+                });
+            }
+        }
+        found
     }
 }
 
@@ -748,7 +960,6 @@ struct Places {
     response: Option<[usize; 2]>,
     divisor: Option<[usize; 2]>,
     derivative: Option<[usize; 2]>,
-    flag: Option<usize>,
     shear: Option<[usize; 2]>,
     position: Option<[usize; 2]>,
     psf: Option<[usize; 2]>,
@@ -781,7 +992,6 @@ impl Places {
             response: pair(Role::R11, Role::R22),
             divisor: pair(Role::Divisor1, Role::Divisor2),
             derivative: pair(Role::Dw1, Role::Dw2),
-            flag: place(Role::Flag),
             shear: pair(Role::G1, Role::G2),
             position: pair(Role::X, Role::Y),
             psf: pair(Role::Psf1, Role::Psf2),
@@ -828,6 +1038,8 @@ impl<'a> Part<'a> {
                 false => table::numbers(frame, name, path)?,
             });
         }
+        check_steps(frame, &source.columns, path)?;
+        check_selected(frame, source, reading)?;
         let keys = |name: &str| identity::keys(frame, name, path);
         let ids = source.columns.of(Role::Id).map(keys).transpose()?;
         let units = source.unit(reading).map(keys).transpose()?;
@@ -914,7 +1126,39 @@ impl<'a> Part<'a> {
             (value <= 0.0 || ranges.psf_size.excludes(value)).then_some(size)
         };
         let named = |found: Option<usize>, what| found.map(|column| (column, what));
+        let noise = |place: Option<usize>, most_wrong: f64| {
+            let place = place.filter(|_| self.shapes == Shapes::Responsivity)?;
+            let value = self.value(place, at);
+            let wrong = value <= most_wrong || MeasuredRange::ELLIPTICITY.excludes(value);
+            wrong.then_some(place)
+        };
+        // Distortions are below 1 and so is their scatter. Without noise, sigma is zero.
+        let rms = noise(places.rms_e, 0.0).or_else(|| {
+            places
+                .rms_e
+                .filter(|_| self.shapes == Shapes::Responsivity)
+                .filter(|rms| self.value(*rms, at) > 1.0)
+        });
+        let sigma = noise(
+            places.sigma_e.filter(|_| places.rms_e.is_none()),
+            -f64::MIN_POSITIVE,
+        );
+        let failed_version = || {
+            let mut flags = self.source.failed_versions.iter().copied();
+            flags.find(|flag| self.value(*flag, at) != 0.0)
+        };
+        let version_weight = || {
+            let mut weights = self.source.weight_versions.into_iter().flatten();
+            weights.find(|weight| {
+                let weight = self.value(*weight, at);
+                weight.is_nan() || weight >= HUGE
+            })
+        };
         named(e(), "an ellipticity")
+            .or_else(|| named(rms, "a standard deviation, above 0 and at most 1"))
+            .or_else(|| named(sigma, "a standard deviation of noise"))
+            .or_else(|| named(failed_version(), "0, as for a version that was measured"))
+            .or_else(|| named(version_weight(), "a weight"))
             .or_else(|| named(outside(places.response, ranges.response), "a response"))
             .or_else(|| {
                 named(
@@ -959,8 +1203,18 @@ impl<'a> Part<'a> {
             if self.reading.drop_missing {
                 return Ok(Err(LeftOut::Failed));
             }
+            let [p1, p2] = places.psf.unwrap_or([usize::MAX; 2]);
+            let of_psf = [Some(p1), Some(p2), places.psf_size].contains(&Some(column));
+            let all_equal = || {
+                let value = self.value(column, at);
+                self.columns[column].iter().all(|other| *other == value)
+            };
+            let remedy = match of_psf && all_equal() {
+                true => "--columns psf_e1=none,psf_e2=none,psf_size=none",
+                false => "--drop-missing",
+            };
             return Err(format!(
-                "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {expected}). Try: --drop-missing",
+                "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {expected}). Try: {remedy}",
                 self.source.wanted[column],
                 shown(self.value(column, at))
             ));
@@ -1017,14 +1271,30 @@ impl<'a> Part<'a> {
         let index = *count;
         *count += 1;
         let own = version.is_none();
-        if places.flag.is_some_and(|flag| self.value(flag, at) != 0.0) {
-            about.flagged += u64::from(own);
-            return Ok(());
-        }
+        let source = self.source;
+        let is_set = |flags: &[usize]| flags.iter().any(|flag| self.value(*flag, at) != 0.0);
+        let flagged = is_set(&source.flags);
         let weight = places.weight.map_or(1.0, |weight| self.value(weight, at));
-        if weight <= 0.0 {
-            about.unweighted += u64::from(own);
-            return Ok(());
+        let counted = !flagged && !(weight <= 0.0);
+        // A version may choose a row that is left out without shear.
+        let of_versions = source.weight_versions;
+        let of_versions = of_versions.map(|own| own.map(|place| self.value(place, at)));
+        let in_versions: [bool; VERSIONS.len()] = std::array::from_fn(|version| {
+            let flagged = match &source.flag_versions {
+                Some(flags) => is_set(&flags[version]),
+                None => flagged,
+            };
+            !flagged && !(of_versions.map_or(weight, |own| own[version]) <= 0.0)
+        });
+        if !counted {
+            let count = match flagged {
+                true => &mut about.flagged,
+                false => &mut about.unweighted,
+            };
+            *count += u64::from(own);
+            if in_versions == [false; VERSIONS.len()] {
+                return Ok(());
+            }
         }
         let fault = |what: String| {
             let row = number + 1;
@@ -1040,9 +1310,13 @@ impl<'a> Part<'a> {
             about.unselected += u64::from(own);
             return Ok(());
         }
-        let binned = self.binned(at);
+        let mut binned = self.binned(at);
+        about.unselected += u64::from(own && counted && binned[0].is_infinite());
+        let left_out = std::iter::once(!counted).chain(in_versions.map(|own| !own));
+        for (bin, _) in binned.iter_mut().zip(left_out).filter(|(_, out)| *out) {
+            *bin = f64::INFINITY;
+        }
         if binned[0].is_infinite() {
-            about.unselected += u64::from(own);
             if binned[1..].iter().all(|value| value.is_infinite()) {
                 return Ok(());
             }
@@ -1083,6 +1357,7 @@ impl<'a> Part<'a> {
         take(&Item {
             key: self.key(at, index),
             version,
+            weights: of_versions.unwrap_or([row.weight; VERSIONS.len()]),
             row,
             binned,
         })
@@ -1216,33 +1491,112 @@ impl<'a> Part<'a> {
     }
 }
 
+/// The version of a name, `None` for that without shear: `ns` in metadetection of LSST, `00` in TXPipe.
+fn version_named(name: &str) -> Option<Option<usize>> {
+    let name = name.trim().to_ascii_lowercase();
+    if ["noshear", "ns", "00"].contains(&name.as_str()) {
+        return Some(None);
+    }
+    let mut versions = VERSIONS.iter();
+    versions.position(|(known, _)| *known == name).map(Some)
+}
+
+/// Whether a text is the name of a sheared version.
+fn is_sheared(text: Option<&str>) -> bool {
+    text.is_some_and(|text| matches!(version_named(text), Some(Some(_))))
+}
+
+/// Refuses a table whose rows belong to versions, if no column has this role: its mean would be one of all versions.
+fn check_steps(frame: &DataFrame, columns: &Columns, path: &Path) -> Result<(), FileError> {
+    for name in &columns.steps {
+        let texts = frame.column(name).ok().and_then(|column| column.str().ok());
+        if texts.is_some_and(|texts| texts.iter().any(is_sheared)) {
+            return Err(FileError::new(
+                path,
+                format!(
+                    "column `{name}` names sheared versions, but is not used. Try: --columns version={name}"
+                ),
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// Columns of cuts that are taken for flags by their names.
+fn recognised_cuts<'a>(
+    source: &'a Source,
+    reading: &Reading,
+) -> impl Iterator<Item = &'a String> + use<'a> {
+    let given = reading.names.is_given("flag");
+    let flags = source.columns.flags.iter().filter(move |_| !given);
+    flags.filter(|name| name.to_ascii_lowercase().contains("select"))
+}
+
+/// Refuses a cut that excludes more than half of the rows: it may be true for selected rows.
+fn check_share(
+    path: &Path,
+    source: &Source,
+    reading: &Reading,
+    about: &Catalogue,
+) -> Result<(), FileError> {
+    let most = 2 * about.flagged > about.rows;
+    match recognised_cuts(source, reading).next().filter(|_| most) {
+        None => Ok(()),
+        Some(name) => Err(FileError::new(
+            path,
+            format!(
+                "flags exclude {} of {} rows, among them `{name}` (expected less than half: 0 for good rows). Try: --columns flag=none --select {name} if good rows have 1, --columns flag={} otherwise",
+                about.flagged,
+                about.rows,
+                source.columns.flags.join("+")
+            ),
+        )),
+    }
+}
+
+/// Refuses a recognised flag that is true for selected rows.
+fn check_selected(frame: &DataFrame, source: &Source, reading: &Reading) -> Result<(), FileError> {
+    for name in recognised_cuts(source, reading) {
+        let is_boolean = || {
+            let column = frame.column(name);
+            column.is_ok_and(|column| *column.dtype() == DataType::Boolean)
+        };
+        if is_boolean() {
+            return Err(FileError::new(
+                &source.place.path,
+                format!(
+                    "column `{name}` is true or false (expected a flag, which is 0 for good rows). Try: --columns flag=none --select {name} if it is true for selected rows, --columns flag={name} otherwise"
+                ),
+            ));
+        }
+    }
+    Ok(())
+}
+
 /// The versions that a column of text names.
 fn versions(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<Option<usize>>, FileError> {
-    let fault = |found: &str| {
+    let fault = |found: &str, remedy: &str| {
         FileError::new(
             path,
             format!(
-                "column `{name}`: unknown version (found {found}, expected noshear, 1p, 1m, 2p or 2m). Try: --columns version=none"
+                "column `{name}`: unknown version (found {found}, expected noshear or ns, 1p, 1m, 2p or 2m). Try: {remedy}"
             ),
         )
     };
-    let column = frame.column(name).map_err(|_| fault("no such column"))?;
-    let texts = column.str().map_err(|_| fault("no text"))?;
-    let mut known: HashMap<&str, Option<usize>> = HashMap::from([("noshear", None)]);
-    known.extend(
-        VERSIONS
-            .iter()
-            .enumerate()
-            .map(|(k, (name, _))| (*name, Some(k))),
-    );
+    let none = "--columns version=none";
+    let column = frame.column(name);
+    let column = column.map_err(|_| fault("no such column", none))?;
+    let texts = column.str().map_err(|_| fault("no text", none))?;
+    // The mean of all versions has a wrong m.
+    let remedy = match texts.iter().any(is_sheared) {
+        true => "a table of these versions alone",
+        false => none,
+    };
     texts
         .iter()
         .map(|text| {
             let text = text.unwrap_or("nothing");
-            known
-                .get(text)
-                .copied()
-                .ok_or_else(|| fault(&format!("`{text}`")))
+            version_named(text).ok_or_else(|| fault(&format!("`{text}`"), remedy))
         })
         .collect()
 }

@@ -301,6 +301,11 @@ fn notes(result: &BiasResult) -> Vec<String> {
             notes.push(format!("Left out: {count} rows {what}."));
         }
     }
+    if 2 * total(|c| c.flagged) > total(|c| c.rows) {
+        notes.push(
+            "More than half of the rows have a flag, which is not 0. If good rows have it, try: --columns flag=none --select NAME".into(),
+        );
+    }
     notes.extend(repeated(&result.catalogues));
     notes.extend(chosen_by_measurement(result));
     for (k, assumes) in (1..).zip(all.assumes_no_c) {
@@ -341,6 +346,12 @@ fn repeated(catalogues: &[Catalogue]) -> Vec<String> {
     let rows: u64 = catalogues.iter().map(|own| own.rows).sum();
     let line = |own: &Repeated| {
         let ([a, b], [first, second]) = (&own.columns, own.values.map(shown));
+        if a == b {
+            return format!(
+                "`{a}` is exactly {first} in {} of {rows} rows, which count. If this stands for a failure, try: --select '{a} != {first}'",
+                own.rows
+            );
+        }
         format!(
             "`{a}` and `{b}` are exactly {first} and {second} in {} of {rows} rows, which count. If this stands for a failure, try: --select '{a} != {first}'",
             own.rows
