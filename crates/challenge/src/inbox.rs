@@ -17,6 +17,9 @@ const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"]
 /// Digits of a file's checksum that a store keeps. Two of a million files agree by chance once in 10⁷ challenges.
 const FILE_DIGITS: usize = 16;
 
+/// How the names of files that are neither catalogues nor spectra start in the list of an entry's content.
+const OTHER_FILE: &str = "other ";
+
 /// An entry as it was found.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Sending {
@@ -89,8 +92,21 @@ fn search(
             || (depth < DEPTH).then(|| name.into_owned()),
             |team| Some(team.to_owned()),
         );
-        for path in inside {
-            search(&path, team.as_deref(), depth - 1, found)?;
+        let before = found.len();
+        for path in &inside {
+            search(path, team.as_deref(), depth - 1, found)?;
+        }
+        // Files of other names would be left out silently.
+        let is_file = |path: &&PathBuf| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            path.is_file() && !name.starts_with('.')
+        };
+        let is_inbox = depth == DEPTH && inside.iter().any(|path| path.is_dir());
+        if found.len() == before && !is_inbox && inside.iter().any(|path| is_file(&path)) {
+            found.push(Sending {
+                path: path.to_owned(),
+                team,
+            });
         }
     }
     Ok(())
@@ -155,7 +171,7 @@ fn list_of(sums: &[(String, FileSum)]) -> Vec<u8> {
 /// Content of an entry.
 #[derive(Debug, Clone)]
 pub struct Content {
-    /// SHA-256 of sets, images and checksums of the files. It depends neither on the name of the method nor on the
+    /// SHA-256 of sets, images and checksums of all files but the manifest. It depends neither on the name of the method nor on the
     /// compression.
     pub sha256: String,
     /// First digits of the checksum of each file.
@@ -185,9 +201,13 @@ pub fn content(sending: &Sending) -> Result<Content, FileError> {
     let mut sums: Vec<(String, FileSum)> = files
         .into_iter()
         .filter_map(|(name, sum)| {
-            let name = match Kind::of(Path::new(&name))? {
-                Kind::Catalogue { set, image, .. } => format!("{set} {image}"),
-                Kind::Spectrum { set, .. } => format!("{set}"),
+            // The manifest names team and method.
+            (name != MANIFEST_FILE).then_some(())?;
+            let name = match Kind::of(Path::new(&name)) {
+                Some(Kind::Catalogue { set, image, .. }) => format!("{set} {image}"),
+                Some(Kind::Spectrum { set, .. }) => format!("{set}"),
+                // Checks see these files, so an entry with them is another entry.
+                None => format!("{OTHER_FILE}{name}"),
             };
             Some((name, sum))
         })
@@ -195,8 +215,10 @@ pub fn content(sending: &Sending) -> Result<Content, FileError> {
     sums.sort_by(|a, b| a.0.cmp(&b.0));
     Ok(Content {
         sha256: sha256(&list_of(&sums)),
+        // Two teams may add the same licence.
         files: sums
             .iter()
+            .filter(|(name, _)| !name.starts_with(OTHER_FILE))
             .map(|(_, sum)| sum.sha256[..FILE_DIGITS].to_owned())
             .collect(),
         entry: manifest.and_then(|manifest| manifest.entry),
@@ -206,6 +228,25 @@ pub fn content(sending: &Sending) -> Result<Content, FileError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_content_covers_all_files_but_the_manifest() {
+        let root = tempfile::tempdir().unwrap();
+        let of = |folder: &str, files: &[&str]| {
+            let path = root.path().join(folder);
+            std::fs::create_dir(&path).unwrap();
+            for file in files {
+                std::fs::write(path.join(file), "1 1 0 0\n").unwrap();
+            }
+            content(&Sending { path, team: None }).unwrap()
+        };
+        let plain = of("a", &["g10_v1_objs_1_1.M.dat"]);
+        let renamed = of("b", &["g10_v1_objs_1_1.N.dat"]);
+        let more = of("c", &["g10_v1_objs_1_1.M.dat", "LICENSE"]);
+        assert_eq!(plain.sha256, renamed.sha256);
+        assert_ne!(plain.sha256, more.sha256);
+        assert_eq!((more.files.len(), &more.files), (1, &plain.files));
+    }
 
     #[test]
     fn entries_are_found_with_the_teams_of_their_folders() {
@@ -219,6 +260,7 @@ mod tests {
             "A team/later/two.tar.gz",
             "B/sent/g10_v1_objs_1_1.M.dat",
             "B/sent/README",
+            "C/set1_image1.dat",
         ] {
             let path = root.path().join(file);
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -236,6 +278,7 @@ mod tests {
             ("A team/later/two.tar.gz", Some("A team")),
             ("A team/one.tgz", Some("A team")),
             ("B/sent", Some("B")),
+            ("C", Some("C")),
             ("a.tar.gz", None),
             ("b.zip", None),
         ];

@@ -225,7 +225,7 @@ impl Judge {
     /// # Errors
     /// If the store cannot be read, or contains entries that were scored with another truth or other data.
     pub fn entries(&self, store: &Path) -> Result<Vec<Entry>, FileError> {
-        let mut entries: BTreeMap<String, Entry> = BTreeMap::new();
+        let mut entries: BTreeMap<(String, String), Entry> = BTreeMap::new();
         for (path, run) in store::files(store)? {
             if !run.settings.starts_with(STORED) {
                 continue;
@@ -248,8 +248,14 @@ impl Judge {
                 withdrawn: None,
             };
             // Of two processes at the same time, or of a time with and without a receipt, the earlier one counts.
-            match entries.entry(entry.info.sha256.clone()) {
-                Slot::Occupied(mut slot) if entry.info.received < slot.get().info.received => {
+            // Teams that sent the same archive are not one entry, and an early one may come again.
+            let order = |entry: &Entry| {
+                let received = entry.info.received;
+                (self.challenge.rules.is_early(received), received)
+            };
+            let id = (entry.info.sha256.clone(), entry.info.team.clone());
+            match entries.entry(id) {
+                Slot::Occupied(mut slot) if order(&entry) < order(slot.get()) => {
                     slot.insert(entry);
                 }
                 Slot::Occupied(_) => {}
@@ -339,7 +345,7 @@ impl Judge {
     }
 
     /// Signs the arrival of an entry, now, for `team` or the team in the manifest, and returns the file of the receipt. A
-    /// receipt that the same content has already is kept.
+    /// receipt that the same content has already is kept, unless it is of a time before entries are accepted.
     ///
     /// # Errors
     /// If the entry cannot be read, or the receipt cannot be written.
@@ -352,13 +358,16 @@ impl Judge {
         let stated = content(&sending)?.entry;
         let team = team_of(&sending, stated.as_ref(), None);
         check_name(&team).map_err(|error| FileError::new(entry, error))?;
+        let counts = |received| !self.challenge.rules.is_early(received);
         match Receipt::read(&self.key, entry, &sha256) {
-            Ok(Some(earlier)) if earlier.team == team => Ok(Receipt::path(entry)),
+            Ok(Some(earlier)) if earlier.team == team && counts(earlier.received) => {
+                Ok(Receipt::path(entry))
+            }
             _ => Receipt::sign(&self.key, &team, now(), &sha256).write(entry),
         }
     }
 
-    /// The entries that must be scored. Known entries are counted; unreadable entries and copies are refused.
+    /// The entries that must be scored. Known entries are counted; unreadable entries and repeated archives are refused.
     fn candidates(
         &self,
         sendings: &[(Sending, bool)],
@@ -367,10 +376,18 @@ impl Judge {
         round: &mut Round,
     ) -> Result<Vec<Candidate>, PipelineError> {
         let now = now();
-        let earlier: BTreeMap<&str, Timestamp> = known
-            .iter()
-            .map(|entry| (entry.info.sha256.as_str(), entry.info.received))
-            .collect();
+        let mut stored: BTreeMap<&str, Vec<&EntryInfo>> = BTreeMap::new();
+        for Entry { info, .. } in known {
+            stored.entry(&info.sha256).or_default().push(info);
+        }
+        // A receipt that is found later states an earlier time than the store; an entry that came too early may come again.
+        let rules = &self.challenge.rules;
+        let order = |received: Timestamp| (rules.is_early(received), received);
+        let is_known = |team: &str, arrival: &Arrival| {
+            let same = stored.get(arrival.sha256.as_str()).into_iter().flatten();
+            same.into_iter()
+                .any(|info| info.team == team && order(info.received) <= order(arrival.received))
+        };
         let mut identified = Vec::new();
         engine::ordered(
             threads,
@@ -385,9 +402,13 @@ impl Judge {
             || (),
             |(), (sending, reference): (Sending, bool)| {
                 let found = self.arrival(&sending, now).and_then(|arrival| {
-                    // A receipt that is found later states an earlier time than the store.
-                    let stored = earlier.get(arrival.sha256.as_str());
-                    let content = match stored.is_some_and(|stored| *stored <= arrival.received) {
+                    // Without a folder or a receipt, the manifest states the team.
+                    let receipt = arrival.receipt.as_ref();
+                    let team = sending
+                        .team
+                        .as_ref()
+                        .or(receipt.map(|receipt| &receipt.team));
+                    let content = match team.is_some_and(|team| is_known(team, &arrival)) {
                         true => None,
                         false => Some(content(&sending)?),
                     };
@@ -413,42 +434,28 @@ impl Judge {
             },
         )?;
         identified.sort_by(|a, b| (a.2.received, &a.0).cmp(&(b.2.received, &b.0)));
-        let mut contents: BTreeMap<String, (Timestamp, String, String)> = BTreeMap::new();
-        for Entry { info, .. } in known {
-            let name = format!("the entry of {} of {}", info.team, info.received);
-            let first = (info.received, info.sha256.clone(), name);
-            contents.entry(info.content.clone()).or_insert(first);
-        }
-        let mut archives: BTreeMap<String, PathBuf> = BTreeMap::new();
+        let mut archives: BTreeMap<(String, String, bool), PathBuf> = BTreeMap::new();
         let mut candidates = Vec::new();
         for (sending, reference, arrival, content) in identified {
             let entry = content.as_ref().and_then(|content| content.entry.as_ref());
             let team = team_of(&sending, entry, arrival.receipt.as_ref());
-            let path = sending.path.clone();
-            let refuse = |reason| round.refused.push(Refused { path, team, reason });
-            if let Some(first) = archives.get(&arrival.sha256) {
-                refuse(format!("identical content as {}", first.display()));
-                continue;
+            let early = rules.is_early(arrival.received);
+            // Of other archives with this content, the first one that counts is known only when all are ranked.
+            match archives.entry((arrival.sha256.clone(), team.clone(), early)) {
+                Slot::Occupied(first) => {
+                    round.refused.push(Refused {
+                        path: sending.path,
+                        team,
+                        reason: format!("identical content as {}", first.get().display()),
+                    });
+                    continue;
+                }
+                Slot::Vacant(slot) => _ = slot.insert(sending.path.clone()),
             }
-            archives.insert(arrival.sha256.clone(), sending.path.clone());
-            let Some(content) = content else {
+            let Some(content) = content.filter(|_| !is_known(&team, &arrival)) else {
                 round.known += 1;
                 continue;
             };
-            // An entry with a receipt may be earlier than a copy in the store, which is then listed as a near copy.
-            if let Some((received, sha256, first)) = contents.get(&content.sha256)
-                && *sha256 != arrival.sha256
-                && *received <= arrival.received
-            {
-                refuse(format!("identical content as {first}"));
-                continue;
-            }
-            let own = (
-                arrival.received,
-                arrival.sha256.clone(),
-                sending.path.display().to_string(),
-            );
-            contents.insert(content.sha256.clone(), own);
             candidates.push(Candidate {
                 sending,
                 reference,

@@ -23,7 +23,7 @@ pub struct Decisions {
     pub anonymous: bool,
     /// Names that the board shows, by team.
     pub aliases: BTreeMap<String, String>,
-    /// Reasons, by the first digits of the SHA-256 of the archive.
+    /// Reasons, by the first digits of the SHA-256 of the archive, or `DIGITS/TEAM` if several teams sent it.
     pub withdrawn: BTreeMap<String, String>,
 }
 
@@ -48,8 +48,15 @@ impl Decisions {
     /// If an entry or a team is unknown, or a name stands for two teams.
     pub fn apply(&self, entries: &mut [Entry], key: &Key) -> Result<(), String> {
         for (id, reason) in &self.withdrawn {
+            // Two teams may have sent the same archive.
+            let (digits, team) = match id.split_once('/') {
+                Some((digits, team)) => (digits, Some(team)),
+                None => (id.as_str(), None),
+            };
             let names = |entry: &Entry| {
-                id.len() >= LEAST_DIGITS && entry.info.sha256.starts_with(id.as_str())
+                digits.len() >= LEAST_DIGITS
+                    && entry.info.sha256.starts_with(digits)
+                    && team.is_none_or(|team| entry.info.team == team)
             };
             let named: Vec<usize> = (0..entries.len()).filter(|k| names(&entries[*k])).collect();
             let [entry] = named.as_slice() else {

@@ -85,6 +85,8 @@ pub fn rank<'a>(
     let mut leaderboard = Leaderboard::default();
     let mut teams: BTreeMap<(Board, bool, &str), Vec<Result<'a>>> = BTreeMap::new();
     let mut numbers: BTreeMap<&str, usize> = BTreeMap::new();
+    // Only entries that count make later ones copies, so that nobody can block others with an entry that does not.
+    let mut firsts: BTreeMap<&str, &EntryInfo> = BTreeMap::new();
     for entry in entries {
         let info = &entry.info;
         let (value, error) = metric.of(&entry.sets, constant);
@@ -96,16 +98,25 @@ pub fn rank<'a>(
         };
         if info.reference && entry.withdrawn.is_none() {
             // Each reference has its own line.
+            firsts.entry(&info.content).or_insert(info);
             let own = teams.entry((Board::Main, true, info.sha256.as_str()));
             own.or_default().push(result);
             continue;
         }
-        let early = rules
-            .opens
-            .as_ref()
-            .filter(|opens| info.received < opens.first);
-        if let Some(opens) = early {
+        if let Some(opens) = &rules.opens
+            && rules.is_early(info.received)
+        {
             let reason = format!("received before the challenge opened, {opens}");
+            leaderboard.excluded.push((info, reason));
+            continue;
+        }
+        if let Some(first) = firsts.get(info.content.as_str())
+            && entry.withdrawn.is_none()
+        {
+            let reason = format!(
+                "identical content as the entry of {} of {}",
+                first.team, first.received
+            );
             leaderboard.excluded.push((info, reason));
             continue;
         }
@@ -126,6 +137,7 @@ pub fn rank<'a>(
                     true => Board::Late,
                     false => Board::Main,
                 };
+                firsts.insert(&info.content, info);
                 let team = teams.entry((board, false, info.team.as_str()));
                 team.or_default().push(result);
                 continue;
@@ -257,7 +269,7 @@ pub(crate) mod tests {
 
     const DAY: &str = "2026-11-24T10:00:00Z";
 
-    fn entry(team: &str, received: &str, q: f64, replicates: &[f64]) -> Entry {
+    pub(crate) fn entry(team: &str, received: &str, q: f64, replicates: &[f64]) -> Entry {
         Entry {
             info: EntryInfo {
                 challenge: "c".into(),
@@ -425,6 +437,39 @@ pub(crate) mod tests {
         assert_eq!(
             board.excluded[0].1,
             "received before the challenge opened, 2026-11-01 (UTC)"
+        );
+    }
+
+    #[test]
+    fn only_entries_that_count_make_others_copies() {
+        let mut entries = [
+            entry("Early", "2026-10-31T10:00:00Z", 3.0, &[3.0]),
+            entry("Withdrawn", "2026-11-20T10:00:00Z", 3.0, &[3.0]),
+            entry("Owner", "2026-11-21T10:00:00Z", 3.0, &[3.0]),
+            entry("Copy", "2026-11-22T10:00:00Z", 3.0, &[3.0]),
+            entry("Owner", "2026-11-23T10:00:00Z", 3.0, &[3.0]),
+            entry("Owner", "2026-11-24T10:00:00Z", 4.0, &[4.0]),
+        ];
+        for entry in &mut entries[..5] {
+            entry.info.content = "same".into();
+        }
+        entries[1].withdrawn = Some("a mistake".into());
+        let mut challenge = challenge();
+        challenge.rules.opens = "2026-11-01".parse().ok();
+        let board = rank(&entries, &challenge, None, 1);
+        assert_eq!(found(&board), [(Board::Main, Some(1), "Owner".to_owned())]);
+        // Two entries per team: the team's own copy is none of them.
+        assert_eq!(board.standings[0].best.value, 4.0);
+        let copy = "identical content as the entry of Owner of 2026-11-21T10:00:00Z";
+        let reasons: Vec<&str> = board.excluded.iter().map(|e| e.1.as_str()).collect();
+        assert_eq!(
+            reasons,
+            [
+                "received before the challenge opened, 2026-11-01 (UTC)",
+                "withdrawn: a mistake",
+                copy,
+                copy
+            ]
         );
     }
 

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use shearq_files::{FileError, open};
 use shearq_quantities::units::{Degrees, Pixels};
@@ -117,6 +118,13 @@ impl Rules {
             None => Some("any number".into()),
             Some(most) => (most >= TUNING_ENTRIES).then(|| most.to_string()),
         }
+    }
+
+    /// Whether a time is before the first day of entries.
+    pub fn is_early(&self, received: Timestamp) -> bool {
+        self.opens
+            .as_ref()
+            .is_some_and(|opens| received < opens.first)
     }
 
     /// Kind of the files of an entry.
