@@ -120,7 +120,7 @@ struct NewArguments {
     /// Entry by entry, a team can tune a spectrum to the truth without images.
     #[arg(long)]
     spectra: bool,
-    /// Most entries of a team [default: as the kind, or any number].
+    /// Most entries of a team, because published values reveal the truth entry by entry [default: 10].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     entries_per_team: Option<u32>,
     /// First day of entries in UTC, or a moment with its zone, such as 2026-12-01T18:00[Europe/Berlin].

@@ -208,7 +208,8 @@ pub static GREAT10: Kind = Kind {
     constant_metric: RankBy::Qc,
     // Q of a spectrum can be tuned without images, entry by entry (tests/extraction.rs).
     contents: &[Contents::Catalogues],
-    entries_per_team: None,
+    // Published values determine the truth entry by entry (docs/run-a-challenge.md).
+    entries_per_team: Some(10),
     layout: Layout::default,
     conventions: &[
         (

@@ -26,7 +26,9 @@ pub(crate) fn rules(challenge: &Challenge) -> Vec<String> {
     all.push("Entries whose difference is below its error share a rank.".into());
     all.push("Symbolic links are not accepted. Entries that share files or shapes with an earlier entry are listed.".into());
     if let Some(most) = rules.entries_per_team {
-        all.push(format!("Each team may send at most {most} entries."));
+        all.push(format!(
+            "Each team may send at most {most} entries, because published values reveal the true shear entry by entry."
+        ));
     }
     if let Some(opens) = &rules.opens {
         all.push(format!("Entries are accepted from {opens}."));
