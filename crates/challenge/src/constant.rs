@@ -57,7 +57,8 @@ impl ConstantShears {
         Ok(Some(ConstantShears(shears)))
     }
 
-    /// m and c of component `k` (0 or 1): least squares of ⟨e⟩ − g = m·g + c over the sets, unweighted as in GREAT3.
+    /// m and c of component `k` (0 or 1): least squares of ⟨e⟩ − g = m·g + c over the sets, unweighted as in GREAT3. Errors
+    /// are those of the scatter of galaxies, or of the residuals if these are larger.
     pub fn bias(&self, sets: &[SetRecord], k: usize) -> (Measured, Measured) {
         let rows: Vec<(f64, f64, f64)> = sets
             .iter()
@@ -70,16 +71,36 @@ impl ConstantShears {
         let count = rows.len() as f64;
         let mean = rows.iter().map(|row| row.0).sum::<f64>() / count;
         let square: f64 = rows.iter().map(|row| (row.0 - mean).powi(2)).sum();
-        let sum = |weight: &dyn Fn(f64) -> f64| {
-            let value = rows.iter().map(|(g, apart, _)| weight(*g) * apart).sum();
-            let variance: f64 = rows
-                .iter()
-                .map(|(g, _, error)| (weight(*g) * error).powi(2))
-                .sum();
-            (value, variance.sqrt())
-        };
         let of_m = |g: f64| (g - mean) / square;
-        (sum(&of_m), sum(&|g| 1.0 / count - mean * of_m(g)))
+        let of_c = |g: f64| 1.0 / count - mean * of_m(g);
+        let value = |weight: &dyn Fn(f64) -> f64| -> f64 {
+            rows.iter().map(|(g, apart, _)| weight(*g) * apart).sum()
+        };
+        let (m, c) = (value(&of_m), value(&of_c));
+        let residuals: f64 = rows
+            .iter()
+            .map(|(g, apart, _)| (apart - m * g - c).powi(2))
+            .sum();
+        let residual = match count > 2.0 {
+            true => residuals / (count - 2.0),
+            false => 0.0,
+        };
+        // Galaxies that are shrunk towards their mean scatter less, but the means of the sets do not.
+        let error = |weight: &dyn Fn(f64) -> f64| -> f64 {
+            let variance = |of: &dyn Fn(f64) -> f64| -> f64 {
+                rows.iter()
+                    .map(|(g, _, error)| weight(*g).powi(2) * of(*error))
+                    .sum()
+            };
+            let (scatter, fit) = (variance(&|error| error.powi(2)), variance(&|_| residual));
+            // An unknown scatter stays unknown.
+            if fit > scatter {
+                fit.sqrt()
+            } else {
+                scatter.sqrt()
+            }
+        };
+        ((m, error(&of_m)), (c, error(&of_c)))
     }
 
     /// m and c of both components.
@@ -155,6 +176,25 @@ mod tests {
         assert!((shears().q_c(&sets([0.0; 2], [0.0; 2])).0 - 1232.0).abs() < 1e-9);
         let zero = shears().q_c(&sets([-1.0; 2], [0.0; 2])).0;
         assert!((zero - 2464.0 / 500_004f64.sqrt()).abs() < 1e-9, "{zero}");
+    }
+
+    #[test]
+    fn small_scatter_of_galaxies_does_not_forge_errors() {
+        // Residuals that are orthogonal to 1 and g change neither m nor c.
+        let g: Vec<f64> = SHEARS.iter().map(|shear| shear[0]).collect();
+        let apart = [g[1] - g[2], g[2] - g[0], g[0] - g[1]].map(|r| 0.01 * r);
+        let mut sets = sets([0.01, 0.0], [0.0, 0.0]);
+        for (set, apart) in sets.iter_mut().zip(apart) {
+            set.metrics.c1 += apart;
+            set.errors.c1 *= 0.02;
+        }
+        let (m, c) = shears().bias(&sets, 0);
+        assert!((m.0 - 0.01).abs() < 1e-12 && c.0.abs() < 1e-14);
+        // One degree of freedom; Σ(g − ⟨g⟩)² = 0.0026.
+        let residual = apart.iter().map(|r| r * r).sum::<f64>().sqrt();
+        assert!((m.1 - residual / 0.0026f64.sqrt()).abs() < 1e-12, "{m:?}");
+        let expected = residual * (1.0 / 3.0 + 1e-4 / 0.0026f64).sqrt();
+        assert!((c.1 - expected).abs() < 1e-12, "{c:?}");
     }
 
     #[test]
