@@ -69,6 +69,7 @@ impl Receipt {
     /// If it cannot be read, belongs to other content, or was not signed with this key.
     pub fn read(key: &Key, entry: &Path, sha256: &str) -> Result<Option<Self>, FileError> {
         let path = Receipt::path(entry);
+        refuse_link(&path)?;
         if !open::is_there(&path) {
             return Ok(None);
         }
@@ -96,6 +97,7 @@ impl Receipt {
     /// If it cannot be written.
     pub fn write(&self, entry: &Path) -> Result<PathBuf, FileError> {
         let path = Receipt::path(entry);
+        refuse_link(&path)?;
         let text =
             toml::to_string(self).map_err(FileError::doing(&path, "cannot write the receipt"))?;
         atomic::write(&path, text.as_bytes())?;
@@ -103,9 +105,35 @@ impl Receipt {
     }
 }
 
+/// A link in an inbox may name any file of the organiser's system.
+fn refuse_link(path: &Path) -> Result<(), FileError> {
+    match path.is_symlink() {
+        true => Err(FileError::new(path, "this is a link; expected a file")),
+        false => Ok(()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_is_neither_read_nor_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let (entry, target) = (folder.path().join("a.tgz"), folder.path().join("target"));
+        let key = Key::new("pilot", 1, None);
+        let receipt = Receipt::sign(&key, "A", "2026-11-24T10:00:00Z".parse().unwrap(), "1f");
+        std::fs::write(&target, toml::to_string(&receipt).unwrap()).unwrap();
+        std::os::unix::fs::symlink(&target, Receipt::path(&entry)).unwrap();
+        assert!(
+            Receipt::read(&key, &entry, "1f")
+                .unwrap_err()
+                .message
+                .contains("link")
+        );
+        assert!(receipt.write(&entry).is_err());
+    }
 
     #[test]
     fn only_the_signed_time_team_and_content_are_accepted() {
