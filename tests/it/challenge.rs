@@ -1057,6 +1057,166 @@ fn changed_truth_images_stores_and_links_are_refused() {
     );
 }
 
+/// Writes a receipt and returns the SHA-256 of the entry.
+fn signed(key: &Key, entry: &Path, team: &str, time: &str) -> String {
+    let id = match entry.is_dir() {
+        true => {
+            let listed: String = contents(entry)
+                .iter()
+                .map(|(name, content)| format!("{name} {}\n", sha256(content)))
+                .collect();
+            sha256(listed.as_bytes())
+        }
+        false => sha256(&fs::read(entry).unwrap()),
+    };
+    let receipt = Receipt::sign(key, team, time.parse().unwrap(), &id);
+    receipt.write(entry).unwrap();
+    id
+}
+
+/// Content that came early, to another challenge, or was withdrawn, blocks no team that sends it as well.
+#[test]
+fn entries_that_do_not_count_block_no_others() {
+    let pilot = Pilot::new(&["--opens", "2020-06-01"]);
+    let private = pilot.at("private");
+    let linear = pilot.enter("48/linear/star", "linear", "a.tar.gz", &["--team", "A"]);
+    let key = Key::read(&private).unwrap().unwrap();
+    let other = pilot.at("in/Wrong/x.tar.gz");
+    fs::create_dir_all(other.parent().unwrap()).unwrap();
+    let pack = ["pack", "--challenge", "another", "--team", "Wrong", "--out"];
+    let measured = pilot.at("linear");
+    succeed(&[&pack[..], &[text(&other), "--measured", text(&measured)]].concat());
+    signed(&key, &other, "Wrong", "2020-06-01T10:00:00Z");
+    let mut id = String::new();
+    for (team, time) in [
+        ("Early", "2020-05-31T10:00:00Z"),
+        ("Owner", "2020-06-02T10:00:00Z"),
+        ("Second", "2020-06-03T10:00:00Z"),
+    ] {
+        let folder = pilot.at(&format!("in/{team}"));
+        succeed(&["unpack", text(&linear), "--out", text(&folder)]);
+        fs::remove_file(folder.join("manifest.json")).unwrap();
+        id = signed(&key, &folder, team, time);
+    }
+    fs::create_dir(pilot.at("in/Misnamed")).unwrap();
+    fs::write(pilot.at("in/Misnamed/set2.dat"), "24.5 24.5 0 0\n").unwrap();
+    let (board, said) = pilot.rank("in", "store", &[]);
+    assert!(teams(&board).contains(&(1, "Owner".into())), "{board}");
+    for expected in [
+        "x.tar.gz: not scored: the entry belongs to another challenge",
+        "Misnamed: not scored: ",
+        "the entry of Early of 2020-05-31T10:00:00Z does not count: received before",
+        "the entry of Second of 2020-06-03T10:00:00Z does not count: identical content as the entry of Owner of 2020-06-02T10:00:00Z",
+        "entries: 3 scored, 0 scored earlier, 2 not scored",
+    ] {
+        assert!(said.contains(expected), "{expected}\n{said}");
+    }
+    let withdrawn = format!("[withdrawn]\n\"{}/Owner\" = \"a mistake\"\n", &id[..8]);
+    fs::write(private.join("board.toml"), withdrawn).unwrap();
+    // The early entry comes again, after the first day.
+    signed(&key, &pilot.at("in/Early"), "Early", "2020-06-04T10:00:00Z");
+    let (board, said) = pilot.rank("in", "store", &[]);
+    assert!(teams(&board).contains(&(1, "Second".into())), "{board}");
+    for expected in [
+        "the entry of Owner of 2020-06-02T10:00:00Z does not count: withdrawn: a mistake",
+        "the entry of Early of 2020-06-04T10:00:00Z does not count: identical content as the entry of Second",
+        "entries: 1 scored, 2 scored earlier, 2 not scored",
+    ] {
+        assert!(said.contains(expected), "{expected}\n{said}");
+    }
+}
+
+#[test]
+fn true_shears_that_the_images_contradict_are_not_sealed() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let data = at("data");
+    let simulate = [
+        "simulate", "--sets", "2,8", "--images", "2", "--grid", "48", "--seed", "4321",
+    ];
+    succeed(&[&simulate[..], &["--amplitude", "80", "--out", text(&data)]].concat());
+    fs::create_dir(at("tables")).unwrap();
+    let (public, private, table) = (at("public"), at("private"), at("tables/shear-{set}.csv"));
+    let new = |from: [u32; 2], edit: fn([f64; 2]) -> [f64; 2]| {
+        for (set, from) in [2, 8].into_iter().zip(from) {
+            let truth = fs::read_to_string(data.join(format!("set0{from}/truth.csv"))).unwrap();
+            let edited: Vec<String> = truth
+                .lines()
+                .map(|line| {
+                    let numbers: Result<Vec<f64>, _> = line.split(',').map(str::parse).collect();
+                    match numbers.as_deref() {
+                        Ok([x, y, g1, g2]) => {
+                            let [g1, g2] = edit([*g1, *g2]);
+                            format!("{x},{y},{g1},{g2}")
+                        }
+                        _ => line.to_owned(),
+                    }
+                })
+                .collect();
+            fs::write(at(&format!("tables/shear-{set}.csv")), edited.join("\n")).unwrap();
+        }
+        let new = [
+            "challenge",
+            "new",
+            "--name",
+            "theirs",
+            "--data",
+            text(&data),
+        ];
+        let folders = ["--public", text(&public), "--private", text(&private)];
+        shearq(&[&new[..], &["--truth-table", text(&table)], &folders].concat())
+    };
+    let refused = |from: [u32; 2], edit: fn([f64; 2]) -> [f64; 2], expected: &[&str]| {
+        let output = new(from, edit);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{expected:?} {said}");
+        for expected in expected {
+            assert!(said.contains(expected), "{expected}\n{said}");
+        }
+        assert!(!public.join("challenge.toml").exists() && !public.join("SHA256SUMS").exists());
+    };
+    let all = "all sets: the images contradict the true shear (found a slope of ";
+    refused(
+        [2, 8],
+        |[a, b]| [a, -b],
+        &[all, "the sign of g2 may be wrong"],
+    );
+    refused(
+        [2, 8],
+        |[a, b]| [-a, b],
+        &[all, "the sign of g1 may be wrong"],
+    );
+    refused(
+        [2, 8],
+        |[a, b]| [b, a],
+        &[all, "the order of g1 and g2 may be wrong"],
+    );
+    refused(
+        [2, 8],
+        |[a, b]| [2.0 * a, 2.0 * b],
+        &[all, " times too large"],
+    );
+    refused(
+        [2, 8],
+        |[a, b]| [0.5 * a, 0.5 * b],
+        &[all, " times too large"],
+    );
+    refused([8, 2], |g| g, &[all, "the true shear of set "]);
+    refused(
+        [2, 2],
+        |g| g,
+        &["set 8: the images contradict the true shear"],
+    );
+    // The same command with the right truth continues.
+    let output = new([2, 8], |g| g);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success(), "{said}");
+    let terms = fs::read_to_string(public.join("challenge.toml")).unwrap();
+    assert!(terms.contains("entries_per_team = 10"), "{terms}");
+    let readme = fs::read_to_string(public.join("README.md")).unwrap();
+    assert!(readme.contains("at most 10 entries"), "{readme}");
+}
+
 #[test]
 fn receipts_copies_and_decisions_shape_the_board() {
     let pilot = Pilot::new(&["--closes", "2020-06-30T18:00:00+02:00", "--partial"]);
@@ -1084,14 +1244,7 @@ fn receipts_copies_and_decisions_shape_the_board() {
     let key = Key::read(&private).unwrap().unwrap();
     let sign = |folder: &Path, time: &str| {
         let team = text(folder).rsplit('/').next().unwrap();
-        let listed: String = contents(folder)
-            .iter()
-            .map(|(name, content)| format!("{name} {}\n", sha256(content)))
-            .collect();
-        let id = sha256(listed.as_bytes());
-        let receipt = Receipt::sign(&key, team, time.parse().unwrap(), &id);
-        receipt.write(folder).unwrap();
-        id
+        signed(&key, folder, team, time)
     };
     sign(&first, "2020-06-30T15:59:58Z");
     sign(&digit, "2020-06-30T16:00:00Z");

@@ -26,6 +26,7 @@ use shearq_simulate::set::{STAMP, SimulationSettings};
 use shearq_studies::bound::{cramer_rao, expected_qs};
 
 use crate::constant::ConstantShears;
+use crate::contradiction::{First, contradiction};
 use crate::deadline::Deadline;
 use crate::judge::unscored;
 use crate::kind::{Kind, RankBy, response};
@@ -236,7 +237,7 @@ pub fn simulated(
     // One image of each set shows whether entries can be ranked, before hours of simulation.
     let first = images::of_simulation(sets, 1);
     simulate_blind(&record, &first, &public, &private, threads, progress)?;
-    let metric = rankable(plan, &data, &public, &private, threads, progress)?;
+    let metric = rankable(plan, &data, &public, &private, false, threads, progress)?;
     let ids = images::of_simulation(sets, *images);
     simulate_blind(&record, &ids, &public, &private, threads, progress)?;
     progress.note("computing the expected Q");
@@ -281,7 +282,7 @@ fn expected(
 /// data folder.
 ///
 /// # Errors
-/// If sets differ in number of images or grid, the sign of the true shear is unknown, or a file cannot be read or written.
+/// If sets differ in number of images or grid, the sign of the true shear is unknown, the images contradict it, or a file cannot be read or written.
 pub fn of_images(
     plan: &Plan,
     data: &DataFolder,
@@ -327,7 +328,7 @@ pub fn of_images(
         write_truth(&private.truth(set), &grid, &shear)?;
         copy_image(data, &public, ImageId { set, image: 1 }, &about)?;
     }
-    let metric = rankable(plan, &about, &public, &private, threads, progress)?;
+    let metric = rankable(plan, &about, &public, &private, true, threads, progress)?;
     for &set in &about.sets {
         for image in 1..=about.images {
             if image > 1 {
@@ -361,18 +362,36 @@ impl Plan {
 }
 
 /// Scores that entries with the noise of a reference measurement can expect, and the mean Q of zero shear. The noise of the
-/// first image of each set is scaled to all images.
+/// first image of each set is scaled to all images. A true shear of `foreign` images that these contradict is an error.
 fn expected_scores(
     data: &Data,
     public: &DataFolder,
     truths: Vec<(u32, TrueShear)>,
     metric: RankBy,
+    foreign: bool,
     threads: usize,
 ) -> Result<(Vec<SetRecord>, f64), PipelineError> {
     let grid = data.grid().map_err(unscored)?;
     let first = data.sets.iter().map(|&set| ImageId { set, image: 1 });
     let first: Vec<ImageId> = first.collect();
     let references = References::measure(public, &first, grid, threads, &mut Quiet)?;
+    if foreign {
+        let firsts: Vec<First> = truths
+            .iter()
+            .filter_map(|(set, truth)| {
+                Some(First {
+                    set: *set,
+                    measured: references.of(*set, 1)?,
+                    truth: truth.clone(),
+                })
+            })
+            .collect();
+        if let Some(message) = contradiction(&firsts) {
+            return Err(PipelineError::Request(format!(
+                "{message}. Try: the same command with the right true shear"
+            )));
+        }
+    }
     let images = f64::from(data.images);
     let mut scored = Vec::new();
     let mut zero = 0.0;
@@ -394,6 +413,9 @@ fn expected_scores(
         let mut score = scorer.score(&sum).map_err(wrong)?;
         // Noise averages down; its power, which dominates Q, by the number of images.
         score.metrics.q *= images;
+        // What c scatters between constant shears is noise, too.
+        score.metrics.c1 /= images.sqrt();
+        score.metrics.c2 /= images.sqrt();
         for error in [
             &mut score.errors.m_cross,
             &mut score.errors.c1,
@@ -424,6 +446,7 @@ fn rankable(
     data: &Data,
     public: &DataFolder,
     private: &DataFolder,
+    foreign: bool,
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<RankBy, PipelineError> {
@@ -457,7 +480,7 @@ fn rankable(
         return refuse("noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8".into());
     }
     progress.note("measuring the first images");
-    let (scored, zero) = expected_scores(data, public, truths, metric, threads)?;
+    let (scored, zero) = expected_scores(data, public, truths, metric, foreign, threads)?;
     let images = f64::from(data.images);
     let constant = constant.as_ref();
     let groups: Vec<&[SetRecord]> = match metric.needs_the_response_of_each_set() {

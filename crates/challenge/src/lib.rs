@@ -12,6 +12,7 @@
 #![forbid(unsafe_code)]
 
 pub mod constant;
+mod contradiction;
 pub mod copies;
 pub mod create;
 pub mod deadline;
