@@ -354,6 +354,47 @@ fn unanswered(
     names.into_iter().cloned().collect()
 }
 
+/// Columns of sheared versions by their names.
+struct Sheared<'a> {
+    names: &'a [String],
+    columns: &'a Columns,
+}
+
+impl<'a> Sheared<'a> {
+    fn of(&self, name: &str, version: &str) -> Option<String> {
+        let wanted = format!("{}_{version}", base(name));
+        let mut names = self.names.iter();
+        names.find(|own| own.eq_ignore_ascii_case(&wanted)).cloned()
+    }
+
+    fn has_all(&self, name: &str) -> bool {
+        let mut versions = VERSIONS.iter();
+        answers(self.columns) && versions.all(|(version, _)| self.of(name, version).is_some())
+    }
+
+    /// Other flags of metacalibration with versions are those of failed measurements.
+    fn is_cut(&self, name: &str) -> bool {
+        let by_name = name.to_ascii_lowercase().contains("select");
+        (by_name || self.columns.preset != Preset::Metacal) && self.has_all(name)
+    }
+
+    /// Without versions, a flag is the same in all.
+    fn of_flag(&self, name: &str, version: &str) -> String {
+        let sheared = Some(name).filter(|name| self.is_cut(name));
+        let sheared = sheared.and_then(|name| self.of(name, version));
+        sheared.unwrap_or_else(|| name.to_owned())
+    }
+
+    fn failures(&self) -> impl Iterator<Item = &'a String> + use<'a> {
+        let metacal = self.columns.preset == Preset::Metacal;
+        self.names.iter().filter(move |name| {
+            let name = name.to_ascii_lowercase();
+            let is_flag = name.contains("flag") && !name.contains("select");
+            metacal && is_flag && version_of(&name).is_some()
+        })
+    }
+}
+
 fn source(
     place: Place,
     version: Option<Option<usize>>,
@@ -388,24 +429,15 @@ fn source(
         }
     }
     wanted.extend(columns.doubtful_weight.clone());
-    let answers = answers(&columns);
-    // Without versions of a flag or weight, they are the same in all.
-    let version_names = |name: &str, version: &str| -> Option<String> {
-        let wanted = format!("{}_{version}", base(name));
-        let mut names = names.iter();
-        names.find(|own| own.eq_ignore_ascii_case(&wanted)).cloned()
-    };
-    let all_versions = |name: &&str| {
-        let mut versions = VERSIONS.iter();
-        answers && versions.all(|(version, _)| version_names(name, version).is_some())
-    };
-    // Other flags of metacalibration with versions are those of failed measurements.
-    let is_cut = |name: &str| {
-        columns.preset != Preset::Metacal || name.to_ascii_lowercase().contains("select")
+    let sheared = Sheared {
+        names,
+        columns: &columns,
     };
     let flags: Vec<&str> = columns.flags.iter().map(String::as_str).collect();
-    let cuts = flags.iter().any(|name| is_cut(name) && all_versions(name));
-    let sheared_weight = columns.of(Role::Weight).filter(all_versions);
+    let cuts = flags.iter().any(|name| sheared.is_cut(name));
+    let sheared_weight = columns
+        .of(Role::Weight)
+        .filter(|name| sheared.has_all(name));
     let by_versions = by_versions || cuts || sheared_weight.is_some();
     let unanswered = unanswered(reading, &columns, has_versions);
     let mut place_of = |name: &str| -> Option<usize> {
@@ -450,26 +482,14 @@ fn source(
     let flag_places = flags.iter().map(|name| certain(name)).collect();
     let flag_versions = (cuts && known).then(|| {
         VERSIONS.map(|(version, _)| {
-            let of = |name: &&str| {
-                let sheared = Some(*name).filter(|name| is_cut(name) && all_versions(name));
-                let sheared = sheared.and_then(|name| version_names(name, version));
-                certain(sheared.as_deref().unwrap_or(name))
-            };
+            let of = |name: &&str| certain(&sheared.of_flag(name, version));
             flags.iter().map(of).collect()
         })
     });
     let weight_versions = sheared_weight.filter(|_| known).map(|name| {
-        VERSIONS.map(|(version, _)| certain(&version_names(name, version).unwrap_or_default()))
+        VERSIONS.map(|(version, _)| certain(&sheared.of(name, version).unwrap_or_default()))
     });
-    let is_failure = |name: &&String| {
-        let name = name.to_ascii_lowercase();
-        columns.preset == Preset::Metacal
-            && name.contains("flag")
-            && !name.contains("select")
-            && version_of(&name).is_some()
-    };
-    let failed_versions = names.iter().filter(is_failure);
-    let failed_versions = failed_versions.map(|name| certain(name)).collect();
+    let failed_versions = sheared.failures().map(|name| certain(name)).collect();
     let chosen: Vec<&String> = expressions.flat_map(Expression::columns).collect();
     let choices = columns.choices.iter();
     let choices = choices.filter(|(name, _)| !chosen.contains(&name));
@@ -1253,6 +1273,28 @@ impl<'a> Part<'a> {
         }
     }
 
+    /// Weights of a row in the versions, and which of them it belongs to: a version may choose a row that is left out without
+    /// shear.
+    fn versions_of(
+        &self,
+        at: usize,
+        flagged: bool,
+        weight: f64,
+    ) -> (Option<[f64; VERSIONS.len()]>, [bool; VERSIONS.len()]) {
+        let source = self.source;
+        let is_set = |flags: &[usize]| flags.iter().any(|flag| self.value(*flag, at) != 0.0);
+        let weights = source.weight_versions;
+        let weights = weights.map(|own| own.map(|place| self.value(place, at)));
+        let counts = std::array::from_fn(|version| {
+            let flagged = match &source.flag_versions {
+                Some(flags) => is_set(&flags[version]),
+                None => flagged,
+            };
+            !flagged && !(weights.map_or(weight, |own| own[version]) <= 0.0)
+        });
+        (weights, counts)
+    }
+
     /// Gives a row to `take` if it counts. `number` counts rows of the table from 0.
     fn row(
         &self,
@@ -1272,20 +1314,10 @@ impl<'a> Part<'a> {
         *count += 1;
         let own = version.is_none();
         let source = self.source;
-        let is_set = |flags: &[usize]| flags.iter().any(|flag| self.value(*flag, at) != 0.0);
-        let flagged = is_set(&source.flags);
+        let flagged = (source.flags.iter()).any(|flag| self.value(*flag, at) != 0.0);
         let weight = places.weight.map_or(1.0, |weight| self.value(weight, at));
         let counted = !flagged && !(weight <= 0.0);
-        // A version may choose a row that is left out without shear.
-        let of_versions = source.weight_versions;
-        let of_versions = of_versions.map(|own| own.map(|place| self.value(place, at)));
-        let in_versions: [bool; VERSIONS.len()] = std::array::from_fn(|version| {
-            let flagged = match &source.flag_versions {
-                Some(flags) => is_set(&flags[version]),
-                None => flagged,
-            };
-            !flagged && !(of_versions.map_or(weight, |own| own[version]) <= 0.0)
-        });
+        let (of_versions, in_versions) = self.versions_of(at, flagged, weight);
         if !counted {
             let count = match flagged {
                 true => &mut about.flagged,
