@@ -7,7 +7,7 @@ use shearq_challenge::copies::near_copies;
 use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
 use shearq_challenge::deadline::Deadline;
 use shearq_challenge::inbox;
-use shearq_challenge::judge::Judge;
+use shearq_challenge::judge::{Judge, one_line};
 use shearq_challenge::kind::{Kind, RankBy, kind};
 use shearq_challenge::organiser::{BOARD_FILE, Decisions};
 use shearq_challenge::page::{Disclosure, View};
@@ -427,12 +427,12 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
     for refused in &round.refused {
         tell(format_args!(
             "warning: {}: not scored: {}",
-            refused.path.display(),
+            one_line(&refused.path),
             refused.reason
         ));
     }
     for (path, doubt) in &round.doubtful {
-        tell(format_args!("warning: {}: {doubt}", path.display()));
+        tell(format_args!("warning: {}: {doubt}", one_line(path)));
     }
     for (info, reason) in &board.excluded {
         tell(format_args!(

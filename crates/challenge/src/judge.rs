@@ -779,7 +779,7 @@ pub(crate) fn unscored(source: ScoringError) -> PipelineError {
 /// A message without the path of the entry, which a list of entries has already.
 fn reason_of(path: &Path, message: &str, sending: &Sending) -> String {
     match path.strip_prefix(&sending.path) {
-        Ok(name) if !name.as_os_str().is_empty() => format!("{}: {message}", name.display()),
+        Ok(name) if !name.as_os_str().is_empty() => format!("{}: {message}", one_line(name)),
         _ => message.to_owned(),
     }
 }
@@ -794,8 +794,20 @@ fn team_of(sending: &Sending, entry: Option<&Team>, receipt: Option<&Receipt>) -
 }
 
 fn file_name(path: &Path) -> String {
-    let name = path.file_name().unwrap_or_default();
-    name.to_string_lossy().into_owned()
+    one_line(Path::new(path.file_name().unwrap_or_default()))
+}
+
+/// A path with escaped control characters. A line break in the name of a file could forge a message.
+pub fn one_line(path: &Path) -> String {
+    let name = path.to_string_lossy();
+    let mut line = String::with_capacity(name.len());
+    for c in name.chars() {
+        match c.is_control() {
+            true => line.extend(c.escape_default()),
+            false => line.push(c),
+        }
+    }
+    line
 }
 
 /// The name of a file without the ending of an archive.
@@ -817,6 +829,12 @@ fn short(name: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_of_files_forge_no_messages() {
+        let name = one_line(Path::new("in/Ä\nwarning: \u{1b}[31m.dat"));
+        assert_eq!(name, "in/Ä\\nwarning: \\u{1b}[31m.dat");
+    }
 
     #[test]
     fn spectra_of_own_simulations_have_no_response() {

@@ -189,6 +189,11 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     // Raw: extensions of tar, such as names of any length, are entries that are not plain files.
     for entry in archive.entries().map_err(cannot_read())?.raw(true) {
         let mut entry = entry.map_err(cannot_read())?;
+        // Python's tarfile writes PAX headers for times and long names. Names and sizes here are those of the plain headers.
+        let kind = entry.header().entry_type();
+        if kind.is_pax_global_extensions() || kind.is_pax_local_extensions() {
+            continue;
+        }
         let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
         // `tar czf … -C folder .` starts with the folder itself.
         if name == "./" && entry.header().entry_type().is_dir() {
@@ -340,6 +345,27 @@ mod tests {
         let zeros = vec![0; 64 << 20];
         let message = refusal(&mut [("a".to_owned(), &zeros[..])].into_iter(), 0);
         assert!(message.contains("it unpacks to more than"), "{message}");
+    }
+
+    #[test]
+    fn pax_headers_are_no_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.tar.gz");
+        let mut writer = ArchiveWriter::create(&path).unwrap();
+        for kind in [tar::EntryType::XGlobalHeader, tar::EntryType::XHeader] {
+            let times = b"20 mtime=1700000000\n";
+            let mut header = Header::new_ustar();
+            header.set_entry_type(kind);
+            header.set_size(times.len() as u64);
+            writer
+                .builder
+                .append_data(&mut header, "pax/header", &times[..])
+                .unwrap();
+        }
+        writer.add("a", b"x").unwrap();
+        writer.finish().unwrap();
+        let names: Vec<String> = read(&path, None).unwrap().files.into_keys().collect();
+        assert_eq!(names, ["a"]);
     }
 
     #[test]
