@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use shearq_scoring::FieldSum;
 
-use crate::judge::{Entry, EntryInfo};
+use crate::entry::{Entry, EntryInfo};
 
 /// Cells of a set whose mean shapes a store keeps. Two methods that share all galaxies differ by far more than the
 /// criterion in any dozen of them.

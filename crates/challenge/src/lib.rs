@@ -16,6 +16,7 @@ mod contradiction;
 pub mod copies;
 pub mod create;
 pub mod deadline;
+pub mod entry;
 pub mod inbox;
 pub mod judge;
 pub mod kind;

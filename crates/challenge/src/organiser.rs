@@ -6,11 +6,8 @@ use std::path::Path;
 use serde::Deserialize;
 use shearq_files::{FileError, open};
 
-use crate::judge::Entry;
-use crate::seal::Key;
-
-/// The file of these decisions in the private folder. Organisers write it, and may change it at any time.
-pub const BOARD_FILE: &str = "board.toml";
+use crate::entry::Entry;
+use crate::seal::{BOARD_FILE, Key};
 
 /// Fewest digits of an SHA-256 that name an entry.
 const LEAST_DIGITS: usize = 8;

@@ -13,7 +13,8 @@ use shearq_results::views::metrics::metric_cell;
 
 use crate::constant::ConstantShears;
 use crate::copies::NearCopy;
-use crate::judge::{EntryInfo, Refused};
+use crate::entry::EntryInfo;
+use crate::judge::Refused;
 use crate::kind::RankBy;
 use crate::ranking::{Board, Leaderboard, Standing, better, rounded};
 use crate::readme;

@@ -6,7 +6,7 @@ use shearq_results::compare::difference;
 
 use crate::constant::ConstantShears;
 use crate::deadline::Deadline;
-use crate::judge::{Entry, EntryInfo};
+use crate::entry::{Entry, EntryInfo};
 use crate::kind::RankBy;
 use crate::terms::Challenge;
 

@@ -15,11 +15,12 @@ use shearq_pipeline::data::fingerprint::hex;
 use shearq_pipeline::{PipelineError, engine};
 use shearq_results::submit::manifest::FileSum;
 
-use crate::organiser::BOARD_FILE;
 use crate::terms::{CHALLENGE_FILE, Challenge};
 
 /// Checksums of the public files, in the format of `sha256sum`.
 pub const SUMS_FILE: &str = "SHA256SUMS";
+/// The organiser's decisions in the private folder. They may change, so the seal does not cover them.
+pub const BOARD_FILE: &str = "board.toml";
 /// The private record.
 pub const KEY_FILE: &str = "key.toml";
 

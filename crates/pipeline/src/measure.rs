@@ -6,6 +6,7 @@
 mod catalogue;
 mod psfs;
 mod source;
+mod stamps;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -19,7 +20,8 @@ pub use self::catalogue::{
 };
 pub(crate) use self::catalogue::{Catalogues, metadata};
 pub use self::source::ImageSource;
-pub(crate) use self::source::{check_strip, open_galaxies};
+pub(crate) use self::source::open_galaxies;
+pub(crate) use self::stamps::check_strip;
 use crate::PipelineError;
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;

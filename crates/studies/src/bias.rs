@@ -120,8 +120,7 @@ pub fn biases(
             }
             let mut found = empty();
             for (k, sums) in found.iter_mut().enumerate() {
-                for ix in 0..n {
-                    let psf = fields.psf.at(ix, iy).shape;
+                for (ix, psf) in (0..n).map(|ix| (ix, fields.psf.at(ix, iy).shape)) {
                     let galaxy = std::array::from_fn(|v| &versions[v][k][ix]);
                     sums.add((fields.image, (iy * n + ix) as u64), galaxy, psf);
                 }

@@ -8,7 +8,7 @@ use shearq_files::fits::ImageReader;
 use shearq_measure::{FunctionalPsf, Psfs, Star, star};
 use shearq_submissions::{Configuration, PsfCut, PsfForm};
 
-use super::source::{check_strip, read_row, stated_image};
+use super::stamps::{check_strip, read_row, stated_image};
 use crate::PipelineError;
 use crate::data::layout::{DataFolder, MAX_STAMP};
 use crate::data::mosaic::Mosaic;

@@ -1,27 +1,23 @@
 //! Images of a data folder as sources of stamps.
 
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use ndarray::Ix3;
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 use shearq_measure::{
-    KnownNoise, Lazy, LazyStamps, Measurer, Pixels, Psfs, Session, StampRows, StampSource, Threads,
-    Warning,
+    KnownNoise, Lazy, LazyStamps, Measurer, Psfs, Session, StampRows, StampSource, Threads, Warning,
 };
 use shearq_submissions::{Configuration, NoiseSource};
 
 use super::psfs::{OpenPsfs, PsfSource, open_psf};
+use super::stamps::{check_strip, read_row, stated_image};
 use crate::PipelineError;
 use crate::data::layout::DataFolder;
 use crate::data::mosaic::Mosaic;
 use crate::grid;
 use crate::images::ImageId;
 use crate::wcs::Wcs;
-
-/// Most pixels of a row of stamps. Several rows are in memory at a time.
-const MAX_STRIP: usize = 1 << 24;
 
 /// An open image with its PSFs.
 pub struct ImageSource {
@@ -162,41 +158,6 @@ impl StampSource<'static> for ImageSource {
     fn psfs(&mut self, row: usize) -> Result<Lazy<'static, Psfs<'static>>, PipelineError> {
         Ok(self.psfs.row(self.mosaic, row)?.into())
     }
-}
-
-/// Reads a row of stamps of `side` pixels. The last row may be shorter.
-pub(super) fn read_row(
-    image: &mut ImageReader,
-    mosaic: Mosaic,
-    side: usize,
-    row: usize,
-) -> Result<Pixels<'static, Ix3>, PipelineError> {
-    image.rewind();
-    image.skip_rows(row * side);
-    let stamps = Pixels::strip(image.read_rows(side)?, mosaic.columns, side)?;
-    Ok(stamps.into_slice(0..mosaic.of_row(row)))
-}
-
-/// Checks that a row of `n` stamps of `side` pixels a side fits into memory.
-pub(crate) fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), FileError> {
-    let pixels = n * side * side;
-    if pixels <= MAX_STRIP {
-        return Ok(());
-    }
-    let message = format!(
-        "a row of {n} stamps of {side} pixels a side has {pixels} pixels; expected at most {MAX_STRIP}"
-    );
-    Err(FileError::new(path, message))
-}
-
-/// Set and image that the header of a simulated image states. Headers of other programs may have one of these keys with
-/// another meaning, so that both must be whole numbers.
-pub(super) fn stated_image(image: &ImageReader) -> Option<[u32; 2]> {
-    let whole = |key: &str| {
-        let value = image.number(key).ok().flatten()?;
-        (value.fract() == 0.0 && value >= 1.0).then_some(value as u32)
-    };
-    Some([whole("SET")?, whole("IMAGE")?])
 }
 
 /// Why stamps of `stamp` pixels a side cannot be measured, with the lines of a configuration that measures them.
