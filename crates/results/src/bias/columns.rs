@@ -804,6 +804,22 @@ pub enum Preset {
 }
 
 impl Preset {
+    fn of_roles(roles: &BTreeMap<Role, String>, is_hsm: bool) -> Self {
+        if roles.contains_key(&Role::Version) {
+            Preset::Metadetect
+        } else if roles.contains_key(&Role::Divisor1) && roles.contains_key(&Role::R11) {
+            Preset::Shearq
+        } else if roles.contains_key(&Role::E1p) && roles.contains_key(&Role::E2p) {
+            Preset::Metacal
+        } else if is_hsm {
+            Preset::Hsm
+        } else if roles.contains_key(&Role::Dw1) {
+            Preset::Anacal
+        } else {
+            Preset::Plain
+        }
+    }
+
     /// Its name.
     pub fn name(self) -> &'static str {
         match self {
@@ -921,19 +937,7 @@ impl Columns {
         let e1 = roles[&Role::E1].to_ascii_lowercase();
         let distortion =
             DISTORTIONS.contains(&e1.as_str()) || survey.is_some_and(|survey| survey.distortion);
-        let preset = if roles.contains_key(&Role::Version) {
-            Preset::Metadetect
-        } else if roles.contains_key(&Role::Divisor1) && roles.contains_key(&Role::R11) {
-            Preset::Shearq
-        } else if roles.contains_key(&Role::E1p) && roles.contains_key(&Role::E2p) {
-            Preset::Metacal
-        } else if distortion || e1 == "corrected_g1" {
-            Preset::Hsm
-        } else if roles.contains_key(&Role::Dw1) {
-            Preset::Anacal
-        } else {
-            Preset::Plain
-        };
+        let preset = Preset::of_roles(&roles, distortion || e1 == "corrected_g1");
         let mut columns = Columns {
             roles,
             preset,

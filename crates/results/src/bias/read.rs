@@ -395,6 +395,60 @@ impl<'a> Sheared<'a> {
     }
 }
 
+/// The columns of roles that are read, each once.
+fn wanted_columns(columns: &Columns, reading: &Reading) -> Vec<String> {
+    let read = columns
+        .all()
+        .filter(|(role, _)| *role != Role::Unit && !is_skipped(*role, reading));
+    let mut wanted: Vec<String> = Vec::new();
+    for (_, name) in read {
+        if !wanted.iter().any(|own| own == name) {
+            wanted.push(name.to_owned());
+        }
+    }
+    wanted.extend(
+        columns
+            .doubtful_weight
+            .iter()
+            .chain(&columns.steps)
+            .cloned(),
+    );
+    wanted
+}
+
+/// Places of the columns of an expression, plainly and under each shear, if they are there; the name of a column that is not.
+fn expression_places<'e>(
+    expression: Option<&'e Expression>,
+    preset: Preset,
+    by_versions: bool,
+    place_of: &mut impl FnMut(&str) -> Option<usize>,
+) -> Result<Vec<Option<Vec<usize>>>, &'e str> {
+    let Some(expression) = expression else {
+        return Ok(vec![Some(Vec::new()); COUNT]);
+    };
+    let mut own = Vec::new();
+    for name in expression.columns() {
+        // Versions of shearq have noise that other columns do not have.
+        let plain = format!("{name}_noshear");
+        let [first, second] = match preset {
+            Preset::Versions => [&plain, name],
+            _ => [name, &plain],
+        };
+        let found = place_of(first).or_else(|| place_of(second));
+        own.push(found.ok_or(name.as_str())?);
+    }
+    let mut all = vec![Some(own)];
+    for (version, _) in VERSIONS {
+        // A column without versions is the same in all, if there are versions of another one.
+        let mut sheared = |name: &String| {
+            let own = place_of(&format!("{}_{version}", base(name)));
+            own.or_else(|| place_of(name).filter(|_| by_versions))
+        };
+        all.push(expression.columns().iter().map(&mut sheared).collect());
+    }
+    Ok(all)
+}
+
 fn source(
     place: Place,
     version: Option<Option<usize>>,
@@ -419,16 +473,7 @@ fn source(
     if columns.have(&[Role::E1p]) && named.any(|name| has_versions(name)) {
         check_step(&place.path, reading.step)?;
     }
-    let all = columns
-        .all()
-        .filter(|(role, _)| *role != Role::Unit && !is_skipped(*role, reading));
-    let mut wanted: Vec<String> = Vec::new();
-    for (_, name) in all {
-        if !wanted.iter().any(|own| own == name) {
-            wanted.push(name.to_owned());
-        }
-    }
-    wanted.extend(columns.doubtful_weight.clone());
+    let mut wanted = wanted_columns(&columns, reading);
     let sheared = Sheared {
         names,
         columns: &columns,
@@ -450,32 +495,15 @@ fn source(
             wanted.len() - 1
         }))
     };
-    let mut places =
-        |expression: &Option<Expression>| -> Result<Vec<Option<Vec<usize>>>, FileError> {
-            let Some(expression) = expression else {
-                return Ok(vec![Some(Vec::new()); COUNT]);
-            };
-            let mut own = Vec::new();
-            for name in expression.columns() {
-                // Versions of shearq have noise that other columns do not have.
-                let plain = format!("{name}_noshear");
-                let found = match columns.preset {
-                    Preset::Versions => place_of(&plain).or_else(|| place_of(name)),
-                    _ => place_of(name).or_else(|| place_of(&plain)),
-                };
-                own.push(found.ok_or_else(|| FileError::no_column(&place.path, name, names))?);
-            }
-            let mut all = vec![Some(own)];
-            for (version, _) in VERSIONS {
-                // A column without versions is the same in all, if there are versions of another one.
-                let mut sheared = |name: &String| {
-                    let own = place_of(&format!("{}_{version}", base(name)));
-                    own.or_else(|| place_of(name).filter(|_| by_versions))
-                };
-                all.push(expression.columns().iter().map(&mut sheared).collect());
-            }
-            Ok(all)
-        };
+    let mut places = |expression: &Option<Expression>| {
+        expression_places(
+            expression.as_ref(),
+            columns.preset,
+            by_versions,
+            &mut place_of,
+        )
+        .map_err(|name| FileError::no_column(&place.path, name, names))
+    };
     let (selected, binned) = (places(&reading.select)?, places(&reading.binned)?);
     let known = selected.iter().chain(&binned).all(Option::is_some);
     let mut certain = |name: &str| place_of(name).unwrap_or_default();
@@ -494,9 +522,6 @@ fn source(
     let choices = columns.choices.iter();
     let choices = choices.filter(|(name, _)| !chosen.contains(&name));
     let choices = choices.map(|(name, good)| (certain(name), *good)).collect();
-    for name in &columns.steps {
-        certain(name);
-    }
     if reading.selection.is_some() {
         require_responses(&place.path, names.iter().map(String::as_str))?;
         for name in READ.iter().chain(&Observables::COLUMNS) {
@@ -915,6 +940,11 @@ struct Part<'a> {
     ranges: Ranges,
 }
 
+/// Whether a row with this weight counts. NaN does, so that it is refused.
+fn weighs(weight: f64) -> bool {
+    weight.is_nan() || weight > 0.0
+}
+
 /// Why a row without a flag does not count.
 enum LeftOut {
     /// A number stands for a failed measurement.
@@ -1290,7 +1320,7 @@ impl<'a> Part<'a> {
                 Some(flags) => is_set(&flags[version]),
                 None => flagged,
             };
-            !flagged && !(weights.map_or(weight, |own| own[version]) <= 0.0)
+            !flagged && weighs(weights.map_or(weight, |own| own[version]))
         });
         (weights, counts)
     }
@@ -1316,7 +1346,7 @@ impl<'a> Part<'a> {
         let source = self.source;
         let flagged = (source.flags.iter()).any(|flag| self.value(*flag, at) != 0.0);
         let weight = places.weight.map_or(1.0, |weight| self.value(weight, at));
-        let counted = !flagged && !(weight <= 0.0);
+        let counted = !flagged && weighs(weight);
         let (of_versions, in_versions) = self.versions_of(at, flagged, weight);
         if !counted {
             let count = match flagged {
@@ -1348,10 +1378,8 @@ impl<'a> Part<'a> {
         for (bin, _) in binned.iter_mut().zip(left_out).filter(|(_, out)| *out) {
             *bin = f64::INFINITY;
         }
-        if binned[0].is_infinite() {
-            if binned[1..].iter().all(|value| value.is_infinite()) {
-                return Ok(());
-            }
+        if binned.iter().all(|value| value.is_infinite()) {
+            return Ok(());
         }
         let weight = match &self.weighted {
             Some(weighted) => weighted.weight[at],
