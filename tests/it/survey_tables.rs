@@ -101,7 +101,7 @@ fn versions_of_flags_and_weights_give_their_response() {
     let folder = tempfile::tempdir().unwrap();
     let count = 20_000;
     let shapes = shapes(count);
-    let failed = |id: usize| id % 40 == 0;
+    let failed = |id: usize| id.is_multiple_of(40);
     for (weighted, name) in [(true, "y3"), (false, "selected")] {
         let weight = |size: f64| {
             if weighted {
@@ -181,7 +181,7 @@ fn galaxies(g: f64, names: &str, values: impl Fn(usize) -> String) -> String {
 #[test]
 fn cuts_that_are_true_for_good_rows_and_constant_patches_are_refused() {
     let folder = tempfile::tempdir().unwrap();
-    let select = |id: usize| u8::from(id % 5 != 0).to_string();
+    let select = |id: usize| u8::from(!id.is_multiple_of(5)).to_string();
     let [plus, minus] = pair(folder.path(), "cut", |g| {
         galaxies(g, "flags_select", select)
     });
