@@ -968,7 +968,7 @@ fn a_response_matrix_is_used_in_bins_sums_and_differences() {
     assert_eq!(found.len(), 3);
     found.iter().for_each(zero);
     assert!((number(&found[0], "r12") - 0.1).abs() < 1e-12);
-    // Without R12 and R21 the error of the issue: 0.1/0.8 and 0.1/0.7.
+    // Without R12 and R21, m is 0.1/0.8 and 0.1/0.7.
     let diagonal = rows(&[
         plus,
         minus,
@@ -999,6 +999,61 @@ fn a_response_matrix_is_used_in_bins_sums_and_differences() {
         against[1],
     ]);
     compared.iter().for_each(zero);
+}
+
+#[test]
+fn sheared_versions_leave_out_a_declined_matrix() {
+    let folder = tempfile::tempdir().unwrap();
+    let response = |g: [f64; 2]| [0.8 * g[0] + 0.3 * g[1], 0.2 * g[0] + 0.7 * g[1]];
+    let versions = [
+        ("noshear", [0.0, 0.0]),
+        ("1p", [0.01, 0.0]),
+        ("1m", [-0.01, 0.0]),
+        ("2p", [0.0, 0.01]),
+        ("2m", [0.0, -0.01]),
+    ];
+    for by_rows in [false, true] {
+        let files = [("plus", 0.02), ("minus", -0.02)].map(|(name, g)| {
+            let mut rng = ChaCha8Rng::seed_from_u64(37);
+            let head = versions.map(|(version, _)| format!("g1_{version},g2_{version}"));
+            let mut text = match by_rows {
+                true => "id,mdet_step,wmom_g_1,wmom_g_2,g1,g2\n".to_owned(),
+                false => format!("id,{},g1,g2\n", head.join(",")),
+            };
+            for id in 0..200 {
+                let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+                let shape = [0; 2].map(|_| 0.2 * normal());
+                let of = |h: [f64; 2]| response([0, 1].map(|k| shape[k] + g + h[k]));
+                let all = versions.map(|(version, h)| (version, of(h)));
+                if by_rows {
+                    for (version, [e1, e2]) in all {
+                        writeln!(text, "{id},{version},{e1},{e2},{g},{g}").unwrap();
+                    }
+                } else {
+                    let all = all.map(|(_, [e1, e2])| format!("{e1},{e2}"));
+                    writeln!(text, "{id},{},{g},{g}", all.join(",")).unwrap();
+                }
+            }
+            let path = folder.path().join(format!("{name}-{by_rows}.csv"));
+            fs::write(&path, text).unwrap();
+            path
+        });
+        let files = [text(&files[0]), text(&files[1])];
+        let declined = ["--columns", "R12=none,R21=none"];
+        for (options, expected) in [
+            (&[][..], [0.0, 0.0]),
+            (&declined[..], [0.3 / 0.8, 0.2 / 0.7]),
+        ] {
+            let found = &rows(&[&files[..], options].concat())[0];
+            for (key, expected) in ["m1", "m2"].into_iter().zip(expected) {
+                // The same shapes under both shears leave rounding alone.
+                assert!(
+                    (number(found, key) - expected).abs() < 1e-9,
+                    "{by_rows}: {found}"
+                );
+            }
+        }
+    }
 }
 
 /// REGAUSS distortions of galaxies under ±0.03, some with moduli above 1, with weights and HSC's columns.

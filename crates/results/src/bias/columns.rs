@@ -725,6 +725,13 @@ impl Names {
         Ok(())
     }
 
+    /// Whether the responses of each component to the other one are not to be used, in columns or by sheared versions.
+    pub fn decline_matrix(&self) -> bool {
+        ["R12", "R21"]
+            .iter()
+            .any(|role| self.0.get(role).is_some_and(|own| own == "none"))
+    }
+
     /// The role for which a column is given.
     pub fn role_of(&self, column: &str) -> Option<&'static str> {
         let mut given = self.0.iter();
@@ -905,8 +912,9 @@ impl Columns {
         let flags = find_flags(path, found, names, survey, roles.get(&Role::E1))?;
         roles.extend(flags.first().map(|first| (Role::Flag, first.clone())));
         find_sheared(&mut roles, found, names);
+        let diagonal = names.decline_matrix();
         for (other, own) in OTHER_RESPONSES {
-            if !roles.contains_key(&own) {
+            if diagonal || !roles.contains_key(&own) {
                 roles.remove(&other);
             }
         }

@@ -203,7 +203,8 @@ impl Source {
             Preset::Metacal | Preset::Versions => self.columns.have(&SHEARED[1]),
             _ => self.columns.have(&[Role::R12, Role::R21]),
         };
-        of_rows || reading.selection.is_some() || self.has_version_rows()
+        let found = of_rows || reading.selection.is_some() || self.has_version_rows();
+        found && !reading.names.decline_matrix()
     }
 
     /// Whether rows have the ellipticity of the PSF.
