@@ -197,7 +197,7 @@ impl Plan {
     /// The last of `more` terms, from both components: the mean weighted by what each component contributes.
     fn joint(&self, sums: &[f64], more: &[usize]) -> f64 {
         let (mut sum, mut weight) = (0.0, 0.0);
-        for (k, extra) in self.layout.extra(sums).own.into_iter().enumerate() {
+        for (k, extra) in self.layout.extra(sums).own.into_iter().take(2).enumerate() {
             let terms = self.with(k, more);
             let alone = last_of(&self.layout.of(sums, k), &terms, extra);
             let Some((mut x, pivot)) = alone else {
