@@ -4,6 +4,9 @@
 use shearq_scoring::ndarray::Array2;
 use shearq_scoring::{FieldSum, TrueShear};
 
+/// A pair of numbers for each component.
+type Pair = [(f64, f64); 2];
+
 /// Largest slope of the measured on the true shear, or inverse. A reference measurement has an m of a few tenths at most,
 /// and a truth of twice or half the scale has a slope of 0.5 or 2.
 const LARGEST_SLOPE: f64 = 1.6;
@@ -145,9 +148,7 @@ fn median_bias(firsts: &[First]) -> Zeros {
 fn together(firsts: &[&First], change: Change) -> Vec<Sums> {
     let all: Option<Vec<_>> = firsts.iter().map(|first| means(first, change)).collect();
     let zeros = all.map(|all| {
-        let mean = |of: &dyn Fn(&[(f64, f64); 2]) -> f64| {
-            all.iter().map(of).sum::<f64>() / all.len() as f64
-        };
+        let mean = |of: &dyn Fn(&Pair) -> f64| all.iter().map(of).sum::<f64>() / all.len() as f64;
         [0, 1].map(|k: usize| (mean(&|set| set[k].0), mean(&|set| set[k].1)))
     });
     let each = firsts.iter();
