@@ -1,4 +1,4 @@
-//! The table of constants in `docs/constants.md` lists each constant of this crate with its value.
+//! Each constant of this crate states its origin: in a `//` comment beside it, or in the table of `docs/constants.md`.
 
 #![expect(clippy::unwrap_used, reason = "a test fails by a panic")]
 
@@ -40,7 +40,15 @@ fn declaration(text: &str) -> Option<(&str, &str, &str)> {
     Some((name, kind, value.trim()))
 }
 
-/// Constants that are numbers or arrays of numbers. Values computed from others are left out.
+/// Whether a `//` comment stands above the declaration that starts at `line`, or behind it.
+fn has_comment(code: &str, line: usize) -> bool {
+    let own = code[line..].lines().next().unwrap_or_default();
+    let above = code[..line].lines().rev().map(str::trim_start);
+    let mut block = above.take_while(|text| text.starts_with("//") || text.starts_with("#["));
+    own.contains("; // ") || block.any(|text| text.starts_with("// "))
+}
+
+/// Constants that are numbers or arrays of numbers, without a comment. Values computed from others are left out.
 fn declared(source: &Path) -> Constants {
     let mut found = Constants::new();
     for path in sources(source) {
@@ -53,6 +61,9 @@ fn declared(source: &Path) -> Constants {
             let Some((name, kind, value)) = declaration(&code[line..]) else {
                 continue;
             };
+            if has_comment(code, line) {
+                continue;
+            }
             let number = ["f64", "f32", "usize", "i32", "u32", "u64"];
             let number = number.iter().any(|number| kind.contains(number));
             let digit = |c: char| c.is_ascii_digit() || "-_.e[],/* \n".contains(c);
@@ -80,7 +91,7 @@ fn listed(page: &Path) -> Constants {
 }
 
 #[test]
-fn the_table_lists_every_constant_with_its_value() {
+fn the_table_lists_every_constant_without_a_comment() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let declared = declared(&root.join("src"));
     let listed = listed(&root.join("../../docs/constants.md"));
@@ -90,5 +101,4 @@ fn the_table_lists_every_constant_with_its_value() {
     for key in listed.keys() {
         assert!(declared.contains_key(key), "{key:?} is not in the code");
     }
-    assert!(declared.len() > 100, "{} constants", declared.len());
 }
