@@ -9,8 +9,8 @@ use shearq_scoring::{Choice, Convention, Definition, TruthSign};
 
 use crate::choices::named;
 use crate::{print, print_table, tell};
-use shearq_pipeline::data::pattern::MAX_SET;
-use shearq_pipeline::images::{ImageId, Shard};
+use shearq_dataset::images::{ImageId, Shard};
+use shearq_dataset::layout::MAX_SET;
 use shearq_render::figure::FigureError;
 use shearq_render::html::Section;
 use shearq_render::table::{Table, TableFormat};

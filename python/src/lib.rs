@@ -41,7 +41,7 @@ mod _shearq {
     /// Version of shearq.
     #[pymodule_export]
     #[expect(non_upper_case_globals, reason = "its name in Python")]
-    const __version__: &str = shearq_pipeline::VERSION;
+    const __version__: &str = shearq_dataset::VERSION;
 
     /// The hook of panics belongs to this module alone: each extension module contains its own standard library.
     #[pymodule_init]

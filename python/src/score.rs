@@ -5,7 +5,7 @@ use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1, ToPyArray};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use shearq_pipeline::truth::{Sign, word};
+use shearq_dataset::truth::{Sign, word};
 use shearq_quantities::MeasuredRange;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::views::metrics::FORMATS;

@@ -9,10 +9,10 @@ use shearq_submissions::{Configuration, Registry};
 use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once, positive};
 use crate::progress::Bar;
 use crate::{print, tell};
+use shearq_dataset::layout::MAX_IMAGE;
+use shearq_dataset::run::{Run, Source, open_data, way};
 use shearq_files::atomic;
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::data::pattern::MAX_IMAGE;
-use shearq_pipeline::data::run::{Run, Source, open_data, way};
 use shearq_render::table::TableFormat;
 use shearq_results::baseline::{
     self, Baseline, BaselineConfiguration, BaselineSet, Change, Checked, Settings, Wanted, measure,

@@ -89,7 +89,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let made_by = vec![
             (
                 "Version".into(),
-                format!("shearq {}", shearq_pipeline::VERSION),
+                format!("shearq {}", shearq_dataset::VERSION),
             ),
             ("Threads".into(), threads.to_string()),
             ("Seed".into(), settings.seed.to_string()),

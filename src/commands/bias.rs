@@ -9,8 +9,8 @@ use shearq_bias::{Design, Errors};
 
 use crate::arguments::{Printing, ReportFile, SignArgument, positive};
 use crate::{Findings, tell};
+use shearq_dataset::images::Shard;
 use shearq_files::{atomic, open};
-use shearq_pipeline::images::Shard;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::bias::columns::{Names, Shapes, role_names};
 use shearq_results::bias::folders;

@@ -65,7 +65,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let made_by = vec![
             (
                 "Version".into(),
-                format!("shearq {}", shearq_pipeline::VERSION),
+                format!("shearq {}", shearq_dataset::VERSION),
             ),
             ("Seed".into(), arguments.seed.to_string()),
             (

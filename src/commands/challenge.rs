@@ -15,10 +15,10 @@ use shearq_challenge::ranking;
 use shearq_challenge::seal::{BOARD_FILE, is_open_to_others, verify_public};
 use shearq_challenge::shapes::References;
 use shearq_challenge::terms::{Challenge, TUNING_ENTRIES};
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::layout::MAX_IMAGE;
 use shearq_files::FileError;
 use shearq_files::open::is_there;
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::pattern::MAX_IMAGE;
 use shearq_results::submit::check::{Finding, Severity, check, check_sent};
 use shearq_results::submit::packed::{Sent, Submission};
 

@@ -8,11 +8,11 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::Grid;
 
 use crate::{Findings, count, print, tell_unread};
+use shearq_dataset::grid;
+use shearq_dataset::layout::MAX_IMAGE;
+use shearq_dataset::layout::{DataFolder, Layout, read_rows};
+use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
-use shearq_pipeline::data::layout::{DataFolder, Layout, read_rows};
-use shearq_pipeline::data::pattern::MAX_IMAGE;
-use shearq_pipeline::grid;
-use shearq_pipeline::truth::grid_of_set;
 use shearq_results::score::COLUMNS;
 use shearq_results::submit::challenge::Kind;
 use shearq_results::submit::check::{Expected, Finding, Severity, check, check_sent};

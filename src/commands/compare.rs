@@ -8,7 +8,7 @@ use clap::Args;
 use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
 use crate::choices::named;
 use crate::{print_heat_map, score};
-use shearq_pipeline::data::run::Run;
+use shearq_dataset::run::Run;
 use shearq_render::figure::{Figure, HeatMap};
 use shearq_render::table::{Table, TableFormat};
 use shearq_results::compare::{Variant, by_name, chosen, score_all};

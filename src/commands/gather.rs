@@ -5,12 +5,12 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::{count, tell};
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::pattern::{MAX_IMAGE, MAX_SET};
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::layout::{MAX_IMAGE, MAX_SET};
 use shearq_pipeline::gather::{
     Content, Files, Gathered, Gathering, Masks, Square, Stamps, Table, gather,
 };
-use shearq_pipeline::images::ImageId;
 
 /// Gather your stamps and PSFs into a data folder for `measure`.
 ///

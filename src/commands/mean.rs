@@ -6,8 +6,8 @@ use clap::Args;
 
 use crate::arguments::{Form, SetList, Threads};
 use crate::tell;
+use shearq_dataset::run::{Run, Source};
 use shearq_measure::Warning;
-use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::inputs;
 use shearq_results::mean::mean_shears;
 use shearq_results::score::without_catalogue;

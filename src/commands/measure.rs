@@ -4,11 +4,11 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
+use shearq_dataset::images::{self, ImageId};
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::run::{Run, Source, open_data};
 use shearq_files::table::FileFormat;
 use shearq_measure::Flag;
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::{Run, Source, open_data};
-use shearq_pipeline::images::{self, ImageId};
 use shearq_pipeline::measure::{FolderMeasurement, Summary, all_flagged};
 use shearq_submissions::Registry;
 

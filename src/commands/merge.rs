@@ -8,13 +8,14 @@ use clap::Args;
 use crate::arguments::{SetList, Threads};
 use crate::progress::{Bar, goes_on};
 use crate::{Findings, count, print, run, tell, tell_unread};
+use shearq_dataset::images::{self, ImageId, Shard};
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::layout::MAX_IMAGE;
+use shearq_dataset::record::{claim, read_record};
+use shearq_dataset::run::{RUN_FILE, Run, Source, check_folder};
+use shearq_dataset::run::{SIMULATION_FILE, SimulationRecord};
 use shearq_files::open::is_there;
 use shearq_pipeline::complete::{Fault, Results};
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::pattern::MAX_IMAGE;
-use shearq_pipeline::data::run::{RUN_FILE, Run, Source, check_folder, claim, read_record};
-use shearq_pipeline::images::{self, ImageId, Shard};
-use shearq_pipeline::simulate::{SIMULATION_FILE, SimulationRecord};
 
 /// Check that a folder written in shards is complete, and score it as `run` does.
 ///

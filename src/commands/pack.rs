@@ -10,7 +10,7 @@ use shearq_submissions::is_control;
 use crate::choices::named;
 use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
-use shearq_pipeline::data::run::{Run, open_data};
+use shearq_dataset::run::{Run, open_data};
 use shearq_results::foreign::Foreign;
 use shearq_results::submit::archive::is_archive;
 use shearq_results::submit::manifest::{Contents, Entry};

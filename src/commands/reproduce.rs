@@ -9,7 +9,7 @@ use shearq_submissions::{Configuration, Published, Registry};
 use crate::arguments::{SetList, Threads, given_once};
 use crate::progress::{Bar, goes_on};
 use crate::{print, print_table, tell};
-use shearq_pipeline::data::pattern::MAX_IMAGE;
+use shearq_dataset::layout::MAX_IMAGE;
 use shearq_pipeline::run::{measurers, simulated_steps};
 use shearq_pipeline::simulate::simulator;
 use shearq_render::page::Page;
@@ -72,7 +72,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let registry = Registry::embedded()?;
     let submissions = of_table_one(&registry, submission)?;
     let plan = Plan {
-        version: shearq_pipeline::VERSION.into(),
+        version: shearq_dataset::VERSION.into(),
         simulation: SimulationSettings::new(*seed, usize::from(*grid)),
         images: *images,
         submissions: submissions.iter().map(|(s, _)| s.clone()).collect(),
@@ -90,7 +90,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let settings = vec![
         (
             "Version".into(),
-            format!("shearq {}", shearq_pipeline::VERSION),
+            format!("shearq {}", shearq_dataset::VERSION),
         ),
         ("Seed".into(), seed.to_string()),
         (

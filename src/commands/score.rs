@@ -13,12 +13,12 @@ use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, SignArgument, Threads, positive,
 };
 use crate::{print, tell, tell_unread};
+use shearq_dataset::fingerprint;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::run::kind_of;
+use shearq_dataset::run::{Run, Source, way};
+use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::data::fingerprint;
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::{Run, Source, way};
-use shearq_pipeline::simulate::kind_of;
-use shearq_pipeline::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_render::table::TableFormat;
 use shearq_results::foreign::{Foreign, Screen, folder_of, plain_columns};
 use shearq_results::row::{Measured, RunRecord, SetRecord};

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::tell;
-use shearq_pipeline::data::run::Run;
+use shearq_dataset::run::Run;
 use shearq_results::select::{selection, write_selected};
 
 /// Write catalogues with cuts and weights that keep the shear calibrated.

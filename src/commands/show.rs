@@ -10,10 +10,10 @@ use shearq_measure::{Measurement, Measurer, Pixels, StampSource, Stop};
 use shearq_submissions::Registry;
 
 use crate::{print, tell};
-use shearq_pipeline::data::mosaic::Mosaic;
-use shearq_pipeline::data::run::open_data;
+use shearq_dataset::images::ImageId;
+use shearq_dataset::mosaic::Mosaic;
+use shearq_dataset::run::open_data;
 use shearq_pipeline::engine::Pool;
-use shearq_pipeline::images::ImageId;
 use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::views::steps::{steps_figure, steps_row};

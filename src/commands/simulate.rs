@@ -7,10 +7,11 @@ use clap::Args;
 use crate::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use crate::progress::{Bar, goes_on};
 use crate::tell;
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::pattern::MAX_IMAGE;
-use shearq_pipeline::images;
-use shearq_pipeline::simulate::{SimulationRecord, simulate_folder};
+use shearq_dataset::images;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::layout::MAX_IMAGE;
+use shearq_dataset::run::SimulationRecord;
+use shearq_pipeline::simulate::simulate_folder;
 use shearq_simulate::set::SimulationSettings;
 
 /// Write simulated GREAT10-like sets: images, PSFs, true shear and intrinsic shapes.
@@ -124,7 +125,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (mut made, mut already) = (0, 0);
     for Version { settings, out } in &versions {
         let record = SimulationRecord {
-            version: shearq_pipeline::VERSION.into(),
+            version: shearq_dataset::VERSION.into(),
             settings: *settings,
         };
         let data = DataFolder::new(out);

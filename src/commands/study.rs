@@ -8,7 +8,7 @@ use shearq_submissions::{Configuration, Registry};
 use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once};
 use crate::print;
 use crate::progress::{Bar, goes_on};
-use shearq_pipeline::data::pattern::MAX_IMAGE;
+use shearq_dataset::layout::MAX_IMAGE;
 use shearq_render::page::Page;
 use shearq_render::table::TableFormat;
 use shearq_results::views::pages;
@@ -71,7 +71,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .map(|name| Ok(registry.get(name)?.configuration))
         .collect::<anyhow::Result<Vec<Configuration>>>()?;
     let plan = Plan {
-        version: shearq_pipeline::VERSION.into(),
+        version: shearq_dataset::VERSION.into(),
         simulation: simulation.settings()?,
         images: *images,
         submissions,
@@ -89,7 +89,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let mut made_by = vec![
         (
             "Version".into(),
-            format!("shearq {}", shearq_pipeline::VERSION),
+            format!("shearq {}", shearq_dataset::VERSION),
         ),
         ("Seed".into(), plan.simulation.seed.to_string()),
         (

@@ -7,11 +7,11 @@ use std::time::{Duration, Instant};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::run::Run;
 use shearq_files::table;
 use shearq_measure::StampSource;
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::Run;
-use shearq_pipeline::images::ImageId;
 use shearq_pipeline::measure::ImageSource;
 use shearq_results::foreign::Foreign;
 use shearq_results::submit::challenge::{Kind, read_spectrum};

@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
+use shearq_dataset::images;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::run::{Run, Source};
 use shearq_files::table::{self, FileFormat};
 use shearq_pipeline::Quiet;
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::{Run, Source};
-use shearq_pipeline::images;
 use shearq_pipeline::measure::measure_folder;
 use shearq_submissions::{Calibration, Registry};
 

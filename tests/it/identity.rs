@@ -6,8 +6,8 @@ use std::process::{Command, Output};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use shearq_dataset::record::{read_record, write_record};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
-use shearq_pipeline::data::run::{read_record, write_record};
 use shearq_render::table::{Cell, Heading, Table, TableFormat};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::SimulationSettings;

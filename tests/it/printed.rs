@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use shearq_pipeline::data::run::Run;
+use shearq_dataset::run::Run;
 use shearq_results::store;
 
 use crate::support::{Small, fail, run_simulated, shearq, succeed, text};

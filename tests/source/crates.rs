@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 /// The crates from the lowest level up, with their folders. A crate uses crates of lower levels only.
-const LEVELS: [&[(&str, &str)]; 9] = [
+const LEVELS: [&[(&str, &str)]; 10] = [
     &[
         ("shearq-fourier", "crates/fourier"),
         ("shearq-quantities", "crates/quantities"),
@@ -21,6 +21,7 @@ const LEVELS: [&[(&str, &str)]; 9] = [
         ("shearq-simulate", "crates/simulate"),
         ("shearq-render", "crates/render"),
     ],
+    &[("shearq-dataset", "crates/dataset")],
     &[("shearq-pipeline", "crates/pipeline")],
     &[("shearq-results", "crates/results")],
     &[("shearq-studies", "crates/studies")],

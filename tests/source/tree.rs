@@ -17,9 +17,10 @@ pub const CODE: [&str; 6] = [
 ];
 
 /// The crates with a library, by package name, and their folders.
-pub const LIBRARIES: [(&str, &str); 13] = [
+pub const LIBRARIES: [(&str, &str); 14] = [
     ("shearq-bias", "crates/bias"),
     ("shearq-challenge", "crates/challenge"),
+    ("shearq-dataset", "crates/dataset"),
     ("shearq-files", "crates/files"),
     ("shearq-fourier", "crates/fourier"),
     ("shearq-measure", "crates/measure"),

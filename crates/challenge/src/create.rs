@@ -3,18 +3,17 @@
 use std::path::Path;
 
 use sha2::{Digest, Sha256};
+use shearq_dataset::images::{self, ImageId};
+use shearq_dataset::layout::fill;
+use shearq_dataset::layout::{DataFolder, LAYOUT_FILE};
+use shearq_dataset::psf_table;
+use shearq_dataset::run::SimulationRecord;
+use shearq_dataset::truth::{ReadTruth, Reading, grid_of_set, read_truth, reading_of, write_truth};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_files::open::is_there;
 use shearq_files::{FileError, atomic};
-use shearq_pipeline::data::layout::{DataFolder, LAYOUT_FILE};
-use shearq_pipeline::data::pattern::fill;
-use shearq_pipeline::data::psf_table;
 use shearq_pipeline::engine::Quiet;
-use shearq_pipeline::images::{self, ImageId};
-use shearq_pipeline::simulate::{SimulationRecord, simulate_blind, simulator};
-use shearq_pipeline::truth::{
-    ReadTruth, Reading, grid_of_set, read_truth, reading_of, write_truth,
-};
+use shearq_pipeline::simulate::{simulate_blind, simulator};
 use shearq_pipeline::{PipelineError, Progress};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::row::SetRecord;
@@ -220,7 +219,7 @@ pub fn simulated(
         .map_err(|error| PipelineError::Request(error.to_string()))?;
     key.write(folders.private)?;
     let record = SimulationRecord {
-        version: shearq_pipeline::VERSION.into(),
+        version: shearq_dataset::VERSION.into(),
         settings,
     };
     let (public, private) = (

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use shearq_dataset::fingerprint;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::run::Source;
+use shearq_dataset::run::kind_of;
 use shearq_files::{FileError, names_of};
-use shearq_pipeline::data::fingerprint;
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::Source;
-use shearq_pipeline::simulate::kind_of;
 use shearq_pipeline::{PipelineError, Progress, engine};
 use shearq_results::row::{RunRecord, SetRecord, definition_word};
 use shearq_results::score::{Basis, OddImages, ScoredSet};
@@ -471,7 +471,7 @@ impl Judge {
             toml::to_string(&Stored { entry: info }).map_err(|error| refuse(error.to_string()))?;
         let run = RunRecord {
             configuration,
-            version: shearq_pipeline::VERSION.into(),
+            version: shearq_dataset::VERSION.into(),
             settings,
             source: self.id.clone(),
             definition: definition_word(self.challenge.rules.metric.definition()).into(),

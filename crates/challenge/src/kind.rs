@@ -1,7 +1,7 @@
 //! Kinds of challenges. A kind is one value with metric, layout and rules.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
-use shearq_pipeline::data::layout::Layout;
+use shearq_dataset::layout::Layout;
 use shearq_results::compare::Paired;
 use shearq_results::row::{SetRecord, mean_metric};
 use shearq_results::submit::manifest::Contents;

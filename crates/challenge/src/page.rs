@@ -436,7 +436,7 @@ impl View<'_> {
         ];
         settings.push((
             "Program".to_owned(),
-            format!("shearq {}", shearq_pipeline::VERSION),
+            format!("shearq {}", shearq_dataset::VERSION),
         ));
         Ok(Report {
             title: name.clone(),

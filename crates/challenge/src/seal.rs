@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use hmac::{Hmac, KeyInit, Mac};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use shearq_dataset::fingerprint::hex;
 use shearq_files::{FileError, atomic, open};
-use shearq_pipeline::data::fingerprint::hex;
 use shearq_pipeline::{PipelineError, engine};
 use shearq_results::submit::manifest::FileSum;
 

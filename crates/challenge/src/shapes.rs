@@ -4,12 +4,12 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::{DataFolder, read_rows};
+use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
 use shearq_files::atomic::Scratch;
 use shearq_files::table::{FileFormat, most_rows};
-use shearq_pipeline::data::layout::{DataFolder, read_rows};
-use shearq_pipeline::data::run::{Run, Source};
-use shearq_pipeline::images::ImageId;
 use shearq_pipeline::measure::measure_folder;
 use shearq_pipeline::{PipelineError, Progress};
 use shearq_results::score::COLUMNS;

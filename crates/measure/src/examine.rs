@@ -80,12 +80,6 @@ pub(crate) fn enough(columns: usize, rows: usize) -> usize {
     ENOUGH.div_ceil(columns.max(1)).min(rows)
 }
 
-/// Stamps in a row of the arrangement of `count` stamps that is nearest to a square: 1 or more.
-pub fn columns_of(count: usize) -> usize {
-    let root = count.isqrt();
-    (root + usize::from(root * root < count)).max(1)
-}
-
 /// What one stamp shows.
 #[derive(Debug, Clone, Copy)]
 struct Look {

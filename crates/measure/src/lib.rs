@@ -75,7 +75,7 @@ pub use batch::strip;
 pub use calibrate::calibrate;
 pub use deconvolve::{Descent, Stop};
 pub use error::MeasureError;
-pub use examine::{EXAMINED_PSFS, Examination, columns_of, examined_rows};
+pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use flag::{Flag, Flags};
 pub use galaxy::Measurer;
 pub use mean_shear::{MeanShear, MeanShearError, ShearSum};

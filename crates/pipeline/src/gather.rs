@@ -21,11 +21,11 @@ pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, shown};
 use self::stamps::StampWriter;
 use super::PipelineError;
-use super::images::ImageId;
 use super::measure::check_strip;
-use crate::data::layout::{DataFolder, MAX_STAMP};
-use crate::data::mosaic::Mosaic;
 use crate::wcs::Wcs;
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::{DataFolder, MAX_STAMP};
+use shearq_dataset::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_files::open::is_there;
@@ -163,7 +163,7 @@ fn gather_alone(
     let which = data.stamps(id.set, id.image);
     remove_leftovers(data, id)?;
     let record = Record {
-        version: crate::VERSION,
+        version: shearq_dataset::VERSION,
         gathering,
     };
     let record = serde_json::to_string_pretty(&record)

@@ -5,23 +5,16 @@
 #![forbid(unsafe_code)]
 
 pub mod complete;
-pub mod data;
 pub mod engine;
 pub mod gather;
-pub mod grid;
-pub mod images;
 pub mod inputs;
 pub mod measure;
 pub mod run;
 pub mod simulate;
-pub mod truth;
 mod warned;
 mod wcs;
 
 pub use engine::{Progress, Quiet};
-
-/// Version of this package, as outputs carry it.
-pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 use shearq_measure::MeasureError;
 use thiserror::Error;
@@ -53,8 +46,3 @@ pub enum PipelineError {
     #[error("cannot start the worker threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
 }
-
-/// The examples of README.md.
-#[cfg(doctest)]
-#[doc = include_str!("../README.md")]
-struct Readme;

@@ -23,12 +23,13 @@ pub use self::source::ImageSource;
 pub(crate) use self::source::open_galaxies;
 pub(crate) use self::stamps::check_strip;
 use crate::PipelineError;
-use crate::data::layout::DataFolder;
-use crate::data::mosaic::Mosaic;
-use crate::data::run::Run;
 use crate::engine::{self, Feeder, Progress};
-use crate::images::ImageId;
-use crate::inputs::Inputs;
+use crate::inputs::verify_images;
+use shearq_dataset::images::ImageId;
+use shearq_dataset::inputs::Inputs;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::mosaic::Mosaic;
+use shearq_dataset::run::Run;
 
 /// What the catalogue of an image contains beside its galaxies.
 #[derive(Debug, Clone)]
@@ -158,7 +159,7 @@ impl<'a> FolderMeasurement<'a> {
     ) -> Result<Summary, PipelineError> {
         let mut catalogues = Catalogues::claim(self.run, self.out, self.images)?;
         let inputs = Inputs::new(self.run, self.data, self.images)?;
-        inputs.verify(self.out, &catalogues.done, threads)?;
+        verify_images(&inputs, self.out, &catalogues.done, threads)?;
         let Some((_, mosaic)) = self.todo else {
             return catalogues.finish(progress);
         };

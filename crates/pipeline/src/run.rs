@@ -14,12 +14,12 @@ use shearq_quantities::Shear;
 use shearq_submissions::{Configuration, PsfForm};
 
 use super::engine::Progress;
-use super::images::ImageId;
 use super::measure::{Catalogues, ImageHead, ImageRow, Measured, Summary, measure_images};
 use super::{PipelineError, simulate};
-use crate::data::layout::DataFolder;
-use crate::data::mosaic::Mosaic;
-use crate::data::run::Run;
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::mosaic::Mosaic;
+use shearq_dataset::run::Run;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
@@ -344,7 +344,7 @@ mod tests {
     use shearq_submissions::Registry;
 
     use super::*;
-    use crate::data::run::Source;
+    use shearq_dataset::run::Source;
 
     /// Galaxies that were done when each warning was shown.
     #[derive(Default)]
@@ -377,7 +377,7 @@ mod tests {
             configuration,
             FileFormat::Parquet,
         );
-        let images = crate::images::of_simulation(&[2], 3);
+        let images = shearq_dataset::images::of_simulation(&[2], 3);
         let out = tempfile::tempdir().unwrap();
         let mut progress = Recorder::default();
         let summary = run_folder(&run, settings, &images, out.path(), 1, &mut progress).unwrap();

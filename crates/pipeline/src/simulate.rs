@@ -3,49 +3,23 @@
 use std::sync::Arc;
 
 use ndarray::Array2;
-use serde::{Deserialize, Serialize};
 use shearq_quantities::FunctionalPsf;
 
 use super::PipelineError;
 use super::engine::{self, Feeder, Progress};
-use super::images::ImageId;
-use super::truth;
-use crate::data::layout::DataFolder;
-use crate::data::psf_table;
-use crate::data::run::{Run, Source, claim};
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::psf_table;
+use shearq_dataset::record::claim;
+use shearq_dataset::run::{SIMULATION_FILE, SimulationRecord};
+use shearq_dataset::truth;
 use shearq_files::atomic;
 use shearq_files::fits::{ImageWriter, Value};
-use shearq_files::open::is_there;
 use shearq_simulate::kinds::{SETS, SetKind};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
 };
-
-/// Name of the record in a simulated data folder.
-pub const SIMULATION_FILE: &str = "simulation.json";
-
-/// Settings of a simulation, stored with its data.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct SimulationRecord {
-    /// Version of shearq.
-    pub version: String,
-    /// The settings.
-    pub settings: SimulationSettings,
-}
-
-/// The kind of a set, if the data were simulated. Other data may have the same set numbers.
-pub fn kind_of(data: &DataFolder, set: u32) -> Option<SetKind> {
-    let in_memory = || {
-        let run = Run::read(data.root()).ok().flatten();
-        run.is_some_and(|run| matches!(run.source, Source::Simulated(_)))
-    };
-    if is_there(&data.root().join(SIMULATION_FILE)) || in_memory() {
-        SetKind::of(set)
-    } else {
-        None
-    }
-}
 
 /// One row of stamps to draw.
 struct RowJob {

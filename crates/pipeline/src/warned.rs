@@ -6,7 +6,7 @@ use shearq_measure::Warning;
 
 use super::PipelineError;
 use super::engine::Progress;
-use super::images::ImageId;
+use shearq_dataset::images::ImageId;
 
 /// Kinds of warnings that were shown, and the number of further images of each.
 #[derive(Debug, Default)]

@@ -29,6 +29,12 @@ pub use ellipticity::{Distortion, Shear};
 pub use psf::{FunctionalPsf, ProfileError, PsfProfile, PsfTransform, TransformedPsf};
 pub use range::MeasuredRange;
 
+/// Stamps in a row of the arrangement of `count` stamps that is nearest to a square: 1 or more.
+pub fn columns_of(count: usize) -> usize {
+    let root = count.isqrt();
+    (root + usize::from(root * root < count)).max(1)
+}
+
 /// The examples of README.md.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]

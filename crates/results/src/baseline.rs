@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use shearq_submissions::{Configuration, checked_name};
 
+use shearq_dataset::run::Source;
 use shearq_files::{FileError, atomic};
-use shearq_pipeline::data::run::Source;
 
 mod measured;
 mod moved;
@@ -106,7 +106,7 @@ impl Baseline {
         submissions: Vec<BaselineConfiguration>,
     ) -> Self {
         Baseline {
-            version: shearq_pipeline::VERSION.into(),
+            version: shearq_dataset::VERSION.into(),
             sets_held: Some(sets_of(&submissions).count()),
             source,
             history,

@@ -17,10 +17,10 @@ use shearq_bias::{
     BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, Missing, Range, UnitSums,
     difference, group,
 };
+use shearq_dataset::layout::stated_sign;
+use shearq_dataset::truth::{Sign, SignBasis, word};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
-use shearq_pipeline::data::layout::stated_sign;
-use shearq_pipeline::truth::{Sign, SignBasis, word};
 use shearq_scoring::TruthSign;
 use thiserror::Error;
 

@@ -14,11 +14,11 @@ use super::groups::Order;
 use super::row::{RunRecord, SetRecord, choice_word, definition_word};
 use super::score::{Catalogues, ScoredSet, own_catalogue, score_variants, unscored};
 use super::submit::packed::PackedCatalogues;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::layout::MAX_SET;
+use shearq_dataset::listing::Files;
+use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::listing::Files;
-use shearq_pipeline::data::pattern::MAX_SET;
-use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::{PipelineError, inputs};
 
 /// One variant in a comparison: a folder, or another program's catalogues.
@@ -247,7 +247,7 @@ pub fn score_all(
             let numbers: Vec<u32> = sets.iter().filter_map(|set| set.set).collect();
             let run = RunRecord {
                 configuration: entrant.name.clone(),
-                version: shearq_pipeline::VERSION.into(),
+                version: shearq_dataset::VERSION.into(),
                 settings: entrant.settings.clone(),
                 source: data.root().display().to_string(),
                 definition: definition_word(way.definition).into(),

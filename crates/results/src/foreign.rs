@@ -8,11 +8,11 @@ use shearq_scoring::{FieldSum, Grid, Row, RowCounts};
 use shearq_submissions::{EllipticityType, checked_name};
 
 use crate::views::rows::fault as odd_rows;
+use shearq_dataset::layout::read_rows;
+use shearq_dataset::layout::{IMAGE_PLACEHOLDERS, check_pattern};
+use shearq_dataset::listing::{self, Files};
 use shearq_files::FileError;
 use shearq_files::table::{self, Place, most_rows};
-use shearq_pipeline::data::layout::read_rows;
-use shearq_pipeline::data::listing::{self, Files};
-use shearq_pipeline::data::pattern::{IMAGE_PLACEHOLDERS, check_pattern};
 
 /// How to read another program's catalogues.
 ///

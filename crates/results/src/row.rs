@@ -13,12 +13,13 @@ use shearq_scoring::{
 use shearq_submissions::check_name;
 
 use super::score::ScoredSet;
+use shearq_dataset::fingerprint::{self, Fingerprint};
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::record::nan_for_null;
+use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
 use shearq_files::table::MAX_ROWS;
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::data::fingerprint::{self, Fingerprint};
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::{Run, Source, nan_for_null};
 use shearq_simulate::kinds::SetKind;
 
 /// Record of one set's score.
@@ -241,7 +242,7 @@ impl RunRecord {
         } = measured;
         Ok(RunRecord {
             configuration: name.to_owned(),
-            version: shearq_pipeline::VERSION.into(),
+            version: shearq_dataset::VERSION.into(),
             settings,
             source: match source {
                 Source::Simulated(settings) => serde_json::to_string(settings)

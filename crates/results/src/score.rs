@@ -9,13 +9,13 @@ use shearq_scoring::{
     Options, RowCounts, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
 };
 
+use shearq_dataset::layout::MAX_SET;
+use shearq_dataset::layout::{DataFolder, read_rows};
+use shearq_dataset::run::Run;
+use shearq_dataset::run::kind_of;
+use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
-use shearq_pipeline::data::layout::{DataFolder, read_rows};
-use shearq_pipeline::data::pattern::MAX_SET;
-use shearq_pipeline::data::run::Run;
-use shearq_pipeline::simulate::kind_of;
-use shearq_pipeline::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_pipeline::{PipelineError, engine, inputs};
 use shearq_simulate::kinds::SetKind;
 

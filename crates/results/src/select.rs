@@ -2,14 +2,15 @@
 
 use std::path::Path;
 
+use shearq_dataset::inputs::PRINTS;
+use shearq_dataset::record::claim;
+use shearq_dataset::run::{RUN_FILE, Run, Source};
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::Place;
 use shearq_files::{FileError, atomic, table};
 use shearq_measure::{Observables, Selection, Versions};
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::data::run::{RUN_FILE, Run, Source, claim};
-use shearq_pipeline::inputs::PRINTS;
 use shearq_pipeline::measure::KEYS;
 
 use crate::expression::Expression;

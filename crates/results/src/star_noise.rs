@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 pub use shearq_bias::StarNoise;
+use shearq_dataset::inputs::PSF;
 use shearq_files::FileError;
 use shearq_files::frames::Metadata;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, FileFormat};
-use shearq_pipeline::inputs::PSF;
 use shearq_pipeline::measure::PSF_NOISE;
 
 /// Largest effect on m or c that metadata can state: a star without any signal has 5.5.

@@ -10,9 +10,9 @@ use std::path::{Path, PathBuf};
 use shearq_files::frames::{Metadata, TableError, parquet_metadata, read_parquet, write_parquet};
 
 use super::row::{RunRecord, table_of};
+use shearq_dataset::fingerprint;
 use shearq_files::parquet::bare;
 use shearq_files::{FileError, atomic};
-use shearq_pipeline::data::fingerprint;
 
 /// Key and value in the footer that identify the files of a store.
 const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");

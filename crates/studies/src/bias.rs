@@ -21,8 +21,8 @@ use shearq_measure::{Measurement, Measurer, Worker};
 use shearq_quantities::Shear;
 use shearq_submissions::Calibration;
 
+use shearq_dataset::record::nan_for_null;
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::data::run::nan_for_null;
 use shearq_pipeline::engine::{self, Progress};
 use shearq_pipeline::run::SimulatedSessions;
 use shearq_pipeline::simulate::place;

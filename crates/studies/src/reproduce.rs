@@ -11,11 +11,11 @@ use shearq_scoring::{
 use shearq_submissions::{Configuration, checked_name};
 
 use super::response::{Regression, Response};
+use shearq_dataset::mosaic::Mosaic;
+use shearq_dataset::record::{Claim, claim, nan_for_null, read_record, write_record};
 use shearq_files::FileError;
 use shearq_measure::{Measurement, Measurer};
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::data::mosaic::Mosaic;
-use shearq_pipeline::data::run::{Claim, claim, nan_for_null, read_record, write_record};
 use shearq_pipeline::engine::Progress;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;

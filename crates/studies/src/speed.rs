@@ -25,6 +25,7 @@ use shearq_submissions::{
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 
+use shearq_dataset::truth::Reading;
 use shearq_files::FileError;
 use shearq_files::atomic::{self, Scratch};
 use shearq_files::table::{self, FileFormat};
@@ -32,7 +33,6 @@ use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
-use shearq_pipeline::truth::Reading;
 use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_results::foreign::{Screen, plain_columns};

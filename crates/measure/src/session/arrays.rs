@@ -7,12 +7,12 @@ use ndarray::{ArrayView3, Axis, Ix3, Slice};
 
 use super::source::{Lazy, LazyStamps, StampRows, StampSource};
 use crate::error::MeasureError;
-use crate::examine::columns_of;
 use crate::galaxy::Measurer;
 use crate::pixel::{Pixel, Pixels};
 use crate::psf::Star;
 use crate::psfs::Psfs;
 use crate::warning::Warning;
+use shearq_quantities::columns_of;
 
 /// Some of the stamps, or of their PSFs.
 type Slices<'a, T, E> = Box<dyn FnMut(Range<usize>) -> Result<T, E> + Send + 'a>;

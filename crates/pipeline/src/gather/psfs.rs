@@ -13,11 +13,11 @@ use super::rows::{Rows, first};
 use super::source::{Files, Planes};
 use super::stamps::central;
 use super::{Square, Stack};
-use crate::data::layout::DataFolder;
-use crate::data::mosaic::Mosaic;
-use crate::data::psf_table;
-use crate::images::ImageId;
 use crate::wcs::Wcs;
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::mosaic::Mosaic;
+use shearq_dataset::psf_table;
 
 /// Pixels a side of a PSF that are examined: as many as configurations use.
 const EXAMINED_SIDE: usize = 48;

@@ -6,7 +6,7 @@ use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_files::fits::{ImageWriter, Value};
 
-use crate::data::mosaic::Mosaic;
+use shearq_dataset::mosaic::Mosaic;
 
 /// A mosaic that is written a row of stamps at a time.
 pub(super) struct Rows {

@@ -12,8 +12,8 @@ use shearq_measure::{Examination, examined_rows};
 use super::rows::Rows;
 use super::source::{Exposure, Files, Origin, Planes, off_middle};
 use super::{Gathering, Masks, Stamps};
-use crate::data::mosaic::Mosaic;
 use crate::wcs::Wcs;
+use shearq_dataset::mosaic::Mosaic;
 
 /// A row of the table of stamps.
 #[derive(Serialize)]

@@ -12,10 +12,11 @@ use shearq_submissions::{Configuration, EllipticityType};
 
 use super::ImageHead;
 use crate::PipelineError;
-use crate::data::run::{Claim, RUN_FILE, Run, claim};
 use crate::engine::Progress;
-use crate::images::ImageId;
 use crate::warned::Warned;
+use shearq_dataset::images::ImageId;
+use shearq_dataset::record::{Claim, claim};
+use shearq_dataset::run::{RUN_FILE, Run};
 
 /// How a column follows from a measurement.
 #[derive(Debug, Clone, Copy)]

@@ -10,12 +10,12 @@ use shearq_submissions::{Configuration, PsfCut, PsfForm};
 
 use super::stamps::{check_strip, read_row, stated_image};
 use crate::PipelineError;
-use crate::data::layout::{DataFolder, MAX_STAMP};
-use crate::data::mosaic::Mosaic;
-use crate::data::psf_table;
-use crate::grid::whole;
-use crate::images::ImageId;
 use crate::wcs::Wcs;
+use shearq_dataset::grid::whole;
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::{DataFolder, MAX_STAMP};
+use shearq_dataset::mosaic::Mosaic;
+use shearq_dataset::psf_table;
 
 /// The PSFs of an image.
 pub(super) enum PsfSource {

@@ -13,11 +13,11 @@ use shearq_submissions::{Configuration, NoiseSource};
 use super::psfs::{OpenPsfs, PsfSource, open_psf};
 use super::stamps::{check_strip, read_row, stated_image};
 use crate::PipelineError;
-use crate::data::layout::DataFolder;
-use crate::data::mosaic::Mosaic;
-use crate::grid;
-use crate::images::ImageId;
 use crate::wcs::Wcs;
+use shearq_dataset::grid;
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::mosaic::Mosaic;
 
 /// An open image with its PSFs.
 pub struct ImageSource {

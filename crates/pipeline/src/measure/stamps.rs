@@ -8,7 +8,7 @@ use shearq_files::fits::ImageReader;
 use shearq_measure::Pixels;
 
 use crate::PipelineError;
-use crate::data::mosaic::Mosaic;
+use shearq_dataset::mosaic::Mosaic;
 
 /// Most pixels of a row of stamps. Several rows are in memory at a time.
 const MAX_STRIP: usize = 1 << 24;

@@ -9,14 +9,14 @@ use shearq_submissions::Configuration;
 use super::BaselineSet;
 use crate::row::SetRecord;
 use crate::score::{OWN, score_folder};
+use shearq_dataset::fingerprint;
+use shearq_dataset::images::{self, ImageId};
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::run::{Run, Source};
 use shearq_files::atomic::Scratch;
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::data::fingerprint;
-use shearq_pipeline::data::layout::DataFolder;
-use shearq_pipeline::data::run::{Run, Source};
 use shearq_pipeline::engine::{self, Progress};
-use shearq_pipeline::images::{self, ImageId};
 use shearq_pipeline::measure::measure_folder;
 use shearq_pipeline::run::run_folder;
 

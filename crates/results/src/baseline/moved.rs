@@ -7,9 +7,9 @@ use thiserror::Error;
 
 use super::measured::{SCATTER, Wanted};
 use super::{Baseline, BaselineConfiguration, BaselineSet};
+use shearq_dataset::record::differences;
+use shearq_dataset::relative::shortened;
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::data::relative::shortened;
-use shearq_pipeline::data::run::differences;
 
 /// Why a baseline cannot be checked.
 #[derive(Debug, Error)]

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use shearq_dataset::run::{RUN_FILE, Run};
 use shearq_files::FileError;
 use shearq_files::open::is_there;
-use shearq_pipeline::data::run::{RUN_FILE, Run};
 
 use super::positions::Positions;
 use super::truth::Truth;

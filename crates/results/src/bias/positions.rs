@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
+use shearq_dataset::truth::sign_on_any_grid;
 use shearq_files::FileError;
 use shearq_files::table::{self, MAX_ROWS, Place, TRUTH_COLUMNS};
-use shearq_pipeline::truth::sign_on_any_grid;
 use shearq_scoring::{Row, TruthSign};
 
 /// Largest distance of a galaxy from its place in the truth, in pixels.

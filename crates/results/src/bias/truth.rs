@@ -4,11 +4,11 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use shearq_dataset::layout::stated_sign;
+use shearq_dataset::truth::{Sign, SignBasis};
 use shearq_files::FileError;
 use shearq_files::open::{SETTINGS, read_to_string};
 use shearq_files::table::{self, Place};
-use shearq_pipeline::data::layout::stated_sign;
-use shearq_pipeline::truth::{Sign, SignBasis};
 use shearq_scoring::TruthSign;
 
 use super::columns::{Role, names_of_role};

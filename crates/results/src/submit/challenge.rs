@@ -12,9 +12,9 @@ use shearq_scoring::{
     cross_spectrum, measured_bandpowers,
 };
 
+use shearq_dataset::layout::{MAX_IMAGE, MAX_SET};
 use shearq_files::FileError;
 use shearq_files::table;
-use shearq_pipeline::data::pattern::{MAX_IMAGE, MAX_SET};
 
 /// One line of a power-spectrum file.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -14,8 +14,8 @@ use super::packed::Sent;
 use crate::score::COLUMNS;
 use crate::views::diagnosis::{odd_response, words};
 use crate::views::rows::fault as odd_rows;
+use shearq_dataset::layout::read_rows;
 use shearq_files::table::most_rows;
-use shearq_pipeline::data::layout::read_rows;
 
 /// Each catalogue is read as one image on the expected grid.
 const ONE_IMAGE: &str = "one image on the expected grid";

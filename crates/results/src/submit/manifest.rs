@@ -11,9 +11,10 @@ use shearq_scoring::SpectrumCovariance;
 use shearq_submissions::{check_name, checked_name};
 
 use crate::foreign::Foreign;
+use shearq_dataset::fingerprint::hex;
+use shearq_dataset::record::read_record;
+use shearq_dataset::run::Run;
 use shearq_files::{FileError, open};
-use shearq_pipeline::data::fingerprint::hex;
-use shearq_pipeline::data::run::{Run, read_record};
 
 /// File name of the manifest.
 pub const MANIFEST_FILE: &str = "manifest.json";

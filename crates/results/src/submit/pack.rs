@@ -14,15 +14,16 @@ use super::challenge::{Kind, Spectrum, catalogue_text, spectrum_text};
 use super::manifest::{Contents, Entry, FileSum, MANIFEST_FILE, Manifest};
 use crate::foreign::Foreign;
 use crate::score::COLUMNS;
+use shearq_dataset::layout::{DataFolder, read_rows};
+use shearq_dataset::listing::Files;
+use shearq_dataset::record::record_text;
+use shearq_dataset::run::Run;
+use shearq_dataset::{grid, truth};
 use shearq_files::FileError;
 use shearq_files::atomic::PartFolder;
 use shearq_files::open::is_there;
 use shearq_files::table::{MAX_ROWS, most_rows};
-use shearq_pipeline::data::layout::{DataFolder, read_rows};
-use shearq_pipeline::data::listing::Files;
-use shearq_pipeline::data::run::Run;
-use shearq_pipeline::data::run::record_text;
-use shearq_pipeline::{Progress, grid, truth};
+use shearq_pipeline::Progress;
 
 /// The catalogues to pack.
 #[derive(Debug, Clone, Copy)]
@@ -211,7 +212,7 @@ impl Packing<'_> {
             Origin::Foreign { foreign, .. } => (None, Some(foreign.clone())),
         };
         let manifest = Manifest {
-            version: shearq_pipeline::VERSION.into(),
+            version: shearq_dataset::VERSION.into(),
             method: self.method.clone(),
             contents: self.contents,
             entry: self.entry.clone(),

@@ -4,7 +4,7 @@ use shearq_bias::{
     Catalogue, Design, Estimate, Measured, QUANTITIES, REQUIREMENTS, Repeated, Verdict, student_t,
     verdict,
 };
-use shearq_pipeline::truth::Sign;
+use shearq_dataset::truth::Sign;
 use shearq_render::figure::{Band, FigureError, LinePlot, PanelGrid, Series, Style};
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Heading, Table};

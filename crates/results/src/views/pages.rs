@@ -84,7 +84,7 @@ pub fn save(
 ) -> Result<(), shearq_files::FileError> {
     let mut made_by = vec![(
         "Version".to_owned(),
-        format!("shearq {}", shearq_pipeline::VERSION),
+        format!("shearq {}", shearq_dataset::VERSION),
     )];
     made_by.extend(settings);
     Report {

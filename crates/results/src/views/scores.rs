@@ -16,7 +16,7 @@ use crate::views::metrics::{FORMATS, metric_cells, metric_heading};
 use crate::views::rows::oddities;
 use crate::views::spectrum;
 use crate::views::verdict::verdict;
-use shearq_pipeline::truth::Sign;
+use shearq_dataset::truth::Sign;
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_simulate::kinds::SetKind;
 
@@ -497,7 +497,7 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
         "description": format!(
             "{} catalogue(s) scored by shearq {}",
             input.catalogues.len(),
-            shearq_pipeline::VERSION
+            shearq_dataset::VERSION
         ),
         "definition": input.definition,
         "files": { "truth": input.truth, "catalogues": input.catalogues },

@@ -30,7 +30,7 @@ pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
 /// Several galaxies under a title, which ends with the version.
 pub fn steps_figure(title: &str, rows: Vec<ImageRow>) -> ImageGrid {
     ImageGrid {
-        title: format!("{title} (shearq {})", shearq_pipeline::VERSION),
+        title: format!("{title} (shearq {})", shearq_dataset::VERSION),
         rows,
     }
 }

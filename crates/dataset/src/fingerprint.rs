@@ -9,8 +9,8 @@ use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use crate::data::layout::DataFolder;
-use crate::data::run::Source;
+use crate::layout::DataFolder;
+use crate::run::Source;
 use shearq_files::FileError;
 use shearq_files::open;
 

@@ -2,10 +2,8 @@
 
 use std::str::FromStr;
 
-use super::PipelineError;
-use crate::data::layout::DataFolder;
-use crate::data::listing::{self, Files};
-use crate::data::pattern::fill;
+use crate::layout::{DataFolder, fill};
+use crate::listing::{self, Files};
 use shearq_files::FileError;
 
 /// One image of a data folder or a simulation.
@@ -21,7 +19,7 @@ pub struct ImageId {
 ///
 /// # Errors
 /// If a set has no image, or the folder none at all, or a folder cannot be listed.
-pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, PipelineError> {
+pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileError> {
     let files = data.images(sets)?;
     let mut found = Vec::new();
     for set in files.wanted(sets) {
@@ -30,7 +28,7 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, Pipeli
             let path = data.galaxies(set, 1);
             let advice = advice(data, &files);
             let message = format!("there is no image of set {set}; expected this file{advice}");
-            return Err(FileError::new(path, message).into());
+            return Err(FileError::new(path, message));
         }
         let id = |(image, _)| ImageId { set, image };
         found.extend(images.into_iter().map(id));
@@ -42,7 +40,7 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, Pipeli
         let message = format!(
             "there are no galaxy images here (found {found}, expected {pattern}, as in {example}){advice}"
         );
-        return Err(FileError::new(data.root(), message).into());
+        return Err(FileError::new(data.root(), message));
     }
     Ok(found)
 }

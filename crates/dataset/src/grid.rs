@@ -5,8 +5,8 @@ use std::path::Path;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, Row};
 
-use crate::data::layout::{DataFolder, MAX_STAMP};
-use crate::data::mosaic::Mosaic;
+use crate::layout::{DataFolder, MAX_STAMP};
+use crate::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 
@@ -23,11 +23,7 @@ fn stamp_of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result
 ///
 /// # Errors
 /// If the image is not made of whole stamps, in the number that its header states.
-pub(super) fn of_image(
-    data: &DataFolder,
-    path: &Path,
-    image: &ImageReader,
-) -> Result<Mosaic, FileError> {
+pub fn of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<Mosaic, FileError> {
     let stamp = stamp_of_image(data, path, image)?;
     let (width, height) = (image.width(), image.height());
     let (columns, rows) = match whole(image, path, "NGRID", width)? {
@@ -90,7 +86,7 @@ pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
 ///
 /// # Errors
 /// If it cannot be read.
-pub(super) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>, FileError> {
+pub(crate) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>, FileError> {
     let images = data.images(&[set])?.of_set(set);
     let first = images.first().map(|(_, path)| {
         let image = ImageReader::open(path)?;
@@ -139,7 +135,7 @@ pub fn side(path: &Path, rows: usize) -> Result<usize, FileError> {
 ///
 /// # Errors
 /// If it is no whole number from 1 to `most`.
-pub(super) fn whole(
+pub fn whole(
     image: &ImageReader,
     path: &Path,
     key: &str,

@@ -8,7 +8,7 @@ use std::path::{Component, Path, PathBuf};
 ///
 /// # Errors
 /// If the current folder cannot be determined.
-pub(super) fn from(folder: &Path, path: &Path) -> Result<PathBuf> {
+pub(crate) fn from(folder: &Path, path: &Path) -> Result<PathBuf> {
     let (folder, path) = (resolve(folder)?, resolve(path)?);
     let shared = folder
         .components()

@@ -1,6 +1,6 @@
 //! The postage stamps of an image side by side.
 
-use shearq_measure::columns_of;
+use shearq_quantities::columns_of;
 use shearq_quantities::units::Pixels;
 use shearq_scoring::{cell_at, centre_of};
 

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, Row, TrueShear, TruthSign, sign_by_modes};
 
-use super::grid;
-use crate::data::layout::{DataFolder, SIGN_KEY, stated_sign, truth_is_there, truth_rows};
+use crate::grid;
+use crate::layout::{DataFolder, SIGN_KEY, stated_sign, truth_is_there, truth_rows};
 use shearq_files::table::{self, MAX_ROWS};
 use shearq_files::{FileError, atomic};
 

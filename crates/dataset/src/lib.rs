@@ -1,0 +1,25 @@
+//! Data folders and folders of results: names and places of files, true shear, what made a result, and fingerprints.
+//!
+//! Nothing here measures or starts threads, so that scoring a catalogue needs no more than this.
+#![forbid(unsafe_code)]
+
+pub mod fingerprint;
+pub mod grid;
+pub mod images;
+pub mod inputs;
+pub mod layout;
+pub mod listing;
+pub mod mosaic;
+pub mod psf_table;
+pub mod record;
+pub mod relative;
+pub mod run;
+pub mod truth;
+
+/// Version of this package, as outputs carry it.
+pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// The examples of README.md.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
