@@ -45,41 +45,52 @@ def stars_of(case, psf, grid, random, fields):
     return stars
 
 
-def measured(case, stamps, stars, fields, options):
-    """Catalogues `[field, ±shear]` as dicts of arrays, from images written for shearq."""
+def write_images(case, stamps, stars, fields, data):
+    """Writes the images of a case for shearq, in pairs of opposite shear, and returns how many."""
     _, count, side, _ = stamps.shape
     grid = int(np.sqrt(count))
+    folder = data / "set01"
+    folder.mkdir(parents=True)
+    number = 0
+    for noise, star in zip(fields, stars):
+        for sign in range(2):
+            number += 1
+            image = stamps[sign] + noise + case.sky
+            image = image.reshape(grid, grid, side, side).transpose(0, 2, 1, 3)
+            image = fits.PrimaryHDU(image.reshape(grid * side, grid * side).astype(np.float32))
+            keys = {"SET": 1, "IMAGE": number, "STAMP": side, "NGRID": grid, "NOISESIG": case.header}
+            image.header.update(keys)
+            image.writeto(folder / f"galaxies-{number:03}.fits")
+            star_file = fits.PrimaryHDU(star.astype(np.float32))
+            star_file.header["STAMP"] = STAR
+            star_file.writeto(folder / f"psf-{number:03}.fits")
+    return number
+
+
+def run_measure(options, data, out, environment=None):
+    """Runs `measure`; returns its error message, or None."""
+    command = [options.shearq, "measure", "--submission", options.submission]
+    command += ["--data", str(data), "--out", str(out), "--threads", str(options.threads)]
+    run = subprocess.run(command, capture_output=True, text=True, env=environment)
+    return run.stderr if run.returncode else None
+
+
+def read_catalogues(folder, names, number):
+    paths = [folder / "set01" / f"catalogue-{k:03}.parquet" for k in range(1, number + 1)]
+    return [parquet.read_table(path, columns=names) for path in paths]
+
+
+def measured(case, stamps, stars, fields, options):
+    """Catalogues `[field, ±shear]` as dicts of arrays, from images written for shearq."""
     with tempfile.TemporaryDirectory() as folder:
-        data = Path(folder) / "data" / "set01"
-        data.mkdir(parents=True)
-        number = 0
-        for noise, star in zip(fields, stars):
-            for sign in range(2):
-                number += 1
-                image = stamps[sign] + noise + case.sky
-                image = image.reshape(grid, grid, side, side).transpose(0, 2, 1, 3)
-                image = fits.PrimaryHDU(image.reshape(grid * side, grid * side).astype(np.float32))
-                keys = {"SET": 1, "IMAGE": number, "STAMP": side, "NGRID": grid, "NOISESIG": case.header}
-                image.header.update(keys)
-                image.writeto(data / f"galaxies-{number:03}.fits")
-                star_file = fits.PrimaryHDU(star.astype(np.float32))
-                star_file.header["STAMP"] = STAR
-                star_file.writeto(data / f"psf-{number:03}.fits")
-        out = Path(folder) / "out"
-        command = [options.shearq, "measure", "--submission", options.submission]
-        command += ["--data", str(data.parent), "--out", str(out), "--threads", str(options.threads)]
-        run = subprocess.run(command, capture_output=True, text=True)
-        if run.returncode:
-            sys.exit(f"{case.name}: {run.stderr}")
+        data, out = Path(folder) / "data", Path(folder) / "out"
+        number = write_images(case, stamps, stars, fields, data)
+        if error := run_measure(options, data, out):
+            sys.exit(f"{case.name}: {error}")
         names = ["e1", "e2", "R11", "R22", "flags", "flux", "size"]
         if options.versions:
             names += [f"{name}_{version}" for name in ("e1", "e2", "flux", "size") for version in VERSIONS]
-
-        def read(folder):
-            paths = [folder / "set01" / f"catalogue-{k:03}.parquet" for k in range(1, number + 1)]
-            return [parquet.read_table(path, columns=names) for path in paths]
-
-        tables = read(out)
+        tables = read_catalogues(out, names, number)
         if case.cut and not options.hard_cuts and not options.versions:
             column, share = case.cut
             values = np.concatenate([table[column].to_numpy()[table["flags"].to_numpy() == 0] for table in tables])
@@ -89,7 +100,8 @@ def measured(case, stamps, stars, fields, options):
             run = subprocess.run(command, capture_output=True, text=True)
             if run.returncode:
                 sys.exit(f"{case.name}: {run.stderr}")
-            tables = read(selected)
+            tables = read_catalogues(selected, names, number)
+    count = stamps.shape[1]
     columns = {name: np.array([table[name].to_numpy() for table in tables]) for name in names}
     return {name: values.reshape(-1, 2, count) for name, values in columns.items()}
 
