@@ -1,6 +1,10 @@
 //! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage. A closed pipe
 //! (`| head`) is not an error: the command finishes its work.
 
+#[cfg(doctest)]
+#[doc = include_str!("../docs/library.md")]
+struct GuideToTheCrates;
+
 mod arguments;
 mod choices;
 mod commands;

@@ -1,0 +1,23 @@
+#!/usr/bin/env bash
+# Makes a release of the version in Cargo.toml, up to the push: checks, archive, a trial of the crates, and a signed or plain tag.
+#     bash .ci/release/tag.sh DIST [--tag]
+# Without --tag it is a rehearsal, which changes nothing in the repository.
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+dist=${1:?usage: .ci/release/tag.sh DIST [--tag]}
+version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
+fail() { echo "error: $*" >&2; exit 1; }
+
+[ -z "$(git status --porcelain)" ] || fail "uncommitted changes. Try: git stash"
+git rev-parse -q --verify "refs/tags/v$version" > /dev/null && fail "the tag v$version exists. Try: a new version in Cargo.toml"
+grep -q "^version: $version\$" CITATION.cff || fail "CITATION.cff: expected version: $version"
+grep -q "^## .*$version" CHANGELOG.md || fail "CHANGELOG.md: expected a section of $version"
+
+bash .ci/run
+cargo test --release -- --ignored
+cargo package --workspace --locked --exclude shearq-python --exclude shearq-benches
+bash .ci/release/archive.sh "$dist"
+if [ "${2:-}" = --tag ]; then
+    git tag -a "v$version" -m "shearq $version"
+    echo "Publish by: git push origin v$version && cargo publish --workspace --exclude shearq-python --exclude shearq-benches"
+fi
