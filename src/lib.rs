@@ -77,7 +77,7 @@ enum Command {
     #[command(after_help = "Example:\n  shearq mean --measured linear")]
     Mean(mean::Arguments),
     #[command(
-        after_help = "Example:\n  shearq select --measured linear --where 'snr > 10, size > 2.5' --out bright"
+        after_help = "Example:\n  shearq select --measured linear --where 'step(snr, 10) and step(size, 2.5)' --out bright"
     )]
     Select(select::Arguments),
     #[command(
@@ -85,7 +85,7 @@ enum Command {
     )]
     Score(score::Arguments),
     #[command(
-        after_help = "Examples:\n  shearq compare raw den linear --format latex\n  shearq compare --store results --where 'snr=high,submission=23/*' --sort q:desc"
+        after_help = "Examples:\n  shearq compare raw den linear --format latex\n  shearq compare --store results --where \"snr == 'high' and submission == '23/*'\" --sort q:desc"
     )]
     Compare(compare::Arguments),
     #[command(

@@ -57,12 +57,12 @@ const WAYS: [(&str, &[&str]); 32] = [
     (
         "bias",
         &[
-            "CATALOGUE g1 g2 columns ellipticity truth-sign bins select design units drop-missing step bootstrap seed fail-above junit sums shard plot format wide metrics report",
-            "CATALOGUE truth columns ellipticity truth-sign bins select design units drop-missing step bootstrap seed fail-above junit sums shard plot format wide metrics report",
-            "CATALOGUE g1 g2 columns truth-sign bins select where weight design units drop-missing bootstrap seed fail-above junit sums shard plot format wide metrics report",
-            "CATALOGUE truth columns truth-sign bins select where weight design units drop-missing bootstrap seed fail-above junit sums shard plot format wide metrics report",
-            "CATALOGUE against g1 g2 columns ellipticity truth-sign bins select design units drop-missing step format wide metrics",
-            "CATALOGUE against truth columns ellipticity truth-sign bins select design units drop-missing step format wide metrics",
+            "CATALOGUE g1 g2 columns ellipticity truth-sign bins where design units drop-missing step bootstrap seed fail-above junit sums shard plot format wide metrics report",
+            "CATALOGUE truth columns ellipticity truth-sign bins where design units drop-missing step bootstrap seed fail-above junit sums shard plot format wide metrics report",
+            "CATALOGUE g1 g2 columns truth-sign bins where weight design units drop-missing bootstrap seed fail-above junit sums shard plot format wide metrics report",
+            "CATALOGUE truth columns truth-sign bins where weight design units drop-missing bootstrap seed fail-above junit sums shard plot format wide metrics report",
+            "CATALOGUE against g1 g2 columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
+            "CATALOGUE against truth columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
             "merge bootstrap seed fail-above junit plot format wide metrics report",
         ],
     ),

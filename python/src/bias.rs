@@ -16,7 +16,7 @@ use shearq_results::bias::truth::{TrueSign, Truth};
 use shearq_results::bias::{
     BiasFailure, Binning, Edges, Input, MOST_BINS, Request, Summed, Units, sum,
 };
-use shearq_results::expression::Expression;
+use shearq_results::expression::{Expression, ExpressionError};
 use shearq_results::views::bias::bias_table;
 use shearq_scoring::TruthSign;
 
@@ -171,8 +171,8 @@ pub(crate) fn bias_sums(
     ellipticity: Option<&str>,
     truth_sign: Option<&str>,
     bins: Option<(String, Option<usize>, Vec<f64>)>,
-    select: Option<&str>,
-    selection: [Option<String>; 2],
+    condition: Option<&str>,
+    weight: Option<&str>,
     design: Option<&str>,
     units: Option<String>,
     drop_missing: bool,
@@ -180,7 +180,7 @@ pub(crate) fn bias_sums(
 ) -> PyResult<BiasSums> {
     let value = |argument: &str| {
         let argument = argument.to_owned();
-        move |fault: String| PyValueError::new_err(format!("{argument}: {fault}"))
+        move |fault: ExpressionError| PyValueError::new_err(format!("{argument}: {fault}"))
     };
     let mut names = Names::default();
     for text in &columns {
@@ -243,15 +243,8 @@ pub(crate) fn bias_sums(
         shapes: ellipticity.map(shapes_of).transpose()?,
         sign,
         bins,
-        select: select
-            .map(Expression::parse)
-            .transpose()
-            .map_err(value("select"))?,
-        selection: shearq_results::select::selection(
-            selection[0].as_deref(),
-            selection[1].as_deref(),
-        )
-        .map_err(|fault| PyValueError::new_err(fault.to_string()))?,
+        selection: shearq_results::select::selection(condition, weight)
+            .map_err(|fault| PyValueError::new_err(fault.to_string()))?,
         design: design.map(design_of).transpose()?,
         units: match units.as_deref() {
             None => Units::Recognised,

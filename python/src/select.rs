@@ -8,7 +8,7 @@ use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use shearq_files::FileError;
-use shearq_results::select::{Weighted, selection};
+use shearq_results::select::{Weighted, smooth_selection};
 
 /// Columns of a catalogue after a selection: e1, e2, R11, R22, R12 and R21 before calibration, and the weight.
 type Selected<'py> = [Bound<'py, PyArray1<f64>>; 7];
@@ -18,11 +18,11 @@ type Selected<'py> = [Bound<'py, PyArray1<f64>>; 7];
 pub(crate) fn select<'py>(
     py: Python<'py>,
     columns: HashMap<String, PyReadonlyArray1<'py, f64>>,
-    cuts: Option<&str>,
+    condition: Option<&str>,
     weight: Option<&str>,
 ) -> PyResult<Selected<'py>> {
     let fault = |error: &dyn std::fmt::Display| PyValueError::new_err(error.to_string());
-    let selection = selection(cuts, weight).map_err(|error| fault(&error))?;
+    let selection = smooth_selection(condition, weight).map_err(|error| fault(&error))?;
     let path = Path::new("catalogue");
     let column = |name: &str| {
         let found = columns.get(name).and_then(|values| values.as_slice().ok());
@@ -36,7 +36,9 @@ pub(crate) fn select<'py>(
     };
     let weighted = Weighted::of(
         path,
-        &selection.map(|stated| stated.selection).unwrap_or_default(),
+        &selection
+            .and_then(|stated| stated.weights)
+            .unwrap_or_default(),
         column,
     );
     let Weighted {

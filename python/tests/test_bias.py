@@ -109,7 +109,7 @@ def test_measured_catalogues_are_calibrated_by_their_divisors(image):
         ({"bins": "snr"}, "bins: found 'snr'"),
         ({"bins": ("snr", [3, 2])}, "increasing edges"),
         ({"bins": ("size", 3)}, "there is no column `size`"),
-        ({"select": "snr >"}, "select: "),
+        ({"where": "snr >"}, "cannot read the expression"),
         ({"design": "pair"}, "design: found \"pair\""),
         ({"columns": {"e1": "shape"}}, "there is no column `shape`"),
         ({"columns": {"e9": "shape"}}, "unknown role"),

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use clap::builder::PossibleValue;
 use clap::{Args, ValueEnum};
 use shearq_bias::{Design, Errors};
@@ -77,17 +77,11 @@ pub(crate) struct Arguments {
     /// `flux/flux_error:5,10,20` has these edges.
     #[arg(long, value_name = "EXPRESSION:BINS", value_parser = parse_bins, conflicts_with = "merge")]
     bins: Option<Binning>,
-    /// Use only rows for which this holds, such as `snr > 10 and size < 4`.
-    #[arg(long, value_name = "EXPRESSION", value_parser = Expression::parse, conflicts_with = "merge")]
-    select: Option<Expression>,
-    /// Cuts on catalogues of linear configurations, such as `snr > 10, size > 2.5 +- 0.5`. The response contains how shear
-    /// changes the selection; `select` explains the steps.
-    #[arg(
-        long = "where",
-        value_name = "CONDITIONS",
-        conflicts_with_all = ["merge", "against", "ellipticity", "step"]
-    )]
-    cuts: Option<String>,
+    /// Use only galaxies for which this holds, such as "snr > 10 and size < 4". Catalogues of linear configurations can
+    /// also be cut by steps, such as "step(snr, 10, 1.5) and step(size, 2.5)", whose response to shear enters (see
+    /// `select`). The response of other conditions on measured quantities needs sheared catalogues.
+    #[arg(long = "where", value_name = "CONDITION", conflicts_with = "merge")]
+    condition: Option<String>,
     /// Weight of each galaxy, a smooth formula of `snr`, `flux` and `size`, such as `snr^2 / (snr^2 + 50)`.
     #[arg(long, value_name = "FORMULA", conflicts_with_all = ["merge", "against", "ellipticity", "step"])]
     weight: Option<String>,
@@ -101,9 +95,9 @@ pub(crate) struct Arguments {
     /// Leave out rows with missing numbers or without a true shear.
     #[arg(long, conflicts_with = "merge")]
     drop_missing: bool,
-    /// Artificial shear of metacalibration.
-    #[arg(long, value_name = "G", default_value_t = DEFAULT_STEP, value_parser = positive, conflicts_with = "merge")]
-    step: f64,
+    /// Artificial shear of metacalibration [default: 0.01].
+    #[arg(long, value_name = "G", value_parser = positive, conflicts_with = "merge")]
+    step: Option<f64>,
     /// Errors from so many bootstrap draws of units instead of a jackknife.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(10..=100_000))]
     bootstrap: Option<u32>,
@@ -197,37 +191,32 @@ impl From<DesignArgument> for Design {
 }
 
 /// Parses `EXPRESSION:N` or `EXPRESSION:EDGE,EDGE,...`.
-fn parse_bins(text: &str) -> Result<Binning, String> {
-    let expected = "expected EXPRESSION:N, or EXPRESSION:EDGE,EDGE,... with increasing edges";
-    let (of, bins) = text.rsplit_once(':').ok_or(expected)?;
+fn parse_bins(text: &str) -> anyhow::Result<Binning> {
+    let expected =
+        || anyhow!("expected EXPRESSION:N, or EXPRESSION:EDGE,EDGE,... with increasing edges");
+    let (of, bins) = text.rsplit_once(':').ok_or_else(expected)?;
     let of = Expression::parse(of)?;
-    let most = format!("expected 2 to {MOST_BINS} bins");
-    if let Ok(count) = bins.trim().parse::<usize>() {
-        let edges = Edges::Equal(count);
-        return match (2..=MOST_BINS).contains(&count) {
-            true => Ok(Binning { of, edges }),
-            false => Err(most),
-        };
-    }
-    let edges: Option<Vec<f64>> = bins
-        .split(',')
-        .map(|edge| {
-            edge.trim()
-                .parse()
-                .ok()
-                .filter(|edge: &f64| edge.is_finite())
-        })
-        .collect();
-    let edges = edges.filter(|edges| edges.len() > 1).ok_or(expected)?;
-    if edges.len() > MOST_BINS + 1 {
-        return Err(most);
-    }
-    match edges.windows(2).all(|pair| pair[0] < pair[1]) {
-        true => Ok(Binning {
-            of,
-            edges: Edges::Given(edges),
-        }),
-        false => Err(expected.into()),
+    let edges = match bins.trim().parse::<usize>() {
+        Ok(count) => Edges::Equal(count),
+        Err(_) => {
+            let edge = |text: &str| {
+                text.trim()
+                    .parse::<f64>()
+                    .ok()
+                    .filter(|edge| edge.is_finite())
+            };
+            let edges: Option<Vec<f64>> = bins.split(',').map(edge).collect();
+            Edges::Given(edges.ok_or_else(expected)?)
+        }
+    };
+    match &edges {
+        Edges::Given(edges) if edges.len() < 2 || !edges.is_sorted_by(|a, b| a < b) => {
+            Err(expected())
+        }
+        edges if !(2..=MOST_BINS).contains(&edges.count()) => {
+            Err(anyhow!("expected 2 to {MOST_BINS} bins"))
+        }
+        _ => Ok(Binning { of, edges }),
     }
 }
 
@@ -322,10 +311,10 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
     if let Some((g1, g2)) = arguments.g1.zip(arguments.g2) {
         made_by.push(("True shear".into(), format!("{g1}, {g2}")));
     }
-    if let Some(select) = &arguments.select {
-        made_by.push(("Selection".into(), select.text().to_owned()));
-    }
-    for (name, text) in [("Where", &arguments.cuts), ("Weight", &arguments.weight)] {
+    for (name, text) in [
+        ("Where", &arguments.condition),
+        ("Weight", &arguments.weight),
+    ] {
         if let Some(text) = text {
             made_by.push((name.into(), text.clone()));
         }
@@ -373,7 +362,7 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
         ),
         (
             "Step of metacalibration",
-            (arguments.step != DEFAULT_STEP).then(|| arguments.step.to_string()),
+            arguments.step.map(|step| step.to_string()),
         ),
         ("Limits", Some(limits.join(", "))),
     ];
@@ -421,6 +410,18 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
             "--shard: all shards need the same bins (found a number of bins, expected edges). Try: --bins 'snr:5,10,20'"
         );
     }
+    let selection = selection(arguments.condition.as_deref(), arguments.weight.as_deref())?;
+    if selection.as_ref().is_some_and(|own| own.weights.is_some()) {
+        // Catalogues of linear configurations contain shears with responses and no sheared catalogues.
+        let unused = [
+            ("--against", !arguments.against.is_empty()),
+            ("--ellipticity", arguments.ellipticity.is_some()),
+            ("--step", arguments.step.is_some()),
+        ];
+        if let Some((option, _)) = unused.into_iter().find(|(_, given)| *given) {
+            anyhow::bail!("{option}: cannot be used with step() in --where");
+        }
+    }
     let (catalogues, truth) = folders::expand(catalogues, truth)?;
     let request = Request {
         catalogues,
@@ -429,8 +430,7 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         shapes: arguments.ellipticity.map(Shapes::from),
         sign,
         bins: arguments.bins.clone(),
-        select: arguments.select.clone(),
-        selection: selection(arguments.cuts.as_deref(), arguments.weight.as_deref())?,
+        selection,
         design: arguments.design.map(Design::from),
         units: match arguments.units.as_deref() {
             None => Units::Recognised,
@@ -439,7 +439,7 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
             Some(column) => Units::Column(column.to_owned()),
         },
         drop_missing: arguments.drop_missing,
-        step: arguments.step,
+        step: arguments.step.unwrap_or(DEFAULT_STEP),
     };
     let own = |number: usize| Shard::holding(number, shard.of()) == shard;
     Ok(sum(&request, &own)?)

@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
 use clap::Args;
 
 use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
@@ -12,7 +11,8 @@ use shearq_dataset::run::Run;
 use shearq_render::figure::{Figure, HeatMap};
 use shearq_render::table::{Table, TableFormat};
 use shearq_results::compare::{Variant, by_name, chosen, score_all};
-use shearq_results::conditions::Conditions;
+use shearq_results::conditions::choose;
+use shearq_results::expression::Expression;
 use shearq_results::groups::{Group, Grouping, Order};
 use shearq_results::row::RunRecord;
 use shearq_results::store;
@@ -42,10 +42,10 @@ pub(crate) struct Arguments {
     /// Results store with the runs to compare, instead of folders.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["measured", "data", "foreign", "definition", "convention", "threads"])]
     store: Option<PathBuf>,
-    /// Compare only sets that meet all conditions, such as `snr=low,submission=23/*,q>50`. A condition is a column of
-    /// a results store, one of = != < <= > >=, and a value; `*` stands for any characters.
-    #[arg(long = "where", value_name = "CONDITIONS")]
-    conditions: Option<Conditions>,
+    /// Compare only sets for which this holds, such as "snr == 'low' and submission == '23/*' and q > 50": columns of a
+    /// results store. In a text `*` stands for any characters.
+    #[arg(long = "where", value_name = "CONDITION", value_parser = Expression::parse)]
+    condition: Option<Expression>,
     /// Metric or column to sort by, such as `q:desc`.
     #[arg(long, value_name = "FIELD[:desc]")]
     sort: Option<Order>,
@@ -78,7 +78,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             )?;
             let variants = chosen(
                 variants,
-                arguments.conditions.as_ref(),
+                arguments.condition.as_ref(),
                 arguments.sort.as_ref(),
             )?;
             (
@@ -139,15 +139,15 @@ fn folders(arguments: &Arguments, variants: &[Variant]) -> anyhow::Result<Table>
 /// Compares the runs of a store.
 fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)> {
     let (mut runs, notes) = store::read(path)?;
-    if let Some(conditions) = &arguments.conditions {
-        runs = conditions.choose(runs).context("--where")?;
+    if let Some(condition) = &arguments.condition {
+        runs = choose(condition, runs)?;
     }
     anyhow::ensure!(
         !runs.is_empty(),
         "{}: found no recorded run{}",
         path.display(),
-        match &arguments.conditions {
-            Some(_) => " that meets the conditions",
+        match &arguments.condition {
+            Some(_) => " that meets the conditions of --where",
             None => ". Try: shearq score --measured OUT --store DIR",
         }
     );

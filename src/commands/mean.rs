@@ -11,7 +11,7 @@ use shearq_measure::Warning;
 use shearq_pipeline::inputs;
 use shearq_results::mean::mean_shears;
 use shearq_results::score::without_catalogue;
-use shearq_results::select::selection;
+use shearq_results::select::smooth_selection;
 use shearq_results::views::mean::mean_table;
 
 /// Mean shear of each set, for fields of constant shear.
@@ -21,9 +21,11 @@ use shearq_results::views::mean::mean_table;
 /// assumes independent galaxies: for pairs that are rotated by 90 degrees it is too large.
 ///
 /// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px).
-/// The mean stays calibrated: the response contains how shear and noise change the selection. A cut is a smooth step. The
-/// weight is 1/2 at the threshold; it reaches 0 and 1 at the distance after `+-`.
-/// The default distance is 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in `size`. Wider steps give smaller errors.
+/// The mean stays calibrated: the response contains how shear and noise change the selection.
+///
+/// Cuts are smooth steps, because a sharp one has no finite response. `step(snr, 10, 1.5)` is a weight of 1/2 at an S/N of 10
+/// that reaches 0 and 1 at 10 ∓ 1.5; `1 - step(size, 6)` keeps small galaxies, and `and` joins steps. The default half
+/// width is 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in `size`. Wider steps give smaller errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
@@ -32,9 +34,9 @@ pub(crate) struct Arguments {
     /// Sets [default: all there are].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
-    /// Galaxies to keep, such as "snr > 10, size > 2.5 +- 0.5".
-    #[arg(long = "where", value_name = "CONDITIONS")]
-    cuts: Option<String>,
+    /// Galaxies to keep, such as "step(snr, 10) and step(size, 2.5, 0.5)".
+    #[arg(long = "where", value_name = "CONDITION")]
+    condition: Option<String>,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
     #[arg(long, value_name = "FORMULA")]
     weight: Option<String>,
@@ -48,12 +50,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Arguments {
         measured,
         sets,
-        cuts,
+        condition,
         weight,
         form,
         threads,
     } = arguments;
-    let selection = selection(cuts.as_deref(), weight.as_deref())?;
+    let selection = smooth_selection(condition.as_deref(), weight.as_deref())?;
     let run = Run::require(measured)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
     // The data may have been removed since.
@@ -68,7 +70,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         &run,
         measured,
         sets,
-        selection.as_ref().map(|stated| &stated.selection),
+        selection
+            .as_ref()
+            .and_then(|stated| stated.weights.as_ref()),
     )?;
     for mean in &means {
         let set = mean.set;
@@ -104,7 +108,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             .notes
             .push(format!("The catalogues have the selection `{text}`."));
     }
-    let chosen = [("where", cuts), ("weight", weight)];
+    let chosen = [("where", condition), ("weight", weight)];
     for (name, text) in chosen {
         if let Some(text) = text {
             table

@@ -6,7 +6,7 @@ use clap::Args;
 
 use crate::tell;
 use shearq_dataset::run::Run;
-use shearq_results::select::{selection, write_selected};
+use shearq_results::select::{smooth_selection, write_selected};
 
 /// Write catalogues with cuts and weights that keep the shear calibrated.
 ///
@@ -15,20 +15,21 @@ use shearq_results::select::{selection, write_selected};
 /// the selection. `score`, `mean`, `bias`, `compare` and `pack` then use the selection. Rows of galaxies that are left out
 /// stay, with ellipticity and response zero; the column `selection` has the weights.
 ///
-/// A cut is a smooth step. The weight is 1/2 at the threshold; it reaches 0 and 1 at the distance after `+-`.
-/// The default distance is 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in `size`. Wider steps give smaller errors.
+/// Cuts are smooth steps, because a sharp one has no finite response. `step(snr, 10, 1.5)` is a weight of 1/2 at an S/N of 10
+/// that reaches 0 and 1 at 10 ∓ 1.5; `1 - step(size, 6)` keeps small galaxies, and `and` joins steps. The default half
+/// width is 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in `size`. Wider steps give smaller errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
     #[arg(long, value_name = "DIR")]
     measured: PathBuf,
-    /// Galaxies to keep, such as "snr > 10, size > 2.5 +- 0.5".
+    /// Galaxies to keep, such as "step(snr, 10) and step(size, 2.5, 0.5)".
     #[arg(
         long = "where",
-        value_name = "CONDITIONS",
+        value_name = "CONDITION",
         required_unless_present = "weight"
     )]
-    cuts: Option<String>,
+    condition: Option<String>,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
     #[arg(long, value_name = "FORMULA")]
     weight: Option<String>,
@@ -40,12 +41,12 @@ pub(crate) struct Arguments {
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Arguments {
         measured,
-        cuts,
+        condition,
         weight,
         out,
     } = arguments;
     let run = Run::require(measured)?;
-    let Some(selection) = selection(cuts.as_deref(), weight.as_deref())? else {
+    let Some(selection) = smooth_selection(condition.as_deref(), weight.as_deref())? else {
         return Ok(());
     };
     let (kept, good) = write_selected(&run, measured, out, &selection)?;

@@ -415,7 +415,7 @@ fn bad_catalogues_give_one_clear_error() {
     );
     refused(
         &nothing,
-        &["--select", "sn > 3"],
+        &["--where", "sn > 3"],
         true,
         "there is no column `sn`",
     );
@@ -1174,7 +1174,7 @@ fn a_selection_without_its_response_is_always_noted() {
     let folder = tempfile::tempdir().unwrap();
     let [plus, minus] = pair(folder.path());
     let said = |select: &str| {
-        let output = shearq(&["bias", text(&plus), text(&minus), "--select", select]);
+        let output = shearq(&["bias", text(&plus), text(&minus), "--where", select]);
         String::from_utf8(output.stderr).unwrap()
     };
     let warning = said("snr > 20");
@@ -1215,7 +1215,7 @@ fn sizes_of_versions_give_the_response_of_a_selection() {
         path
     });
     let [plus, minus] = [text(&files[0]), text(&files[1])];
-    let found = &rows(&[plus, minus, "--select", "T > 1"])[0];
+    let found = &rows(&[plus, minus, "--where", "T > 1"])[0];
     for key in ["m1", "m2"] {
         let (m, error) = (number(found, key), number(found, &format!("{key}_error")));
         assert!(
@@ -1225,7 +1225,7 @@ fn sizes_of_versions_give_the_response_of_a_selection() {
     }
     // The response of the selection is about 2 σ² times the density of ln T at the cut over the share: 0.16.
     assert!(number(found, "r1") > 1.1, "{found}");
-    let printed = shearq(&["bias", plus, minus, "--select", "T > 1"]);
+    let printed = shearq(&["bias", plus, minus, "--where", "T > 1"]);
     assert!(printed.stderr.is_empty());
 }
 

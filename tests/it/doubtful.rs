@@ -393,7 +393,7 @@ fn folders_are_chosen_sorted_and_grouped_like_a_store() {
         table["rows"].as_array().unwrap().clone()
     };
     let q = |row: &serde_json::Value| row["q"].as_f64().unwrap();
-    let (all, one) = (rows(&[]), rows(&["--where", "set=8"]));
+    let (all, one) = (rows(&[]), rows(&["--where", "set == 8"]));
     assert_ne!(q(&all[0]), q(&one[0]));
     let grouped = rows(&["--group-by", "set", "--sort", "q:desc"]);
     let sets: Vec<f64> = grouped
@@ -405,9 +405,9 @@ fn folders_are_chosen_sorted_and_grouped_like_a_store() {
     assert!(grouped[2..].iter().any(|row| q(row) == q(&one[0])));
     let sorted = rows(&["--sort", "q:desc"]);
     assert!(q(&sorted[0]) >= q(&sorted[1]));
-    let named = rows(&["--where", "submission=48/*"]);
+    let named = rows(&["--where", "submission == '48/*'"]);
     assert_eq!(named.len(), 1);
-    let message = fail(&["compare", text(&raw), "--where", "set=3"]);
+    let message = fail(&["compare", text(&raw), "--where", "set == 3"]);
     assert!(message.contains("no set meets the conditions"), "{message}");
     // A data folder in place of results.
     let message = fail(&["compare", text(&data), text(&raw)]);

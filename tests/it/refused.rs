@@ -194,7 +194,7 @@ fn kinds_are_those_of_simulated_sets_alone() {
         "--store",
         text(&store),
         "--where",
-        "set_kind=Fiducial",
+        "set_kind == 'Fiducial'",
     ];
     succeed(&chosen);
     // The same images without a word of where they come from.

@@ -26,7 +26,7 @@ fn selected_folders_have_the_means_of_the_option_and_can_be_scored() {
     // The median, so that some galaxies are left out, some weighted.
     let mut sizes = small.measured("02", "size");
     sizes.sort_by(f64::total_cmp);
-    let cut = format!("size > {}", sizes[sizes.len() / 2]);
+    let cut = format!("step(size, {})", sizes[sizes.len() / 2]);
     let options = ["--where", &cut, "--weight", "snr^2/(snr^2 + 100)"];
     let arguments = ["select", "--measured", text(&out), "--out", text(&chosen)];
     succeed(&[&arguments[..], &options].concat());
@@ -73,7 +73,7 @@ fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
     ];
     let simulated = [&["simulate", "--out", text(&data)], &size[..], &shears].concat();
     succeed(&simulated);
-    let cut = ["--where", "size > 2, snr > 15"];
+    let cut = ["--where", "step(size, 2) and step(snr, 15)"];
     let (mut measured, mut selected) = (Vec::new(), Vec::new());
     for sign in ["+", "-"] {
         let data = data.join(format!("g1_{sign}0.02_g2_{sign}0.02"));
@@ -104,8 +104,8 @@ fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
     }
     let (_, warned) = m(&measured, &["--bins", "snr:2"]);
     assert!(warned.contains("a choice by `snr`"), "{warned}");
-    let (filtered, warned) = m(&measured, &["--select", "size > 2 and snr > 15"]);
-    assert!(warned.contains("Try: --where"), "{warned}");
+    let (filtered, warned) = m(&measured, &["--where", "size > 2 and snr > 15"]);
+    assert!(warned.contains("Try: --where 'step("), "{warned}");
     // A cut in size removes sheared galaxies; m of 3200 galaxies without shape noise has an error of 0.03.
     assert!(filtered[0] + filtered[1] < -0.2, "{filtered:?}");
     // The table says how the galaxies were chosen, and shards of other choices do not merge.
@@ -126,11 +126,11 @@ fn bias_has_the_selection_of_the_folder_and_warns_of_others() {
         succeed(&[&["bias"], &folders[..], &options].concat());
         text(&sums).to_owned()
     };
-    let (first, second) = (shard(1, "snr > 15"), shard(2, "snr > 15"));
+    let (first, second) = (shard(1, "step(snr, 15)"), shard(2, "step(snr, 15)"));
     let merged = succeed(&["bias", "--merge", &first, &second]);
-    let stated = "Selection: where: snr > 15; weight: snr^2.";
+    let stated = "Selection: where: step(snr, 15); weight: snr^2.";
     assert!(merged.contains(stated), "{merged}");
-    let other = shard(2, "snr > 16");
+    let other = shard(2, "step(snr, 16)");
     let refused = fail(&["bias", "--merge", &first, &other]);
     assert!(refused.contains("different options"), "{refused}");
     let path = at("chosen+").join("set02/catalogue-001.parquet");
@@ -161,7 +161,7 @@ fn sheared_versions_give_the_response_of_any_selection() {
     let said = |options: &[&str]| succeed(&[&["bias"], &folders[..], options].concat());
     // The ellipticity of each version may be cut, too.
     let cut = [
-        "--select",
+        "--where",
         "e1*e1 + e2*e2 < 0.09 and size > 1",
         "--step",
         "0.02",
@@ -182,7 +182,7 @@ fn sheared_versions_give_the_response_of_any_selection() {
     assert!(said(&cut).contains("Columns: shearq, sheared versions."));
     // Names of the unsheared version, and columns that shear does not change, select the same galaxies with the same response.
     let json = |select: &str| {
-        let printed = said(&["--select", select, "--step", "0.02", "--format", "json"]);
+        let printed = said(&["--where", select, "--step", "0.02", "--format", "json"]);
         let table: Value = serde_json::from_str(&printed).unwrap();
         table["rows"][0].clone()
     };
@@ -197,13 +197,13 @@ fn sheared_versions_give_the_response_of_any_selection() {
         let table: Value = serde_json::from_str(&printed).unwrap();
         ["m1", "m2", "r1", "r2"].map(|name| table["rows"][0][name].as_f64().unwrap())
     };
-    let alone = of_all(&["--select", "size > 2.7"]);
-    let binned = of_all(&["--select", "size > 2.7", "--bins", "x:2"]);
+    let alone = of_all(&["--where", "size > 2.7"]);
+    let binned = of_all(&["--where", "size > 2.7", "--bins", "x:2"]);
     for (alone, binned) in alone.iter().zip(binned) {
         // Sums in another order.
         assert!((alone - binned).abs() < 1e-9, "{alone} {binned}");
     }
-    let by_place = of_all(&["--select", "x > 0", "--bins", "snr:2"]);
+    let by_place = of_all(&["--where", "x > 0", "--bins", "snr:2"]);
     for (alone, binned) in of_all(&["--bins", "snr:2"]).iter().zip(by_place) {
         assert!((alone - binned).abs() < 1e-9, "{alone} {binned}");
     }
@@ -221,7 +221,7 @@ fn sheared_versions_give_the_response_of_any_selection() {
             &[
                 &["bias"],
                 &folders[..],
-                &["--select", select, "--step", "0.02"],
+                &["--where", select, "--step", "0.02"],
             ]
             .concat(),
         );
@@ -229,7 +229,7 @@ fn sheared_versions_give_the_response_of_any_selection() {
     }
     // Without a selection that needs them, and with one whose response is known, versions only add noise.
     assert!(said(&[]).contains("Columns: shearq."));
-    assert!(said(&["--where", "snr > 20"]).contains("Columns: shearq."));
+    assert!(said(&["--where", "step(snr, 20)"]).contains("Columns: shearq."));
     let refused = fail(&[&["bias"], &folders[..], &cut[..2]].concat());
     assert!(
         refused.contains("found 0.02, expected 0.01). Try: --step 0.02"),
@@ -238,7 +238,7 @@ fn sheared_versions_give_the_response_of_any_selection() {
     // What `select` wrote has none that are not selected.
     let chosen = at("chosen");
     let folders = ["--measured", &measured[0], "--out", text(&chosen)];
-    succeed(&[&["select"], &folders[..], &["--where", "snr > 20"]].concat());
+    succeed(&[&["select"], &folders[..], &["--where", "step(snr, 20)"]].concat());
     for (folder, has) in [(at("+"), true), (chosen, false)] {
         let path = folder.join("set08/catalogue-001.parquet");
         let read = table::read(&path, None, table::MAX_ROWS).unwrap();
@@ -255,9 +255,14 @@ fn selections_that_cannot_be_corrected_are_refused() {
     let refused =
         |option: &str, value: &str| fail(&["mean", "--measured", text(&out), option, value]);
     for (option, value, expected) in [
-        ("--where", "R11 > 0.3", "its response to shear is not known"),
-        ("--where", "snr", "not a condition on galaxies"),
-        ("--where", "snr > 1e9", "the selection leaves none"),
+        (
+            "--where",
+            "step(R11, 0.3)",
+            "its response to shear is not known",
+        ),
+        ("--where", "snr > 10", "Try: step(NAME, THRESHOLD)"),
+        ("--where", "step(snr, 10, 0)", "half width positive"),
+        ("--where", "step(snr, 1e9)", "the selection leaves none"),
         ("--weight", "abs(snr)", "is not smooth"),
         ("--weight", "e1", "cannot depend on `e1`"),
         ("--weight", "snr +", "cannot read the expression"),
@@ -268,14 +273,14 @@ fn selections_that_cannot_be_corrected_are_refused() {
     }
     let (from, to) = (text(&out), small.at("too-few"));
     let select = ["select", "--measured", from, "--out", text(&to), "--where"];
-    let message = fail(&[&select[..], &["snr > 1e9"]].concat());
+    let message = fail(&[&select[..], &["step(snr, 1e9)"]].concat());
     assert!(
         message.contains("leaves no galaxies with a response"),
         "{message}"
     );
     assert!(!to.exists());
     small.measure(&["--submission", "23/raw/star"]);
-    let message = refused("--where", "snr > 10");
+    let message = refused("--where", "step(snr, 10)");
     assert!(
         message.contains("expected a catalogue of a linear configuration"),
         "{message}"

@@ -137,7 +137,10 @@ fn runs_are_chosen_sorted_and_grouped() {
     let down = recorded.compare("store", &["--sort", "q:desc"]);
     assert!(q(&up[0]) <= q(&up[1]) && q(&up[0]) == q(&down[1]));
     assert!(up[0]["q_difference"].is_null() && up[1]["q_difference"].is_number());
-    let chosen = recorded.compare("store", &["--where", "snr=low,submission=*/star"]);
+    let chosen = recorded.compare(
+        "store",
+        &["--where", "snr == 'low' and submission == '*/star'"],
+    );
     assert_eq!(chosen.len(), 1);
     assert_eq!(chosen[0]["sets"], "5");
     assert_eq!(chosen[0]["submission"], "23/raw/star");
@@ -149,10 +152,10 @@ fn runs_are_chosen_sorted_and_grouped() {
     assert!(grouped[1]["sigma"].is_null());
     let store = recorded.at("store");
     let mut query = vec!["compare", "--store", text(&store), "--where"];
-    query.push("colour=red");
+    query.push("colour == 'red'");
     let message = fail(&query);
     assert!(message.contains("found `colour`") && message.contains("set_kind"));
-    query[3] = "--where=q>300000";
+    query[3] = "--where=q > 300000";
     query.pop();
     assert!(fail(&query).contains("meets the conditions"));
     let picture = recorded.at("map.png");

@@ -187,7 +187,7 @@ fn cuts_that_are_true_for_good_rows_and_constant_patches_are_refused() {
     });
     let error = fail(&["bias", &plus, &minus]);
     assert!(
-        error.contains("--columns flag=none --select flags_select"),
+        error.contains("--columns flag=none --where flags_select"),
         "{error}"
     );
     let found = result(&[
@@ -195,7 +195,7 @@ fn cuts_that_are_true_for_good_rows_and_constant_patches_are_refused() {
         &minus,
         "--columns",
         "flag=none",
-        "--select",
+        "--where",
         "flags_select",
     ]);
     assert_eq!(number(&found, "n"), 1600.0);
@@ -216,8 +216,8 @@ fn choices_failures_and_repeated_numbers_are_named() {
     let every =
         |id: usize, one: &str, other: &str| if id % 50 == 3 { one } else { other }.to_owned();
     for (names, one, other, expected) in [
-        ("is_primary", "0", "1", "--select 'is_primary'"),
-        ("deblend_failed", "1", "0", "--select 'not(deblend_failed)'"),
+        ("is_primary", "0", "1", "--where 'is_primary'"),
+        ("deblend_failed", "1", "0", "--where 'not(deblend_failed)'"),
         (
             "psf_e1,psf_e2",
             "2,2",

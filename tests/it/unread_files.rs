@@ -55,7 +55,7 @@ fn image_1000_of_set_100_goes_through_all_commands() {
     let score = ["score", "--measured", text(&out), "--store", text(&store)];
     let said = reported(&[&score[..], &["--sets", "100"]].concat());
     assert!(said.contains("100") && !said.contains("arning"), "{said}");
-    let listed = reported(&["compare", "--store", text(&store), "--where", "set=100"]);
+    let listed = reported(&["compare", "--store", text(&store), "--where", "set == 100"]);
     assert!(listed.contains("23/raw/star"), "{listed}");
     succeed(&["mean", "--measured", text(&out)]);
     succeed(&["merge", text(&out)]);

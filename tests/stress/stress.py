@@ -96,7 +96,7 @@ def measured(case, stamps, stars, fields, options):
             values = np.concatenate([table[column].to_numpy()[table["flags"].to_numpy() == 0] for table in tables])
             selected = Path(folder) / "selected"
             command = [options.shearq, "select", "--measured", str(out), "--out", str(selected)]
-            command += ["--where", f"{column} > {np.quantile(values, share)}"]
+            command += ["--where", f"step({column}, {np.quantile(values, share)})"]
             run = subprocess.run(command, capture_output=True, text=True)
             if run.returncode:
                 sys.exit(f"{case.name}: {run.stderr}")

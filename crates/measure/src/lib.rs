@@ -87,7 +87,7 @@ pub use observables::{Coupling, Observables};
 pub use pixel::{Pixel, Pixels};
 pub use psf::{Star, average_stars, star, star_psf};
 pub use psfs::Psfs;
-pub use selection::{Cut, Quantity, Selected, Selection, SelectionError};
+pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{
     ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,
     RowJob, Session, StampRows, StampSource, Threads,

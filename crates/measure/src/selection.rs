@@ -15,10 +15,7 @@
 //! density of galaxies at the edge, with an infinite scatter.
 
 use std::fmt;
-use std::str::FromStr;
 use std::sync::Arc;
-
-use thiserror::Error;
 
 use crate::measurement::ResponseMatrix;
 use crate::observables::{Coupling, Observables};
@@ -63,29 +60,7 @@ pub struct Cut {
     pub half_width: Option<f64>,
 }
 
-/// Why a selection cannot be used.
-#[derive(Debug, Clone, PartialEq, Error)]
-#[non_exhaustive]
-pub enum SelectionError {
-    /// A condition that cannot be read.
-    #[error(
-        "not a condition on galaxies (found `{0}`, expected snr, flux or size, > or <, and a number, such as `snr > 10` or `size > 2.5 +- 0.5`)"
-    )]
-    Condition(String),
-    /// A column whose response to shear is unknown.
-    #[error(
-        "galaxies cannot be selected by `{0}`: its response to shear is not known, so the mean shear would be biased (expected snr, flux or size)"
-    )]
-    Unknown(String),
-    /// A number that is out of its range.
-    #[error("`{0}`: the threshold must be finite and the half width positive")]
-    Range(String),
-}
-
 /// Cuts and a weight, which are multiplied.
-///
-/// From text: conditions with commas between them, such as `snr > 10, size > 2.5 +- 0.5`. The number after `+-` is the
-/// half width of the step.
 #[derive(Clone, Default)]
 pub struct Selection {
     cuts: Vec<Cut>,
@@ -125,47 +100,16 @@ struct Jet {
     second: [f64; 3],
 }
 
-impl FromStr for Selection {
-    type Err = SelectionError;
-
-    fn from_str(text: &str) -> Result<Self, SelectionError> {
-        let cuts = text
-            .split(',')
-            .map(Cut::from_str)
-            .collect::<Result<_, _>>()?;
-        Ok(Selection { cuts, weight: None })
-    }
-}
-
-impl FromStr for Cut {
-    type Err = SelectionError;
-
-    fn from_str(text: &str) -> Result<Self, SelectionError> {
-        let unread = || SelectionError::Condition(text.trim().to_owned());
-        let at = text.find(['<', '>']).ok_or_else(unread)?;
-        let name = text[..at].trim();
-        let above = text[at..].starts_with('>');
-        let rest = text[at + 1..].trim_start_matches('=');
-        let (threshold, width) = match rest.split_once("+-").or_else(|| rest.split_once('±')) {
-            Some((threshold, width)) => (threshold, Some(width)),
-            None => (rest, None),
-        };
-        let number = |text: &str| text.trim().parse::<f64>().map_err(|_| unread());
-        let (threshold, half_width) = (number(threshold)?, width.map(number).transpose()?);
-        let word = |name: &str| name.chars().all(|c| c.is_alphanumeric() || c == '_');
-        let known = Quantity::ALL.iter().find(|(known, _)| *known == name);
-        let quantity = match known {
-            Some((_, quantity)) => *quantity,
-            None if !name.is_empty() && word(name) => {
-                return Err(SelectionError::Unknown(name.to_owned()));
-            }
-            None => return Err(unread()),
-        };
-        if !threshold.is_finite() || half_width.is_some_and(|width| width.is_nan() || width <= 0.0)
-        {
-            return Err(SelectionError::Range(text.trim().to_owned()));
-        }
-        Ok(Cut {
+impl Cut {
+    /// A cut; `None` if the threshold is not finite or the half width not positive.
+    pub fn new(
+        quantity: Quantity,
+        above: bool,
+        threshold: f64,
+        half_width: Option<f64>,
+    ) -> Option<Self> {
+        let usable = threshold.is_finite() && half_width.is_none_or(|width| width > 0.0);
+        usable.then_some(Cut {
             quantity,
             above,
             threshold,
@@ -175,6 +119,13 @@ impl FromStr for Cut {
 }
 
 impl Selection {
+    /// Adds a cut.
+    #[must_use]
+    pub fn with_cut(mut self, cut: Cut) -> Self {
+        self.cuts.push(cut);
+        self
+    }
+
     /// Adds a weight: a function of S/N, flux and size that is smooth on the scale of their noise. Derivatives are taken
     /// numerically.
     #[must_use]
@@ -333,39 +284,27 @@ mod tests {
 
     const RESPONSE: ResponseMatrix = [[0.4, 9.0], [9.0, 0.3]];
 
-    #[test]
-    fn conditions_are_read_or_refused_with_the_reason() {
-        let selection: Selection = "snr > 10, size<=2.5 +- 0.5".parse().unwrap();
-        let [snr, size] = selection.cuts() else {
-            panic!("{selection:?}")
+    fn cuts(all: &[(Quantity, bool, f64, Option<f64>)]) -> Selection {
+        let add = |selection: Selection, (quantity, above, at, width): &(_, _, _, _)| {
+            selection.with_cut(Cut::new(*quantity, *above, *at, *width).unwrap())
         };
-        assert_eq!(
-            (snr.quantity, snr.above, snr.threshold),
-            (Quantity::Snr, true, 10.0)
-        );
-        assert_eq!(snr.half_width, None);
-        assert_eq!(
-            (size.quantity, size.above, size.half_width),
-            (Quantity::Size, false, Some(0.5))
-        );
-        for (text, expected) in [
-            ("R11 > 0.3", "galaxies cannot be selected by `R11`"),
-            ("size", "not a condition"),
-            ("size > big", "not a condition"),
-            ("snr > 10 +- 0", "half width positive"),
-            ("snr > nan", "must be finite"),
-            ("", "not a condition"),
-        ] {
-            let error = text.parse::<Selection>().unwrap_err().to_string();
-            assert!(error.contains(expected), "{text}: {error}");
+        all.iter().fold(Selection::default(), add)
+    }
+
+    #[test]
+    fn cuts_without_a_place_or_a_width_are_refused() {
+        for (threshold, width) in [(f64::NAN, None), (10.0, Some(0.0)), (10.0, Some(f64::NAN))] {
+            assert_eq!(Cut::new(Quantity::Snr, true, threshold, width), None);
         }
     }
 
     #[test]
     fn steps_and_their_products_have_the_derivatives_of_differences() {
-        let selection: Selection = "snr > 14.2, size > 2.4 +- 0.4, flux < 31 +- 4"
-            .parse()
-            .unwrap();
+        let selection = cuts(&[
+            (Quantity::Snr, true, 14.2, None),
+            (Quantity::Size, true, 2.4, Some(0.4)),
+            (Quantity::Flux, false, 31.0, Some(4.0)),
+        ]);
         let jet = selection.jet(&galaxy());
         let plain = selection.clone();
         let value = move |_: f64, flux: f64, size: f64| {
@@ -397,10 +336,10 @@ mod tests {
     #[test]
     fn galaxies_away_from_the_step_keep_their_ellipticity_or_vanish() {
         let e = [0.1, -0.2];
-        let all: Selection = "snr > 5".parse().unwrap();
+        let all = cuts(&[(Quantity::Snr, true, 5.0, None)]);
         let kept = all.apply(e, RESPONSE, &galaxy());
         assert_eq!((kept.e, kept.response, kept.weight), (e, RESPONSE, 1.0));
-        let none: Selection = "snr < 5".parse().unwrap();
+        let none = cuts(&[(Quantity::Snr, false, 5.0, None)]);
         assert_eq!(none.apply(e, RESPONSE, &galaxy()), Selected::default());
     }
 

@@ -4,7 +4,7 @@ use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_measure::{ImageNoise, Measurement, Measurer, Selection};
+use shearq_measure::{Cut, ImageNoise, Measurement, Measurer, Quantity, Selection};
 use shearq_submissions::Method;
 
 const N: usize = 48;
@@ -110,12 +110,16 @@ fn mean_of(batches: [f64; BATCHES]) -> (f64, f64) {
 #[test]
 fn cuts_on_noisy_sizes_and_fluxes_leave_the_shear_as_it_is() {
     let measurer = Measurer::named("48/linear/star", N).unwrap();
-    let cuts: [Selection; 3] = [
-        "size > 2.6 +- 0.4",
-        "snr > 8 +- 2",
-        "flux < 125 +- 30, size > 2.2",
-    ]
-    .map(|text| text.parse().unwrap());
+    let cut = |quantity, above, threshold, half_width| {
+        Cut::new(quantity, above, threshold, half_width).unwrap()
+    };
+    let cuts = [
+        Selection::default().with_cut(cut(Quantity::Size, true, 2.6, Some(0.4))),
+        Selection::default().with_cut(cut(Quantity::Snr, true, 8.0, Some(2.0))),
+        Selection::default()
+            .with_cut(cut(Quantity::Flux, false, 125.0, Some(30.0)))
+            .with_cut(cut(Quantity::Size, true, 2.2, None)),
+    ];
     // Of each cut: with the response of the selection, and with the responses of the galaxies alone.
     let mut sums = [[[Sums::default(); BATCHES]; 2]; 3];
     let flagged = measure_pairs(&measurer, |batch, sign, galaxy| {

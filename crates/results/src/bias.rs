@@ -63,6 +63,16 @@ pub enum Edges {
     Given(Vec<f64>),
 }
 
+impl Edges {
+    /// Number of bins.
+    pub fn count(&self) -> usize {
+        match self {
+            Edges::Equal(count) => *count,
+            Edges::Given(edges) => edges.len().saturating_sub(1),
+        }
+    }
+}
+
 /// Which galaxies form an independent unit.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub enum Units {
@@ -107,9 +117,7 @@ pub struct Request {
     pub sign: TrueSign,
     /// Bins.
     pub bins: Option<Binning>,
-    /// Rows that count.
-    pub select: Option<Expression>,
-    /// Cuts and weights of catalogues of linear configurations, whose response to shear enters.
+    /// Rows that count, and weights of catalogues of linear configurations, whose response to shear enters.
     pub selection: Option<StatedSelection>,
     /// The design; recognised if `None`.
     pub design: Option<Design>,
@@ -143,7 +151,7 @@ pub struct Summed {
     /// Text of the binned expression.
     binned: String,
     edges: Vec<f64>,
-    /// Measured columns in `--select` or `--bins`.
+    /// Measured columns in `--where` or `--bins`.
     measured: Vec<String>,
     /// Which rows count, and their weights, in words of the options.
     selection: Option<String>,
@@ -200,9 +208,9 @@ pub struct BiasResult {
     pub catalogues: Vec<Catalogue>,
     /// The program that wrote them.
     pub program: String,
-    /// Columns of `--select` or `--bins` without sheared versions: m contains how shear changes this choice.
+    /// Columns of `--where` or `--bins` without sheared versions: m contains how shear changes this choice.
     pub measured: Vec<String>,
-    /// The texts of the options that select and weight rows, such as `select: snr > 10`.
+    /// The texts of the options that select and weight rows, such as `where: snr > 10`.
     pub selection: Option<String>,
     /// Which columns are used as what, and which look as if they should be, a line each.
     pub columns: Vec<String>,
@@ -230,15 +238,6 @@ const SAMPLE: usize = 1 << 20;
 pub const MOST_BINS: usize = 100;
 
 impl Request {
-    /// The texts of what selects and weights rows.
-    fn stated_selection(&self) -> Option<String> {
-        let select = self.select.as_ref();
-        let select = select.map(|expression| format!("select: {}", expression.text()));
-        let stated = self.selection.as_ref().map(|stated| stated.text.clone());
-        let parts: Vec<String> = select.into_iter().chain(stated).collect();
-        (!parts.is_empty()).then(|| parts.join("; "))
-    }
-
     fn reading(&self) -> Result<Reading, FileError> {
         let paths = self.catalogues.iter().map(|input| input.name.as_path());
         Ok(Reading {
@@ -246,11 +245,8 @@ impl Request {
             truth: self.truth.of_paths(paths)?,
             shapes: self.shapes,
             flip_g2: false,
-            select: self.select.clone(),
-            selection: self
-                .selection
-                .as_ref()
-                .map(|stated| stated.selection.clone()),
+            select: self.selection.as_ref().and_then(|own| own.rows.clone()),
+            selection: self.selection.as_ref().and_then(|own| own.weights.clone()),
             binned: self.bins.as_ref().map(|bins| bins.of.clone()),
             drop_missing: self.drop_missing,
             step: self.step,
@@ -322,7 +318,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
             .map_or_else(String::new, |bins| bins.of.text().to_owned()),
         edges,
         measured,
-        selection: request.stated_selection(),
+        selection: request.selection.as_ref().map(|own| own.text.clone()),
         columns: described,
         sign,
     };

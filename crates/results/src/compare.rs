@@ -8,7 +8,8 @@ use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
 use shearq_scoring::{Choice, Definition, FieldSum, Grid, Options, RowCounts};
 use shearq_submissions::{Published, Registry};
 
-use super::conditions::Conditions;
+use super::conditions::{ChoiceError, choose};
+use super::expression::Expression;
 use super::foreign::Foreign;
 use super::groups::Order;
 use super::row::{RunRecord, SetRecord, choice_word, definition_word};
@@ -55,13 +56,13 @@ fn records(sets: &[ScoredSet]) -> Vec<SetRecord> {
 /// If a condition has an unknown column, or no set meets the conditions.
 pub fn chosen(
     variants: Vec<Variant>,
-    conditions: Option<&Conditions>,
+    condition: Option<&Expression>,
     order: Option<&Order>,
-) -> Result<Vec<Variant>, PipelineError> {
+) -> Result<Vec<Variant>, ChoiceError> {
     let mut kept = Vec::new();
     for mut variant in variants {
-        if let Some(conditions) = conditions {
-            let left = conditions.choose(vec![variant.run])?;
+        if let Some(condition) = condition {
+            let left = choose(condition, vec![variant.run])?;
             let Some(run) = left.into_iter().next() else {
                 continue;
             };
@@ -72,13 +73,11 @@ pub fn chosen(
         kept.push(variant);
     }
     if kept.is_empty() {
-        let message = "--where: no set meets the conditions";
-        return Err(PipelineError::Request(message.into()));
+        return Err(ChoiceError::NoSet);
     }
     let sets: Vec<Vec<SetRecord>> = kept.iter().map(Variant::records).collect();
     if common_sets(&sets).is_empty() {
-        let message = "--where: the sets that meet the conditions have none in common";
-        return Err(PipelineError::Request(message.into()));
+        return Err(ChoiceError::NoCommonSet);
     }
     if let Some(order) = order {
         kept.sort_by(|a, b| order.compare(&a.run, &b.run));

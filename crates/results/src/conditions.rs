@@ -1,169 +1,72 @@
-//! Conditions that choose rows of a results store.
+//! `compare --where`: conditions on the columns of a results store.
 
-use std::str::FromStr;
+use shearq_files::frames::polars::DataFrame;
+use shearq_files::frames::{TableError, reals};
+use thiserror::Error;
 
-use shearq_files::frames::polars::{Column, DataFrame};
-use shearq_files::frames::reals;
-
+use super::expression::{Expression, Operand, fits};
 use super::row::{RunRecord, table_of};
-use shearq_pipeline::PipelineError;
 
-/// How a column is compared with a value.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Relation {
-    Is,
-    IsNot,
-    Below,
-    AtMost,
-    Above,
-    AtLeast,
+/// Why sets cannot be chosen.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ChoiceError {
+    #[error(transparent)]
+    Table(#[from] TableError),
+    #[error(
+        "--where: unknown column of a results store (found `{found}`, expected one of {known})"
+    )]
+    UnknownColumn { found: String, known: String },
+    #[error(
+        "--where: column `{0}` contains numbers (found a comparison with a text, expected a number)"
+    )]
+    Numbers(String),
+    #[error(
+        "--where: column `{0}` contains text (expected == or != with a text in quotation marks, such as {0} == 'a*')"
+    )]
+    Text(String),
+    #[error("--where: no set meets the conditions")]
+    NoSet,
+    #[error("--where: the sets that meet the conditions have none in common")]
+    NoCommonSet,
 }
 
-/// Conditions on rows of a store, which must all be met: `snr=low,submission=23/*,q>50`.
-///
-/// A condition is a column, one of `=`, `!=`, `<`, `<=`, `>`, `>=`, and a value. `*` in a text stands
-/// for any characters.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Conditions(Vec<(String, Relation, String)>);
-
-impl FromStr for Conditions {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        // Longer signs first: `<=` begins with `<`.
-        const RELATIONS: [(&str, Relation); 6] = [
-            ("!=", Relation::IsNot),
-            ("<=", Relation::AtMost),
-            (">=", Relation::AtLeast),
-            ("<", Relation::Below),
-            (">", Relation::Above),
-            ("=", Relation::Is),
-        ];
-        let condition = |part: &str| {
-            let at = part.find(['=', '<', '>', '!']);
-            at.and_then(|at| {
-                let (name, rest) = (part[..at].trim(), &part[at..]);
-                let (sign, relation) = RELATIONS.iter().find(|(sign, _)| rest.starts_with(sign))?;
-                let value = rest[sign.len()..].trim();
-                (!name.is_empty()).then(|| (name.to_owned(), *relation, value.to_owned()))
-            })
-            .ok_or_else(|| {
-                format!(
-                    "not a condition (found `{part}`, expected a column, one of = != < <= > >=, and a value, such as `q>50`)"
-                )
-            })
-        };
-        text.split(',')
-            .map(condition)
-            .collect::<Result<_, _>>()
-            .map(Conditions)
+/// Keeps the sets of each run for which the `condition` holds, and drops runs without such a set.
+pub fn choose(
+    condition: &Expression,
+    mut runs: Vec<RunRecord>,
+) -> Result<Vec<RunRecord>, ChoiceError> {
+    let table = table_of(&runs)?;
+    let operands = condition.operands().iter();
+    let values: Vec<Vec<f64>> = operands
+        .map(|operand| values(&table, operand))
+        .collect::<Result<_, _>>()?;
+    let mut rows = 0..table.height();
+    for run in &mut runs {
+        run.sets.retain(|_| {
+            let row = rows.next().unwrap_or_default();
+            // A missing number, such as Q of a set without errors, meets no condition.
+            let held = condition.value(&|place| values[place][row]);
+            held != 0.0 && !held.is_nan()
+        });
     }
+    runs.retain(|run| !run.sets.is_empty());
+    Ok(runs)
 }
 
-impl Conditions {
-    /// Keeps the sets of each run that meet all conditions, and drops runs without such a set.
-    ///
-    /// # Errors
-    /// If a column does not exist, or a value has another type than its column.
-    pub fn choose(&self, mut runs: Vec<RunRecord>) -> Result<Vec<RunRecord>, PipelineError> {
-        let table = table_of(&runs).map_err(|error| PipelineError::Request(error.to_string()))?;
-        let mut kept = vec![true; table.height()];
-        for (name, relation, wanted) in &self.0 {
-            let held = hold(column(&table, name)?, *relation, wanted)?;
-            kept.iter_mut().zip(held).for_each(|(all, one)| *all &= one);
-        }
-        let mut kept = kept.into_iter();
-        for run in &mut runs {
-            run.sets.retain(|_| kept.next().unwrap_or(false));
-        }
-        runs.retain(|run| !run.sets.is_empty());
-        Ok(runs)
-    }
-}
-
-/// A column of the table of runs.
-fn column<'a>(table: &'a DataFrame, name: &str) -> Result<&'a Column, PipelineError> {
-    table.column(name).map_err(|_| {
-        let names: Vec<&str> = table
-            .get_column_names()
-            .iter()
-            .map(|n| n.as_str())
-            .collect();
-        let names = names.join(", ");
-        PipelineError::Request(format!(
-            "unknown column of a results store (found `{name}`, expected one of {names})"
-        ))
-    })
-}
-
-/// Whether a condition holds, for each value of a column.
-fn hold(column: &Column, relation: Relation, wanted: &str) -> Result<Vec<bool>, PipelineError> {
-    let name = column.name();
-    if let Ok(texts) = column.str() {
-        let holds: fn(&str, &str) -> bool = match relation {
-            Relation::Is => matches,
-            Relation::IsNot => |wanted, own| !matches(wanted, own),
-            _ => {
-                let message = format!("column `{name}` contains text; expected = or !=");
-                return Err(PipelineError::Request(message));
-            }
-        };
-        return Ok(texts
-            .iter()
-            .map(|own| holds(wanted, own.unwrap_or("")))
-            .collect());
-    }
-    let wanted: f64 = wanted.parse().map_err(|_| {
-        PipelineError::Request(format!(
-            "column `{name}` contains numbers (found `{wanted}`, expected a number)"
-        ))
+fn values(table: &DataFrame, operand: &Operand) -> Result<Vec<f64>, ChoiceError> {
+    let name = &operand.column;
+    let column = table.column(name).map_err(|_| ChoiceError::UnknownColumn {
+        found: name.clone(),
+        known: shearq_files::names_of(&table.get_column_names()),
     })?;
-    let holds: fn(&f64, &f64) -> bool = match relation {
-        Relation::Is => f64::eq,
-        Relation::IsNot => f64::ne,
-        Relation::Below => f64::lt,
-        Relation::AtMost => f64::le,
-        Relation::Above => f64::gt,
-        Relation::AtLeast => f64::ge,
-    };
-    let values = reals(column).unwrap_or_default();
-    Ok(values.iter().map(|own| holds(own, &wanted)).collect())
-}
-
-/// Whether `text` is `pattern`, in which `*` stands for any characters.
-fn matches(pattern: &str, text: &str) -> bool {
-    let Some((first, rest)) = pattern.split_once('*') else {
-        return pattern == text;
-    };
-    let Some(text) = text.strip_prefix(first) else {
-        return false;
-    };
-    // `*` may stand for any beginning of the remaining text.
-    text.char_indices()
-        .map(|(at, _)| at)
-        .chain([text.len()])
-        .any(|at| matches(rest, &text[at..]))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn stars_stand_for_any_characters() {
-        assert!(matches("23/*", "23/den/star") && matches("*star", "23/den/star"));
-        assert!(matches("*/den/*", "subm/23/den/func") && matches("low", "low"));
-        assert!(!matches("23/*", "subm/23/den/func") && !matches("low", "lower"));
-        assert!(!matches("*star", "23/den/stars"));
-    }
-
-    #[test]
-    fn conditions_are_parsed() {
-        let conditions: Conditions = "snr=low, q>=50,psf!=fixed".parse().unwrap();
-        let second = ("q".into(), Relation::AtLeast, "50".into());
-        assert_eq!(conditions.0[1], second);
-        for wrong in ["", "q", "=3", "q!5"] {
-            assert!(wrong.parse::<Conditions>().is_err(), "{wrong}");
-        }
+    match (&operand.pattern, column.str()) {
+        (Some(pattern), Ok(texts)) => Ok(texts
+            .iter()
+            .map(|text| f64::from(u8::from(fits(pattern, text.unwrap_or_default()))))
+            .collect()),
+        (Some(_), Err(_)) => Err(ChoiceError::Numbers(name.clone())),
+        (None, Ok(_)) => Err(ChoiceError::Text(name.clone())),
+        (None, Err(_)) => Ok(reals(column).unwrap_or_default().into_owned()),
     }
 }

@@ -1,13 +1,58 @@
-//! Expressions of columns, such as `flux/flux_error` or `snr > 10 and size < 4`.
+//! The language of `--where`, `--weight` and `--bins`: formulas and conditions of columns.
 
-/// An expression of columns.
+use thiserror::Error;
+
+/// Why a text is no expression.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum ExpressionError {
+    #[error("cannot read the expression `{text}` (found {found}, expected {expected})")]
+    Syntax {
+        text: String,
+        found: String,
+        expected: &'static str,
+    },
+    #[error(
+        "`{0}`: a step is a weight of galaxies, no number or condition (expected step() alone or beside `and` in --where, for catalogues of linear configurations)"
+    )]
+    Step(String),
+}
+
+/// A formula such as `flux/flux_error`, or a condition such as `snr > 10 and band == 'r'`.
 #[derive(Debug, Clone)]
 pub struct Expression {
     text: String,
-    columns: Vec<String>,
+    operands: Vec<Operand>,
     root: Node,
-    /// Whether a comparison, `and`, `or`, `not` or `abs` is used.
     sharp: bool,
+}
+
+/// What an expression reads in each row: the number in a column, or whether the text in it has a pattern.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Operand {
+    pub column: String,
+    /// A text in which `*` stands for any characters. The operand is 1 where it fits, else 0.
+    pub pattern: Option<String>,
+}
+
+/// A smooth step of a weight along a column, `step(snr, 10, 1.5)`: 1/2 at the threshold, and 0 and 1 at the half width
+/// from it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Step {
+    pub column: String,
+    pub threshold: f64,
+    pub half_width: Option<f64>,
+    /// `1 - step(…)`, which keeps the galaxies below the threshold.
+    pub falls: bool,
+}
+
+/// A text of `--where`, whose parts beside `and` are conditions on rows or steps.
+#[derive(Debug, Clone)]
+pub struct Condition {
+    pub text: String,
+    /// The parts without a step: a row counts if they are not zero.
+    pub rows: Option<Expression>,
+    pub steps: Vec<Step>,
 }
 
 type Function = fn(f64) -> f64;
@@ -16,25 +61,36 @@ type Operator = fn(f64, f64) -> f64;
 #[derive(Debug, Clone)]
 enum Node {
     Number(f64),
-    Column(usize),
+    Operand(usize),
     Unary(Function, Box<Node>),
-    Binary(Operator, Box<Node>, Box<Node>),
+    Binary(&'static Binary, Box<Node>, Box<Node>),
+    Step(Step),
 }
 
-/// Functions of one number.
+/// The token of an operator, and what it does.
+type Binary = (&'static str, Operator);
+
 const FUNCTIONS: [(&str, Function); 6] = [
     ("abs", f64::abs),
     ("sqrt", f64::sqrt),
     ("exp", f64::exp),
     ("log", f64::ln),
     ("log10", f64::log10),
-    ("not", |a| truth(a == 0.0)),
+    ("not", |a| compared(a, a, a == 0.0)),
 ];
 
-/// Operators from the loosest to the tightest. Within a level the left one is applied first.
-const OPERATORS: [&[(&str, Operator)]; 5] = [
-    &[("or", |a, b| truth(a != 0.0 || b != 0.0))],
-    &[("and", |a, b| truth(a != 0.0 && b != 0.0))],
+const POWER: Binary = ("^", f64::powf);
+
+// From the loosest to the tightest. Within a level the left one is applied first.
+const OPERATORS: [&[Binary]; 5] = [
+    &[("or", |a, b| {
+        let certain = [a, b].iter().any(|own| *own != 0.0 && !own.is_nan());
+        if certain { 1.0 } else { compared(a, b, false) }
+    })],
+    &[("and", |a, b| {
+        let certain = a == 0.0 || b == 0.0;
+        if certain { 0.0 } else { compared(a, b, true) }
+    })],
     // Longer operators first.
     &[
         ("<=", |a, b| compared(a, b, a <= b)),
@@ -52,7 +108,7 @@ fn truth(of: bool) -> f64 {
     f64::from(u8::from(of))
 }
 
-/// A comparison; NaN with a missing number, so that it is noticed.
+// NaN with a missing number: a row that neither holds nor fails a condition has to be noticed.
 fn compared(a: f64, b: f64, holds: bool) -> f64 {
     if a.is_nan() || b.is_nan() {
         return f64::NAN;
@@ -60,33 +116,18 @@ fn compared(a: f64, b: f64, holds: bool) -> f64 {
     truth(holds)
 }
 
-/// Deepest nesting.
+// The parser calls itself for each bracket: 10⁴ of them would exhaust the stack.
 const DEEPEST: usize = 100;
 
 impl Expression {
-    /// Parses an expression: numbers, columns, `+ - * / ^`, comparisons, `and`, `or`, and `abs`, `sqrt`, `exp`, `log`,
-    /// `log10`, `not` of an expression in brackets.
-    ///
-    /// # Errors
-    /// What was expected, and where.
-    pub fn parse(text: &str) -> Result<Self, String> {
-        let mut parser = Parser {
-            text,
-            at: 0,
-            depth: 0,
-            columns: Vec::new(),
-            sharp: false,
-        };
-        let root = parser.level(0)?;
-        if !parser.rest().is_empty() {
-            return Err(parser.expected("an operator"));
+    /// Parses an expression: numbers, columns, `+ - * / ^`, comparisons of numbers, `==` and `!=` of a column with a text
+    /// in quotation marks, `and`, `or`, and `abs`, `sqrt`, `exp`, `log`, `log10`, `not` of an expression in brackets.
+    pub fn parse(text: &str) -> Result<Self, ExpressionError> {
+        let condition = Condition::parse(text)?;
+        match condition.rows {
+            Some(expression) if condition.steps.is_empty() => Ok(expression),
+            _ => Err(ExpressionError::Step(condition.text)),
         }
-        Ok(Expression {
-            text: text.trim().to_owned(),
-            columns: parser.columns,
-            root,
-            sharp: parser.sharp,
-        })
     }
 
     /// Whether the expression has derivatives of all orders where its functions are defined: no comparison and no `abs`.
@@ -94,27 +135,101 @@ impl Expression {
         !self.sharp
     }
 
-    /// The text that was parsed.
     pub fn text(&self) -> &str {
         &self.text
     }
 
-    /// The columns, each once.
-    pub fn columns(&self) -> &[String] {
-        &self.columns
+    /// What is read in each row, each once.
+    pub fn operands(&self) -> &[Operand] {
+        &self.operands
     }
 
-    /// The value; `value` gives the value of the column of a number in [`Expression::columns`].
+    pub fn columns(&self) -> impl Iterator<Item = &str> + Clone {
+        self.operands.iter().map(|operand| operand.column.as_str())
+    }
+
+    /// The value; `value` gives the number of an operand by its place in [`Expression::operands`].
     pub fn value(&self, value: &impl Fn(usize) -> f64) -> f64 {
-        fn of(node: &Node, value: &impl Fn(usize) -> f64) -> f64 {
-            match node {
-                Node::Number(number) => *number,
-                Node::Column(column) => value(*column),
-                Node::Unary(function, a) => function(of(a, value)),
-                Node::Binary(operator, a, b) => operator(of(a, value), of(b, value)),
-            }
+        self.root.value(value)
+    }
+}
+
+impl Node {
+    fn value(&self, value: &impl Fn(usize) -> f64) -> f64 {
+        match self {
+            Node::Number(number) => *number,
+            Node::Operand(place) => value(*place),
+            Node::Unary(function, a) => function(a.value(value)),
+            Node::Binary((_, operator), a, b) => operator(a.value(value), b.value(value)),
+            // `Condition::parse` leaves no step in an expression.
+            Node::Step(_) => f64::NAN,
         }
-        of(&self.root, value)
+    }
+
+    fn has_step(&self) -> bool {
+        match self {
+            Node::Number(_) | Node::Operand(_) => false,
+            Node::Unary(_, a) => a.has_step(),
+            Node::Binary(_, a, b) => a.has_step() || b.has_step(),
+            Node::Step(_) => true,
+        }
+    }
+
+    /// Takes the steps beside `and` out, and returns the rest.
+    fn without_steps(self, steps: &mut Vec<Step>) -> Option<Node> {
+        match self {
+            Node::Step(step) => {
+                steps.push(step);
+                None
+            }
+            Node::Binary(both @ ("and", _), a, b) => {
+                match (a.without_steps(steps), b.without_steps(steps)) {
+                    (Some(a), Some(b)) => Some(Node::Binary(both, Box::new(a), Box::new(b))),
+                    (a, b) => a.or(b),
+                }
+            }
+            Node::Binary(("-", _), one, step)
+                if matches!((&*one, &*step), (Node::Number(1.0), Node::Step(_))) =>
+            {
+                step.without_steps(steps);
+                if let Some(step) = steps.last_mut() {
+                    step.falls = true;
+                }
+                None
+            }
+            other => Some(other),
+        }
+    }
+}
+
+impl Condition {
+    /// Parses conditions as [`Expression::parse`] does, and `step(COLUMN, THRESHOLD, HALF_WIDTH)`, `step(COLUMN, THRESHOLD)`
+    /// and `1 - step(…)` alone or beside `and`.
+    pub fn parse(text: &str) -> Result<Self, ExpressionError> {
+        let mut parser = Parser {
+            text,
+            at: 0,
+            depth: 0,
+            operands: Vec::new(),
+            sharp: false,
+        };
+        let root = parser.level(0)?;
+        if !parser.rest().is_empty() {
+            return Err(parser.expected("an operator"));
+        }
+        let text = text.trim().to_owned();
+        let mut steps = Vec::new();
+        let root = root.without_steps(&mut steps);
+        if root.as_ref().is_some_and(Node::has_step) {
+            return Err(ExpressionError::Step(text));
+        }
+        let rows = root.map(|root| Expression {
+            text: text.clone(),
+            operands: parser.operands,
+            root,
+            sharp: parser.sharp,
+        });
+        Ok(Condition { text, rows, steps })
     }
 }
 
@@ -122,7 +237,7 @@ struct Parser<'a> {
     text: &'a str,
     at: usize,
     depth: usize,
-    columns: Vec<String>,
+    operands: Vec<Operand>,
     sharp: bool,
 }
 
@@ -134,15 +249,16 @@ impl<'a> Parser<'a> {
         &self.text[self.at..]
     }
 
-    fn expected(&mut self, what: &str) -> String {
+    fn expected(&mut self, expected: &'static str) -> ExpressionError {
         let found = match self.rest() {
             "" => "the end".to_owned(),
             rest => format!("`{rest}`"),
         };
-        format!(
-            "cannot read the expression `{}` (found {found}, expected {what})",
-            self.text
-        )
+        ExpressionError::Syntax {
+            text: self.text.to_owned(),
+            found,
+            expected,
+        }
     }
 
     /// Consumes `token`, which must not continue as a word.
@@ -158,21 +274,57 @@ impl<'a> Parser<'a> {
         true
     }
 
-    fn level(&mut self, level: usize) -> Result<Node, String> {
+    fn level(&mut self, level: usize) -> Result<Node, ExpressionError> {
         let Some(operators) = OPERATORS.get(level) else {
             return self.signed();
         };
         let mut node = self.level(level + 1)?;
-        while let Some((_, operator)) = operators.iter().find(|(token, _)| self.take(token)) {
+        while let Some(operator) = operators.iter().find(|(token, _)| self.take(token)) {
             // The loosest three levels compare.
             self.sharp |= level < 3;
             let right = self.level(level + 1)?;
-            node = Node::Binary(*operator, Box::new(node), Box::new(right));
+            node = Node::Binary(operator, Box::new(node), Box::new(right));
+        }
+        if level == 2 && self.rest().starts_with('=') {
+            return Err(self.expected("`==` to compare"));
         }
         Ok(node)
     }
 
-    fn signed(&mut self) -> Result<Node, String> {
+    /// Compares a column with the text in quotation marks that follows, if one does.
+    fn pattern(&mut self, column: &str) -> Option<Result<Node, ExpressionError>> {
+        let before = self.at;
+        let equal = self.take("==");
+        let mark = (equal || self.take("!=")).then(|| self.rest().chars().next());
+        let Some(mark @ ('\'' | '"')) = mark.flatten() else {
+            self.at = before;
+            return None;
+        };
+        let rest = &self.rest()[1..];
+        let Some(length) = rest.find(mark) else {
+            return Some(Err(
+                self.expected("a text that ends with the same quotation mark")
+            ));
+        };
+        self.at += length + 2;
+        self.sharp = true;
+        let fits = self.operand(column.to_owned(), Some(rest[..length].to_owned()));
+        Some(Ok(match equal {
+            true => fits,
+            false => Node::Unary(|fits| 1.0 - fits, Box::new(fits)),
+        }))
+    }
+
+    fn operand(&mut self, column: String, pattern: Option<String>) -> Node {
+        let operand = Operand { column, pattern };
+        let known = self.operands.iter().position(|own| *own == operand);
+        Node::Operand(known.unwrap_or_else(|| {
+            self.operands.push(operand);
+            self.operands.len() - 1
+        }))
+    }
+
+    fn signed(&mut self) -> Result<Node, ExpressionError> {
         if self.depth == DEEPEST {
             return Err(self.expected("fewer brackets"));
         }
@@ -182,7 +334,7 @@ impl<'a> Parser<'a> {
         } else {
             let base = self.atom()?;
             if self.take("^") {
-                Node::Binary(f64::powf, Box::new(base), Box::new(self.signed()?))
+                Node::Binary(&POWER, Box::new(base), Box::new(self.signed()?))
             } else {
                 base
             }
@@ -191,41 +343,74 @@ impl<'a> Parser<'a> {
         Ok(node)
     }
 
-    fn atom(&mut self) -> Result<Node, String> {
+    fn atom(&mut self) -> Result<Node, ExpressionError> {
         if self.take("(") {
             return self.closed();
         }
         let rest = self.rest();
-        let word = rest
-            .find(|c: char| !(c.is_alphanumeric() || c == '_' || c == '.'))
-            .unwrap_or(rest.len());
-        let number = number_length(rest);
-        if number > 0 {
-            self.at += number;
-            return rest[..number]
-                .parse()
-                .map(Node::Number)
-                .map_err(|_| self.expected("a number"));
+        if number_length(rest) > 0 {
+            return self.number().map(Node::Number);
         }
-        if word == 0 {
+        let name = self.word();
+        if name.is_empty() {
             return Err(self.expected("a number or a column"));
         }
-        let name = &rest[..word];
-        self.at += word;
+        if name == "step" && self.take("(") {
+            return self.step();
+        }
         if let Some((_, function)) = FUNCTIONS.iter().find(|(known, _)| *known == name)
             && self.take("(")
         {
             self.sharp |= ["abs", "not"].contains(&name);
             return Ok(Node::Unary(*function, Box::new(self.closed()?)));
         }
-        let known = self.columns.iter().position(|column| column == name);
-        Ok(Node::Column(known.unwrap_or_else(|| {
-            self.columns.push(name.to_owned());
-            self.columns.len() - 1
-        })))
+        match self.pattern(name) {
+            Some(fits) => fits,
+            None => Ok(self.operand(name.to_owned(), None)),
+        }
     }
 
-    fn closed(&mut self) -> Result<Node, String> {
+    fn word(&mut self) -> &'a str {
+        let rest = self.rest();
+        let end = rest.find(|c: char| !(c.is_alphanumeric() || c == '_' || c == '.'));
+        let word = &rest[..end.unwrap_or(rest.len())];
+        self.at += word.len();
+        word
+    }
+
+    fn number(&mut self) -> Result<f64, ExpressionError> {
+        let sign = if self.take("-") { -1.0 } else { 1.0 };
+        let rest = self.rest();
+        let length = number_length(rest);
+        let number = rest[..length].parse::<f64>();
+        let number = number.map_err(|_| self.expected("a number"))?;
+        self.at += length;
+        Ok(sign * number)
+    }
+
+    /// The step whose bracket was opened.
+    fn step(&mut self) -> Result<Node, ExpressionError> {
+        let column = self.word().to_owned();
+        if column.is_empty() {
+            return Err(self.expected("a column"));
+        }
+        if !self.take(",") {
+            return Err(self.expected("a comma and the threshold of the step"));
+        }
+        let threshold = self.number()?;
+        let half_width = self.take(",").then(|| self.number()).transpose()?;
+        if !self.take(")") {
+            return Err(self.expected("`)`"));
+        }
+        Ok(Node::Step(Step {
+            column,
+            threshold,
+            half_width,
+            falls: false,
+        }))
+    }
+
+    fn closed(&mut self) -> Result<Node, ExpressionError> {
         let inner = self.level(0)?;
         if self.take(")") {
             Ok(inner)
@@ -233,6 +418,19 @@ impl<'a> Parser<'a> {
             Err(self.expected("`)`"))
         }
     }
+}
+
+/// Whether `text` is `pattern`, in which `*` stands for any characters.
+pub(crate) fn fits(pattern: &str, text: &str) -> bool {
+    let Some((first, rest)) = pattern.split_once('*') else {
+        return pattern == text;
+    };
+    let Some(text) = text.strip_prefix(first) else {
+        return false;
+    };
+    // `*` may stand for any beginning of the remaining text.
+    let mut ends = text.char_indices().map(|(at, _)| at).chain([text.len()]);
+    ends.any(|at| fits(rest, &text[at..]))
 }
 
 /// Characters of the number that a text starts with, with its exponent.
@@ -280,10 +478,19 @@ mod tests {
         assert_eq!(value("8 - 2 - 1", &[]), 5.0);
         assert_eq!(value("log10(flux_2/err)", &[100.0, 1.0]), 2.0);
         assert_eq!(value("a > 1 and b <= 2 or not(a == a)", &[2.0, 2.0]), 1.0);
-        assert_eq!(value("android", &[7.0]), 7.0);
-        assert!(value("a > 1", &[f64::NAN]).is_nan());
+        assert_eq!(value("android + stepper", &[7.0, 1.0]), 8.0);
+        for (text, missing) in [
+            ("a > 1", true),
+            ("not(a > 1)", true),
+            ("a > 1 and b == 1", true),
+            ("a > 1 and b == 2", false),
+            ("a > 1 or b == 2", true),
+            ("a > 1 or b == 1", false),
+        ] {
+            assert_eq!(value(text, &[f64::NAN, 1.0]).is_nan(), missing, "{text}");
+        }
         let twice = Expression::parse("a*a + b").unwrap();
-        assert_eq!(twice.columns(), ["a", "b"]);
+        assert!(twice.columns().eq(["a", "b"]));
     }
 
     #[test]
@@ -295,12 +502,68 @@ mod tests {
             ("size + (snr > 10)", false),
             ("not(snr)", false),
         ] {
-            assert_eq!(
-                Expression::parse(text).unwrap().is_smooth(),
-                smooth,
-                "{text}"
-            );
+            let expression = Expression::parse(text).unwrap();
+            assert_eq!(expression.is_smooth(), smooth, "{text}");
         }
+    }
+
+    #[test]
+    fn texts_are_compared_with_patterns() {
+        let found = Expression::parse("psf == 'a*' or psf != \"b\" and set == 3").unwrap();
+        let operand = |column: &str, pattern: Option<&str>| Operand {
+            column: column.into(),
+            pattern: pattern.map(str::to_owned),
+        };
+        let expected = [
+            operand("psf", Some("a*")),
+            operand("psf", Some("b")),
+            operand("set", None),
+        ];
+        assert_eq!(found.operands(), expected);
+        assert_eq!(found.value(&|k| [0.0, 1.0, 3.0][k]), 0.0);
+        assert_eq!(found.value(&|k| [0.0, 0.0, 3.0][k]), 1.0);
+        for (pattern, text, expected) in [
+            ("23/*", "23/den/star", true),
+            ("*star", "23/den/star", true),
+            ("*/den/*", "subm/23/den/func", true),
+            ("low", "low", true),
+            ("23/*", "subm/23/den/func", false),
+            ("low", "lower", false),
+            ("*star", "23/den/stars", false),
+        ] {
+            assert_eq!(fits(pattern, text), expected, "{pattern} {text}");
+        }
+    }
+
+    #[test]
+    fn steps_are_separated_from_conditions() {
+        let step = |column: &str, threshold, half_width, falls| Step {
+            column: column.into(),
+            threshold,
+            half_width,
+            falls,
+        };
+        let found =
+            Condition::parse("step(snr, -10) and x > 2 and 1 - step(size, 3, 0.5)").unwrap();
+        let expected = [
+            step("snr", -10.0, None, false),
+            step("size", 3.0, Some(0.5), true),
+        ];
+        assert_eq!(found.steps, expected);
+        let rows = found.rows.unwrap();
+        assert_eq!([1.0, 3.0].map(|x| rows.value(&|_| x)), [0.0, 1.0]);
+        assert!(Condition::parse("step(snr, 10)").unwrap().rows.is_none());
+        for text in [
+            "2*step(snr, 10)",
+            "x > 1 or step(snr, 1)",
+            "not(step(snr, 1))",
+        ] {
+            let expected = ExpressionError::Step(text.into());
+            assert_eq!(Condition::parse(text).unwrap_err(), expected);
+        }
+        let text = "step(snr, 10)";
+        let expected = ExpressionError::Step(text.into());
+        assert_eq!(Expression::parse(text).unwrap_err(), expected);
     }
 
     #[test]
@@ -311,9 +574,14 @@ mod tests {
             ("(a", "expected `)`"),
             ("a b", "found `b`, expected an operator"),
             ("a ? 2", "found `? 2`"),
+            ("a = 2", "found `= 2`, expected `==` to compare"),
+            ("a == 'b", "ends with the same quotation mark"),
+            ("a + 1 == 'b'", "found `'b'`, expected a number or a column"),
+            ("step(snr > 3)", "a comma and the threshold"),
+            ("step(snr, x)", "found `x)`, expected a number"),
             (&"(".repeat(10_000), "fewer brackets"),
         ] {
-            let error = Expression::parse(text).unwrap_err();
+            let error = Condition::parse(text).unwrap_err().to_string();
             assert!(error.contains(expected), "{text}: {error}");
         }
     }

@@ -9,74 +9,115 @@ use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::Place;
 use shearq_files::{FileError, atomic, table};
-use shearq_measure::{Observables, Selection, Versions};
-use shearq_pipeline::PipelineError;
+use shearq_measure::{Cut, Observables, Quantity, Selection, Versions};
 use shearq_pipeline::measure::KEYS;
+use thiserror::Error;
 
-use crate::expression::Expression;
+use crate::expression::{Condition, Expression, ExpressionError, Step};
 
 /// Columns that a selection replaces or reads. It also reads the columns of [`Observables`].
 pub(crate) const READ: [&str; 9] = [
     "e1", "e2", "flags", "R11", "R22", "R12", "R21", "divisor1", "divisor2",
 ];
 
-/// A selection and the texts that it was made from.
-#[derive(Debug, Clone)]
+/// Why `--where` and `--weight` cannot be used.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum SelectionError {
+    #[error(transparent)]
+    Expression(#[from] ExpressionError),
+    #[error(
+        "galaxies cannot be selected by `{0}`: its response to shear is not known, so the mean shear would be biased (expected step() of snr, flux or size)"
+    )]
+    Unknown(String),
+    #[error("a step of `{0}`: the threshold must be finite and the half width positive")]
+    Range(String),
+    // A sharp cut gives the response the density of galaxies at its edge, which no galaxy by itself determines.
+    #[error(
+        "`{0}` is a condition, whose response to shear is not known, so the mean shear would be biased (expected steps, such as `step(snr, 10, 1.5) and step(size, 2.5)`). Try: step(NAME, THRESHOLD)"
+    )]
+    Condition(String),
+    #[error(
+        "a weight cannot depend on `{0}`, whose response to shear is not known (expected snr, flux or size)"
+    )]
+    WeightColumn(String),
+    #[error(
+        "the weight `{0}` is not smooth (found a comparison, `abs` or `not`). Try: --where with step()"
+    )]
+    WeightNotSmooth(String),
+}
+
+/// What `--where` and `--weight` select, and their texts.
+#[derive(Debug, Clone, Default)]
 #[non_exhaustive]
 pub struct StatedSelection {
-    /// The selection.
-    pub selection: Selection,
-    /// The texts, such as `where: snr > 10; weight: snr^2`.
+    /// Which rows count: a hard selection, whose response to shear follows from sheared catalogues or is missing.
+    pub rows: Option<Expression>,
+    /// Steps and weights, whose response to shear follows from the columns of linear configurations.
+    pub weights: Option<Selection>,
+    /// The texts, such as `where: step(snr, 10); weight: snr^2`.
     pub text: String,
 }
 
 /// The selection of `--where` and `--weight`; `None` without either.
-///
-/// # Errors
-/// If one of the texts cannot be used, with the reason.
 pub fn selection(
-    cuts: Option<&str>,
+    condition: Option<&str>,
     weight: Option<&str>,
-) -> Result<Option<StatedSelection>, PipelineError> {
-    if cuts.is_none() && weight.is_none() {
-        return Ok(None);
+) -> Result<Option<StatedSelection>, SelectionError> {
+    let mut stated = StatedSelection::default();
+    let mut weights = Selection::default();
+    if let Some(text) = condition {
+        let condition = Condition::parse(text)?;
+        for step in &condition.steps {
+            weights = weights.with_cut(cut(step)?);
+        }
+        stated.weights = (!condition.steps.is_empty()).then_some(weights.clone());
+        stated.rows = condition.rows;
+        stated.text = format!("where: {}", condition.text);
     }
-    let fault = |message: String| PipelineError::Request(message);
-    let mut selection = match cuts {
-        Some(text) => text
-            .parse::<Selection>()
-            .map_err(|error| fault(error.to_string()))?,
-        None => Selection::default(),
-    };
     if let Some(text) = weight {
-        let expression = Expression::parse(text).map_err(fault)?;
-        let known = |name: &String| ["snr", "flux", "size"].contains(&name.as_str());
-        if let Some(other) = expression.columns().iter().find(|name| !known(name)) {
-            return Err(fault(format!(
-                "a weight cannot depend on `{other}`, whose response to shear is not known (expected snr, flux or size)"
-            )));
+        let expression = Expression::parse(text)?;
+        let known = |name: &&str| Quantity::ALL.iter().any(|(known, _)| known == name);
+        if let Some(other) = expression.columns().find(|name| !known(name)) {
+            return Err(SelectionError::WeightColumn(other.to_owned()));
         }
         if !expression.is_smooth() {
-            return Err(fault(format!(
-                "the weight `{text}` is not smooth (found a comparison, `abs` or `not`). Try: --where for cuts"
-            )));
+            return Err(SelectionError::WeightNotSmooth(text.to_owned()));
         }
-        selection = selection.with_weight(move |snr, flux, size| {
-            expression.value(&|column| match expression.columns()[column].as_str() {
-                "snr" => snr,
-                "flux" => flux,
-                _ => size,
-            })
-        });
+        let joint = if condition.is_some() { "; " } else { "" };
+        stated.text += &format!("{joint}weight: {}", text.trim());
+        stated.weights = Some(weights.with_weight(move |snr, flux, size| {
+            expression.value(
+                &|place| match expression.operands()[place].column.as_str() {
+                    "snr" => snr,
+                    "flux" => flux,
+                    _ => size,
+                },
+            )
+        }));
     }
-    let parts = [("where", cuts), ("weight", weight)];
-    let parts = parts
-        .iter()
-        .filter_map(|(name, text)| Some(format!("{name}: {}", (*text)?.trim())));
-    Ok(Some(StatedSelection {
-        selection,
-        text: parts.collect::<Vec<_>>().join("; "),
-    }))
+    Ok((condition.is_some() || weight.is_some()).then_some(stated))
+}
+
+/// The selection of `--where` and `--weight` by steps and weights alone, which keep a mean shear calibrated.
+pub fn smooth_selection(
+    condition: Option<&str>,
+    weight: Option<&str>,
+) -> Result<Option<StatedSelection>, SelectionError> {
+    let stated = selection(condition, weight)?;
+    match stated.as_ref().and_then(|stated| stated.rows.as_ref()) {
+        Some(rows) => Err(SelectionError::Condition(rows.text().to_owned())),
+        None => Ok(stated),
+    }
+}
+
+fn cut(step: &Step) -> Result<Cut, SelectionError> {
+    let mut known = Quantity::ALL.into_iter();
+    let Some((_, quantity)) = known.find(|(name, _)| *name == step.column) else {
+        return Err(SelectionError::Unknown(step.column.clone()));
+    };
+    Cut::new(quantity, !step.falls, step.threshold, step.half_width)
+        .ok_or_else(|| SelectionError::Range(step.column.clone()))
 }
 
 /// Name of the column with the weights.
@@ -95,6 +136,7 @@ pub fn write_selected(
     to: &Path,
     stated: &StatedSelection,
 ) -> Result<(usize, usize), FileError> {
+    let selection = stated.weights.clone().unwrap_or_default();
     if let Some(earlier) = &run.selection {
         return Err(FileError::new(
             from,
@@ -107,9 +149,7 @@ pub fn write_selected(
     // Nothing is written if one of the images has too few galaxies left.
     for set in files.wanted(&[]) {
         for (_, path) in files.of_set(set) {
-            Weighted::read(&path, &stated.selection)?
-                .0
-                .divisors(&path)?;
+            Weighted::read(&path, &selection)?.0.divisors(&path)?;
         }
     }
     let record = Run {
@@ -134,7 +174,7 @@ pub fn write_selected(
         }
         for (image, path) in files.of_set(set) {
             let read = table::read(&path, None, table::MAX_ROWS)?;
-            let weighted = Weighted::of_table(&path, &stated.selection, &read)?;
+            let weighted = Weighted::of_table(&path, &selection, &read)?;
             kept += weighted
                 .weight
                 .iter()

@@ -127,7 +127,6 @@ def bias(
     ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
     truth_sign: Literal["standard", "challenge"] | None = None,
     bins: Bins | None = None,
-    select: str | None = None,
     where: str | None = None,
     weight: str | None = None,
     design: Design | None = None,
@@ -172,11 +171,12 @@ def bias(
     bins : (str, int or sequence of float)
         Also estimate in bins of a column or expression: ``("snr", 5)`` has five bins with equally many galaxies,
         ``("flux / flux_error", [5, 10, 20])`` has these edges. The response is that of each bin.
-    select : str
-        Use only rows for which this holds, such as ``"snr > 10 and size < 4"``.
-    where, weight : str
-        Cuts and a weight by S/N, flux and size of shearq's own catalogues, as for :meth:`Catalogue.select`: m contains no
-        effect of the selection.
+    where : str
+        Use only galaxies for which this holds, such as ``"snr > 10 and size < 4"``. Catalogues of shearq's linear
+        configurations can also be cut by steps, such as ``"step(snr, 10) and step(size, 2.5)"``, as for
+        :meth:`Catalogue.select`: m contains no effect of this selection.
+    weight : str
+        A weight by S/N, flux and size of the same catalogues.
     design : str
         How catalogues belong together; recognised from the true shears.
     units : str
@@ -205,7 +205,6 @@ def bias(
         ellipticity=ellipticity,
         truth_sign=truth_sign,
         bins=bins,
-        select=select,
         where=where,
         weight=weight,
         design=design,
@@ -226,7 +225,6 @@ def bias_sums(
     ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
     truth_sign: Literal["standard", "challenge"] | None = None,
     bins: Bins | None = None,
-    select: str | None = None,
     where: str | None = None,
     weight: str | None = None,
     design: Design | None = None,
@@ -256,8 +254,8 @@ def bias_sums(
             ellipticity,
             truth_sign,
             _bins(bins),
-            select,
-            [where, weight],
+            where,
+            weight,
             design,
             units,
             drop_missing,

@@ -212,9 +212,9 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         Parameters
         ----------
         where : str, optional
-            Cuts by ``snr``, ``flux`` (image units) and ``size`` (px), such as ``"snr > 10, size > 2.5 +- 0.5"``. A cut is
-            a smooth step. The number after ``+-`` is the distance from the threshold at which the weight is 0 or 1: 1.5
-            for ``snr``, 1.5 errors for ``flux`` and 0.3 px for ``size`` by default.
+            Cuts by ``snr``, ``flux`` (image units) and ``size`` (px), such as ``"step(snr, 10) and step(size, 2.5, 0.5)"``.
+            A step is a weight of 1/2 at the threshold. The third number is the distance at which it is 0 or 1: 1.5 for
+            ``snr``, 1.5 errors for ``flux`` and 0.3 px for ``size`` by default. ``1 - step(size, 6)`` keeps small galaxies.
         weight : str, optional
             Smooth weight as a formula of ``snr``, ``flux`` and ``size``, such as ``"snr^2/(snr^2 + 100)"``.
 
@@ -232,7 +232,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         --------
         >>> image = shearq.simulate(set=2, grid=12, seed=1)[0]
         >>> catalogue = shearq.measure(image.stamps, image.psf)
-        >>> bright = catalogue.select(where="snr > 10").mean_shear()
+        >>> bright = catalogue.select(where="step(snr, 10)").mean_shear()
         """
         missing = [name for name in _schema.SELECTED if name not in (self.dtype.names or ())]
         if missing:

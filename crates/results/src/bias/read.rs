@@ -11,7 +11,7 @@ use shearq_files::table::{self, FileFormat, Place};
 use shearq_measure::{Observables, Selection};
 use shearq_quantities::{Distortion, MeasuredRange};
 
-use crate::expression::Expression;
+use crate::expression::{Expression, Operand};
 use crate::select::{READ, Weighted, require_responses};
 use crate::star_noise;
 use crate::views::rows::shown;
@@ -132,7 +132,7 @@ impl Source {
             && all(&self.binned)
     }
 
-    /// Columns of `--select` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
+    /// Columns of `--where` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
     pub(super) fn unanswered(&self) -> &[String] {
         match self.has_version_rows() {
             // Each version is chosen by its own columns.
@@ -346,13 +346,13 @@ fn unanswered(
 ) -> Vec<String> {
     let expressions = [&reading.select, &reading.binned].into_iter().flatten();
     let names = expressions.flat_map(Expression::columns);
-    let names: BTreeSet<&String> = names
+    let names: BTreeSet<&str> = names
         .filter(|name| match columns.preset {
             Preset::Shearq => is_measured(name),
             _ => !is_fixed(name, columns) && !has_versions(name),
         })
         .collect();
-    names.into_iter().cloned().collect()
+    names.into_iter().map(str::to_owned).collect()
 }
 
 /// Columns of sheared versions by their names.
@@ -432,20 +432,20 @@ fn expression_places<'e>(
         // Versions of shearq have noise that other columns do not have.
         let plain = format!("{name}_noshear");
         let [first, second] = match preset {
-            Preset::Versions => [&plain, name],
-            _ => [name, &plain],
+            Preset::Versions => [plain.as_str(), name],
+            _ => [name, plain.as_str()],
         };
         let found = place_of(first).or_else(|| place_of(second));
-        own.push(found.ok_or(name.as_str())?);
+        own.push(found.ok_or(name)?);
     }
     let mut all = vec![Some(own)];
     for (version, _) in VERSIONS {
         // A column without versions is the same in all, if there are versions of another one.
-        let mut sheared = |name: &String| {
+        let mut sheared = |name: &str| {
             let own = place_of(&format!("{}_{version}", base(name)));
             own.or_else(|| place_of(name).filter(|_| by_versions))
         };
-        all.push(expression.columns().iter().map(&mut sheared).collect());
+        all.push(expression.columns().map(&mut sheared).collect());
     }
     Ok(all)
 }
@@ -463,6 +463,7 @@ fn source(
     let has_versions = |name: &str| names.contains(&format!("{}_1p", base(name)));
     let expressions = [&reading.select, &reading.binned].into_iter().flatten();
     let mut named = expressions.clone().flat_map(Expression::columns);
+    refuse_texts(&place.path, expressions.clone())?;
     // Also if one of them is named.
     let by_versions = named
         .clone()
@@ -471,7 +472,7 @@ fn source(
     if columns.preset == Preset::Versions {
         check_named(&place.path, named.clone(), has_versions)?;
     }
-    if columns.have(&[Role::E1p]) && named.any(|name| has_versions(name)) {
+    if columns.have(&[Role::E1p]) && named.any(has_versions) {
         check_step(&place.path, reading.step)?;
     }
     let mut wanted = wanted_columns(&columns, reading);
@@ -519,9 +520,9 @@ fn source(
         VERSIONS.map(|(version, _)| certain(&sheared.of(name, version).unwrap_or_default()))
     });
     let failed_versions = sheared.failures().map(|name| certain(name)).collect();
-    let chosen: Vec<&String> = expressions.flat_map(Expression::columns).collect();
+    let chosen: Vec<&str> = expressions.flat_map(Expression::columns).collect();
     let choices = columns.choices.iter();
-    let choices = choices.filter(|(name, _)| !chosen.contains(&name));
+    let choices = choices.filter(|(name, _)| !chosen.contains(&name.as_str()));
     let choices = choices.map(|(name, good)| (certain(name), *good)).collect();
     if reading.selection.is_some() {
         require_responses(&place.path, names.iter().map(String::as_str))?;
@@ -556,6 +557,20 @@ fn source(
     }
     source.wanted = wanted;
     Ok(source)
+}
+
+fn refuse_texts<'a>(
+    path: &Path,
+    expressions: impl Iterator<Item = &'a Expression>,
+) -> Result<(), FileError> {
+    let mut operands = expressions.flat_map(Expression::operands);
+    match operands.find(|own| own.pattern.is_some()) {
+        None => Ok(()),
+        Some(Operand { column, .. }) => Err(FileError::new(
+            path,
+            format!("column `{column}` cannot be compared with a text (expected a number)"),
+        )),
+    }
 }
 
 /// Whether the column of a role is not needed.
@@ -609,7 +624,7 @@ fn is_measured(name: &str) -> bool {
 /// Checks that the columns of an expression have versions, unless they do not change with shear.
 fn check_named<'a>(
     path: &Path,
-    named: impl Iterator<Item = &'a String>,
+    named: impl Iterator<Item = &'a str>,
     has_versions: impl Fn(&str) -> bool,
 ) -> Result<(), FileError> {
     for name in named {
@@ -826,7 +841,7 @@ impl Shared {
         Err(FileError::new(
             path,
             format!(
-                "`{name}` excludes {rows} of {} rows that would count (expected none). Try: --select '{choice}', or --select '{name} > -1' for all rows",
+                "`{name}` excludes {rows} of {} rows that would count (expected none). Try: --where '{choice}', or --where '{name} > -1' for all rows",
                 self.used
             ),
         ))
@@ -1285,7 +1300,7 @@ impl<'a> Part<'a> {
                 slope[0] + slope[1] + cross[0] + cross[1],
             ),
             ("the PSF's ellipticity or size", psf[0] + psf[1] + psf_size),
-            ("the expression of --select or --bins", expression),
+            ("the expression of --where or --bins", expression),
         ];
         match checked.iter().find(|(_, value)| !value.is_finite()) {
             Some(_) if self.reading.drop_missing => Ok(Err(LeftOut::Missing)),
@@ -1606,7 +1621,7 @@ fn check_share(
         Some(name) => Err(FileError::new(
             path,
             format!(
-                "flags exclude {} of {} rows, among them `{name}` (expected less than half: 0 for good rows). Try: --columns flag=none --select {name} if good rows have 1, --columns flag={} otherwise",
+                "flags exclude {} of {} rows, among them `{name}` (expected less than half: 0 for good rows). Try: --columns flag=none --where {name} if good rows have 1, --columns flag={} otherwise",
                 about.flagged,
                 about.rows,
                 source.columns.flags.join("+")
@@ -1626,7 +1641,7 @@ fn check_selected(frame: &DataFrame, source: &Source, reading: &Reading) -> Resu
             return Err(FileError::new(
                 &source.place.path,
                 format!(
-                    "column `{name}` is true or false (expected a flag, which is 0 for good rows). Try: --columns flag=none --select {name} if it is true for selected rows, --columns flag={name} otherwise"
+                    "column `{name}` is true or false (expected a flag, which is 0 for good rows). Try: --columns flag=none --where {name} if it is true for selected rows, --columns flag={name} otherwise"
                 ),
             ));
         }

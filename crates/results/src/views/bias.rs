@@ -143,7 +143,7 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     let column = result.measured.first()?;
     let remedy = match result.program.starts_with("shearq") {
         true => {
-            "--where for cuts by snr, flux or size, or catalogues with shape.sheared_step".into()
+            "--where 'step(snr, THRESHOLD)' for cuts by snr, flux or size, or catalogues with shape.sheared_step".into()
         }
         false => format!("catalogues with {column}_1p, {column}_1m, {column}_2p and {column}_2m"),
     };
@@ -286,7 +286,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
     for (count, what) in [
         (total(|c| c.flagged), "with a flag"),
         (total(|c| c.unweighted), "with a weight of zero or less"),
-        (total(|c| c.unselected), "that --select or --where excludes"),
+        (total(|c| c.unselected), "that --where excludes"),
         (total(|c| c.missing), "with missing numbers"),
         (
             total(|c| c.failed),
@@ -303,7 +303,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
     }
     if 2 * total(|c| c.flagged) > total(|c| c.rows) {
         notes.push(
-            "More than half of the rows have a flag, which is not 0. If good rows have it, try: --columns flag=none --select NAME".into(),
+            "More than half of the rows have a flag, which is not 0. If good rows have it, try: --columns flag=none --where NAME".into(),
         );
     }
     notes.extend(repeated(&result.catalogues));
@@ -348,12 +348,12 @@ fn repeated(catalogues: &[Catalogue]) -> Vec<String> {
         let ([a, b], [first, second]) = (&own.columns, own.values.map(shown));
         if a == b {
             return format!(
-                "`{a}` is exactly {first} in {} of {rows} rows, which count. If this stands for a failure, try: --select '{a} != {first}'",
+                "`{a}` is exactly {first} in {} of {rows} rows, which count. If this stands for a failure, try: --where '{a} != {first}'",
                 own.rows
             );
         }
         format!(
-            "`{a}` and `{b}` are exactly {first} and {second} in {} of {rows} rows, which count. If this stands for a failure, try: --select '{a} != {first}'",
+            "`{a}` and `{b}` are exactly {first} and {second} in {} of {rows} rows, which count. If this stands for a failure, try: --where '{a} != {first}'",
             own.rows
         )
     };
