@@ -181,8 +181,8 @@ fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {
     for (set, snr) in [(5, 10), (2, 20), (8, 40)] {
         let simulator = simulator(set, plan.simulation)?;
         let measurer = &measurers(std::slice::from_ref(submission))?[0];
-        if let Some((psf, steps)) = simulated_steps(&simulator, measurer, 1, (1, 1))? {
-            rows.push(steps_row(&format!("S/N {snr}"), psf, steps));
+        if let Some(steps) = simulated_steps(&simulator, measurer, 1, (1, 1))? {
+            rows.push(steps_row(&format!("S/N {snr}"), steps));
         }
     }
     page.figure(

@@ -5,8 +5,7 @@ use std::str::FromStr;
 
 use anyhow::Context;
 use clap::Args;
-use ndarray::Axis;
-use shearq_measure::{Measurement, Measurer, Pixels, StampSource, Stop};
+use shearq_measure::{Measurement, Measurer, Stop};
 use shearq_submissions::Registry;
 
 use crate::{print, tell};
@@ -86,9 +85,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         let session = source.session(&measurer, &threads)?;
         let Mosaic {
-            columns,
-            galaxies,
-            stamp: side,
+            columns, galaxies, ..
         } = source.mosaic();
         anyhow::ensure!(
             index <= galaxies,
@@ -97,33 +94,18 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             image.image
         );
         let (ix, iy) = ((index - 1) % columns, (index - 1) / columns);
-        let psf = source
-            .psfs(iy)?
-            .at(ix, submission.psf_cut(), side)
-            .map(|star| star.psf);
-        let psf = psf.with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
-        let mut worker = measurer.worker();
-        let mut worker = session.image(&mut worker);
-        let mut worker = worker.psf(psf.view())?;
-        let stamps = source.stamps(iy)?;
-        let Pixels::Single(stamps) = &*stamps else {
-            anyhow::bail!("the image is not in single precision");
-        };
-        let stamp = stamps.index_axis(Axis(0), ix);
-        let measured = worker.measure(stamp)?;
-        anyhow::ensure!(
-            measured.descent.is_some(),
-            "galaxy {index} could not be measured: {}",
-            measured.flags
-        );
-        let steps = worker.steps(stamp, psf.view(), &measured)?;
+        let (measured, steps) = session
+            .steps(&mut source, iy, ix)
+            .with_context(|| format!("the PSF of galaxy {index} cannot be used"))?;
+        let steps = steps
+            .with_context(|| format!("galaxy {index} could not be measured: {}", measured.flags))?;
         let response_text = response(&measured, "\nR ");
         responses |= !response_text.is_empty();
         let label = format!(
             "{}/{}/{index}: {:+.3}, {:+.3}{response_text}",
             image.set, image.image, measured.e1, measured.e2
         );
-        rows.push(steps_row(&label, psf, steps));
+        rows.push(steps_row(&label, steps));
         print(&format!("{}\n", describe(image, index, &measured)))?;
     }
     let title = format!(

@@ -4,7 +4,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::ndarray::{Array3, Axis};
-use shearq_measure::{ArraySource, KnownNoise, Measurer, OneThread, Psfs, Session, strip};
+use shearq_measure::{ArraySource, KnownNoise, Measurer, OneThread, Pixels, Psfs, Session};
 
 use crate::support::{Small, fits_image, floats, pixels_of, succeed, text};
 
@@ -59,7 +59,10 @@ fn files_and_arrays_with_a_noisy_star_per_galaxy_give_the_same() {
     let rows = |pixels: &[f32], side: usize| {
         let mut stamps = Vec::new();
         for row in pixels.chunks_exact(n * side * side) {
-            stamps.extend(strip(row, n, side).unwrap().iter().copied());
+            let Pixels::Single(row) = Pixels::strip(row.to_vec(), n, side).unwrap() else {
+                unreachable!("a strip in single precision");
+            };
+            stamps.extend(row.iter().copied());
         }
         Array3::from_shape_vec((n * n, side, side), stamps).unwrap()
     };

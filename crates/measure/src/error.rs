@@ -71,7 +71,7 @@ pub enum MeasureError {
     #[error(transparent)]
     Profile(#[from] ProfileError),
     /// Data from which no result should be made.
-    #[error("{0}")]
+    #[error(transparent)]
     Data(Warning),
     /// A submission that does not exist or is not valid.
     #[error(transparent)]
@@ -89,15 +89,6 @@ impl MeasureError {
             what,
             found: format!("{rows} × {columns} pixels"),
             expected: expected.into(),
-        }
-    }
-
-    /// A strip of `count` stamps of `side` pixels that cannot be an array.
-    pub(crate) fn strip(count: usize, side: usize, error: &ndarray::ShapeError) -> Self {
-        MeasureError::Shape {
-            what: "a strip of stamps",
-            found: format!("{count} stamps of {side} × {side} pixels"),
-            expected: error.to_string(),
         }
     }
 }

@@ -8,79 +8,50 @@ use ndarray::ArrayView2;
 use shearq_quantities::statistics::{OF_MEDIAN, median, scatter};
 use shearq_submissions::PsfCut;
 
-use crate::brightness::{PEAKS, highest};
 use crate::error::MeasureError;
 use crate::extent::{Core, core_sums};
-use crate::pixel::{self, Pixel};
+use crate::pixel::{self, PEAKS, Pixel, highest};
 use crate::psf::Star;
 use crate::psf::examine::{self, PsfLook};
 use crate::psfs::Psfs;
 use crate::sky::{Cells, INNER, Subtraction, disc, inner};
 use crate::surroundings::centre;
-use crate::warning::Warning;
+use crate::warning::{Estimate, Warning};
 
-/// Largest side of the corner blocks in which the sky is measured. See docs/constants.md.
+// Largest side in px of the corner blocks in which the sky is measured. Chosen by hand.
 const BLOCK: usize = 8;
-/// A corner block has at most one such part of the stamp's side. See docs/constants.md.
-const BLOCK_SHARE: usize = 4;
-/// Distances of pixel pairs that show correlations longer than the survey covers. See
-/// docs/constants.md.
-const LONG: [usize; 2] = [4, 5];
-/// Stamps of an image that are examined. They give the variance to 0.15 % for 48 px. See
-/// docs/constants.md.
-const ENOUGH: usize = 1000;
-
-/// Fewest galaxies whose core is compared with the PSF's core. See docs/constants.md.
-const FEWEST: usize = 30;
-/// Times the median by which one galaxy's light may count. See docs/constants.md.
-const MOST: f64 = 4.0;
-/// PSFs of single galaxies of an image that are examined. See docs/constants.md.
-pub const EXAMINED_PSFS: usize = 100;
-
-/// Significance that every warning requires. See docs/constants.md.
-const CLEAR: f64 = 5.0;
-/// Light of the sky within 8 px, in units of the galaxy's, above which a warning is due. See
-/// docs/constants.md.
-const SKY_SHARE: f64 = 0.15;
-/// Largest ratio of corner to side brightness of a galaxy's wings; a sky is equal in both. See
-/// docs/constants.md.
-const FALLING: f64 = 0.6;
-/// Change of the sky's share over 8 px above which a warning is due. See docs/constants.md.
-const GRADIENT_SHARE: f64 = 0.04;
-/// Mean offset of the galaxies above which a warning is due. See docs/constants.md.
-const OFFSET: f64 = 0.85;
-/// Scatter of the galaxies' positions above which a warning is due. See docs/constants.md.
-const SCATTER: f64 = 2.0;
-/// Relative difference between given and measured noise above which a warning is due. See
-/// docs/constants.md.
-const LEAST_NOISE: f64 = 0.02;
-/// Relative scatter of the noise between stamps above which a warning is due. See
-/// docs/constants.md.
-const DEPTHS: f64 = 0.1;
-/// Correlation at long distances above which a warning is due. See docs/constants.md.
-const LONG_CORRELATION: f64 = 0.03;
+const BLOCKS_PER_SIDE: usize = 4; // At least, on small stamps. Chosen by hand.
+// Distances in px of pixel pairs that show long correlations: next to the distances that the survey covers.
+const LONG_LAGS: [usize; 2] = [4, 5];
+// On 48 px they give the variance to 0.15 %: √(2/n) for n independent pixels.
+const EXAMINED_STAMPS: usize = 1000;
+// Fewest galaxies whose core is compared with the core of the PSF. Chosen by hand.
+const MIN_GALAXIES_CORE: usize = 30;
+// Largest weight of one galaxy in units of the median light. Chosen by hand.
+const MAX_LIGHT: f64 = 4.0;
+/// PSFs of single galaxies of an image that are examined.
+pub const EXAMINED_PSFS: usize = 100; // Chosen by hand.
 
 /// Which of `rows` rows of `columns` stamps are examined: enough for a thousand stamps, or all. They are spread
 /// evenly but not regularly, so that they do not miss what differs from row to row.
 pub fn examined_rows(columns: usize, rows: usize) -> Vec<usize> {
-    /// Fractional step between examined rows, which avoids periods. See docs/constants.md.
+    // The golden ratio minus 1: fractional steps between examined rows without a period.
     const STEP: f64 = 0.618_033_988_749_895;
     let count = enough(columns, rows);
     let place = |k: usize| (k as f64 + (STEP * k as f64).fract()) * rows as f64 / count as f64;
     let mut chosen: Vec<usize> = (0..count)
         .map(|k| (place(k) as usize).min(rows - 1))
         .collect();
-    // Of a few rows more than are enough, two places may be in one. A row that counted twice would be taken for copies.
+    // If there are hardly more rows than needed, two places may be in one row. Its stamps would count as copies.
     chosen.dedup();
     chosen
 }
 
-/// How many of `rows` rows of `columns` stamps are enough.
+/// Number of rows, out of `rows` rows of `columns` stamps, with enough stamps.
 pub(crate) fn enough(columns: usize, rows: usize) -> usize {
-    ENOUGH.div_ceil(columns.max(1)).min(rows)
+    EXAMINED_STAMPS.div_ceil(columns.max(1)).min(rows)
 }
 
-/// What one stamp shows.
 #[derive(Debug, Clone, Copy)]
 struct Look {
     /// Level of its corners, and of the middles of its sides.
@@ -90,7 +61,7 @@ struct Look {
     slope: [f64; 2],
     /// Noise of two of the corners, and of the other two.
     noise: [f64; 2],
-    /// Sums over pairs at the distances `LONG`: of products, of the pixels, and their number.
+    /// Sums over pairs at the distances `LONG_LAGS`: of products, of the pixels, and their number.
     pairs: [f64; 3],
     /// Centroid from the expected place.
     place: [f64; 2],
@@ -131,7 +102,7 @@ impl Examination {
     pub fn new(full: usize, count: usize) -> Self {
         Examination {
             full,
-            block: BLOCK.min(full / BLOCK_SHARE),
+            block: BLOCK.min(full / BLOCKS_PER_SIDE),
             pixels: vec![0.0; full * full],
             looks: Vec::with_capacity(count),
             blank: 0,
@@ -143,8 +114,7 @@ impl Examination {
     }
 
     /// The same for stamps from which this is subtracted before they are measured.
-    #[must_use]
-    pub fn without(self, subtraction: Subtraction) -> Self {
+    pub(crate) fn without(self, subtraction: Subtraction) -> Self {
         Examination {
             subtraction,
             ..self
@@ -245,7 +215,7 @@ impl Examination {
             flux: 0.0,
             core: [0.0; 2],
         };
-        // Of stamps without corners the sky is not known.
+        // The sky of a stamp without corners is unknown.
         let sky = if corner.is_nan() { 0.0 } else { corner };
         for value in &mut self.pixels {
             // Missing pixels are as bright as the sky.
@@ -288,15 +258,16 @@ impl Examination {
             found.extend(self.psfs(None));
             return found;
         }
-        let (peak, _) = self.median(|look| look.peak, 0.0);
-        // On a stamp without a positive pixel it is zero.
+        let Estimate { value: peak, .. } = self.median(|look| look.peak, 0.0);
+        // Zero on stamps without a positive pixel.
         if peak > 0.0 && !PEAKS.contains(&(peak as f32)) {
             found.push(Warning::Brightness { peak });
         }
-        let (noise, _) = self.noise();
-        let (flux, flux_error) = self.median(|look| look.flux, noise * INNER);
+        let Estimate { value: noise, .. } = self.noise();
+        let flux = self.median(|look| look.flux, noise * INNER);
         // An offset needs light to be measured.
-        let lit = flux.abs() > CLEAR * flux_error;
+        let lit = flux.is_significant();
+        let Estimate { value: flux, .. } = flux;
         if lit && flux < 0.0 {
             let count = self.looks.iter().filter(|look| look.flux < 0.0).count();
             found.push(Warning::Negative {
@@ -331,19 +302,17 @@ impl Examination {
 
     /// A warning if `given` is not the noise of the stamps.
     pub fn given_noise(&self, given: f64) -> Option<Warning> {
-        let (measured, error) = self.noise();
-        let apart = (given - measured).abs();
-        let differs = apart > (CLEAR * error).max(LEAST_NOISE * measured) && measured > 0.0;
-        differs.then_some(Warning::GivenNoise { given, measured })
+        Warning::of_given_noise(given, self.noise())
     }
 
-    /// Median noise in the corners of the stamps, with its standard error.
-    fn noise(&self) -> (f64, f64) {
+    /// Median noise in the corners of the stamps.
+    fn noise(&self) -> Estimate {
         let of = |look: &Look| look.noise[0].hypot(look.noise[1]) / 2f64.sqrt();
-        let (noise, error) = self.median(of, 0.0);
-        // Of one stamp or two there is no scatter. The variance of n pixels has the relative error √(2/n).
+        let Estimate { value, error } = self.median(of, 0.0);
+        // One stamp or two have no scatter. The variance of n pixels has the relative error √(2/n).
         let pixels = (4 * self.block * self.block * self.looks.len()) as f64;
-        (noise, error.max(OF_MEDIAN * noise / (2.0 * pixels).sqrt()))
+        let error = error.max(OF_MEDIAN * value / (2.0 * pixels).sqrt());
+        Estimate { value, error }
     }
 
     fn psfs(&self, galaxies: Option<Core>) -> Vec<Warning> {
@@ -353,7 +322,7 @@ impl Examination {
     /// How broad the core of the galaxies is, with the PSF.
     fn core(&self) -> Option<Core> {
         let mut lights: Vec<f64> = self.looks.iter().map(|look| look.core[0].abs()).collect();
-        let most = MOST * median(&mut lights).filter(|_| lights.len() >= FEWEST)?;
+        let most = MAX_LIGHT * median(&mut lights).filter(|_| lights.len() >= MIN_GALAXIES_CORE)?;
         let sums = || {
             self.looks.iter().map(|look| {
                 // Bright stars and bad pixels count no more than a few galaxies.
@@ -370,18 +339,9 @@ impl Examination {
     fn sky(&self, noise: f64, flux: f64) -> Option<Warning> {
         let pixels = (self.block * self.block) as f64;
         // The median of four corners is about the mean of two.
-        let (level, error) = self.median(|look| look.corner, noise / (2.0 * pixels).sqrt());
-        let (side, _) = self.median(|look| look.side, 0.0);
-        let share = level * disc() / flux.abs();
-        let wings = level > 0.0 && level < FALLING * side;
-        let clear = level.abs() > CLEAR * error && share.abs() > SKY_SHARE && !wings;
-        clear.then_some(Warning::Sky {
-            level,
-            error,
-            noise,
-            share,
-            subtracted: false,
-        })
+        let corner = self.median(|look| look.corner, noise / (2.0 * pixels).sqrt());
+        let side = self.median(|look| look.side, 0.0);
+        Warning::of_sky(corner, side.value, noise, disc() / flux.abs())
     }
 
     /// What was found and subtracted.
@@ -408,29 +368,15 @@ impl Examination {
     fn gradient(&self, noise: f64, flux: f64) -> Option<Warning> {
         let edge = (self.full - self.block) as f64;
         let floor = noise / (self.block as f64 * edge);
-        let found = [0, 1].map(|k| self.median(|look| look.slope[k], floor));
-        let error = found[0].1.max(found[1].1);
-        let slope = found.map(|(slope, _)| slope);
-        let steep = slope[0].hypot(slope[1]);
-        let share = steep * INNER * disc() / flux.abs();
-        (steep > CLEAR * error && share > GRADIENT_SHARE).then_some(Warning::Gradient {
-            slope,
-            error,
-            noise,
-            subtracted: false,
-        })
+        let slope = [0, 1].map(|k| self.median(|look| look.slope[k], floor));
+        Warning::of_gradient(slope, noise, INNER * disc() / flux.abs())
     }
 
     fn places(&self) -> Option<Warning> {
-        let found = [0, 1].map(|k| self.median(|look| look.place[k], 0.0));
-        let offset = found.map(|(offset, _)| offset);
-        let error = found[0].1.max(found[1].1);
-        let away = offset[0].hypot(offset[1]);
-        if away > OFFSET && away > CLEAR * error {
-            return Some(Warning::OffCentre { offset, error });
-        }
-        let scatter = found.map(|(_, error)| error * (self.looks.len() as f64).sqrt() / OF_MEDIAN);
-        (scatter[0].max(scatter[1]) > SCATTER).then_some(Warning::Wandering { scatter })
+        let offset = [0, 1].map(|k| self.median(|look| look.place[k], 0.0));
+        let count = self.looks.len() as f64;
+        let scatter = offset.map(|offset| offset.error * count.sqrt() / OF_MEDIAN);
+        Warning::of_places(offset, scatter)
     }
 
     /// Compares the noise of two corners with the noise of the other two. Both vary together from stamp to stamp if
@@ -454,31 +400,28 @@ impl Examination {
             .iter()
             .map(|product| (product - mean).powi(2))
             .sum::<f64>();
-        let error = (square / (count - 1.0) / count).sqrt();
-        let scatter = mean.max(0.0).sqrt();
-        (mean > CLEAR * error && scatter > DEPTHS).then_some(Warning::Depths { scatter })
+        Warning::of_depths(Estimate {
+            value: mean,
+            error: (square / (count - 1.0) / count).sqrt(),
+        })
     }
 
     fn long_correlation(&self, noise: f64) -> Option<Warning> {
-        let (level, _) = self.median(|look| look.corner, 0.0);
+        let Estimate { value: level, .. } = self.median(|look| look.corner, 0.0);
         let of = |look: &Look| {
             let [products, sums, count] = look.pairs;
             (products - level * sums + count * level * level) / (count * noise * noise)
         };
-        let mut all: Vec<f64> = self
-            .looks
-            .iter()
-            .map(of)
-            .filter(|r| r.is_finite())
-            .collect();
+        let all = self.looks.iter().map(of);
+        let mut all: Vec<f64> = all.filter(|r| r.is_finite()).collect();
         let count = all.len() as f64;
-        let (middle, scatter) = scatter(&mut all)?;
+        let (middle, scatter) = scatter(&mut all).filter(|_| count > 1.0)?;
         let most = 3.0 * scatter;
         let clipped = all.iter().map(|r| (r - middle).clamp(-most, most));
-        let correlation = middle + clipped.sum::<f64>() / count;
-        let error = scatter / count.sqrt();
-        (correlation > CLEAR * error && correlation > LONG_CORRELATION && count > 1.0)
-            .then_some(Warning::LongCorrelation { correlation })
+        Warning::of_long_correlation(Estimate {
+            value: middle + clipped.sum::<f64>() / count,
+            error: scatter / count.sqrt(),
+        })
     }
 
     fn copies(&self, of: usize) -> Option<Warning> {
@@ -488,17 +431,14 @@ impl Examination {
         (count > 0).then_some(Warning::Copies { count, of })
     }
 
-    /// Median of a number over stamps with its standard error. Each stamp has an error of at least `floor`.
-    fn median(&self, of: impl Fn(&Look) -> f64, floor: f64) -> (f64, f64) {
-        let mut all: Vec<f64> = self
-            .looks
-            .iter()
-            .map(of)
-            .filter(|value| !value.is_nan())
-            .collect();
+    /// Median of a number over stamps. Each stamp has an error of at least `floor`.
+    fn median(&self, of: impl Fn(&Look) -> f64, floor: f64) -> Estimate {
+        let all = self.looks.iter().map(of);
+        let mut all: Vec<f64> = all.filter(|value| !value.is_nan()).collect();
         let count = all.len() as f64;
-        let (middle, scatter) = scatter(&mut all).unwrap_or((f64::NAN, f64::NAN));
-        (middle, OF_MEDIAN * scatter.max(floor) / count.sqrt())
+        let (value, scatter) = scatter(&mut all).unwrap_or((f64::NAN, f64::NAN));
+        let error = OF_MEDIAN * scatter.max(floor) / count.sqrt();
+        Estimate { value, error }
     }
 }
 
@@ -545,7 +485,7 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
         pairs[1] += a + b;
         pairs[2] += 1.0;
     };
-    for apart in LONG.into_iter().filter(|apart| *apart < side) {
+    for apart in LONG_LAGS.into_iter().filter(|apart| *apart < side) {
         for y in 0..side {
             let here = row(y);
             here.iter()
@@ -674,7 +614,10 @@ mod tests {
 
     #[test]
     fn noise_is_that_of_the_pixels_that_corners_have() {
-        let (noise, error) = without_corners(false).noise();
+        let Estimate {
+            value: noise,
+            error,
+        } = without_corners(false).noise();
         // One pixel of 10 among the 63 of a corner, in the mean with three corners without noise: √(10² / 60 / 4).
         assert!((noise - 0.645).abs() < 0.03, "{noise}");
         assert!(error.is_finite());
@@ -683,7 +626,7 @@ mod tests {
     #[test]
     fn of_stamps_without_corners_all_but_noise_and_sky_is_told() {
         let examination = without_corners(true);
-        assert!(examination.noise().0.is_nan());
+        assert!(examination.noise().value.is_nan());
         let sky = Sky {
             level: 0.1,
             level_error: 0.01,
@@ -695,7 +638,7 @@ mod tests {
             let text = warning.to_string();
             assert!(!text.contains("inf") && !text.contains("NaN"), "{text}");
         }
-        assert!(examination.core().is_none() && examination.looks.len() < FEWEST);
+        assert!(examination.core().is_none() && examination.looks.len() < MIN_GALAXIES_CORE);
         assert!(examination.looks.iter().all(|look| look.flux > 100.0));
     }
 

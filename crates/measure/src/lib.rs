@@ -38,52 +38,38 @@
 
 #![warn(missing_docs, clippy::missing_errors_doc)]
 
-mod batch;
-mod brightness;
-mod calibrate;
+mod calibration;
 mod deconvolve;
 mod denoise;
-mod ellipticity;
 mod error;
 mod examine;
 mod extent;
 mod fft;
-mod flag;
-mod galaxy;
-mod mean_shear;
 mod measurement;
+mod measurer;
 mod method;
 mod noise;
-mod observables;
 pub mod parts;
 mod pixel;
-mod plan;
 mod psf;
 mod psfs;
 mod selection;
 mod session;
 mod shape;
-mod sizes;
+mod sheared;
 mod sky;
-mod steps;
 mod surroundings;
-mod versions;
 mod warning;
-mod worker;
 
-pub use batch::strip;
-pub use calibrate::calibrate;
+pub use calibration::{MeanShear, MeanShearError, ShearSum, calibrate};
 pub use deconvolve::{Descent, Stop};
 pub use error::MeasureError;
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
-pub use flag::{Flag, Flags};
-pub use galaxy::Measurer;
-pub use mean_shear::{MeanShear, MeanShearError, ShearSum};
-pub use measurement::{Measurement, ResponseMatrix};
+pub use measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
+pub use measurer::{ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, Worker};
 pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};
-pub use observables::{Coupling, Observables};
 pub use pixel::{Pixel, Pixels};
 pub use psf::{Star, average_stars, star, star_psf};
 pub use psfs::Psfs;
@@ -92,13 +78,11 @@ pub use session::{
     ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,
     RowJob, Session, StampRows, StampSource, Threads,
 };
+pub use sheared::{ShearedCatalogues, ShearedGalaxy};
 pub use shearq_quantities::{Distortion, FunctionalPsf, PsfProfile, Shear};
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::Sky;
-pub use steps::Steps;
-pub use versions::{Version, Versions};
 pub use warning::{Of, PixelFrame, Warning};
-pub use worker::{ImageNoise, ImageWorker, PsfWorker, Worker};
 
 /// The examples of README.md.
 #[cfg(doctest)]

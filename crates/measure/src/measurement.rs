@@ -1,14 +1,16 @@
-//! The result of measuring one galaxy.
+//! The result of measuring one galaxy: ellipticity, response, flux and size, or flags.
+
+use std::fmt;
+
+use thiserror::Error;
 
 use crate::deconvolve::Descent;
-use crate::flag::Flags;
-use crate::observables::Observables;
-use crate::versions::Versions;
+use crate::sheared::ShearedCatalogues;
 
 /// Response ∂e_i/∂γ_j of an ellipticity to shear, as `[i][j]`: R11, R12 and R21, R22.
 pub type ResponseMatrix = [[f64; 2]; 2];
 
-/// Result of measuring one galaxy.
+/// The result of measuring one galaxy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub struct Measurement {
@@ -24,8 +26,8 @@ pub struct Measurement {
     pub response: Option<ResponseMatrix>,
     /// Flux and size before the PSF, with their responses; `None` for the network and for galaxies that could not be measured.
     pub observables: Option<Observables>,
-    /// The galaxy under small shears, if the configuration asks for them.
-    pub versions: Option<Versions>,
+    /// The galaxy under small shears, if the configuration requests sheared catalogues.
+    pub sheared: Option<ShearedCatalogues>,
     /// Mean responses of the galaxies calibrated together, by which e1 and e2 were divided; `None` before calibration.
     pub divisor: Option<[f64; 2]>,
     /// Iterations of the network; `None` if it did not run.
@@ -55,7 +57,7 @@ impl Measurement {
             flags: flag.into(),
             response: None,
             observables: None,
-            versions: None,
+            sheared: None,
             divisor: None,
             descent: None,
             noise: f64::NAN,
@@ -63,5 +65,229 @@ impl Measurement {
             radius: f64::NAN,
             size: f64::NAN,
         }
+    }
+}
+
+/// Why a galaxy could not be measured. The number is a bit of the column `flags` in catalogues.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Error)]
+#[repr(u32)]
+#[non_exhaustive]
+pub enum Flag {
+    /// Pixels are not finite numbers: one, or under a linear method more than can be filled from the opposite side.
+    #[error("pixels are missing")]
+    NotFinite = 1,
+    /// The galaxy's PSF cannot be used.
+    #[error("the PSF cannot be used")]
+    BadPsf = 2,
+    /// All pixels are equal, none is positive, or the noise level is zero where one is needed: no unit
+    /// of brightness. Or the brightest pixel is too faint or bright for single precision.
+    #[error("nothing to scale the brightness by")]
+    NoScale = 4,
+    /// The deconvolved stamp has no light.
+    #[error("nothing left after deconvolution")]
+    NoLight = 8,
+    /// The moments have no extent.
+    #[error("moments without extent")]
+    NoExtent = 16,
+    /// The distortion exceeds 1 and has no shear-type ellipticity.
+    #[error("distortion above 1")]
+    NoShear = 32,
+    /// The response by which the ellipticities were to be divided is not positive.
+    #[error("no response to shear to divide by")]
+    NoResponse = 64,
+    /// Another galaxy is too near to be separated, or the galaxy has such a shape.
+    #[error("a neighbour or an unusual shape")]
+    Neighbour = 128,
+}
+
+impl Flag {
+    /// All, in the order of their bits.
+    pub const ALL: [Flag; 8] = [
+        Flag::NotFinite,
+        Flag::BadPsf,
+        Flag::NoScale,
+        Flag::NoLight,
+        Flag::NoExtent,
+        Flag::NoShear,
+        Flag::NoResponse,
+        Flag::Neighbour,
+    ];
+}
+
+/// All reasons why a galaxy could not be measured: none for a good galaxy. With any flag, e1 and e2 are NaN.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Flags(u32);
+
+impl Flags {
+    /// The flags of a good galaxy.
+    pub const NONE: Flags = Flags(0);
+
+    /// Whether the galaxy is good.
+    pub fn is_empty(self) -> bool {
+        self.0 == 0
+    }
+
+    /// Whether `flag` is set.
+    pub fn contains(self, flag: Flag) -> bool {
+        self.0 & flag as u32 != 0
+    }
+
+    /// The flags that are set.
+    pub fn iter(self) -> impl Iterator<Item = Flag> {
+        Flag::ALL
+            .into_iter()
+            .filter(move |&flag| self.contains(flag))
+    }
+
+    /// The value in the column `flags`.
+    pub fn bits(self) -> u32 {
+        self.0
+    }
+
+    /// The flags of a value of the column `flags`.
+    pub fn from_bits(bits: u32) -> Flags {
+        Flags(bits)
+    }
+
+    pub(crate) fn add(&mut self, flag: Flag) {
+        self.0 |= flag as u32;
+    }
+}
+
+impl From<Flag> for Flags {
+    fn from(flag: Flag) -> Self {
+        Flags(flag as u32)
+    }
+}
+
+impl fmt::Display for Flags {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let reasons: Vec<String> = self.iter().map(|flag| flag.to_string()).collect();
+        f.write_str(&reasons.join(", "))
+    }
+}
+
+/// Flux and size of a galaxy before the PSF.
+///
+/// A selection or weight by them is also a selection by shear and by noise. [`Selection`](crate::Selection) corrects for
+/// both with the responses and the couplings of this struct.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct Observables {
+    /// Flux in a round Gaussian aperture as wide as the window, in image units, corrected for the light of a typical galaxy
+    /// beyond the aperture.
+    pub flux: f64,
+    /// Standard deviation of the flux. S/N is flux over this error.
+    pub flux_error: f64,
+    /// Standard deviation per axis, in pixels, of the round Gaussian galaxy with the same moments of the autocorrelation.
+    pub size: f64,
+    /// Derivatives of the flux with γ1 and γ2.
+    pub flux_response: [f64; 2],
+    /// Derivatives of the size with γ1 and γ2.
+    pub size_response: [f64; 2],
+    /// Effect of noise on products of flux, size and ellipticity.
+    pub coupling: Coupling,
+}
+
+impl Observables {
+    /// Names of the columns of catalogues with the values of [`Observables::to_array`].
+    pub const COLUMNS: [&'static str; 25] = [
+        "flux",
+        "size",
+        "flux_error",
+        "flux_g1",
+        "flux_g2",
+        "size_g1",
+        "size_g2",
+        "n1_ef",
+        "n1_es",
+        "n1_ff",
+        "n1_fs",
+        "n1_ss",
+        "n2_ef",
+        "n2_es",
+        "n2_ff",
+        "n2_fs",
+        "n2_ss",
+        "t_e1f",
+        "t_e1s",
+        "t_e2f",
+        "t_e2s",
+        "t_ff",
+        "t_fs",
+        "t_ss",
+        "t_s",
+    ];
+
+    /// Flux over its error.
+    pub fn snr(&self) -> f64 {
+        self.flux / self.flux_error
+    }
+
+    /// All values, in the order of [`Observables::COLUMNS`].
+    pub fn to_array(&self) -> [f64; 25] {
+        let Observables {
+            flux,
+            flux_error,
+            size,
+            flux_response: [f1, f2],
+            size_response: [s1, s2],
+            coupling: Coupling { shear, turned },
+        } = *self;
+        let mut all = [0.0; 25];
+        all[..7].copy_from_slice(&[flux, size, flux_error, f1, f2, s1, s2]);
+        all[7..12].copy_from_slice(&shear[0]);
+        all[12..17].copy_from_slice(&shear[1]);
+        all[17..].copy_from_slice(&turned);
+        all
+    }
+
+    /// Observables with these values, in the order of [`Observables::COLUMNS`].
+    pub fn from_array(all: &[f64; 25]) -> Self {
+        let five = |first: usize| std::array::from_fn(|k| all[first + k]);
+        Observables {
+            flux: all[0],
+            size: all[1],
+            flux_error: all[2],
+            flux_response: [all[3], all[4]],
+            size_response: [all[5], all[6]],
+            coupling: Coupling {
+                shear: [five(7), five(12)],
+                turned: std::array::from_fn(|k| all[17 + k]),
+            },
+        }
+    }
+}
+
+/// Mean products of the changes of ellipticity, flux and size by noise.
+///
+/// They are determined for one galaxy in eight, with eight times the weight, and zero for the others: only means enter.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[non_exhaustive]
+pub struct Coupling {
+    /// For the change of noise with γ1 and with γ2: products of e (of the same component) and flux, e and size, flux and flux,
+    /// flux and size, size and size.
+    pub shear: [[f64; 5]; 2],
+    /// For the difference to noise behind a PSF turned by 90 degrees: e1 and flux, e1 and size, e2 and flux, e2 and size, flux and
+    /// flux, flux and size, size and size; and the mean change of the size alone.
+    pub turned: [f64; 8],
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_keep_every_value_in_its_place() {
+        let all: [f64; 25] = std::array::from_fn(|k| k as f64 + 0.5);
+        let observables = Observables::from_array(&all);
+        assert_eq!(observables.to_array(), all);
+        let at = |name: &str| {
+            let place = Observables::COLUMNS.iter().position(|own| *own == name);
+            all[place.unwrap()]
+        };
+        assert_eq!(observables.size_response[1], at("size_g2"));
+        assert_eq!(observables.coupling.shear[1][3], at("n2_fs"));
+        assert_eq!(observables.coupling.turned[2], at("t_e2f"));
     }
 }

@@ -1,41 +1,40 @@
-//! The two ways from a cut stamp to a distortion: the network, and its linear closed form.
+//! A method measures a cut stamp: the network, or the linear method. What it found becomes the reported ellipticity here.
 
-mod family;
-mod found;
 mod linear;
 mod network;
-mod softening;
-mod window;
 
 use std::sync::Arc;
 
-use shearq_submissions::{Configuration, Method};
+use ndarray::{Array2, ArrayView2};
+use shearq_quantities::{Distortion, Shear};
+use shearq_submissions::{Configuration, EllipticityType, Method};
 
-use self::family::LinearFamily;
-pub use self::found::AdaptedSettings;
-pub(crate) use self::found::{CutWorker, Found, FoundObservables, Images, Sheared};
-use self::network::NetworkPlan;
+use self::linear::LinearFamily;
+use self::network::{NetworkPlan, NetworkWorker};
+use crate::deconvolve::Descent;
 use crate::error::MeasureError;
+use crate::measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
+use crate::noise::StampNoise;
+use crate::psf::CommonProfile;
+use crate::sheared::{NoiseProducts, ShearSettings, ShearedCatalogues, sheared};
 
 /// A method, planned for one size of cut stamps.
 pub(crate) enum MethodPlan {
-    /// The network, and moments of the clipped ACF.
+    /// The network, and moments of the clipped autocorrelation.
     Network(Arc<NetworkPlan>),
-    /// The linear network, and moments under an adaptive weight.
+    /// The closed form of the network, and moments under an adaptive weight.
     Linear(Arc<LinearFamily>),
 }
 
 impl MethodPlan {
     pub(crate) fn new(configuration: &Configuration, n: usize) -> Result<Self, MeasureError> {
+        let cut = configuration.psf_cut();
         Ok(match &configuration.method {
-            Method::Network(network) => MethodPlan::Network(Arc::new(NetworkPlan::new(
-                network,
-                n,
-                configuration.psf.size,
-            )?)),
+            Method::Network(network) => {
+                MethodPlan::Network(Arc::new(NetworkPlan::new(network, n, cut.size)?))
+            }
             Method::Linear(linear) => {
-                let family = LinearFamily::new(linear, n, configuration.psf_cut())?;
-                MethodPlan::Linear(Arc::new(family))
+                MethodPlan::Linear(Arc::new(LinearFamily::new(linear, n, cut)?))
             }
         })
     }
@@ -43,8 +42,320 @@ impl MethodPlan {
     /// A worker for one thread.
     pub(crate) fn worker(&self) -> Box<dyn CutWorker> {
         match self {
-            MethodPlan::Network(plan) => network::worker(Arc::clone(plan)),
-            MethodPlan::Linear(family) => family::worker(Arc::clone(family)),
+            MethodPlan::Network(plan) => Box::new(NetworkWorker::new(Arc::clone(plan))),
+            MethodPlan::Linear(family) => Box::new(family.worker()),
+        }
+    }
+}
+
+/// The PSF and buffers of a method in one thread.
+pub(crate) trait CutWorker: Send {
+    /// Sets properties of an image: its noise in units of the level, the mean square per axis of its galaxies with the PSF
+    /// in px², and the common profile of its noisy stars. Before the first image, noise is white and nothing else is known.
+    fn set_image(
+        &mut self,
+        _noise: &StampNoise,
+        _galaxy_variance: Option<f64>,
+        _stars: Option<&Arc<CommonProfile>>,
+    ) {
+    }
+
+    fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;
+
+    /// The settings that were adapted to PSF and galaxies, if the method adapts any.
+    fn adapted(&self) -> Option<AdaptedSettings> {
+        None
+    }
+
+    /// Measures a cut stamp of noise level `noise`. `None` if there is no unit of brightness.
+    fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError>;
+
+    /// The deconvolved stamp and the autocorrelation of the last measurement.
+    fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images;
+}
+
+/// Lengths of the linear method after their adaptation to the PSF and to the galaxies of a survey.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct AdaptedSettings {
+    /// σ in pixels of the Gaussian that the deconvolved stamp is convolved with.
+    pub target_sigma: f64,
+    /// σ in pixels of the window.
+    pub window_sigma: f64,
+    /// Scale in pixels of the weight of the moments.
+    pub weight_scale: f64,
+}
+
+/// Results of a method on a stamp. Methods measure the distortion χ; a configuration reports χ or ε.
+pub(crate) struct Found {
+    descent: Descent,
+    distortion: Result<Distortion, Flag>,
+    /// Response of the distortion, if the method determines it.
+    response: Option<ResponseMatrix>,
+    noise_field: Option<NoiseField>,
+    observables: Option<FoundObservables>,
+    flux: f64,
+    radius: f64,
+    size: f64,
+}
+
+/// Flux and size of a galaxy before the PSF.
+struct FoundObservables {
+    flux: f64,
+    flux_error: f64,
+    flux_response: [f64; 2],
+    /// Response of T, from which the size follows.
+    square_response: [f64; 2],
+    /// The size, and its first and second derivative with T.
+    size: [f64; 3],
+    /// On galaxies with a noise field: mean products of the changes by noise of χ₁, χ₂, T and the flux, in the order 00, 01,
+    /// 02, 03, 11, …, for noise changed by γ₁, by γ₂, turned, and unchanged.
+    products: Option<[[f64; 4]; 10]>,
+    /// For sheared catalogues, if they are requested.
+    sheared: Option<ShearSettings>,
+}
+
+/// Changes of a galaxy with a field of noise that is added and subtracted.
+struct NoiseField {
+    /// Distortion with the field added and subtracted, with the response to a shear of the field alone.
+    sides: [(Distortion, ResponseMatrix); 2],
+    /// Change of the distortion on either side by the difference of the field to a field behind a PSF turned by 90 degrees.
+    turned: [[f64; 2]; 2],
+    /// Change of the size's T on either side by the field under γ₁ and γ₂, and by the same difference.
+    square: [[f64; 3]; 2],
+    /// Factor from the difference of both sides to the effect of sheared noise on the mean response.
+    weight: f64,
+}
+
+/// The steps of a measurement as images.
+pub(crate) struct Images {
+    pub(crate) deconvolved: Array2<f64>,
+    /// Zero lag in the middle.
+    pub(crate) acf: Array2<f64>,
+    /// Weight of each lag in the moments, if it varies within the radius.
+    pub(crate) weight: Option<Array2<f64>>,
+    /// Pixels between lags.
+    pub(crate) spacing: f64,
+}
+
+/// The whole autocorrelation from its lags dy = 0…R, dx = −R…R: the half with dy < 0 follows from
+/// A(−dx, −dy) = A(dx, dy).
+fn whole_lags(lags: &[f32], reach: usize) -> Array2<f64> {
+    let side = 2 * reach + 1;
+    Array2::from_shape_fn((side, side), |(y, x)| {
+        let (y, x) = if y < reach {
+            (side - 1 - y, side - 1 - x)
+        } else {
+            (y, x)
+        };
+        f64::from(lags[(y - reach) * side + x])
+    })
+}
+
+fn image(values: &[f32], n: usize) -> Array2<f64> {
+    Array2::from_shape_fn((n, n), |(y, x)| f64::from(values[y * n + x]))
+}
+
+impl Found {
+    /// The measurement with an ellipticity of type `kind`, before calibration.
+    pub(crate) fn measurement(&self, kind: EllipticityType, noise: f64) -> Measurement {
+        let measured = Measurement {
+            descent: Some(self.descent),
+            noise,
+            flux: self.flux,
+            radius: self.radius,
+            size: self.size,
+            ..Measurement::flagged(Flag::NoShear)
+        };
+        let (e, response) = match self.ellipticity(kind) {
+            Ok(found) => found,
+            Err(flag) => {
+                return Measurement {
+                    flags: flag.into(),
+                    ..measured
+                };
+            }
+        };
+        let observables = self.observables(kind);
+        let pair = observables.as_ref().zip(response);
+        Measurement {
+            e1: e[0],
+            e2: e[1],
+            flags: Flags::NONE,
+            response,
+            observables,
+            sheared: pair.and_then(|(observables, response)| {
+                self.sheared_catalogues(kind, e, response, observables)
+            }),
+            ..measured
+        }
+    }
+
+    /// The ellipticity of type `kind`, and its response if the method determines it.
+    fn ellipticity(
+        &self,
+        kind: EllipticityType,
+    ) -> Result<([f64; 2], Option<ResponseMatrix>), Flag> {
+        let chi = self.distortion?;
+        let mut e = of_type(kind, chi).ok_or(Flag::NoShear)?;
+        let mut response = self.response.map(|r| response_of_type(kind, chi, r));
+        let usable = |field: &&NoiseField| {
+            let mut sides = field.sides.iter();
+            sides.all(|(chi, _)| of_type(kind, *chi).is_some())
+        };
+        if let Some(field) = self.noise_field.as_ref().filter(usable) {
+            let [plus, minus] = field.sides.map(|(chi, r)| response_of_type(kind, chi, r));
+            for (i, row) in response.iter_mut().flatten().enumerate() {
+                for (j, value) in row.iter_mut().enumerate() {
+                    *value -= field.weight * (plus[i][j] - minus[i][j]);
+                }
+            }
+            let [plus, minus] = [0, 1].map(|side| {
+                // A change of χ is like the response to one shear that changes both components.
+                let change = field.turned[side].map(|change| [change; 2]);
+                let change = response_of_type(kind, field.sides[side].0, change);
+                [change[0][0], change[1][1]]
+            });
+            for k in 0..2 {
+                e[k] += 0.5 * field.weight * (plus[k] - minus[k]);
+            }
+        }
+        Ok((e, response))
+    }
+
+    /// Flux and size with their couplings to an ellipticity of type `kind`.
+    fn observables(&self, kind: EllipticityType) -> Option<Observables> {
+        let (chi, found) = (self.distortion.ok()?, self.observables.as_ref()?);
+        let [size, first, second] = found.size;
+        let mut size_response = found.square_response.map(|response| first * response);
+        let mut coupling = Coupling::default();
+        if let (Some(field), Some(products)) = (&self.noise_field, &found.products) {
+            let product = |number: usize, noise: usize| products[number][noise];
+            let jacobian = response_of_type(kind, chi, [[1.0, 0.0], [0.0, 1.0]]);
+            let with_e = |i: usize, numbers: [usize; 2], noise: usize| {
+                let [one, two] = numbers.map(|number| product(number, noise));
+                jacobian[i][0] * one + jacobian[i][1] * two
+            };
+            // Numbers of the products of χ₁ and χ₂ with T and with the flux.
+            let (with_size, with_flux) = ([2, 5], [3, 6]);
+            let squares = |noise: usize| {
+                let [size2, cross, flux2] = [7, 8, 9].map(|number| product(number, noise));
+                [flux2, first * cross, first * first * size2]
+            };
+            // The size is not linear in T, and T not in the autocorrelation.
+            let curved = |noise: usize| {
+                let [plus, minus] = field.square;
+                first * field.weight * (plus[noise] - minus[noise]) + second * product(7, noise)
+            };
+            for (k, response) in size_response.iter_mut().enumerate() {
+                let [flux2, cross, size2] = squares(k);
+                let (e_flux, e_size) = (with_e(k, with_flux, k), first * with_e(k, with_size, k));
+                coupling.shear[k] = [e_flux, e_size, flux2, cross, size2];
+                *response -= curved(k);
+            }
+            let [flux2, cross, size2] = squares(2);
+            let [one, two] =
+                [0, 1].map(|i| [with_e(i, with_flux, 2), first * with_e(i, with_size, 2)]);
+            let size_change = curved(2);
+            coupling.turned = [
+                one[0],
+                one[1],
+                two[0],
+                two[1],
+                flux2,
+                cross,
+                size2,
+                size_change,
+            ];
+        }
+        Some(Observables {
+            flux: found.flux,
+            flux_error: found.flux_error,
+            size,
+            flux_response: found.flux_response,
+            size_response,
+            coupling,
+        })
+    }
+
+    /// The galaxy as it would be measured under small shears; `None` if that is not requested. In the rare case that the
+    /// effect of noise is unknown, it is not corrected.
+    fn sheared_catalogues(
+        &self,
+        kind: EllipticityType,
+        e: [f64; 2],
+        response: ResponseMatrix,
+        observables: &Observables,
+    ) -> Option<ShearedCatalogues> {
+        let (chi, found) = (self.distortion.ok()?, self.observables.as_ref()?);
+        let settings = found.sheared?;
+        let products = found.products.unwrap_or_default();
+        let [[a, b], [c, d]] = response_of_type(kind, chi, [[1.0, 0.0], [0.0, 1.0]]);
+        // Rows are e1, e2, flux and size; columns χ₁, χ₂, T and flux.
+        let rows = [
+            [a, b, 0.0, 0.0],
+            [c, d, 0.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+            [0.0, 0.0, found.size[1], 0.0],
+        ];
+        // Place of a pair in the order 00, 01, 02, 03, 11, …
+        let number = |i: usize, j: usize| i.min(j) * (7 - i.min(j)) / 2 + i.max(j);
+        let product = |a: usize, b: usize, noise: usize| -> f64 {
+            let terms = (0..4).flat_map(|i| (0..4).map(move |j| [i, j]));
+            terms
+                .map(|[i, j]| rows[a][i] * rows[b][j] * products[number(i, j)][noise])
+                .sum()
+        };
+        let matrix =
+            |noise: usize| std::array::from_fn(|a| std::array::from_fn(|b| product(a, b, noise)));
+        let noise = NoiseProducts {
+            plain: matrix(3),
+            sheared: [matrix(0), matrix(1)],
+            turned: matrix(2),
+        };
+        let Observables {
+            flux_response,
+            size_response,
+            ..
+        } = *observables;
+        let [.., size_change] = observables.coupling.turned;
+        let size = observables.size + 0.5 * size_change;
+        let values = [e[0], e[1], observables.flux, size];
+        let derivatives = [0, 1].map(|k| {
+            let [e1, e2] = [response[0][k], response[1][k]];
+            [e1, e2, flux_response[k], size_response[k]]
+        });
+        let catalogues = |noise| sheared(values, derivatives, noise, &settings);
+        Some(ShearedCatalogues {
+            each: catalogues(&noise).or_else(|| catalogues(&NoiseProducts::NONE))?,
+            flux_error: observables.flux_error,
+        })
+    }
+}
+
+/// The ellipticity of type `kind`; `None` if the distortion exceeds 1 and has no shear-type ellipticity.
+fn of_type(kind: EllipticityType, chi: Distortion) -> Option<[f64; 2]> {
+    match kind {
+        EllipticityType::Distortion => Some([chi.e1, chi.e2]),
+        EllipticityType::Shear => chi.to_shear().map(|Shear { e1, e2 }| [e1, e2]),
+    }
+}
+
+/// The response of the ellipticity of type `kind`, from the response of the distortion.
+fn response_of_type(kind: EllipticityType, chi: Distortion, r: ResponseMatrix) -> ResponseMatrix {
+    match kind {
+        EllipticityType::Distortion => r,
+        EllipticityType::Shear => {
+            // ε = χ f, f = 1/(1 + s), s = √(1 − |χ|²): ∂ε_i/∂χ_j = f δ_ij + χ_i χ_j f²/s.
+            let s = (1.0 - chi.e1 * chi.e1 - chi.e2 * chi.e2).sqrt();
+            let f = 1.0 / (1.0 + s);
+            let cross = |a: f64, b: f64| a * b * f * f / s;
+            let (own1, own2) = (f + cross(chi.e1, chi.e1), f + cross(chi.e2, chi.e2));
+            let other = cross(chi.e1, chi.e2);
+            [
+                [0, 1].map(|j| own1 * r[0][j] + other * r[1][j]),
+                [0, 1].map(|j| own2 * r[1][j] + other * r[0][j]),
+            ]
         }
     }
 }

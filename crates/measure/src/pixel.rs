@@ -1,12 +1,14 @@
-//! Pixels of either precision.
+//! Pixels in either precision: copies, checks, and the range in which single precision is enough.
 
 use std::borrow::Cow;
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
+use multiversion::multiversion;
 use ndarray::{
     Array, Array3, ArrayView, ArrayView1, ArrayView2, ArrayView3, Axis, CowArray, Dimension, Ix3,
     RemoveAxis, Slice,
 };
+use shearq_submissions::limits::{MAX_CUT, MAX_PSF};
 
 use crate::error::{MeasureError, length};
 
@@ -112,7 +114,11 @@ impl Pixels<'_, Ix3> {
     pub fn strip(pixels: Vec<f32>, count: usize, side: usize) -> Result<Self, MeasureError> {
         length("a strip of stamps", pixels.len(), count * side * side)?;
         let rows = Array3::from_shape_vec((side, count, side), pixels);
-        let rows = rows.map_err(|error| MeasureError::strip(count, side, &error))?;
+        let rows = rows.map_err(|error| MeasureError::Shape {
+            what: "a strip of stamps",
+            found: format!("{count} stamps of {side} × {side} pixels"),
+            expected: error.to_string(),
+        })?;
         Ok(rows.permuted_axes([1, 0, 2]).into())
     }
 }
@@ -184,6 +190,77 @@ pub(crate) fn contiguous<P: Pixel>(row: ArrayView1<'_, P>) -> Cow<'_, [P]> {
 fn convert<'a, P: Pixel + 'a>(to: &mut [f32], from: impl Iterator<Item = &'a P>) {
     for (value, pixel) in to.iter_mut().zip(from) {
         *value = pixel.to_f32();
+    }
+}
+
+/// Brightest pixels, in image units, whose autocorrelation keeps single precision: the squares of its values neither
+/// vanish nor overflow.
+pub(crate) const PEAKS: RangeInclusive<f32> = 1e-18..=1e17;
+/// Noise levels other than zero, in image units, whose squares keep single precision beside those of [`PEAKS`].
+const LEVELS: RangeInclusive<f64> = 1e-30..=1e18;
+
+/// Whether a noise level can be used.
+pub(crate) fn is_level(sigma: f64) -> bool {
+    sigma == 0.0 || LEVELS.contains(&sigma)
+}
+
+/// The largest pixel, or zero if none is positive. 64 running maxima let vector instructions take several at a time.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+pub(crate) fn highest(pixels: &[f32]) -> f32 {
+    // Four vectors of AVX-512, so that comparisons overlap.
+    const LANES: usize = 64;
+    let mut lanes = [0.0f32; LANES];
+    let chunks = pixels.chunks_exact(LANES);
+    let rest = chunks.remainder().iter().copied().fold(0.0, f32::max);
+    for chunk in chunks {
+        for (lane, value) in lanes.iter_mut().zip(chunk) {
+            // Not a number is not larger.
+            *lane = if *value > *lane { *value } else { *lane };
+        }
+    }
+    lanes.into_iter().fold(rest, f32::max)
+}
+
+/// Whether all pixels are finite.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+pub(crate) fn all_finite(pixels: &[f32]) -> bool {
+    // No early exit, so that several pixels are tested at a time.
+    let largest = pixels
+        .iter()
+        .fold(0, |most: u32, value| most.max(value.abs().to_bits()));
+    largest < f32::INFINITY.to_bits()
+}
+
+/// Checks the sides of a stamp and a PSF that are planned for.
+pub(crate) fn check_sizes(n: usize, p: usize) -> Result<(), MeasureError> {
+    if !(3..=MAX_CUT).contains(&n) {
+        let expected = format!("a side of 3 to {MAX_CUT} pixels");
+        return Err(MeasureError::square("a stamp", (n, n), expected));
+    }
+    if !(2..=MAX_PSF).contains(&p) {
+        let expected = format!("a side of 2 to {MAX_PSF} pixels");
+        return Err(MeasureError::square("a PSF stamp", (p, p), expected));
+    }
+    Ok(())
+}
+
+/// Checks that a PSF has p×p finite pixels.
+pub(crate) fn check_psf(psf: ArrayView2<'_, f64>, p: usize) -> Result<(), MeasureError> {
+    if psf.dim() != (p, p) {
+        let expected = format!("{p} × {p}");
+        return Err(MeasureError::square("a PSF stamp", psf.dim(), expected));
+    }
+    // Without the places of its pixels, which only a bad one needs, and without an early exit.
+    if !psf.fold(false, |bad, value| bad | !value.is_finite()) {
+        return Ok(());
+    }
+    match psf.indexed_iter().find(|(_, value)| !value.is_finite()) {
+        None => Ok(()),
+        Some(((y, x), _)) => Err(MeasureError::NotFinite {
+            what: "PSF stamp",
+            x: x + 1,
+            y: y + 1,
+        }),
     }
 }
 

@@ -17,13 +17,13 @@
 use std::fmt;
 use std::sync::Arc;
 
-use crate::measurement::ResponseMatrix;
-use crate::observables::{Coupling, Observables};
+use crate::measurement::{Coupling, Observables, ResponseMatrix};
 
-/// Half width of a step in S/N, if none is given: one and a half times the noise of the S/N. See docs/constants.md.
-const SNR_WIDTH: f64 = 1.5;
-/// Half width of a step in size, in px, if none is given. See docs/constants.md.
-const SIZE_WIDTH: f64 = 0.3;
+// In units of the noise of the S/N. At S/N 20, half widths of 0.25, 0.5 and 1 standard deviation of the size give errors of
+// m of 2.4, 1.8 and 1.4 (10⁻³) for 64,000 measurements.
+const SNR_HALF_WIDTH: f64 = 1.5;
+// In px. The same measurement: the standard deviation of the size is 0.40 px.
+const SIZE_HALF_WIDTH: f64 = 0.3;
 
 /// A quantity that galaxies can be selected by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -197,9 +197,9 @@ impl Cut {
     fn jet(&self, galaxy: &Observables) -> Jet {
         // A place along flux or size; S/N is flux in units of its error.
         let (value, along, unit, usual) = match self.quantity {
-            Quantity::Snr => (galaxy.flux, 0, galaxy.flux_error, SNR_WIDTH),
-            Quantity::Flux => (galaxy.flux, 0, 1.0, SNR_WIDTH * galaxy.flux_error),
-            Quantity::Size => (galaxy.size, 1, 1.0, SIZE_WIDTH),
+            Quantity::Snr => (galaxy.flux, 0, galaxy.flux_error, SNR_HALF_WIDTH),
+            Quantity::Flux => (galaxy.flux, 0, 1.0, SNR_HALF_WIDTH * galaxy.flux_error),
+            Quantity::Size => (galaxy.size, 1, 1.0, SIZE_HALF_WIDTH),
         };
         let half = self.half_width.unwrap_or(usual) * unit;
         let sign = if self.above { 1.0 } else { -1.0 };
@@ -239,8 +239,7 @@ impl Jet {
 
 /// A weight and its derivatives by differences.
 fn numerical(weight: &dyn Fn(f64, f64, f64) -> f64, galaxy: &Observables) -> Jet {
-    /// Steps of flux in its errors, and of size in px: the rounding of second differences is 10⁻¹⁰ of the weight. See
-    /// docs/constants.md.
+    // Steps of the flux in its errors, and of the size in px: rounding of second differences is then 10⁻¹⁰ of the weight.
     const STEP: f64 = 1e-3;
     let steps = [STEP * galaxy.flux_error, STEP];
     let at = |i: i32, j: i32| {

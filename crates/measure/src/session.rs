@@ -1,48 +1,39 @@
 //! The measurement of one image, from its stamps and PSFs to calibrated rows and warnings.
 //!
-//! A [`Session`] is opened on a [`StampSource`]. Opening surveys the image: the noise and the sky of its stamps, and what
-//! noisy stars have in common. Rows are then read, measured in any thread, and collected in order by a
-//! [`MeasuredImage`], which calibrates them and says what is wrong with the image. Files, simulations, [`Measurer::batch`]
-//! and Python all take this one way: while each of them had its own, they differed in what they surveyed and reported.
+//! A [`Session`] is opened on a [`StampSource`]. Opening surveys the image: the noise and the sky of its stamps, and the
+//! common profile of noisy stars. Rows are then read, measured in any thread, and collected in order by a
+//! [`MeasuredImage`], which calibrates them and checks the image. Files, simulations, [`Measurer::batch`] and Python all
+//! use it: while each of them had its own way, they differed in what they surveyed and reported.
 
-mod arrays;
-mod source;
-mod survey;
+use std::fmt;
+use std::ops::{ControlFlow, Deref, Range};
+use std::sync::{Arc, LazyLock};
 
-use std::sync::Arc;
-
-use ndarray::{ArrayView3, Axis, Ix3};
+use ndarray::{ArrayView3, Axis, Ix3, Slice};
+use shearq_quantities::columns_of;
 use shearq_quantities::statistics::upper_median;
 use shearq_submissions::{Configuration, NoiseSource};
 
-pub use self::arrays::ArraySource;
-pub use self::source::{Lazy, LazyStamps, OneThread, StampRows, StampSource, Threads};
-use crate::brightness::is_level;
-use crate::calibrate::calibrate;
+use crate::calibration::calibrate;
 use crate::error::{MeasureError, length};
 use crate::examine::{EXAMINED_PSFS, Examination, enough, examined_rows};
-use crate::galaxy::Measurer;
 use crate::measurement::Measurement;
-use crate::noise::{NoisePlan, StampNoise, Survey};
-use crate::pixel::{Pixel, Pixels};
-use crate::psf::CommonProfile;
+use crate::measurer::{ImageNoise, ImageWorker, Measurer, Steps, Worker};
+use crate::noise::{NoisePlan, NoiseSurvey, Survey};
+use crate::pixel::{Pixel, Pixels, is_level};
+use crate::psf::{CommonProfile, Star, StarSurvey};
 use crate::psfs::Psfs;
 use crate::warning::Warning;
-use crate::worker::{ImageNoise, ImageWorker, Worker};
 
-/// Largest distance along each axis at which white noise is tested for correlation, in pixels.
-const CORRELATION_REACH: usize = 2;
-/// Least relative difference between stated and measured noise that is reported.
-const LEAST_NOISE_DIFFERENCE: f64 = 0.01;
-/// The same in units of its standard error.
-const NOISE_SIGNIFICANCE: f64 = 5.0;
-/// Effect on m below which the noise of a star is not stated: a star that was rounded to single precision has that much.
+// In pixels along each axis. Chosen by hand.
+const WHITENESS_TEST_REACH: usize = 2;
+// Effect on m below which the noise of a star is not stated: rounding a star to single precision has this effect.
 const LEAST_PSF_NOISE: f64 = 1e-5;
 
-/// What is known about the noise of an image before it is measured.
+/// The noise of an image before it is measured, as far as it is known.
 #[derive(Debug, Clone, Copy, Default)]
 pub enum KnownNoise<'n> {
-    /// Nothing.
+    /// Unknown.
     #[default]
     Unknown,
     /// A level that the data state. A configuration that measures the noise on the stamps reports a difference.
@@ -51,6 +42,207 @@ pub enum KnownNoise<'n> {
     Given(f64),
     /// The same, one level per stamp.
     GivenEach(&'n [f64]),
+}
+
+/// The stamps of an image in rows. The last row may be shorter.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StampRows {
+    /// Stamps of a full row, 1 or more.
+    pub columns: usize,
+    /// All stamps.
+    pub count: usize,
+}
+
+impl StampRows {
+    /// Number of rows.
+    #[expect(clippy::len_without_is_empty, reason = "an image has rows")]
+    pub fn len(&self) -> usize {
+        self.count.div_ceil(self.columns)
+    }
+
+    /// Which stamps are in a row.
+    pub fn stamps(&self, row: usize) -> Range<usize> {
+        row * self.columns..((row + 1) * self.columns).min(self.count)
+    }
+}
+
+/// Stamps and PSFs of an image: files, arrays, a simulation.
+///
+/// One thread reads, so a source may own a file that threads cannot share. Rows are read in ascending order and, for
+/// surveys, some of them before that.
+pub trait StampSource<'a> {
+    /// Why a row cannot be read or measured.
+    type Error: From<MeasureError> + Send;
+
+    /// The rows of the image.
+    fn rows(&self) -> StampRows;
+
+    /// Warnings about the image from other sources than its pixels, such as headers.
+    fn warnings(&self) -> Vec<Warning> {
+        Vec::new()
+    }
+
+    /// Reads the stamps of a row, one along the first axis per galaxy.
+    ///
+    /// # Errors
+    /// If they cannot be read.
+    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'a>, Self::Error>;
+
+    /// Reads the PSFs of a row: one PSF for all galaxies, or one per galaxy.
+    ///
+    /// # Errors
+    /// If they cannot be read.
+    fn psfs(&mut self, row: usize) -> Result<Lazy<'a, Psfs<'a>>, Self::Error>;
+}
+
+/// A value that is made by the first thread that needs it: threads share the drawing of simulated galaxies, although one
+/// thread reads the rows. Clones share the value.
+#[derive(Debug, Clone)]
+pub struct Lazy<'a, T>(Arc<LazyLock<T, Box<dyn FnOnce() -> T + Send + 'a>>>);
+
+/// The stamps of a row.
+pub type LazyStamps<'a> = Lazy<'a, Pixels<'a, Ix3>>;
+
+impl<'a, T> Lazy<'a, T> {
+    /// A value that will be made.
+    pub fn new(make: impl FnOnce() -> T + Send + 'a) -> Self {
+        Lazy(Arc::new(LazyLock::new(Box::new(make))))
+    }
+}
+
+impl<'a, T: Send + 'a> From<T> for Lazy<'a, T> {
+    fn from(value: T) -> Self {
+        Lazy::new(move || value)
+    }
+}
+
+impl<T> Deref for Lazy<'_, T> {
+    type Target = T;
+
+    fn deref(&self) -> &T {
+        &self.0
+    }
+}
+
+/// Threads of the caller. This crate starts none.
+pub trait Threads {
+    /// Number of threads, 1 or more.
+    fn count(&self) -> usize;
+
+    /// Maps values, in order, in any thread.
+    fn map<T: Send, R: Send>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R>;
+}
+
+/// The calling thread alone.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct OneThread;
+
+impl Threads for OneThread {
+    fn count(&self) -> usize {
+        1
+    }
+
+    fn map<T: Send, R: Send>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R> {
+        of.into_iter().map(map).collect()
+    }
+}
+
+/// Some of the stamps, or of their PSFs.
+type Slices<'a, T, E> = Box<dyn FnMut(Range<usize>) -> Result<T, E> + Send + 'a>;
+
+/// Stamps and PSFs in arrays, in the arrangement nearest to a square: images of as many stamps have the same rows, so
+/// that the same stamps are surveyed and examined.
+pub struct ArraySource<'a, E = MeasureError> {
+    count: usize,
+    stamps: Slices<'a, Pixels<'a, Ix3>, E>,
+    psfs: Slices<'a, Psfs<'a>, E>,
+    moved: Option<[f64; 2]>,
+}
+
+impl<E> fmt::Debug for ArraySource<'_, E> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ArraySource")
+            .field("count", &self.count)
+            .finish_non_exhaustive()
+    }
+}
+
+impl<'a> ArraySource<'a> {
+    /// Of stamps, one along the first axis per galaxy. A star for all galaxies is cut and normalised here.
+    ///
+    /// # Errors
+    /// If there is not one PSF for all or one per galaxy, or the star for all cannot be used.
+    pub fn new<T: Pixel>(
+        measurer: &Measurer,
+        stamps: ArrayView3<'a, T>,
+        psfs: &'a Psfs<'_>,
+    ) -> Result<Self, MeasureError> {
+        let (count, full, _) = stamps.dim();
+        let (psfs, moved) = match psfs.count() {
+            Some(given) if given != count => {
+                return Err(MeasureError::Shape {
+                    what: "PSFs",
+                    found: format!("{given} galaxies"),
+                    expected: format!("{count}, one each"),
+                });
+            }
+            None if matches!(psfs, Psfs::Star(_)) => {
+                let Star { psf, moved } = psfs.at(0, measurer.configuration().psf_cut(), full)?;
+                (Psfs::Prepared(psf.into_shared()), moved)
+            }
+            _ => (psfs.slice(0..count), None),
+        };
+        let stamps = move |range| {
+            let mut some = stamps;
+            some.slice_axis_inplace(Axis(0), Slice::from(range));
+            Ok(T::pixels(some))
+        };
+        let psfs = move |range| Ok(psfs.clone().into_slice(range));
+        Ok(ArraySource::from_fn(count, stamps, psfs, moved))
+    }
+}
+
+impl<'a, E> ArraySource<'a, E> {
+    /// Of `count` stamps, of which functions give some with their PSFs. The star for all galaxies was `moved` by so many
+    /// pixels to be in the middle.
+    pub fn from_fn(
+        count: usize,
+        stamps: impl FnMut(Range<usize>) -> Result<Pixels<'a, Ix3>, E> + Send + 'a,
+        psfs: impl FnMut(Range<usize>) -> Result<Psfs<'a>, E> + Send + 'a,
+        moved: Option<[f64; 2]>,
+    ) -> Self {
+        ArraySource {
+            count,
+            stamps: Box::new(stamps),
+            psfs: Box::new(psfs),
+            moved,
+        }
+    }
+}
+
+impl<'a, E: From<MeasureError> + Send> StampSource<'a> for ArraySource<'a, E> {
+    type Error = E;
+
+    fn rows(&self) -> StampRows {
+        StampRows {
+            columns: columns_of(self.count),
+            count: self.count,
+        }
+    }
+
+    fn warnings(&self) -> Vec<Warning> {
+        self.moved.map(Warning::of_moved).into_iter().collect()
+    }
+
+    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'a>, E> {
+        let range = self.rows().stamps(row);
+        Ok((self.stamps)(range)?.into())
+    }
+
+    fn psfs(&mut self, row: usize) -> Result<Lazy<'a, Psfs<'a>>, E> {
+        let range = self.rows().stamps(row);
+        Ok((self.psfs)(range)?.into())
+    }
 }
 
 /// One image between its survey and its last row. Threads share it.
@@ -158,7 +350,7 @@ impl<'n> Session<'n> {
         };
         let of_settings = Warning::of_settings(measurer.configuration());
         let warnings = of_settings.into_iter().chain(source.warnings()).collect();
-        let stars = survey::stars(measurer, source, &examined, threads)?;
+        let stars = survey_stars(measurer, source, &examined, threads)?;
         let mut session = Session {
             measurer: measurer.clone(),
             rows,
@@ -176,12 +368,14 @@ impl<'n> Session<'n> {
             session.typical_level = upper_median(&mut levels);
         }
         if let Some(plan) = session.surveyed() {
-            session.survey = survey::noise(plan, source, threads)?;
-            let found = session.survey.as_ref();
-            let warning = found.map_or(Some(Warning::NoNoise), |survey| {
-                differing(noise, &survey.noise)
+            session.survey = survey_noise(plan, source, threads)?;
+            session.warnings.extend(match (&session.survey, noise) {
+                (None, _) => Some(Warning::NoNoise),
+                (Some(survey), KnownNoise::Stated(level)) => {
+                    Warning::of_stated_noise(level, survey.noise.sigma(), survey.noise.error())
+                }
+                (Some(_), _) => None,
             });
-            session.warnings.extend(warning);
         }
         Ok(session)
     }
@@ -233,9 +427,9 @@ impl<'n> Session<'n> {
             return Ok(None);
         }
         // Small stamps have no border that could be surveyed.
-        let found = NoisePlan::new(self.measurer.full(), CORRELATION_REACH)
+        let found = NoisePlan::new(self.measurer.full(), WHITENESS_TEST_REACH)
             .map_err(S::Error::from)
-            .and_then(|plan| survey::noise(&plan, source, threads));
+            .and_then(|plan| survey_noise(&plan, source, threads));
         let found = match found {
             Err(error) if self.surveyed().is_some() => return Err(error),
             found => found.ok().flatten(),
@@ -279,6 +473,33 @@ impl<'n> Session<'n> {
             Pixels::Single(stamps) => self.measure_row(worker, row, stamps.view(), psfs),
             Pixels::Double(stamps) => self.measure_row(worker, row, stamps.view(), psfs),
         }
+    }
+
+    /// Measures stamp `k` of a row before calibration, with all steps unless the method did not run. Levels of single stamps
+    /// are not used.
+    ///
+    /// # Errors
+    /// If the row cannot be read, or the PSF cannot be used.
+    pub fn steps<S: StampSource<'n>>(
+        &self,
+        source: &mut S,
+        row: usize,
+        k: usize,
+    ) -> Result<(Measurement, Option<Steps>), S::Error> {
+        let (stamps, psfs) = (source.stamps(row)?, source.psfs(row)?);
+        let cut = self.measurer.configuration().psf_cut();
+        let psf = psfs.at(k, cut, self.measurer.full())?.psf;
+        let mut worker = self.measurer.worker();
+        let mut image = self.image(&mut worker);
+        let mut worker = image.psf(psf.view())?;
+        Ok(match &*stamps {
+            Pixels::Single(stamps) => {
+                worker.measure_with_steps(stamps.index_axis(Axis(0), k), psf)?
+            }
+            Pixels::Double(stamps) => {
+                worker.measure_with_steps(stamps.index_axis(Axis(0), k), psf)?
+            }
+        })
     }
 
     fn measure_row<T: Pixel>(
@@ -427,7 +648,15 @@ impl MeasuredImage<'_> {
                     .zip(session.typical_level)
                     .and_then(|(scaled, level)| scaled.given_noise(level)),
                 KnownNoise::Stated(level) if configuration.noise == NoiseSource::Header => {
-                    stamps.given_noise(level).map(Warning::of_stated)
+                    let given = stamps.given_noise(level);
+                    given.map(|warning| match warning {
+                        Warning::GivenNoise { given, measured } => Warning::NoiseLevel {
+                            given,
+                            measured,
+                            used: false,
+                        },
+                        other => other,
+                    })
                 }
                 KnownNoise::Stated(_) | KnownNoise::Unknown => None,
             });
@@ -464,17 +693,384 @@ fn check(
     found.map_or(Ok(()), |found| Err(MeasureError::Noise(found)))
 }
 
-/// A warning if a stated level disagrees with the measured noise, which is used.
-fn differing(noise: KnownNoise<'_>, measured: &StampNoise) -> Option<Warning> {
-    let KnownNoise::Stated(given) = noise else {
-        return None;
+/// The noise, the sky and the galaxy size of an image; `None` if galaxies on all of its stamps will be flagged.
+fn survey_noise<'a, S: StampSource<'a>>(
+    plan: &NoisePlan,
+    source: &mut S,
+    threads: &impl Threads,
+) -> Result<Option<Arc<Survey>>, S::Error> {
+    let rows = source.rows();
+    let chosen = plan.rows(rows.columns, rows.len());
+    let mut pass = |mut all: NoiseSurvey| {
+        let empty = all.clone();
+        scan(
+            (rows, &chosen, threads),
+            |row| source.stamps(row),
+            |stamps, range| {
+                let mut survey = empty.clone();
+                match &**stamps {
+                    Pixels::Single(stamps) => add_stamps(&mut survey, stamps.view(), range)?,
+                    Pixels::Double(stamps) => add_stamps(&mut survey, stamps.view(), range)?,
+                }
+                Ok(survey)
+            },
+            |found| {
+                all.join(&found)?;
+                Ok(ControlFlow::Continue(()))
+            },
+        )?;
+        Ok::<_, S::Error>(all)
     };
-    let apart = measured.sigma() / given - 1.0;
-    let least = (NOISE_SIGNIFICANCE * measured.error()).max(LEAST_NOISE_DIFFERENCE);
-    // NaN if the stated level is zero or NaN.
-    (apart.abs() > least || apart.is_nan()).then_some(Warning::NoiseLevel {
-        given,
-        measured: measured.sigma(),
-        used: true,
-    })
+    let mut survey = pass(plan.survey())?;
+    if let Some(again) = survey.without_sky() {
+        survey = pass(again)?;
+    }
+    Ok(survey.shared()?)
+}
+
+fn add_stamps<T: Pixel>(
+    survey: &mut NoiseSurvey,
+    mut stamps: ArrayView3<'_, T>,
+    range: Range<usize>,
+) -> Result<(), MeasureError> {
+    stamps.slice_axis_inplace(Axis(0), Slice::from(range));
+    stamps.outer_iter().try_for_each(|stamp| survey.add(stamp))
+}
+
+/// What noisy stars, one per galaxy, have in common. `None` if there is one PSF for all galaxies, a formula, no noise, or
+/// the configuration uses stars as they are.
+fn survey_stars<'a, S: StampSource<'a>>(
+    measurer: &Measurer,
+    source: &mut S,
+    chosen: &[usize],
+    threads: &impl Threads,
+) -> Result<Option<Arc<CommonProfile>>, S::Error> {
+    if measurer.star_looker().is_none() {
+        return Ok(None);
+    }
+    let mut survey = StarSurvey::default();
+    let rows = source.rows();
+    scan(
+        (rows, chosen, threads),
+        |row| source.psfs(row),
+        |psfs, range| {
+            let (Psfs::Stars(_), Some(mut looker)) = (&**psfs, measurer.star_looker()) else {
+                return Ok(Vec::new());
+            };
+            Ok(range.map(|at| looker.look(psfs, at)).collect())
+        },
+        |looks| {
+            if looks.is_empty() {
+                return Ok(ControlFlow::Break(()));
+            }
+            for look in looks {
+                survey.add(look);
+                if survey.is_over() {
+                    return Ok(ControlFlow::Break(()));
+                }
+            }
+            Ok(ControlFlow::Continue(()))
+        },
+    )?;
+    Ok(survey.common())
+}
+
+/// Reads `chosen` rows, as many at a time as there are threads, looks at parts of them, and takes what was found in the
+/// order of the stamps.
+fn scan<R: Send + Sync, L: Send, E: Send>(
+    (rows, chosen, threads): (StampRows, &[usize], &impl Threads),
+    mut read: impl FnMut(usize) -> Result<R, E>,
+    look: impl Fn(&R, Range<usize>) -> Result<L, E> + Send + Sync,
+    mut take: impl FnMut(L) -> Result<ControlFlow<()>, E>,
+) -> Result<(), E> {
+    let together = threads.count().max(1);
+    for some in chosen.chunks(together) {
+        let read: Vec<(R, usize)> = some
+            .iter()
+            .map(|&row| Ok((read(row)?, rows.stamps(row).len())))
+            .collect::<Result<_, E>>()?;
+        let parts = together.div_ceil(read.len());
+        let jobs = read.iter().flat_map(|(row, count)| {
+            let size = count.div_ceil(parts);
+            let starts = (0..*count).step_by(size.max(1));
+            starts.map(move |start| (row, start..(start + size).min(*count)))
+        });
+        for found in threads.map(jobs.collect(), |(row, range)| look(row, range)) {
+            if take(found?)?.is_break() {
+                return Ok(());
+            }
+        }
+    }
+    Ok(())
+}
+
+impl Measurer {
+    /// Measures stamps, one each along the first axis, of one noise level, and calibrates their
+    /// ellipticities by their mean response, as the submission asks. A noise level that is given is that of white
+    /// noise; where none is, a submission that asks for it measures the noise on the stamps. Several thousand galaxies tell the
+    /// response to a per cent.
+    ///
+    /// # Errors
+    /// Where sizes or numbers do not fit, the noise level is not one, or a PSF for all cannot be used. A
+    /// galaxy with pixels that are not finite (under a linear method: too many), or with a PSF of its own that cannot be
+    /// used, is flagged.
+    pub fn batch<T: Pixel>(
+        &self,
+        stamps: ArrayView3<'_, T>,
+        psfs: &Psfs<'_>,
+        noise: Option<f64>,
+    ) -> Result<Batch, MeasureError> {
+        let mut source = ArraySource::new(self, stamps, psfs)?;
+        let noise = noise.map_or(KnownNoise::Unknown, KnownNoise::Given);
+        let session = Session::open(self, &mut source, noise, &OneThread)?;
+        let session = Arc::new(session);
+        let mut image = Arc::clone(&session).begin()?;
+        let mut worker = self.worker();
+        for row in 0..session.rows().len() {
+            image.add(session.read(&mut source, row)?.measure(&mut worker)?);
+        }
+        image.finish().checked()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::{Array3, s};
+    use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
+
+    use super::*;
+    use crate::measurement::Flag;
+
+    fn moffat(e1: f64) -> FunctionalPsf {
+        let profile = PsfProfile::Moffat { beta: 3.0 };
+        FunctionalPsf::new(profile, 3.4, Shear::new(e1, 0.0)).unwrap()
+    }
+
+    /// Elongated galaxies, every one a little more than the one before.
+    fn stamps(count: usize, side: usize) -> Array3<f32> {
+        let middle = (side as f32 - 1.0) / 2.0;
+        Array3::from_shape_fn((count, side, side), |(k, y, x)| {
+            let (y, x) = (y as f32 - middle, x as f32 - middle);
+            100.0 * (-(x * x / (9.0 + 0.5 * k as f32) + y * y / 9.0)).exp()
+        })
+    }
+
+    fn message<T>(result: Result<T, MeasureError>, expected: &str) {
+        let Err(error) = result else {
+            panic!("nothing wrong; expected {expected}")
+        };
+        assert!(error.to_string().contains(expected), "{error}");
+    }
+
+    #[test]
+    fn a_batch_is_its_stamps_divided_by_their_mean_response_in_either_precision() {
+        let measurer = Measurer::named("48/linear/star", 48).unwrap();
+        let (stamps, psf) = (stamps(6, 48), moffat(0.02));
+        let star = psf.stamp(40);
+        let batch = measurer.batch(stamps.view(), &Psfs::star(star.view()), Some(0.5));
+        let batch = batch.unwrap();
+        let response = batch.response.unwrap();
+        let mut means = [0.0; 2];
+        for (stamp, galaxy) in stamps.outer_iter().zip(&batch.galaxies) {
+            let double = stamp.mapv(f64::from);
+            let one = measurer
+                .stamp(double.view(), star.view(), Some(0.5))
+                .unwrap();
+            assert_eq!(one.response, galaxy.response);
+            assert_eq!(one.e1 / response[0], galaxy.e1);
+            means = [0, 1].map(|k| means[k] + one.response_diagonal()[k] / 6.0);
+        }
+        assert!((means[0] / response[0] - 1.0).abs() < 1e-12);
+        assert!((means[1] / response[1] - 1.0).abs() < 1e-12);
+        let increase = batch
+            .galaxies
+            .windows(2)
+            .all(|pair| pair[0].e1 < pair[1].e1);
+        assert!(increase, "{:?}", batch.galaxies);
+    }
+
+    #[test]
+    fn psfs_one_each_are_each_galaxys_own() {
+        let measurer = Measurer::named("23/raw/star", 48).unwrap();
+        let stamps = stamps(3, 48);
+        let formulas = [0.0, 0.1, -0.1].map(moffat);
+        let mut stars = Array3::<f32>::zeros((3, 26, 26));
+        for (formula, mut star) in formulas.iter().zip(stars.outer_iter_mut()) {
+            star.assign(&formula.stamp(26).mapv(|v| v as f32));
+        }
+        let batch = measurer
+            .batch(stamps.view(), &Psfs::stars(stars.view()), None)
+            .unwrap();
+        assert_eq!(batch.response, None);
+        for (k, galaxy) in batch.galaxies.iter().enumerate() {
+            let (stamp, star) = (stamps.slice(s![k, .., ..]), stars.slice(s![k, .., ..]));
+            let one = measurer.stamp(stamp, star, None).unwrap();
+            assert_eq!(
+                (one.e1, one.e2, one.size),
+                (galaxy.e1, galaxy.e2, galaxy.size)
+            );
+        }
+        let functional = Psfs::functional(&formulas);
+        let drawn = measurer.batch(stamps.view(), &functional, None).unwrap();
+        for (drawn, star) in drawn.galaxies.iter().zip(&batch.galaxies) {
+            // Light beyond the 15 px of the submission, which each is normalised without.
+            assert!((drawn.e1 - star.e1).abs() < 1e-3, "{drawn:?} {star:?}");
+        }
+    }
+
+    #[test]
+    fn noisy_stars_one_each_share_what_they_have_in_common() {
+        let measurer = Measurer::named("48/linear/star", 48).unwrap();
+        let psf = FunctionalPsf::new(PsfProfile::Kolmogorov, 3.4, Shear::ZERO).unwrap();
+        let psf = psf.stamp(48).mapv(|v| v as f32);
+        let count = 80;
+        let sigma = psf.mapv(|v| v * v).sum().sqrt() / 100.0;
+        // Uniform noise: enough for a test of who gets what.
+        let mut state = 5;
+        let mut noise = || {
+            let uniform = crate::deconvolve::uniform(&mut state) as f32;
+            12f32.sqrt() * (uniform - 0.5)
+        };
+        let stars =
+            Array3::from_shape_fn((count, 48, 48), |(_, y, x)| psf[(y, x)] + sigma * noise());
+        let (stamps, psfs) = (stamps(count, 48), Psfs::stars(stars.view()));
+        let batch = measurer.batch(stamps.view(), &psfs, Some(0.5)).unwrap();
+        let mut worker = measurer.worker();
+        let of = |mut image: ImageWorker<'_>| {
+            let found = image.measure_each(stamps.view(), &psfs).unwrap();
+            found.iter().map(|one| one.response).collect::<Vec<_>>()
+        };
+        let of_batch: Vec<_> = batch.galaxies.iter().map(|one| one.response).collect();
+        let session = |measurer: &Measurer| {
+            let mut source = ArraySource::new(measurer, stamps.view(), &psfs).unwrap();
+            Session::open(measurer, &mut source, KnownNoise::Given(0.5), &OneThread).unwrap()
+        };
+        assert_eq!(of(session(&measurer).image(&mut worker)), of_batch);
+        // The next image knows nothing of it.
+        assert_ne!(of(worker.image(ImageNoise::Level(0.5))), of_batch);
+    }
+
+    #[test]
+    fn what_cannot_be_measured_is_an_error_for_one_and_a_flag_for_one_of_many() {
+        let measurer = Measurer::named("48/linear/star", 48).unwrap();
+        let mut stamps = stamps(3, 48);
+        // Both sides of the galaxy.
+        stamps[(1, 7, 5)] = f32::NAN;
+        stamps.slice_mut(s![1, 23..25, ..]).fill(f32::NAN);
+        let star = moffat(0.0).stamp(32);
+        let bad = stamps.slice(s![1, .., ..]);
+        message(
+            measurer.stamp(bad, star.view(), Some(1.0)),
+            "pixel (6, 8) of the stamp, counted from 1, is not a finite number",
+        );
+        let mut stars = Array3::zeros((3, 32, 32));
+        stars.slice_mut(s![0, .., ..]).assign(&star);
+        stars.slice_mut(s![1, .., ..]).assign(&star);
+        let batch = measurer.batch(stamps.view(), &Psfs::stars(stars.view()), Some(1.0));
+        let flags: Vec<Vec<Flag>> = batch
+            .unwrap()
+            .galaxies
+            .iter()
+            .map(|galaxy| galaxy.flags.iter().collect())
+            .collect();
+        assert_eq!(flags, [vec![], vec![Flag::NotFinite], vec![Flag::BadPsf]]);
+    }
+
+    #[test]
+    fn a_linear_submission_measures_without_a_few_pixels_and_a_network_does_not() {
+        let whole = stamps(2, 48);
+        let star = moffat(0.0).stamp(32);
+        let mut holed = whole.clone();
+        holed.slice_mut(s![.., 19..22, 26..29]).fill(f32::NAN);
+        let measured = |configuration: &str, stamps: &Array3<f32>| {
+            let measurer = Measurer::named(configuration, 48).unwrap();
+            let psf = &Psfs::star(star.view());
+            measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
+        };
+        let linear = "48/linear/star";
+        let (found, expected) = (measured(linear, &holed), measured(linear, &whole));
+        for (found, expected) in found.galaxies.iter().zip(&expected.galaxies) {
+            assert!(found.flags.is_empty());
+            // Without noise, and the same turned by 180 degrees.
+            assert!(
+                (found.e1 - expected.e1).abs() < 1e-3,
+                "{found:?} {expected:?}"
+            );
+            assert!(
+                (found.e2 - expected.e2).abs() < 1e-3,
+                "{found:?} {expected:?}"
+            );
+        }
+        // Pixels beyond the 48 that are cut are not looked at.
+        let (mut holed, mut framed) = (stamps(2, 64), stamps(2, 64));
+        framed.slice_mut(s![.., .., ..8]).fill(f32::NAN);
+        framed.slice_mut(s![.., 56.., ..]).fill(f32::NAN);
+        let measurer = Measurer::named(linear, 64).unwrap();
+        let [whole, framed] = [&holed, &framed].map(|stamps| {
+            let psf = &Psfs::star(star.view());
+            measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
+        });
+        for (whole, framed) in whole.galaxies.iter().zip(&framed.galaxies) {
+            assert_eq!((whole.e1, whole.e2), (framed.e1, framed.e2));
+        }
+        holed.slice_mut(s![.., 30, 30]).fill(f32::NAN);
+        let network = Measurer::named("23/raw/star", 64).unwrap();
+        let network = network.batch(holed.view(), &Psfs::star(star.view()), Some(1.0));
+        let network = network.unwrap();
+        assert!(
+            network
+                .galaxies
+                .iter()
+                .all(|galaxy| galaxy.flags.contains(Flag::NotFinite))
+        );
+    }
+
+    #[test]
+    fn wrong_shapes_parities_and_numbers_are_told_with_what_was_expected() {
+        let measurer = Measurer::named("48/linear/star", 48).unwrap();
+        let (good, star) = (stamps(2, 48), moffat(0.0).stamp(32));
+        let one = good.slice(s![0, .., ..]);
+        let noise = Some(1.0);
+        message(
+            Measurer::named("48/linear/star", 40),
+            "stamps of 40 × 40 pixels; expected at least 48 × 48",
+        );
+        message(
+            Measurer::named("48/linear/stra", 48),
+            "no configuration or file named",
+        );
+        let narrow = one.slice(s![.., ..46]);
+        message(
+            measurer.stamp(narrow, star.view(), noise),
+            "a stamp of 48 × 46 pixels; expected 48 × 48",
+        );
+        let small = star.slice(s![..30, ..]);
+        message(
+            measurer.stamp(one, small, noise),
+            "a PSF stamp of 30 × 32 pixels; expected at least 32 × 32",
+        );
+        let stars = Array3::<f32>::zeros((3, 32, 32));
+        message(
+            measurer.batch(good.view(), &Psfs::stars(stars.view()), noise),
+            "PSFs of 3 galaxies; expected 2, one each",
+        );
+        message(
+            measurer.batch(good.view(), &Psfs::prepared(star.slice(s![1.., ..])), noise),
+            "a PSF stamp of 31 × 32 pixels; expected an even number a side, 32 to 48",
+        );
+        for (level, found) in [
+            (None, "not given"),
+            (Some(f64::NAN), "NaN"),
+            (Some(-1.0), "-1"),
+        ] {
+            let expected = format!("the noise level is {found}; expected a finite number");
+            message(measurer.stamp(one, star.view(), level), &expected);
+        }
+        let mut dead = star.clone();
+        dead[(3, 2)] = f64::INFINITY;
+        message(
+            measurer.batch(good.view(), &Psfs::star(dead.view()), noise),
+            "pixel (3, 4) of the PSF stamp",
+        );
+    }
 }

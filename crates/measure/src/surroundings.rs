@@ -18,7 +18,7 @@ pub(crate) use self::contrast::{Contrasts, turn};
 pub(crate) use self::missing::Missing;
 use self::near::Near;
 use self::profile::{AROUND, Profile};
-use crate::flag::Flag;
+use crate::measurement::Flag;
 
 /// Least difference of opposite places that is a neighbour, in units of its noise. See
 /// docs/constants.md.

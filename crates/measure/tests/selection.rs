@@ -198,7 +198,7 @@ fn sharp_cuts_of_sheared_versions_leave_the_shear_as_it_is() {
     let mut sums = [[VersionSums::default(); BATCHES]; 3];
     let (mut difference, mut scatter) = (0.0, 0.0);
     let flagged = measure_pairs(&measurer, |batch, sign, galaxy| {
-        let versions = galaxy.versions.expect("the configuration asks for them");
+        let versions = galaxy.sheared.expect("the configuration requests them");
         let own = versions.values(0);
         difference += (own[0] - galaxy.e1).powi(2);
         scatter += galaxy.e1.powi(2);

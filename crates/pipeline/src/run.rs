@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use ndarray::{ArcArray2, Array2, ArrayView2, Axis, Ix3};
+use ndarray::{ArcArray2, Array2, ArrayView2, Ix3};
 use shearq_measure::{
-    Batch, ImageNoise, KnownNoise, Lazy, LazyStamps, Measurement, Measurer, Pixels, Psfs, Session,
-    StampRows, StampSource, Steps, Threads, Worker, star_psf, strip,
+    Batch, KnownNoise, Lazy, LazyStamps, Measurement, Measurer, OneThread, Pixels, Psfs, Session,
+    StampRows, StampSource, Steps, Threads, Worker, star_psf,
 };
 use shearq_quantities::Shear;
 use shearq_submissions::{Configuration, PsfForm};
@@ -309,8 +309,7 @@ pub fn run_set(
     )
 }
 
-/// Simulates galaxy `(ix, iy)` of an image and measures it with all intermediate steps. Returns them with the PSF,
-/// `None` if the galaxy could not be measured.
+/// The steps of measuring galaxy `(ix, iy)` of a simulated image; `None` if it could not be measured.
 ///
 /// # Errors
 /// If the measurer is for stamps of another size.
@@ -319,23 +318,11 @@ pub fn simulated_steps(
     measurer: &Measurer,
     image: u32,
     (ix, iy): (usize, usize),
-) -> Result<Option<(Array2<f64>, Steps)>, PipelineError> {
-    let fields = Arc::new(set.image_fields(image));
-    let mut pixels = vec![0.0; STAMP * STAMP];
-    set.draw(&fields, ix, iy, &mut RenderScratch::new(), &mut pixels);
-    let stamps = strip(&pixels, 1, STAMP)?;
-    let stamp = stamps.index_axis(Axis(0), 0);
-    let cut = measurer.configuration().psf_cut();
-    let psf = fields.psf.at(ix, iy).stamp_beside(cut.size, STAMP);
-    let mut worker = measurer.worker();
-    let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
-    let mut worker = image.psf(psf.view())?;
-    let measured = worker.measure(stamp)?;
-    if measured.descent.is_none() {
-        return Ok(None);
-    }
-    let steps = worker.steps(stamp, psf.view(), &measured)?;
-    Ok(Some((psf, steps)))
+) -> Result<Option<Steps>, PipelineError> {
+    let measurer = std::slice::from_ref(measurer);
+    let mut open = SimulatedSessions::new(set, image, measurer, &OneThread)?;
+    let (session, source) = &mut open.sessions[0];
+    Ok(session.steps(source, iy, ix)?.1)
 }
 
 #[cfg(test)]

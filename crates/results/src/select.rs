@@ -9,7 +9,7 @@ use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::Place;
 use shearq_files::{FileError, atomic, table};
-use shearq_measure::{Cut, Observables, Quantity, Selection, Versions};
+use shearq_measure::{Cut, Observables, Quantity, Selection, ShearedCatalogues};
 use shearq_pipeline::measure::KEYS;
 use thiserror::Error;
 
@@ -348,7 +348,8 @@ impl Weighted {
             _ => None,
         };
         // Sheared versions would not have the selection.
-        let kept = |own: &&Column| !Versions::columns().any(|name| own.name().as_str() == name);
+        let kept =
+            |own: &&Column| !ShearedCatalogues::columns().any(|name| own.name().as_str() == name);
         let mut columns: Vec<Column> = read
             .columns()
             .iter()

@@ -8,7 +8,7 @@ use super::kernel::{Buffers, Wide};
 use super::operator::Operator;
 use super::rule::Rule;
 use crate::error::{MeasureError, length};
-use crate::sizes::check_psf;
+use crate::pixel::check_psf;
 
 /// A network for one stamp size, PSF size and λ, holding one PSF at a time.
 ///

@@ -6,7 +6,7 @@ use shearq_submissions::limits::MAX_PSF;
 use super::convolution::Convolution;
 use super::sun::SUN_KERNEL;
 use crate::error::MeasureError;
-use crate::sizes::check_sizes;
+use crate::pixel::check_sizes;
 use shearq_quantities::product::LANES;
 use shearq_quantities::real::Real;
 

@@ -57,7 +57,7 @@ use self::smoothing::Smoothing;
 use super::sun::high_pass;
 use crate::error::MeasureError;
 use crate::fft::StampFft;
-use crate::sizes::check_sizes;
+use crate::pixel::check_sizes;
 
 /// Padding around a stamp, so that the deconvolved stamp does not wrap around. See
 /// docs/constants.md.

@@ -1,77 +1,155 @@
-//! The linear network, and moments under an adaptive weight.
+//! The linear method: the closed form of the network, and moments under an adaptive weight.
 //!
-//! # Sheared noise
+//! # Noise that is sheared along
 //!
-//! The response of a galaxy is worked out on its image with noise, and shears that noise along with
-//! the galaxy; what the challenge shears has none. Of the difference, the mean of what noise adds to
-//! the autocorrelation's change is subtracted there. What remains is that the ellipticity is not
-//! linear in the autocorrelation: f″(δA, δA′), with δA the change that noise makes and δA′ that of the
-//! noise's own shear. It is estimated with a second field of noise (as Sheldon & Huff 2017 do, but on
-//! both sides and as a derivative), of which response and ellipticity are taken with the field added and
-//! taken away. One galaxy in [`SHARE`] is enough.
+//! The response of a galaxy is computed on its noisy image, and shears the noise along with the galaxy. The galaxies that
+//! lensing shears have no noise yet. The mean effect of noise on the change of the autocorrelation is subtracted in
+//! `deconvolve`. What remains is that the ellipticity is not linear in the autocorrelation: f″(δA, δA′), with δA the
+//! change by noise and δA′ the change by the shear of this noise. It is estimated with a second field of noise (as in
+//! Sheldon & Huff 2017, but on both sides and as a derivative), for which response and ellipticity are taken with the field
+//! added and subtracted. One galaxy in [`NOISE_FIELD_INTERVAL`] is enough.
 //!
-//! # What noise makes of the PSF
+//! # Noise that has the shape of the PSF
 //!
-//! Deconvolved noise has the ellipticity of the PSF, and its mean effect on the galaxy's, ½f″(δA, δA), leaves −0.014 of it
-//! for small galaxies of S/N 10. With a PSF turned by 90 degrees it would be the opposite: half of the difference,
-//! −½f″(δA, δA⊥ − δA), is subtracted. δA⊥ is that of the same field, each mode with the amplitude that the turned PSF
-//! gives it, so that its noise is that of the PSF's small ellipticity alone. It is worked out and subtracted on the same
-//! galaxies as the above, for all.
+//! Deconvolved noise has the ellipticity of the PSF. Its mean effect on the ellipticity of the galaxy, ½f″(δA, δA), is
+//! −0.014 of the ellipticity of the PSF for small galaxies of S/N 10. Behind a PSF turned by 90 degrees it would have the
+//! opposite sign, so half of the difference, −½f″(δA, δA⊥ − δA), is subtracted. δA⊥ is the same field with the amplitude of
+//! each mode behind the turned PSF, so that its own noise is small. It is computed on the same galaxies as above.
 
-use std::sync::Arc;
+use std::ops::RangeInclusive;
+use std::sync::{Arc, OnceLock};
 
 use ndarray::{Array2, ArrayView2};
-use shearq_submissions::{LinearMethod, Neighbours};
+use shearq_submissions::limits::{MAX_TARGET, MIN_TARGET, WINDOWS};
+use shearq_submissions::{LinearDeconvolution, LinearMethod, Neighbours, PsfCut};
 
-use super::found::{
-    AdaptedSettings, CutWorker, Found, FoundObservables, Images, Sheared, image, whole,
+use super::{
+    AdaptedSettings, CutWorker, Found, FoundObservables, Images, NoiseField, image, whole_lags,
 };
-use super::softening::Softening;
 use crate::deconvolve::{
     Descent, Gradients, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop, uniform,
 };
 use crate::error::MeasureError;
+use crate::extent::Moments;
 use crate::measurement::ResponseMatrix;
 use crate::noise::StampNoise;
 use crate::pixel::hash;
+use crate::psf::shrink::Shrinker;
+use crate::psf::{CommonProfile, breadth};
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Breadth};
+use crate::sheared::ShearSettings;
 use crate::surroundings::{Surroundings, centre, followed};
-use crate::versions::VersionSettings;
 
-/// One galaxy in this many is measured with a field of noise, for the noise term of the response. With sheared versions it is
-/// every galaxy. See docs/constants.md.
-const SHARE: u64 = 8;
-/// Level of the field of noise in units of the image's noise. See docs/constants.md.
-const FIELD: f32 = 0.25;
+// With 4 instead, errors of the mean shear with and without cuts change by less than 0.06 %: `simulate --sets 4
+// --images 4 --grid 100 --seed 5`, then `mean --where`. Sheared catalogues need the noise of every galaxy.
+const NOISE_FIELD_INTERVAL: u64 = 8;
+// In units of the image's noise. Chosen by hand: small enough for a derivative, large enough for single precision.
+const NOISE_FIELD_LEVEL: f32 = 0.25;
+// S/N at which a size is half its own and half the size of a typical galaxy. Chosen by hand: it shrinks sizes at S/N 20 by 6 %.
+const HALF_SIZE_SNR: f32 = 5.0;
 
-/// What one submission and stamp size need.
-pub(super) struct LinearPlan {
+// The window follows the galaxies: on small galaxies a wide window keeps noise, on large ones a narrow window loses light. One
+// width for all galaxies of an image cannot select by shear.
+//
+// Steps of 19 %. Chosen by hand.
+const WINDOWS_PER_OCTAVE: f64 = 4.0;
+// Power of the galaxies' mean square with which the best width grows: least scatter of simulated galaxies of different
+// sizes. Command and seed were not kept.
+const WINDOW_POWER: f64 = 0.8;
+const WINDOW_STEPS: RangeInclusive<i32> = -3..=3;
+// Mean square per axis of GREAT10's galaxies in units of the best window's σ²: least scatter of the simulated sets.
+// Command and seed were not kept.
+const GREAT10_VARIANCE: f64 = 0.1375;
+// In units of the stamp's side. On 48 px a window of 10.4 px lowers the scatter by 0.9 %, but leaves m₁ = −0.0013 for
+// large galaxies.
+const WIDEST_WINDOW: f64 = 0.2;
+
+/// Index of the configured width among all widths.
+const CONFIGURED_WINDOW: usize = WINDOW_STEPS.start().unsigned_abs() as usize;
+const WINDOW_COUNT: usize = CONFIGURED_WINDOW + 1 + WINDOW_STEPS.end().unsigned_abs() as usize;
+
+/// What is added to the divisors of the moments and of the size, so that faint galaxies respond less.
+///
+/// Divisors go with the square of the flux, as the square of the S/N ν does, so that a galaxy has the weight
+/// ν²/(ν² + ν₀²). ν₀ is converted to a flux by PSF and noise, for galaxies of the size that the window is for, with the S/N
+/// of the matched filter. Noise of the autocorrelation instead, which grows much faster with the width of the PSF, would
+/// give galaxies behind broad PSFs too little weight: in sets with a PSF for each galaxy that costs 0.4 % of the scatter at
+/// S/N 20, and 0.8 % for large galaxies. The galaxy is taken as deconvolved to the target, which is not exact for few
+/// iterations or λ > 0.
+struct Regularisation {
+    /// Divisor of the moments at half of the response, for such a galaxy of flux one, times ν₀².
+    moments: f32,
+    /// P₀ of [`Breadth`] for such a galaxy of flux one, times the square of [`HALF_SIZE_SNR`].
+    size: f32,
+    /// Power of such a galaxy in each mode, as `Spectral::light` returns it.
+    galaxy: Vec<f32>,
+    /// T of [`Breadth`] for such a galaxy.
+    typical_square: f32,
+}
+
+impl Regularisation {
+    /// For round Gaussian galaxies of mean square `variance` px² per axis.
+    fn new(
+        method: &LinearMethod,
+        variance: f64,
+        spectral: &Spectral,
+        moments: &AdaptiveMoments,
+        breadth: &Breadth,
+    ) -> Self {
+        let LinearDeconvolution {
+            target_sigma,
+            window_sigma,
+            ..
+        } = method.deconvolution;
+        let side = 2 * spectral.reach() as i32 + 1;
+        let deconvolved = variance + target_sigma * target_sigma;
+        let windowed = 1.0 / (1.0 / deconvolved + 1.0 / (window_sigma * window_sigma));
+        let peak = windowed / (4.0 * std::f64::consts::PI * deconvolved * deconvolved);
+        let acf: Vec<f32> = (0..=spectral.reach() as i32)
+            .flat_map(|y| (0..side).map(move |x| (x - side / 2, y)))
+            .map(|(x, y)| {
+                let square = f64::from(x * x + y * y) * spectral.spacing().powi(2);
+                (peak * (-square / (4.0 * windowed)).exp()) as f32
+            })
+            .collect();
+        let [zero, two] = breadth.sums(&acf);
+        Regularisation {
+            moments: moments.halving(&acf) * method.shape.half_snr.powi(2) as f32,
+            size: zero * HALF_SIZE_SNR * HALF_SIZE_SNR,
+            galaxy: spectral.light(variance),
+            typical_square: two / zero,
+        }
+    }
+
+    /// The terms for moments and size behind `psf` in noise of level one; not finite if the PSF passes no light.
+    fn behind(&self, psf: &SpectralPsf) -> [f32; 2] {
+        let modes = self.galaxy.iter().zip(psf.clarity());
+        let snr_squared = modes.map(|(light, clarity)| light * clarity).sum::<f32>();
+        [self.moments / snr_squared, self.size / snr_squared]
+    }
+}
+
+/// The plan for one target, window and weight.
+struct LinearPlan {
     lengths: AdaptedSettings,
     iterations: u32,
-    /// One galaxy in this many is measured with a field of noise.
-    share: u64,
-    /// Shear of sheared versions, if there are any.
-    versions: Option<f64>,
-    softening: Softening,
+    noise_field_interval: u64,
+    /// Shear of sheared catalogues, if they are requested.
+    shear_step: Option<f64>,
+    regularisation: Regularisation,
     spectral: Spectral,
     moments: AdaptiveMoments,
     breadth: Breadth,
-    /// Gradients of P₀ and P₂.
-    broad: [Vec<f32>; 2],
-    /// Whether neighbours are subtracted, or flag the galaxy.
-    clears: bool,
-    /// What corrects the flux for the light beyond the window.
+    /// Gradients of P₀ and P₂ of [`Breadth`].
+    size_gradients: [Vec<f32>; 2],
+    removes_neighbours: bool,
+    /// Factor that corrects the flux for the light beyond the window.
     aperture: f64,
 }
 
 impl LinearPlan {
-    /// For stamps of `n` and PSFs of `p` pixels a side, and galaxies with a mean square of `extent` px² per axis.
-    pub(super) fn new(
-        method: &LinearMethod,
-        n: usize,
-        p: usize,
-        extent: f64,
-    ) -> Result<Self, MeasureError> {
+    /// For stamps of `n` and PSFs of `p` pixels a side, and galaxies of mean square `variance` px² per axis.
+    fn new(method: &LinearMethod, n: usize, p: usize, variance: f64) -> Result<Self, MeasureError> {
         let settings = &method.deconvolution;
         let spectral = Spectral::new(n, p, settings)?;
         let scale = method.shape.weight_scale;
@@ -79,84 +157,227 @@ impl LinearPlan {
         let (target, window) = (settings.target_sigma, settings.window_sigma);
         let breadth = Breadth::new(target, window, spectral.spacing(), spectral.reach());
         let mut scratch = spectral.scratch();
-        let broad = breadth
-            .gradients()
-            .map(|weights| spectral.spectrum_of(&weights, &mut scratch));
+        let gradients = breadth.gradients();
         let step = method.shape.sheared_step;
-        let versions = (step > 0.0).then_some(step);
+        let shear_step = (step > 0.0).then_some(step);
         Ok(LinearPlan {
-            clears: method.shape.neighbours == Neighbours::Flag,
-            share: if versions.is_some() { 1 } else { SHARE },
-            versions,
+            removes_neighbours: method.shape.neighbours == Neighbours::Flag,
+            noise_field_interval: shear_step.map_or(NOISE_FIELD_INTERVAL, |_| 1),
+            shear_step,
             lengths: AdaptedSettings {
-                target_sigma: settings.target_sigma,
-                window_sigma: settings.window_sigma,
+                target_sigma: target,
+                window_sigma: window,
                 weight_scale: scale,
             },
             iterations: u32::try_from(settings.max_iterations).unwrap_or(u32::MAX),
-            softening: Softening::new(method, extent, &spectral, &moments, &breadth),
-            aperture: 1.0 + (extent + target * target) / (window * window),
+            regularisation: Regularisation::new(method, variance, &spectral, &moments, &breadth),
+            aperture: 1.0 + (variance + target * target) / (window * window),
+            size_gradients: gradients.map(|weights| spectral.spectrum_of(&weights, &mut scratch)),
             breadth,
-            broad,
             moments,
             spectral,
         })
     }
 }
 
-/// A worker for one thread.
+/// Index of a plan of the family: the step of the PSF's width, and the index of the window.
+type PlanIndex = (i32, usize);
+
+const CONFIGURED: PlanIndex = (0, CONFIGURED_WINDOW);
+
+/// The linear method for PSFs and galaxies of any width, with a plan for each step of both.
+///
+/// The wavenumbers that a PSF removes follow its width. So do the Gaussian that the deconvolved stamp is convolved with
+/// and the weight of the moments: a target much sharper than the PSF consists of noise. The window, which excludes noise
+/// beyond the galaxy, follows the galaxies.
+pub(crate) struct LinearFamily {
+    method: LinearMethod,
+    n: usize,
+    cut: PsfCut,
+    configured: Arc<LinearPlan>,
+    /// By step of the PSF and window, planned by the first thread that needs them.
+    others: Vec<[OnceLock<Arc<LinearPlan>>; WINDOW_COUNT]>,
+}
+
+impl LinearFamily {
+    pub(super) fn new(method: &LinearMethod, n: usize, cut: PsfCut) -> Result<Self, MeasureError> {
+        let variance = Self::variance(method, CONFIGURED_WINDOW);
+        Ok(LinearFamily {
+            method: method.clone(),
+            n,
+            cut,
+            configured: Arc::new(LinearPlan::new(method, n, cut.size, variance)?),
+            others: breadth::STEPS.map(|_| Default::default()).collect(),
+        })
+    }
+
+    fn variance(method: &LinearMethod, window: usize) -> f64 {
+        let settings = &method.deconvolution;
+        galaxy_variance(settings.reference_extent, settings.window_sigma, window)
+    }
+
+    fn plan(&self, index: PlanIndex) -> Result<Arc<LinearPlan>, MeasureError> {
+        if index == CONFIGURED {
+            return Ok(Arc::clone(&self.configured));
+        }
+        let (step, window) = index;
+        let place = &self.others[(step - breadth::STEPS.start()) as usize][window];
+        if let Some(plan) = place.get() {
+            return Ok(Arc::clone(plan));
+        }
+        let mut method = self.method.clone();
+        let target = &mut method.deconvolution.target_sigma;
+        // A configured target beyond the bounds is kept.
+        let (least, most) = (MIN_TARGET / *target, MAX_TARGET / *target);
+        let factor = breadth::factor(step).clamp(least.min(1.0), most.max(1.0));
+        *target *= factor;
+        method.shape.weight_scale *= factor;
+        let variance = Self::variance(&method, window);
+        let sigma = &mut method.deconvolution.window_sigma;
+        *sigma = window_width(*sigma, window, self.n);
+        let plan = LinearPlan::new(&method, self.n, self.cut.size, variance)?;
+        Ok(Arc::clone(place.get_or_init(|| Arc::new(plan))))
+    }
+
+    /// A worker for one thread.
+    pub(super) fn worker(self: &Arc<Self>) -> LinearWorker {
+        LinearWorker {
+            workers: vec![(CONFIGURED, PlanWorker::new(Arc::clone(&self.configured)))],
+            current: 0,
+            galaxy_variance: None,
+            moments: Moments::default(),
+            shrinker: Shrinker::default(),
+            noise: StampNoise::white(1.0),
+            family: Arc::clone(self),
+        }
+    }
+}
+
 pub(super) struct LinearWorker {
+    family: Arc<LinearFamily>,
+    /// Workers of the plans that this thread has needed.
+    workers: Vec<(PlanIndex, PlanWorker)>,
+    /// Place of the worker for the present PSF.
+    current: usize,
+    noise: StampNoise,
+    galaxy_variance: Option<f64>,
+    moments: Moments,
+    shrinker: Shrinker,
+}
+
+impl CutWorker for LinearWorker {
+    fn set_image(
+        &mut self,
+        noise: &StampNoise,
+        galaxy_variance: Option<f64>,
+        stars: Option<&Arc<CommonProfile>>,
+    ) {
+        self.shrinker.set_common(stars);
+        self.galaxy_variance = galaxy_variance;
+        // The noise of each mode takes as long as several galaxies, and rows of an image share it.
+        if self.noise != *noise {
+            self.noise = noise.clone();
+            for (_, worker) in &mut self.workers {
+                worker.set_noise(noise);
+            }
+        }
+    }
+
+    fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
+        let PsfCut { size, least, .. } = self.family.cut;
+        let side = psf.nrows();
+        if !(least..=size).contains(&side) || side % 2 != size % 2 {
+            let parity = if size % 2 == 0 { "an even" } else { "an odd" };
+            let expected = format!("{parity} number a side, {least} to {size}");
+            return Err(MeasureError::square("a PSF stamp", psf.dim(), expected));
+        }
+        let psf = self.shrinker.shrunk(psf);
+        let settings = &self.family.method.deconvolution;
+        let (reference, variance) = (settings.reference_extent, self.galaxy_variance);
+        let window = window_index(variance, psf, reference, &mut self.moments);
+        let index = (breadth::step(psf, settings.reference_area), window);
+        let known = self.workers.iter().position(|(of, _)| *of == index);
+        self.current = if let Some(known) = known {
+            known
+        } else {
+            let mut worker = PlanWorker::new(self.family.plan(index)?);
+            worker.set_noise(&self.noise);
+            self.workers.push((index, worker));
+            self.workers.len() - 1
+        };
+        self.workers[self.current].1.set_psf(psf)
+    }
+
+    fn adapted(&self) -> Option<AdaptedSettings> {
+        Some(self.workers[self.current].1.plan.lengths)
+    }
+
+    fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
+        Ok((noise >= 0.0 && noise.is_finite())
+            .then(|| self.workers[self.current].1.measure(cut, noise)))
+    }
+
+    fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
+        self.workers[self.current].1.images(cut, psf)
+    }
+}
+
+/// Buffers of one thread for one plan.
+struct PlanWorker {
     plan: Arc<LinearPlan>,
     noise: ModeNoise,
-    /// Noise of sums over many pixels, in units of that of white noise.
-    grain: f32,
+    /// Amplitude of the noise at wavenumber zero in units of white noise: the noise of sums over many pixels.
+    low_k_noise: f32,
     /// None if neighbours are kept.
     surroundings: Option<Surroundings>,
     psf: SpectralPsf,
-    /// What is added to the divisor of the moments, in px⁴ times the unit of the autocorrelation, in noise of level one.
-    added: f32,
-    /// What is added to P₀ of the size, in its unit, in noise of level one.
-    faint: f32,
+    /// Terms of [`Regularisation::behind`].
+    regularisation: [f32; 2],
     gradients: Gradients,
     buffers: SpectralScratch,
     lags: Lags,
-    /// What was found on them last.
+    /// The shape last measured on `lags`.
     shape: Option<AdaptiveShape>,
-    /// Of a field of noise, and of what it lacks to be that of a PSF turned by 90 degrees.
+    /// A field of noise, and its difference to the field behind a PSF turned by 90 degrees.
     field: Lags,
     turned: Lags,
-    /// The autocorrelation with that field.
-    shifted: Vec<f32>,
+    acf_with_field: Vec<f32>,
     values: AdaptiveScratch,
 }
 
-impl LinearWorker {
-    pub(super) fn new(plan: Arc<LinearPlan>) -> Self {
-        LinearWorker {
+impl PlanWorker {
+    fn new(plan: Arc<LinearPlan>) -> Self {
+        let surroundings = || Surroundings::new(plan.spectral.stamp_size());
+        PlanWorker {
             noise: plan.spectral.noise(&StampNoise::white(1.0)),
+            low_k_noise: 1.0,
+            surroundings: plan.removes_neighbours.then(surroundings),
             psf: plan.spectral.psf(),
-            added: 0.0,
-            faint: 0.0,
+            regularisation: [0.0; 2],
             gradients: plan.spectral.gradients(),
             buffers: plan.spectral.scratch(),
-            surroundings: plan
-                .clears
-                .then(|| Surroundings::new(plan.spectral.stamp_size())),
-            grain: 1.0,
             lags: plan.spectral.lags(),
             shape: None,
             field: plan.spectral.lags(),
             turned: plan.spectral.lags(),
-            shifted: plan.spectral.lags().acf,
+            acf_with_field: plan.spectral.lags().acf,
             values: plan.moments.scratch(),
             plan,
         }
     }
 
     /// Sets the noise of an image in units of its level. A PSF is set after it.
-    pub(super) fn set_noise(&mut self, noise: &StampNoise) {
+    fn set_noise(&mut self, noise: &StampNoise) {
         self.noise = self.plan.spectral.noise(noise);
-        self.grain = noise.power([0.0; 2]).0.sqrt() as f32;
+        self.low_k_noise = noise.power([0.0; 2]).0.sqrt() as f32;
+    }
+
+    fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
+        let plan = &self.plan;
+        plan.spectral
+            .set_psf(psf, &self.noise, &mut self.buffers, &mut self.psf)?;
+        self.regularisation = plan.regularisation.behind(&self.psf);
+        Ok(())
     }
 
     /// Response of `shape` to a change of the autocorrelation by `lags.shear1` and `lags.shear2`.
@@ -171,37 +392,38 @@ impl LinearWorker {
         [[first[0], second[0]], [first[1], second[1]]]
     }
 
-    /// Flux and size with their responses, of the galaxy whose `shape` was found last; with the effect of noise on them and
-    /// on the ellipticity if `coupled`.
-    fn observed(
+    /// Flux and size with their responses, of the galaxy whose `shape` was measured last. With the effect of noise on them
+    /// and on the ellipticity if `with_noise`.
+    fn observables(
         &mut self,
         shape: &AdaptiveShape,
         noise: f32,
         seed: u64,
-        coupled: bool,
+        with_noise: bool,
     ) -> FoundObservables {
         let plan = &*self.plan;
         let lags = &self.lags;
-        let (soft, typical) = (self.faint * noise * noise, plan.softening.typical);
-        let breadth = plan.breadth.measure(&lags.acf, soft, typical);
+        let [_, floor] = self.regularisation.map(|term| term * noise * noise);
+        let typical = plan.regularisation.typical_square;
+        let breadth = plan.breadth.measure(&lags.acf, floor, typical);
         let response = |change: &[f32]| f64::from(plan.breadth.response(&breadth, change));
         let flux = lags.flux.map(|flux| plan.aperture * f64::from(flux));
-        let products = coupled.then(|| {
+        let products = with_noise.then(|| {
             let [first, second] = &mut self.gradients.pair;
             plan.moments
                 .gradients(shape, &mut self.values, [first, second]);
-            let [zero, two] = &plan.broad;
+            let [zero, two] = &plan.size_gradients;
             for ((third, zero), two) in self.gradients.third.iter_mut().zip(zero).zip(two) {
                 *third = Breadth::combine(&breadth, [*zero, *two]);
             }
             let found = plan
                 .spectral
                 .products(&self.psf, &self.gradients, &mut self.buffers);
-            let unit = f64::from(noise * noise) * plan.share as f64;
-            // The last of four quantities is the flux.
-            let scale = [0, 0, 0, 1, 0, 0, 1, 0, 1, 2];
+            let unit = f64::from(noise * noise) * plan.noise_field_interval as f64;
+            // The last of four quantities is the flux, and the aperture corrects each of its factors.
+            let powers = [0, 0, 0, 1, 0, 0, 1, 0, 1, 2];
             std::array::from_fn(|k| {
-                let unit = unit * plan.aperture.powi(scale[k]);
+                let unit = unit * plan.aperture.powi(powers[k]);
                 found[k].map(|value| unit * f64::from(value))
             })
         });
@@ -212,7 +434,7 @@ impl LinearWorker {
             square_response: [response(&lags.shear1), response(&lags.shear2)],
             size: plan.breadth.size(f64::from(breadth.square)),
             products,
-            versions: plan.versions.map(|step| VersionSettings {
+            sheared: plan.shear_step.map(|step| ShearSettings {
                 step,
                 normals: normals(seed),
             }),
@@ -220,113 +442,95 @@ impl LinearWorker {
     }
 
     /// The response to sheared noise; `None` if the galaxy cannot be measured with the field.
-    fn sheared_noise(&mut self, seed: u64, noise: f32, softening: f32) -> Option<Sheared> {
+    fn noise_field(&mut self, seed: u64, noise: f32) -> Option<NoiseField> {
         let plan = &*self.plan;
         plan.spectral
             .noise_field(&self.psf, seed, &mut self.buffers, &mut self.field);
         plan.spectral
             .turned_field(&self.psf, seed, &mut self.buffers, &mut self.turned);
-        let step = FIELD * noise;
-        let soft = self.faint * noise * noise;
+        let step = NOISE_FIELD_LEVEL * noise;
+        let [divisor, floor] = self.regularisation.map(|term| term * noise * noise);
         let mut side = |step: f32| {
             let terms = self.lags.acf.iter().zip(&self.field.acf);
-            for (out, (acf, change)) in self.shifted.iter_mut().zip(terms) {
+            for (out, (acf, change)) in self.acf_with_field.iter_mut().zip(terms) {
                 *out = acf + step * change;
             }
-            let moments = &plan.moments;
-            let shape = moments.measure(&self.shifted, softening, &mut self.values);
-            let shape = shape.ok()?;
+            let acf = &self.acf_with_field;
+            let shape = plan.moments.measure(acf, divisor, &mut self.values).ok()?;
             let response = Self::response(plan, &shape, &self.field, &mut self.values);
-            let turned = moments.response(&shape, &self.turned.acf, &mut self.values);
-            let breadth = plan
-                .breadth
-                .measure(&self.shifted, soft, plan.softening.typical);
+            let turned = plan
+                .moments
+                .response(&shape, &self.turned.acf, &mut self.values);
+            let typical = plan.regularisation.typical_square;
+            let breadth = plan.breadth.measure(acf, floor, typical);
             let changes = [&self.field.shear1, &self.field.shear2, &self.turned.acf];
-            let breadth = changes.map(|change| f64::from(plan.breadth.response(&breadth, change)));
-            Some(((shape.distortion, response), turned, breadth))
+            let square = changes.map(|change| f64::from(plan.breadth.response(&breadth, change)));
+            Some(((shape.distortion, response), turned, square))
         };
         let (plus, minus) = (side(step)?, side(-step)?);
-        Some(Sheared {
+        Some(NoiseField {
             sides: [plus.0, minus.0],
             turned: [plus.1, minus.1],
-            breadth: [plus.2, minus.2],
-            weight: f64::from(noise * noise / (2.0 * step)) * plan.share as f64,
+            square: [plus.2, minus.2],
+            weight: f64::from(noise * noise / (2.0 * step)) * plan.noise_field_interval as f64,
         })
     }
-}
 
-impl CutWorker for LinearWorker {
-    fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
-        self.plan
-            .spectral
-            .set_psf(psf, &self.noise, &mut self.buffers, &mut self.psf)?;
-        [self.added, self.faint] = self.plan.softening.behind(&self.psf);
-        Ok(())
-    }
-
-    fn adapted(&self) -> Option<AdaptedSettings> {
-        Some(self.plan.lengths)
-    }
-
-    fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
-        if !(noise >= 0.0 && noise.is_finite()) {
-            return Ok(None);
-        }
+    fn measure(&mut self, stamp: &[f32], noise: f64) -> Found {
         let plan = Arc::clone(&self.plan);
         let sigma = noise as f32;
-        let found = centre(cut, plan.spectral.stamp_size());
+        let place = centre(stamp, plan.spectral.stamp_size());
         let surroundings = self.surroundings.as_mut();
         let cleared = surroundings.map_or(Ok(false), |surroundings| {
-            surroundings.clear(cut, found, self.grain * sigma)
+            surroundings.clear(stamp, place, self.low_k_noise * sigma)
         });
-        let whole = cut;
         let cut = match &self.surroundings {
             Some(surroundings) if cleared == Ok(true) => &surroundings.filled,
-            _ => cut,
+            _ => stamp,
         };
         let (buffers, lags) = (&mut self.buffers, &mut self.lags);
-        plan.spectral.place_window(followed(found), buffers);
+        plan.spectral.place_window(followed(place), buffers);
         plan.spectral
             .autocorrelate(&self.psf, cut, sigma, buffers, lags);
-        let softening = self.added * sigma * sigma;
+        let divisor = self.regularisation[0] * sigma * sigma;
         let shape =
-            cleared.and_then(|_| plan.moments.measure(&lags.acf, softening, &mut self.values));
+            cleared.and_then(|_| plan.moments.measure(&lags.acf, divisor, &mut self.values));
         self.shape = shape.as_ref().ok().copied();
-        let mut response = None;
-        let mut sheared_noise = None;
-        let mut observed = None;
-        if let Ok(shape) = &shape {
-            response = Some(Self::response(&plan, shape, lags, &mut self.values));
-            let seed = seed_of(whole, sigma);
-            let coupled = noise > 0.0 && seed.is_multiple_of(plan.share);
-            if coupled {
-                sheared_noise = self.sheared_noise(seed, sigma, softening);
-            }
-            observed = Some(self.observed(shape, sigma, seed, sheared_noise.is_some()));
-        }
-        Ok(Some(Found {
+        let mut found = Found {
             descent: Descent {
                 iterations: plan.iterations,
                 stop: Stop::MaxIterations,
                 first_energy: f64::NAN,
                 energy: f64::NAN,
-                updated: whole.len() as u32,
+                updated: stamp.len() as u32,
             },
-            distortion: shape.map(|s| s.distortion),
-            response,
-            sheared_noise,
-            flux: plan.aperture * f64::from(self.lags.flux[0]),
+            distortion: shape.map(|shape| shape.distortion),
+            response: None,
+            noise_field: None,
+            observables: None,
+            flux: plan.aperture * f64::from(lags.flux[0]),
             radius: plan.spectral.reach() as f64 * plan.spectral.spacing(),
-            size: observed.as_ref().map_or(f64::NAN, |found| found.size[0]),
-            observed,
-        }))
+            size: f64::NAN,
+        };
+        if let Some(shape) = self.shape {
+            let response = Self::response(&plan, &shape, &self.lags, &mut self.values);
+            found.response = Some(response);
+            let seed = seed_of(stamp, sigma);
+            if noise > 0.0 && seed.is_multiple_of(plan.noise_field_interval) {
+                found.noise_field = self.noise_field(seed, sigma);
+            }
+            let observables = self.observables(&shape, sigma, seed, found.noise_field.is_some());
+            found.size = observables.size[0];
+            found.observables = Some(observables);
+        }
+        found
     }
 
-    fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
+    fn images(&self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
         let LinearPlan {
             spectral, moments, ..
         } = &*self.plan;
-        let acf = whole(&self.lags.acf, spectral.reach());
+        let acf = whole_lags(&self.lags.acf, spectral.reach());
         let lag = |place: usize| (place as f64 - spectral.reach() as f64) * spectral.spacing();
         let weight = self.shape.map(|shape| {
             Array2::from_shape_fn(acf.dim(), |(y, x)| moments.weight(&shape, lag(x), lag(y)))
@@ -340,18 +544,61 @@ impl CutWorker for LinearWorker {
     }
 }
 
-/// A seed that is the stamp's own: whether and with which noise a galaxy is looked at depends on nothing
-/// else. Of pixels in steps of a sixteenth of the noise, so that another machine's rounding hardly ever
-/// gives another.
+/// Index of the width for galaxies whose mean square per axis, PSF included, is `seen` px². The configured width is for
+/// `reference` px² without the PSF.
+fn window_index(
+    seen: Option<f64>,
+    psf: ArrayView2<'_, f64>,
+    reference: f64,
+    moments: &mut Moments,
+) -> usize {
+    let (Some(seen), true) = (seen, reference > 0.0) else {
+        return CONFIGURED_WINDOW;
+    };
+    let Some(psf) = moments.of_psf(psf) else {
+        return CONFIGURED_WINDOW;
+    };
+    // A point source has no positive ratio, and gets the narrowest window.
+    let ratio = ((seen - psf) / reference).max(f64::MIN_POSITIVE);
+    let step = (WINDOWS_PER_OCTAVE * WINDOW_POWER * ratio.log2()).round() as i32;
+    CONFIGURED_WINDOW
+        .wrapping_add_signed(step.clamp(*WINDOW_STEPS.start(), *WINDOW_STEPS.end()) as isize)
+}
+
+/// Mean square per axis in px² of the galaxies that the width at `index` is for, if the configured width is `sigma` px
+/// for `reference` px². Without a reference it is that of GREAT10's galaxies, in proportion to `sigma`².
+fn galaxy_variance(reference: f64, sigma: f64, index: usize) -> f64 {
+    let configured = if reference > 0.0 {
+        reference
+    } else {
+        sigma * sigma * GREAT10_VARIANCE
+    };
+    configured
+        * ((index as f64 - CONFIGURED_WINDOW as f64) / (WINDOWS_PER_OCTAVE * WINDOW_POWER)).exp2()
+}
+
+/// The width at `index` on stamps of `n` pixels a side, if the configured width is `sigma`.
+fn window_width(sigma: f64, index: usize, n: usize) -> f64 {
+    if index == CONFIGURED_WINDOW {
+        return sigma;
+    }
+    let steps = index as f64 - CONFIGURED_WINDOW as f64;
+    let widest = (WIDEST_WINDOW * n as f64).max(sigma).min(*WINDOWS.end());
+    (sigma * (steps / WINDOWS_PER_OCTAVE).exp2()).clamp(*WINDOWS.start(), widest)
+}
+
+/// A seed from the stamp alone, so that neither order nor threads decide which galaxies get which field of noise. Pixels
+/// count in steps of a sixteenth of the noise: the rounding of another machine hardly ever changes the seed.
 fn seed_of(stamp: &[f32], noise: f32) -> u64 {
-    // Pixels along the middle: noise makes them different for every galaxy.
+    // Noise makes the middle row different for each galaxy.
     let n = stamp.len().isqrt();
     let row = &stamp[n / 2 * n..][..n];
     let step = |value: &f32| ((16.0 * value / noise).round() as i32).cast_unsigned();
     hash(row.iter().map(step)) >> 16
 }
 
-/// Gaussian numbers from a seed (Box and Muller 1958), other than the signs of the field of noise.
+/// Gaussian numbers from a seed (Box & Muller 1958). They are independent of the signs of the noise field, which come
+/// from the same seed. The crate has no dependency on random generators outside of tests.
 fn normals(seed: u64) -> [f64; 4] {
     let mut state = seed ^ 0x5368_6561_7265_6421;
     let mut pair = || {
@@ -361,4 +608,233 @@ fn normals(seed: u64) -> [f64; 4] {
     };
     let ([a, b], [c, d]) = (pair(), pair());
     [a, b, c, d]
+}
+
+#[cfg(test)]
+mod tests {
+    use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
+    use shearq_submissions::{Configuration, Method, Registry};
+
+    use super::*;
+    use crate::measurement::Measurement;
+    use crate::measurer::{ImageNoise, Measurer};
+    use crate::noise::Survey;
+
+    #[test]
+    fn windows_follow_the_galaxies_without_their_psf() {
+        assert_eq!(WINDOW_STEPS.count(), WINDOW_COUNT);
+        let mut moments = Moments::default();
+        // A variance of 3 px².
+        let psf = Array2::from_shape_fn((32, 32), |(y, x)| {
+            let (x, y) = (x as f64 - 15.5, y as f64 - 15.5);
+            (-(x * x + y * y) / 6.0).exp()
+        });
+        let mut index = |seen, reference| window_index(seen, psf.view(), reference, &mut moments);
+        let found = [13.0, 5.0, 23.0, 3.0, 1.0, 1e9].map(|seen| index(Some(seen), 10.0));
+        // Once, a fifth, twice, and nothing of 10 px²: 3.2·log₂ of it, within bounds.
+        assert_eq!(found, [CONFIGURED_WINDOW, 0, 6, 0, 0, 6]);
+        let wider = index(Some(3.0 + 10.0 * 2f64.powf(0.34)), 10.0);
+        assert_eq!(wider, CONFIGURED_WINDOW + 1);
+        assert_eq!(index(None, 10.0), CONFIGURED_WINDOW);
+        assert_eq!(index(Some(5.0), 0.0), CONFIGURED_WINDOW);
+        let ratio =
+            |of: &dyn Fn(usize) -> f64| of(CONFIGURED_WINDOW + 2) / of(CONFIGURED_WINDOW - 2);
+        let twice = ratio(&|at| window_width(5.0, at, 48));
+        assert!((twice - 2.0).abs() < 1e-12, "{twice}");
+        let twice = ratio(&|at| galaxy_variance(9.0, 8.0, at));
+        assert!((twice.powf(WINDOW_POWER) - 2.0).abs() < 1e-12, "{twice}");
+        assert_eq!(galaxy_variance(9.0, 8.0, CONFIGURED_WINDOW), 9.0);
+        assert_eq!(galaxy_variance(0.0, 8.0, CONFIGURED_WINDOW), 8.8);
+        let widths = [
+            (8.0, CONFIGURED_WINDOW, 48),
+            (8.0, CONFIGURED_WINDOW, 32),
+            (8.0, 6, 32),
+            (15.0, 6, 64),
+        ];
+        assert_eq!(
+            widths.map(|(s, at, n)| window_width(s, at, n)),
+            [8.0, 8.0, 8.0, 15.0]
+        );
+        assert!((window_width(8.0, 6, 48) - 9.6).abs() < 1e-12);
+        assert_eq!(window_width(2.0, 0, 48), 2.0);
+        assert_eq!(window_width(8.0, 6, 96), 8.0 * 2f64.powf(0.75));
+    }
+
+    fn configuration(reference_area: f64) -> Configuration {
+        let mut configuration = Registry::embedded()
+            .unwrap()
+            .get("48/linear/star")
+            .unwrap()
+            .configuration;
+        if let Method::Linear(linear) = &mut configuration.method {
+            linear.deconvolution.reference_area = reference_area;
+        }
+        configuration
+    }
+
+    fn moffat(fwhm: f64) -> FunctionalPsf {
+        let profile = PsfProfile::Moffat { beta: 3.0 };
+        FunctionalPsf::new(profile, fwhm, Shear::new(0.03, -0.02)).unwrap()
+    }
+
+    /// Measurements of a galaxy as wide as the PSF, elongated along x, with the σ of the target.
+    fn measured(
+        configuration: &Configuration,
+        fwhms: &[f64],
+        noise: f64,
+    ) -> Vec<(Measurement, f64)> {
+        let mut worker = Measurer::new(configuration, 48).unwrap().worker();
+        let each = fwhms.iter().map(|&fwhm| {
+            let psf = moffat(fwhm).stamp_beside(configuration.psf_cut().size, 48);
+            let stamp = Array2::from_shape_fn((48, 48), |(y, x)| {
+                let (y, x) = (y as f64 - 23.5, x as f64 - 23.5);
+                (100.0 * (-(x * x / 1.2 + y * y) / (fwhm * fwhm)).exp()) as f32
+            });
+            let mut image = worker.image(ImageNoise::Level(noise));
+            let mut worker = image.psf(psf.view()).unwrap();
+            let found = worker.measure(stamp.view()).unwrap();
+            (found, worker.adapted().unwrap().target_sigma)
+        });
+        each.collect()
+    }
+
+    #[test]
+    fn targets_follow_the_width_of_the_psf() {
+        let (with, without) = (configuration(50.0), configuration(0.0));
+        let fwhms = [3.4, 6.0, 3.06, 2.0];
+        let found = measured(&with, &fwhms, 0.5);
+        let plain = measured(&without, &fwhms, 0.5);
+        for k in [0, 2] {
+            assert_eq!(
+                (found[k].0.e1, found[k].0.response),
+                (plain[k].0.e1, plain[k].0.response)
+            );
+        }
+        assert!(found[1].1 > 1.2 * plain[1].1, "{found:?} {plain:?}");
+        assert!(found[3].1 < 0.8 * plain[3].1, "{found:?} {plain:?}");
+        // Earlier PSFs of the worker do not matter.
+        let alone = measured(&with, &[6.0], 0.5);
+        assert_eq!(
+            (found[1].0.e1, found[1].0.e2),
+            (alone[0].0.e1, alone[0].0.e2)
+        );
+    }
+
+    #[test]
+    fn windows_follow_the_galaxies_of_the_image() {
+        let configuration = configuration(50.0);
+        let mut worker = Measurer::new(&configuration, 48).unwrap().worker();
+        let psf = moffat(3.4).stamp_beside(configuration.psf_cut().size, 48);
+        let stamp = moffat(6.0).stamp(48).mapv(|v| 1000.0 * v as f32);
+        let mut radius = |extent: Option<f64>| {
+            let survey = Survey {
+                noise: StampNoise::white(0.1),
+                extent,
+                sky: None,
+            };
+            let survey = Arc::new(survey);
+            let mut image = worker.image(ImageNoise::Survey(&survey));
+            let mut worker = image.psf(psf.view()).unwrap();
+            let found = worker.measure(stamp.view()).unwrap();
+            assert!(found.e1.is_finite() && found.noise == 0.1, "{found:?}");
+            (found.radius, worker.adapted().unwrap().window_sigma)
+        };
+        let [own, narrow, wide, again] = [None, Some(4.0), Some(30.0), Some(13.0)].map(&mut radius);
+        // In steps of the lags; the stamp's side limits the wide one.
+        assert!(
+            narrow.0 < 0.7 * own.0 && wide.0 > own.0 && again == own,
+            "{narrow:?} {own:?} {wide:?} {again:?}"
+        );
+        assert!(narrow.1 < own.1 && wide.1 > own.1);
+        assert_eq!(
+            own.1,
+            configuration.linear().unwrap().deconvolution.window_sigma
+        );
+    }
+
+    #[test]
+    fn zeros_around_a_psf_change_nothing() {
+        let configuration = configuration(50.0);
+        let mut worker = Measurer::new(&configuration, 48).unwrap().worker();
+        let stamp = moffat(8.0).stamp(48).mapv(|v| 1000.0 * v as f32);
+        let star = moffat(6.0).stamp(36);
+        let mut wide = Array2::zeros((48, 48));
+        wide.slice_mut(ndarray::s![6..42, 6..42]).assign(&star);
+        let mut image = worker.image(ImageNoise::Level(0.1));
+        let [small, large] = [&star, &wide].map(|psf| {
+            let mut worker = image.psf(psf.view()).unwrap();
+            worker.measure(stamp.view()).unwrap()
+        });
+        assert_eq!((small.e1, small.response), (large.e1, large.response));
+        for side in [30, 33, 50] {
+            assert!(image.psf(moffat(6.0).stamp(side).view()).is_err(), "{side}");
+        }
+    }
+
+    /// `48/linear/star` with a PSF as large as the stamp.
+    fn wide_psf(half_snr: f64) -> Configuration {
+        let registry = Registry::embedded().unwrap();
+        let mut configuration = registry.get("48/linear/star").unwrap().configuration;
+        configuration.psf.size = 48;
+        if let Method::Linear(linear) = &mut configuration.method {
+            linear.shape.half_snr = half_snr;
+        }
+        configuration
+    }
+
+    /// A nearly round Gaussian of a mean square of `extent` px² per axis behind a round Gaussian PSF of `variance` px².
+    fn stamp(extent: f64, variance: f64) -> Array2<f32> {
+        let (along, across) = (1.01 * extent + variance, 0.99 * extent + variance);
+        Array2::from_shape_fn((48, 48), |(y, x)| {
+            let (y, x) = (y as f64 - 23.5, x as f64 - 23.5);
+            (-0.5 * (x * x / along + y * y / across)).exp() as f32
+        })
+    }
+
+    fn gaussian(fwhm: f64) -> FunctionalPsf {
+        // A Moffat of large exponent.
+        let profile = PsfProfile::Moffat { beta: 60.0 };
+        FunctionalPsf::new(profile, fwhm, Shear::new(0.0, 0.0)).unwrap()
+    }
+
+    #[test]
+    fn half_snr_halves_the_weight_behind_any_psf_and_window() {
+        let half_snr = 15.0;
+        let mut workers =
+            [half_snr, 0.0].map(|snr| Measurer::new(&wide_psf(snr), 48).unwrap().worker());
+        let mut moments = Moments::default();
+        for (fwhm, window) in [
+            (2.4, CONFIGURED_WINDOW),
+            (3.4, CONFIGURED_WINDOW),
+            (3.4, 0),
+            (3.4, WINDOW_COUNT - 1),
+            (5.5, CONFIGURED_WINDOW),
+            (5.5, WINDOW_COUNT - 1),
+        ] {
+            let psf = gaussian(fwhm).stamp(48);
+            let extent = galaxy_variance(8.8, 8.0, window);
+            let stamp = stamp(extent, (fwhm / 2.354_82_f64).powi(2) + 1.0 / 12.0);
+            let light = stamp.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>();
+            let seen = extent + moments.of_psf(psf.view()).unwrap();
+            // ν²/(ν² + ν₀²).
+            for (snr, share) in [(half_snr, 0.5), (2.0 * half_snr, 0.8)] {
+                let survey = Arc::new(Survey {
+                    noise: StampNoise::white(light.sqrt() / snr),
+                    extent: Some(seen),
+                    sky: None,
+                });
+                let [soft, hard] = workers.each_mut().map(|worker| {
+                    let mut image = worker.image(ImageNoise::Survey(&survey));
+                    let mut worker = image.psf(psf.view()).unwrap();
+                    worker.measure(stamp.view()).unwrap().e1
+                });
+                // The mean of noise is subtracted from a stamp without: its share of the light goes as 1/ν².
+                let tolerance = 0.02 * (half_snr / snr).powi(2);
+                assert!(
+                    (soft / hard / share - 1.0).abs() < tolerance,
+                    "{fwhm} {window} {snr}: {soft} of {hard}"
+                );
+            }
+        }
+    }
 }

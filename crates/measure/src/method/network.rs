@@ -1,16 +1,15 @@
-//! The network, and moments of the clipped autocorrelation.
+//! The Hopfield network, and moments of the clipped autocorrelation (Nurbaeva et al. 2015, Sects. 2 and 3).
 
 use std::sync::Arc;
 
 use ndarray::ArrayView2;
 use shearq_submissions::{NetworkDeconvolution, NetworkMethod};
 
-use super::found::{CutWorker, Found, Images, image, whole};
+use super::{CutWorker, Found, Images, image, whole_lags};
 use crate::deconvolve::{Network, NetworkScratch, Rule};
 use crate::error::MeasureError;
 use crate::shape::{ClippedAcf, ClippedAcfScratch};
 
-/// What one submission and stamp size need.
 pub(crate) struct NetworkPlan {
     settings: NetworkDeconvolution,
     network: Network<f32>,
@@ -28,28 +27,28 @@ impl NetworkPlan {
     }
 }
 
-/// A worker for one thread.
-pub(super) fn worker(plan: Arc<NetworkPlan>) -> Box<dyn CutWorker> {
-    let n = plan.network.stamp_size();
-    Box::new(NetworkWorker {
-        network: plan.network.clone(),
-        buffers: plan.network.scratch(),
-        light: 1.0,
-        acf_buffers: plan.acf.scratch(),
-        deconvolved: vec![0.0; n * n],
-        plan,
-    })
-}
-
-struct NetworkWorker {
+pub(super) struct NetworkWorker {
     plan: Arc<NetworkPlan>,
-    /// With the PSF.
     network: Network<f32>,
     buffers: NetworkScratch<f32>,
-    /// Light of a state in units of its pixels.
+    /// Flux of a state per sum of its pixels: a scaled PSF does not have a sum of one.
     light: f64,
     acf_buffers: ClippedAcfScratch,
     deconvolved: Vec<f32>,
+}
+
+impl NetworkWorker {
+    pub(super) fn new(plan: Arc<NetworkPlan>) -> Self {
+        let n = plan.network.stamp_size();
+        NetworkWorker {
+            network: plan.network.clone(),
+            buffers: plan.network.scratch(),
+            light: 1.0,
+            acf_buffers: plan.acf.scratch(),
+            deconvolved: vec![0.0; n * n],
+            plan,
+        }
+    }
 }
 
 impl CutWorker for NetworkWorker {
@@ -80,8 +79,8 @@ impl CutWorker for NetworkWorker {
             descent,
             distortion,
             response: None,
-            sheared_noise: None,
-            observed: None,
+            noise_field: None,
+            observables: None,
             flux,
             radius,
             size,
@@ -92,7 +91,7 @@ impl CutWorker for NetworkWorker {
         let n = self.network.stamp_size();
         Images {
             deconvolved: image(&self.deconvolved, n),
-            acf: whole(self.acf_buffers.lags(), n - 1),
+            acf: whole_lags(self.acf_buffers.lags(), n - 1),
             weight: None,
             spacing: 1.0,
         }

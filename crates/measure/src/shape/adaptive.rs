@@ -17,7 +17,7 @@
 use multiversion::multiversion;
 use shearq_quantities::Distortion;
 
-use crate::flag::Flag;
+use crate::measurement::Flag;
 
 /// Most Newton steps. See docs/constants.md.
 const MAX_STEPS: usize = 30;

@@ -5,7 +5,7 @@ use shearq_submissions::{AcfKind, Background, ClippedShape};
 use super::acf::{AcfScratch, Autocorrelation};
 use super::moments::{ClippedMoments, Moments};
 use crate::error::MeasureError;
-use crate::flag::Flag;
+use crate::measurement::Flag;
 
 /// Width of the border whose mean is a stamp's background. See docs/constants.md.
 const BORDER: usize = 3;

@@ -3,7 +3,7 @@
 use shearq_quantities::Distortion;
 use shearq_submissions::{AcfKind, Background, ClippedShape, ShareOf};
 
-use crate::flag::Flag;
+use crate::measurement::Flag;
 
 /// Quadrupole moments of the clipped autocorrelation (Eq. 14), in px² relative to its light.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -7,7 +7,9 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
 use shearq_files::table::{self, FileFormat};
-use shearq_measure::{Batch, Flag, Flags, Measurement, Observables, PixelFrame, Versions, Warning};
+use shearq_measure::{
+    Batch, Flag, Flags, Measurement, Observables, PixelFrame, ShearedCatalogues, Warning,
+};
 use shearq_submissions::{Configuration, EllipticityType};
 
 use super::ImageHead;
@@ -88,23 +90,18 @@ pub fn more_columns(
         }
     }
     if linear.shape.sheared_step > 0.0 {
-        columns.extend(versions(galaxies));
+        const COUNT: usize = ShearedCatalogues::QUANTITIES.len();
+        let values = |at: usize| {
+            let value = move |galaxy: &Measurement| {
+                let sheared = galaxy.sheared.as_ref();
+                sheared.map_or(f64::NAN, |all| all.values(at / COUNT)[at % COUNT])
+            };
+            galaxies.iter().map(value).collect()
+        };
+        let names = ShearedCatalogues::columns().enumerate();
+        columns.extend(names.map(|(at, name)| (name, values(at))));
     }
     columns
-}
-
-/// Each quantity of each sheared version.
-fn versions(galaxies: &[Measurement]) -> Vec<(String, Vec<f64>)> {
-    const COUNT: usize = Versions::QUANTITIES.len();
-    let of = |at: usize| {
-        let value = move |galaxy: &Measurement| {
-            let all = galaxy.versions.as_ref();
-            all.map_or(f64::NAN, |all| all.values(at / COUNT)[at % COUNT])
-        };
-        galaxies.iter().map(value).collect()
-    };
-    let names = Versions::columns().enumerate();
-    names.map(|(at, name)| (name, of(at))).collect()
 }
 
 /// Mean responses by which the ellipticity was divided; NaN if it was not.

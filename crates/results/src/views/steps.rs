@@ -1,12 +1,11 @@
 //! Plots of the processing steps of a measurement, as in Fig. 3 of the paper.
 
-use ndarray::Array2;
 use shearq_measure::Steps;
 
 use shearq_render::figure::{ColourMap, ImageGrid, ImagePanel, ImageRow, Stretch};
 
 /// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, and the part of the ACF that is measured.
-pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
+pub fn steps_row(label: &str, steps: Steps) -> ImageRow {
     use ColourMap::{Diverging, Viridis};
     let panel = |title: &str, image, map, stretch| ImagePanel {
         title: title.into(),
@@ -18,7 +17,7 @@ pub fn steps_row(label: &str, psf: Array2<f64>, steps: Steps) -> ImageRow {
         label: label.into(),
         panels: vec![
             panel("Stamp", steps.stamp, Viridis, Stretch::Linear),
-            panel("PSF", psf, Viridis, Stretch::Asinh),
+            panel("PSF", steps.psf, Viridis, Stretch::Asinh),
             panel("Deconvolved", steps.deconvolved, Viridis, Stretch::Linear),
             panel("Residual", steps.residual, Diverging, Stretch::Linear),
             panel("ACF", steps.acf, Viridis, Stretch::Linear),

@@ -8,8 +8,8 @@ use super::plane::{Modes, even_quarters};
 use super::{Spectral, SpectralScratch};
 use crate::error::MeasureError;
 use crate::noise::StampNoise;
+use crate::pixel::check_psf;
 use crate::pixel::copy_row;
-use crate::sizes::check_psf;
 
 /// Least power of the PSF's transform; modes below it are left out as pure noise. See
 /// docs/constants.md.

@@ -1,37 +1,37 @@
-//! Galaxies as they would be measured under small shears, for selections of the user's own.
+//! Sheared catalogues: galaxies as they would be measured under small shears, for selections by the user.
 //!
-//! The values X of a galaxy (ellipticity, flux, size) change to X ± hX′ if its image is sheared by ±h. But that shears the
-//! noise, too. For noise of covariance C, changed by D n, the mean of any smooth function φ(X) then changes by
+//! The values X of a galaxy (ellipticity, flux, size) change to X ± hX′ if its image is sheared by ±h. This shears the
+//! noise, too. For noise n of covariance C that changes by D n, the mean of any smooth function φ(X) then changes by
 //!
 //! ```text
 //! h ⟨∇φ(X)·D n⟩ = h ⟨φ_a tr(D C X_a″) + φ_ab K_ab⟩,   K_ab = ∇X_a·D C ∇X_b
 //! ```
 //!
-//! (Stein's lemma). The responses X′ are already without the first term. Gaussian noise of covariance ∓2hK, added to X, takes
-//! out the second one. A covariance cannot be negative, so that a small share of C is added in all versions, without its couplings of
-//! the ellipticity to flux and size.
-//! In the same way, noise of covariance T takes out what the shape of the PSF gives to noise. For each mode, T is the geometric mean
-//! of the power behind the PSF and the power behind a PSF turned by 90 degrees, less the former.
+//! (Stein's lemma). The responses X′ are already corrected for the first term. Gaussian noise of covariance ∓2hK, added to
+//! X, removes the second one. A covariance cannot be negative, so a small share of C is added in all catalogues, without
+//! its couplings of the ellipticity to flux and size. Likewise, noise of covariance T removes the effect of noise that has
+//! the shape of the PSF. For each mode, T is the geometric mean of the power behind the PSF and the power behind a PSF turned
+//! by 90 degrees, minus the former.
 //!
-//! The difference of the means of versions 1p and 1m, divided by 2h, is then the response to γ1 for any selection by the values of
-//! each version.
+//! The difference of the means of catalogues 1p and 1m, divided by 2h, is then the response to γ1 for any selection by the
+//! values of each catalogue.
 
 use shearq_quantities::linear::cholesky;
 
-/// Values that change with shear: e1, e2, flux and size.
+// e1, e2, flux and size.
 const VALUES: usize = 4;
 /// A symmetric matrix of all values.
 type Matrix = [[f64; VALUES]; VALUES];
 
-/// Share of the noise that is enough by more than rounding. See docs/constants.md.
+// Of the noise. Against the rounding of covariances, which is 10⁻⁵ of them.
 const MARGIN: f64 = 1e-3;
-/// Steps of the bisection for the share of the noise that is added. See docs/constants.md.
-const HALVINGS: usize = 8;
+// The added share of the noise is then at most 1/256 of its bound too large.
+const BISECTIONS: usize = 8;
 
-/// What is measured on a galaxy under a shear.
+/// The values of a galaxy in one catalogue.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
-pub struct Version {
+pub struct ShearedGalaxy {
     /// First component of the ellipticity.
     pub e1: f64,
     /// Second component.
@@ -42,50 +42,45 @@ pub struct Version {
     pub size: f64,
 }
 
-/// A galaxy without shear, under γ1 = ±h and under γ2 = ±h, in the order of [`Versions::NAMES`].
+/// A galaxy without shear, under γ1 = ±h and under γ2 = ±h, in the order of [`ShearedCatalogues::NAMES`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
-pub struct Versions {
-    /// All versions.
-    pub each: [Version; 5],
-    /// Standard deviation of the flux of each.
+pub struct ShearedCatalogues {
+    /// The galaxy in each catalogue.
+    pub each: [ShearedGalaxy; 5],
+    /// Standard deviation of the flux in each catalogue.
     pub flux_error: f64,
 }
 
-impl Versions {
-    /// Names of the versions.
+impl ShearedCatalogues {
+    /// Names of the catalogues.
     pub const NAMES: [&'static str; 5] = ["noshear", "1p", "1m", "2p", "2m"];
 
-    /// Names of what each version has.
+    /// Names of the values in each catalogue.
     pub const QUANTITIES: [&'static str; 5] = ["e1", "e2", "snr", "flux", "size"];
 
-    /// The names of all columns, version by version.
+    /// The names of all columns, catalogue by catalogue: `e1_noshear`, `e2_noshear`, …
     pub fn columns() -> impl Iterator<Item = String> {
-        let of = |version: &'static str| {
-            let names = Versions::QUANTITIES.into_iter();
-            names.map(move |quantity| format!("{quantity}_{version}"))
-        };
-        Versions::NAMES.into_iter().flat_map(of)
+        let columns = |name| Self::QUANTITIES.map(|quantity| format!("{quantity}_{name}"));
+        Self::NAMES.into_iter().flat_map(columns)
     }
 
-    /// The values of a version, in the order of [`Versions::QUANTITIES`].
-    pub fn values(&self, version: usize) -> [f64; 5] {
-        let Version { e1, e2, flux, size } = self.each[version];
+    /// The values in a catalogue, in the order of [`ShearedCatalogues::QUANTITIES`].
+    pub fn values(&self, catalogue: usize) -> [f64; 5] {
+        let ShearedGalaxy { e1, e2, flux, size } = self.each[catalogue];
         [e1, e2, flux / self.flux_error, flux, size]
     }
 }
 
-/// What sheared versions of a galaxy are made with.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct VersionSettings {
-    /// The shear.
+pub(crate) struct ShearSettings {
     pub(crate) step: f64,
-    /// Gaussian numbers of the galaxy's own.
+    /// Gaussian numbers from the pixels of the galaxy.
     pub(crate) normals: [f64; 4],
 }
 
-/// Mean products of the changes that noise makes of the values.
-pub(crate) struct Products {
+/// Mean products of the changes of the values by noise.
+pub(crate) struct NoiseProducts {
     /// Covariance C of the noise of the values.
     pub(crate) plain: Matrix,
     /// K for γ1 and for γ2.
@@ -94,25 +89,24 @@ pub(crate) struct Products {
     pub(crate) turned: Matrix,
 }
 
-impl Products {
-    /// Without noise.
-    pub(crate) const NONE: Products = Products {
+impl NoiseProducts {
+    pub(crate) const NONE: NoiseProducts = NoiseProducts {
         plain: [[0.0; VALUES]; VALUES],
         sheared: [[[0.0; VALUES]; VALUES]; 2],
         turned: [[0.0; VALUES]; VALUES],
     };
 }
 
-/// The versions of a galaxy, from its values, their derivatives with γ1 and γ2, and its noise. `None` if the products cannot
-/// be products of noise.
-pub(crate) fn versions(
+/// The galaxy in each catalogue, from its values, their derivatives with γ1 and γ2, and its noise. `None` if the products
+/// are not products of noise.
+pub(crate) fn sheared(
     values: [f64; VALUES],
     derivatives: [[f64; VALUES]; 2],
-    products: &Products,
-    settings: &VersionSettings,
-) -> Option<[Version; 5]> {
-    let &VersionSettings { step, normals } = settings;
-    let Products {
+    products: &NoiseProducts,
+    settings: &ShearSettings,
+) -> Option<[ShearedGalaxy; 5]> {
+    let &ShearSettings { step, normals } = settings;
+    let NoiseProducts {
         plain,
         sheared,
         turned,
@@ -146,14 +140,13 @@ pub(crate) fn versions(
                 .all(|along| root(&covariance(share, *along)).is_some())
         };
         let (mut low, mut high) = (0.0, most);
-        for _ in 0..HALVINGS {
+        for _ in 0..BISECTIONS {
             let middle = 0.5 * (low + high);
             *(if enough(middle) { &mut high } else { &mut low }) = middle;
         }
         high
     };
-    // Along no shear, γ1 and γ2.
-    let version = |along: [f64; 2]| -> Option<Version> {
+    let galaxy = |along: [f64; 2]| -> Option<ShearedGalaxy> {
         let root = if silent {
             [[0.0; VALUES]; VALUES]
         } else {
@@ -164,9 +157,9 @@ pub(crate) fn versions(
             let changed = along[0] * derivatives[0][a] + along[1] * derivatives[1][a];
             values[a] + changed + added
         });
-        Some(Version { e1, e2, flux, size })
+        Some(ShearedGalaxy { e1, e2, flux, size })
     };
-    let [plain, first_plus, first_minus, second_plus, second_minus] = shears.map(version);
+    let [plain, first_plus, first_minus, second_plus, second_minus] = shears.map(galaxy);
     Some([
         plain?,
         first_plus?,
@@ -176,8 +169,8 @@ pub(crate) fn versions(
     ])
 }
 
-/// Noise of the size of `covariance` that does not depend on the direction of the galaxy: couplings of the ellipticity to flux and
-/// size change with shear, which the versions do not.
+/// Noise of the size of `covariance` that does not depend on the direction of the galaxy: couplings of the ellipticity to
+/// flux and size would change with shear, and the added noise must not.
 fn round(covariance: &Matrix) -> Matrix {
     let mut round = [[0.0; VALUES]; VALUES];
     let mean = 0.5 * (covariance[0][0] + covariance[1][1]);
@@ -203,7 +196,7 @@ fn root(matrix: &Matrix) -> Option<Matrix> {
 
 /// The root of the sum of squares of L⁻¹ M L⁻ᵀ, no less than the modulus of its eigenvalues.
 fn whitened_norm(matrix: &Matrix, root: &Matrix) -> f64 {
-    // L⁻¹ of each column, twice: of the matrix, and of what that gives, turned over.
+    // L⁻¹ of each column, transposed; twice, because the matrix is symmetric.
     let solved = |matrix: &Matrix| -> Matrix {
         let mut out = [[0.0; VALUES]; VALUES];
         for column in 0..VALUES {
@@ -231,8 +224,8 @@ mod tests {
         std::array::from_fn(|a| std::array::from_fn(|b| lower[a.max(b)][a.min(b)]))
     }
 
-    fn products() -> Products {
-        Products {
+    fn products() -> NoiseProducts {
+        NoiseProducts {
             plain: symmetric([
                 [0.09, 0.0, 0.0, 0.0],
                 [0.01, 0.08, 0.0, 0.0],
@@ -263,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn versions_scatter_as_they_should() {
+    fn catalogues_scatter_by_the_products_of_noise() {
         let products = products();
         let values = [0.1, -0.2, 30.0, 2.5];
         let derivatives = [[0.9, 0.05, 3.0, 0.4], [-0.02, 0.8, 1.0, 0.2]];
@@ -274,14 +267,14 @@ mod tests {
         let mut squares = [[[0.0; 4]; 4]; 5];
         for _ in 0..count {
             let normals = [0; 4].map(|_| StandardNormal.sample(&mut rng));
-            let settings = VersionSettings { step, normals };
-            let found = versions(values, derivatives, &products, &settings).unwrap();
-            for (version, Version { e1, e2, flux, size }) in found.into_iter().enumerate() {
+            let settings = ShearSettings { step, normals };
+            let found = sheared(values, derivatives, &products, &settings).unwrap();
+            for (catalogue, ShearedGalaxy { e1, e2, flux, size }) in found.into_iter().enumerate() {
                 let x = [e1, e2, flux, size];
                 for a in 0..4 {
-                    sums[version][a] += x[a] - values[a];
+                    sums[catalogue][a] += x[a] - values[a];
                     for b in 0..4 {
-                        squares[version][a][b] += (x[a] - values[a]) * (x[b] - values[b]);
+                        squares[catalogue][a][b] += (x[a] - values[a]) * (x[b] - values[b]);
                     }
                 }
             }
@@ -294,23 +287,24 @@ mod tests {
             [0.0, step],
             [0.0, -step],
         ];
-        let covariance = |version: usize, a: usize, b: usize| {
-            squares[version][a][b] / count - sums[version][a] * sums[version][b] / count / count
+        let covariance = |catalogue: usize, a: usize, b: usize| {
+            squares[catalogue][a][b] / count
+                - sums[catalogue][a] * sums[catalogue][b] / count / count
         };
         for a in 0..4 {
-            for version in 0..5 {
-                let expected =
-                    along[version][0] * derivatives[0][a] + along[version][1] * derivatives[1][a];
-                let error = (covariance(version, a, a) / count).sqrt();
-                let found = sums[version][a] / count;
+            for catalogue in 0..5 {
+                let expected = along[catalogue][0] * derivatives[0][a]
+                    + along[catalogue][1] * derivatives[1][a];
+                let error = (covariance(catalogue, a, a) / count).sqrt();
+                let found = sums[catalogue][a] / count;
                 assert!(
                     (found - expected).abs() < 4.0 * error,
-                    "{version} {a}: {found} {expected}"
+                    "{catalogue} {a}: {found} {expected}"
                 );
             }
             for b in 0..4 {
                 let scale = (covariance(0, a, a) * covariance(0, b, b)).sqrt();
-                // All versions have the same normals, so that their difference scatters much less than each.
+                // All catalogues have the same normals, so that their difference scatters much less than each.
                 let error = 4.0 * scale * (2.0 / count).sqrt();
                 for (k, [plus, minus]) in [[1, 2], [3, 4]].into_iter().enumerate() {
                     let difference = covariance(plus, a, b) - covariance(minus, a, b);
@@ -324,7 +318,7 @@ mod tests {
                 }
             }
         }
-        // Next to T, what is added is noise of the galaxy's own kind.
+        // Apart from T, a share of the galaxy's own noise was added.
         let share = (covariance(0, 3, 3) - products.turned[3][3]) / products.plain[3][3];
         assert!(share > 0.0 && share < 0.5, "{share}");
         for a in 0..4 {
@@ -338,26 +332,32 @@ mod tests {
     }
 
     #[test]
-    fn without_noise_versions_are_exact_and_of_nonsense_there_are_none() {
+    fn without_noise_catalogues_are_exact() {
         let derivatives = [[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]];
-        let settings = |step: f64, normal: f64| VersionSettings {
+        let settings = |step: f64, normal: f64| ShearSettings {
             step,
             normals: [normal; 4],
         };
-        let found = versions([0.0; 4], derivatives, &Products::NONE, &settings(0.5, 9.0)).unwrap();
-        let expected = |e1, e2, flux, size| Version { e1, e2, flux, size };
+        let found = sheared(
+            [0.0; 4],
+            derivatives,
+            &NoiseProducts::NONE,
+            &settings(0.5, 9.0),
+        )
+        .unwrap();
+        let expected = |e1, e2, flux, size| ShearedGalaxy { e1, e2, flux, size };
         assert_eq!(found[0], expected(0.0, 0.0, 0.0, 0.0));
         assert_eq!(found[1], expected(0.5, 1.0, 1.5, 2.0));
         assert_eq!(found[4], expected(-2.5, -3.0, -3.5, -4.0));
         let mut bad = products();
         bad.plain[2][2] = -1.0;
         assert_eq!(
-            versions([0.0; 4], derivatives, &bad, &settings(0.01, 0.0)),
+            sheared([0.0; 4], derivatives, &bad, &settings(0.01, 0.0)),
             None
         );
         bad.plain[2][2] = f64::NAN;
         assert_eq!(
-            versions([0.0; 4], derivatives, &bad, &settings(0.01, 0.0)),
+            sheared([0.0; 4], derivatives, &bad, &settings(0.01, 0.0)),
             None
         );
     }

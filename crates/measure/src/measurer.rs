@@ -1,0 +1,608 @@
+//! A plan for one configuration and size of stamps, and the workers that measure galaxies with it.
+//!
+//! The types fix the order. A [`Worker`] becomes an [`ImageWorker`] for an image, whose noise is known. An [`ImageWorker`]
+//! becomes a [`PsfWorker`] for a PSF, and only this measures galaxies.
+
+use std::fmt;
+use std::sync::Arc;
+
+use ndarray::{Array2, ArrayView2, ArrayView3};
+use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registry};
+
+use crate::deconvolve::convolve;
+use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
+use crate::error::MeasureError;
+use crate::measurement::{Flag, Measurement};
+use crate::method::{AdaptedSettings, CutWorker, Images, MethodPlan};
+use crate::noise::{NoisePlan, StampNoise, Survey};
+use crate::pixel::{self, PEAKS, Pixel, all_finite, highest, is_level};
+use crate::psf::{CommonProfile, StarLooker, cut_start, star_psf};
+use crate::psfs::Psfs;
+use crate::sky::{Cells, Subtraction};
+use crate::surroundings::Missing;
+
+/// The plan of a measurement, for one configuration and one size of stamps. Measuring does not change it, so it serves
+/// all threads. Each thread has a [`Worker`]. Clones share the plan.
+#[derive(Clone)]
+pub struct Measurer(Arc<Plan>);
+
+struct Plan {
+    configuration: Configuration,
+    full: usize,
+    denoise: Option<WaveletWiener>,
+    method: MethodPlan,
+    noise: Option<NoisePlan>,
+}
+
+impl fmt::Debug for Measurer {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Measurer")
+            .field("configuration", &self.0.configuration)
+            .field("full", &self.0.full)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Measurer {
+    /// Plans for full stamps of `full` pixels a side.
+    ///
+    /// If the stamps are odd and the configuration's stamp size is even, or the reverse, the linear method takes a pixel
+    /// more of the stamps and a pixel less of PSFs. So galaxies stay in the middle of its window.
+    ///
+    /// # Errors
+    /// If a setting is out of its range, or the stamps are smaller than the configuration needs.
+    pub fn new(configuration: &Configuration, full: usize) -> Result<Self, MeasureError> {
+        configuration.validate().map_err(ConfigurationError::from)?;
+        let n = configuration.stamp.size;
+        if full < n {
+            let expected = format!(
+                "at least {n} × {n}, as submission {} needs",
+                configuration.name
+            );
+            return Err(MeasureError::square("stamps", (full, full), expected));
+        }
+        let mut configuration = configuration.clone();
+        if configuration.linear().is_some() && full % 2 != n % 2 {
+            configuration.stamp.size += 1;
+            configuration.psf.size -= 1;
+            configuration.validate().map_err(ConfigurationError::from)?;
+        }
+        let wavelet = configuration.wavelet();
+        Ok(Measurer(Arc::new(Plan {
+            full,
+            denoise: wavelet.map(|settings| WaveletWiener::new(full, settings)),
+            method: MethodPlan::new(&configuration, configuration.stamp.size)?,
+            noise: match configuration.noise {
+                NoiseSource::Image { correlation, sky } => {
+                    Some(NoisePlan::new(full, correlation)?.with_sky(sky))
+                }
+                NoiseSource::Header | NoiseSource::Border { .. } => None,
+            },
+            configuration,
+        })))
+    }
+
+    /// The same for the name of a configuration or the path of a settings file.
+    ///
+    /// # Errors
+    /// If there is no such configuration, it is not valid, or as [`Measurer::new`].
+    pub fn named(configuration: &str, full: usize) -> Result<Self, MeasureError> {
+        let named = Registry::embedded()?.get(configuration)?;
+        Measurer::new(&named.configuration, full)
+    }
+
+    /// The configuration.
+    pub fn configuration(&self) -> &Configuration {
+        &self.0.configuration
+    }
+
+    /// Pixels a side of the full stamps.
+    pub fn full(&self) -> usize {
+        self.0.full
+    }
+
+    /// The plan for measuring the noise of an image on its stamps, if the configuration requires that.
+    pub(crate) fn noise_plan(&self) -> Option<&NoisePlan> {
+        self.0.noise.as_ref()
+    }
+
+    /// The sky that is subtracted from stamps of an image with this survey.
+    pub(crate) fn subtraction(&self, survey: Option<&Survey>) -> Subtraction {
+        let sky = survey.and_then(|survey| survey.sky);
+        Subtraction::of(self.0.configuration.noise.sky(), sky)
+    }
+
+    /// Buffers to examine the stars of an image with one per galaxy; `None` if the configuration uses stars as they are.
+    pub(crate) fn star_looker(&self) -> Option<StarLooker> {
+        self.0.configuration.linear()?;
+        Some(StarLooker::new(self.0.configuration.psf_cut(), self.full()))
+    }
+
+    /// Buffers for one thread.
+    pub fn worker(&self) -> Worker {
+        let (plan, n) = (&*self.0, self.0.configuration.stamp.size);
+        Worker {
+            measurer: self.clone(),
+            method: plan.method.worker(),
+            denoise: plan.denoise.as_ref().map(WaveletWiener::scratch),
+            full: vec![0.0; plan.full * plan.full],
+            cut: vec![0.0; n * n],
+            border: Vec::with_capacity(plan.full * plan.full),
+            missing: Missing::new(n),
+            cells: Cells::new(plan.full),
+            subtraction: Subtraction::Nothing,
+        }
+    }
+
+    /// Measures one stamp with its star stamp and noise level, which may be `None` if the configuration measures the noise
+    /// on the border of the stamp.
+    ///
+    /// The response is the galaxy's own. The ellipticity is **not calibrated**: dividing it by its own
+    /// response would be noisy and biased. Divide it by [`Batch::response`](crate::Batch::response) of galaxies like this one.
+    ///
+    /// # Errors
+    /// If sizes do not fit, the noise level is not finite, pixels are not (more of them than a linear method fills
+    /// from the opposite side), or the PSF is dark or off centre. A galaxy that cannot be measured for other reasons is
+    /// flagged.
+    pub fn stamp<T: Pixel, P: Pixel>(
+        &self,
+        stamp: ArrayView2<'_, T>,
+        psf: ArrayView2<'_, P>,
+        noise: Option<f64>,
+    ) -> Result<Measurement, MeasureError> {
+        match noise {
+            Some(level) if !is_level(level) => return Err(MeasureError::Noise(level.to_string())),
+            None if !matches!(self.configuration().noise, NoiseSource::Border { .. }) => {
+                return Err(MeasureError::Noise("not given".into()));
+            }
+            _ => {}
+        }
+        let psf = star_psf(psf, self.configuration().psf_cut())?;
+        let mut worker = self.worker();
+        let mut image = worker.image(noise.map_or(ImageNoise::Unknown, ImageNoise::Level));
+        let found = image.psf(psf.view())?.measure(stamp)?;
+        if found.flags.contains(Flag::NotFinite) {
+            let mut pixels = stamp.indexed_iter();
+            let place = pixels.find(|(_, pixel)| !pixel.to_f32().is_finite());
+            let (y, x) = place.map(|(at, _)| at).unwrap_or_default();
+            return Err(MeasureError::NotFinite {
+                what: "stamp",
+                x: x + 1,
+                y: y + 1,
+            });
+        }
+        Ok(found)
+    }
+}
+
+/// The noise of an image, as far as it is known.
+#[derive(Debug, Clone, Copy, Default)]
+pub enum ImageNoise<'a> {
+    /// Level and correlation as measured on the stamps of the image, with the size of its galaxies.
+    Survey(&'a Survey),
+    /// White noise of this standard deviation per pixel.
+    Level(f64),
+    /// Nothing. A configuration that does not measure the noise on each stamp flags the galaxies.
+    #[default]
+    Unknown,
+}
+
+impl<'a> ImageNoise<'a> {
+    fn survey(self) -> Option<&'a Survey> {
+        match self {
+            ImageNoise::Survey(survey) => Some(survey),
+            ImageNoise::Level(_) | ImageNoise::Unknown => None,
+        }
+    }
+
+    fn level(self) -> f64 {
+        match self {
+            ImageNoise::Survey(survey) => survey.noise.sigma(),
+            ImageNoise::Level(level) => level,
+            ImageNoise::Unknown => f64::NAN,
+        }
+    }
+}
+
+/// Buffers of one thread. Measuring a galaxy allocates nothing.
+pub struct Worker {
+    measurer: Measurer,
+    method: Box<dyn CutWorker>,
+    denoise: Option<DenoiseScratch>,
+    /// Full stamp, denoised in place.
+    full: Vec<f32>,
+    /// Cut stamp.
+    cut: Vec<f32>,
+    border: Vec<f32>,
+    missing: Missing,
+    cells: Cells,
+    subtraction: Subtraction,
+}
+
+/// A worker for the galaxies of one image.
+#[derive(Debug)]
+pub struct ImageWorker<'a> {
+    worker: &'a mut Worker,
+    level: f64,
+}
+
+/// A worker for galaxies of one image and one PSF.
+#[derive(Debug)]
+pub struct PsfWorker<'a> {
+    worker: &'a mut Worker,
+    level: f64,
+}
+
+impl fmt::Debug for Worker {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Worker")
+            .field("measurer", &self.measurer)
+            .field("subtraction", &self.subtraction)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Worker {
+    /// The configuration.
+    pub fn configuration(&self) -> &Configuration {
+        self.measurer.configuration()
+    }
+
+    /// Prepares for the galaxies of an image with this noise.
+    ///
+    /// Noise of a survey is treated as white if its correlation is not significant. Without a survey, noise is white, and
+    /// the window is the configuration's own. [`Session::image`](crate::Session::image) prepares for an image that was
+    /// surveyed.
+    pub fn image(&mut self, noise: ImageNoise<'_>) -> ImageWorker<'_> {
+        self.image_with_stars(noise, None)
+    }
+
+    /// The same for an image whose noisy stars, one per galaxy, have a common profile.
+    pub(crate) fn image_with_stars(
+        &mut self,
+        noise: ImageNoise<'_>,
+        stars: Option<&Arc<CommonProfile>>,
+    ) -> ImageWorker<'_> {
+        let (white, survey) = (StampNoise::white(1.0), noise.survey());
+        self.subtraction = self.measurer.subtraction(survey);
+        let correlated = survey
+            .map(|survey| &survey.noise)
+            .filter(|noise| noise.is_correlated());
+        let extent = survey.and_then(|survey| survey.extent);
+        let of_modes = correlated.unwrap_or(&white);
+        self.method.set_image(of_modes, extent, stars);
+        ImageWorker {
+            worker: self,
+            level: noise.level(),
+        }
+    }
+
+    /// Measures a galaxy in noise of `level`, without calibration. Without a usable PSF it is flagged.
+    fn measure<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+        level: f64,
+        usable_psf: bool,
+    ) -> Result<Measurement, MeasureError> {
+        let plan = Arc::clone(&self.measurer.0);
+        let n = plan.configuration.stamp.size;
+        let linear = plan.configuration.linear().is_some();
+        let mut whole = self.read(stamp)?;
+        if linear && pixel::lose_padding(&mut self.full, plan.full) {
+            whole = false;
+        }
+        if !whole && !linear {
+            return Ok(Measurement::flagged(Flag::NotFinite));
+        }
+        if !usable_psf {
+            return Ok(Measurement::flagged(Flag::BadPsf));
+        }
+        if self.full.iter().all(|v| *v == self.full[0]) {
+            return Ok(Measurement::flagged(Flag::NoScale));
+        }
+        if self.subtraction != Subtraction::Nothing {
+            self.subtraction.apply(&mut self.full, &mut self.cells);
+        }
+        let noise = match plan.configuration.noise {
+            NoiseSource::Header | NoiseSource::Image { .. } => level,
+            NoiseSource::Border { border } => {
+                let found = border_noise(&self.full, plan.full, border, &mut self.border);
+                found.map_or(f64::NAN, f64::from)
+            }
+        };
+        if let (Some(filter), Some(buffers)) = (&plan.denoise, &mut self.denoise) {
+            filter.apply(&mut self.full, noise as f32, buffers);
+        }
+        if n == plan.full {
+            std::mem::swap(&mut self.cut, &mut self.full);
+        } else {
+            let start = cut_start(plan.full, n).unwrap_or(0);
+            for (y, row) in self.cut.chunks_exact_mut(n).enumerate() {
+                let from = (start + y) * plan.full + start;
+                row.copy_from_slice(&self.full[from..from + n]);
+            }
+        }
+        if !whole && !self.missing.mend(&mut self.cut, n) {
+            return Ok(Measurement::flagged(Flag::NotFinite));
+        }
+        let no_scale = Measurement {
+            noise,
+            ..Measurement::flagged(Flag::NoScale)
+        };
+        if !PEAKS.contains(&highest(&self.cut)) || (noise.is_finite() && !is_level(noise)) {
+            return Ok(no_scale);
+        }
+        let Some(found) = self.method.measure(&self.cut, noise)? else {
+            return Ok(no_scale);
+        };
+        Ok(found.measurement(plan.configuration.ellipticity(), noise))
+    }
+
+    /// Copies a full stamp; whether all of its pixels are finite.
+    fn read<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) -> Result<bool, MeasureError> {
+        let full = self.measurer.full();
+        if stamp.dim() != (full, full) {
+            let expected = format!("{full} × {full}");
+            return Err(MeasureError::square("a stamp", stamp.dim(), expected));
+        }
+        pixel::copy(stamp, &mut self.full);
+        Ok(all_finite(&self.full))
+    }
+}
+
+impl ImageWorker<'_> {
+    /// The configuration.
+    pub fn configuration(&self) -> &Configuration {
+        self.worker.configuration()
+    }
+
+    /// Prepares for galaxies with this PSF: centred, of sum one, and with the pixels that
+    /// [`star_psf`](crate::star_psf) cuts for [`Configuration::psf_cut`].
+    ///
+    /// # Errors
+    /// If the PSF has another size, or a pixel that is not finite.
+    pub fn psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<PsfWorker<'_>, MeasureError> {
+        self.worker.method.set_psf(psf)?;
+        Ok(PsfWorker {
+            worker: self.worker,
+            level: self.level,
+        })
+    }
+
+    /// Measures stamps, one per galaxy along the first axis, without calibration, in the noise of the image.
+    ///
+    /// # Errors
+    /// If sizes or numbers do not fit, or a PSF for all galaxies cannot be used. A galaxy whose own PSF cannot be used is
+    /// flagged.
+    pub fn measure_each<T: Pixel>(
+        &mut self,
+        stamps: ArrayView3<'_, T>,
+        psfs: &Psfs<'_>,
+    ) -> Result<Vec<Measurement>, MeasureError> {
+        self.measure_in_noise(stamps, psfs, None)
+    }
+
+    /// The same for white noise with one level per stamp, if there are any.
+    pub(crate) fn measure_in_noise<T: Pixel>(
+        &mut self,
+        stamps: ArrayView3<'_, T>,
+        psfs: &Psfs<'_>,
+        levels: Option<&[f64]>,
+    ) -> Result<Vec<Measurement>, MeasureError> {
+        let cut = self.configuration().psf_cut();
+        let (count, full, _) = stamps.dim();
+        let given = psfs.count();
+        match given {
+            Some(given) if given != count => {
+                return Err(MeasureError::Shape {
+                    what: "PSFs",
+                    found: format!("{given} galaxies"),
+                    expected: format!("{count}, one each"),
+                });
+            }
+            Some(_) => {}
+            None => self
+                .worker
+                .method
+                .set_psf(psfs.at(0, cut, full)?.psf.view())?,
+        }
+        let stamps = stamps.outer_iter().enumerate();
+        let measured = stamps.map(|(k, stamp)| {
+            let mut set = || {
+                let psf = psfs.at(k, cut, full)?;
+                self.worker.method.set_psf(psf.psf.view())
+            };
+            let usable_psf = given.is_none() || set().is_ok();
+            let level = levels.map_or(self.level, |levels| levels[k]);
+            self.worker.measure(stamp, level, usable_psf)
+        });
+        measured.collect()
+    }
+}
+
+impl PsfWorker<'_> {
+    /// The configuration.
+    pub fn configuration(&self) -> &Configuration {
+        self.worker.configuration()
+    }
+
+    /// The settings that were adapted to the PSF, and to the galaxies of a survey. `None` for the network, which adapts
+    /// nothing.
+    pub fn adapted(&self) -> Option<AdaptedSettings> {
+        self.worker.method.adapted()
+    }
+
+    /// Measures a galaxy on its full stamp, without calibration, in the noise of the image.
+    ///
+    /// # Errors
+    /// If the stamp has another size than planned.
+    pub fn measure<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+    ) -> Result<Measurement, MeasureError> {
+        self.worker.measure(stamp, self.level, true)
+    }
+
+    /// Measures a galaxy behind `psf`, the PSF of this worker, with the steps of the method unless it did not run.
+    pub(crate) fn measure_with_steps<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+        psf: Array2<f64>,
+    ) -> Result<(Measurement, Option<Steps>), MeasureError> {
+        let measured = self.measure(stamp)?;
+        if measured.descent.is_none() {
+            return Ok((measured, None));
+        }
+        let n = self.configuration().stamp.size;
+        let start = cut_start(stamp.nrows(), n).unwrap_or(0);
+        let pixel = |(y, x)| f64::from(stamp[(start + y, start + x)].to_f32());
+        let stamp = Array2::from_shape_fn((n, n), pixel);
+        let Images {
+            deconvolved,
+            acf,
+            weight,
+            spacing,
+        } = self.worker.method.images(&self.worker.cut, psf.view());
+        let reconvolved = convolve(deconvolved.view(), psf.view());
+        let middle = (acf.nrows() / 2) as f64;
+        let used = Array2::from_shape_fn(acf.dim(), |at| {
+            let (dy, dx) = (at.0 as f64 - middle, at.1 as f64 - middle);
+            if dy.hypot(dx) * spacing <= measured.radius {
+                acf[at] * weight.as_ref().map_or(1.0, |weight| weight[at])
+            } else {
+                f64::NAN
+            }
+        });
+        let steps = Steps {
+            residual: &stamp - &reconvolved,
+            stamp,
+            psf,
+            deconvolved,
+            acf,
+            used,
+        };
+        Ok((measured, Some(steps)))
+    }
+}
+
+/// The steps of one measurement as images.
+#[derive(Clone)]
+pub struct Steps {
+    /// The stamp as cut from the data, before any denoising.
+    pub stamp: Array2<f64>,
+    /// The PSF that was deconvolved.
+    pub psf: Array2<f64>,
+    /// The deconvolved stamp.
+    pub deconvolved: Array2<f64>,
+    /// Data minus the deconvolved stamp convolved with the PSF.
+    pub residual: Array2<f64>,
+    /// Autocorrelation, zero lag in the middle: all lags for the network, lags within the weight for the linear method.
+    pub acf: Array2<f64>,
+    /// The same times the weight of the moments, if the method has one; NaN beyond the radius of the moments.
+    pub used: Array2<f64>,
+}
+
+impl std::fmt::Debug for Steps {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Steps").finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array2;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use shearq_submissions::{Method, Neighbours};
+
+    use super::*;
+
+    const N: usize = 48;
+
+    /// A Gaussian of covariance (xx, yy) and flux one, about the middle of the stamp.
+    fn gaussian(n: usize, xx: f64, yy: f64) -> Array2<f64> {
+        let middle = (n as f64 - 1.0) / 2.0;
+        Array2::from_shape_fn((n, n), |(y, x)| {
+            let (x, y) = (x as f64 - middle, y as f64 - middle);
+            (-0.5 * (x * x / xx + y * y / yy)).exp() / (std::f64::consts::TAU * (xx * yy).sqrt())
+        })
+    }
+
+    #[test]
+    fn neighbours_flag_a_galaxy_or_are_kept() {
+        let named = Measurer::named("48/linear/star", N).unwrap();
+        let mut configuration = named.configuration().clone();
+        let Method::Linear(linear) = &mut configuration.method else {
+            panic!("a linear configuration");
+        };
+        linear.shape.neighbours = Neighbours::Keep;
+        let keeping = Measurer::new(&configuration, N).unwrap();
+        let psf = gaussian(32, 2.0, 2.0);
+        let psf = &psf / psf.sum();
+        let galaxy = gaussian(N, 8.0, 8.0) * 100.0;
+        // The same galaxy once more, 8 px to the left.
+        let pair = Array2::from_shape_fn((N, N), |(y, x)| {
+            galaxy[(y, x)] + galaxy.get((y, x + 8)).unwrap_or(&0.0)
+        });
+        let measure = |measurer: &Measurer, stamp: &Array2<f64>| {
+            let mut worker = measurer.worker();
+            let mut image = worker.image(ImageNoise::Level(0.1));
+            let mut worker = image.psf(psf.view()).unwrap();
+            worker.measure(stamp.view()).unwrap()
+        };
+        assert!(measure(&named, &pair).flags.contains(Flag::Neighbour));
+        let kept = measure(&keeping, &pair);
+        // The pair counts as one galaxy along x.
+        assert!(kept.flags.is_empty() && kept.e1 > 0.2, "{kept:?}");
+        // Without a neighbour both are the same.
+        let [one, other] = [&named, &keeping].map(|measurer| measure(measurer, &galaxy));
+        assert!(one.flags.is_empty() && one.e1 == other.e1 && one.e2 == other.e2);
+    }
+
+    #[test]
+    fn noise_of_an_elliptical_psf_leaves_round_galaxies_round() {
+        // Covariances in px²: a PSF of |e| = 0.05, along x and along y, and a small galaxy.
+        let (long, short, own) = (2.31, 1.89, 3.0);
+        let e = (long - short) / (long + short) / 2.0;
+        let measurer = Measurer::named("48/linear/star", N).unwrap();
+        let sides = [(long, short), (short, long)].map(|(xx, yy)| {
+            let psf = gaussian(32, xx, yy);
+            let psf = &psf / psf.sum();
+            let galaxy = gaussian(N, own + xx, own + yy);
+            let strength = galaxy.iter().map(|v| v * v).sum::<f64>().sqrt();
+            // S/N 10.
+            (psf, galaxy * (10.0 / strength))
+        });
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let half = 3f64.sqrt();
+        let [first, second] = sides;
+        let mut worker = measurer.worker();
+        let mut leaks = Vec::new();
+        let mut response = 0.0;
+        for _ in 0..3000 {
+            let noise = Array2::from_shape_fn((N, N), |_| rng.random_range(-half..half));
+            let mut mean = |(psf, galaxy): &(Array2<f64>, Array2<f64>)| {
+                let mut image = worker.image(ImageNoise::Level(1.0));
+                let mut worker = image.psf(psf.view()).unwrap();
+                // Noise of both signs leaves the even part of its effect.
+                let [a, b] = [1.0, -1.0].map(|sign| {
+                    let stamp = &*galaxy + &(&noise * sign);
+                    worker.measure(stamp.view()).unwrap()
+                });
+                response += 0.25 * (a.response_diagonal()[0] + b.response_diagonal()[0]);
+                0.5 * (a.e1 + b.e1)
+            };
+            leaks.push(0.5 * (mean(&first) - mean(&second)));
+        }
+        let count = leaks.len() as f64;
+        let scale = e * response / count;
+        let mean = leaks.iter().sum::<f64>() / count;
+        let square = leaks.iter().map(|leak| (leak - mean).powi(2)).sum::<f64>();
+        let (leak, error) = (mean / scale, square.sqrt() / count / scale);
+        // Without looking at the field of the turned PSF it is −0.014.
+        assert!(
+            error < 2.5e-3 && leak.abs() < 2.5 * error,
+            "{leak} ± {error}"
+        );
+    }
+}
