@@ -17,8 +17,7 @@ use shearq_results::foreign::Foreign;
 use shearq_results::submit::challenge::{Kind, read_spectrum};
 use shearq_submissions::{Configuration, Registry};
 
-use crate::bad_images::gzip;
-use crate::support::{PACKED, Small, fits_image, pixels_of};
+use crate::support::{PACKED, Small, fits_image, gzip, pixels_of};
 
 /// Inputs of each reader in the ordinary test.
 const INPUTS: u64 = 300;

@@ -1,6 +1,7 @@
 //! Killed at any moment, or without room on the disk: whatever that interrupts, going on ends in the same bytes.
 
 use std::collections::BTreeMap;
+use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -228,4 +229,68 @@ fn ends_within(arguments: &[&str], delay: Duration, temporary: &Path) -> bool {
     let status = child.wait().expect("one's own child can be waited for");
     assert!(status.code().is_none_or(|code| code == 0), "{arguments:?}");
     status.success()
+}
+
+#[cfg(unix)]
+#[test]
+fn an_output_folder_that_is_taken_away_is_an_error() {
+    let root = tempfile::tempdir().unwrap();
+    let at = |name: &str| root.path().join(name);
+    let data = at("data");
+    succeed(&[
+        "simulate",
+        "--sets",
+        "2",
+        "--images",
+        "40",
+        "--grid",
+        "8",
+        "--out",
+        text(&data),
+    ]);
+    let sets = ["--sets", "2", "--images", "40", "--grid", "8"];
+    let submission = ["--submission", "23/den/star"];
+    for (name, first, command) in [
+        (
+            "measured",
+            "catalogue-001.parquet",
+            [&["measure", "--data", text(&data)], &submission[..]].concat(),
+        ),
+        (
+            "run",
+            "catalogue-001.parquet",
+            [&["run", "--simulate"], &submission[..], &sets].concat(),
+        ),
+        (
+            "simulated",
+            "galaxies-001.fits",
+            [&["simulate"], &sets[..]].concat(),
+        ),
+    ] {
+        let out = at(name);
+        let child = Command::new(env!("CARGO_BIN_EXE_shearq"))
+            .args(&command)
+            .args(["--threads", "1", "--out", text(&out)])
+            .stderr(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        let start = Instant::now();
+        while !out.join("set02").join(first).exists() {
+            assert!(
+                start.elapsed() < Duration::from_secs(60),
+                "{name}: nothing is written"
+            );
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        fs::rename(&out, at(&format!("{name}-away"))).unwrap();
+        let output = child.wait_with_output().unwrap();
+        let message = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{name}: {message}");
+        let expected = "was removed or replaced while results were written";
+        assert!(
+            message.contains(name) && message.contains(expected),
+            "{message}"
+        );
+    }
 }

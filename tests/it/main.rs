@@ -7,16 +7,14 @@
     reason = "a failed test stops at the cause and prints to standard error; tables of cases are long"
 )]
 
-mod bad_catalogues;
-mod bad_images;
-mod bad_settings;
 mod baselines;
 mod bias;
 mod bias_design;
+mod cases;
 mod chain;
 mod challenge;
+mod damaged;
 mod documents;
-mod doubtful;
 mod entry_points;
 mod examined;
 mod figures;
@@ -26,20 +24,17 @@ mod galsim_measured;
 mod gathered;
 mod generated;
 mod identity;
+mod inputs;
 mod killed;
 mod ledger;
-mod limits;
 mod noisy_stars;
-mod odd_files;
 mod odd_images;
 mod one_session;
 mod orientation;
 mod own_images;
 mod packed;
-mod position_tables;
 mod printed;
 mod reference;
-mod refused;
 mod reproduced;
 mod scoring_cases;
 mod selected;
@@ -50,6 +45,5 @@ mod support;
 mod survey_tables;
 mod terminal;
 mod truth_sign;
-mod unread_files;
 mod wrong_data;
 mod wrong_psfs;

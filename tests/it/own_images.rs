@@ -7,8 +7,7 @@ use serde_json::Value;
 use shearq_files::fits::{self, ImageWriter};
 use shearq_files::table;
 
-use crate::bad_images::gzip;
-use crate::support::{Small, fail, pixels_of, shearq, succeed, text};
+use crate::support::{Small, fail, gzip, pixels_of, shearq, succeed, text};
 
 const RAW: [&str; 2] = ["--submission", "23/raw/star"];
 

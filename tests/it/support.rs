@@ -1,8 +1,11 @@
 //! Helpers of several tests: the binary, images that GalSim rendered, numbers from CSV files.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use flate2::Compression;
+use flate2::write::GzEncoder;
 use shearq_files::table;
 
 /// The images of `tests/data` that fpack made, one for each of its ways.
@@ -202,4 +205,11 @@ pub fn pixels_of(path: &Path) -> (Vec<f32>, usize) {
 /// Pixels as FITS stores them.
 pub fn floats(pixels: &[f32]) -> Vec<u8> {
     pixels.iter().flat_map(|v| v.to_be_bytes()).collect()
+}
+
+/// Bytes as gzip stores them.
+pub fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut gzip = GzEncoder::new(Vec::new(), Compression::fast());
+    gzip.write_all(bytes).expect("in memory");
+    gzip.finish().expect("in memory")
 }

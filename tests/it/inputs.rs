@@ -1,0 +1,162 @@
+//! Commands of the pages of `tests/cases` that make or show what no text can hold: images and tables of FITS.
+//!
+//! * `image FROM TO WHAT...`: an image of the pixels of another. WHAT is applied in order: `size=WxH` or other axes,
+//!   `pad=SIDE` (zeros around it), `cube=STAMP,SIDE` (the central pixels of a mosaic's stamps), `scale=F`, `add=F`, `shift=X,Y`, `pixel=X,Y,F` (from 1), `number=SIDE` (of the
+//!   square of pixels from 0), `bitpix=N`, or a card such as `STAMP=48`.
+//! * `card FROM TO KEY=VALUE`: a copy with another value of a key. `card FROM TO KEY CARD`: a copy with any card in the
+//!   place of the last one of this key; `"` stands for `'`.
+//! * `tables TO NAME=CSV...`: a file of tables, each from a CSV of numbers.
+//! * `stamps FROM SIDE`: prints the first pixel of each stamp of a mosaic.
+
+use std::fs;
+use std::path::Path;
+
+use shearq_files::fits::write_table;
+use shearq_files::frames::frame;
+use shearq_files::frames::polars::Column;
+
+use crate::support::{csv, fits_image, pixels_of};
+
+/// Runs a command of this module in `root`, and gives what it prints; `None` if it is another.
+pub fn run(command: &str, root: &Path) -> Option<String> {
+    // Words may have spaces in single quotes.
+    let quoted = command.split('\'').enumerate();
+    let words: Vec<String> = quoted
+        .flat_map(|(k, part)| match k % 2 {
+            0 => part.split_whitespace().map(str::to_owned).collect(),
+            _ => vec![part.to_owned()],
+        })
+        .collect();
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let at = |name: &str| match name.strip_prefix("[tests/data]/") {
+        Some(name) => Path::new("tests/data").join(name),
+        None => root.join(name),
+    };
+    match words.as_slice() {
+        ["image", from, to, what @ ..] => fs::write(at(to), image(&at(from), what)).unwrap(),
+        ["card", from, to, what @ ..] => {
+            let mut bytes = fs::read(at(from)).unwrap();
+            let (key, card) = match what {
+                [key, card] => ((*key).to_owned(), card.replace('"', "'")),
+                _ => {
+                    let (key, value) = what[0].split_once('=').unwrap();
+                    (key.to_owned(), format!("{key:<8}= {value:>20}"))
+                }
+            };
+            let key = format!("{key:<8}");
+            let mut cards = bytes.chunks_exact_mut(80).rev();
+            let old = cards.find(|old| old.starts_with(key.as_bytes())).unwrap();
+            old.copy_from_slice(format!("{card:<80}").as_bytes());
+            fs::write(at(to), bytes).unwrap();
+        }
+        ["tables", to, tables @ ..] => {
+            let mut file = Vec::new();
+            for (name, table) in tables.iter().filter_map(|table| table.split_once('=')) {
+                let bytes = table_of(&at(table), &at("one.fits"), name);
+                file.extend(&bytes[if file.is_empty() { 0 } else { 2880 }..]);
+            }
+            fs::write(at(to), file).unwrap();
+        }
+        ["stamps", from, side] => {
+            let (pixels, width) = pixels_of(&at(from));
+            let side: usize = side.parse().unwrap();
+            let rows = pixels.chunks(width).step_by(side);
+            let corners = rows.flat_map(|row| row.iter().step_by(side));
+            let shown: Vec<String> = corners.map(ToString::to_string).collect();
+            return Some(shown.join(" "));
+        }
+        _ => return None,
+    }
+    Some(String::new())
+}
+
+fn numbers<const N: usize>(text: &str) -> [f64; N] {
+    let numbers: Vec<f64> = text.split([',', 'x']).map(|n| n.parse().unwrap()).collect();
+    numbers.try_into().expect("numbers")
+}
+
+fn image(from: &Path, what: &[&str]) -> Vec<u8> {
+    let (mut pixels, width) = pixels_of(from);
+    let mut sides = vec![width, pixels.len() / width];
+    let (mut bitpix, mut cards) = (-32, Vec::new());
+    for (key, value) in what.iter().map(|what| what.split_once('=').unwrap()) {
+        match key {
+            "size" => {
+                sides = value.split('x').map(|side| side.parse().unwrap()).collect();
+                pixels.resize(sides.iter().product(), 0.0);
+            }
+            "cube" => {
+                let [stamp, side] = numbers(value).map(|side| side as usize);
+                let (n, first) = (sides[0] / stamp, (stamp - side) / 2);
+                let corner = |k: usize| (k / n * stamp + first) * sides[0] + k % n * stamp + first;
+                let old = pixels.clone();
+                let row = |k: usize, y: usize| &old[corner(k) + y * sides[0]..][..side];
+                let rows = (0..n * n).flat_map(|k| (0..side).map(move |y| (k, y)));
+                pixels = rows.flat_map(|(k, y)| row(k, y).to_vec()).collect();
+                sides = vec![side, side, n * n];
+            }
+            "scale" => pixels
+                .iter_mut()
+                .for_each(|v| *v *= value.parse::<f32>().unwrap()),
+            "add" => pixels
+                .iter_mut()
+                .for_each(|v| *v += value.parse::<f32>().unwrap()),
+            "pad" => {
+                let (side, width) = (value.parse::<usize>().unwrap(), sides[0]);
+                let first = (side - width) / 2;
+                let mut padded = vec![0.0; side * side];
+                for (k, pixel) in pixels.iter().enumerate() {
+                    padded[(first + k / width) * side + first + k % width] = *pixel;
+                }
+                (pixels, sides) = (padded, vec![side; 2]);
+            }
+            "number" => {
+                let (side, width) = (value.parse::<usize>().unwrap(), sides[0]);
+                let stamp = |k: usize| k / width / side * (width / side) + k % width / side;
+                pixels = (0..pixels.len()).map(|k| stamp(k) as f32).collect();
+            }
+            "shift" => {
+                let [dx, dy] = numbers(value).map(|by| by as i64);
+                let [w, h] = [sides[0], sides[1]].map(|side| side as i64);
+                let old = pixels.clone();
+                let place =
+                    |k: i64| ((k / w - dy).rem_euclid(h) * w + (k % w - dx).rem_euclid(w)) as usize;
+                pixels = (0..w * h).map(|k| old[place(k)]).collect();
+            }
+            "pixel" => {
+                let [x, y, v] = numbers(value);
+                pixels[(y as usize - 1) * sides[0] + x as usize - 1] = v as f32;
+            }
+            "bitpix" => bitpix = value.parse().unwrap(),
+            key => cards.push(format!("{key:<8}= {value:>20}")),
+        }
+    }
+    let bytes = |pixel: &f32| match bitpix {
+        8 => vec![*pixel as u8],
+        16 => (*pixel as i16).to_be_bytes().to_vec(),
+        32 => (*pixel as i32).to_be_bytes().to_vec(),
+        64 => (*pixel as i64).to_be_bytes().to_vec(),
+        -64 => f64::from(*pixel).to_be_bytes().to_vec(),
+        _ => pixel.to_be_bytes().to_vec(),
+    };
+    let cards: Vec<&str> = cards.iter().map(String::as_str).collect();
+    let bytes: Vec<u8> = pixels.iter().flat_map(bytes).collect();
+    fits_image(bitpix, &sides, &cards, &bytes)
+}
+
+/// A FITS file of one table with the columns of a CSV file.
+fn table_of(table: &Path, scratch: &Path, name: &str) -> Vec<u8> {
+    let head = fs::read_to_string(table).unwrap();
+    let names: Vec<&str> = head.lines().next().unwrap().split(',').collect();
+    let columns = names.iter().zip(csv(table, &names));
+    let columns = columns.map(|(name, values)| Column::new((*name).into(), values));
+    let _ = fs::remove_file(scratch);
+    write_table(scratch, &frame(columns.collect()).unwrap(), &[]).unwrap();
+    let mut bytes = fs::read(scratch).unwrap();
+    fs::remove_file(scratch).unwrap();
+    let mut cards = bytes.chunks_exact_mut(80);
+    let card = cards.find(|card| card.starts_with(b"EXTNAME ")).unwrap();
+    let quoted = format!("'{name}'");
+    card.copy_from_slice(format!("{:<80}", format!("EXTNAME = {quoted:<20}")).as_bytes());
+    bytes
+}
